@@ -8,11 +8,11 @@ from realsim.app.school.tables import (
     SCHOOL_HEADER,
     doubts,
     level_tables,
+    p_hold_line,
     reasons,
     school_table,
     survivors,
 )
-from realsim.app.show import p_hold_line
 from realsim.geometry.parts import part
 from tried_grasps import tried_set
 

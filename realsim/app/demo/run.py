@@ -18,10 +18,12 @@ from realsim.app.calibrate.show import show_hand_eye
 from realsim.app.console import Console, StageTime
 from realsim.app.register.run import register_session
 from realsim.app.school.run import school_session
-from realsim.app.show import show_grasps, show_scene
+from realsim.app.school.tables import show_school
+from realsim.app.show import show_scene
 from realsim.app.stages import (
     BOARD_VIEWS,
     save_starts,
+    session_models,
 )
 from realsim.errors import InputError
 from realsim.records import CaptureSession, GraspSet, HandEye, Scene
@@ -214,7 +216,7 @@ def show_demo(result: DemoResult, console: Console) -> None:
     """Print the tables, the errors against the truth, the pictures, and what to do next."""
     show_hand_eye(result.hand_eye, console)
     show_scene(result.store, result.scene, console)
-    show_grasps(result.store, result.grasps, console)
+    show_school(result.grasps, session_models(result.store), console)
     console.table(
         "Errors against the truth of the simulated lab",
         ["figure", "measured", "goal"],

@@ -7,7 +7,7 @@ import numpy as np
 from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count, share
 from realsim.app.report.section import Section, drawn
-from realsim.app.show import GRASP_HEADER, grasp_rows, why_no_grasp
+from realsim.app.school.tables import p_hold_line, school_table, why_no_grasp
 from realsim.formats.grasps.scene_grasps import labelled
 from realsim.records import GraspSet
 from realsim.store import SessionStore
@@ -47,8 +47,9 @@ def school_section(section: Section, store: SessionStore) -> None:
             why = "none of them is good" if np.isfinite(s.scores).any() else why_no_grasp(s)
             section.say("note", f"Robot School: {s.instance} {name} has no good grasp: {why}.")
     section.page.text(SLIPS_NOTE)
-    known = [s for s in sets if s.obj_id in models]
-    section.page.table(GRASP_HEADER, grasp_rows(known, models))
+    section.page.table(*school_table(sets, models))
+    if line := p_hold_line(sets):
+        section.page.text(line)
     shares = [x for n, x in f.items() if n.endswith("_share") or n in MEASURED]
     rows = [[x.meaning.text, f"{x.shown} {x.meaning.unit}".strip()] for x in shares]
     if rows:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from realsim.app.console import Console
 from realsim.app.register.files import plain
-from realsim.app.show import p_hold_line
 from realsim.records import STAGES, GraspSet, ObjectModel
 
 Rows = list[list[str]]
@@ -177,6 +176,14 @@ def agreement_line(sets: Sequence[GraspSet]) -> str:
     )
 
 
+def p_hold_line(sets: Sequence[GraspSet]) -> str:
+    """Return in one line how p_hold is distributed; empty where no set has one."""
+    from realsim_sim_bridge.school.measure_statistics import p_hold_spread
+
+    spread = p_hold_spread(sets)
+    return "" if spread is None else spread.in_words
+
+
 def setting_lines(sets: Sequence[GraspSet]) -> list[str]:
     """Return what the labels hang on, a line for each setting: engine, force, friction, density."""
     densities: dict[str, set[str]] = {}
@@ -223,10 +230,20 @@ def _engine_of(s: GraspSet) -> str:
     return ""
 
 
+def why_no_grasp(grasps: GraspSet) -> str:
+    """Return in words what took all candidates of an object."""
+    counts = grasps.parameters.get("counts") or {}
+    if not counts.get("turned"):
+        return f"not tried: {grasps.parameters.get('not_tried') or 'no antipodal pair fits'}"
+    return (
+        f"no candidate is free: of {counts['turned']}, {counts['hand_in_table']} would touch the "
+        f"table, {counts['hand_in_object']} the object itself, {counts['hand_in_neighbour']} a "
+        "neighbour"
+    )
+
+
 def not_tried(sets: Sequence[GraspSet], models: Names) -> list[str]:
     """Return in words, of each object without tried grasps, why there are none."""
-    from realsim.app.show import why_no_grasp
-
     words: list[str] = []
     for s in sets:
         if len(s) == 0:

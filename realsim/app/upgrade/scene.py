@@ -13,7 +13,7 @@ from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console, Tick
 from realsim.app.register.run import register_session
 from realsim.app.school.run import school_session
-from realsim.app.show import why_no_grasp
+from realsim.app.school.tables import why_no_grasp
 from realsim.app.stages import save_starts
 from realsim.app.upgrade.analytic import AnalyticJob, agreement_of, try_analytic
 from realsim.app.upgrade.config import UpgradeConfig

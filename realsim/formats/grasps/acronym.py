@@ -26,18 +26,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.formats.grasps.hand_frames import grasp_poses, hand_poses, require_panda
-from realsim.formats.grasps.hdf5 import COLUMNS, known_measures
+from realsim.formats.grasps.hdf5 import get_set, put_set
 from realsim.formats.grasps.scene_grasps import (
     check_values,
     executed,
     held,
-    parameters_json,
     untried_set,
 )
 from realsim.formats.hdf5_checked import CheckedGroup, opened
 from realsim.geometry import se3
-from realsim.records import STAGES, GraspSet
-from realsim.records.grasps import MEASURES
+from realsim.records import GraspSet
 from realsim.robots.hand import find_hand
 from realsim.store import atomic
 
@@ -127,21 +125,10 @@ def acronym_bytes(grasps: GraspSet, obj: AcronymObject) -> bytes:
         flex["object_in_gripper"] = held(grasps)[rows].astype(np.int64)
         flex.attrs["simulator"] = f"realsim {version('realsim')}, not FleX; see {OURS}"
         ours = file.create_group(OURS)
-        ours.attrs["obj_id"], ours.attrs["instance"] = grasps.obj_id, grasps.instance
         ours.attrs["left_out"] = len(grasps) - len(rows)
         ours.attrs["left_out_meaning"] = "grasps of the set that physics has not tried"
         ours["row"] = rows.astype(np.int64)
-        for name, (attribute, unit, meaning) in COLUMNS.items():
-            _put(ours, name, getattr(grasps, attribute)[rows], unit, meaning)
-        _put(ours, "reachable", grasps.reachable[rows], "1", "whether the arm has a path")
-        texts = [grasps.failures[row].encode() for row in rows.tolist()]
-        length = max([1, *(len(t) for t in texts)])
-        _put(ours, "failure", np.array(texts, dtype=f"S{length}"), "", "why it stopped")
-        measures = ours.create_group("measures")
-        for name, values in grasps.measures.items():
-            _put(measures, name, values[rows], MEASURES[name].unit, MEASURES[name].meaning)
-        text = parameters_json(grasps).encode()
-        _put(ours, "parameters", np.array(text, dtype=f"S{len(text)}"), "", "JSON")
+        put_set(ours, grasps, rows)
     return buffer.getvalue()
 
 
@@ -155,12 +142,6 @@ def _put_object(group: Any, obj: AcronymObject) -> None:
     for name, value in known.items():
         if value is not None:
             group[name] = np.asarray(value, dtype=np.float64)
-
-
-def _put(group: Any, name: str, values: NDArray[Any], unit: str, meaning: str) -> None:
-    group.create_dataset(name, data=values, track_times=False)
-    group[name].attrs["unit"] = unit
-    group[name].attrs["meaning"] = meaning
 
 
 # --- reading ----------------------------------------------------------------------------------
@@ -187,13 +168,17 @@ def read_acronym(path: Path | str) -> AcronymGrasps:
             raise flex.wrong("object_in_gripper holds other values than 0 and 1.")
         is_ours = qualities.has("realsim")
         Ts = se3.check_rigid(grasp_poses(Ts_hand, "acronym"), f"{path}: grasps") if n else Ts_hand
+        tried = None
+        if is_ours:
+            tried = get_set(qualities.group("realsim"), Ts)
+            check_values(tried)
         return AcronymGrasps(
             obj=_get_object(file.group("object")),
             Ts_obj_grasp=Ts,
             object_in_gripper=label == 1,
             simulator=flex.attribute("simulator", str) if is_ours else "FleX",
             motions={m: flex.numbers(m, (n,)) for m in MOTIONS if flex.has(m)},
-            tried=_get_set(qualities.group("realsim"), Ts) if is_ours else None,
+            tried=tried,
         )
 
 
@@ -223,29 +208,3 @@ def _get_object(group: CheckedGroup) -> AcronymObject:
         center_of_mass=numbers("com", (3,)),
         inertia=numbers("inertia", (3, 3)),
     )
-
-
-def _get_set(group: CheckedGroup, Ts_obj_grasp: Array) -> GraspSet:
-    """Return the set that realsim wrote."""
-    n, stages = len(Ts_obj_grasp), len(STAGES)
-    columns = {
-        attribute: group.numbers(name, (n, stages) if attribute.startswith("slip") else (n,))
-        for name, (attribute, _, _) in COLUMNS.items()
-    }
-    measured = group.group("measures")
-    parameters = group.json("parameters")
-    found = GraspSet(
-        obj_id=group.attribute("obj_id", int),
-        instance=group.attribute("instance", int),
-        Ts_obj_grasp=Ts_obj_grasp,
-        reachable=group.booleans("reachable", (n,)),
-        failures=group.texts("failure", n),
-        measures={
-            name: measured.numbers(name, (n, stages) if MEASURES[name].by_stage else (n,))
-            for name in known_measures(measured.names(), measured)
-        },
-        parameters=parameters,
-        **columns,
-    )
-    check_values(found)
-    return found

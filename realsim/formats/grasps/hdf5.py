@@ -87,7 +87,8 @@ def grasps_hdf5_bytes(scene: SceneGrasps) -> bytes:
         for s in scene.sets:
             group = sets.create_group(f"{s.instance:06d}_obj{s.obj_id:06d}")
             group.attrs["name"] = scene.names.get(s.obj_id, "")
-            _put_set(group, s)
+            _put(group, "T_obj_grasp", s.Ts_obj_grasp, "m", "grasp in object")
+            put_set(group, s, np.arange(len(s)))
             _put_poses(group, scene, s)
             if s.instance in scene.trajectories:
                 attempts = group.create_group("trajectories")
@@ -121,7 +122,7 @@ def read_grasps_hdf5(path: Path | str) -> SceneGrasps:
         groups = file.group("sets")
         for name in groups.names():
             group = groups.group(name)
-            s = _get_set(group)
+            s = get_set(group, group.numbers("T_obj_grasp", (None, 4, 4)))
             sets.append(s)
             called = group.attribute("name", str)
             if called:
@@ -139,21 +140,22 @@ def read_grasps_hdf5(path: Path | str) -> SceneGrasps:
 # --- one set ----------------------------------------------------------------------------------
 
 
-def _put_set(group: Any, s: GraspSet) -> None:
+def put_set(group: Any, s: GraspSet, rows: NDArray[np.int64]) -> None:
+    """Write some rows of a set into a group, all but the poses."""
     group.attrs["obj_id"] = s.obj_id
     group.attrs["instance"] = s.instance
-    _put(group, "T_obj_grasp", s.Ts_obj_grasp, "m", "grasp in object")
     for name, (field, unit, meaning) in COLUMNS.items():
-        _put(group, name, getattr(s, field), unit, meaning)
-    _put(group, "reachable", s.reachable, "1", "whether the arm has a path free of collisions")
-    texts = [text.encode() for text in s.failures]
+        _put(group, name, getattr(s, field)[rows], unit, meaning)
+    reachable = s.reachable[rows]
+    _put(group, "reachable", reachable, "1", "whether the arm has a path free of collisions")
+    texts = [s.failures[row].encode() for row in rows.tolist()]
     length = max([1, *(len(t) for t in texts)])
     _put(
         group, "failure", np.array(texts, dtype=f"S{length}"), "", "why it stopped; '' = passed all"
     )
     measures = group.create_group("measures")
     for name, values in s.measures.items():
-        _put(measures, name, values, MEASURES[name].unit, MEASURES[name].meaning)
+        _put(measures, name, values[rows], MEASURES[name].unit, MEASURES[name].meaning)
     _put(
         group, "parameters", _text(parameters_json(s)), "", "all that the scores depend on, as JSON"
     )
@@ -187,8 +189,8 @@ def _text(text: str) -> NDArray[np.bytes_]:
     return np.array(data, dtype=f"S{max(1, len(data))}")
 
 
-def _get_set(group: CheckedGroup) -> GraspSet:
-    Ts = group.numbers("T_obj_grasp", (None, 4, 4))
+def get_set(group: CheckedGroup, Ts: NDArray[np.float64]) -> GraspSet:
+    """Return the set of these poses (N, 4, 4) [m] that `put_set` wrote."""
     n, stages = len(Ts), len(STAGES)
     columns = {
         field: group.numbers(name, (n, stages) if field.startswith("slip") else (n,))
@@ -197,7 +199,7 @@ def _get_set(group: CheckedGroup) -> GraspSet:
     measured = group.group("measures")
     measures = {
         name: measured.numbers(name, (n, stages) if MEASURES[name].by_stage else (n,))
-        for name in known_measures(measured.names(), measured)
+        for name in _known_measures(measured.names(), measured)
     }
     parameters = group.json("parameters")
     if not isinstance(parameters, dict):
@@ -214,7 +216,7 @@ def _get_set(group: CheckedGroup) -> GraspSet:
     )
 
 
-def known_measures(names: list[str], group: CheckedGroup) -> list[str]:
+def _known_measures(names: list[str], group: CheckedGroup) -> list[str]:
     """Return the names in the order of MEASURES.
 
     Raises:

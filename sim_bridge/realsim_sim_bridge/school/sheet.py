@@ -43,7 +43,8 @@ FEW = 6
 """Up to so many objects stand three in a row, more four."""
 MOST_OBJECTS = 60
 """Objects on one sheet: 15 rows, and a picture of 6,000 pixels."""
-MARGIN_BINS = 10
+BAR = 0.94 / LABEL_BINS
+"""Width of a histogram's bar."""
 LEFT_AFTER = ("candidates", "trajectory", "close", "lift", "oscillate", "pendulum")
 BAR_COLOR = "#5b7f95"
 ROOM, PAD = 0.35, 0.015
@@ -207,30 +208,28 @@ def _label_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
     """
     counts, title, name = label_chart(sets)
     nowhere = sum(int(np.sum(~labelled(s) & (s.scores == 0))) for s in sets)
-    width = 1 / LABEL_BINS
-    left = width * np.arange(LABEL_BINS)
+    ax.bar(0, nowhere, BAR, align="edge", bottom=counts[0], color=STOPS[1][1])
     colors = [score_hex(x) for x in np.linspace(0, 1, LABEL_BINS)]
-    ax.bar(left, counts, width=0.94 * width, align="edge", color=colors)
-    ax.bar(0, nowhere, width=0.94 * width, align="edge", bottom=counts[0], color=STOPS[1][1])
-    ax.set_ylim(0, 1.18 * max(1, int(counts[0] + nowhere), int(counts.max())))
-    ax.set_xlim(-0.02, 1.02)
-    ax.set_xticks([0, 0.25, 0.5, 0.75, 1])
-    ax.yaxis.get_major_locator().set_params(integer=True)
-    _named(ax, title, name, "grasps")
+    _ten_bars(ax, counts, colors, title, name, int(counts[0] + nowhere))
 
 
 def _margin_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
     """Draw how many grasps have which margin: 1 = held at every friction and force tried."""
     margins = _joined([s.measures["margin"] for s in sets if "margin" in s.measures])
-    known = margins[~np.isnan(margins)]
-    edges = np.linspace(0, 1, MARGIN_BINS + 1)
-    counts = np.histogram(np.clip(known, 0, 1), edges)[0]
-    ax.bar(edges[:-1], counts, width=0.94 / MARGIN_BINS, align="edge", color=BAR_COLOR)
+    counts = np.histogram(margins[~np.isnan(margins)], LABEL_BINS, (0.0, 1.0))[0]
+    _ten_bars(ax, counts, BAR_COLOR, "Margins over friction and force", "margin")
+
+
+def _ten_bars(
+    ax: Any, counts: NDArray[np.int64], colors: str | list[str], title: str, name: str, top: int = 1
+) -> None:
+    """Draw counts of ten equal bins from 0 to 1; `top` is what is drawn there already."""
+    ax.bar(np.arange(LABEL_BINS) / LABEL_BINS, counts, BAR, align="edge", color=colors)
     ax.set_xlim(-0.02, 1.02)
     ax.set_xticks([0, 0.25, 0.5, 0.75, 1])
-    ax.set_ylim(0, 1.18 * max(1, counts.max()))
+    ax.set_ylim(0, 1.18 * max(1, top, int(counts.max())))
     ax.yaxis.get_major_locator().set_params(integer=True)
-    _named(ax, "Margins over friction and force", "margin", "grasps")
+    _named(ax, title, name, "grasps")
 
 
 def _legend(figure: Any, top: float, sets: Sequence[GraspSet]) -> None:
