@@ -33,6 +33,20 @@ def lost(all_of_them):
     return [d for d in all_of_them if "lost" in d.outcome.failure or "touch" in d.outcome.failure]
 
 
+def test_an_attempt_tells_its_p_hold(school):
+    grasps, models = stored_grasps(school)
+    told = [
+        replace(s, measures={"p_hold": np.arange(len(s)) / len(s), "safety": np.ones((len(s), 4))})
+        for s in grasps.sets
+    ]
+    known = DemonstrationSource(
+        replace(grasps, sets=tuple(told)), models, cameras=(), cache=school / "grasps/cache"
+    )
+    d = known[0]
+    count = next(len(s) for s in told if s.instance == d.name.instance)
+    assert d.outcome.labels == {"p_hold": d.name.grasp / count, "safety": [1.0] * 4}
+
+
 def lowest_m(d, k):
     """Return the height of the object's lowest vertex over the table."""
     mesh = d.scenery.models[d.name.instance].mesh
