@@ -34,6 +34,55 @@ class PadContacts:
         return np.asarray(np.isfinite(self.levers_m).all(axis=1))
 
 
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class PadRays:
+    """What parallel rays from two pads meet, object frame; R rays each, finger 0 at -y."""
+
+    points: Array
+    """(N, 2, R, 3) [m]; on the pad where nothing is touched."""
+    normals: Array
+    """(N, 2, R, 3) unit normals towards the pad."""
+    touched: NDArray[np.bool_]
+    """(N, 2, R) whether the pad touches there when it has closed."""
+
+
+def pad_rays(
+    surface: RaySurface,
+    Ts_obj_pads: Array,
+    openings_m: Array,
+    geometry: Hand,
+    rays: int,
+    softness_m: float,
+) -> PadRays:
+    """Return what closing pads meet; arguments as of `pad_contacts`. Rays go by x, then by z."""
+    n, cell = len(Ts_obj_pads), (np.arange(rays) + 0.5) / rays * 2 - 1
+    width, length = geometry.pad_width_m, geometry.pad_length_m
+    x, z = np.meshgrid(0.5 * width * cell, 0.5 * length * cell, indexing="ij")
+    side = np.array([-1.0, 1.0])
+    origins = np.empty((n, 2, rays * rays, 3))
+    origins[..., 0], origins[..., 2] = x.ravel(), z.ravel()
+    origins[..., 1] = 0.5 * openings_m[:, None, None] * side[:, None]
+    shape = origins.shape
+    origins = se3.transform(Ts_obj_pads, origins.reshape(n, 2 * rays * rays, 3)).reshape(shape)
+    inward = -side[:, None] * Ts_obj_pads[:, None, :3, 1]
+    directions = np.broadcast_to(inward[:, :, None], origins.shape)
+
+    t, face = surface.first_hits(origins.reshape(-1, 3), directions.reshape(-1, 3))
+    t, face = t.reshape(shape[:3]), face.reshape(shape[:3])
+    # The other pad is where the opening ends.
+    t = np.where(t <= openings_m[:, None, None], t, np.inf)
+    first = t.min(axis=2, keepdims=True, initial=np.inf)
+    touched = np.isfinite(t) & (t <= first + softness_m)
+    normals = surface.face_normals[np.where(touched, face, 0)]
+    # A pad comes from outside, whatever way the triangles face.
+    facing = np.sum(normals * directions, axis=-1, keepdims=True)
+    return PadRays(
+        points=origins + np.where(touched, t, 0.0)[..., None] * directions,
+        normals=np.where(facing > 0, -normals, normals),
+        touched=touched,
+    )
+
+
 def pad_contacts(
     surface: RaySurface,
     Ts_obj_pads: Array,
@@ -55,30 +104,8 @@ def pad_contacts(
         rays: per side of a pad.
         softness_m: how deep a pad gives way [m].
     """
-    n, cell = len(Ts_obj_pads), (np.arange(rays) + 0.5) / rays * 2 - 1
-    width, length = geometry.pad_width_m, geometry.pad_length_m
-    x, z = np.meshgrid(0.5 * width * cell, 0.5 * length * cell, indexing="ij")
-    side = np.array([-1.0, 1.0])
-    origins = np.empty((n, 2, rays * rays, 3))
-    origins[..., 0], origins[..., 2] = x.ravel(), z.ravel()
-    origins[..., 1] = 0.5 * openings_m[:, None, None] * side[:, None]
-    shape = origins.shape
-    origins = se3.transform(Ts_obj_pads, origins.reshape(n, 2 * rays * rays, 3)).reshape(shape)
-    inward = -side[:, None] * Ts_obj_pads[:, None, :3, 1]
-    directions = np.broadcast_to(inward[:, :, None], origins.shape)
-
-    t, face = surface.first_hits(origins.reshape(-1, 3), directions.reshape(-1, 3))
-    t, face = t.reshape(shape[:3]), face.reshape(shape[:3])
-    # The other pad is where the opening ends.
-    t = np.where(t <= openings_m[:, None, None], t, np.inf)
-    first = t.min(axis=2, keepdims=True, initial=np.inf)
-    touched = np.isfinite(t) & (t <= first + softness_m)
-    points = origins + np.where(touched, t, 0.0)[..., None] * directions
-    normals = surface.face_normals[np.where(touched, face, 0)]
-    # A pad comes from outside, whatever way the triangles face.
-    facing = np.sum(normals * directions, axis=-1, keepdims=True)
-    normals = np.where(facing > 0, -normals, normals)
-
+    met = pad_rays(surface, Ts_obj_pads, openings_m, geometry, rays, softness_m)
+    points, normals, touched = met.points, met.normals, met.touched
     weight = touched[..., None].astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         count = weight.sum(axis=2)
@@ -88,7 +115,7 @@ def pad_contacts(
         away = np.linalg.norm(points - middle[:, :, None], axis=-1)
         spread = (touched * np.where(touched, away, 0.0)).sum(axis=2) / count[..., 0]
     # Each ray stands for a cell of the pad.
-    of_cell = SQUARE_LEVER * np.sqrt(width * length) / rays
+    of_cell = SQUARE_LEVER * np.sqrt(geometry.pad_width_m * geometry.pad_length_m) / rays
     return PadContacts(points=middle, normals=normal, levers_m=np.hypot(spread, of_cell))
 
 
