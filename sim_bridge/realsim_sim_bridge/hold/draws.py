@@ -1,0 +1,366 @@
+"""What a grasp does when nothing is where it is thought to be: limit analysis on random draws.
+
+A draw moves the object (by its registration's covariance and by the error of the robot cell that
+will execute the grasp) and changes mass and pad stiffness. In each draw the hand comes as planned:
+
+- blocked: an open finger reaches deeper into the object than it gives way. The palm's touch is
+  noted and fails nothing: of real trials 77 % held with it and 74 % without.
+- missed: a pad meets nothing.
+- skewed: at this friction the squeeze alone cannot be balanced, the object is pushed out.
+- overloaded: a stage's load is greater than what the contacts bear.
+
+Friction and force are uncertain as well, and a draw's contacts tell all of them at once: friction
+is one of a few levels alike, the force is uniform in a range, to which the factor is proportional.
+"""
+
+from dataclasses import dataclass, field, fields
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import STAGES
+from realsim.robots.hand import Hand, along_approach
+from realsim_sim_bridge.grasping.antipodal import RaySurface
+from realsim_sim_bridge.grasping.limit_analysis import pad_patches, safety_factors
+from realsim_sim_bridge.grasping.pad_contacts import pad_heights
+from realsim_sim_bridge.grasping.surroundings import SurfaceTree, first_triangle_inside
+from realsim_sim_bridge.slip.motion import SlipMotion, stage_wrenches
+from realsim_sim_bridge.slip.slip_test import SlipTrial
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+LOAD_DT_S = 1.0 / 12.0
+"""Times at which the stages' loads are looked at [s]: eight in a period of the oscillation."""
+WORST = 2
+"""Loads of each stage, the worst at the nominal pose, that every draw is asked for."""
+MOST_DRAWS = 4096
+UNKNOWN_ELASTIC = 1e-3
+"""Softness of a pad whose stiffness is not modelled [m]."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PoseSpread:
+    """Stated error of the robot cell that executes the grasp: standard deviations, table axes.
+
+    The defaults are those of a cell whose object poses are a printed board's: where GRASPA's trials
+    stop telling more spread from less (8 to 12 mm).
+    """
+
+    across_m: float = 0.008
+    """Along the table's x and y, each [m]."""
+    height_m: float = 0.003
+    yaw_deg: float = 10.0
+    """About the vertical through the object's centre of mass [deg]."""
+    tilt_deg: float = 3.0
+    """About x and y, each [deg]."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class HoldConfig:
+    """What p_hold depends on besides the hand, the objects and the stages' motion."""
+
+    draws: int = 16
+    """Draws of a grasp, 2 or more; a power of two is spread most evenly."""
+    spread: PoseSpread = field(default_factory=PoseSpread)
+    friction: tuple[float, ...] = (0.3, 0.45, 0.65, 1.0)
+    """Coulomb coefficients, equally likely: rubber on waxed card and on dry wood."""
+    force_share: tuple[float, float] = (2.0 / 7.0, 1.0)
+    """The force on the object is uniform between these shares of the hand's: 20 to 70 N of 70."""
+    mass_spread: float = 0.1
+    """Standard deviation of the mass [share of it]."""
+    stiffness_spread: float = 0.5
+    """Standard deviation of the logarithm of the pads' stiffness."""
+    touch_m: float = 0.003
+    """So far an open finger may reach into the object [m]: it slides off, or the object does."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            InputError: one that cannot be; it is named with what can.
+        """
+        if not 2 <= self.draws <= MOST_DRAWS:
+            raise InputError(
+                f"p_hold needs 2 draws or more, for its error, and takes up to {MOST_DRAWS}; "
+                f"{self.draws} were asked for. 16 are usual."
+            )
+        told = {f.name: getattr(self.spread, f.name) for f in fields(self.spread)}
+        told |= {n: getattr(self, n) for n in ("mass_spread", "stiffness_spread", "touch_m")}
+        for name, value in told.items():
+            if not (np.isfinite(value) and value >= 0):
+                raise InputError(f"p_hold's {name} is {value}; 0 or more is accepted.")
+        if not self.friction or not all(np.isfinite(mu) and mu > 0 for mu in self.friction):
+            raise InputError(f"p_hold's friction is {self.friction}; positive numbers are accepted.")
+        least, most = self.force_share
+        if not 0 < least < most:
+            raise InputError(
+                f"p_hold's force is {least:g} to {most:g} of the hand's; a range above 0 is needed."
+            )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Drawn:
+    """What N grasps did in K draws, before calibration."""
+
+    holds: Array
+    """(N, K) probability that the draw holds, over friction and force."""
+    blocked: Array
+    """(N,) shares of the draws, as in the head of this file; with those that hold they are 1."""
+    missed: Array
+    skewed: Array
+    overloaded: Array
+    palm: Array
+    """(N,) share of draws in which the palm touches."""
+
+    @property
+    def share(self) -> Array:
+        """(N,) share that holds."""
+        return self.holds.mean(axis=1)
+
+    @property
+    def error(self) -> Array:
+        """(N,) standard error of the share; of draws that all say the same at most 1 / K."""
+        k = self.holds.shape[1]
+        # As if one draw more had said the opposite: no finite number of draws proves 0 or 1.
+        p = (self.holds.sum(axis=1) + 0.5) / (k + 1)
+        spread = np.maximum(self.holds.var(axis=1), p * (1 - p) / (k + 1))
+        return np.sqrt(spread / k)
+
+    def measures(self) -> dict[str, Array]:
+        """Return columns by the names of `realsim.records.grasps.MEASURES`."""
+        names = ("blocked", "missed", "skewed", "overloaded", "palm")
+        return {f"share_{name}": getattr(self, name) for name in names}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Loads:
+    """What the object feels in the stages, in the grasp frame."""
+
+    wrenches: Array
+    """(N, L, 6) torque about the centre of mass [N m] and force [N]."""
+    stage: Rows
+    """(L,) number in STAGES; 0 = its weight at rest."""
+
+    def about_grasp(self, centers: Array, at: Array | None = None) -> Array:
+        """Return wrenches (N, L, 6) about the grasp's origin; `at`: some of each grasp's (N, l).
+
+        Args:
+            centers: (N, 3) the centre of mass, grasp frame [m].
+            at: (N, l) numbers of loads; None = all.
+        """
+        chosen = self.wrenches if at is None else np.take_along_axis(
+            self.wrenches, at[:, :, None], axis=1
+        )  # fmt: skip
+        moved = chosen.copy()
+        moved[..., :3] += np.cross(centers[:, None], chosen[..., 3:])
+        return moved
+
+
+def stage_loads(trial: SlipTrial, motion: SlipMotion) -> Loads:
+    """Return the loads of the stages at points in time, and the weight at rest."""
+    Ts = se3.invert(trial.Ts_obj_grasp)
+    Ts_world_body = np.broadcast_to(np.eye(4), Ts.shape).copy()
+    R = trial.Ts_table_grasp[:, :3, :3]
+    T_obj_body = trial.body.principal_frame()[0]
+    Ts_world_body[:, :3, :] = R @ (Ts @ T_obj_body)[:, :3, :]
+    rest = np.zeros((len(trial), 1, 6))
+    rest[..., 5] = -trial.body.mass_kg * motion.gravity
+    found, stage = [rest], [np.zeros(1, dtype=np.int64)]
+    for k in range(1, len(STAGES)):
+        wrenches = stage_wrenches(k, trial, Ts_world_body, motion, LOAD_DT_S)
+        if STAGES[k] == "oscillate":  # all periods are alike
+            once = round(1.0 / motion.oscillation_hz / LOAD_DT_S)
+            half = wrenches.shape[1] // 2
+            wrenches = wrenches[:, np.r_[0:once, half : half + once]]
+        found.append(wrenches)
+        stage.append(np.full(wrenches.shape[1], k))
+    world = np.concatenate(found, axis=1)
+    pairs = world.reshape(*world.shape[:2], 2, 3) @ R[:, None]
+    return Loads(wrenches=pairs.reshape(world.shape), stage=np.concatenate(stage))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class GraspedObject:
+    """An object's surface, ready for rays and for hands that touch it."""
+
+    rays: RaySurface
+    tree: SurfaceTree | None
+
+
+def nominal_safety(
+    obj: GraspedObject, trial: SlipTrial, loads: Loads, hand: Hand, friction: float, force_n: float,
+    softness_m: float,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Return the safety factors of the stages (N, 4) and of all loads (N, L), pose as planned."""
+    Ts = trial.Ts_obj_grasp
+    patches = pad_patches(obj.rays, _pads(obj, trial, Ts, hand), trial.openings_m, hand, softness_m)
+    centers = se3.transform(se3.invert(Ts), trial.body.center_of_mass[None])[:, 0]
+    n = len(trial)
+    factors = safety_factors(
+        patches, loads.about_grasp(centers), np.full(n, friction), np.full(n, force_n)
+    )
+    by_stage = [factors[:, loads.stage == k].min(axis=1) for k in range(len(STAGES))]
+    return np.stack(by_stage, axis=1), factors
+
+
+def draw_holds(
+    obj: GraspedObject,
+    trial: SlipTrial,
+    loads: Loads,
+    hand: Hand,
+    force_n: float,
+    covariance: Array | None = None,
+    config: HoldConfig | None = None,
+    stiffness_n_per_m: float | None = None,
+) -> Drawn:
+    """Return what the grasps do in all draws.
+
+    Args:
+        obj: the object's surface.
+        trial: the grasps.
+        loads: of the stages.
+        hand: the hand.
+        force_n: its usual force [N].
+        covariance: (6, 6) of the object's registered pose, right perturbation, rotation first
+            [rad, m]; None = of no registration.
+        config: see `HoldConfig`.
+        stiffness_n_per_m: of a pad; None = not modelled.
+
+    Raises:
+        InputError: the covariance is none.
+    """
+    config = config or HoldConfig()
+    n, count = len(trial), config.draws
+    normal = _normals(count, config.seed)
+    Ts_moved = moved_objects(trial, covariance, config.spread, normal)
+    mass = np.maximum(1.0 + config.mass_spread * normal[:, 12], 0.1)
+    press_n = force_n * float(np.mean(config.force_share))
+    soft = UNKNOWN_ELASTIC if stiffness_n_per_m is None else press_n / stiffness_n_per_m
+    softness = soft * np.exp(config.stiffness_spread * normal[:, 13])
+    low, high = (force_n * share for share in config.force_share)
+
+    _, factors = nominal_safety(
+        obj, trial, loads, hand, float(np.median(config.friction)), high, soft
+    )
+    at = _worst(factors, loads)
+    boxes, palms = hand.boxes(trial.openings_m), len(hand.palm_boxes)
+    holds, palm = np.zeros((n, count)), np.zeros((n, count))
+    counts = {name: np.zeros((n, count)) for name in ("blocked", "missed", "skewed")}
+    ones = np.ones(n)
+    for k in range(count):
+        Ts = Ts_moved[k]
+        blocked = first_triangle_inside(boxes[:, palms:], Ts, obj.tree, -config.touch_m) >= 0
+        touched = first_triangle_inside(boxes[:, :palms], Ts, obj.tree, -config.touch_m) >= 0
+        pads = _pads(obj, trial, Ts, hand)
+        patches = pad_patches(obj.rays, pads, trial.openings_m, hand, float(softness[k]))
+        centers = se3.transform(se3.invert(Ts), trial.body.center_of_mass[None])[:, 0]
+        wrenches = loads.about_grasp(centers, at) * mass[k]
+        free = ~blocked & patches.both
+        skewed = np.zeros(n)
+        for friction in config.friction:
+            borne = safety_factors(patches, wrenches, friction * ones, ones).min(axis=1)
+            with np.errstate(divide="ignore"):
+                needed = 1.0 / borne
+            holds[:, k] += free * np.clip((high - needed) / (high - low), 0.0, 1.0)
+            skewed += borne <= 0
+        holds[:, k] /= len(config.friction)
+        counts["blocked"][:, k] = blocked
+        counts["missed"][:, k] = ~blocked & ~patches.both
+        counts["skewed"][:, k] = free * skewed / len(config.friction)
+        palm[:, k] = touched
+    shares = {name: values.mean(axis=1) for name, values in counts.items()}
+    rest = 1.0 - holds.mean(axis=1) - sum(shares.values())
+    return Drawn(
+        holds=holds, overloaded=np.maximum(rest, 0.0), palm=palm.mean(axis=1), **shares
+    )  # fmt: skip
+
+
+def moved_objects(
+    trial: SlipTrial, covariance: Array | None, spread: PoseSpread, normal: Array
+) -> Array:
+    """Return T_obj_grasp (K, N, 4, 4) of draws, with the object moved and the hand where it was.
+
+    Args:
+        trial: the grasps.
+        covariance: see `draw_holds`.
+        spread: of the robot cell.
+        normal: (K, 12 or more) standard normal numbers: six of the cell, six of the registration.
+
+    Raises:
+        InputError: the covariance is not one.
+    """
+    root = np.zeros((6, 6)) if covariance is None else covariance_root(covariance)
+    tilt, yaw = np.radians(spread.tilt_deg), np.radians(spread.yaw_deg)
+    scale = np.array([tilt, tilt, yaw, spread.across_m, spread.across_m, spread.height_m])
+    c = trial.body.center_of_mass
+    # All grasps of an object share the object's own frame; the table's axes in it are any grasp's.
+    R_obj_table = (
+        trial.Ts_obj_grasp[:, :3, :3] @ np.swapaxes(trial.Ts_table_grasp[:, :3, :3], -1, -2)
+    )[:1]
+    found = np.empty((len(normal), len(trial), 4, 4))
+    for k, z in enumerate(normal):
+        if len(trial) == 0:
+            break
+        cell = scale * z[:6]
+        R, R_t = R_obj_table[0], np.eye(4)
+        R_t[:3, :3] = R @ se3.exp_so3(cell[:3]) @ R.T
+        R_t[:3, 3] = c - R_t[:3, :3] @ c + R @ cell[3:]
+        D = R_t @ se3.exp(root @ z[6:12])
+        found[k] = se3.invert(D) @ trial.Ts_obj_grasp
+    return found
+
+
+def covariance_root(covariance: Array) -> Array:
+    """Return a root (6, 6) of a covariance (6, 6).
+
+    Raises:
+        InputError: it is not symmetric or has a negative variance.
+    """
+    C = np.asarray(covariance, dtype=np.float64)
+    if C.shape != (6, 6) or not np.isfinite(C).all() or not np.allclose(C, C.T, atol=1e-12):
+        raise InputError(
+            "the covariance of an object's pose must be (6, 6), symmetric and finite; found "
+            f"{C.shape}. Register the scene again, or leave it out."
+        )
+    values, axes = np.linalg.eigh(C)
+    if values[0] < -1e-9 * max(values[-1], 1e-12):
+        raise InputError(
+            f"the covariance of an object's pose has the negative variance {values[0]:.3g}; it "
+            "must be positive. Register the scene again, or leave it out."
+        )
+    return axes * np.sqrt(np.maximum(values, 0.0))
+
+
+@lru_cache(maxsize=4)
+def _normals(count: int, seed: int) -> Array:
+    """Return standard normal numbers (K, 14), spread evenly (Sobol), the same for every object."""
+    sobol = qmc.Sobol(14, scramble=True, rng=np.random.default_rng(seed))
+    uniform = sobol.random_base2(int(np.ceil(np.log2(count))))[:count]
+    return np.asarray(ndtri(np.clip(uniform, 1e-9, 1.0 - 1e-9)))
+
+
+def _worst(factors: Array, loads: Loads) -> Rows:
+    """Return the numbers (N, l) of the worst loads of each stage but the rest."""
+    chosen: list[Rows] = []
+    size = np.linalg.norm(loads.wrenches[..., 3:], axis=-1)
+    # Where nothing is borne the greatest force decides.
+    order = np.where(factors > 0, factors, 1e6 / (1.0 + size))
+    for k in range(1, len(STAGES)):
+        rows = np.flatnonzero(loads.stage == k)
+        chosen.append(rows[np.argsort(order[:, rows], axis=1, kind="stable")[:, :WORST]])
+    return np.concatenate(chosen, axis=1)
+
+
+def _pads(obj: GraspedObject, trial: SlipTrial, Ts_obj_grasp: Array, hand: Hand) -> Array:
+    """Return T_obj_pads (N, 4, 4) of hands that have closed."""
+    if not hand.arc_radius_m:
+        return Ts_obj_grasp
+    heights = pad_heights(obj.rays, Ts_obj_grasp, trial.openings_m, hand)
+    return along_approach(Ts_obj_grasp, heights)
