@@ -1,10 +1,11 @@
 """What a grasp does when nothing is where it is thought to be: limit analysis on random draws.
 
 A draw moves the object (by its registration's covariance and by the error of the robot cell that
-will execute the grasp) and changes mass and pad stiffness. In each draw the hand comes as planned:
+will execute the grasp) and changes mass and pad stiffness. In each draw the hand comes as planned.
+The approach ends where the palm meets the object. That is noted and fails nothing: of real trials
+77 % held with it and 74 % without.
 
-- blocked: an open finger reaches deeper into the object than it gives way. The palm's touch is
-  noted and fails nothing: of real trials 77 % held with it and 74 % without.
+- blocked: an open finger reaches deeper into the object than it gives way.
 - missed: a pad meets nothing.
 - skewed: at this friction the squeeze alone cannot be balanced, the object is pushed out.
 - overloaded: a stage's load is greater than what the contacts bear.
@@ -23,25 +24,28 @@ from scipy.stats import qmc
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.records import STAGES
+from realsim.records import STAGES, Mesh
 from realsim.robots.hand import Hand, along_approach
 from realsim_sim_bridge.grasping.antipodal import RaySurface
 from realsim_sim_bridge.grasping.limit_analysis import pad_patches, safety_factors
 from realsim_sim_bridge.grasping.pad_contacts import pad_heights
-from realsim_sim_bridge.grasping.surroundings import SurfaceTree, first_triangle_inside
+from realsim_sim_bridge.grasping.surroundings import SurfaceTree, first_triangle_inside, surface_tree
 from realsim_sim_bridge.slip.motion import SlipMotion, stage_wrenches
 from realsim_sim_bridge.slip.slip_test import SlipTrial
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
+PALM_M = 0.0015
+"""So deep the palm may reach into the object before the hand has stopped [m]."""
 LOAD_DT_S = 1.0 / 12.0
 """Times at which the stages' loads are looked at [s]: eight in a period of the oscillation."""
 WORST = 2
 """Loads of each stage, the worst at the nominal pose, that every draw is asked for."""
 MOST_DRAWS = 4096
-UNKNOWN_ELASTIC = 1e-3
-"""Softness of a pad whose stiffness is not modelled [m]."""
+STEP_BACK_M, MOST_STEPS_BACK = 0.003, 20
+"""A hand whose palm is in the object is moved back in such steps [m], at most so many."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -75,7 +79,10 @@ class HoldConfig:
     mass_spread: float = 0.1
     """Standard deviation of the mass [share of it]."""
     stiffness_spread: float = 0.5
-    """Standard deviation of the logarithm of the pads' stiffness."""
+    """Standard deviation of the logarithm of how far pads give way."""
+    conformity_m: float = 0.0015
+    """What is so near to a pad that touches is touched too [m]: the object gives way as well, and
+    scanned surfaces are off by as much. The pad's own share, force over stiffness, is added."""
     touch_m: float = 0.003
     """So far an open finger may reach into the object [m]: it slides off, or the object does."""
     seed: int = 0
@@ -92,7 +99,7 @@ class HoldConfig:
                 f"{self.draws} were asked for. 16 are usual."
             )
         told = {f.name: getattr(self.spread, f.name) for f in fields(self.spread)}
-        told |= {n: getattr(self, n) for n in ("mass_spread", "stiffness_spread", "touch_m")}
+        told |= {n: getattr(self, n) for n in ("mass_spread", "stiffness_spread", "conformity_m", "touch_m")}
         for name, value in told.items():
             if not (np.isfinite(value) and value >= 0):
                 raise InputError(f"p_hold's {name} is {value}; 0 or more is accepted.")
@@ -193,13 +200,40 @@ class GraspedObject:
     rays: RaySurface
     tree: SurfaceTree | None
 
+    @classmethod
+    def of(cls, mesh: Mesh) -> "GraspedObject":
+        """Return the surface of a mesh."""
+        return cls(rays=RaySurface(mesh), tree=surface_tree(mesh.vertices[mesh.faces]))
+
+    def stopped(self, Ts_obj_grasp: Array, hand: Hand, most_m: float) -> tuple[Array, Mask]:
+        """Return where hands (N, 4, 4) stop that would reach into the object with the palm.
+
+        Args:
+            Ts_obj_grasp: (N, 4, 4) as planned [m].
+            hand: the hand.
+            most_m: so deep the palm may reach [m].
+
+        Returns:
+            the poses (N, 4, 4), moved back along the approach, and which were (N,).
+        """
+        palms = np.array(hand.palm_boxes)[None].repeat(len(Ts_obj_grasp), axis=0)
+        back = np.zeros(len(Ts_obj_grasp))
+        Ts = Ts_obj_grasp
+        for _ in range(MOST_STEPS_BACK):
+            inside = first_triangle_inside(palms, Ts, self.tree, -most_m) >= 0
+            if not inside.any():
+                break
+            back[inside] += STEP_BACK_M
+            Ts = along_approach(Ts_obj_grasp, -back)
+        return Ts, back > 0
+
 
 def nominal_safety(
     obj: GraspedObject, trial: SlipTrial, loads: Loads, hand: Hand, friction: float, force_n: float,
     softness_m: float,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Return the safety factors of the stages (N, 4) and of all loads (N, L), pose as planned."""
-    Ts = trial.Ts_obj_grasp
+    """Return the safety factors of the stages (N, 4) and of all loads (N, L) where hands stop."""
+    Ts, _ = obj.stopped(trial.Ts_obj_grasp, hand, PALM_M)
     patches = pad_patches(obj.rays, _pads(obj, trial, Ts, hand), trial.openings_m, hand, softness_m)
     centers = se3.transform(se3.invert(Ts), trial.body.center_of_mass[None])[:, 0]
     n = len(trial)
@@ -218,7 +252,7 @@ def draw_holds(
     force_n: float,
     covariance: Array | None = None,
     config: HoldConfig | None = None,
-    stiffness_n_per_m: float | None = None,
+    stiffness_n_per_m: float = np.inf,
 ) -> Drawn:
     """Return what the grasps do in all draws.
 
@@ -231,7 +265,7 @@ def draw_holds(
         covariance: (6, 6) of the object's registered pose, right perturbation, rotation first
             [rad, m]; None = of no registration.
         config: see `HoldConfig`.
-        stiffness_n_per_m: of a pad; None = not modelled.
+        stiffness_n_per_m: of a pad.
 
     Raises:
         InputError: the covariance is none.
@@ -242,7 +276,7 @@ def draw_holds(
     Ts_moved = moved_objects(trial, covariance, config.spread, normal)
     mass = np.maximum(1.0 + config.mass_spread * normal[:, 12], 0.1)
     press_n = force_n * float(np.mean(config.force_share))
-    soft = UNKNOWN_ELASTIC if stiffness_n_per_m is None else press_n / stiffness_n_per_m
+    soft = config.conformity_m + press_n / stiffness_n_per_m
     softness = soft * np.exp(config.stiffness_spread * normal[:, 13])
     low, high = (force_n * share for share in config.force_share)
 
@@ -255,9 +289,8 @@ def draw_holds(
     counts = {name: np.zeros((n, count)) for name in ("blocked", "missed", "skewed")}
     ones = np.ones(n)
     for k in range(count):
-        Ts = Ts_moved[k]
+        Ts, touched = obj.stopped(Ts_moved[k], hand, PALM_M)
         blocked = first_triangle_inside(boxes[:, palms:], Ts, obj.tree, -config.touch_m) >= 0
-        touched = first_triangle_inside(boxes[:, :palms], Ts, obj.tree, -config.touch_m) >= 0
         pads = _pads(obj, trial, Ts, hand)
         patches = pad_patches(obj.rays, pads, trial.openings_m, hand, float(softness[k]))
         centers = se3.transform(se3.invert(Ts), trial.body.center_of_mass[None])[:, 0]
@@ -301,20 +334,17 @@ def moved_objects(
     scale = np.array([tilt, tilt, yaw, spread.across_m, spread.across_m, spread.height_m])
     c = trial.body.center_of_mass
     # All grasps of an object share the object's own frame; the table's axes in it are any grasp's.
-    R_obj_table = (
-        trial.Ts_obj_grasp[:, :3, :3] @ np.swapaxes(trial.Ts_table_grasp[:, :3, :3], -1, -2)
-    )[:1]
-    found = np.empty((len(normal), len(trial), 4, 4))
-    for k, z in enumerate(normal):
-        if len(trial) == 0:
-            break
+    if len(trial) == 0:
+        return np.empty((len(normal), 0, 4, 4))
+    R_obj_table = trial.Ts_obj_grasp[0, :3, :3] @ trial.Ts_table_grasp[0, :3, :3].T
+    found: list[Array] = []
+    for z in normal:
         cell = scale * z[:6]
-        R, R_t = R_obj_table[0], np.eye(4)
-        R_t[:3, :3] = R @ se3.exp_so3(cell[:3]) @ R.T
-        R_t[:3, 3] = c - R_t[:3, :3] @ c + R @ cell[3:]
-        D = R_t @ se3.exp(root @ z[6:12])
-        found[k] = se3.invert(D) @ trial.Ts_obj_grasp
-    return found
+        turn = R_obj_table @ se3.exp_so3(cell[:3]) @ R_obj_table.T
+        moved = se3.from_rt(turn, c - turn @ c + R_obj_table @ cell[3:])
+        moved = moved @ se3.exp(root @ z[6:12])
+        found.append(se3.invert(moved) @ trial.Ts_obj_grasp)
+    return np.stack(found)
 
 
 def covariance_root(covariance: Array) -> Array:

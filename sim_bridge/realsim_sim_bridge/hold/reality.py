@@ -1,0 +1,402 @@
+"""How well labels tell what a real robot did: trials, every predictor, intervals by object."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import rankdata
+
+from realsim.errors import InputError
+from realsim.formats.grasps.graspa import TriedObject
+from realsim.models.convex import ConvexConfig, convex_parts
+from realsim.models.properties import DEFAULT_DENSITY, physical_properties
+from realsim.robots.hand import Hand, find_hand
+from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
+from realsim_sim_bridge.hold.calibration import (
+    Calibration,
+    Reliability,
+    evidence_of,
+    fitted_curve,
+    left_out,
+    shipped,
+)
+from realsim_sim_bridge.hold.draws import (
+    PALM_M,
+    GraspedObject,
+    HoldConfig,
+    draw_holds,
+    nominal_safety,
+    stage_loads,
+)
+from realsim_sim_bridge.slip.engines import make_engine
+from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
+from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
+from realsim_sim_bridge.slip.stand import Stand
+from realsim_sim_bridge.slip.world import SlipBody
+from realsim_sim_bridge.validation.specimens import ready_trial
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Names = NDArray[np.str_]
+
+RESAMPLES = 2000
+"""Bootstrap samples of whole objects."""
+BINS = 10
+"""Equal ones of p_hold, in the expected calibration error and the reliability diagram."""
+FEW_OBJECTS = 3
+"""Of fewer objects no interval is given, and no object can be left out."""
+TABLE_FRICTION = 0.4
+"""Of the object on the table."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RealityConfig:
+    """What the trials are judged with; nothing here is chosen after the trials are read."""
+
+    hand: Hand = field(default_factory=find_hand)
+    slip: SlipConfig = field(default_factory=SlipConfig)
+    hold: HoldConfig = field(default_factory=HoldConfig)
+    convex: ConvexConfig = field(default_factory=ConvexConfig)
+    seed: int = 0
+    """Of the intervals' bootstrap."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Judged:
+    """What was predicted of T trials, and what came of them."""
+
+    held: Mask
+    """(T,) whether the robot lifted the object."""
+    objects: Names
+    """(T,)"""
+    evidence: Array
+    """(T,) of p_hold, before calibration."""
+    evidence_error: Array
+    """(T,) its standard error."""
+    columns: dict[str, Array]
+    """(T,) each: other predictors, greater = more likely to hold."""
+    shares: dict[str, Array]
+    """(T,) shares of the draws' failures."""
+    digest: str
+    engine: str
+    notes: tuple[str, ...] = ()
+    """What was assumed."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PredictorRow:
+    """How well one predictor orders the trials."""
+
+    name: str
+    auc: float
+    """Probability that a trial that held is ranked before one that did not."""
+    auc_low: float
+    auc_high: float
+    """95 % interval; whole objects are resampled. NaN = too few objects."""
+    within: float
+    """The same among trials of one object only; NaN = constant there."""
+    average_precision: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Reality:
+    """All predictors' figures, and p_hold's calibration."""
+
+    rows: tuple[PredictorRow, ...]
+    p_hold: Array
+    """(T,) as the shipped calibration has it; on its own trials by curves that were fitted on the
+    other objects."""
+    in_sample: bool
+    """Whether the shipped calibration was fitted on these trials."""
+    ece: float
+    """Expected calibration error of it: ten equal bins."""
+    balanced_accuracy: float
+    """Mean share of held and of dropped trials told right; told as held: more p_hold than the share
+    of the calibration's trials that held."""
+    gain: float
+    gain_low: float
+    gain_high: float
+    """AUC of p_hold less that of the nominal score, with its interval by object."""
+    reliability: tuple[Reliability, ...]
+
+
+def judge_trials(
+    objects: Sequence[TriedObject],
+    config: RealityConfig | None = None,
+    cache: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Judged:
+    """Return what every predictor says of the trials.
+
+    Args:
+        objects: with their trials.
+        config: see `RealityConfig`.
+        cache: folder for convex parts; None = they are not kept.
+        progress: called with (trials done, trials).
+
+    Raises:
+        InputError: there is no trial, or an engine is not installed.
+    """
+    config = config or RealityConfig()
+    total = sum(len(o.held) for o in objects)
+    if total == 0:
+        raise InputError("there are no trials to judge by; grasps with a result each are needed.")
+    engine = make_engine(config.slip.engine)
+    parts: list[dict[str, Array]] = []
+    notes: list[str] = []
+    done = 0
+    for obj in objects:
+        trial, surface = _trial_of(obj, config, cache, notes)
+        found = _of_object(obj, trial, surface, config)
+        stopped, _ = surface.stopped(trial.Ts_obj_grasp, config.hand, PALM_M)
+        reached = replace(
+            trial, Ts_obj_grasp=stopped, Ts_table_grasp=obj.T_board_obj @ stopped
+        )  # fmt: skip
+        slips = run_slip_test(reached, config.slip, ScoreLimits(), config.hand, engine)
+        every = np.ones(len(trial), dtype=np.bool_)
+        for name, limits in (("score", ScoreLimits()), ("score_old", ScoreLimits.paper())):
+            found[name] = score_stages(slips.slip_m, slips.slip_rad, every, limits)[1]
+        parts.append(found)
+        done += len(trial)
+        if progress is not None:
+            progress(done, total)
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    shares = {name: joined.pop(name) for name in tuple(joined) if name.startswith("share_")}
+    share, error = joined.pop("draws"), joined.pop("error")
+    return Judged(
+        held=np.concatenate([o.held for o in objects]),
+        objects=np.array([o.name for o in objects for _ in o.held], dtype=np.str_),
+        evidence=evidence_of(share, joined["score"], config.hold.draws),
+        evidence_error=error,
+        columns={"draws": share, **joined},
+        shares=shares,
+        digest=_digest(objects),
+        engine=engine.name,
+        notes=tuple(notes),
+    )
+
+
+def _trial_of(
+    obj: TriedObject, config: RealityConfig, cache: Path | None, notes: list[str]
+) -> tuple[SlipTrial, GraspedObject]:
+    """Return an object's trials where it stood, and its surface."""
+    parts = convex_parts(obj.mesh, config.convex, cache)
+    if obj.mass_kg is None:
+        matter = physical_properties(obj.mesh, density=DEFAULT_DENSITY, parts=parts)
+        told = (
+            f"{obj.name} was not weighed: {DEFAULT_DENSITY:g} kg/m^3 make {matter.mass_kg:.3f} kg; "
+            f"weigh it and give --mass {obj.name}=KG."
+        )
+        if told not in notes:
+            notes.append(told)
+    else:
+        matter = physical_properties(obj.mesh, mass_kg=obj.mass_kg, parts=parts)
+    body = SlipBody.of(parts, matter)
+    T = obj.T_board_obj
+    standing = [part @ T[:3, :3].T + T[:3, 3] for part in body.parts]
+    gravity = config.slip.motion.gravity
+    trial = ready_trial(body, obj.Ts_obj_grasp, obj.Ts_board_grasp, config.hand.max_opening_m)
+    surface = GraspedObject.of(obj.mesh)
+    stand = Stand.around(standing, (), TABLE_FRICTION, gravity)
+    return replace(trial, stand=stand), surface
+
+
+def _of_object(
+    obj: TriedObject, trial: SlipTrial, surface: GraspedObject, config: RealityConfig
+) -> dict[str, Array]:
+    """Return what geometry and statics say of an object's trials."""
+    hand, physics = config.hand, config.slip.physics
+    closure = force_closure(
+        obj.mesh, trial.Ts_obj_grasp, trial.openings_m, ClosureConfig(friction=physics.friction),
+        hand, trial.body.center_of_mass,
+    )  # fmt: skip
+    loads = stage_loads(trial, config.slip.motion)
+    stiffness = hand.stiffness_n_per_m
+    softness_m = config.hold.conformity_m + physics.force_n / stiffness
+    drawn = draw_holds(
+        surface, trial, loads, hand, hand.force_n, None, config.hold, stiffness
+    )  # fmt: skip
+    safety, _ = nominal_safety(
+        surface, trial, loads, hand, physics.friction, physics.force_n, softness_m
+    )
+    return {
+        "draws": drawn.share,
+        "error": drawn.error,
+        "safety": safety[:, 1:].min(axis=1),
+        "dexnet_closure": closure.dexnet_closure,
+        "closure_friction": -closure.closure_friction,
+        "ferrari_canny": closure.ferrari_canny,
+        **drawn.measures(),
+    }
+
+
+def reality_of(judged: Judged, calibration: Calibration | None = None, seed: int = 0) -> Reality:
+    """Return how well each predictor tells what came of the trials.
+
+    Args:
+        judged: see `judge_trials`.
+        calibration: of p_hold; None = the shipped one.
+        seed: of the bootstrap.
+    """
+    calibration = calibration or shipped()
+    held, groups = judged.held, judged.objects
+    in_sample = calibration.digest == judged.digest
+    enough = len(np.unique(groups)) >= FEW_OBJECTS
+    p = calibration.p_hold(judged.evidence)
+    told = left_out(judged.evidence, held, groups) if in_sample and enough else p
+    columns = {
+        "p_hold": judged.evidence,
+        **judged.columns,
+        "object": _identity(held, groups),
+        "always holds": np.ones(len(held)),
+    }
+    picks = _resampled(groups, seed) if enough else []
+    rows = tuple(_row(name, values, held, groups, picks) for name, values in columns.items())
+    old = judged.columns["score_old"]
+    gains = [_auc(judged.evidence[i], held[i]) - _auc(old[i], held[i]) for i in picks]
+    low, high = _interval(gains)
+    share = calibration.held_share
+    return Reality(
+        rows=rows,
+        p_hold=told,
+        in_sample=in_sample,
+        ece=expected_calibration_error(told, held),
+        balanced_accuracy=0.5 * float(np.mean(told[held] > share) + np.mean(told[~held] <= share)),
+        gain=_auc(judged.evidence, held) - _auc(old, held),
+        gain_low=low,
+        gain_high=high,
+        reliability=reliability(told, held),
+    )
+
+
+def calibrate(judged: Judged, data: str) -> Calibration:
+    """Return the calibration that fits the trials, with what objects left out say of it.
+
+    Raises:
+        InputError: the trials cannot calibrate anything.
+    """
+    kinds = np.unique(judged.objects)
+    if len(kinds) < FEW_OBJECTS:
+        raise InputError(
+            f"the trials are of {len(kinds)} objects; {FEW_OBJECTS} or more are needed, so that "
+            "each can be left out."
+        )
+    w = fitted_curve(judged.evidence, judged.held)
+    return Calibration(
+        intercept=float(w[0]),
+        slope=float(w[1]),
+        data=data,
+        digest=judged.digest,
+        trials=len(judged.held),
+        objects=tuple(kinds.tolist()),
+        held_share=float(judged.held.mean()),
+        engine=judged.engine,
+        reliability=reliability(
+            left_out(judged.evidence, judged.held, judged.objects), judged.held
+        ),
+    )
+
+
+# --- figures --------------------------------------------------------------------------------------
+
+
+def reliability(p: Array, held: Mask) -> tuple[Reliability, ...]:
+    """Return mean p_hold and share held of the trials in each of ten equal bins with any."""
+    bins = np.minimum((p * BINS).astype(np.int64), BINS - 1)
+    return tuple(
+        Reliability(
+            predicted=float(p[bins == k].mean()),
+            held=float(held[bins == k].mean()),
+            trials=int(np.sum(bins == k)),
+        )
+        for k in range(BINS)
+        if np.any(bins == k)
+    )
+
+
+def expected_calibration_error(p: Array, held: Mask) -> float:
+    """Return the mean distance of p_hold from the share held, over ten equal bins (Guo 2017)."""
+    return sum(r.trials * abs(r.predicted - r.held) for r in reliability(p, held)) / len(p)
+
+
+def _row(
+    name: str, values: Array, held: Mask, groups: Names, picks: list[NDArray[np.int64]]
+) -> PredictorRow:
+    """Return the figures of one predictor."""
+    low, high = _interval([_auc(values[i], held[i]) for i in picks])
+    pairs = hits = 0.0
+    for group in np.unique(groups):
+        mine = groups == group
+        count = float(held[mine].sum() * (~held[mine]).sum())
+        if count:
+            pairs += count
+            hits += count * _auc(values[mine], held[mine])
+    return PredictorRow(
+        name=name,
+        auc=_auc(values, held),
+        auc_low=low,
+        auc_high=high,
+        # The object's other trials tell nothing about one of its trials: a count is a count.
+        within=hits / pairs if pairs and name not in ("object", "always holds") else float("nan"),
+        average_precision=_average_precision(values, held),
+    )
+
+
+def _auc(values: Array, held: Mask) -> float:
+    """Return the area under the ROC curve; ties count half; NaN where all ended alike."""
+    yes = int(held.sum())
+    no = len(held) - yes
+    if yes == 0 or no == 0:
+        return float("nan")
+    ranks = rankdata(np.nan_to_num(values, nan=-np.inf, posinf=1e300, neginf=-1e300))
+    return float((ranks[held].sum() - yes * (yes + 1) / 2) / (yes * no))
+
+
+def _average_precision(values: Array, held: Mask) -> float:
+    """Return the mean precision at each trial that held; equal values are taken together."""
+    order = np.argsort(-values, kind="stable")
+    sorted_values, hits = values[order], np.cumsum(held[order])
+    last = np.append(np.flatnonzero(np.diff(sorted_values)), len(values) - 1)
+    recall = hits[last] / max(int(held.sum()), 1)
+    return float(np.sum(np.diff(np.append(0.0, recall)) * hits[last] / (last + 1)))
+
+
+def _identity(held: Mask, groups: Names) -> Array:
+    """Return, of each trial, the share of the object's other trials that held."""
+    found = np.full(len(held), held.mean())
+    for group in np.unique(groups):
+        mine = groups == group
+        if mine.sum() > 1:
+            found[mine] = (held[mine].sum() - held[mine]) / (mine.sum() - 1)
+    return found
+
+
+def _resampled(groups: Names, seed: int) -> list[NDArray[np.int64]]:
+    """Return trials of resampled objects."""
+    rng = np.random.default_rng(seed)
+    rows = [np.flatnonzero(groups == group) for group in np.unique(groups)]
+    return [
+        np.concatenate([rows[k] for k in rng.integers(0, len(rows), len(rows))])
+        for _ in range(RESAMPLES)
+    ]
+
+
+def _interval(values: list[float]) -> tuple[float, float]:
+    """Return the 95 % interval of bootstrap values; NaN of none."""
+    known = [v for v in values if np.isfinite(v)]
+    if not known:
+        return float("nan"), float("nan")
+    low, high = np.percentile(known, (2.5, 97.5))
+    return float(low), float(high)
+
+
+def _digest(objects: Sequence[TriedObject]) -> str:
+    """Return a hash of all poses and results."""
+    told = hashlib.sha256()
+    for obj in objects:
+        told.update(obj.name.encode())
+        told.update(np.round(obj.Ts_obj_grasp, 6).tobytes() + obj.held.tobytes())
+    return told.hexdigest()[:16]
