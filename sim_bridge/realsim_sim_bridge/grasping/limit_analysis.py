@@ -38,7 +38,7 @@ MOST_STEPS = 2000
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class PadPatches:
-    """Where closed pads touch, P = 9 points each; finger 0 is at -y of the grasp, finger 1 at +y."""
+    """Where closed pads touch, P = 9 points each; finger 0 is at -y of the grasp, 1 at +y."""
 
     points: Array
     """(N, 2, P, 3) grasp frame [m]; 0 where `there` is false."""

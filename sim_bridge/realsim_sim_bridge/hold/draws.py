@@ -29,7 +29,11 @@ from realsim.robots.hand import Hand, along_approach
 from realsim_sim_bridge.grasping.antipodal import RaySurface
 from realsim_sim_bridge.grasping.limit_analysis import pad_patches, safety_factors
 from realsim_sim_bridge.grasping.pad_contacts import pad_heights
-from realsim_sim_bridge.grasping.surroundings import SurfaceTree, first_triangle_inside, surface_tree
+from realsim_sim_bridge.grasping.surroundings import (
+    SurfaceTree,
+    first_triangle_inside,
+    surface_tree,
+)
 from realsim_sim_bridge.slip.motion import SlipMotion, stage_wrenches
 from realsim_sim_bridge.slip.slip_test import SlipTrial
 
@@ -99,12 +103,17 @@ class HoldConfig:
                 f"{self.draws} were asked for. 16 are usual."
             )
         told = {f.name: getattr(self.spread, f.name) for f in fields(self.spread)}
-        told |= {n: getattr(self, n) for n in ("mass_spread", "stiffness_spread", "conformity_m", "touch_m")}
+        told |= {
+            n: getattr(self, n)
+            for n in ("mass_spread", "stiffness_spread", "conformity_m", "touch_m")
+        }
         for name, value in told.items():
             if not (np.isfinite(value) and value >= 0):
                 raise InputError(f"p_hold's {name} is {value}; 0 or more is accepted.")
         if not self.friction or not all(np.isfinite(mu) and mu > 0 for mu in self.friction):
-            raise InputError(f"p_hold's friction is {self.friction}; positive numbers are accepted.")
+            raise InputError(
+                f"p_hold's friction is {self.friction}; positive numbers are accepted."
+            )
         least, most = self.force_share
         if not 0 < least < most:
             raise InputError(

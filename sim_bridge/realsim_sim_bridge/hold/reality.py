@@ -214,7 +214,7 @@ def _of_object(
         hand, trial.body.center_of_mass,
     )  # fmt: skip
     loads = stage_loads(trial, config.slip.motion)
-    stiffness = hand.stiffness_n_per_m
+    stiffness = hand.pad_stiffness_n_per_m
     softness_m = config.hold.conformity_m + physics.force_n / stiffness
     drawn = draw_holds(
         surface, trial, loads, hand, hand.force_n, None, config.hold, stiffness
