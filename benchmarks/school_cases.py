@@ -31,8 +31,8 @@ from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.registration.simulated import TableLabConfig, scatter_objects
 from realsim_sim_bridge.grasping.antipodal import CandidateConfig
 from realsim_sim_bridge.school.config import SchoolConfig
-from realsim_sim_bridge.school.object_slips import stand_of, trial_of
-from realsim_sim_bridge.school.object_task import ObjectTask, prepare
+from realsim_sim_bridge.school.object_slips import stand_of
+from realsim_sim_bridge.school.object_task import ObjectTask, prepare, trial_of
 from realsim_sim_bridge.school.school import object_tasks
 from realsim_sim_bridge.slip.engines import settings_of
 from realsim_sim_bridge.slip.score import ScoreLimits

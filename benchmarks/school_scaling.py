@@ -151,8 +151,7 @@ def day(staff: AbstractContextManager[Workers], case: SchoolCase, config: School
 
 def _warmed(task: Any) -> None:
     """Try an object with two candidates, so that everything is loaded."""
-    from realsim_sim_bridge.school.object_slips import trial_of
-    from realsim_sim_bridge.school.object_task import prepare
+    from realsim_sim_bridge.school.object_task import prepare, trial_of
     from realsim_sim_bridge.school.shards import run_shard
 
     prepared = prepare(task)

@@ -171,6 +171,43 @@ def _minimise_loops(table: Any, basis: Any, columns: Any) -> None:
 _minimise: Any = njit(_minimise_loops)
 
 
+def _add_edges_loops(
+    table: Any, points: Any, normals: Any, there: Any, friction: Any, corners: Any
+) -> None:
+    """Write the wrench of every edge of a grasp's cones into a column of its own."""
+    push, u, v = np.empty(3), np.empty(3), np.empty(3)
+    at = 0
+    for pad in range(2):
+        inward = 1.0 if pad == 0 else -1.0
+        for p in range(points.shape[1]):
+            if not there[pad, p]:
+                continue
+            a, r = normals[pad, p], points[pad, p]
+            axis = np.argmin(np.abs(a))
+            u[:] = -a[axis] * a
+            u[axis] += 1.0
+            u /= np.sqrt(np.sum(u * u))
+            v = np.array(
+                [
+                    a[1] * u[2] - a[2] * u[1],
+                    a[2] * u[0] - a[0] * u[2],
+                    a[0] * u[1] - a[1] * u[0],
+                ]
+            )
+            for e in range(len(corners)):
+                for i in range(3):
+                    push[i] = -a[i] + friction * (corners[e, 0] * u[i] + corners[e, 1] * v[i])
+                table[0, at] = (r[1] * push[2] - r[2] * push[1]) / LENGTH_M
+                table[1, at] = (r[2] * push[0] - r[0] * push[2]) / LENGTH_M
+                table[2, at] = (r[0] * push[1] - r[1] * push[0]) / LENGTH_M
+                table[3:6, at] = push
+                table[6, at] = inward * push[1]
+                at += 1
+
+
+_add_edges: Any = njit(_add_edges_loops)
+
+
 def _factors_loops(
     points: Any, normals: Any, there: Any, loads: Any, friction: Any, force: Any, corners: Any
 ) -> Any:
@@ -181,40 +218,11 @@ def _factors_loops(
     table = np.zeros((m + 1, columns + m + 1))
     wide = np.zeros((m + 1, columns + m + 2))
     basis, basis_of_load = np.empty(m, np.int64), np.empty(m, np.int64)
-    force_k, u = np.empty(3), np.empty(3)
     for k in range(n):
         if not there[k].any():
             continue
         table[:] = 0.0
-        at = 0
-        for pad in range(2):
-            inward = 1.0 if pad == 0 else -1.0
-            for p in range(per_pad):
-                if not there[k, pad, p]:
-                    continue
-                a, r = normals[k, pad, p], points[k, pad, p]
-                axis = np.argmin(np.abs(a))
-                u[:] = -a[axis] * a
-                u[axis] += 1.0
-                u /= np.sqrt(np.sum(u * u))
-                v = np.array(
-                    [
-                        a[1] * u[2] - a[2] * u[1],
-                        a[2] * u[0] - a[0] * u[2],
-                        a[0] * u[1] - a[1] * u[0],
-                    ]
-                )
-                for e in range(edges):
-                    for i in range(3):
-                        force_k[i] = -a[i] + friction[k] * (
-                            corners[e, 0] * u[i] + corners[e, 1] * v[i]
-                        )
-                    table[0, at] = (r[1] * force_k[2] - r[2] * force_k[1]) / LENGTH_M
-                    table[1, at] = (r[2] * force_k[0] - r[0] * force_k[2]) / LENGTH_M
-                    table[2, at] = (r[0] * force_k[1] - r[1] * force_k[0]) / LENGTH_M
-                    table[3:6, at] = force_k
-                    table[6, at] = inward * force_k[1]
-                    at += 1
+        _add_edges(table, points[k], normals[k], there[k], friction[k], corners)
         # In units of the fingers' force; columns of contacts that are not there stay zero.
         table[6, columns + m] = 2.0
         for i in range(m):

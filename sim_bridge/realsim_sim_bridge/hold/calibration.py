@@ -20,6 +20,7 @@ from realsim.untrusted.own_json import read_own
 
 Array = NDArray[np.float64]
 SHIPPED = Path(__file__).parent / "calibration.json"
+FAILURES = ("blocked", "missed", "skewed", "overloaded")
 SURE = 0.02
 """Evidence is kept this far from 0 and 1: neither is proven by some draws."""
 
@@ -77,6 +78,24 @@ def evidence_of(share: Array, scores: Array, draws: int) -> Array:
         draws: their number.
     """
     return (draws * share + scores) / (draws + 1)
+
+
+def p_hold_columns(measures: dict[str, Array], scores: Array, draws: int) -> dict[str, Array]:
+    """Return p_hold, its error and its draws of what the draws and the attempt said.
+
+    Args:
+        measures: columns of `draws.chance_columns`.
+        scores: (N,) of the simulated attempt; NaN = there was none.
+        draws: their number.
+    """
+    share = 1.0 - sum(measures[f"share_{name}"] for name in FAILURES)
+    evidence = evidence_of(np.asarray(share), scores, draws)
+    told = np.isfinite(evidence)
+    return {
+        "p_hold": shipped().p_hold(evidence),
+        "p_hold_error": shipped().error(evidence, measures["p_hold_error"]),
+        "p_hold_draws": np.where(told, float(draws), np.nan),
+    }
 
 
 def fitted_curve(evidence: Array, held: NDArray[np.bool_]) -> Array:

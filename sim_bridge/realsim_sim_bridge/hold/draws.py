@@ -35,7 +35,7 @@ from realsim_sim_bridge.grasping.surroundings import (
     surface_tree,
 )
 from realsim_sim_bridge.slip.motion import SlipMotion, stage_wrenches
-from realsim_sim_bridge.slip.slip_test import SlipTrial
+from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -177,6 +177,40 @@ class Loads:
         moved = chosen.copy()
         moved[..., :3] += np.cross(centers[:, None], chosen[..., 3:])
         return moved
+
+
+def chance_columns(
+    mesh: Mesh,
+    trial: SlipTrial,
+    slip: SlipConfig,
+    hand: Hand,
+    config: HoldConfig,
+    covariance: Array | None = None,
+) -> dict[str, Array]:
+    """Return safety, the shares of the draws and the error of what holds, by names of MEASURES.
+
+    The error is that of the share that holds; `p_hold_columns` makes p_hold and its error of them.
+
+    Args:
+        mesh: the object [m].
+        trial: N grasps.
+        slip: friction, force and stiffness of the nominal attempt, and the stages' motion.
+        hand: the hand.
+        config: what is uncertain.
+        covariance: see `draw_holds`.
+
+    Raises:
+        InputError: the covariance is none.
+    """
+    physics, surface = slip.physics, GraspedObject.of(mesh)
+    stiffness = physics.pads.pad_stiffness_n_per_m if physics.pads else np.inf
+    loads = stage_loads(trial, slip.motion)
+    soft = config.conformity_m + physics.force_n / stiffness
+    safety, _ = nominal_safety(surface, trial, loads, hand, physics.friction, physics.force_n, soft)
+    drawn = draw_holds(
+        surface, trial, loads, hand, physics.force_n, covariance, config, stiffness
+    )  # fmt: skip
+    return {"safety": safety, "p_hold_error": drawn.error, **drawn.measures()}
 
 
 def stage_loads(trial: SlipTrial, motion: SlipMotion) -> Loads:

@@ -16,6 +16,7 @@ from realsim.models.properties import DEFAULT_DENSITY, physical_properties
 from realsim.robots.hand import Hand, find_hand
 from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
 from realsim_sim_bridge.hold.calibration import (
+    FAILURES,
     Calibration,
     Reliability,
     evidence_of,
@@ -27,9 +28,7 @@ from realsim_sim_bridge.hold.draws import (
     PALM_M,
     GraspedObject,
     HoldConfig,
-    draw_holds,
-    nominal_safety,
-    stage_loads,
+    chance_columns,
 )
 from realsim_sim_bridge.slip.engines import make_engine
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
@@ -48,8 +47,6 @@ BINS = 10
 """Equal ones of p_hold, in the expected calibration error and the reliability diagram."""
 FEW_OBJECTS = 3
 """Of fewer objects no interval is given, and no object can be left out."""
-TABLE_FRICTION = 0.4
-"""Of the object on the table."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -150,7 +147,7 @@ def judge_trials(
     done = 0
     for obj in objects:
         trial, surface = _trial_of(obj, config, cache, notes)
-        found = _of_object(obj, trial, surface, config)
+        found = _of_object(obj, trial, config)
         stopped, _ = surface.stopped(trial.Ts_obj_grasp, config.hand, PALM_M)
         reached = replace(
             trial, Ts_obj_grasp=stopped, Ts_table_grasp=obj.T_board_obj @ stopped
@@ -200,36 +197,28 @@ def _trial_of(
     gravity = config.slip.motion.gravity
     trial = ready_trial(body, obj.Ts_obj_grasp, obj.Ts_board_grasp, config.hand.max_opening_m)
     surface = GraspedObject.of(obj.mesh)
-    stand = Stand.around(standing, (), TABLE_FRICTION, gravity)
+    friction = config.slip.closing.table_friction
+    stand = None if friction is None else Stand.around(standing, (), friction, gravity)
     return replace(trial, stand=stand), surface
 
 
-def _of_object(
-    obj: TriedObject, trial: SlipTrial, surface: GraspedObject, config: RealityConfig
-) -> dict[str, Array]:
+def _of_object(obj: TriedObject, trial: SlipTrial, config: RealityConfig) -> dict[str, Array]:
     """Return what geometry and statics say of an object's trials."""
     hand, physics = config.hand, config.slip.physics
     closure = force_closure(
         obj.mesh, trial.Ts_obj_grasp, trial.openings_m, ClosureConfig(friction=physics.friction),
         hand, trial.body.center_of_mass,
     )  # fmt: skip
-    loads = stage_loads(trial, config.slip.motion)
-    stiffness = hand.pad_stiffness_n_per_m
-    softness_m = config.hold.conformity_m + physics.force_n / stiffness
-    drawn = draw_holds(
-        surface, trial, loads, hand, hand.force_n, None, config.hold, stiffness
-    )  # fmt: skip
-    safety, _ = nominal_safety(
-        surface, trial, loads, hand, physics.friction, physics.force_n, softness_m
-    )
+    columns = chance_columns(obj.mesh, trial, config.slip, hand, config.hold)
+    share = 1.0 - sum(columns[f"share_{name}"] for name in FAILURES)
     return {
-        "draws": drawn.share,
-        "error": drawn.error,
-        "safety": safety[:, 1:].min(axis=1),
+        "draws": np.asarray(share),
+        "error": columns.pop("p_hold_error"),
+        "safety": columns.pop("safety")[:, 1:].min(axis=1),
         "dexnet_closure": closure.dexnet_closure,
         "closure_friction": -closure.closure_friction,
         "ferrari_canny": closure.ferrari_canny,
-        **drawn.measures(),
+        **columns,
     }
 
 

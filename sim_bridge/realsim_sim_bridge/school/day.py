@@ -21,8 +21,14 @@ from realsim_sim_bridge.school.kept_sets import (
     write_prepared,
     write_result,
 )
-from realsim_sim_bridge.school.object_slips import Rows, in_words, result_of, stand_of, trial_of
-from realsim_sim_bridge.school.object_task import ObjectTask, Prepared, not_prepared, prepare
+from realsim_sim_bridge.school.object_slips import Rows, in_words, result_of, stand_of
+from realsim_sim_bridge.school.object_task import (
+    ObjectTask,
+    Prepared,
+    not_prepared,
+    prepare,
+    trial_of,
+)
 from realsim_sim_bridge.school.shards import (
     Tested,
     read_tested,

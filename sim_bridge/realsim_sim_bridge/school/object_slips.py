@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet
 from realsim.records.grasps import MEASURES
-from realsim_sim_bridge.arm.reach_config import grasping_arm
+from realsim_sim_bridge.hold.calibration import p_hold_columns
 from realsim_sim_bridge.school.kept_sets import SchoolResult
 from realsim_sim_bridge.school.object_task import ObjectTask, Prepared
 from realsim_sim_bridge.school.run_record import versions
 from realsim_sim_bridge.school.shards import Tested
 from realsim_sim_bridge.slip.score import score_paper, score_stages
-from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial
+from realsim_sim_bridge.slip.slip_test import SlipConfig
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import SlipBody
 
@@ -41,34 +41,6 @@ def stand_of(
         return None
     parts = [se3.transform(T_table_obj, part) for part in body.parts]
     return Stand.around(parts, list(neighbours), friction, config.motion.gravity)
-
-
-def trial_of(
-    task: ObjectTask, prepared: Prepared, rows: Rows, stand: Stand | None = None
-) -> SlipTrial:
-    """Return some rows of the candidates, ready for the slip test.
-
-    Args:
-        task: the object.
-        prepared: its candidates.
-        rows: some of them.
-        stand: what it stands on while the fingers close; None = it is free.
-    """
-    assert prepared.body is not None, "rows are tested only of objects with a body"
-    lifted = prepared.joints_lifted[rows]
-    arm = grasping_arm(task.config.reach, task.config.hand)
-    axes, points, ranges = arm.swing_in_grasp(lifted)
-    Ts = prepared.Ts_obj_grasp[rows]
-    return SlipTrial(
-        body=prepared.body,
-        Ts_obj_grasp=Ts,
-        Ts_table_grasp=task.T_table_obj @ Ts,
-        openings_m=prepared.openings_m[rows],
-        swing_axes=axes,
-        swing_points=points,
-        swing_ranges=ranges,
-        stand=stand,
-    )
 
 
 def result_of(
@@ -100,6 +72,10 @@ def result_of(
         for row in rows.tolist():
             failures[row] = f"not tested: {why}"
     base, scores = score_stages(slip_m, slip_rad, tried, task.config.score)
+    known = prepared.measures | {"score_paper": score_paper(slip_m, slip_rad, tried)}
+    if task.config.hold is not None and "safety" in known:
+        attempted = np.where(prepared.reachable, scores, np.nan)
+        known |= p_hold_columns(known, attempted, task.config.hold.draws)
     grasp_set = GraspSet(
         obj_id=task.obj_id,
         instance=task.instance,
@@ -111,9 +87,7 @@ def result_of(
         slip_rad=slip_rad,
         reachable=prepared.reachable,
         failures=tuple(failures),
-        measures=_measures(
-            prepared.measures | {"score_paper": score_paper(slip_m, slip_rad, tried)}, tested, n
-        ),
+        measures=_measures(known, tested, n),
         parameters=_parameters(task, prepared) | {"stand": standing},
     )
     return SchoolResult(

@@ -24,7 +24,10 @@ from realsim_sim_bridge.grasping.analytic_select import select_rows
 from realsim_sim_bridge.grasping.candidates import Candidates, sample_candidates
 from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
 from realsim_sim_bridge.grasping.surroundings import Surroundings, standing_object
+from realsim_sim_bridge.hold.draws import chance_columns
 from realsim_sim_bridge.school.config import SchoolConfig
+from realsim_sim_bridge.slip.slip_test import SlipTrial
+from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import SlipBody
 
 # --- Analytic grasps as what the School tries: labels of an object, those that stand, a few of them
@@ -110,6 +113,8 @@ class ObjectTask:
     """Folder for the convex parts of meshes, or None to keep none."""
     solid: KnownSolid | None = None
     """Convex parts and matter, where a model library knows them."""
+    covariance: Array | None = None
+    """(6, 6) of the registered pose, right perturbation, rotation first [rad, m], if known."""
     labels_file: Path | None = None
     """GraspNet's labels of the object, where the config asks for analytic grasps; None = they are
     computed."""
@@ -125,6 +130,8 @@ class ObjectTask:
                 "known_inertia": _hash(matter.inertia),
                 "known_parts": _hash(*self.solid.parts.parts),
             }
+        if self.covariance is not None:
+            known["covariance"] = _hash(self.covariance)
         if self.labels_file is not None:
             digest = hashlib.sha256(self.labels_file.read_bytes()).hexdigest()
             known["labels"] = f"{self.labels_file.name} {digest[:16]}"
@@ -214,7 +221,7 @@ def prepare(task: ObjectTask) -> Prepared:
         body.center_of_mass,
         contact_depths_m=found.contact_depths_m,
     )
-    return Prepared(
+    prepared = Prepared(
         Ts_obj_grasp=found.Ts_obj_grasp,
         widths_m=found.widths_m,
         openings_m=found.openings_m,
@@ -229,6 +236,51 @@ def prepare(task: ObjectTask) -> Prepared:
         body=body,
         notes=notes,
     )
+    return replace(prepared, measures=prepared.measures | _chances(task, prepared))
+
+
+def trial_of(
+    task: ObjectTask, prepared: Prepared, rows: NDArray[np.int64], stand: Stand | None = None
+) -> SlipTrial:
+    """Return some rows of the candidates, ready for the slip test.
+
+    Args:
+        task: the object.
+        prepared: its candidates.
+        rows: some of them.
+        stand: what it stands on while the fingers close; None = it is free.
+    """
+    assert prepared.body is not None, "rows are tested only of objects with a body"
+    lifted = prepared.joints_lifted[rows]
+    arm = grasping_arm(task.config.reach, task.config.hand)
+    axes, points, ranges = arm.swing_in_grasp(lifted)
+    Ts = prepared.Ts_obj_grasp[rows]
+    return SlipTrial(
+        body=prepared.body,
+        Ts_obj_grasp=Ts,
+        Ts_table_grasp=task.T_table_obj @ Ts,
+        openings_m=prepared.openings_m[rows],
+        swing_axes=axes,
+        swing_points=points,
+        swing_ranges=ranges,
+        stand=stand,
+    )
+
+
+def _chances(task: ObjectTask, prepared: Prepared) -> dict[str, Array]:
+    """Return safety and the draws' outcomes as columns of all candidates; NaN where not tested."""
+    config, rows = task.config, prepared.tested
+    if config.hold is None or len(rows) == 0:
+        return {}
+    found = chance_columns(
+        task.mesh, trial_of(task, prepared, rows), config.slip, config.hand, config.hold,
+        task.covariance,
+    )  # fmt: skip
+    columns: dict[str, Array] = {}
+    for name, values in found.items():
+        columns[name] = np.full((len(prepared.widths_m), *values.shape[1:]), np.nan)
+        columns[name][rows] = values
+    return columns
 
 
 def chance_of(task: ObjectTask) -> np.random.Generator:

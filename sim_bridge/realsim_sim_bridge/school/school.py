@@ -200,6 +200,7 @@ def object_tasks(
                 config=config,
                 cache=cache,
                 solid=(solids or {}).get(obj.obj_id),
+                covariance=obj.covariance,
                 labels_file=(label_files or {}).get(obj.obj_id),
             )
         )
