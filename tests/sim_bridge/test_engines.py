@@ -190,7 +190,7 @@ def table(neighbours=(), gravity=9.81):
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_table_far_below_and_no_weight_are_no_table(engine):
-    free = Closing(drag_per_s=0.0)
+    free = Closing(drag_per_s=0.0, release_m=0.0)
     far = replace(table(gravity=0.0), height_m=-10.0)
     cube = block([0.04] * 3)
     pushed, alone = (standing(engine, cube, s, None, free, 0.004)[1] for s in (far, None))
@@ -209,9 +209,12 @@ def test_what_stands_stays_and_the_table_forbids_to_go_down(engine):
     slippery = SlipPhysics(friction=0.1, force_n=20.0)
     down = {}
     for name, stand in (("free", None), ("stands", table())):
-        start, seen, forces = standing(engine, roof, stand, slippery)
+        start, seen, forces = standing(engine, roof, stand, slippery, Closing(release_m=0.0))
         down[name] = start[2, 3] - seen[-1, 2, 3]
     assert down["stands"] < 1e-3 < 0.01 < down["free"] and forces[-1].min() > 1.0
+    # It is squeezed out as soon as the table leaves it.
+    start, seen, forces = standing(engine, roof, table(), slippery)
+    assert start[2, 3] - np.nanmin(seen[:, 2, 3]) > 0.01 and forces[-1].min() < 1.0
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -95,8 +95,9 @@ class BulletPair:
             self.object = self._add_object(self._shape(cores, Path(folder) / "object.obj"), margin)
             self._stands = [] if stand is None else self._add_stand(stand, Path(folder))
         self.stand = stand
-        self.weight_n = 0.0 if stand is None else stand.gravity * self._mass
-        """Of the object in the engine [N]."""
+        gravity = 0.0 if stand is None else stand.gravity
+        self.weights_n = gravity * self._mass, gravity * body.mass_kg
+        """Of the object in the engine while it stands, and its own from then [N]."""
 
     # --- what is in it ------------------------------------------------------------------------
 

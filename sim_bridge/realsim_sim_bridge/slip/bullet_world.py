@@ -106,28 +106,38 @@ class BulletWorld(HandWorld):
     def _close(self, k: int, closing: Closing, sample: int) -> list[tuple[Array, Array]]:
         """Close hand k and return what is seen every `sample` steps."""
         pair = self._pair
-        pair.place_stand(self._Ts_hand_table[k])
+        T_hand_table = self._Ts_hand_table[k]
+        pair.place_stand(T_hand_table)
         self._take(k)
         pair.drive(closing.speed)
-        weight: list[float] = (-pair.weight_n * self._R_world_hand[k, 2]).tolist()
+        down = -self._R_world_hand[k, 2]
         duration_s = float(self._fingers[k].max()) / closing.speed + closing.settle_s
+        most = 0 if pair.stand is None else round(closing.release_s / (sample * self.dt))
+        sunk, weight = -1, (pair.weights_n[0] * down).tolist()
         start = before = self._Ts_hand_body[k, :3, 3]
         fingers = self._fingers[k]
         seen: list[tuple[Array, Array]] = []
-        while len(seen) * sample < duration_s / self.dt:
-            for _ in range(sample):
+        while sunk < most:
+            for step in range(1, sample + 1):
+                if sunk >= 0:
+                    far = closing.release_speed * self.dt * (sunk * sample + step)
+                    pair.place_stand(T_hand_table @ se3.from_translation([0.0, 0.0, -far]))
                 pair.follow_arc()
-                if pair.weight_n:
+                if pair.stand is not None:
                     pair.push([0.0, 0.0, 0.0], weight)
                 pair.engine.stepSimulation()
             seen.append((pair.pose(), pair.finger_forces()))
             at, forces = seen[-1][0][:3, 3], seen[-1][1]
             now = pair.fingers()[0]
             moved = max(float(np.linalg.norm(at - before)), float(np.abs(now - fingers).max()))
-            gone = float(np.linalg.norm(at - start)) > closing.lost_m
             pressed = bool(np.all(forces > self._physics.contact_n))
-            if gone or (pressed and moved < closing.settled_m):
+            rests = pressed and moved < closing.settled_m
+            if float(np.linalg.norm(at - start)) > closing.lost_m or (rests and sunk >= 0):
                 break
+            if sunk >= 0 or rests or len(seen) * sample >= duration_s / self.dt:
+                if not pressed and sunk < 0:
+                    break
+                sunk, weight = sunk + 1, (pair.weights_n[1] * down).tolist()
             before, fingers = at, now
         self._leave(k)
         return seen

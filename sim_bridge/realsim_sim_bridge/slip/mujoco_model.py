@@ -69,6 +69,8 @@ class PairModel:
     reach_m: float
     """Greatest distance of a vertex from the centre of mass [m]."""
     geometry: Hand
+    mass_kg: float
+    """The object's own, which may be less than what is simulated."""
     stand: Stand | None
     """What the object stands on while the fingers close; it is off while loads are played."""
     lifting: Array | None
@@ -137,6 +139,7 @@ def compile_pair(
         triangles_obj=triangles,
         reach_m=body.reach(),
         geometry=geometry,
+        mass_kg=body.mass_kg,
         stand=stand,
         lifting=lifting,
         **_columns(model, lifts),

@@ -162,35 +162,49 @@ class MujocoWorld(HandWorld):
             )
         self._start_near_objects()
         self._speed = closing.speed
-        stand, weights = self._pair.stand, None
+        stand = self._pair.stand
         set_drag(self._model, closing.drag_per_s if stand is None else 0.0)
         set_stand(self._model, stand is not None)
-        if stand is not None:
-            weights = np.zeros((1, 1, 6))
-            weights[..., 5] = -stand.gravity * float(self._model.body(OBJECT).mass[0])
         self._lock(False)
         every = max(1, round(closing.sample_s / self.dt))
         arrival_s = self._rows[:, mujoco_state.FINGERS].max(axis=1) / closing.speed
         looks = np.ceil((arrival_s + closing.settle_s) / (every * self.dt)).astype(np.int64)
         origin = self._rows[:, mujoco_state.POSITION].copy()
         count = int(looks[self.alive].max()) if self.alive.any() else 0
-        seen = Samples.empty(len(self._rows), _times(np.arange(1, count + 1) * every, self.dt))
-        going, lost = self.alive.copy(), ~self.alive
+        # Looks at a table that sinks: of each pair from when it rests, or has had its time.
+        most = 0 if stand is None else round(closing.release_s / (every * self.dt))
+        sunk = np.zeros(len(self._rows), dtype=np.int64)
+        steps = np.arange(1, every + 1)
+        seen = Samples.empty(
+            len(self._rows), _times(np.arange(1, count + most + 1) * every, self.dt)
+        )
+        going, lost, standing = self.alive.copy(), ~self.alive, self.alive.copy()
         last = np.zeros(len(going), dtype=np.int64)
-        for look in range(count):
+        for look in range(count + most):
             k = np.nonzero(going)[0]
             if len(k) == 0:
                 break
             before = self._rows[k]
-            states, forces, sound = self._run(k, every, weights)
+            down = (every * sunk[k, None] + steps) * ~standing[k, None]
+            states, forces, sound = self._run(
+                k,
+                every,
+                None if stand is None else self._weights(stand, standing[k]),
+                np.asarray(closing.release_speed * self.dt * down, dtype=np.float64),
+            )
             seen.rows[k[sound], look] = states[sound, -1]
             seen.finger_n[k[sound], look] = forces[sound, -1]
             last[k] = look
+            sunk[k] += ~standing[k]
             moved = mujoco_state.moved_m(before, self._rows[k], self._pair.reach_m)
             pressed = (forces[:, -1] > self._physics.contact_n).all(axis=1)
             shift = np.linalg.norm(self._rows[k, mujoco_state.POSITION] - origin[k], axis=1)
             lost[k] = (shift > closing.lost_m) | ~sound
-            going[k] = ~lost[k] & ~((moved < closing.settled_m) & pressed) & (look + 1 < looks[k])
+            late = np.where(standing[k], look + 1 >= looks[k], sunk[k] >= most)
+            done = late | ((moved < closing.settled_m) & pressed)
+            ends = done & (~standing[k] | ~pressed | (most == 0))
+            going[k] = ~lost[k] & ~ends
+            standing[k] &= ~done
         set_drag(self._model, 0.0)
         set_stand(self._model, False)
         self._lock(True)
@@ -258,6 +272,13 @@ class MujocoWorld(HandWorld):
         )[:, None]
         self._open[k] = False
 
+    def _weights(self, stand: Stand, standing: NDArray[np.bool_]) -> Array:
+        """Return the objects' weights as wrenches (n, 1, 6): see `Stand` for whose."""
+        weights = np.zeros((len(standing), 1, 6))
+        simulated = float(self._model.body(OBJECT).mass[0])
+        weights[:, 0, 5] = -stand.gravity * np.where(standing, simulated, self._pair.mass_kg)
+        return weights
+
     def _lock(self, locked: bool) -> None:
         """Hold the height of fingers on an arc, or let it follow."""
         lock_lifts(self._model, locked, self._settings)
@@ -277,14 +298,15 @@ class MujocoWorld(HandWorld):
         return full
 
     def _run(
-        self, k: Rows, steps: int, wrenches: Array | None
+        self, k: Rows, steps: int, wrenches: Array | None, sunk_m: Array | None = None
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Roll pairs k out and keep where they end.
 
         Args:
             k: (n,) numbers of the pairs.
             steps: how many.
-            wrenches: (n, steps, 6) or (1, 1, 6) torque and force, world axes; None = no load.
+            wrenches: (n, steps, 6) or (n, 1, 6) torque and force, world axes; None = no load.
+            sunk_m: (n, steps) how far the table has sunk [m]; None = not at all.
 
         Returns:
             state rows (n, steps, 20), normal forces of the fingers (n, steps, 2) [N] and whether
@@ -300,7 +322,10 @@ class MujocoWorld(HandWorld):
             # v @ R turns into the hand's axes; MuJoCo takes the force first.
             control[..., self._load.start : self._load.stop - 3] = wrenches[..., 3:] @ R
             control[..., self._load.start + 3 : self._load.stop] = wrenches[..., :3] @ R
-        control[..., self._control_width - self._stands.shape[1] :] = self._stands[k, None]
+        stands = control[..., self._control_width - self._stands.shape[1] :]
+        stands[:] = self._stands[k, None]
+        if sunk_m is not None and self._stands.size:
+            stands[..., :3] -= sunk_m[..., None] * self._Rs_world_hand[k, None, 2]
         pair = self._pair
         states = self._space("states", n, steps, len(pair.plain) + pair.lifts.size)
         forces = self._space("forces", n, steps, 2)

@@ -24,11 +24,11 @@ RESTING_M = 1e-5
 class Stand:
     """A table and fixed neighbours, table frame, which the object meets and the hand does not.
 
-    Reach has judged before whether the hand meets them. They are there until the hand has closed;
-    what holds the object then is the hand. The object has its weight meanwhile: in an engine that
-    simulates a greater mass (`SlipPhysics.mass_floor_kg`) the weight of that mass, because an
-    object that is pushed over a table comes to rest as its weight makes it, whatever its mass; the
-    fingers' force is not scaled, and is far greater.
+    Reach has judged before whether the hand meets them. They are there until the hand has closed,
+    then they sink, and what holds the object is the hand. While fingers close the object has its
+    weight: in an engine that simulates a greater mass (`SlipPhysics.mass_floor_kg`) the weight of
+    that mass, because an object that is pushed over a table comes to rest as its weight makes it,
+    whatever its mass. From when the table sinks it is the true weight, as in all loads.
     """
 
     height_m: float

@@ -208,6 +208,12 @@ class Closing:
     """Coulomb coefficient of the object with the table that it stands on and the neighbours beside
     it: wood on wood (0.25 to 0.5 in the Engineering ToolBox's table), plastics and metals on it
     are near. None = no table, no neighbours, no weight, as sets have it that do not name it."""
+    release_m: float = 0.02
+    """Once both fingers touch the table sinks so far, at most, until nothing moves any more [m]:
+    what they squeeze onto it finds its hold in them, or none, as the hand begins to rise. If table
+    and neighbours were gone at once, it would be shot out of the fingers."""
+    release_speed: float = 0.1
+    """How fast it sinks [m/s]: the lift is at 0.14 m/s where the hand has risen by 2 cm."""
     drag_per_s: float = 40.0
     """Where there is no table (a specimen, grasps of other data sets), the object is weightless
     and its speed decays at this rate [1/s]: mu g / v, what the friction of 0.4 does to an object
@@ -221,6 +227,11 @@ class Closing:
     """Closing ends when both fingers press and nothing moved more than this in a sample [m]."""
     lost_m: float = 0.05
     """An object that moved so far is lost [m]."""
+
+    @property
+    def release_s(self) -> float:
+        """Longest time that the table sinks [s]."""
+        return self.release_m / self.release_speed
 
     @classmethod
     def of(cls, hand: Hand) -> "Closing":
