@@ -211,7 +211,8 @@ class Closing:
     release_m: float = 0.02
     """Once both fingers touch the table sinks so far, at most, until nothing moves any more [m]:
     what they squeeze onto it finds its hold in them, or none, as the hand begins to rise. If table
-    and neighbours were gone at once, it would be shot out of the fingers."""
+    and neighbours were gone at once, it would be shot out of the fingers. What slides farther fails
+    the lift in any case: 2 cm is its limit."""
     release_speed: float = 0.1
     """How fast it sinks [m/s]: the lift is at 0.14 m/s where the hand has risen by 2 cm."""
     drag_per_s: float = 40.0
