@@ -41,14 +41,14 @@ def test_grasps_on_the_edge_fit_the_hand_and_do_not_hang_on_the_mass(shape):
         seen = se3.transform(se3.invert(T), corners)
         assert np.abs(seen[:, 1]).max() < hand.max_opening_m / 2
         assert seen[:, 2].min() > hand.palm_face_z_m
-    beside = edge_trial(shape, 0.01, 5, 7, hand, 5e-5)
+    beside = edge_trial(shape, 0.01, 5, 7, hand, shift_m=5e-5)
     moved = np.linalg.norm((beside.Ts_obj_grasp - light.Ts_obj_grasp)[:, :3, 3], axis=1)
     assert np.allclose(moved, 5e-5)
 
 
 def test_a_shape_that_there_is_not_is_named():
-    with pytest.raises(InputError, match=r"no specimen 'cone'.*wedge"):
-        specimen("cone", 1.0)
+    with pytest.raises(InputError, match=r"no specimen 'torus'.*wedge"):
+        specimen("torus", 1.0)
 
 
 def test_the_peak_load_is_what_lift_and_oscillation_ask_for():

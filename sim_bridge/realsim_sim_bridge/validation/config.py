@@ -17,6 +17,7 @@ CHECKS = (
     "convergence",
     "replay",
     "full_arm",
+    "reference",
 )
 """The suite's parts in the order in which they run: cheap ones that explain others come first."""
 
@@ -135,6 +136,34 @@ class LabelConfig:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class ReferenceConfig:
+    """Grasps on the edge that the independent contact model tries as well."""
+
+    force_n: float = 20.0
+    friction: float = 0.5
+    """With that force, friction carries 20 N."""
+    masses_kg: tuple[tuple[str, tuple[float, ...]], ...] = (
+        ("box", (0.4, 1.1)),
+        ("l_shape", (0.4, 0.7)),
+        ("disc", (0.8, 1.3)),
+        ("cylinder", (0.8, 1.2)),
+        ("cone", (0.4, 1.1)),
+        ("ball", (0.6, 1.2)),
+        ("bottle", (0.3, 0.9)),
+    )
+    """Shapes and their masses: about half of the lighter ones turn by more than 10 deg, and half of
+    the heavier ones are dropped."""
+    seed: int = 7
+    """Of where the grasps are."""
+    grasps: int = 1
+    """Of each shape and mass; they take the contact model about a second each."""
+    lean_deg: float = 20.0
+    """How far the surfaces under the fingers may lean over [deg]: friction holds 26 deg."""
+    agreement: float = 0.85
+    """Least share of equal labels: of 14 grasps two may differ."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class ValidationConfig:
     """Everything the validation suite can be told."""
 
@@ -146,6 +175,7 @@ class ValidationConfig:
     limits: LimitConfig = field(default_factory=LimitConfig)
     stages: StageConfig = field(default_factory=StageConfig)
     labels: LabelConfig = field(default_factory=LabelConfig)
+    reference: ReferenceConfig = field(default_factory=ReferenceConfig)
 
     @classmethod
     def of(cls, hand: Hand) -> "ValidationConfig":
@@ -169,5 +199,9 @@ class ValidationConfig:
                 masses_kg=(0.01, 0.5),
                 finer=((2, 1),),
                 arm_cases=((0.125, 5.0, 0.05, 0.0), (0.125, 10.0, 0.3, 0.015)),
+            ),
+            reference=replace(
+                self.reference,
+                masses_kg=tuple((shape, masses[1:]) for shape, masses in self.reference.masses_kg),
             ),
         )

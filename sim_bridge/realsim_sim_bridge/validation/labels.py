@@ -1,4 +1,4 @@
-"""Labels of grasps on the edge: they must not hang on time step, iterations or replay."""
+"""Labels of grasps on the edge: they must not hang on time step, iterations, replay or engine."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings
+from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import Engine
 from realsim_sim_bridge.validation.config import ValidationConfig
 from realsim_sim_bridge.validation.loads import with_hand
+from realsim_sim_bridge.validation.reference_contact import ReferenceEngine
 from realsim_sim_bridge.validation.report import CheckResult
 from realsim_sim_bridge.validation.specimens import edge_trial
 
@@ -51,7 +53,7 @@ def edge_labels(engine: Engine, config: ValidationConfig, shift_m: float = 0.0) 
     for mass in labels.masses_kg:
         for shape in labels.shapes:
             trial: SlipTrial = edge_trial(
-                shape, mass, labels.grasps, labels.seed, config.hand, shift_m
+                shape, mass, labels.grasps, labels.seed, config.hand, shift_m=shift_m
             )
             tried = run_slip_test(
                 trial, edge_config(config, mass), geometry=config.hand, engine=engine
@@ -148,3 +150,61 @@ def _by_mass(a: EdgeLabels, b: EdgeLabels) -> str:
     return f"{len(a.passed)} grasps, {100 * a.passed.mean():.0f} % held; differing at " + ", ".join(
         words
     )
+
+
+# --- the engine against the independent contact model -------------------------------------------
+
+
+PATIENT = ScoreLimits(slip_m=0.05, slip_deg=360.0)
+"""Under these a grasp is held whose object is between both fingers at the end of all stages,
+however far it slipped."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ReferenceLabels:
+    """What became of the grasps that the contact model tries, too."""
+
+    shapes: tuple[str, ...]
+    """(N,) shape and mass of each."""
+    held: Mask
+    """(N,) still between both fingers at the end, however far it slipped."""
+    passed: Mask
+    """(N,) under the paper's limits of every stage besides."""
+
+
+def reference_labels(engine: Engine, config: ValidationConfig) -> ReferenceLabels:
+    """Return what an engine makes of the grasps of `ValidationConfig.reference`."""
+    asked = config.reference
+    slip = with_hand(config.slip, asked.force_n, asked.friction)
+    shapes: list[str] = []
+    held: list[Mask] = []
+    passed: list[Mask] = []
+    for shape, masses in asked.masses_kg:
+        for k, mass in enumerate(masses):
+            trial = edge_trial(
+                shape, mass, asked.grasps * len(masses), asked.seed, config.hand,
+                lean_deg=asked.lean_deg,
+            ).part(slice(k * asked.grasps, (k + 1) * asked.grasps))  # fmt: skip
+            slips = run_slip_test(trial, slip, PATIENT, config.hand, engine)
+            tried = np.ones(len(trial), dtype=np.bool_)
+            score = score_stages(slips.slip_m, slips.slip_rad, tried, ScoreLimits())[1]
+            shapes += [f"{shape} {mass:g} kg"] * len(trial)
+            held.append(slips.passed)
+            passed.append(slips.passed & (score >= 1.0))
+    return ReferenceLabels(
+        shapes=tuple(shapes), held=np.concatenate(held), passed=np.concatenate(passed)
+    )
+
+
+def reference_check(engine: Engine, config: ValidationConfig) -> CheckResult:
+    """Return the share of grasps that the independent contact model holds or drops as well."""
+    found, judge = (reference_labels(e, config) for e in (engine, ReferenceEngine()))
+    same = found.held == judge.held
+    differing = [s for s, equal in zip(found.shapes, same.tolist(), strict=True) if not equal]
+    return CheckResult(
+        group="reference", name="labels of the contact model",
+        what="share of grasps held or dropped as by an independent contact model",
+        measured=float(same.mean()), unit="", limit=config.reference.agreement, at_least=True,
+        detail=f"{len(same)} grasps, {int(judge.held.sum())} held; under the paper's limits "
+        f"{np.mean(found.passed == judge.passed):.3f}; differing: {', '.join(differing) or 'none'}",
+    )  # fmt: skip

@@ -39,6 +39,13 @@ def cube(mass_kg: float) -> SlipBody:
     return _body((_box((-half, -half, -half), (half, half, half)),), mass_kg)
 
 
+def frustum(mass_kg: float, half_angle_deg: float) -> SlipBody:
+    """Return a cone of 5 cm at its middle, cut off 1 cm above and below; it widens towards z."""
+    change = 0.01 * np.tan(np.radians(half_angle_deg))
+    half = SIDE_M / 2
+    return _body((_turned((half - change, -0.01), (half + change, 0.01), sides=32),), mass_kg)
+
+
 def specimen(shape: str, mass_kg: float) -> SlipBody:
     """Return one of the shapes with a mass; closing along its y meets it within the opening.
 
@@ -76,7 +83,14 @@ def cube_trial(mass_kg: float, rotations: Array, hand: Hand) -> SlipTrial:
 
 
 def edge_trial(
-    shape: str, mass_kg: float, grasps: int, seed: int, hand: Hand, shift_m: float = 0.0
+    shape: str,
+    mass_kg: float,
+    grasps: int,
+    seed: int,
+    hand: Hand,
+    *,
+    shift_m: float = 0.0,
+    lean_deg: float = 90.0,
 ) -> SlipTrial:
     """Return grasps of a shape that close beside its centre, in all positions to gravity.
 
@@ -90,6 +104,8 @@ def edge_trial(
         seed: of the draw.
         hand: what grasps it.
         shift_m: moves every grasp along a drawn direction [m].
+        lean_deg: how far the surfaces that the fingers meet may lean over [deg]; what leans by more
+            than the angle of friction is squeezed out.
     """
     body = specimen(shape, mass_kg)
     corners = np.concatenate(body.parts)
@@ -106,22 +122,40 @@ def edge_trial(
         T_obj_grasp[:3, 3] -= z_pad * T_obj_grasp[:3, 2]
         in_hand = se3.transform(se3.invert(T_obj_grasp), corners)
         fits = np.abs(in_hand[:, 1]).max() < hand.max_opening_m / 2 - CLEARANCE_M
-        if fits and in_hand[:, 2].min() > hand.palm_face_z_m + CLEARANCE_M and _met(body, at):
+        clear = in_hand[:, 2].min() > hand.palm_face_z_m + CLEARANCE_M
+        if fits and clear and _lean_deg(body, at) <= lean_deg:
             found.append((T_obj_grasp, se3.from_rt(tilt @ DOWN @ turn, np.zeros(3))))
     return ready_trial(
         body, np.stack([T for T, _ in found]), np.stack([T for _, T in found]), hand.max_opening_m
     )
 
 
-def _met(body: SlipBody, at: Array) -> bool:
-    """Return whether a point (3,) is inside a part, seen along y."""
+def _lean_deg(body: SlipBody, at: Array) -> float:
+    """Return the greatest angle to y of the two outermost faces that the line along y meets [deg].
+
+    Args:
+        body: what it meets.
+        at: (3,) a point on the line.
+
+    Returns:
+        infinity if it does not meet the body.
+    """
     from scipy.spatial import ConvexHull
 
+    first, last = (np.inf, 0.0), (-np.inf, 0.0)
     for part in body.parts:
-        sides = ConvexHull(part[:, [0, 2]]).equations
-        if np.all(sides[:, :2] @ at[[0, 2]] + sides[:, 2] <= 0.0):
-            return True
-    return False
+        planes = ConvexHull(part).equations
+        across, beside = planes[:, 1], planes[:, [0, 2]] @ at[[0, 2]] + planes[:, 3]
+        if np.any((across == 0.0) & (beside > 0.0)):
+            continue
+        with np.errstate(divide="ignore", invalid="ignore"):
+            y = -beside / across
+        inwards, outwards = np.where(across < 0.0, y, -np.inf), np.where(across > 0.0, y, np.inf)
+        enter, leave = int(np.argmax(inwards)), int(np.argmin(outwards))
+        if inwards[enter] < outwards[leave]:
+            first = min(first, (float(inwards[enter]), float(across[enter])))
+            last = max(last, (float(outwards[leave]), float(across[leave])))
+    return float(np.degrees(np.arccos(min(-first[1], last[1])))) if first[1] else np.inf
 
 
 def _body(parts: tuple[Array, ...], mass_kg: float) -> SlipBody:
@@ -145,11 +179,19 @@ def _box(low: tuple[float, float, float], high: tuple[float, float, float]) -> A
     return np.array(list(product(*zip(low, high, strict=True))))
 
 
-def _cylinder() -> Array:
-    """Return the corners (48, 3) of an upright cylinder, 50 mm thick and 60 mm high [m]."""
-    angle = 2 * np.pi * np.arange(24) / 24
-    ring = 0.025 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-0.03, 0.03)])
+def _turned(*rings: tuple[float, float], sides: int = 24) -> Array:
+    """Return the corners (R * sides, 3) of rings about z, given by radius and z [m]."""
+    angle = 2 * np.pi * np.arange(sides) / sides
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.concatenate([np.insert(r * circle, 2, z, axis=1) for r, z in rings])
+
+
+def _ball() -> Array:
+    """Return 400 points (400, 3) of a sphere of 50 mm, along a spiral: facets sink in by 0.1 mm."""
+    z = np.linspace(-1.0, 1.0, 400)
+    angle = np.pi * (1 + 5**0.5) * np.arange(400)
+    r = np.sqrt(1.0 - z**2)
+    return 0.025 * np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=-1)
 
 
 @lru_cache(maxsize=1)
@@ -167,7 +209,15 @@ _SHAPES = {
         _box((-0.01, -0.02, -0.04), (0.01, 0.02, 0.04)),
         _box((0.01, -0.02, -0.04), (0.06, 0.02, -0.02)),
     ),
-    "cylinder": (_cylinder(),),
+    "cylinder": (_turned((0.025, -0.03), (0.025, 0.03)),),
     "wedge": (_wedge(),),
+    "disc": (_turned((0.03, -0.02), (0.03, 0.02))[:, [0, 2, 1]],),
+    "cone": (_turned((0.032, -0.03), (0.032 - 0.06 * np.tan(np.radians(10.0)), 0.03), sides=32),),
+    "ball": (_ball(),),
+    "bottle": (
+        _turned((0.03, -0.06), (0.03, 0.01)),
+        _turned((0.03, 0.01), (0.014, 0.035)),
+        _turned((0.014, 0.035), (0.014, 0.06)),
+    ),
 }
 """Convex parts (V, 3) of each shape, about its middle [m]; y is where the hand closes."""

@@ -16,7 +16,13 @@ from realsim_sim_bridge.slip.world import Engine
 from realsim_sim_bridge.validation.config import CHECKS, ValidationConfig
 from realsim_sim_bridge.validation.full_arm import arm_checks
 from realsim_sim_bridge.validation.known_outcomes import box_checks, capacity_checks
-from realsim_sim_bridge.validation.labels import LabelChecks, MakeEngine, Settings, edge_config
+from realsim_sim_bridge.validation.labels import (
+    LabelChecks,
+    MakeEngine,
+    Settings,
+    edge_config,
+    reference_check,
+)
 from realsim_sim_bridge.validation.loads import with_hand
 from realsim_sim_bridge.validation.report import CheckResult, LimitRatio, ValidationReport
 from realsim_sim_bridge.validation.slip_limits import (
@@ -205,8 +211,10 @@ def validate(
             checks += labels.convergence()
         elif part == "replay":
             checks += labels.replay()
-        else:
+        elif part == "full_arm":
             checks += arm_checks(engine, config)
+        else:
+            checks.append(reference_check(engine, config))
     return ValidationReport(
         engine=engine.name,
         version=engine.version(),

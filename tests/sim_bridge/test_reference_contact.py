@@ -1,0 +1,163 @@
+"""The independent contact model: its laws, and what it must say where the answer is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.robots.hand import find_hand
+from realsim_sim_bridge.slip.motion import SlipMotion
+from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
+from realsim_sim_bridge.slip.world import Closing, Grips, PadModel, SlipPhysics
+from realsim_sim_bridge.validation.loads import hand_patch, hold, with_hand
+from realsim_sim_bridge.validation.reference_contact import ReferenceEngine, ReferenceSettings
+from realsim_sim_bridge.validation.reference_loops import closest
+from realsim_sim_bridge.validation.specimens import cube, edge_trial, frustum, specimen
+
+HAND = find_hand()
+MIRROR = np.diag([1.0, -1.0, 1.0])
+EDGE = with_hand(SlipConfig.of(HAND), 20.0, 0.5)
+
+
+def closed(body, physics=EDGE.physics, settings=None):
+    """Return a world of one hand that has closed on a body, with its origin between the pads."""
+    grips = Grips(
+        Ts_table_grasp=np.eye(4)[None],
+        Ts_obj_grasp=np.eye(4)[None],
+        openings_m=np.array([0.06]),
+    )
+    world = ReferenceEngine(settings).world(body, grips, physics, HAND)
+    world.close(Closing())
+    return world
+
+
+def slips_of(trial, settings=None):
+    """Return the slips in stages of half the usual length."""
+    motion = SlipMotion(lift_height_m=0.05, lift_s=0.5, oscillation_cycles=1, pendulum_s=1.8)
+    config = replace(EDGE, motion=motion)
+    return run_slip_test(trial, config, None, HAND, ReferenceEngine(settings))
+
+
+def held_at(shares, load, limit, body, config):
+    """Return whether each share of the limit (K,) moves the body by less than a millimetre."""
+    loads = np.outer(np.array(shares) * limit, load)
+    moved = hold(ReferenceEngine(), config, HAND, body, loads, ramp_s=0.1, hold_s=0.2)
+    return moved.shift_m < 1e-3
+
+
+# --- laws ----------------------------------------------------------------------------------------
+
+
+def test_the_nearest_point_of_a_triangle_is_no_farther_than_any_other():
+    rng = np.random.default_rng(0)
+    shares = rng.dirichlet([0.5, 0.5, 0.5], 4000)
+    for _ in range(200):
+        triangle, p = rng.normal(size=(3, 3)), 2.0 * rng.normal(size=3)
+        squared, found = closest(tuple(p), triangle)
+        assert squared == pytest.approx(np.sum((p - found) ** 2))
+        inside = np.linalg.solve(triangle.T, found)
+        assert inside.min() > -1e-9 and inside.sum() == pytest.approx(1.0)
+        sampled = np.linalg.norm(shares @ triangle - p, axis=1).min()
+        assert np.sqrt(squared) - 1e-12 <= sampled < np.sqrt(squared) + 0.1
+
+
+def test_energy_does_not_grow():
+    world = closed(frustum(0.3, 8.0), settings=ReferenceSettings(damping=0.2))
+    states = world.states()
+    pushed = np.array([[3.0, 2.0, -4.0, 0.15, 0.1, -0.2]])
+    world.put(replace(states, twists=pushed))
+    energies = []
+    for _ in range(150):
+        world.play(np.zeros((1, 1, 6)), 1, 1.0)
+        energies.append(world.energy_j[0])
+    lost = -np.diff(energies)
+    assert lost.min() > -1e-4 * (energies[0] - energies[-1]) and lost.sum() > 5e-3
+
+
+def test_what_the_fingers_give_is_what_the_object_takes():
+    world = closed(cube(0.5))
+    pull = np.array([2.0, 0.0, -3.0])
+    seen = world.play(np.tile(np.concatenate([np.zeros(3), pull]), (1, 400, 1)), 100, 1.0)
+    # It rests: the friction of both fingers is the load, and they press as hard as they are driven.
+    assert np.linalg.norm(world.states().twists) < 1e-5
+    assert np.allclose(seen.finger_n[0, -1], 20.0, rtol=1e-4)
+    sideways = np.tile([0.0, 0.0, 0.0, 0.0, 3.0, 0.0], (1, 400, 1))
+    first, second = world.play(sideways, 400, 1.0).finger_n[0, -1]
+    # The fingers are coupled: a load along y is carried by their difference, whatever they press.
+    assert first - second == pytest.approx(3.0, rel=1e-3) and first + second == pytest.approx(40.0)
+
+
+def test_a_mirrored_load_does_the_mirrored_thing():
+    rng = np.random.default_rng(1)
+    cone = frustum(0.5, 8.0)
+    parts = tuple(p @ MIRROR for p in cone.parts)
+    mirrored = replace(cone, parts=parts, inertia=MIRROR @ cone.inertia @ MIRROR)
+    force, torque = 2.8 * rng.normal(size=3), 0.056 * rng.normal(size=3)
+    ends = []
+    for body, load in (
+        (cone, [*torque, *force]),
+        (mirrored, [*(-MIRROR @ torque), *(MIRROR @ force)]),
+    ):
+        world = closed(body)
+        world.play(np.tile(load, (1, 300, 1)), 300, 1.0)
+        ends.append(world.states().Ts_world_body[0] @ se3.invert(body.principal_frame()[0]))
+    flip = se3.from_rt(MIRROR, np.zeros(3))
+    assert np.abs(ends[0] - np.eye(4)).max() > 1e-3
+    assert np.allclose(flip @ ends[0] @ flip, ends[1], atol=1e-12)
+
+
+def test_half_the_step_changes_nothing_that_counts():
+    trial = edge_trial("cylinder", 0.8, 2, 7, HAND, lean_deg=20.0)
+    coarse, fine = slips_of(trial), slips_of(trial, ReferenceSettings(step_s=12.5e-6))
+    assert np.array_equal(coarse.passed, fine.passed)
+    both = np.isfinite(coarse.slip_m)
+    assert np.array_equal(both, np.isfinite(fine.slip_m))
+    assert np.allclose(coarse.slip_m[both], fine.slip_m[both], rtol=0.02, atol=2e-5)
+
+
+# --- known answers -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("force_n", "friction"), [(20.0, 0.25), (70.0, 1.0)])
+def test_pulls_and_spins_slip_at_the_computed_limits(force_n, friction):
+    config = with_hand(SlipConfig.of(HAND), force_n, friction)
+    patch = hand_patch(PadModel().centers_xz(), force_n, friction)
+    body = cube(np.clip(2.0 * friction * force_n / 20.0, 0.05, 2.0))
+    for angle in (0.0, 0.7, np.pi / 2):
+        load = np.array([0.0, 0.0, 0.0, np.cos(angle), 0.0, np.sin(angle)])
+        limit = patch.slip_load([0.0, np.cos(angle), np.sin(angle)])
+        assert held_at([0.98, 1.02], load, limit, body, config).tolist() == [True, False]
+    aside = np.array([0.0, 0.03, 0.0, 0.0, 0.0, -1.0])
+    limit = patch.slip_load([-0.03, 0.0, -1.0])
+    assert held_at([0.97, 1.05], aside, limit, body, config).tolist() == [True, False]
+
+
+@pytest.mark.parametrize(("half_angle_deg", "stays"), [(13.0, True), (15.0, False)])
+def test_a_cone_is_squeezed_out_where_its_flank_leans_beyond_friction(half_angle_deg, stays):
+    # atan(0.25) is 14.04 degrees; the narrow end is at the palm, the cone leaves along z.
+    cone = frustum(0.3, half_angle_deg)
+    world = closed(cone, replace(EDGE.physics, friction=0.25))
+    world.play(np.zeros((1, 300, 6)), 300, 1.0)
+    moved = world.states().Ts_world_body[0, 2, 3] - cone.center_of_mass[2]
+    assert moved < 2e-4 if stays else moved > 4e-3
+
+
+def test_a_ball_rolls_between_flat_pads_and_does_not_slip_along_them():
+    ball = specimen("ball", 0.2)
+    config = with_hand(SlipConfig.of(HAND), 20.0, 0.5)
+    along = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+    # The spheres' normals lean by 12 degrees: they carry 2 mu F and a little more.
+    assert held_at([0.8, 1.5], along, 20.0, ball, config).tolist() == [True, False]
+
+
+def test_a_hand_without_pads_and_a_flat_part_are_named():
+    grips = Grips(
+        Ts_table_grasp=np.eye(4)[None], Ts_obj_grasp=np.eye(4)[None], openings_m=np.array([0.06])
+    )
+    with pytest.raises(InputError, match=r"sphere pads.*PadModel\.of"):
+        ReferenceEngine().world(cube(0.1), grips, SlipPhysics(pads=None), HAND)
+    flat = replace(cube(0.1), parts=(np.eye(4)[:, :3] * [1.0, 1.0, 0.0],))
+    with pytest.raises(InputError, match="has no volume"):
+        ReferenceEngine().world(flat, grips, EDGE.physics, HAND)
