@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from figures import Found
 from numpy.typing import NDArray
-from school_cases import PATIENT, in_processes, slip_config
+from school_cases import in_processes, slip_config
 
 from realsim.formats.grasps.acronym import read_acronym
 from realsim.geometry import se3
@@ -24,6 +24,7 @@ from realsim.records import Mesh
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.slip.slip_test import SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import SlipBody
+from realsim_sim_bridge.validation.labels import PATIENT
 from realsim_sim_bridge.validation.specimens import ready_trial
 
 Mask = NDArray[np.bool_]

@@ -1,11 +1,15 @@
-"""Whether labels depend on how they were made: fast or reference settings, one engine or the other.
+"""Whether labels depend on how they were made: fast or slow settings, one engine or the other.
 
 The same grasps, all reached by the arm in a scene of ten objects, are tried by both engines in both
 conditions. Held = the object is still between both fingers after all four stages, however far it
 slipped; passed = under the paper's limits, which the same slips tell.
+
+The independent contact model of `realsim school validate` judges both on its own specimens.
 """
 
-from dataclasses import dataclass
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -15,7 +19,6 @@ from numpy.typing import NDArray
 from school_cases import (
     CONDITIONS,
     MARGINAL_DENSITY,
-    PATIENT,
     NamedTrial,
     TrialKey,
     candidate_config,
@@ -33,8 +36,12 @@ from realsim_sim_bridge.school.cross_check import wilson_interval
 from realsim_sim_bridge.school.measure_statistics import closure_confusions, rank_correlations
 from realsim_sim_bridge.school.school import run_school
 from realsim_sim_bridge.school.sweep import SweepConfig
+from realsim_sim_bridge.slip.engines import make_engine, settings_of
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import run_slip_test
+from realsim_sim_bridge.validation.config import ReferenceConfig, ValidationConfig
+from realsim_sim_bridge.validation.labels import PATIENT, ReferenceLabels, reference_labels
+from realsim_sim_bridge.validation.reference_contact import ReferenceEngine
 
 Mask = NDArray[np.bool_]
 ENGINES = ("pybullet", "mujoco")
@@ -60,6 +67,9 @@ class Labels:
     held: Mask
     passed: Mask
     """(N,) each."""
+
+
+AnyLabels = Labels | ReferenceLabels
 
 
 def labels_of(attempt: Attempt) -> Labels:
@@ -142,18 +152,18 @@ def _figures(table: dict[tuple[str, str, bool], list[Labels]], names: list[str])
     return found
 
 
-def _same(a: list[Labels], b: list[Labels], kind: str) -> Mask:
+def _same(a: Sequence[AnyLabels], b: Sequence[AnyLabels], kind: str) -> Mask:
     """Return whether each label is the same, all objects one after the other."""
     first = np.concatenate([getattr(x, kind) for x in a])
     return first == np.concatenate([getattr(x, kind) for x in b])
 
 
-def _share(a: list[Labels], b: list[Labels], kind: str) -> float:
+def _share(a: Sequence[AnyLabels], b: Sequence[AnyLabels], kind: str) -> float:
     """Return the share of equal labels."""
     return float(np.mean(_same(a, b, kind)))
 
 
-def _words(a: list[Labels], b: list[Labels], kind: str) -> str:
+def _words(a: Sequence[AnyLabels], b: Sequence[AnyLabels], kind: str) -> str:
     """Return the agreement in words, with its 95 % interval."""
     same = _same(a, b, kind)
     low, high = wilson_interval(int(same.sum()), len(same))
@@ -162,6 +172,73 @@ def _words(a: list[Labels], b: list[Labels], kind: str) -> str:
         f"{kind} {same.mean():.3f} [{low:.3f}, {high:.3f}] of {len(same)} grasps "
         f"({shares[0]:.0f} and {shares[1]:.0f} % {kind})"
     )
+
+
+# --- The engines and a contact model that shares nothing with them -------------------------------
+
+
+REFERENCE, REFERENCE_QUICK = 6, 1
+"""Grasps of each of seven shapes and two masses: 84 and 14."""
+CONTACT_MODEL = "contact model"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SpecimenJob:
+    """A specimen, and what tries it."""
+
+    engine: str
+    """One of ENGINES, or CONTACT_MODEL."""
+    shape: str
+    masses_kg: tuple[float, ...]
+    grasps: int
+    seed: int
+
+
+def specimen_labels(job: SpecimenJob) -> ReferenceLabels:
+    """Return what becomes of a specimen's grasps."""
+    asked = ReferenceConfig(
+        masses_kg=((job.shape, job.masses_kg),), grasps=job.grasps, seed=job.seed
+    )
+    model = job.engine == CONTACT_MODEL
+    engine = ReferenceEngine() if model else make_engine(settings_of(job.engine))
+    return reference_labels(engine, replace(ValidationConfig(), reference=asked))
+
+
+def reference(given: argparse.Namespace) -> Found:
+    """Return how often each engine holds or drops what the independent contact model does."""
+    grasps = REFERENCE_QUICK if given.quick else REFERENCE
+    jobs = [
+        SpecimenJob(engine=name, shape=shape, masses_kg=masses, grasps=grasps, seed=given.seed)
+        for name in (CONTACT_MODEL, *ENGINES)
+        for shape, masses in ReferenceConfig().masses_kg
+    ]
+    labels: dict[str, list[ReferenceLabels]] = {}
+    for job, one in zip(jobs, in_processes(specimen_labels, jobs), strict=True):
+        labels.setdefault(job.engine, []).append(one)
+    found, shares = Found(), dict[str, float]()
+    judge = labels[CONTACT_MODEL]
+    for engine in ENGINES:
+        same = _same(labels[engine], judge, "held")
+        shares[engine] = float(same.mean())
+        names = [name for one in judge for name in one.shapes]
+        differing = [n for n, equal in zip(names, same.tolist(), strict=True) if not equal]
+        found.notes.append(
+            f"contact model and {engine}: {_words(labels[engine], judge, 'held')}; "
+            f"{_words(labels[engine], judge, 'passed')}; differing: {', '.join(differing)}"
+        )
+    worse = min(shares, key=lambda k: shares[k])
+    count = sum(len(one.held) for one in judge)
+    found.add("reference_agree_share", shares[worse], f"held, {count} grasps; the worse: {worse}")
+    found.cases["contact model"] = {
+        name: {
+            one.shapes[0].split()[0]: [
+                "".join("01"[int(v)] for v in x) for x in (one.held, one.passed)
+            ]
+            for one in all_shapes
+        }
+        for name, all_shapes in labels.items()
+    }
+    return found
 
 
 # --- How margin, score and analytic quality rank the same grasps ---------------------------------

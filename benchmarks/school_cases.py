@@ -35,7 +35,6 @@ from realsim_sim_bridge.school.object_slips import stand_of
 from realsim_sim_bridge.school.object_task import ObjectTask, prepare, trial_of
 from realsim_sim_bridge.school.school import object_tasks
 from realsim_sim_bridge.slip.engines import settings_of
-from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial
 from realsim_sim_bridge.slip.world import SlipBody
 
@@ -124,9 +123,6 @@ MARGINAL_FRICTION = 0.3
 MARGINAL_FACTOR = 6.0
 """The force is this many weights over the friction, so two fingers carry twelve weights, and the
 load's lever drops a third of these objects; with half of it, nearly half."""
-PATIENT = ScoreLimits(slip_m=0.05, slip_deg=360.0)
-"""Under these a grasp is held whose object is between both fingers at the end of all stages,
-however far it slipped."""
 
 
 def marginal_force_n(mass_kg: float) -> float:

@@ -10,10 +10,13 @@ from realsim.geometry import se3
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.slip.motion import SlipMotion
 from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
+from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import Closing, Grips, PadModel, SlipPhysics
+from realsim_sim_bridge.validation.config import ValidationConfig
 from realsim_sim_bridge.validation.loads import hand_patch, hold, with_hand
 from realsim_sim_bridge.validation.reference_contact import ReferenceEngine, ReferenceSettings
 from realsim_sim_bridge.validation.reference_loops import closest
+from realsim_sim_bridge.validation.slip_limits import press_checks
 from realsim_sim_bridge.validation.specimens import cube, edge_trial, frustum, specimen
 
 HAND = find_hand()
@@ -109,7 +112,7 @@ def test_a_mirrored_load_does_the_mirrored_thing():
 
 
 def test_half_the_step_changes_nothing_that_counts():
-    trial = edge_trial("cylinder", 0.8, 2, 7, HAND, lean_deg=20.0)
+    trial = edge_trial("cylinder", 0.8, 1, 7, HAND, lean_deg=20.0)
     coarse, fine = slips_of(trial), slips_of(trial, ReferenceSettings(step_s=12.5e-6))
     assert np.array_equal(coarse.passed, fine.passed)
     both = np.isfinite(coarse.slip_m)
@@ -134,6 +137,12 @@ def test_pulls_and_spins_slip_at_the_computed_limits(force_n, friction):
     assert held_at([0.97, 1.05], aside, limit, body, config).tolist() == [True, False]
 
 
+def test_the_pads_are_as_stiff_as_they_are_said_to_be():
+    config = ValidationConfig.of(HAND)
+    (check,) = press_checks(ReferenceEngine(), config)
+    assert check.measured < 0.01, check.detail
+
+
 @pytest.mark.parametrize(("half_angle_deg", "stays"), [(13.0, True), (15.0, False)])
 def test_a_cone_is_squeezed_out_where_its_flank_leans_beyond_friction(half_angle_deg, stays):
     # atan(0.25) is 14.04 degrees; the narrow end is at the palm, the cone leaves along z.
@@ -152,12 +161,15 @@ def test_a_ball_rolls_between_flat_pads_and_does_not_slip_along_them():
     assert held_at([0.8, 1.5], along, 20.0, ball, config).tolist() == [True, False]
 
 
-def test_a_hand_without_pads_and_a_flat_part_are_named():
+def test_no_pads_a_flat_part_and_a_table_are_named():
     grips = Grips(
         Ts_table_grasp=np.eye(4)[None], Ts_obj_grasp=np.eye(4)[None], openings_m=np.array([0.06])
     )
     with pytest.raises(InputError, match=r"sphere pads.*PadModel\.of"):
         ReferenceEngine().world(cube(0.1), grips, SlipPhysics(pads=None), HAND)
+    stand = Stand(height_m=0.0, friction=0.4, gravity=9.81)
+    with pytest.raises(InputError, match="free objects"):
+        ReferenceEngine().world(cube(0.1), grips, EDGE.physics, HAND, stand)
     flat = replace(cube(0.1), parts=(np.eye(4)[:, :3] * [1.0, 1.0, 0.0],))
     with pytest.raises(InputError, match="has no volume"):
         ReferenceEngine().world(flat, grips, EDGE.physics, HAND)

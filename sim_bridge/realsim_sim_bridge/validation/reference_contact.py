@@ -21,6 +21,7 @@ from realsim import __version__
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
+from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import (
     Closing,
     Engine,
@@ -49,7 +50,7 @@ class ReferenceSettings:
     """How finely the contact model steps, and what it takes for granted."""
 
     step_s: float = 25e-6
-    """Time step [s]: a hundredth of the fastest vibration of 100 g between pads of 240 kN/m."""
+    """Time step [s]: a hundredth of the vibration of 100 g between two pads of 200 kN/m."""
     load_s: float = 1e-3
     """Time for which a load stands [s]; a multiple of the step."""
     damping: float = 1.0
@@ -78,13 +79,24 @@ class ReferenceEngine(Engine):
         return __version__
 
     def world(
-        self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: Hand
+        self,
+        body: SlipBody,
+        grips: Grips,
+        physics: SlipPhysics,
+        geometry: Hand,
+        stand: Stand | None = None,
     ) -> "ReferenceWorld":
         """Return a world with these pairs.
 
         Raises:
-            InputError: the hand has no sphere pads, or a part of the object is flat.
+            InputError: the objects stand on something, the hand has no sphere pads, or a part of
+                the object is flat.
         """
+        if stand is not None:
+            raise InputError(
+                "the reference contact model closes on free objects and was given a table; give "
+                "it trials without a stand."
+            )
         return ReferenceWorld(body, grips, physics, geometry, self.settings)
 
 
@@ -171,7 +183,7 @@ class ReferenceWorld(HandWorld):
         self._spheres, (self._boxes, self._sides) = _spheres(pads), _boxes(pads, geometry)
         fingers_kg = 2.0 * (pads.finger_mass_kg + settings.drive_kg)
         self._matter = np.array([body.mass_kg, *moments, fingers_kg, body.reach()])
-        stiffness = pads.stiffness_n_per_m
+        stiffness = pads.point_n_per_m
         share_kg = body.mass_kg / len(self._spheres)
         self._pad = np.array([
             stiffness, settings.tangent_share * stiffness,
@@ -265,7 +277,7 @@ class ReferenceWorld(HandWorld):
             "dt_s": self._settings.step_s,
             "object_mass_kg": float(self._matter[0]),
             "force_n": force_n,
-            "contact_stiffness": float(self._pad[0]),
+            "pad_stiffness_n_per_m": 0.5 * len(self._spheres) * float(self._pad[0]),
             "contact_damping": float(self._pad[2]),
         }
 
