@@ -66,6 +66,16 @@ def test_the_nearest_point_of_a_triangle_is_no_farther_than_any_other():
         assert np.sqrt(squared) - 1e-12 <= sampled < np.sqrt(squared) + 0.1
 
 
+def test_no_sphere_takes_the_far_side_of_a_sharp_edge_for_its_own():
+    # Beyond the wide rim of a cone, whose flank and end meet at 80 degrees, most faces see the
+    # sphere's centre from below.
+    trial = edge_trial("cone", 1.1, 12, 7, HAND, lean_deg=20.0).part(slice(6, 7))
+    grips = trial.grips(EDGE.headroom_m)
+    with ReferenceEngine().world(trial.body, grips, EDGE.physics, HAND) as world:
+        world.close(Closing())
+        assert world.deepest_m.max() < 1e-3
+
+
 def test_energy_does_not_grow():
     world = closed(frustum(0.3, 8.0), settings=ReferenceSettings(damping=0.2))
     states = world.states()

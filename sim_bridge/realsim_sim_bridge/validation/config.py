@@ -143,13 +143,13 @@ class ReferenceConfig:
     friction: float = 0.5
     """With that force, friction carries 20 N."""
     masses_kg: tuple[tuple[str, tuple[float, ...]], ...] = (
-        ("box", (0.4, 1.1)),
-        ("l_shape", (0.4, 0.7)),
-        ("disc", (0.8, 1.3)),
-        ("cylinder", (0.8, 1.2)),
-        ("cone", (0.4, 1.1)),
-        ("ball", (0.6, 1.2)),
-        ("bottle", (0.3, 0.9)),
+        ("box", (0.4, 1.3)),
+        ("l_shape", (0.4, 0.8)),
+        ("disc", (0.8, 1.6)),
+        ("cylinder", (0.6, 1.5)),
+        ("cone", (0.3, 1.5)),
+        ("ball", (0.6, 1.6)),
+        ("bottle", (0.3, 1.2)),
     )
     """Shapes and their masses: about half of the lighter ones turn by more than 10 deg, and half of
     the heavier ones are dropped."""

@@ -196,6 +196,7 @@ class ReferenceWorld(HandWorld):
         self._place(np.arange(n), Ts, np.zeros((n, 6)), grips.openings_m / 2.0, np.zeros(n))
         self._bristles = np.zeros((n, len(self._spheres), len(body.parts), 3))
         self._bristles_box = np.zeros((n, len(self._surface.points), len(self._boxes), 3))
+        self._entered = np.full(self._bristles_box.shape[:3], -1)
 
     def __exit__(
         self,
@@ -267,6 +268,7 @@ class ReferenceWorld(HandWorld):
         fingers, speeds = states.fingers_m[k].mean(axis=1), states.finger_speeds[k].mean(axis=1)
         self._place(k, Ts, twists, fingers, speeds)
         self._bristles[k] = self._bristles_box[k] = 0.0
+        self._entered[k] = -1
 
     def settings(self) -> dict[str, float]:
         """Return what the model computes with."""
@@ -304,7 +306,7 @@ class ReferenceWorld(HandWorld):
         """
         s, surface = self._settings, self._surface
         loops.march(
-            self._state[k], self._bristles[k], self._bristles_box[k],
+            self._state[k], self._bristles[k], self._bristles_box[k], self._entered[k],
             np.ascontiguousarray(wrenches),
             round(s.load_s / s.step_s), sample, s.step_s, lost_m, seen,
             closing.drag_per_s if closing else 0.0, closing.speed if closing else PRESSING_SPEED,

@@ -25,6 +25,8 @@ SKIN_M = 1e-3
 """What is no farther apart than this is looked at [m], until something moved that far."""
 SEAM_M = 1e-7
 """A point so far outside another part still belongs to the seam between them [m]."""
+TIE_M2 = 1e-14
+"""Triangles are equally near where their squared distances differ by less [m^2]."""
 
 # A pair's state (20,): position of the centre of mass 0:3 and quaternion w x y z 3:7 of the
 # principal frame, velocity 7:10 and angular velocity 10:13, all in the hand's axes; the fingers'
@@ -142,17 +144,19 @@ def _sink(  # noqa: PLR0913, PLR0917 - compiled code takes plain arrays
     Where parts meet, what is inside another one is no surface of the object.
     """
     for p in range(len(depths)):
-        depths[p], best, face = -1.0, np.inf, 0
+        depths[p], best, face, over = -1.0, np.inf, 0, 0.0
         for k in range(first[p], first[p] + counts[p]):
             squared, found = closest(center, triangles[near[k]])
-            if squared < best:
-                best, face = squared, near[k]
-                _put(points[p], 0, found)
+            if squared < best + TIE_M2:
+                above = _dot(_at(normals[near[k]]), _plus(center, -1.0, found))
+                # Beyond an edge or a corner a point is above one of the faces, not above them all.
+                if squared < best - TIE_M2 or above > over:
+                    best, face, over = squared, near[k], above
+                    _put(points[p], 0, found)
         if best == np.inf:
             continue
-        # Of a convex part the plane of the nearest triangle tells inside from outside.
         away, out = _plus(center, -1.0, _at(points[p])), _at(normals[face])
-        distance = np.sqrt(best) if _dot(out, away) >= 0.0 else -np.sqrt(best)
+        distance = np.sqrt(best) if over >= 0.0 else -np.sqrt(best)
         depths[p] = radius - distance
         far = abs(distance) > 1e-6 * radius
         _put(outwards[p], 0, _times(1.0 / distance, away) if far else out)
@@ -168,15 +172,19 @@ def _sink(  # noqa: PLR0913, PLR0917 - compiled code takes plain arrays
 
 
 @njit(error_model="numpy")
-def _under(point: Vector, box: Array) -> tuple[float, Vector]:
-    """Return how deep a point is in a box (2, 3), and the outward normal where it is least deep."""
-    depth, out = np.inf, (0.0, 0.0, 0.0)
-    for i in range(3):
-        for below, over in ((box[1, i] - point[i], 1.0), (point[i] - box[0, i], -1.0)):
-            if below < depth:
-                depth = below
-                out = (over if i == 0 else 0.0, over if i == 1 else 0.0, over if i == 2 else 0.0)
-    return depth, out
+def _below(point: Vector, box: Array, face: int) -> float:
+    """Return how far a point is below a face of a box (2, 3): 0 to 2 high ones, 3 to 5 low."""
+    return box[1, face] - point[face] if face < 3 else point[face - 3] - box[0, face - 3]
+
+
+@njit(error_model="numpy")
+def _nearest(point: Vector, box: Array) -> int:
+    """Return the face of a box (2, 3) below which a point is least, or above which it is most."""
+    face = 0
+    for other in range(1, 6):
+        if _below(point, box, other) < _below(point, box, face):
+            face = other
+    return face
 
 
 @njit(error_model="numpy")
@@ -232,10 +240,10 @@ def _press(  # noqa: PLR0913, PLR0917 - compiled code takes plain arrays
 
 @njit(error_model="numpy")
 def march(  # noqa: PLR0912, PLR0913, PLR0915, PLR0917 - compiled code takes plain arrays
-    state: Array, bristles: Array, bristles_box: Array, wrenches: Array, inner: int, sample: int,
-    dt: float, lost_m: float, seen: Array, drag: float, speed: float, matter: Array, pad: Array,
-    spheres: Array, boxes: Array, sides: Array, triangles: Array, normals: Array, first: Rows,
-    surface: Array, arc: Array,
+    state: Array, bristles: Array, bristles_box: Array, entered: Rows, wrenches: Array, inner: int,
+    sample: int, dt: float, lost_m: float, seen: Array, drag: float, speed: float, matter: Array,
+    pad: Array, spheres: Array, boxes: Array, sides: Array, triangles: Array, normals: Array,
+    first: Rows, surface: Array, arc: Array,
 ) -> int:  # fmt: skip
     """Move a pair under loads; return how often it was looked at until the end, or it was lost.
 
@@ -243,6 +251,7 @@ def march(  # noqa: PLR0912, PLR0913, PLR0915, PLR0917 - compiled code takes pla
         state: (SIZE,) of the pair; changed.
         bristles: (S, P, 3) how far each sphere's are bent, hand axes [m]; changed.
         bristles_box: (N, B, 3) the same of each point's; changed.
+        entered: (N, B) the face of each box that each point is in front of, or came in by; changed.
         wrenches: (T, 6) torque and force on the object, hand axes.
         inner: steps for which each stands.
         sample: loads between two looks.
@@ -288,7 +297,7 @@ def march(  # noqa: PLR0912, PLR0913, PLR0915, PLR0917 - compiled code takes pla
                     place = _plus(at, 1.0, _turn(R, _at(surface[m])))
                     for b in range(len(boxes)):
                         _shift(boxes[b], float(sides[b]), state, box)
-                        if _under(place, box)[0] > -SKIN_M:
+                        if _below(place, box, _nearest(place, box)) > -SKIN_M:
                             met[meets, 0], met[meets, 1] = m, b
                             meets += 1
             for s in range(count):
@@ -316,11 +325,20 @@ def march(  # noqa: PLR0912, PLR0913, PLR0915, PLR0917 - compiled code takes pla
                 side = float(sides[b])
                 x = _turn(R, _at(surface[m]))
                 _shift(boxes[b], side, state, box)
-                depth, out = _under(_plus(at, 1.0, x), box)
-                if depth <= 0.0:
+                place = _plus(at, 1.0, x)
+                face = _nearest(place, box)
+                if _below(place, box, face) <= 0.0:
+                    entered[m, b] = face
                     _put(bristles_box[m, b], 0, (0.0, 0.0, 0.0))
                     continue
-                n = _times(-1.0, out)
+                # Not the nearest face: a point that comes in beside an edge would be caught there.
+                face = entered[m, b] if entered[m, b] >= 0 else face
+                depth, toward = _below(place, box, face), -1.0 if face < 3 else 1.0
+                n = (
+                    toward if face % 3 == 0 else 0.0,
+                    toward if face % 3 == 1 else 0.0,
+                    toward if face % 3 == 2 else 0.0,
+                )
                 x = _plus(x, -0.5 * depth, n)
                 _press(state, sums, bristles_box[m, b], x, n, depth, side, slope, dt, pad)
             drive = min(force, max(-force, gain * (-speed - state[FINGER_SPEED])))
