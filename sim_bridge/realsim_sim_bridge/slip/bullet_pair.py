@@ -227,6 +227,7 @@ class BulletPair:
 
     def place_stand(self, T_hand_table: Array | None) -> None:
         """Put the table under the hand and the neighbours where they are, or all of it away."""
+        self._placed: list[tuple[int, Array, Any]] = []
         for n, body in enumerate(self._stands):
             position, xyzw = AWAY, (0.0, 0.0, 0.0, 1.0)
             if T_hand_table is not None:
@@ -236,7 +237,14 @@ class BulletPair:
                     top = self.stand.height_m - TABLE_M[2] / 2.0
                     T = T @ se3.from_translation([*se3.invert(T)[:2, 3], top])
                 position, xyzw = interop.pybullet_from_T(T)
-            self.engine.resetBasePositionAndOrientation(body, position, xyzw)
+            self._placed.append((body, np.array(position), xyzw))
+        self.sink_stand(np.zeros(3))
+
+    def sink_stand(self, way: Array) -> None:
+        """Put table and neighbours a way (3,) from where they were placed [m], hand axes."""
+        for body, position, xyzw in self._placed:
+            there = (position + way).tolist()
+            self.engine.resetBasePositionAndOrientation(body, there, xyzw)
 
     def drive(self, speed: float) -> None:
         """Let the fingers close at a speed [m/s] each, with at most the hand's force."""

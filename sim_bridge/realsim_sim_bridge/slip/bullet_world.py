@@ -106,8 +106,7 @@ class BulletWorld(HandWorld):
     def _close(self, k: int, closing: Closing, sample: int) -> list[tuple[Array, Array]]:
         """Close hand k and return what is seen every `sample` steps."""
         pair = self._pair
-        T_hand_table = self._Ts_hand_table[k]
-        pair.place_stand(T_hand_table)
+        pair.place_stand(self._Ts_hand_table[k])
         self._take(k)
         pair.drive(closing.speed)
         down = -self._R_world_hand[k, 2]
@@ -121,7 +120,7 @@ class BulletWorld(HandWorld):
             for step in range(1, sample + 1):
                 if sunk >= 0:
                     far = closing.release_speed * self.dt * (sunk * sample + step)
-                    pair.place_stand(T_hand_table @ se3.from_translation([0.0, 0.0, -far]))
+                    pair.sink_stand(far * down)
                 pair.follow_arc()
                 if pair.stand is not None:
                     pair.push([0.0, 0.0, 0.0], weight)
