@@ -14,7 +14,7 @@ of each grasp: a repeated trial stands there again.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 MM = 1e-3
 ROUNDED = 0.02
 """Greatest entry of R^T R - 1 that rounding explains; the worst of the open trials has 0.001."""
+PLAIN = re.compile(r"\w[\w.-]*")
+"""A name that stays in its folder."""
 YCB_MASSES_KG = {
     "banana": 0.066,
     "chips_can": 0.205,
@@ -94,7 +96,8 @@ def read_graspa(
 
     Raises:
         InputError: a folder or file is missing or of another layout, a trial has no pose or no
-            result, an object is not on its board; the file and what was expected are named.
+            result, an object is not on its board, a mass is none or of no object; the file and what
+            was expected are named.
     """
     folder = Path(folder)
     for need in ("layouts", "results", "objects"):
@@ -145,6 +148,13 @@ def read_graspa(
                 trials=tuple(row[1] for row in rows),
             )
         )
+    for name, mass in (masses_kg or {}).items():
+        if name not in {obj.name for obj in found}:
+            told = ", ".join(sorted({obj.name for obj in found}))
+            raise InputError(
+                f"a mass is given for '{name}', which no trial is of; there are {told}."
+            )
+        values.number(mass, f"the mass of {name} [kg]", low=1e-6)
     return found
 
 
@@ -165,26 +175,38 @@ def _trials(path: Path) -> list[tuple[str, Array, bool]]:
     """Return name, pose and result of every trial of a file; of a planner without a grasp none."""
     root = read_xml(path)
     told = root.find("Grasped")
-    results = {} if told is None else {g.get("name"): g.get("quality") for g in told.iter("Grasp")}
-    poses = root.findall(".//GraspSet/Grasp")
+    results = _by_name(() if told is None else told.iter("Grasp"), path)
+    poses = _by_name(root.iterfind(".//GraspSet/Grasp"), path)
     if not poses and results:
         raise InputError(
             f"{path} has {len(results)} results and no poses; a GraspSet with a Grasp and its "
             "Transform for each is expected."
         )
+    for name in results:
+        if name not in poses:
+            raise InputError(f"{path}: '{name}' has a result and no pose; both are expected.")
     found: list[tuple[str, Array, bool]] = []
-    for grasp in poses:
-        name = str(grasp.get("name"))
-        result = results.get(name)
-        if result is None:
+    for name, grasp in poses.items():
+        if name not in results:
             raise InputError(
                 f"{path}: the trial '{name}' has no result; Grasped has "
                 f"{', '.join(map(str, results)) or 'none'}."
             )
-        quality = _number(result, f"{path}: the result of '{name}'")
+        quality = _number(results[name].get("quality"), f"{path}: the result of '{name}'")
         if quality not in (0.0, 1.0):
             raise InputError(f"{path}: the result of '{name}' is {quality:g}; 0 or 1 is expected.")
         found.append((name, _pose(grasp, f"{path}: the trial '{name}'"), quality == 1.0))
+    return found
+
+
+def _by_name(grasps: Iterable[Any], path: Path) -> dict[str, Any]:
+    """Return the elements by their names, of which none may stand there twice."""
+    found: dict[str, Any] = {}
+    for grasp in grasps:
+        name = str(grasp.get("name"))
+        if name in found:
+            raise InputError(f"{path} has '{name}' twice; a name for each trial is expected.")
+        found[name] = grasp
     return found
 
 
@@ -222,7 +244,7 @@ def _mesh(folder: Path, told: str) -> tuple[str, Mesh]:
     """Return an object's name and mesh; the boards name a file that names the mesh."""
     place = PurePosixPath(told)
     name = place.parent.name
-    if not re.fullmatch(r"[\w.-]+", name) or not re.fullmatch(r"[\w.-]+", place.stem):
+    if not (PLAIN.fullmatch(name) and PLAIN.fullmatch(place.stem)):
         raise InputError(f"a board names the object's file {told!r}; FOLDER/NAME.xml is expected.")
     path = folder / "objects" / name / f"{place.stem}.stl"
     if not path.is_file():
