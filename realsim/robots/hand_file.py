@@ -8,8 +8,8 @@ from realsim.untrusted.own_json import OwnFile
 Point = tuple[float, float, float]
 
 
-STIFFEST_N_PER_M = 1e6
-"""Greatest normal stiffness of a pad that both engines press as they are told [N/m]."""
+STIFFEST_N_PER_M = 5e5
+"""Greatest normal stiffness of a pad with which both engines pass the validation suite [N/m]."""
 
 
 def soft_n_per_m(patch_m: tuple[float, float]) -> float:

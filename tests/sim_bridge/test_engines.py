@@ -108,7 +108,7 @@ def test_every_hand_carries_a_cube_through_all_stages(engine, name):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize(("mass", "asked"), [(0.05, 6e4), (2.0, 2e5), (0.2, 1e6)])
+@pytest.mark.parametrize(("mass", "asked"), [(0.05, 6e4), (2.0, 2e5), (0.2, 5e5)])
 def test_pads_are_as_stiff_as_they_are_told_whatever_they_hold(engine, mass, asked):
     if engine == "mujoco":
         pytest.importorskip("mujoco")
@@ -127,13 +127,13 @@ def test_pads_are_as_stiff_as_they_are_told_whatever_they_hold(engine, mass, ask
 
 def test_a_stiffness_that_cannot_be_is_refused_with_what_can():
     for value in (0.0, -2e5, float("nan"), float("inf"), 2e6):
-        with pytest.raises(InputError, match=r"1000 to 1e\+06 N/m is accepted"):
+        with pytest.raises(InputError, match="1000 to 500000 N/m is accepted"):
             PadModel(pad_stiffness_n_per_m=value)
     with pytest.raises(InputError, match=r"4\.667e\+04 N/m or more .* 30 N or less"):
         SlipPhysics(force_n=70.0, pads=PadModel(pad_stiffness_n_per_m=2e4))
     if pytest.importorskip("mujoco"):
-        trial, long = cube_trial(20.0, DOWN[None], find_hand()), MujocoSettings(step_s=0.05)
-        physics = SlipPhysics(pads=PadModel(pad_stiffness_n_per_m=1e6))
+        trial, long = cube_trial(20.0, DOWN[None], find_hand()), MujocoSettings(step_s=0.1)
+        physics = SlipPhysics(pads=PadModel(pad_stiffness_n_per_m=5e5))
         with pytest.raises(InputError, match=r"shorter step_s"):
             make_engine(long).world(trial.body, trial.grips(0.004), physics, find_hand())
 

@@ -110,7 +110,7 @@ def test_the_least_friction_and_force_are_coulomb_s(engine, mass):
     assert found.force.least == pytest.approx([peak * 1.05 / (2 * friction)])
     assert found.measures()["margin"] == pytest.approx([0.5])
     # A face that covers the pads is held by the same friction, however soft they are.
-    assert found.stiffness.levels == pytest.approx([8e5, 4e5, 2e5, 1e5])
+    assert found.stiffness.levels == pytest.approx([5e5, 3e5, 2e5, 1.2e5])
     assert found.measures()["stiffness_share"] == pytest.approx([1.0])
     assert not found.friction.exceptions.any() and not found.force.exceptions.any()
 

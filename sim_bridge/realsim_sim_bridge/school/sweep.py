@@ -45,7 +45,7 @@ class SweepConfig:
     by. Antipodal contacts tilted by 45 deg need 1, flat ones on 250 g at 70 N need 0.02."""
     forces_n: tuple[float, ...] = (70.0, 50.0, 35.0, 25.0, 17.0, 12.0, 8.5, 6.0, 4.0, 2.0, 1.0)
     """Force of each finger [N], descending: from the Franka Hand's continuous force down."""
-    stiffness_factors: tuple[float, ...] = (4.0, 2.0, 1.0, 0.5)
+    stiffness_factors: tuple[float, ...] = (2.5, 1.5, 1.0, 0.6)
     """Stiffness of the pads in units of the slip test's own, descending: about what hardness and
     thickness of silicone pads leave open (docs/decisions/0046-pad-stiffness.md). What no engine
     can press, or would be pressed through at the test's force, is left out."""

@@ -75,8 +75,8 @@ SPREAD = 0.3
 """Distance of the outer spheres from the pad's middle, in sizes of the pad."""
 
 STIFFNESS_N_PER_M = (1e3, STIFFEST_N_PER_M)
-"""Least and greatest normal stiffness of a pad [N/m]. At 1 MN/m PyBullet's solver is up to 9 % off,
-beyond its pads become rigid, whatever was asked; MuJoCo keeps to what it is told."""
+"""Least and greatest normal stiffness of a pad [N/m]. From 600 kN/m on PyBullet's solver leaves
+Coulomb's limit with small forces, at 1 MN/m its pads are 9 % off; MuJoCo keeps to what is asked."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
