@@ -5,7 +5,7 @@ the fingers press with the hand's force (Boyd and Wegbreit 2007, with cones of e
 pads are patches, up to nine points each, so torsion and tilting moments need no law of their own:
 where the pressure goes is found with the rest. That is a linear program of seven rows; its optimum
 is the safety factor, the multiple of a load that is borne. Rigid bodies and the best distribution
-of pressure make it an upper bound.
+of pressure make it an upper bound; the eight edges are 2.6 % inside the cone to 5.4 % outside it.
 
 Wrenches are (torque about the grasp's origin, force), in the grasp frame.
 """
