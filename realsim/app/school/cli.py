@@ -8,7 +8,7 @@ import click
 
 from realsim.app.command import Command, Group
 from realsim.app.options import FOLDER, JSON, QUIET, arm, json_file, seed, workers
-from realsim.app.outputs import GOES_ON, OutputFolder
+from realsim.app.outputs import GOES_ON, OutputFile, OutputFolder
 
 ENGINES = ("pybullet", "mujoco")
 FORMATS = ("acronym", "graspgen", "isaac", "hdf5", "parquet")
@@ -18,6 +18,14 @@ VALIDATION = OutputFolder(
     own=("validation_*.json", ('"checks"', '"ratios"')),
 )
 
+REALITY = OutputFolder(
+    ("reality.json", "reliability.png"), own=("reality.json", ('"predictors"', '"reliability"'))
+)
+CALIBRATION = OutputFile({".json": ('"held_share"', '"slope"')}, "calibration")
+DRAWS = click.option("--draws", default=16, show_default=True, type=int,
+                     help="Draws of each grasp behind p_hold.")  # fmt: skip
+CELL = click.option("--cell-error", nargs=4, type=float, default=None, metavar="MM MM DEG DEG",
+                    help="Of the cell that grasps: across, height, yaw, tilt.  [8 3 10 3]")  # fmt: skip
 HAND = click.option("--hand", default="franka_hand", show_default=True, metavar="NAME",
                     help="Hand, by its name (`realsim robots`) or its folder.")  # fmt: skip
 
@@ -47,6 +55,7 @@ def SCHOOL() -> None:
       realsim school SESSION              try grasps on the registered objects of a session
       realsim school SCENE --out FOLDER   of a BOP scene, GraspNet scene or scene.yaml
       realsim school validate             is the physics right on this machine?
+      realsim school reality TRIALS       do labels tell what a real robot did?
       realsim school settle SCENE         do the objects stand, or jump and fall?
       realsim school export SESSION --to acronym --out FOLDER
       realsim school summary SESSION ...  the paper's statistics over many sessions
@@ -88,6 +97,8 @@ def SCHOOL() -> None:
 @click.option("--friction", type=float, default=None, help="Coulomb coefficient.  [the hand's]")
 @click.option("--stiffness", "stiffness_n_per_m", type=float, default=None,
               help="Of one pad [N/m].  [the hand's]")  # fmt: skip
+@DRAWS
+@CELL
 @click.option("--density", type=float, default=None,
               help="Of objects that are not weighed [kg/m^3].  [the models' own]")  # fmt: skip
 @click.option(
@@ -182,6 +193,39 @@ def validate_command(
     console = Console(quiet=quiet, as_json=as_json)
     if not validate_engines(names, hand, quick, json_file, out, console):
         sys.exit(1)
+
+
+@SCHOOL.command(
+    "reality", cls=Command,
+    examples=("realsim school reality ../shared/data/school/graspa_open --out reality",
+              "realsim school reality trials --engine mujoco --fit calibration.json"),
+)  # fmt: skip
+@click.argument("trials", type=FOLDER)
+@click.option("--engine", default="pybullet", show_default=True, type=click.Choice(ENGINES),
+              help="Of the simulated attempt.")  # fmt: skip
+@DRAWS
+@CELL
+@click.option(
+    "--mass", "masses", multiple=True, metavar="NAME=KG", help="A weighed object; repeat."
+)
+@click.option("--cache", type=GOES_ON, default=None, help="Folder where convex parts are kept.")
+@click.option("--out", type=REALITY, default=None, help="Folder for report and picture.")
+@click.option("--fit", type=CALIBRATION, default=None,
+              help="Fit p_hold to these trials and write the calibration there.")  # fmt: skip
+@JSON
+@QUIET
+def reality_command(
+    trials: Path, out: Path | None, fit: Path | None, as_json: bool, quiet: bool, **options: Any
+) -> None:
+    """Judge labels by TRIALS of a real robot, in GRASPA's layout.
+
+    Tells for p_hold, the scores and the analytic measures how well each predicts which grasps held
+    (AUC, intervals by object), and whether p_hold means what it says.
+    """
+    from realsim.app.console import Console
+    from realsim.app.school.reality import judge
+
+    judge(trials, options, out, fit, Console(quiet=quiet, as_json=as_json))
 
 
 @SCHOOL.command(

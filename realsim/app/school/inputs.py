@@ -46,6 +46,10 @@ class SchoolRequest:
     friction: float | None = None
     stiffness_n_per_m: float | None = None
     """Normal stiffness of one pad [N/m]."""
+    draws: int = 16
+    """Draws behind p_hold, 2 or more."""
+    cell_error: tuple[float, float, float, float] | None = None
+    """Standard deviations where grasps are executed: across [mm], height [mm], yaw, tilt [deg]."""
     density: float | None = None
     """Of all objects that are not weighed [kg/m^3]."""
     masses: tuple[str, ...] = ()
@@ -242,6 +246,39 @@ def _of_density(model: ObjectModel, solid: KnownSolid, density: float) -> KnownS
     return replace(solid, matter=matter)
 
 
+def named_mass(text: str) -> tuple[str, float]:
+    """Return name and mass [kg] of a text NAME=KG.
+
+    Raises:
+        InputError: it is of no such form, or no positive mass.
+    """
+    name, mark, number = text.rpartition("=")
+    try:
+        mass = float(number)
+    except ValueError:
+        mass = math.nan
+    if not mark or not name or not (math.isfinite(mass) and 0 < mass <= 100):
+        raise InputError(
+            f"--mass '{text}' is no weighed object; NAME=KG with a mass above 0 and up to 100 "
+            "kg is one, such as mug=0.31."
+        )
+    return name, mass
+
+
+def spread_of(cell_error: tuple[float, float, float, float] | None) -> dict[str, Any]:
+    """Return what `HoldConfig` takes of a stated cell error; nothing where none is stated."""
+    from realsim_sim_bridge.hold.draws import PoseSpread
+
+    if cell_error is None:
+        return {}
+    across_mm, height_mm, yaw_deg, tilt_deg = cell_error
+    return {
+        "spread": PoseSpread(
+            across_m=1e-3 * across_mm, height_m=1e-3 * height_mm, yaw_deg=yaw_deg, tilt_deg=tilt_deg
+        )
+    }
+
+
 def masses_of(texts: Sequence[str], models: Mapping[int, ObjectModel]) -> dict[int, float]:
     """Return weighed masses [kg] by object id.
 
@@ -254,16 +291,7 @@ def masses_of(texts: Sequence[str], models: Mapping[int, ObjectModel]) -> dict[i
     """
     masses: dict[int, float] = {}
     for text in texts:
-        name, mark, number = text.rpartition("=")
-        try:
-            mass = float(number)
-        except ValueError:
-            mass = math.nan
-        if not mark or not name or not (math.isfinite(mass) and 0 < mass <= 100):
-            raise InputError(
-                f"--mass '{text}' is no weighed object; NAME=KG with a mass above 0 and up to 100 "
-                "kg is one, such as mug=0.31."
-            )
+        name, mass = named_mass(text)
         named = [i for i, m in models.items() if m.name == name or str(i) == name]
         if len(named) != 1:
             what = "names several objects" if named else "is of no object of this scene"

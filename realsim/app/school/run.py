@@ -13,6 +13,7 @@ from realsim.app.school.inputs import (
     base_on_table,
     read_inputs,
     session_inputs,
+    spread_of,
 )
 from realsim.app.school.settle import warn_of_falls
 from realsim.errors import InputError
@@ -37,6 +38,7 @@ def config_of(request: SchoolRequest, scene: Scene) -> "SchoolConfig":
     """
     from realsim.robots.hand import find_hand
     from realsim_sim_bridge.arm.reach_config import chosen_arm
+    from realsim_sim_bridge.hold.draws import HoldConfig
     from realsim_sim_bridge.school import SchoolConfig
     from realsim_sim_bridge.school.sweep import SweepConfig
     from realsim_sim_bridge.slip.engines import make_engine, settings_of
@@ -58,6 +60,10 @@ def config_of(request: SchoolRequest, scene: Scene) -> "SchoolConfig":
         stiff = request.stiffness_n_per_m
         changed["pads"] = replace(physics.pads, pad_stiffness_n_per_m=stiff)
     physics = replace(physics, **changed)  # at once: a force may need these very pads
+    hold = HoldConfig(seed=request.seed, draws=request.draws, **spread_of(request.cell_error))
+    if request.friction is not None:  # what is stated is not uncertain
+        hold = replace(hold, friction=(request.friction,))
+    config = replace(config, hold=hold)
     engine = settings_of(request.engine)
     make_engine(engine)  # not in a worker, minutes later: what is not installed is said at once
     config = replace(config, slip=replace(config.slip, physics=physics, engine=engine))

@@ -348,7 +348,7 @@ def _average_precision(values: Array, held: Mask) -> float:
     """Return the mean precision at each trial that held; equal values are taken together."""
     order = np.argsort(-values, kind="stable")
     sorted_values, hits = values[order], np.cumsum(held[order])
-    last = np.append(np.flatnonzero(np.diff(sorted_values)), len(values) - 1)
+    last = np.append(np.flatnonzero(sorted_values[1:] != sorted_values[:-1]), len(values) - 1)
     recall = hits[last] / max(int(held.sum()), 1)
     return float(np.sum(np.diff(np.append(0.0, recall)) * hits[last] / (last + 1)))
 

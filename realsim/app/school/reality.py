@@ -1,0 +1,151 @@
+"""`realsim school reality`: what labels tell of grasps that a real robot has tried."""
+
+import math
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from realsim.app.console import Console
+from realsim.app.school.inputs import named_mass, spread_of
+from realsim.errors import InputError
+from realsim.store import atomic
+
+if TYPE_CHECKING:
+    from realsim_sim_bridge.hold.reality import Reality
+
+HEADER = ["predictor", "AUC", "95 % by object", "within objects", "average precision"]
+WORDS = {
+    "p_hold": "p_hold",
+    "draws": "draws alone",
+    "safety": "safety factor, nominal pose",
+    "score": "score, one nominal attempt",
+    "score_old": "score with limits in closing",
+    "dexnet_closure": "force closure (Dex-Net)",
+    "closure_friction": "least friction that closes (GraspNet)",
+    "ferrari_canny": "Ferrari-Canny",
+    "object": "the object's other trials",
+    "always holds": "always holds",
+}
+
+
+def judge(
+    folder: Path, options: dict[str, Any], out: Path | None, fit: Path | None, console: Console
+) -> None:
+    """Judge every predictor by the trials of a folder; show, and write, how well each does.
+
+    Args:
+        folder: GRASPA's layout.
+        options: engine, draws, cell_error, masses and cache of the command line.
+        out: folder for the report and the picture.
+        fit: file for a calibration that is fitted on these trials.
+        console: progress and tables go there.
+
+    Raises:
+        InputError: the folder is of another layout, or the trials cannot be judged.
+    """
+    from realsim.formats.grasps.graspa import read_graspa
+    from realsim.robots.hand import find_hand
+    from realsim_sim_bridge.hold.draws import HoldConfig
+    from realsim_sim_bridge.hold.reality import (
+        RealityConfig,
+        calibrate,
+        judge_trials,
+        reality_of,
+    )
+    from realsim_sim_bridge.slip.engines import settings_of
+    from realsim_sim_bridge.slip.slip_test import SlipConfig
+
+    masses = dict(named_mass(text) for text in options["masses"])
+    objects = read_graspa(folder, masses)
+    names = {obj.name for obj in objects}
+    if set(masses) - names:
+        raise InputError(
+            f"--mass names {', '.join(sorted(set(masses) - names))}, of which there are no trials; "
+            f"there are: {', '.join(sorted(names))}."
+        )
+    hand = find_hand()
+    hold = HoldConfig(draws=options["draws"], **spread_of(options["cell_error"]))
+    config = RealityConfig(
+        hand=hand, hold=hold,
+        slip=replace(SlipConfig.of(hand), engine=settings_of(options["engine"])),
+    )  # fmt: skip
+    with console.stage("reality", "trials") as tick:
+        judged = judge_trials(objects, config, options["cache"], tick)
+    for note in judged.notes:
+        console.warn(note)
+    fitted = None
+    if fit is not None:
+        fitted = calibrate(judged, str(folder.resolve().name))
+        fitted.write(fit)
+        console.say(f"calibration {fit}")
+    found = reality_of(judged, fitted)
+    rows = [
+        [WORDS[row.name], _number(row.auc), f"{_number(row.auc_low)} to {_number(row.auc_high)}",
+         _number(row.within), _number(row.average_precision)]
+        for row in found.rows
+    ]  # fmt: skip
+    held = int(judged.held.sum())
+    title = f"{len(judged.held)} trials of {len(names)} objects, {held} held; {judged.engine}"
+    console.table(title, HEADER, rows)
+    console.say(
+        f"p_hold: expected calibration error {found.ece:.3f}, balanced accuracy "
+        f"{found.balanced_accuracy:.3f}; AUC {found.gain:+.3f} over the score with limits in "
+        f"closing, 95 % {_number(found.gain_low)} to {_number(found.gain_high)} by object."
+    )
+    if found.in_sample:
+        console.say(
+            "The calibration was fitted on these very trials: both figures are of curves fitted "
+            "on the other objects."
+        )
+    document = _document(found, asdict(config), judged.notes)
+    if out is not None:
+        atomic.write_json(out / "reality.json", document)
+        atomic.write_bytes(out / "reliability.png", reliability_picture(found))
+        console.say(f"report    {out / 'reality.json'} and {out / 'reliability.png'}")
+    console.result(document)
+
+
+def reliability_picture(found: "Reality") -> bytes:
+    """Return a PNG: how often grasps of like p_hold held, and how many there were."""
+    import numpy as np
+
+    from realsim.pages import plots
+
+    drawn, (left, right) = plots.columns(2)
+    left.plot([0, 1], [0, 1], color=plots.MUTED, linewidth=1, linestyle="--")
+    p = np.array([r.predicted for r in found.reliability])
+    held = np.array([r.held for r in found.reliability])
+    trials = np.array([r.trials for r in found.reliability])
+    # A binomial's standard error, as if one trial more had ended each way.
+    shared = (held * trials + 1) / (trials + 2)
+    error = np.sqrt(shared * (1 - shared) / (trials + 2))
+    left.errorbar(p, held, yerr=error, fmt="o-", color=plots.SERIES[0], capsize=3)
+    left.set_xlim(0, 1)
+    left.set_ylim(0, 1)
+    plots.titled(
+        left, f"Of grasps with p_hold so and so many held (error {found.ece:.3f})", "p_hold", "held"
+    )
+    counts = np.histogram(found.p_hold, bins=10, range=(0.0, 1.0))[0]
+    plots.share_bars(right, counts, "Trials", "p_hold", "trials")
+    return plots.png(drawn)
+
+
+def _document(found: "Reality", config: dict[str, Any], notes: tuple[str, ...]) -> dict[str, Any]:
+    """Return the report as plain values; null where nothing is known."""
+    document = asdict(replace(found, p_hold=found.p_hold.tolist()))
+    document["predictors"] = {row.pop("name"): row for row in document.pop("rows")}
+    return _plain(document | {"config": config, "notes": list(notes)})
+
+
+def _plain(value: Any) -> Any:
+    """Return values for JSON, which has no NaN."""
+    if isinstance(value, dict):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _number(value: float) -> str:
+    """Return a figure, or a dash."""
+    return f"{value:.3f}" if math.isfinite(value) else "-"
