@@ -25,7 +25,7 @@ CALIBRATION = OutputFile({".json": ('"held_share"', '"slope"')}, "calibration")
 DRAWS = click.option("--draws", default=16, show_default=True, type=int,
                      help="Draws of each grasp behind p_hold.")  # fmt: skip
 CELL = click.option("--cell-error", nargs=4, type=float, default=None, metavar="MM MM DEG DEG",
-                    help="Of the cell that grasps: across, height, yaw, tilt.  [8 3 10 3]")  # fmt: skip
+                    help="Of the cell: across, height, yaw, tilt.  [8 3 10 3]")  # fmt: skip
 HAND = click.option("--hand", default="franka_hand", show_default=True, metavar="NAME",
                     help="Hand, by its name (`realsim robots`) or its folder.")  # fmt: skip
 
