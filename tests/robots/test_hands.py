@@ -60,6 +60,7 @@ def test_the_arc_is_the_urdf_s_through_its_mimic_joints(own_2f85):
         ("robot.toml", "mass_kg = 0.925", "mass_kg = 0.15", "of it 0.1 kg"),
         ("robot.toml", "length_m = 0.0375\nfriction", "length_m = 0.05\nfriction", "beyond"),
         ("robot.toml", "max_opening_m", "max_opening", "max_opening"),
+        ("robot.toml", "friction = 0.7", "normal_stiffness_n_per_m = 0", "0 N/m; 1000 to 500000"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_named(own_2f85, file, old, new, told):
@@ -91,6 +92,10 @@ def test_every_hand_that_ships_is_right_and_goes_through_json(name):
     hand, findings = check_hand(name)
     assert all(f.is_right for f in findings), findings
     assert hand_of_json(json.loads(json.dumps(asdict(hand))), "a file") == hand == find_hand(name)
+    older = asdict(hand)  # of each of six points
+    older["stiffness_n_per_m"] = older.pop("pad_stiffness_n_per_m") / 6
+    found = hand_of_json(older, "a file").pad_stiffness_n_per_m
+    assert np.isclose(found, hand.pad_stiffness_n_per_m)
     T = hand.T_ee_grasp
     assert np.allclose(T[:3, 3], [0, 0, -hand.mount_z_m]) and np.isclose(np.linalg.det(T), 1)
 
