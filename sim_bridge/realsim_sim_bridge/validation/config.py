@@ -159,8 +159,9 @@ class ReferenceConfig:
     """Of each shape and mass; they take the contact model about a second each."""
     lean_deg: float = 20.0
     """How far the surfaces under the fingers may lean over [deg]: friction holds 26 deg."""
-    agreement: float = 0.85
-    """Least share of equal labels: of 14 grasps two may differ."""
+    agreement: float = 0.78
+    """Least share of equal labels: of 14 grasps three may differ, which is one in 250 where 95 %
+    agree."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -199,9 +200,5 @@ class ValidationConfig:
                 masses_kg=(0.01, 0.5),
                 finer=((2, 1),),
                 arm_cases=((0.125, 5.0, 0.05, 0.0), (0.125, 10.0, 0.3, 0.015)),
-            ),
-            reference=replace(
-                self.reference,
-                masses_kg=tuple((shape, masses[1:]) for shape, masses in self.reference.masses_kg),
             ),
         )
