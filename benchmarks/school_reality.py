@@ -40,6 +40,7 @@ from school_cases import KEEP, PROCESSES, spent
 from realsim.formats.grasps.graspa import read_graspa
 from realsim.formats.grasps.scene_grasps import executed
 from realsim.geometry import se3
+from realsim.models.convex import ConvexConfig
 from realsim.records import ObjectPose, Scene, SupportPlane
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
 from realsim_sim_bridge.hold.calibration import p_hold_columns
@@ -65,6 +66,8 @@ FIGURES = {
     "p_hold_flip_share": Figure(unit="", goal=Goal(high=0.05)),
     "p_hold_cpu_s_per_grasp": Figure(unit="s", goal=Goal(high=0.12)),
 }
+COARSE = ConvexConfig(thresholds=(0.1,), time_limit_s=3.0)
+"""How meshes are cut with --quick: the simulated attempt counts as one draw of 17."""
 CANDIDATES, CANDIDATES_QUICK = 60, 10
 MOVED_M, TURNED_DEG, CHANGED = 0.001, 1.0, 0.2
 
@@ -79,7 +82,7 @@ def trials(given: argparse.Namespace) -> Found:
         )
         return found
     engine = settings_of("mujoco" if given.quick else "pybullet")
-    config = RealityConfig()
+    config = RealityConfig(convex=COARSE if given.quick else ConvexConfig())
     config = replace(config, slip=replace(config.slip, engine=engine))
     judged = judge_trials(read_graspa(folder), config, KEEP / "convex")
     reality = reality_of(judged)
@@ -123,6 +126,8 @@ def demo(given: argparse.Namespace) -> Found:
         max_candidates=CANDIDATES_QUICK if given.quick else CANDIDATES,
     )
     config = replace(config, slip=replace(config.slip, engine=settings_of("mujoco")))
+    if given.quick:
+        config = replace(config, convex=COARSE)
     cache = KEEP / "demo" / ("quick" if given.quick else "full")
     sets = run_school(scene, lab.models, config, workers=PROCESSES, cache=cache, restart=True)
     found = Found()
