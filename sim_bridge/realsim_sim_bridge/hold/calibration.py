@@ -59,10 +59,13 @@ class Calibration:
         return _curve(np.array([self.intercept, self.slope]), evidence)
 
     def error(self, evidence: Array, evidence_error: Array) -> Array:
-        """Return the standard errors (N,) of p_hold that come of the evidence's."""
-        e = np.clip(evidence, SURE, 1.0 - SURE)
-        p = self.p_hold(evidence)
-        return p * (1.0 - p) * self.slope * evidence_error / (e * (1.0 - e))
+        """Return the standard errors (N,) of p_hold that come of the evidence's.
+
+        Half of what p_hold spans over the evidence's error; at the curve's ends a tangent would
+        tell more than there is.
+        """
+        span = self.p_hold(evidence + evidence_error) - self.p_hold(evidence - evidence_error)
+        return 0.5 * span
 
     def write(self, path: Path) -> None:
         """Write it as JSON."""

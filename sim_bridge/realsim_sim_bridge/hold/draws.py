@@ -115,7 +115,7 @@ class HoldConfig:
                 f"p_hold's friction is {self.friction}; positive numbers are accepted."
             )
         least, most = self.force_share
-        if not 0 < least < most:
+        if not 0 < least < most < np.inf:
             raise InputError(
                 f"p_hold's force is {least:g} to {most:g} of the hand's; a range above 0 is needed."
             )
@@ -142,12 +142,11 @@ class Drawn:
 
     @property
     def error(self) -> Array:
-        """(N,) standard error of the share; of draws that all say the same at most 1 / K."""
+        """(N,) standard error of the share; of K draws that all say the same 1 / (K + 1)."""
         k = self.holds.shape[1]
         # As if one draw more had said the opposite: no finite number of draws proves 0 or 1.
-        p = (self.holds.sum(axis=1) + 0.5) / (k + 1)
-        spread = np.maximum(self.holds.var(axis=1), p * (1 - p) / (k + 1))
-        return np.sqrt(spread / k)
+        far = np.maximum(self.share, 1.0 - self.share)
+        return np.sqrt((self.holds.var(axis=1) + far**2 / (k + 1)) / (k + 1))
 
     def measures(self) -> dict[str, Array]:
         """Return columns by the names of `realsim.records.grasps.MEASURES`."""
@@ -337,15 +336,16 @@ def draw_holds(
         pads = _pads(obj, trial, Ts, hand)
         patches = pad_patches(obj.rays, pads, trial.openings_m, hand, float(softness[k]))
         centers = se3.transform(se3.invert(Ts), trial.body.center_of_mass[None])[:, 0]
-        wrenches = loads.about_grasp(centers, at) * mass[k]
+        # The last load is none: it is borne wherever the squeeze is balanced.
+        wrenches = np.pad(loads.about_grasp(centers, at) * mass[k], ((0, 0), (0, 1), (0, 0)))
         free = ~blocked & patches.both
         skewed = np.zeros(n)
         for friction in config.friction:
-            borne = safety_factors(patches, wrenches, friction * ones, ones).min(axis=1)
+            borne = safety_factors(patches, wrenches, friction * ones, ones)
             with np.errstate(divide="ignore"):
-                needed = 1.0 / borne
+                needed = 1.0 / borne.min(axis=1)
             holds[:, k] += free * np.clip((high - needed) / (high - low), 0.0, 1.0)
-            skewed += borne <= 0
+            skewed += borne[:, -1] <= 0
         holds[:, k] /= len(config.friction)
         counts["blocked"][:, k] = blocked
         counts["missed"][:, k] = ~blocked & ~patches.both
@@ -423,11 +423,11 @@ def _worst(factors: Array, loads: Loads) -> Rows:
     """Return the numbers (N, l) of the worst loads of each stage but the rest."""
     chosen: list[Rows] = []
     size = np.linalg.norm(loads.wrenches[..., 3:], axis=-1)
-    # Where nothing is borne the greatest force decides.
-    order = np.where(factors > 0, factors, 1e6 / (1.0 + size))
     for k in range(1, len(STAGES)):
         rows = np.flatnonzero(loads.stage == k)
-        chosen.append(rows[np.argsort(order[:, rows], axis=1, kind="stable")[:, :WORST]])
+        # Of loads that are not borne at all the greatest force comes first.
+        order = np.lexsort((-size[:, rows], factors[:, rows]))
+        chosen.append(rows[order[:, :WORST]])
     return np.concatenate(chosen, axis=1)
 
 
