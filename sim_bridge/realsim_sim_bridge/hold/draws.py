@@ -163,7 +163,7 @@ class Loads:
     stage: Rows
     """(L,) number in STAGES; 0 = its weight at rest."""
 
-    def about_grasp(self, centers: Array, at: Array | None = None) -> Array:
+    def about_grasp(self, centers: Array, at: Rows | None = None) -> Array:
         """Return wrenches (N, L, 6) about the grasp's origin; `at`: some of each grasp's (N, l).
 
         Args:
@@ -192,7 +192,7 @@ def chance_columns(
 
     Args:
         mesh: the object [m].
-        trial: N grasps.
+        trial: N grasps, one or more.
         slip: friction, force and stiffness of the nominal attempt, and the stages' motion.
         hand: the hand.
         config: what is uncertain.
@@ -364,7 +364,7 @@ def moved_objects(
     """Return T_obj_grasp (K, N, 4, 4) of draws, with the object moved and the hand where it was.
 
     Args:
-        trial: the grasps.
+        trial: the grasps, one or more.
         covariance: see `draw_holds`.
         spread: of the robot cell.
         normal: (K, 12 or more) standard normal numbers: six of the cell, six of the registration.
@@ -377,8 +377,6 @@ def moved_objects(
     scale = np.array([tilt, tilt, yaw, spread.across_m, spread.across_m, spread.height_m])
     c = trial.body.center_of_mass
     # All grasps of an object share the object's own frame; the table's axes in it are any grasp's.
-    if len(trial) == 0:
-        return np.empty((len(normal), 0, 4, 4))
     R_obj_table = trial.Ts_obj_grasp[0, :3, :3] @ trial.Ts_table_grasp[0, :3, :3].T
     found: list[Array] = []
     for z in normal:

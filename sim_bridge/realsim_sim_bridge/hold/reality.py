@@ -45,6 +45,7 @@ RESAMPLES = 2000
 """Bootstrap samples of whole objects."""
 BINS = 10
 """Equal ones of p_hold, in the expected calibration error and the reliability diagram."""
+NO_INTERVAL = (float("nan"), float("nan"))
 FEW_OBJECTS = 3
 """Of fewer objects no interval is given, and no object can be left out."""
 
@@ -242,11 +243,13 @@ def reality_of(judged: Judged, calibration: Calibration | None = None, seed: int
         "object": _identity(held, groups),
         "always holds": np.ones(len(held)),
     }
-    picks = _resampled(groups, seed) if enough else []
-    rows = tuple(_row(name, values, held, groups, picks) for name, values in columns.items())
-    old = judged.columns["score_old"]
-    gains = [_auc(judged.evidence[i], held[i]) - _auc(old[i], held[i]) for i in picks]
-    low, high = _interval(gains)
+    kinds = len(np.unique(groups))
+    all_once, samples = np.ones(kinds), _resampled(kinds if enough else 0, seed)
+    rows = tuple(_row(name, values, held, groups, samples) for name, values in columns.items())
+    mine, old = (
+        _wins(values, held, groups) for values in (judged.evidence, judged.columns["score_old"])
+    )
+    low, high = _interval(_aucs(*mine, samples) - _aucs(*old, samples)) if enough else NO_INTERVAL
     share = calibration.held_share
     return Reality(
         rows=rows,
@@ -254,7 +257,7 @@ def reality_of(judged: Judged, calibration: Calibration | None = None, seed: int
         in_sample=in_sample,
         ece=expected_calibration_error(told, held),
         balanced_accuracy=0.5 * float(np.mean(told[held] > share) + np.mean(told[~held] <= share)),
-        gain=_auc(judged.evidence, held) - _auc(old, held),
+        gain=float(_aucs(*mine, all_once) - _aucs(*old, all_once)),
         gain_low=low,
         gain_high=high,
         reliability=reliability(told, held),
@@ -311,37 +314,53 @@ def expected_calibration_error(p: Array, held: Mask) -> float:
     return sum(r.trials * abs(r.predicted - r.held) for r in reliability(p, held)) / len(p)
 
 
-def _row(
-    name: str, values: Array, held: Mask, groups: Names, picks: list[NDArray[np.int64]]
-) -> PredictorRow:
+def _row(name: str, values: Array, held: Mask, groups: Names, samples: Array) -> PredictorRow:
     """Return the figures of one predictor."""
-    low, high = _interval([_auc(values[i], held[i]) for i in picks])
-    pairs = hits = 0.0
-    for group in np.unique(groups):
-        mine = groups == group
-        count = float(held[mine].sum() * (~held[mine]).sum())
-        if count:
-            pairs += count
-            hits += count * _auc(values[mine], held[mine])
+    wins, pairs = _wins(values, held, groups)
+    low, high = _interval(_aucs(wins, pairs, samples)) if samples.size else NO_INTERVAL
+    inside = float(np.trace(pairs))
+    # The object's other trials tell nothing about one of its trials: a count is a count.
+    known = inside > 0 and name not in ("object", "always holds")
     return PredictorRow(
         name=name,
-        auc=_auc(values, held),
+        auc=float(_aucs(wins, pairs, np.ones(len(wins)))),
         auc_low=low,
         auc_high=high,
-        # The object's other trials tell nothing about one of its trials: a count is a count.
-        within=hits / pairs if pairs and name not in ("object", "always holds") else float("nan"),
+        within=float(np.trace(wins)) / inside if known else float("nan"),
         average_precision=_average_precision(values, held),
     )
 
 
-def _auc(values: Array, held: Mask) -> float:
-    """Return the area under the ROC curve; ties count half; NaN where all ended alike."""
-    yes = int(held.sum())
-    no = len(held) - yes
-    if yes == 0 or no == 0:
-        return float("nan")
-    ranks = rankdata(np.nan_to_num(values, nan=-np.inf, posinf=1e300, neginf=-1e300))
-    return float((ranks[held].sum() - yes * (yes + 1) / 2) / (yes * no))
+def _wins(values: Array, held: Mask, groups: Names) -> tuple[Array, Array]:
+    """Return how often the held trials of object i are before the others of j, ties by half.
+
+    Returns:
+        the counts (G, G), and of how many pairs (G, G).
+    """
+    ranks, number = _ranks(values), np.unique(groups, return_inverse=True)[1]
+    kinds = int(number.max()) + 1
+    wins = np.empty((kinds, kinds))
+    for j in range(kinds):
+        others = np.sort(ranks[~held & (number == j)])
+        ties = (np.searchsorted(others, ranks[held], side) for side in ("left", "right"))
+        wins[:, j] = np.bincount(number[held], 0.5 * sum(ties), kinds)
+    yes, no = (np.bincount(number[rows], minlength=kinds) for rows in (held, ~held))
+    return wins, np.outer(yes, no).astype(np.float64)
+
+
+def _aucs(wins: Array, pairs: Array, samples: Array) -> Array:
+    """Return the areas under the ROC curve (...) with objects taken `samples` (..., G) times.
+
+    NaN where all ended alike.
+    """
+    with np.errstate(invalid="ignore"):
+        found = np.sum(samples @ wins * samples, axis=-1) / np.sum(samples @ pairs * samples, -1)
+    return np.asarray(found)
+
+
+def _ranks(values: Array) -> Array:
+    """Return ranks from 1; equal values share one, infinite ones too, and NaN is the least."""
+    return rankdata(np.nan_to_num(values, nan=-np.inf, posinf=1e300, neginf=-1e300))
 
 
 def _average_precision(values: Array, held: Mask) -> float:
@@ -363,22 +382,16 @@ def _identity(held: Mask, groups: Names) -> Array:
     return found
 
 
-def _resampled(groups: Names, seed: int) -> list[NDArray[np.int64]]:
-    """Return trials of resampled objects."""
+def _resampled(kinds: int, seed: int) -> Array:
+    """Return how often each object is taken (B, G) by each sample of the bootstrap."""
     rng = np.random.default_rng(seed)
-    rows = [np.flatnonzero(groups == group) for group in np.unique(groups)]
-    return [
-        np.concatenate([rows[k] for k in rng.integers(0, len(rows), len(rows))])
-        for _ in range(RESAMPLES)
-    ]
+    drawn = [rng.integers(0, kinds, kinds) for _ in range(RESAMPLES if kinds else 0)]
+    return np.array([np.bincount(rows, minlength=kinds) for rows in drawn], dtype=np.float64)
 
 
-def _interval(values: list[float]) -> tuple[float, float]:
-    """Return the 95 % interval of bootstrap values; NaN of none."""
-    known = [v for v in values if np.isfinite(v)]
-    if not known:
-        return float("nan"), float("nan")
-    low, high = np.percentile(known, (2.5, 97.5))
+def _interval(values: Array) -> tuple[float, float]:
+    """Return the 95 % interval of bootstrap values."""
+    low, high = np.nanpercentile(values, (2.5, 97.5))
     return float(low), float(high)
 
 
@@ -387,5 +400,6 @@ def _digest(objects: Sequence[TriedObject]) -> str:
     told = hashlib.sha256()
     for obj in objects:
         told.update(obj.name.encode())
-        told.update(np.round(obj.Ts_obj_grasp, 6).tobytes() + obj.held.tobytes())
+        # Without + 0.0 the sign of a zero, which is chance, would be told.
+        told.update((np.round(obj.Ts_obj_grasp, 6) + 0.0).tobytes() + obj.held.tobytes())
     return told.hexdigest()[:16]
