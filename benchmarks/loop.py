@@ -67,10 +67,11 @@ def held_box(given: argparse.Namespace) -> Found:
     del given
     trial = cube_trial(0.125, DOWN[None], find_hand())  # grasped from above, through its middle
     bare = SlipConfig(
+        sure=None,
         physics=SlipPhysics(pads=None, mass_floor_kg=0.0),
         engine=BulletSettings(iterations=50, friction_anchor=False, replay=Replay()),
     )
-    ours, default = (run_slip_test(trial, config) for config in (SlipConfig(), bare))
+    ours, default = (run_slip_test(trial, config) for config in (SlipConfig(sure=None), bare))
     tried = np.ones(1, dtype=bool)
     score = score_stages(default.slip_m, default.slip_rad, tried, ScoreLimits())[1][0]
     return Found(figures={

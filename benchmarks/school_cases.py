@@ -144,6 +144,8 @@ def slip_config(
         reference: with the slow settings.
     """
     config = SlipConfig(engine=settings_of(engine, reference=reference))
+    if reference:
+        config = replace(config, sure=None)
     if condition == "plain":
         return config
     force_n = marginal_force_n(mass_kg)

@@ -60,7 +60,7 @@ def run_suite(job: SuiteJob) -> ValidationReport:
         collision_margin_m=0.001,
         replay=Replay(),
     )
-    bare = SlipConfig(physics=SlipPhysics(pads=None, mass_floor_kg=0.0))
+    bare = SlipConfig(sure=None, physics=SlipPhysics(pads=None, mass_floor_kg=0.0))
     return validate(settings, replace(config, slip=bare))
 
 

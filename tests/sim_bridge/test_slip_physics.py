@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from held_boxes import held_box
+from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.slip.bullet_world import BulletEngine
-from realsim_sim_bridge.slip.engines import BulletSettings
+from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings
 from realsim_sim_bridge.slip.motion import (
     SlipMotion,
     lift_acceleration,
@@ -43,7 +44,10 @@ def trial(n=1, mass=0.125, R=DOWN):
 
 
 def run(physics=None, engine=None, **kwargs):
-    config = SlipConfig(physics=physics or SlipPhysics(), engine=engine or BulletSettings())
+    """Simulate all stages: the engine is judged, not what is sure."""
+    config = SlipConfig(
+        physics=physics or SlipPhysics(), engine=engine or BulletSettings(), sure=None
+    )
     return run_slip_test(trial(**kwargs), config)
 
 
@@ -61,7 +65,9 @@ def test_the_box_is_held_through_all_stages_without_slip():
 def test_a_bare_default_world_drops_the_same_box():
     default = SlipPhysics(pads=None, mass_floor_kg=0.0)
     patient = ScoreLimits(slip_m=0.04, slip_deg=360.0)
-    config = SlipConfig(physics=default, engine=BulletSettings(iterations=50, replay=Replay()))
+    config = SlipConfig(
+        physics=default, engine=BulletSettings(iterations=50, replay=Replay()), sure=None
+    )
     assert score(run_slip_test(trial(), config))[0] < 0.5
     # Even if turning and slipping are let pass, the box falls out before the end.
     slips = run_slip_test(trial(), config, patient)
@@ -114,9 +120,9 @@ def test_light_objects_are_held_and_carry_their_true_weight():
     assert run(SlipPhysics(friction=0.05, force_n=4.0), mass=0.013).failures[0] == ""
 
 
-def turned_trial(n):
+def turned_trial(n, mass=0.125):
     """Return grasps of the cube that differ: off its middle, and about its closing axis."""
-    t = trial(n)
+    t = trial(n, mass)
     Ts = t.Ts_obj_grasp.copy()
     for k in range(n):
         Ts[k] = se3.from_rt(DOWN @ se3.exp_so3([0, 0.3 * k, 0]), [0.004 * k, 0.0, 0.002 * k])
@@ -223,3 +229,25 @@ def test_inertial_forces_are_those_of_newton_in_the_world():
     assert np.allclose(force[middle], expected[middle], atol=2e-2)
     # A ball's spin: torque against the angular acceleration alone.
     assert np.allclose(torque, -1e-3 * angle[2][:, None] * axis, atol=1e-12)
+
+
+def test_the_safety_factor_is_coulomb_s_and_what_it_makes_sure_is_what_the_engine_says():
+    physics = replace(SlipPhysics(), force_n=10.0, friction=0.3)
+    simulated = SlipConfig(physics=physics, engine=MujocoSettings(), sure=None)
+    skipped = 0
+    for mass in (0.02, 0.1, 0.125, 0.25, 0.5, 3.0):
+        cubes = turned_trial(2, mass)
+        sure = run_slip_test(cubes, replace(simulated, sure=3.0))
+        every = run_slip_test(cubes, simulated)
+        # Two fingers carry 2 mu F; a cone of eight edges is at most 5 % off.
+        assert sure.safety[0, 0] == pytest.approx(2 * 0.3 * 10.0 / (9.81 * mass), rel=0.06)
+        np.testing.assert_array_equal(sure.safety, every.safety)
+        np.testing.assert_array_equal(sure.passed, every.passed)
+        is_sure = sure.safety[:, 1:] >= 3.0
+        assert np.all(sure.slip_m[:, 1:][is_sure] == 0) and np.all(
+            every.slip_m[:, 1:][is_sure] < 1e-3
+        )
+        skipped += int(is_sure.sum())
+    assert skipped >= 18
+    with pytest.raises(InputError, match=r"0.5 makes nothing sure.*more than 1"):
+        SlipConfig(sure=0.5)

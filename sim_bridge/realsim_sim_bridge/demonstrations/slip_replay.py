@@ -227,7 +227,9 @@ def replay_grasp(
     """
     trial = replace(_trial(grasps, row, joints_lifted, T_table_obj, body, config), stand=stand)
     engine.begin()
-    slips = run_slip_test(trial, config.slip, config.score, config.hand, engine)
+    # Stages that were sure are wanted to be seen, too.
+    every = replace(config.slip, sure=None)
+    slips = run_slip_test(trial, every, config.score, config.hand, engine)
     base, score = score_stages(
         slips.slip_m, slips.slip_rad, np.ones(1, dtype=np.bool_), config.score
     )

@@ -34,7 +34,7 @@ from realsim_sim_bridge.grasping.surroundings import (
     first_triangle_inside,
     surface_tree,
 )
-from realsim_sim_bridge.slip.motion import SlipMotion, stage_wrenches
+from realsim_sim_bridge.slip.motion import Loads, stage_loads
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial
 
 Array = NDArray[np.float64]
@@ -43,8 +43,6 @@ Rows = NDArray[np.int64]
 
 PALM_M = 0.0015
 """So deep the palm may reach into the object before the hand has stopped [m]."""
-LOAD_DT_S = 1.0 / 12.0
-"""Times at which the stages' loads are looked at [s]: eight in a period of the oscillation."""
 WORST = 2
 """Loads of each stage, the worst at the nominal pose, that every draw is asked for."""
 MOST_DRAWS = 4096
@@ -154,30 +152,6 @@ class Drawn:
         return {f"share_{name}": getattr(self, name) for name in names}
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Loads:
-    """What the object feels in the stages, in the grasp frame."""
-
-    wrenches: Array
-    """(N, L, 6) torque about the centre of mass [N m] and force [N]."""
-    stage: Rows
-    """(L,) number in STAGES; 0 = its weight at rest."""
-
-    def about_grasp(self, centers: Array, at: Rows | None = None) -> Array:
-        """Return wrenches (N, L, 6) about the grasp's origin; `at`: some of each grasp's (N, l).
-
-        Args:
-            centers: (N, 3) the centre of mass, grasp frame [m].
-            at: (N, l) numbers of loads; None = all.
-        """
-        chosen = self.wrenches if at is None else np.take_along_axis(
-            self.wrenches, at[:, :, None], axis=1
-        )  # fmt: skip
-        moved = chosen.copy()
-        moved[..., :3] += np.cross(centers[:, None], chosen[..., 3:])
-        return moved
-
-
 def chance_columns(
     mesh: Mesh,
     trial: SlipTrial,
@@ -186,7 +160,7 @@ def chance_columns(
     config: HoldConfig,
     covariance: Array | None = None,
 ) -> dict[str, Array]:
-    """Return safety, the shares of the draws and the error of what holds, by names of MEASURES.
+    """Return the shares of the draws and the error of what holds, by names of MEASURES.
 
     The error is that of the share that holds; `p_hold_columns` makes p_hold and its error of them.
 
@@ -204,35 +178,10 @@ def chance_columns(
     physics, surface = slip.physics, GraspedObject.of(mesh)
     stiffness = physics.pads.pad_stiffness_n_per_m if physics.pads else np.inf
     loads = stage_loads(trial, slip.motion)
-    soft = config.conformity_m + physics.force_n / stiffness
-    safety, _ = nominal_safety(surface, trial, loads, hand, physics.friction, physics.force_n, soft)
     drawn = draw_holds(
         surface, trial, loads, hand, physics.force_n, covariance, config, stiffness
     )  # fmt: skip
-    return {"safety": safety, "p_hold_error": drawn.error, **drawn.measures()}
-
-
-def stage_loads(trial: SlipTrial, motion: SlipMotion) -> Loads:
-    """Return the loads of the stages at points in time, and the weight at rest."""
-    Ts = se3.invert(trial.Ts_obj_grasp)
-    Ts_world_body = np.broadcast_to(np.eye(4), Ts.shape).copy()
-    R = trial.Ts_table_grasp[:, :3, :3]
-    T_obj_body = trial.body.principal_frame()[0]
-    Ts_world_body[:, :3, :] = R @ (Ts @ T_obj_body)[:, :3, :]
-    rest = np.zeros((len(trial), 1, 6))
-    rest[..., 5] = -trial.body.mass_kg * motion.gravity
-    found, stage = [rest], [np.zeros(1, dtype=np.int64)]
-    for k in range(1, len(STAGES)):
-        wrenches = stage_wrenches(k, trial, Ts_world_body, motion, LOAD_DT_S)
-        if STAGES[k] == "oscillate":  # all periods are alike
-            once = round(1.0 / motion.oscillation_hz / LOAD_DT_S)
-            half = wrenches.shape[1] // 2
-            wrenches = wrenches[:, np.r_[0:once, half : half + once]]
-        found.append(wrenches)
-        stage.append(np.full(wrenches.shape[1], k))
-    world = np.concatenate(found, axis=1)
-    pairs = world.reshape(*world.shape[:2], 2, 3) @ R[:, None]
-    return Loads(wrenches=pairs.reshape(world.shape), stage=np.concatenate(stage))
+    return {"p_hold_error": drawn.error, **drawn.measures()}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -270,20 +219,21 @@ class GraspedObject:
         return Ts, back > 0
 
 
-def nominal_safety(
+def nominal_factors(
     obj: GraspedObject, trial: SlipTrial, loads: Loads, hand: Hand, friction: float, force_n: float,
     softness_m: float,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Return the safety factors of the stages (N, 4) and of all loads (N, L) where hands stop."""
+) -> Array:  # fmt: skip
+    """Return the safety factors of all loads (N, L) where hands stop."""
     Ts, _ = obj.stopped(trial.Ts_obj_grasp, hand, PALM_M)
-    patches = pad_patches(obj.rays, _pads(obj, trial, Ts, hand), trial.openings_m, hand, softness_m)
-    centers = se3.transform(se3.invert(Ts), trial.body.center_of_mass[None])[:, 0]
+    pads = _pads(obj, trial, Ts, hand)
+    patches = pad_patches(obj.rays, pads, trial.openings_m, hand, softness_m)
     n = len(trial)
-    factors = safety_factors(
-        patches, loads.about_grasp(centers), np.full(n, friction), np.full(n, force_n)
+    return safety_factors(
+        patches,
+        loads.about_grasp(_centers(trial, pads)),
+        np.full(n, friction),
+        np.full(n, force_n),
     )
-    by_stage = [factors[:, loads.stage == k].min(axis=1) for k in range(len(STAGES))]
-    return np.stack(by_stage, axis=1), factors
 
 
 def draw_holds(
@@ -322,7 +272,7 @@ def draw_holds(
     softness = soft * np.exp(config.stiffness_spread * normal[:, 13])
     low, high = (force_n * share for share in config.force_share)
 
-    _, factors = nominal_safety(
+    factors = nominal_factors(
         obj, trial, loads, hand, float(np.median(config.friction)), high, soft
     )
     at = _worst(factors, loads)
@@ -335,9 +285,10 @@ def draw_holds(
         blocked = first_triangle_inside(boxes[:, palms:], Ts, obj.tree, -config.touch_m) >= 0
         pads = _pads(obj, trial, Ts, hand)
         patches = pad_patches(obj.rays, pads, trial.openings_m, hand, float(softness[k]))
-        centers = se3.transform(se3.invert(Ts), trial.body.center_of_mass[None])[:, 0]
         # The last load is none: it is borne wherever the squeeze is balanced.
-        wrenches = np.pad(loads.about_grasp(centers, at) * mass[k], ((0, 0), (0, 1), (0, 0)))
+        wrenches = np.pad(
+            loads.about_grasp(_centers(trial, pads), at) * mass[k], ((0, 0), (0, 1), (0, 0))
+        )
         free = ~blocked & patches.both
         skewed = np.zeros(n)
         for friction in config.friction:
@@ -435,3 +386,8 @@ def _pads(obj: GraspedObject, trial: SlipTrial, Ts_obj_grasp: Array, hand: Hand)
         return Ts_obj_grasp
     heights = pad_heights(obj.rays, Ts_obj_grasp, trial.openings_m, hand)
     return along_approach(Ts_obj_grasp, heights)
+
+
+def _centers(trial: SlipTrial, Ts_obj_pads: Array) -> Array:
+    """Return the centre of mass between the pads (N, 3) [m]."""
+    return se3.transform(se3.invert(Ts_obj_pads), trial.body.center_of_mass[None])[:, 0]

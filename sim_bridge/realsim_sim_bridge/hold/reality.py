@@ -154,6 +154,7 @@ def judge_trials(
             trial, Ts_obj_grasp=stopped, Ts_table_grasp=obj.T_board_obj @ stopped
         )  # fmt: skip
         slips = run_slip_test(reached, config.slip, ScoreLimits(), config.hand, engine)
+        found["safety"] = slips.safety[:, 1:].min(axis=1)
         every = np.ones(len(trial), dtype=np.bool_)
         for name, limits in (("score", ScoreLimits()), ("score_old", ScoreLimits.paper())):
             found[name] = score_stages(slips.slip_m, slips.slip_rad, every, limits)[1]
@@ -215,7 +216,6 @@ def _of_object(obj: TriedObject, trial: SlipTrial, config: RealityConfig) -> dic
     return {
         "draws": np.asarray(share),
         "error": columns.pop("p_hold_error"),
-        "safety": columns.pop("safety")[:, 1:].min(axis=1),
         "dexnet_closure": closure.dexnet_closure,
         "closure_friction": -closure.closure_friction,
         "ferrari_canny": closure.ferrari_canny,

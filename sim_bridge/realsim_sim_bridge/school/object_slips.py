@@ -73,7 +73,7 @@ def result_of(
             failures[row] = f"not tested: {why}"
     base, scores = score_stages(slip_m, slip_rad, tried, task.config.score)
     known = prepared.measures | {"score_paper": score_paper(slip_m, slip_rad, tried)}
-    if task.config.hold is not None and "safety" in known:
+    if task.config.hold is not None and "p_hold_error" in known:
         attempted = np.where(prepared.reachable, scores, np.nan)
         known |= p_hold_columns(known, attempted, task.config.hold.draws)
     grasp_set = GraspSet(

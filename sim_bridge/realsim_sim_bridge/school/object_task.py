@@ -268,7 +268,7 @@ def trial_of(
 
 
 def _chances(task: ObjectTask, prepared: Prepared) -> dict[str, Array]:
-    """Return safety and the draws' outcomes as columns of all candidates; NaN where not tested."""
+    """Return the draws' outcomes as columns of all candidates; NaN where not tested."""
     config, rows = task.config, prepared.tested
     if config.hold is None or len(rows) == 0:
         return {}

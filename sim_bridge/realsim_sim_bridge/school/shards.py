@@ -1,6 +1,6 @@
 """A shard: some grasps of one object that one worker tests in one go, and its file."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -39,7 +39,11 @@ def shard_measures(
     Raises:
         InputError: the second engine is not installed.
     """
-    found = {"force_n": slips.force_n, "duration_s": slips.duration_s}
+    found = {
+        "force_n": slips.force_n,
+        "duration_s": slips.duration_s,
+        "safety": slips.safety,
+    }
     slip, limits, hand = config.slip, config.score, config.hand
     if config.sweep is not None:
         found |= sweep_margins(trial, slips, slip, limits, hand, engine, config.sweep)
@@ -107,6 +111,8 @@ def run_shard(trial: SlipTrial, rows: Rows, config: SchoolConfig) -> Tested:
         config: the school's.
     """
     engine = _engine(config.slip.engine)
+    if config.second_engine is not None:  # which judges the engine, so there is to be one
+        config = replace(config, slip=replace(config.slip, sure=None))
     slips = run_slip_test(trial, config.slip, config.score, config.hand, engine)
     return Tested(
         rows=rows,

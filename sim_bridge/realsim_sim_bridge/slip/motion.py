@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.geometry import se3
 from realsim.records import STAGES
 
 Array = NDArray[np.float64]
@@ -176,3 +177,68 @@ def stage_wrenches(
     return pendulum_wrenches(
         angles, axes, Ts_world_body[:, :3, 3] - points, inertias, mass, motion.gravity
     )
+
+
+LOAD_DT_S = 1.0 / 12.0
+"""Times at which a swing's loads are looked at [s]: ten in a quarter of it."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Loads:
+    """What the object feels in the stages, in the grasp frame."""
+
+    wrenches: Array
+    """(N, L, 6) torque about the centre of mass [N m] and force [N]."""
+    stage: NDArray[np.int64]
+    """(L,) number in STAGES; 0 = its weight at rest."""
+
+    def about_grasp(self, centers: Array, at: NDArray[np.int64] | None = None) -> Array:
+        """Return wrenches (N, L, 6) about the grasp's origin; `at`: some of each grasp's (N, l).
+
+        Args:
+            centers: (N, 3) the centre of mass, grasp frame [m].
+            at: (N, l) numbers of loads; None = all.
+        """
+        chosen = self.wrenches if at is None else np.take_along_axis(
+            self.wrenches, at[:, :, None], axis=1
+        )  # fmt: skip
+        moved = chosen.copy()
+        moved[..., :3] += np.cross(centers[:, None], chosen[..., 3:])
+        return moved
+
+
+def stage_loads(
+    trial: "SlipTrial", motion: SlipMotion, Ts_world_body: Array | None = None
+) -> Loads:
+    """Return the loads of the stages that decide, and the weight at rest.
+
+    What a grasp bears is convex, and it bears nothing: of a lift the greatest load decides, of an
+    oscillation the ends of both waves, of a swing those at points in time.
+
+    Args:
+        trial: N grasps.
+        motion: of the stages.
+        Ts_world_body: (N, 4, 4) where the objects are; None = as the grasps have them.
+    """
+    R = trial.Ts_table_grasp[:, :3, :3]
+    if Ts_world_body is None:
+        T_obj_body = trial.body.principal_frame()[0]
+        Ts_world_body = np.broadcast_to(np.eye(4), trial.Ts_obj_grasp.shape).copy()
+        Ts_world_body[:, :3, :] = R @ (se3.invert(trial.Ts_obj_grasp) @ T_obj_body)[:, :3, :]
+    rest = np.zeros((len(trial), 1, 6))
+    rest[..., 5] = -trial.body.mass_kg * motion.gravity
+    found, stage = [rest], [0]
+    for k in range(1, len(STAGES)):
+        wrenches = stage_wrenches(k, trial, Ts_world_body, motion, LOAD_DT_S)
+        if STAGES[k] == "lift":
+            # A multiple of the weight, the same one for all grasps.
+            most = int(np.argmax(lift_acceleration(motion, LOAD_DT_S)[:, 2]))
+            wrenches = wrenches[:, [most]]
+        elif STAGES[k] == "oscillate":
+            half, other = round(0.5 / motion.oscillation_hz / LOAD_DT_S), wrenches.shape[1] // 2
+            wrenches = wrenches[:, [0, half, other, other + half]]
+        found.append(wrenches)
+        stage += [k] * wrenches.shape[1]
+    world = np.concatenate(found, axis=1)
+    pairs = world.reshape(*world.shape[:2], 2, 3) @ R[:, None]
+    return Loads(wrenches=pairs.reshape(world.shape), stage=np.array(stage))

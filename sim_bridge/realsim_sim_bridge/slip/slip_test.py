@@ -14,12 +14,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import STAGES
 from realsim.records.checked_arrays import rows_of
 from realsim.robots.hand import Hand, find_hand
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings, make_engine
 from realsim_sim_bridge.slip.motion import SlipMotion, stage_wrenches
+from realsim_sim_bridge.slip.safety import closed_safety, hull_surface, resting
 from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import (
@@ -55,6 +57,22 @@ class SlipConfig:
     headroom_m: float = 0.004
     """Fingers that stand farther than this outside the object start here [m]: closing through air
     takes time and changes nothing."""
+    sure: float | None = 3.0
+    """Safety factor from which a stage is not simulated: the object rests and does not slip in it.
+    One that is not at rest and weighs so many times what the grasp bears falls in the lift. None =
+    all are simulated."""
+
+    def __post_init__(self) -> None:
+        """Check the factor.
+
+        Raises:
+            InputError: it says nothing for sure.
+        """
+        if self.sure is not None and not self.sure > 1.0:
+            raise InputError(
+                f"a safety factor of {self.sure:g} makes nothing sure; more than 1 is accepted, "
+                "3 is usual, None simulates every stage."
+            )
 
     @classmethod
     def of(cls, hand: Hand) -> "SlipConfig":
@@ -104,7 +122,11 @@ class SlipTrial:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Slips:
-    """What each grasp did in each stage: NaN = not executed, inf = lost."""
+    """What each grasp did in each stage: NaN = not executed, inf = lost.
+
+    A stage that is sure (`SlipConfig.sure`) has slips of exactly 0 or inf, and neither force nor
+    duration.
+    """
 
     slip_m: Array
     """(N, 4) [m]."""
@@ -116,6 +138,8 @@ class Slips:
     """(N, 4) until the stage ended or the object was lost [s]."""
     failures: tuple[str, ...]
     """(N,) where and why it stopped; '' = passed all."""
+    safety: Array
+    """(N, 4) of the closed hand, see `closed_safety`; 0 = it did not close on the object."""
 
     @property
     def passed(self) -> Mask:
@@ -174,6 +198,9 @@ class _SlipTest:
         self._end_n = np.full(n, np.nan)
         self._failures = [""] * n
         self._going: Mask = np.ones(n, dtype=np.bool_)
+        self._played: Mask = self._going.copy()
+        """Which of them are simulated in this stage."""
+        self._safety, self._rests = np.zeros(shape), np.zeros(n, dtype=np.bool_)
 
     def run(self) -> Slips:
         """Go through all stages with all worlds side by side."""
@@ -187,6 +214,7 @@ class _SlipTest:
                 self._observe(CLOSE, rows, start, world.close(self._config.closing))
                 self._judge(CLOSE, rows)
                 world.remove(~self._going[rows])
+            self._weigh(worlds)
             for stage in (LIFT, OSCILLATE, PENDULUM):
                 self._stage(stage, worlds)
         return Slips(
@@ -195,7 +223,26 @@ class _SlipTest:
             force_n=self._force_n,
             duration_s=self._duration_s,
             failures=tuple(self._failures),
+            safety=self._safety,
         )
+
+    def _weigh(self, worlds: list[tuple[Rows, HandWorld]]) -> None:
+        """Note the safety factors of what has been closed on."""
+        if not self._going.any():
+            return
+        surface, config = hull_surface(self._trial.body), self._config
+        for rows, world in worlds:
+            held = world.alive.copy()
+            states = world.states().rows(held)
+            self._rests[rows[held]] = resting(self._trial.body, states)
+            self._safety[rows[held]] = closed_safety(
+                surface,
+                self._trial.part(rows[held]),
+                states,
+                config.physics,
+                config.motion,
+                self._geometry,
+            )
 
     # --- a stage -----------------------------------------------------------------------------
 
@@ -203,14 +250,17 @@ class _SlipTest:
         """Play a stage in all worlds; what moved in a fast replay is played again at true speed."""
         replay = self._engine.replay
         again: list[tuple[Rows, PairStates]] = []
+        self._played = self._going & ~self._sure(stage)
         for rows, world in worlds:
-            if not world.alive.any():
-                continue
-            start = world.states()
-            self._play(stage, rows, world, replay.speed)
-            if replay.speed > 1:
-                moved = self._moved(stage, rows, replay) & world.alive
-                again.append((rows[moved], start.rows(moved)))
+            there = world.alive.copy()
+            world.alive[:] = there & self._played[rows]
+            if world.alive.any():
+                start = world.states()
+                self._play(stage, rows, world, replay.speed)
+                if replay.speed > 1:
+                    moved = self._moved(stage, rows, replay) & world.alive
+                    again.append((rows[moved], start.rows(moved)))
+            world.alive[:] = there
         played_again = self._at_true_speed(stage, again)
         for rows, world in worlds:
             self._judge(stage, rows)
@@ -218,6 +268,20 @@ class _SlipTest:
             if played_again is not None:
                 # What was not played again is NaN there, and stays as it is.
                 world.put(played_again.rows(rows))
+
+    def _sure(self, stage: int) -> Mask:
+        """Return what needs no simulation in a stage (N,), after noting its slips."""
+        sure = self._config.sure
+        if sure is None:
+            return np.zeros_like(self._going)
+        held = self._going & self._rests & (self._safety[:, stage] >= sure)
+        # A factor of 0, or one of what rests, contradicts the engine: it has to say.
+        borne, falls = self._safety[:, CLOSE], self._going & ~self._rests & (stage == LIFT)
+        dropped = falls & (borne > 0) & (borne <= 1.0 / sure)
+        for slips in (self._slip_m, self._slip_rad):
+            slips[held, stage] = 0.0
+            slips[dropped, stage] = np.inf
+        return held | dropped
 
     def _play(self, stage: int, rows: Rows, world: HandWorld, speed: int) -> None:
         """Play a stage in one world, `speed` times as fast as it is."""
@@ -298,7 +362,7 @@ class _SlipTest:
             "_force_n": np.where(lost, 0.0, weaker.min(axis=1)),
             "_duration_s": speed * motion.times_s[last],
         }
-        going = self._going[rows]
+        going = self._going[rows] & self._played[rows]
         for name, values in seen.items():
             getattr(self, name)[rows[going], stage] = values[going]
         self._end_n[rows[going]] = np.where(lost, 0.0, weaker[:, -1])[going]
@@ -308,7 +372,12 @@ class _SlipTest:
         limit_m, limit_rad = (limits[stage] for limits in self._limits.by_stage())
         for row in rows[self._going[rows]].tolist():
             slip, turn = self._slip_m[row, stage], self._slip_rad[row, stage]
-            if np.isinf(slip):
+            if np.isinf(slip) and not self._played[row]:
+                why = (
+                    f"the object's weight is {1.0 / self._safety[row, CLOSE]:.1f} times what the "
+                    "grasp bears; not simulated"
+                )
+            elif np.isinf(slip):
                 why = "the object was lost"
             elif self._end_n[row] <= self._config.physics.contact_n:
                 why = "the fingers did not both touch the object"

@@ -169,8 +169,9 @@ class ValidationConfig:
     """Everything the validation suite can be told."""
 
     hand: Hand = field(default_factory=find_hand)
-    slip: SlipConfig = field(default_factory=SlipConfig)
-    """Physics, closing and stages of the slip test; its engine's settings are not used."""
+    slip: SlipConfig = field(default_factory=lambda: SlipConfig(sure=None))
+    """Physics, closing and stages of the slip test, all of them simulated; its engine's settings
+    are not used."""
     checks: tuple[str, ...] = CHECKS
     """Which parts of the suite run."""
     limits: LimitConfig = field(default_factory=LimitConfig)
@@ -182,7 +183,7 @@ class ValidationConfig:
     def of(cls, hand: Hand) -> "ValidationConfig":
         """Return the suite for a hand, with its pads; forces and frictions are the suite's own."""
         pads = PadModel.of(hand)
-        slip = SlipConfig(physics=SlipPhysics(pads=pads), closing=Closing.of(hand))
+        slip = SlipConfig(physics=SlipPhysics(pads=pads), closing=Closing.of(hand), sure=None)
         return cls(hand=hand, slip=slip)
 
     def quick(self) -> "ValidationConfig":
