@@ -275,14 +275,21 @@ def test_hands_on_an_arc_and_open_meshes_work(bar, trial):
 # --- loads ----------------------------------------------------------------------------------------
 
 
-def test_loads_are_those_of_the_slip_test_in_the_hands_frame(trial, loads):
-    motion, R = SlipMotion(), trial.Ts_table_grasp[:, :3, :3]
+def test_loads_are_those_of_the_slip_test_in_the_hands_frame(trial):
+    tilts = se3.random_transform(np.random.default_rng(2), len(trial))
+    trial = replace(trial, Ts_table_grasp=tilts)
+    motion, R = SlipMotion(), tilts[:, :3, :3]
+    loads = stage_loads(trial, motion)
     turned = np.concatenate(
         [loads.wrenches[..., :3] @ np.swapaxes(R, 1, 2),
          loads.wrenches[..., 3:] @ np.swapaxes(R, 1, 2)], axis=-1,
     )  # fmt: skip
     weight = [0, 0, 0, 0, 0, -MASS * motion.gravity]
     np.testing.assert_allclose(turned[:, loads.stage == 0], [[weight]] * len(trial), atol=1e-12)
+    centers = se3.transform(se3.invert(trial.Ts_obj_grasp), np.zeros((1, 3)))[:, 0]
+    rest = loads.about_grasp(centers, np.zeros((len(trial), 1), dtype=np.int64))[:, 0]
+    down = -MASS * motion.gravity * R[:, 2]  # the weight in the hand's axes, where the middle is
+    np.testing.assert_allclose(rest, np.hstack([np.cross(centers, down), down]), atol=1e-12)
     start = np.broadcast_to(np.eye(4), trial.Ts_obj_grasp.shape).copy()
     T_grasp_obj = se3.invert(trial.Ts_obj_grasp)
     T_obj_body = trial.body.principal_frame()[0]

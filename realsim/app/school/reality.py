@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from realsim.app.console import Console
 from realsim.app.school.inputs import named_mass, spread_of
-from realsim.errors import InputError
 from realsim.store import atomic
 
 if TYPE_CHECKING:
@@ -45,6 +44,7 @@ def judge(
     """
     from realsim.formats.grasps.graspa import read_graspa
     from realsim.robots.hand import find_hand
+    from realsim_sim_bridge.hold.calibration import shipped
     from realsim_sim_bridge.hold.draws import HoldConfig
     from realsim_sim_bridge.hold.reality import (
         RealityConfig,
@@ -55,14 +55,8 @@ def judge(
     from realsim_sim_bridge.slip.engines import settings_of
     from realsim_sim_bridge.slip.slip_test import SlipConfig
 
-    masses = dict(named_mass(text) for text in options["masses"])
-    objects = read_graspa(folder, masses)
+    objects = read_graspa(folder, dict(named_mass(text) for text in options["masses"]))
     names = {obj.name for obj in objects}
-    if set(masses) - names:
-        raise InputError(
-            f"--mass names {', '.join(sorted(set(masses) - names))}, of which there are no trials; "
-            f"there are: {', '.join(sorted(names))}."
-        )
     hand = find_hand()
     hold = HoldConfig(draws=options["draws"], **spread_of(options["cell_error"]))
     config = RealityConfig(
@@ -78,7 +72,8 @@ def judge(
         fitted = calibrate(judged, str(folder.resolve().name))
         fitted.write(fit)
         console.say(f"calibration {fit}")
-    found = reality_of(judged, fitted)
+    calibration = fitted or shipped()
+    found = reality_of(judged, calibration)
     rows = [
         [WORDS[row.name], _number(row.auc), f"{_number(row.auc_low)} to {_number(row.auc_high)}",
          _number(row.within), _number(row.average_precision)]
@@ -96,6 +91,11 @@ def judge(
         console.say(
             "The calibration was fitted on these very trials: both figures are of curves fitted "
             "on the other objects."
+        )
+    elif shared := sorted(names & set(calibration.objects)):
+        console.warn(
+            f"the calibration was fitted on trials of {', '.join(shared)} too, though not on these "
+            "alone or not on all of them: both figures may be too good."
         )
     document = _document(found, asdict(config), judged.notes)
     if out is not None:
