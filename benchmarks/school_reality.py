@@ -68,7 +68,7 @@ FIGURES = {
 }
 COARSE = ConvexConfig(thresholds=(0.1,), time_limit_s=3.0)
 """How meshes are cut with --quick: the simulated attempt counts as one draw of 17."""
-CANDIDATES, CANDIDATES_QUICK = 60, 10
+CANDIDATES, CANDIDATES_QUICK = 60, 8
 MOVED_M, TURNED_DEG, CHANGED = 0.001, 1.0, 0.2
 
 
@@ -129,7 +129,14 @@ def demo(given: argparse.Namespace) -> Found:
     if given.quick:
         config = replace(config, convex=COARSE)
     cache = KEEP / "demo" / ("quick" if given.quick else "full")
-    sets = run_school(scene, lab.models, config, workers=PROCESSES, cache=cache, restart=True)
+    sets = run_school(
+        scene,
+        lab.models,
+        config,
+        workers=1 if given.quick else PROCESSES,
+        cache=cache,
+        restart=True,
+    )
     found = Found()
     tried = sum(int(executed(s).sum()) for s in sets)
     found.add("p_hold_entropy_bits", p_hold_entropy_bits(sets), f"{tried} grasps of 5 objects")
