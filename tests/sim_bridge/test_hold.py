@@ -304,6 +304,26 @@ def test_loads_are_those_of_the_slip_test_in_the_hands_frame(trial):
         assert np.all(np.linalg.norm(mine[..., 3:], axis=-1).max(axis=1) > 0.985 * peak)
 
 
+def test_the_few_loads_are_the_worst_of_all(bar):
+    """What a stage's few loads say of each grasp is what all of the stage's moments say."""
+    trial, motion = bar_trial(np.linspace(0.0, 0.06, 5)), SlipMotion()
+    turn = se3.exp_so3([0.4, 0.3, 0.2])  # so that no load is along an axis
+    trial = replace(trial, Ts_table_grasp=se3.from_rt(turn, np.zeros(3)) @ trial.Ts_table_grasp)
+    few = stage_loads(trial, motion)
+    R = trial.Ts_table_grasp[:, :3, :3]
+    start = np.broadcast_to(np.eye(4), (*R.shape[:1], 4, 4)).copy()
+    start[:, :3] = R @ se3.invert(trial.Ts_obj_grasp)[:, :3] @ trial.body.principal_frame()[0]
+    told = nominal_factors(bar, trial, few, HAND, 0.5, FORCE, 0.0015)
+    for k in range(1, len(STAGES)):
+        fine = stage_wrenches(k, trial, start, motion, 1 / 96)
+        turned = np.concatenate([fine[..., :3] @ R, fine[..., 3:] @ R], axis=-1)
+        every = replace(few, wrenches=turned, stage=np.full(turned.shape[1], k))
+        factors = nominal_factors(bar, trial, every, HAND, 0.5, FORCE, 0.0015)
+        np.testing.assert_allclose(
+            told[:, few.stage == k].min(axis=1), factors.min(axis=1), rtol=0.02
+        )
+
+
 def test_the_columns_are_named_as_records_have_them(trial):
     columns = chance_columns(BAR, trial, SlipConfig(), HAND, HoldConfig(draws=2))
     known = columns | p_hold_columns(columns, np.ones(len(trial)), 2)
