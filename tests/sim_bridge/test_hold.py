@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import trimesh
+from scipy.special import ndtr
 
 from graspa_folders import DOWN, box_grasps, write_graspa
 from held_boxes import held_box
@@ -159,6 +160,9 @@ def test_a_draw_without_spread_says_what_the_nominal_safety_says(bar):
         said = draw_holds(bar, trial, loads, HAND, FORCE, None, CERTAIN).share
         sure = np.abs(safety - 1.0) > 0.002
         np.testing.assert_array_equal(said[sure], safety[sure] > 1)
+        spread = replace(CERTAIN, draws=64, mass_spread=0.3)
+        said_of_masses = draw_holds(bar, trial, loads, HAND, FORCE, None, spread).share
+        np.testing.assert_allclose(said_of_masses, ndtr((safety - 1.0) / 0.3), atol=0.03)
     assert 0 < said.mean() < 1
 
 

@@ -45,7 +45,6 @@ RESAMPLES = 2000
 """Bootstrap samples of whole objects."""
 BINS = 10
 """Equal ones of p_hold, in the expected calibration error and the reliability diagram."""
-NO_INTERVAL = (float("nan"), float("nan"))
 FEW_OBJECTS = 3
 """Of fewer objects no interval is given, and no object can be left out."""
 
@@ -244,12 +243,12 @@ def reality_of(judged: Judged, calibration: Calibration | None = None, seed: int
         "always holds": np.ones(len(held)),
     }
     kinds = len(np.unique(groups))
-    all_once, samples = np.ones(kinds), _resampled(kinds if enough else 0, seed)
+    all_once, samples = np.ones(kinds), _resampled(kinds, RESAMPLES if enough else 0, seed)
     rows = tuple(_row(name, values, held, groups, samples) for name, values in columns.items())
     mine, old = (
         _wins(values, held, groups) for values in (judged.evidence, judged.columns["score_old"])
     )
-    low, high = _interval(_aucs(*mine, samples) - _aucs(*old, samples)) if enough else NO_INTERVAL
+    low, high = _interval(_aucs(*mine, samples) - _aucs(*old, samples))
     share = calibration.held_share
     return Reality(
         rows=rows,
@@ -292,9 +291,6 @@ def calibrate(judged: Judged, data: str) -> Calibration:
     )
 
 
-# --- figures --------------------------------------------------------------------------------------
-
-
 def reliability(p: Array, held: Mask) -> tuple[Reliability, ...]:
     """Return mean p_hold and share held of the trials in each of ten equal bins with any."""
     bins = np.minimum((p * BINS).astype(np.int64), BINS - 1)
@@ -317,16 +313,15 @@ def expected_calibration_error(p: Array, held: Mask) -> float:
 def _row(name: str, values: Array, held: Mask, groups: Names, samples: Array) -> PredictorRow:
     """Return the figures of one predictor."""
     wins, pairs = _wins(values, held, groups)
-    low, high = _interval(_aucs(wins, pairs, samples)) if samples.size else NO_INTERVAL
-    inside = float(np.trace(pairs))
+    low, high = _interval(_aucs(wins, pairs, samples))
     # The object's other trials tell nothing about one of its trials: a count is a count.
-    known = inside > 0 and name not in ("object", "always holds")
+    known = np.trace(pairs) > 0 and name not in ("object", "always holds")
     return PredictorRow(
         name=name,
         auc=float(_aucs(wins, pairs, np.ones(len(wins)))),
         auc_low=low,
         auc_high=high,
-        within=float(np.trace(wins)) / inside if known else float("nan"),
+        within=float(np.trace(wins) / np.trace(pairs)) if known else float("nan"),
         average_precision=_average_precision(values, held),
     )
 
@@ -354,8 +349,7 @@ def _aucs(wins: Array, pairs: Array, samples: Array) -> Array:
     NaN where all ended alike.
     """
     with np.errstate(invalid="ignore"):
-        found = np.sum(samples @ wins * samples, axis=-1) / np.sum(samples @ pairs * samples, -1)
-    return np.asarray(found)
+        return np.sum(samples @ wins * samples, -1) / np.sum(samples @ pairs * samples, -1)
 
 
 def _ranks(values: Array) -> Array:
@@ -382,16 +376,17 @@ def _identity(held: Mask, groups: Names) -> Array:
     return found
 
 
-def _resampled(kinds: int, seed: int) -> Array:
+def _resampled(kinds: int, count: int, seed: int) -> Array:
     """Return how often each object is taken (B, G) by each sample of the bootstrap."""
     rng = np.random.default_rng(seed)
-    drawn = [rng.integers(0, kinds, kinds) for _ in range(RESAMPLES if kinds else 0)]
-    return np.array([np.bincount(rows, minlength=kinds) for rows in drawn], dtype=np.float64)
+    taken = [np.bincount(rng.integers(0, kinds, kinds), minlength=kinds) for _ in range(count)]
+    return np.array(taken, dtype=np.float64).reshape(count, kinds)
 
 
 def _interval(values: Array) -> tuple[float, float]:
-    """Return the 95 % interval of bootstrap values."""
-    low, high = np.nanpercentile(values, (2.5, 97.5))
+    """Return the 95 % interval of bootstrap values; NaN of none."""
+    known = values[np.isfinite(values)]
+    low, high = np.percentile(known, (2.5, 97.5)) if known.size else (np.nan, np.nan)
     return float(low), float(high)
 
 
