@@ -32,7 +32,7 @@ def test_physics_that_cannot_be_is_refused(pristine: Path) -> None:
 
 def test_p_hold_of_one_draw_or_of_a_negative_error_is_refused(pristine: Path) -> None:
     assert "2 draws or more" in refused(pristine, *QUICK, "--draws", "1")
-    assert "yaw_deg" in refused(pristine, *QUICK, "--cell-error", "8", "3", "-10", "3")
+    assert "has -10 for yaw" in refused(pristine, *QUICK, "--cell-error", "8", "3", "-10", "3")
     assert not (pristine / "grasps").exists()
 
 

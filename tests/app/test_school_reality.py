@@ -40,12 +40,13 @@ def test_trials_are_judged_and_a_calibration_is_fitted_on_them(trials: Path) -> 
     np.testing.assert_allclose(told.p_hold(np.array([0.0, 1.0])), [0.25, 0.75], atol=0.02)
 
 
-def test_trials_of_an_object_of_the_calibration_are_told(tmp_path: Path) -> None:
-    Ts, held = box_grasps()
-    write_graspa(tmp_path, "chips_can", Ts[3:5], held[3:5])
+def test_trials_of_a_known_object_that_all_ended_alike_are_told(tmp_path: Path) -> None:
+    Ts, _ = box_grasps()
+    write_graspa(tmp_path, "chips_can", Ts[3:5], [True, True])
     found = run("reality", tmp_path, "--draws", 2)
     assert found.exit_code == 0, found.output
     assert "fitted on trials of chips_can too" in " ".join(found.output.split())
+    assert "all trials ended alike" in found.output and "nan" not in found.output
 
 
 @pytest.mark.parametrize(
@@ -54,7 +55,8 @@ def test_trials_of_an_object_of_the_calibration_are_told(tmp_path: Path) -> None
         (("--mass", "wooden=0.1"), "'wooden', which no trial is of; there are chips_can"),
         (("--mass", "wooden_box=-1"), "no weighed object"),
         (("--draws", "1"), "2 draws or more"),
-        (("--cell-error", "8", "3", "-10", "3"), "yaw_deg"),
+        (("--cell-error", "8", "3", "-10", "3"), "--cell-error has -10 for yaw"),
+        (("--cell-error", "1e9", "3", "10", "3"), "0 to 180 is accepted"),
     ],
 )
 def test_what_cannot_be_is_refused(trials: Path, words: tuple[str, ...], told: str) -> None:

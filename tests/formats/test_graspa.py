@@ -54,6 +54,23 @@ def test_numbers_may_end_in_an_equals_sign_and_rotations_be_rounded(folder):
     np.testing.assert_allclose(box.Ts_board_grasp[0], T, atol=1e-3)
 
 
+def in_metres(file):
+    position = re.compile(r'c4="([^"]+)"/><row')
+    text = position.sub(lambda m: f'c4="{float(m[1]) / 1e3}"/><row', file.read_text())
+    file.write_text(text)
+
+
+def test_boards_and_hands_in_metres_are_refused(folder):
+    in_metres(folder / "layouts/layout_0.xml")
+    with pytest.raises(
+        InputError, match=r"YcbGelatinBox.*layout_0 are up to 0.* away.*millimetres"
+    ):
+        read_graspa(folder)
+    in_metres(trials_of(folder))
+    with pytest.raises(InputError, match=r"within 2 mm of the board's origin.*in metres"):
+        read_graspa(folder)
+
+
 def test_a_planner_without_a_grasp_is_no_trial(folder):
     Ts, held = box_grasps()
     file = write_graspa(folder, "tennis_ball", Ts, held)

@@ -266,11 +266,21 @@ def named_mass(text: str) -> tuple[str, float]:
 
 
 def spread_of(cell_error: tuple[float, float, float, float] | None) -> dict[str, Any]:
-    """Return what `HoldConfig` takes of a stated cell error; nothing where none is stated."""
+    """Return what `HoldConfig` takes of a stated cell error; nothing where none is stated.
+
+    Raises:
+        InputError: an error that no cell has.
+    """
     from realsim_sim_bridge.hold.draws import PoseSpread
 
     if cell_error is None:
         return {}
+    for name, value in zip(("across", "height", "yaw", "tilt"), cell_error, strict=True):
+        if not 0 <= value <= 180:  # NaN, too
+            raise InputError(
+                f"--cell-error has {value:g} for {name}; 0 to 180 is accepted: standard deviations "
+                "across [mm], in height [mm], of yaw and of tilt [deg], such as 8 3 10 3."
+            )
     across_mm, height_mm, yaw_deg, tilt_deg = cell_error
     return {
         "spread": PoseSpread(

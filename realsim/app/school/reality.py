@@ -80,12 +80,15 @@ def judge(
         for row in found.rows
     ]  # fmt: skip
     held = int(judged.held.sum())
+    if held in (0, len(judged.held)):
+        console.warn("all trials ended alike, so nothing can be told apart: no AUC is given.")
     title = f"{len(judged.held)} trials of {len(names)} objects, {held} held; {judged.engine}"
     console.table(title, HEADER, rows)
     console.say(
         f"p_hold: expected calibration error {found.ece:.3f}, balanced accuracy "
-        f"{found.balanced_accuracy:.3f}; AUC {found.gain:+.3f} over the score with limits in "
-        f"closing, 95 % {_number(found.gain_low)} to {_number(found.gain_high)} by object."
+        f"{_number(found.balanced_accuracy)}; AUC {_number(found.gain, '+.3f')} over the score "
+        f"with limits in closing, 95 % {_number(found.gain_low)} to {_number(found.gain_high)} "
+        "by object."
     )
     if found.in_sample:
         console.say(
@@ -146,6 +149,6 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _number(value: float) -> str:
+def _number(value: float, form: str = ".3f") -> str:
     """Return a figure, or a dash."""
-    return f"{value:.3f}" if math.isfinite(value) else "-"
+    return format(value, form) if math.isfinite(value) else "-"

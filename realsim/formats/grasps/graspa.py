@@ -33,6 +33,10 @@ Array = NDArray[np.float64]
 MM = 1e-3
 ROUNDED = 0.02
 """Greatest entry of R^T R - 1 that rounding explains; the worst of the open trials has 0.001."""
+FAR_M = 0.3
+"""A hand so far from its object's box was tried on nothing; the open trials reach to 0.09 m."""
+AT_ORIGIN_M = 2e-3
+"""Hands all so near to the board's origin are in metres; the open trials keep 0.12 m."""
 PLAIN = re.compile(r"\w[\w.-]*")
 """A name that stays in its folder."""
 YCB_MASSES_KG = {
@@ -96,8 +100,8 @@ def read_graspa(
 
     Raises:
         InputError: a folder or file is missing or of another layout, a trial has no pose or no
-            result, an object is not on its board, a mass is none or of no object; the file and what
-            was expected are named.
+            result, an object is not on its board or not where its hands are, a mass is none or of
+            no object; the file and what was expected are named.
     """
     folder = Path(folder)
     for need in ("layouts", "results", "objects"):
@@ -135,6 +139,8 @@ def read_graspa(
         if told not in meshes:
             meshes[told] = _mesh(folder, told)
         name, mesh = meshes[told]
+        Ts = np.array([row[2] for row in rows])
+        _require_near(mesh, T, Ts, f"{folder}: the hands of '{label}' on {layout}")
         found.append(
             TriedObject(
                 name=name,
@@ -142,7 +148,7 @@ def read_graspa(
                 mesh=mesh,
                 mass_kg=known.get(name),
                 T_board_obj=T,
-                Ts_board_grasp=np.array([row[2] for row in rows]),
+                Ts_board_grasp=Ts,
                 held=np.array([row[3] for row in rows], dtype=np.bool_),
                 planners=tuple(row[0] for row in rows),
                 trials=tuple(row[1] for row in rows),
@@ -230,6 +236,23 @@ def _pose(element: Any, where: str) -> Array:
     U, _, Vt = np.linalg.svd(T[:3, :3])
     T[:3, :3], T[:3, 3] = U @ Vt, MM * T[:3, 3]
     return se3.check_rigid(T, where)
+
+
+def _require_near(mesh: Mesh, T: Array, Ts: Array, where: str) -> None:
+    """Raise if hands (N, 4, 4) of a board are not at their object, whose pose is T (4, 4) [m]."""
+    if np.linalg.norm(Ts[:, :3, 3], axis=1).max() < AT_ORIGIN_M:
+        raise InputError(
+            f"{where} are all within {1e3 * AT_ORIGIN_M:g} mm of the board's origin. Positions "
+            "in millimetres are expected; are these in metres?"
+        )
+    at = (se3.invert(T) @ Ts)[:, :3, 3]
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    far = np.linalg.norm(at - np.clip(at, low, high), axis=1).max()
+    if far > FAR_M:
+        raise InputError(
+            f"{where} are up to {far:.2f} m away from it; at most {FAR_M:g} m is accepted. "
+            "Boards and hands are expected in millimetres, in the frame of the same board."
+        )
 
 
 def _number(told: str | None, where: str) -> float:
