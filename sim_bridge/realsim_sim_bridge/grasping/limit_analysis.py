@@ -50,7 +50,7 @@ class PadPatches:
     @property
     def both(self) -> Mask:
         """(N,) whether both fingers touch."""
-        return np.asarray(self.there.any(axis=2).all(axis=1))
+        return np.asarray(np.all(np.any(self.there, axis=2), axis=1))
 
 
 def pad_patches(

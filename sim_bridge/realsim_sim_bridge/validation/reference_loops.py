@@ -332,7 +332,7 @@ def march(  # noqa: PLR0912, PLR0913, PLR0915, PLR0917 - compiled code takes pla
                     _put(bristles_box[m, b], 0, (0.0, 0.0, 0.0))
                     continue
                 # Not the nearest face: a point that comes in beside an edge would be caught there.
-                face = entered[m, b] if entered[m, b] >= 0 else face
+                face = int(entered[m, b]) if entered[m, b] >= 0 else face
                 depth, toward = _below(place, box, face), -1.0 if face < 3 else 1.0
                 n = (
                     toward if face % 3 == 0 else 0.0,
