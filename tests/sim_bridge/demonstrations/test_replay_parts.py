@@ -17,6 +17,7 @@ from realsim_sim_bridge.demonstrations.slip_replay import (
     replay_grasp,
 )
 from realsim_sim_bridge.school import run_school_results
+from realsim_sim_bridge.school.object_slips import stand_of
 from realsim_sim_bridge.school.sweep import SweepConfig
 from realsim_sim_bridge.slip.engines import make_engine, settings_of
 from realsim_sim_bridge.slip.world import SlipBody
@@ -110,9 +111,10 @@ def test_a_replay_in_bullet_ends_as_the_school_did():
     engine = RecordedEngine(make_engine(config.slip.engine))
     body = tried_body(s, model(), T_table_obj, school_config_of(s), None, None)
     assert body.mass_kg == pytest.approx(mass_properties(model().mesh, 1000.0).mass_kg)
+    stand = stand_of(config.slip, T_table_obj, body, [])
     for row in attempts.rows.tolist():
         lifted = attempts.joints_rad[attempts.attempt(row)][-1]
-        replay = replay_grasp(s, row, lifted, T_table_obj, body, config, engine)
+        replay = replay_grasp(s, row, lifted, T_table_obj, body, config, engine, stand)
         assert replay.agrees, replay.disagreement
         assert replay.base_score == s.base_scores[row]
         executed = int((~np.isnan(s.slip_m[row])).sum())
