@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 from graspa_folders import box_grasps, write_graspa
+from realsim.app.school.inputs import SchoolRequest
+from realsim.app.school.run import config_of
+from realsim.errors import InputError
 from realsim.untrusted.own_json import read_own
 from realsim_sim_bridge.hold.calibration import Calibration
-from school_sessions import refused, run
+from school_sessions import refused, run, scene
 
 KINDS = ("chips_can", "gelatin_box", "wooden_box")
 
@@ -38,6 +41,14 @@ def test_trials_are_judged_and_a_calibration_is_fitted_on_them(trials: Path) -> 
     assert (told.trials, told.objects, told.held_share) == (24, KINDS, 0.5)
     # Bad grasps held in 1 of 4 and good ones in 3 of 4: what the curve must say of 0 and 1.
     np.testing.assert_allclose(told.p_hold(np.array([0.0, 1.0])), [0.25, 0.75], atol=0.02)
+    # It serves the next run and the school, which refuse what is no calibration.
+    again = run("reality", trials, *words, "--calibration", fit, "--json")
+    assert again.exit_code == 0 and '"in_sample": true' in again.output
+    config = config_of(SchoolRequest(calibration=fit), scene())
+    assert config.calibration == told
+    with pytest.raises(InputError, match=r"reality\.json"):
+        config_of(SchoolRequest(calibration=out / "reality.json"), scene())
+    assert "one of them" in refused("reality", trials, "--fit", fit, "--calibration", fit)
 
 
 def test_trials_of_a_known_object_that_all_ended_alike_are_told(tmp_path: Path) -> None:

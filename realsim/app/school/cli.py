@@ -26,6 +26,8 @@ DRAWS = click.option("--draws", default=16, show_default=True, type=int,
                      help="Draws of each grasp behind p_hold.")  # fmt: skip
 CELL = click.option("--cell-error", nargs=4, type=float, default=None, metavar="MM MM DEG DEG",
                     help="Of the cell: across, height, yaw, tilt.  [8 3 10 3]")  # fmt: skip
+FITTED = click.option("--calibration", type=FOLDER, default=None, metavar="FILE",
+                      help="Of p_hold, by `school reality --fit`.  [the shipped one]")  # fmt: skip
 HAND = click.option("--hand", default="franka_hand", show_default=True, metavar="NAME",
                     help="Hand, by its name (`realsim robots`) or its folder.")  # fmt: skip
 
@@ -99,6 +101,7 @@ def SCHOOL() -> None:
               help="Of one pad [N/m].  [the hand's]")  # fmt: skip
 @DRAWS
 @CELL
+@FITTED
 @click.option("--density", type=float, default=None,
               help="Of objects that are not weighed [kg/m^3].  [the models' own]")  # fmt: skip
 @click.option(
@@ -205,6 +208,7 @@ def validate_command(
               help="Of the simulated attempt.")  # fmt: skip
 @DRAWS
 @CELL
+@FITTED
 @click.option(
     "--mass", "masses", multiple=True, metavar="NAME=KG", help="A weighed object; repeat."
 )

@@ -50,6 +50,8 @@ class SchoolRequest:
     """Draws behind p_hold, 2 or more."""
     cell_error: tuple[float, float, float, float] | None = None
     """Standard deviations where grasps are executed: across [mm], height [mm], yaw, tilt [deg]."""
+    calibration: Path | None = None
+    """File of p_hold's calibration, as `realsim school reality --fit` writes it."""
     density: float | None = None
     """Of all objects that are not weighed [kg/m^3]."""
     masses: tuple[str, ...] = ()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from realsim.app.console import Console
 from realsim.app.school.inputs import named_mass, spread_of
+from realsim.errors import InputError
 from realsim.store import atomic
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def judge(
 
     Args:
         folder: GRASPA's layout.
-        options: engine, draws, cell_error, masses and cache of the command line.
+        options: engine, draws, cell_error, calibration, masses and cache of the command line.
         out: folder for the report and the picture.
         fit: file for a calibration that is fitted on these trials.
         console: progress and tables go there.
@@ -44,7 +45,8 @@ def judge(
     """
     from realsim.formats.grasps.graspa import read_graspa
     from realsim.robots.hand import find_hand
-    from realsim_sim_bridge.hold.calibration import shipped
+    from realsim.untrusted.own_json import read_own
+    from realsim_sim_bridge.hold.calibration import Calibration, shipped
     from realsim_sim_bridge.hold.draws import HoldConfig
     from realsim_sim_bridge.hold.reality import (
         RealityConfig,
@@ -55,7 +57,14 @@ def judge(
     from realsim_sim_bridge.slip.engines import settings_of
     from realsim_sim_bridge.slip.slip_test import SlipConfig
 
-    objects = read_graspa(folder, dict(named_mass(text) for text in options["masses"]))
+    masses = [named_mass(text) for text in options["masses"]]
+    if len(dict(masses)) < len(masses):
+        raise InputError("--mass names an object twice; give it once.")
+    if options["cache"] is not None and not options["cache"].is_dir() and options["cache"].exists():
+        raise InputError(f"--cache {options['cache']} is a file; a folder is expected.")
+    if fit is not None and options["calibration"] is not None:
+        raise InputError("--fit makes a calibration and --calibration takes one; give one of them.")
+    objects = read_graspa(folder, dict(masses))
     names = {obj.name for obj in objects}
     hand = find_hand()
     hold = HoldConfig(draws=options["draws"], **spread_of(options["cell_error"]))
@@ -72,7 +81,8 @@ def judge(
         fitted = calibrate(judged, str(folder.resolve().name))
         fitted.write(fit)
         console.say(f"calibration {fit}")
-    calibration = fitted or shipped()
+    given = options["calibration"]
+    calibration = fitted or (read_own(given, Calibration) if given else shipped())
     found = reality_of(judged, calibration)
     rows = [
         [WORDS[row.name], _number(row.auc), f"{_number(row.auc_low)} to {_number(row.auc_high)}",

@@ -37,7 +37,9 @@ def config_of(request: SchoolRequest, scene: Scene) -> "SchoolConfig":
             pose that cannot be read.
     """
     from realsim.robots.hand import find_hand
+    from realsim.untrusted.own_json import read_own
     from realsim_sim_bridge.arm.reach_config import chosen_arm
+    from realsim_sim_bridge.hold.calibration import Calibration
     from realsim_sim_bridge.hold.draws import HoldConfig
     from realsim_sim_bridge.school import SchoolConfig
     from realsim_sim_bridge.school.sweep import SweepConfig
@@ -63,7 +65,8 @@ def config_of(request: SchoolRequest, scene: Scene) -> "SchoolConfig":
     hold = HoldConfig(seed=request.seed, draws=request.draws, **spread_of(request.cell_error))
     if request.friction is not None:  # what is stated is not uncertain
         hold = replace(hold, friction=(request.friction,))
-    config = replace(config, hold=hold)
+    curve = None if request.calibration is None else read_own(request.calibration, Calibration)
+    config = replace(config, hold=hold, calibration=curve)
     engine = settings_of(request.engine)
     make_engine(engine)  # not in a worker, minutes later: what is not installed is said at once
     config = replace(config, slip=replace(config.slip, physics=physics, engine=engine))

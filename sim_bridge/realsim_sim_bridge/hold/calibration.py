@@ -83,20 +83,24 @@ def evidence_of(share: Array, scores: Array, draws: int) -> Array:
     return (draws * share + scores) / (draws + 1)
 
 
-def p_hold_columns(measures: dict[str, Array], scores: Array, draws: int) -> dict[str, Array]:
+def p_hold_columns(
+    measures: dict[str, Array], scores: Array, draws: int, calibration: Calibration | None = None
+) -> dict[str, Array]:
     """Return p_hold, its error and its draws of what the draws and the attempt said.
 
     Args:
         measures: columns of `draws.chance_columns`.
         scores: (N,) of the simulated attempt; NaN = there was none.
         draws: their number.
+        calibration: the curve; None = the shipped one.
     """
+    curve = calibration or shipped()
     share = 1.0 - sum(measures[f"share_{name}"] for name in FAILURES)
     evidence = evidence_of(np.asarray(share), scores, draws)
     told = np.isfinite(evidence)
     return {
-        "p_hold": shipped().p_hold(evidence),
-        "p_hold_error": shipped().error(evidence, measures["p_hold_error"]),
+        "p_hold": curve.p_hold(evidence),
+        "p_hold_error": curve.error(evidence, measures["p_hold_error"]),
         "p_hold_draws": np.where(told, float(draws), np.nan),
     }
 

@@ -255,12 +255,19 @@ def reality_of(judged: Judged, calibration: Calibration | None = None, seed: int
         p_hold=told,
         in_sample=in_sample,
         ece=expected_calibration_error(told, held),
-        balanced_accuracy=0.5 * float(np.mean(told[held] > share) + np.mean(told[~held] <= share)),
+        balanced_accuracy=_balanced_accuracy(told > share, held),
         gain=float(_aucs(*mine, all_once) - _aucs(*old, all_once)),
         gain_low=low,
         gain_high=high,
         reliability=reliability(told, held),
     )
+
+
+def _balanced_accuracy(told: Mask, held: Mask) -> float:
+    """Return the mean share of trials told right of those that held and of the others, or NaN."""
+    if held.all() or not held.any():
+        return float("nan")
+    return 0.5 * float(np.mean(told[held]) + np.mean(~told[~held]))
 
 
 def calibrate(judged: Judged, data: str) -> Calibration:

@@ -7,6 +7,7 @@ from realsim.robots.hand import Hand, find_hand
 from realsim_sim_bridge.arm.reach import ReachConfig
 from realsim_sim_bridge.grasping.analytic import AnalyticConfig
 from realsim_sim_bridge.grasping.candidates import CandidateConfig
+from realsim_sim_bridge.hold.calibration import Calibration
 from realsim_sim_bridge.hold.draws import HoldConfig
 from realsim_sim_bridge.school.sweep import SweepConfig
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings
@@ -36,6 +37,8 @@ class SchoolConfig:
     score: ScoreLimits = field(default_factory=ScoreLimits)
     hold: HoldConfig | None = field(default_factory=HoldConfig)
     """What is uncertain where the grasps are executed, for p_hold; None = p_hold is not told."""
+    calibration: Calibration | None = None
+    """What makes p_hold of the evidence; None = what realsim ships."""
     sweep: SweepConfig | None = None
     """Frictions and forces at which each grasp is tried besides, for its margin; None = none."""
     second_engine: BulletSettings | MujocoSettings | None = None

@@ -75,7 +75,7 @@ def result_of(
     known = prepared.measures | {"score_paper": score_paper(slip_m, slip_rad, tried)}
     if task.config.hold is not None and "p_hold_error" in known:
         attempted = np.where(prepared.reachable, scores, np.nan)
-        known |= p_hold_columns(known, attempted, task.config.hold.draws)
+        known |= p_hold_columns(known, attempted, task.config.hold.draws, task.config.calibration)
     grasp_set = GraspSet(
         obj_id=task.obj_id,
         instance=task.instance,
