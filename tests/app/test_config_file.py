@@ -137,7 +137,8 @@ def test_every_option_can_be_set_in_the_file_and_by_its_variable(
             assert option.type_cast_value(ctx, value) == wanted
             assert isinstance(option.envvar, str)
             single = other[0] if isinstance(other, list) else other
-            monkeypatch.setenv(option.envvar, str(single))
+            words = " ".join([str(single)] * option.nargs)
+            monkeypatch.setenv(option.envvar, words)
             value, source = option.consume_value(ctx, {})
             assert source is click.core.ParameterSource.ENVIRONMENT
             assert option.type_cast_value(ctx, value) == wanted, (path, option.name)
@@ -162,6 +163,8 @@ def another_value(option: click.Option) -> Any:
         value = f"another{next(iter(kind.own))}"
     else:
         value = "another"
+    if option.nargs > 1:
+        return [value] * option.nargs
     return [value] if option.multiple else value
 
 

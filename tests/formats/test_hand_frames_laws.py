@@ -17,7 +17,7 @@ from realsim.formats.graspnet.grasp_group import grasp_group, read_grasp_group, 
 from realsim.formats.grasps.acronym import AcronymObject, read_acronym, write_acronym
 from realsim.formats.grasps.graspgen import read_graspgen, write_graspgen
 from realsim.formats.grasps.isaac_grasp import read_isaac_grasp, write_isaac_grasp
-from realsim.formats.grasps.scene_grasps import SceneGrasps, executed
+from realsim.formats.grasps.scene_grasps import SceneGrasps, executed, labelled
 from realsim.geometry import se3
 from realsim.robots.hand import find_hand
 from tried_grasps import tried_set
@@ -211,13 +211,13 @@ def test_another_hand_s_frame_and_joint_are_its_description_s(tmp_path):
 
     data = YAML(typ="safe").load(write_isaac_grasp(tmp_path / "a.yaml", s, object_frame="a"))
     assert data["gripper_frame_link"] == "robotiq_2f85"
-    for row in np.flatnonzero(tried):
+    for row in np.flatnonzero(labelled(s)):
         joint = data["grasps"][f"grasp_{row}"]["cspace_position"]["finger_joint"]
         # The URDF's chain: where the pad is when its joint is there.
         y = 0.0306011 + 0.0376009 * np.cos(joint) - 0.0430400 * np.sin(joint) - 0.0255
         assert 2 * y == pytest.approx(s.widths_m[row], abs=2e-5)
     Ts = grasp_group([s], {s.instance: np.eye(4)}).Ts_a_grasp
-    scored = ~np.isnan(s.scores)
+    scored = ~np.isnan(s.labels)
     np.testing.assert_array_equal(Ts, s.Ts_obj_pads[scored])
     moved = np.linalg.norm((s.Ts_obj_pads - s.Ts_obj_grasp)[:, :3, 3], axis=1)
     np.testing.assert_allclose(moved, np.abs(hand.z_pad(s.widths_m)), atol=1e-12)

@@ -94,6 +94,13 @@ def _value(option: click.Option, value: Any, where: str) -> Any:
     if option.multiple:
         several = cast("list[Any]", value) if isinstance(value, list) else [value]
         return [_one(option, each, where) for each in several]
+    if option.nargs > 1:
+        several = cast("list[Any]", value) if isinstance(value, list) else [value]
+        if len(several) != option.nargs:
+            raise InputError(
+                f"{where} = {_shown(value)} cannot be used; a list of {option.nargs} is accepted."
+            )
+        return [_one(option, each, where) for each in several]
     return _one(option, value, where)
 
 

@@ -36,7 +36,7 @@ def template(commands: Commands) -> str:
 
 
 def _many(option: click.Option) -> str:
-    return "a list of: " if option.multiple else ""
+    return "a list of: " if option.multiple or option.nargs > 1 else ""
 
 
 def toml_value(value: Any) -> str:
