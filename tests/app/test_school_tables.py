@@ -47,3 +47,16 @@ def test_shapes_that_make_labels_doubtful_are_named() -> None:
     words = doubts(sets, {})
     assert [w[0] for w in words] == ["1", "2", "2"]
     assert "1.41 times" in words[0] and "0.80 of" in words[1] and "not closed" in words[2]
+
+
+def test_reasons_lose_their_figures_and_keep_their_words() -> None:
+    one = tried_set(np.random.default_rng(5), 3)
+    told = (
+        "lift: the object's weight is 3.4 times what the grasp bears; not simulated",
+        "lift: the object's weight is 7.0 times what the grasp bears; not simulated",
+        "lift: the object slipped 21.3 mm and turned 4.0 deg",
+    )
+    assert reasons([replace(one, failures=told)]) == {
+        "lift: the object's weight is more than the grasp bears": 2,
+        "lift: the object slipped or turned too far": 1,
+    }

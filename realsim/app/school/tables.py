@@ -109,6 +109,8 @@ def _kind(failure: str) -> str:
     stage, mark, why = failure.partition(": ")
     if mark and stage in STAGES and "slipped" in why and "turned" in why:
         return f"{stage}: the object slipped or turned too far"
+    if failure.endswith("not simulated"):
+        return f"{stage}: the object's weight is more than the grasp bears"
     return re.sub(r":[^:]*\d+\.\d+.*", "", failure)
 
 
