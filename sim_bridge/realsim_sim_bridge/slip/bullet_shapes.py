@@ -103,7 +103,7 @@ def drawn_in(parts: list[Array], margin_m: float) -> tuple[list[Array], float]:
         margin_m: wished for [m]; less is used where a part is too thin for it.
     """
     hulls = [_planes(part) for part in parts]
-    inner = [_inner_ball(planes) for planes in hulls]
+    inner = [_inner_ball(planes, part) for planes, part in zip(hulls, parts, strict=True)]
     thinnest = min(LEAST_CORE * radius for _, radius in inner)
     margin = min(margin_m, max(LEAST_MARGIN_M, thinnest))
     cores = [
@@ -121,15 +121,20 @@ def _planes(part: Array) -> Array:
     return np.unique(np.round(hull.equations, 12), axis=0)
 
 
-def _inner_ball(planes: Array) -> tuple[Array, float]:
-    """Return centre (3,) and radius [m] of the largest ball inside (a linear program)."""
+def _inner_ball(planes: Array, part: Array) -> tuple[Array, float]:
+    """Return centre (3,) and radius [m] of the largest ball inside (a linear program).
+
+    A sliver's planes may leave nothing inside, or nothing that the solver finds: the radius is 0.
+    """
     from scipy.optimize import linprog
 
     A = np.hstack([planes[:, :3], np.ones((len(planes), 1))])
     found: Any = linprog(
-        [0.0, 0.0, 0.0, -1.0], A_ub=A, b_ub=-planes[:, 3], bounds=[(None, None)] * 3 + [(0, None)]
+        [0.0, 0.0, 0.0, -1.0], A_ub=A, b_ub=-planes[:, 3], bounds=[(None, None)] * 4
     )
-    return np.asarray(found.x[:3], dtype=np.float64), float(found.x[3])
+    if found.x is None:
+        return part.mean(axis=0), 0.0
+    return np.asarray(found.x[:3], dtype=np.float64), max(float(found.x[3]), 0.0)
 
 
 def _core(part: Array, planes: Array, inside: Array, margin_m: float) -> Array:
