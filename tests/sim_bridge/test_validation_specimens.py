@@ -1,18 +1,22 @@
 """The suite's specimens, its loads, and the arm that carries a cube."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand import find_hand
+from realsim_sim_bridge.slip.engines import MujocoSettings
 from realsim_sim_bridge.slip.motion import SlipMotion
 from realsim_sim_bridge.slip.slip_test import SlipConfig
-from realsim_sim_bridge.validation.config import LabelConfig
+from realsim_sim_bridge.validation.config import LabelConfig, ValidationConfig
 from realsim_sim_bridge.validation.full_arm import carry_cube, stage_joints
 from realsim_sim_bridge.validation.known_outcomes import peak_load
 from realsim_sim_bridge.validation.loads import with_hand
-from realsim_sim_bridge.validation.specimens import READY, edge_trial, panda, specimen
+from realsim_sim_bridge.validation.specimens import READY, edge_trial, fits, panda, specimen
+from realsim_sim_bridge.validation.suite import validate
 
 SHAPES = LabelConfig().shapes
 
@@ -44,6 +48,21 @@ def test_grasps_on_the_edge_fit_the_hand_and_do_not_hang_on_the_mass(shape):
     beside = edge_trial(shape, 0.01, 5, 7, hand, shift_m=5e-5)
     moved = np.linalg.norm((beside.Ts_obj_grasp - light.Ts_obj_grasp)[:, :3, 3], axis=1)
     assert np.allclose(moved, 5e-5)
+
+
+def test_a_shape_too_large_for_the_hand_is_named_and_not_looked_for_without_end():
+    narrow = replace(find_hand("parallel"), max_opening_m=0.06)
+    assert not fits("cone", narrow) and fits("ball", narrow)
+    with pytest.raises(InputError, match=r"(?s)cone.*64 mm wide.*opens 60 mm"):
+        edge_trial("cone", 1.0, 1, 7, narrow)
+    with pytest.raises(InputError, match=r"cone.*opens 80 mm"):
+        edge_trial("cone", 1.0, 1, 7, find_hand(), lean_deg=1.0)
+
+
+def test_the_suite_names_a_hand_that_does_not_open_wide_enough_for_its_cube():
+    narrow = replace(find_hand("parallel"), max_opening_m=0.05)
+    with pytest.raises(InputError, match=r"cube of 50 mm.*opens 50 mm only.*58 mm or more"):
+        validate(MujocoSettings(), ValidationConfig.of(narrow))
 
 
 def test_a_shape_that_there_is_not_is_named():

@@ -15,7 +15,7 @@ from realsim_sim_bridge.validation.config import ValidationConfig
 from realsim_sim_bridge.validation.loads import with_hand
 from realsim_sim_bridge.validation.reference_contact import ReferenceEngine
 from realsim_sim_bridge.validation.report import CheckResult
-from realsim_sim_bridge.validation.specimens import edge_trial
+from realsim_sim_bridge.validation.specimens import edge_trial, fits
 
 Mask = NDArray[np.bool_]
 Settings = BulletSettings | MujocoSettings
@@ -180,6 +180,8 @@ def reference_labels(engine: Engine, config: ValidationConfig) -> ReferenceLabel
     held: list[Mask] = []
     passed: list[Mask] = []
     for shape, masses in asked.masses_kg:
+        if not fits(shape, config.hand):
+            continue
         for k, mass in enumerate(masses):
             trial = edge_trial(
                 shape, mass, asked.grasps * len(masses), asked.seed, config.hand,
@@ -201,10 +203,13 @@ def reference_check(engine: Engine, config: ValidationConfig) -> CheckResult:
     found, judge = (reference_labels(e, config) for e in (engine, ReferenceEngine()))
     same = found.held == judge.held
     differing = [s for s, equal in zip(found.shapes, same.tolist(), strict=True) if not equal]
+    wide = [shape for shape, _ in config.reference.masses_kg if not fits(shape, config.hand)]
+    words = f"differing: {', '.join(differing) or 'none'}"
+    words += f"; too wide for the hand: {', '.join(wide)}" if wide else ""
     return CheckResult(
         group="reference", name="labels of the contact model",
         what="share of grasps held or dropped as by an independent contact model",
         measured=float(same.mean()), unit="", limit=config.reference.agreement, at_least=True,
         detail=f"{len(same)} grasps, {int(judge.held.sum())} held; under the paper's limits "
-        f"{np.mean(found.passed == judge.passed):.3f}; differing: {', '.join(differing) or 'none'}",
+        f"{np.mean(found.passed == judge.passed):.3f}; {words}",
     )  # fmt: skip

@@ -19,12 +19,16 @@ Array = NDArray[np.float64]
 
 SIDE_M = 0.05
 """Side of the cube."""
+OPENING_M = SIDE_M + 0.008
+"""Of the hand before it closes on the cube."""
 DOWN = np.diag([1.0, -1.0, -1.0])
 """Rotation of a grasp from above."""
 READY = np.array([0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4])
 """Franka's ready pose (7,) [rad]: its joint 5 swings in the suite."""
 CLEARANCE_M = 0.003
-"""Between object and palm [m]."""
+"""Between object and palm, and between object and open fingers [m]."""
+MOST_DRAWS = 20_000
+"""Places tried for one grasp of a shape."""
 
 
 @lru_cache(maxsize=1)
@@ -57,6 +61,12 @@ def specimen(shape: str, mass_kg: float) -> SlipBody:
     return _body(_SHAPES[shape], mass_kg)
 
 
+def fits(shape: str, hand: Hand) -> bool:
+    """Return whether the open hand takes a shape between its fingers."""
+    across = np.abs(np.concatenate(specimen(shape, 1.0).parts)[:, 1]).max()
+    return bool(across < hand.max_opening_m / 2 - CLEARANCE_M)
+
+
 def ready_trial(
     body: SlipBody, Ts_obj_grasp: Array, Ts_table_grasp: Array, opening_m: float
 ) -> SlipTrial:
@@ -79,7 +89,7 @@ def cube_trial(mass_kg: float, rotations: Array, hand: Hand) -> SlipTrial:
     """Return grasps of the cube in its centre, with the hand at rotations (N, 3, 3)."""
     n = len(rotations)
     Ts = hand.grasps_of_pads(np.tile(np.eye(4), (n, 1, 1)), SIDE_M)
-    return ready_trial(cube(mass_kg), Ts, se3.from_rt(rotations, np.zeros(3)), SIDE_M + 0.008)
+    return ready_trial(cube(mass_kg), Ts, se3.from_rt(rotations, np.zeros(3)), OPENING_M)
 
 
 def edge_trial(
@@ -106,6 +116,9 @@ def edge_trial(
         shift_m: moves every grasp along a drawn direction [m].
         lean_deg: how far the surfaces that the fingers meet may lean over [deg]; what leans by more
             than the angle of friction is squeezed out.
+
+    Raises:
+        InputError: no such grasp was found; the shape is too large for the hand.
     """
     body = specimen(shape, mass_kg)
     corners = np.concatenate(body.parts)
@@ -113,7 +126,16 @@ def edge_trial(
     z_pad = hand.z_pad(high[1] - low[1])
     rng = np.random.default_rng([seed, sorted(_SHAPES).index(shape)])
     found: list[tuple[Array, Array]] = []
+    tries = MOST_DRAWS * grasps if fits(shape, hand) else 0
     while len(found) < grasps:
+        if tries == 0:
+            raise InputError(
+                f"no grasp of the validation suite's {shape}, {1e3 * (high[1] - low[1]):.0f} mm "
+                f"wide, was found for the hand '{hand.name}', which opens "
+                f"{1e3 * hand.max_opening_m:.0f} mm and has fingers of "
+                f"{-1e3 * hand.palm_face_z_m:.0f} mm; it takes a larger hand."
+            )
+        tries -= 1
         at = rng.uniform(low, high) * [1.0, 0.0, 1.0]
         turn = se3.exp_so3([0.0, rng.uniform(-np.pi, np.pi), 0.0])
         tilt = se3.exp_so3(rng.uniform(-0.5, 0.5, 3))
@@ -121,9 +143,8 @@ def edge_trial(
         T_obj_grasp = se3.from_rt(turn, at + shift_m * shift / np.linalg.norm(shift))
         T_obj_grasp[:3, 3] -= z_pad * T_obj_grasp[:3, 2]
         in_hand = se3.transform(se3.invert(T_obj_grasp), corners)
-        fits = np.abs(in_hand[:, 1]).max() < hand.max_opening_m / 2 - CLEARANCE_M
         clear = in_hand[:, 2].min() > hand.palm_face_z_m + CLEARANCE_M
-        if fits and clear and _lean_deg(body, at) <= lean_deg:
+        if clear and _lean_deg(body, at) <= lean_deg:
             found.append((T_obj_grasp, se3.from_rt(tilt @ DOWN @ turn, np.zeros(3))))
     return ready_trial(
         body, np.stack([T for T, _ in found]), np.stack([T for _, T in found]), hand.max_opening_m

@@ -33,7 +33,13 @@ from realsim_sim_bridge.validation.slip_limits import (
     press_checks,
     torque_checks,
 )
-from realsim_sim_bridge.validation.specimens import DOWN, cube_trial, edge_trial
+from realsim_sim_bridge.validation.specimens import (
+    DOWN,
+    OPENING_M,
+    SIDE_M,
+    cube_trial,
+    edge_trial,
+)
 
 # --- What the engine says its settings are, whether it repeats itself, and whether pairs are alone
 
@@ -175,10 +181,11 @@ def validate(
         make: makes an engine of settings.
 
     Raises:
-        InputError: the engine is not installed, or a part's name is unknown.
+        InputError: the engine is not installed, a part's name is unknown, or the hand does not open
+            wide enough for the suite's cube.
     """
     config = config or ValidationConfig()
-    _check_names(config.checks)
+    _check_config(config)
     config = replace(config, slip=replace(config.slip, engine=engine_settings))
     began = time.process_time()
     engine = make(engine_settings)
@@ -229,9 +236,17 @@ def validate(
     )
 
 
-def _check_names(checks: tuple[str, ...]) -> None:
-    """Raise if a part of the suite is asked for that there is not."""
+def _check_config(config: ValidationConfig) -> None:
+    """Raise if a part of the suite is asked for that there is not, or the hand takes no cube."""
+    checks, hand = config.checks, config.hand
     unknown = [c for c in checks if c not in CHECKS]
     if unknown or not checks:
         asked = f"no part '{unknown[0]}'" if unknown else "nothing to do"
         raise InputError(f"the validation suite has {asked}; its parts are: {', '.join(CHECKS)}.")
+    if hand.max_opening_m < OPENING_M:
+        raise InputError(
+            f"the validation suite grasps a cube of {1e3 * SIDE_M:.0f} mm, and the hand "
+            f"'{hand.name}' opens {1e3 * hand.max_opening_m:.0f} mm only. Validate "
+            f"the engine with a hand that opens {1e3 * OPENING_M:.0f} mm or more; its settings "
+            "are the same for every hand."
+        )
