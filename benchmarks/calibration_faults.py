@@ -14,8 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Rows
 from realsim.geometry import se3
 from realsim.records import Chessboard
 from realsim_calibration.faults.diagnose import diagnose
@@ -27,8 +27,6 @@ from realsim_calibration.faults.rotation_readings import (
     three_number_conventions,
 )
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 Rng = np.random.Generator
 BOARD = Chessboard(rows=5, columns=9, square_m=0.02)
 """Odd by odd inner corners: the same turned by 180 deg."""

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Rows
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
@@ -38,8 +38,6 @@ from realsim_calibration.inputs import (
 )
 from realsim_calibration.targets.target_text import parse_target
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 FOLDS = 5
 MIN_POINTS = 8
 """Fewest points of a view that counts: with less, a view's RMS says little."""

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from realsim.arrays import Array
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
@@ -36,7 +36,6 @@ from realsim_calibration.fit.linear_model import LinearModel
 from realsim_calibration.fit.robust_fit import solve
 from realsim_calibration.fit.view_system import camera_vector
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 BOARD = Chessboard(rows=10, columns=14, square_m=0.02)
 MIDDLE = (BOARD.points_board.max(0) + BOARD.points_board.min(0)) / 2

@@ -20,6 +20,8 @@ from capture import KINDS
 from figures import Found
 from numpy.typing import NDArray
 
+from realsim.arrays import UInt8, UInt16
+
 WIDTH, HEIGHT = 1280, 720
 FRAME_HZ, JOINT_HZ = 5, 125
 RENDERED = 4
@@ -28,7 +30,7 @@ SHIFT_PX = 37
 JOINTS = ("elbow_joint", "shoulder_lift_joint", "shoulder_pan_joint", "wrist_1_joint",
           "wrist_2_joint", "wrist_3_joint")  # fmt: skip
 """In the alphabetic order in which the UR driver sends them."""
-Images = list[tuple[NDArray[np.uint8], NDArray[np.uint16]]]
+Images = list[tuple[UInt8, UInt16]]
 
 
 def photographs() -> tuple[Any, Images]:
@@ -51,7 +53,7 @@ def photographs() -> tuple[Any, Images]:
     return lab.camera.intrinsics, images
 
 
-def frames(images: Images, n: int) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint16]]]:
+def frames(images: Images, n: int) -> Iterator[tuple[UInt8, UInt16]]:
     """Yield n frames, no two alike."""
     rng = np.random.default_rng(0)
     for k in range(n):

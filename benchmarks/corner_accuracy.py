@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Image, Int64
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import (
@@ -27,8 +27,6 @@ from realsim_calibration.detect.find import find_target
 from realsim_calibration.detect.markers import FAMILY_DICTIONARY, predefined_dictionary
 from realsim_calibration.sheets import target_image
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 SUPER = 8
 """Rays per pixel and axis."""
 BLOCK_ROWS = 60
@@ -169,16 +167,16 @@ class PointErrors:
         return len(self.errors) / max(self.visible, 1)
 
 
-Finder = Callable[[Image, Target], tuple[NDArray[np.int64], Array]]
+Finder = Callable[[Image, Target], tuple[Int64, Array]]
 
 
-def ours(image: Image, target: Target) -> tuple[NDArray[np.int64], Array]:
+def ours(image: Image, target: Target) -> tuple[Int64, Array]:
     """Return point numbers and places of our own finder."""
     d = find_target(image, target)
     return d.point_ids, d.uv
 
 
-def opencv(image: Image, target: Target) -> tuple[NDArray[np.int64], Array]:
+def opencv(image: Image, target: Target) -> tuple[Int64, Array]:
     """Return the same of OpenCV's detectors, each with the refinement that suits it best."""
     import cv2
     from cv2 import aruco
@@ -224,7 +222,7 @@ def opencv(image: Image, target: Target) -> tuple[NDArray[np.int64], Array]:
     return ids, uv.reshape(-1, 2)
 
 
-def _ends(target: Target) -> list[NDArray[np.int64]]:
+def _ends(target: Target) -> list[Int64]:
     """Return the numberings that a finder cannot tell apart."""
     n = np.arange(len(target.points_board))
     if isinstance(target, TagBoard | CharucoBoard):

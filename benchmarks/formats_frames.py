@@ -18,12 +18,10 @@ from labels_scene import camera_720p, cameras, scene
 from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Array, Array32, Counts, Mask, Rgb
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.labels import LabelRenderer
 
-Mask = NDArray[np.bool_]
-Rgb = NDArray[np.uint8]
-Counts = NDArray[np.uint16]
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("REALSIM_DATA", ROOT.parent / "shared" / "data")) / "scenes"
 PIXELS_720P = 1280 * 720
@@ -75,7 +73,7 @@ def simulated(seed: int, count: int) -> tuple[Picture, ...]:
 
 
 def _photograph(
-    normals: NDArray[np.float32], ids: NDArray[np.integer], R: NDArray[np.float64],
+    normals: Array32, ids: NDArray[np.integer], R: Array,
     rng: np.random.Generator,
 ) -> Rgb:  # fmt: skip
     """Return (H, W, 3): one lamp, a colour for each object, grain, and the sensor's noise."""
@@ -93,7 +91,7 @@ def _photograph(
     return np.ascontiguousarray(cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2RGB)[..., ::-1])
 
 
-def _grain(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float32]:
+def _grain(shape: tuple[int, ...], rng: np.random.Generator) -> Array32:
     """Return a texture of all sizes (H, W) about 1: noise, enlarged by powers of two, summed."""
     import cv2
 

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 from figures import Found
-from numpy.typing import NDArray
+
+from realsim.arrays import Array
 
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
 
@@ -35,7 +36,6 @@ from realsim.geometry import se3
 from realsim.records import GraspSet
 from tried_grasps import tried_set
 
-Array = NDArray[np.float64]
 FRAMES, QUICK_FRAMES = 60, 8
 POSES = 20_000
 GRASPS = 2_000

@@ -12,15 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Array, Mask
 from realsim.formats.grasps.scene_grasps import SceneGrasps
-from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, Mask
+from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Mesh, ObjectModel
 
-Array = NDArray[np.float64]
 WIDTH, HEIGHT, FOCAL_PX = 64, 48, 60.0
 HEIGHT_M = 0.7
 """Of the camera over the table."""

@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 from figures import Found
-from numpy.typing import NDArray
 from registration_real import ycbv_frame
 
+from realsim.arrays import Array32, Mask
 from realsim.errors import InputError
 from realsim.geometry.camera import ray_table
 from realsim.images import read_image
@@ -42,9 +42,6 @@ from realsim.rendering.depth_sensors.statistics import hole_share, local_noise
 from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.rays import BACKGROUND, PlacedMesh, RayScene
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("REALSIM_DATA", ROOT.parent / "shared" / "data"))
 XTION = profile("structured_light")

@@ -9,12 +9,11 @@ shifted by three pixels, and of those at the network's own poses.
 
 import numpy as np
 from figures import Found
-from numpy.typing import NDArray
 from registration_real import DATA, MATCHING, SHIFTED, registered, ycbv_frame
 
+from realsim.arrays import Array, Mask, UInt8
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 
-Array = NDArray[np.float64]
 REACH_PX = 6.0
 """The edge is looked for within this distance of the outline [px]."""
 STEP_PX = 0.25
@@ -22,7 +21,7 @@ LEAST_STEP = 20.0
 """Outline pixels across which the brightness changes by less per pixel [of 255] show no edge."""
 
 
-def outline_offsets(gray: NDArray[np.uint8], mask: NDArray[np.bool_]) -> tuple[Array, int]:
+def outline_offsets(gray: UInt8, mask: Mask) -> tuple[Array, int]:
     """Return signed distances (N,) from outline to image edge [px], + = outside; and all tried.
 
     Args:

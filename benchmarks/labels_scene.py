@@ -7,13 +7,12 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 
-Array = NDArray[np.float64]
 PARTS = (
     "differential/diff_ring.stl", "quadruped/microtaur/channel.stl",
     "xarm/xarm_description/meshes/xarm6/visual/link2.stl", "xarm/xarm_gripper/meshes/base_link.STL",
@@ -29,7 +28,7 @@ SPREAD_M = 0.17
 """The objects stand within this of the table's middle [m]: one hides the other."""
 
 
-def _read(path: Path) -> tuple[Array, NDArray[np.int64]]:
+def _read(path: Path) -> tuple[Array, Int64]:
     import trimesh
 
     loaded = trimesh.load(path, process=False)

@@ -27,7 +27,6 @@ import time
 
 import numpy as np
 from figures import Figure, Found, Goal, run
-from numpy.typing import NDArray
 
 from realsim.errors import MissingLibraryError
 from realsim.robots.arm import UR5
@@ -44,7 +43,6 @@ from realsim_capture_plans.planning.viewpoints import (
     with_turns,
 )
 
-Array = NDArray[np.float64]
 VIEWS, QUICK_VIEWS, SEEDS = 256, 48, 3
 AIM_HEIGHT_M = 0.05
 RING_DEG = 10.0

@@ -24,10 +24,10 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import numpy as np
-from numpy.typing import NDArray
 from registration_calibration_fit import DISTORTED, fitted, printed, tested
 from scale_shapes import SHAPES
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.mesh import symmetry_transforms
 from realsim.geometry.metrics import mssd
@@ -70,7 +70,6 @@ from realsim.registration.verify import VerifyConfig, verify_objects
 from realsim.registration.views import SampleConfig, ViewPoints, sample_views, world_cloud
 from realsim.scanning.simulated import distorted
 
-Array = NDArray[np.float64]
 OBJECTS = 15
 VIEWS = 48
 SUBSETS = (48, 24, 8, 1)

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.registration.judging import verdict
 from realsim.registration.judging.verdict import NAMES, Coefficients, Kind, VerdictConfig, terms_of
 
-Array = NDArray[np.float64]
 RIDGE = 0.003
 """Weight of the squared coefficients against the mean log-loss: tables are few, and what separates
 them perfectly would grow without bound."""
@@ -98,7 +97,7 @@ def told(sets: Mapping[Kind, Coefficients], samples: Sequence[Any], drop: str) -
         verdict.COEFFICIENTS.update(before)
 
 
-def figures(name: str, p: Array, right: NDArray[np.bool_]) -> str:
+def figures(name: str, p: Array, right: Mask) -> str:
     """Return the figures of one group of samples as a line."""
     accept, wrong = VerdictConfig().accept, ~right
     order = np.argsort(np.argsort(p, kind="stable"))
@@ -179,14 +178,14 @@ def _edges() -> Array:
     return np.array([0.0, 0.01, 0.05, 0.2, 0.4, 0.6, 0.8, 0.9, 0.95, 0.99, 1.0])
 
 
-def _bins(p: Array, right: NDArray[np.bool_]) -> list[tuple[float, float, int]]:
+def _bins(p: Array, right: Mask) -> list[tuple[float, float, int]]:
     """Return per bin that has samples the mean told, the share right, and how many."""
     which = np.clip(np.digitize(p, _edges()) - 1, 0, BINS - 1)
     return [(float(p[which == k].mean()), float(right[which == k].mean()), int((which == k).sum()))
             for k in range(BINS) if np.any(which == k)]  # fmt: skip
 
 
-def _reliability(name: str, p: Array, right: NDArray[np.bool_]) -> str:
+def _reliability(name: str, p: Array, right: Mask) -> str:
     """Return the bins as text, with their mean error weighted by samples."""
     bins = _bins(p, right)
     error = sum(n * abs(told - share) for told, share, n in bins) / max(len(p), 1)
@@ -194,7 +193,7 @@ def _reliability(name: str, p: Array, right: NDArray[np.bool_]) -> str:
     return f"{name}: expected calibration error {error:.4f}; told->right (poses): {text}"
 
 
-def _picture(p: Array, right: NDArray[np.bool_], several: NDArray[np.bool_], out: Path) -> None:
+def _picture(p: Array, right: Mask, several: Mask, out: Path) -> None:
     """Write the reliability diagram and the histogram of probabilities."""
     import matplotlib
 

@@ -11,7 +11,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scale_shapes import SHAPES
 
 from realsim.geometry import se3
@@ -26,7 +25,6 @@ from realsim.registration.simulated import (
 )
 from realsim.store.atomic import write_text
 
-Array = NDArray[np.float64]
 OBJECTS = 14
 THIN = "cup"
 """In every scene: its wall is 2 mm."""

@@ -24,10 +24,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from registration_cases import SceneKey, library, make_scene
 from registration_figures import Done
 
+from realsim.arrays import Array32
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose
 from realsim.registration.body import make_body
 from realsim.registration.config import RegistrationConfig
@@ -38,7 +38,6 @@ from realsim.registration.search.records import Wanted
 from realsim.registration.search.templates import model_templates
 from realsim.registration.simulated import DEPTH_UNIT_M
 
-Array = NDArray[np.float64]
 OBJECTS, VIEWS = 15, 256
 PILE_OBJECTS, PILE_VIEWS = 13, 256
 QUICK_VIEWS = 16
@@ -49,7 +48,7 @@ MB = 1024.0
 PNG_LEVEL = 1
 
 
-def _image(path: Path) -> NDArray[np.float32]:
+def _image(path: Path) -> Array32:
     """Return a depth image (H, W) [m]."""
     import cv2
 

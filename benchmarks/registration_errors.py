@@ -6,9 +6,9 @@ Imported by the registration benchmark. Continuous symmetries are aligned exactl
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from registration_figures import LOST_MM, RIGHT_MM, Row
 
+from realsim.arrays import Array, Mask
 from realsim.geometry import se3
 from realsim.geometry.mesh import sample_surface
 from realsim.geometry.metrics import add_s, aligned_pose, mssd_symmetric, reprojection_px
@@ -16,7 +16,6 @@ from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose
 from realsim.registration.simulated import TableScene
 from realsim.registration.simulated_lab import FULL_FOCAL_PX
 
-Array = NDArray[np.float64]
 SURFACE_POINTS = 120
 """Points of a model whose place in the image is compared."""
 
@@ -119,7 +118,7 @@ def image_errors_px(
     return errors
 
 
-def _in_image(intrinsics: CameraIntrinsics, points: Array) -> NDArray[np.bool_]:
+def _in_image(intrinsics: CameraIntrinsics, points: Array) -> Mask:
     """Return which points (N, 3) of the camera's frame are in its image (N,)."""
     i, z = intrinsics, np.maximum(points[:, 2], 1e-3)
     u, v = i.fx * points[:, 0] / z + i.cx, i.fy * points[:, 1] / z + i.cy

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from registration_cases import SceneKey, library, make_scene, starts_of, stream
 from registration_errors import camera_errors, image_errors_px, rows_of, rows_of_unknown
 from registration_figures import LOST_MM, Done, Row
@@ -23,7 +22,6 @@ from realsim.registration.search.find import find_objects
 from realsim.registration.search.records import Wanted
 from realsim.registration.simulated import TableScene
 
-Array = NDArray[np.float64]
 ABSENT = 4
 """Models that are wanted and not in the scene."""
 

@@ -12,15 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 from realsim.models.convex import convex_parts
 from realsim.models.convex_config import ConvexConfig
 from realsim.records import ObjectModel, ObjectPose
 
-Array = NDArray[np.float64]
 SCALE = 10.0
 """Metres of the engine per metre."""
 GRAVITY = 9.81

@@ -11,12 +11,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from registration_cases import moved_start, stream
 from registration_errors import rows_of
 from registration_figures import Done, Row
 from registration_methods import Given, registered
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose
 from realsim.registration.body import make_body
@@ -25,7 +25,6 @@ from realsim.registration.judge import Poses, judge_objects
 from realsim.registration.many_views import comparer_on, register_many
 from realsim.registration.search.records import Region, Wanted
 
-Array = NDArray[np.float64]
 ROUNDS = 3
 JUDGED_ROUNDS = 2
 KINDS = ("near", "slid", "turned", "near", "place")

@@ -25,9 +25,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from registration_figures import Done
 
+from realsim.arrays import Array
 from realsim.formats.bop import scene as bop
 from realsim.formats.bop.keyframes import read_keyframe_poses
 from realsim.formats.bop.models import load_models
@@ -42,7 +42,6 @@ from realsim.registration.refinement.views_only import refine_views
 from realsim.registration.register import Registration, register_scene
 from realsim.registration.views import SampleConfig, sample_views
 
-Array = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("REALSIM_DATA", ROOT.parent / "shared" / "data"))
 MATCHING, SHIFTED = (50, 51, 54), (52, 53)

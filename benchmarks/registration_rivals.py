@@ -10,12 +10,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from registration_cases import starts_of
 from registration_errors import rows_of
 from registration_figures import Done, Row
 from registration_methods import Given
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.depth import points_from_depth
@@ -26,7 +26,6 @@ from realsim.registration.body import Body, make_body
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.single_view import SingleViewConfig, fit_single_view
 
-Array = NDArray[np.float64]
 CONFIG = SingleViewConfig()
 SAMPLES = 4000
 """Points of the whole model, for the variants that seek the scene's points on it."""

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from labels_scene import cameras
 from labels_scene import scene as labels_scene
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.records import (
@@ -115,9 +115,7 @@ def _save_scene(store: SessionStore, rng: np.random.Generator) -> None:
         save_grasps(store, _grasps(p.instance, p.mesh.vertices, n, rng))
 
 
-def _grasps(
-    instance: int, vertices: NDArray[np.float64], n: int, rng: np.random.Generator
-) -> GraspSet:
+def _grasps(instance: int, vertices: Array, n: int, rng: np.random.Generator) -> GraspSet:
     at = vertices[rng.integers(0, len(vertices), n)]
     Ts = se3.from_rt(se3.exp_so3(rng.normal(size=(n, 3))), at)
     stages = rng.integers(0, 5, n)

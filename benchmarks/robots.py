@@ -36,10 +36,10 @@ from pathlib import Path
 
 import numpy as np
 from figures import Figure, Found, Goal, run
-from numpy.typing import NDArray
 from school_cases import KEEP, cut_shapes
 
 from realsim.app.console import Console
+from realsim.arrays import Array, Mask
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.robots.arm import RobotArm, find_arm
@@ -51,7 +51,6 @@ from realsim_capture_plans import PlanConfig, d405_mount
 from realsim_capture_plans.planning.advise import advise
 from realsim_capture_plans.planning.make import hemisphere_plan
 
-Array = NDArray[np.float64]
 EXAMPLES = Path(__file__).parents[1] / "examples" / "robots"
 POSES, QUICK_POSES = 150, 24
 """Random poses an arm is asked for: three times as many as it reaches, or so."""
@@ -129,7 +128,7 @@ def _poses(arm: RobotArm, count: int, seed: int) -> Array:
     return Ts
 
 
-def _searched(arm: RobotArm, Ts: Array, starts: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+def _searched(arm: RobotArm, Ts: Array, starts: int, rng: np.random.Generator) -> Mask:
     """Return which poses Pinocchio's damped Newton steps reach inside the limits from any start."""
     import pinocchio as pin  # pyright: ignore[reportMissingImports]
 

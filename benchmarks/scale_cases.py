@@ -8,16 +8,15 @@ off by x0.87 or x1.15. Depth is what a D405 stores: 16 bit, 0.1 mm. All methods 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scale_shapes import SHAPES, resting_rotation
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim.registration.evidence import DepthFrame
 from realsim.scanning.scale.result import Similarity
 from realsim.scanning.simulated import ScanLabConfig, ScanViews, distorted, scan_views, standing
 
-Array = NDArray[np.float64]
 DEPTH_UNIT_M = 1e-4
 """The D405's depth unit [m]; images are kept in it, as in a session."""
 DISTORTION = 0.02

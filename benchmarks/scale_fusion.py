@@ -28,8 +28,8 @@ from typing import Any
 
 import numpy as np
 from figures import Figure, Found, Goal, run
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.geometry.distance_field import raycasting_scene
@@ -40,7 +40,6 @@ from realsim.records import Mesh
 from realsim.scanning.fusion.fuse import FusedObject, FusionConfig, FusionFrame, fuse_object
 from realsim.scanning.simulated import ScanLabConfig, ScanViews, scan_views, standing
 
-Array = NDArray[np.float64]
 PACKAGES = ("realsim", "numpy", "open3d-cpu")
 OBJECTS: tuple[tuple[str, float, tuple[float, float, float]], ...] = (
     ("mug", 0.11, (0, 0, 0)),
@@ -118,14 +117,14 @@ def _score(truth: Mesh, seen: Array, mesh: Mesh, judged: Array) -> dict[str, flo
     }
 
 
-def _masked(views: ScanViews, fused: FusedObject) -> list[NDArray[np.float32]]:
+def _masked(views: ScanViews, fused: FusedObject) -> list[Array32]:
     """Return the depth of what is above the table near the object: the rivals get it for free."""
     rays = ray_table(views.intrinsics)
     T = se3.invert(fused.plane.T_world_table)
     local = se3.transform(T, fused.mesh.vertices)
     low, high = local.min(0) - 0.01, local.max(0) + 0.01
     low[2] = 0.003
-    out: list[NDArray[np.float32]] = []
+    out: list[Array32] = []
     for f in views.frames:
         p = se3.transform(T @ f.T_world_cam, rays * f.depth_m[..., None])
         inside = np.all((p > low) & (p < high), axis=-1)
@@ -133,7 +132,7 @@ def _masked(views: ScanViews, fused: FusedObject) -> list[NDArray[np.float32]]:
     return out
 
 
-def _open3d_tsdf(views: ScanViews, depths: Sequence[NDArray[np.float32]]) -> Mesh:
+def _open3d_tsdf(views: ScanViews, depths: Sequence[Array32]) -> Mesh:
     """Return Open3D's own fusion at the robot's poses."""
     o3d = import_open3d()
     grid = o3d.t.geometry.VoxelBlockGrid(
@@ -153,7 +152,7 @@ def _open3d_tsdf(views: ScanViews, depths: Sequence[NDArray[np.float32]]) -> Mes
     )
 
 
-def _poisson(views: ScanViews, depths: Sequence[NDArray[np.float32]]) -> Mesh:
+def _poisson(views: ScanViews, depths: Sequence[Array32]) -> Mesh:
     """Return Poisson's surface of the joined cloud at the robot's poses, cut where it has none."""
     o3d = import_open3d()
     rays = ray_table(views.intrinsics)

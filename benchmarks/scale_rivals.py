@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scale_cases import Case, stream
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.geometry.mesh import sample_surface
@@ -20,7 +20,6 @@ from realsim.records import CameraIntrinsics, Mesh
 from realsim.registration.evidence import DepthFrame
 from realsim.scanning.scale.result import Similarity
 
-Array = NDArray[np.float64]
 ABOVE_M = 0.004
 """What is this low over the table is taken for table [m]."""
 AROUND_M = 0.25

@@ -32,8 +32,8 @@ from typing import Any
 
 import numpy as np
 from figures import Figure, Found, Goal, run
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.images import png_bytes
 from realsim.records import CameraIntrinsics, Mesh
@@ -45,7 +45,6 @@ from realsim.scanning.sfm.result import Poses, SfmResult
 from realsim_capture_plans import PlanConfig, hemisphere_plan
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
 
-Array = NDArray[np.float64]
 PACKAGES = ("realsim", "numpy", "pycolmap")
 HAND_EYE_MM, HAND_EYE_DEG = 0.5, 0.1
 SHEET_M, SHEET_PX = (0.6, 0.45), 1800

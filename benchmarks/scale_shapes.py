@@ -9,15 +9,14 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import parts_solids as solids
 from realsim.geometry import se3
 from realsim.geometry.mesh import to_trimesh, welded_mesh
 from realsim.geometry.parts import object_model, part_names
 from realsim.records import Mesh
 
-Array = NDArray[np.float64]
 FACETS = 96
 """Facets around a turned shape."""
 RESIZED = {"cube": 1.3, "knob": 1.15}

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 from figures import Found
-from numpy.typing import NDArray
 from school_cases import in_processes, slip_config
 
+from realsim.arrays import Mask
 from realsim.formats.grasps.acronym import read_acronym
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
@@ -27,7 +27,6 @@ from realsim_sim_bridge.slip.world import SlipBody
 from realsim_sim_bridge.validation.labels import PATIENT
 from realsim_sim_bridge.validation.specimens import ready_trial
 
-Mask = NDArray[np.bool_]
 ENGINES = ("pybullet", "mujoco")
 DENSITY = 150.0
 """ACRONYM's [kg/m^3]."""

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 from figures import Found
-from numpy.typing import NDArray
 from school_cases import (
     CONDITIONS,
     MARGINAL_DENSITY,
@@ -30,6 +29,7 @@ from school_cases import (
     spent,
 )
 
+from realsim.arrays import Mask
 from realsim.formats.grasps.scene_grasps import executed
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.cross_check import wilson_interval
@@ -43,7 +43,6 @@ from realsim_sim_bridge.validation.config import ReferenceConfig, ValidationConf
 from realsim_sim_bridge.validation.labels import PATIENT, ReferenceLabels, reference_labels
 from realsim_sim_bridge.validation.reference_contact import ReferenceEngine
 
-Mask = NDArray[np.bool_]
 ENGINES = ("pybullet", "mujoco")
 KINDS = ("reference", "fast", "sure")
 FULL = (40, 16)

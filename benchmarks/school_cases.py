@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from registration_jobs import die_with_parent
 from school_shapes import SHAPES
 
@@ -153,7 +152,6 @@ def slip_config(
     return replace(config, physics=physics)
 
 
-Array = NDArray[np.float64]
 CONVEX = ConvexConfig(thresholds=(0.05, 0.02), max_parts=32)
 """Cut until nine of the ten kinds have 16 to 32 parts."""
 QUICK_KINDS = ("mug", "pipe", "ring")

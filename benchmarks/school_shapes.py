@@ -8,13 +8,12 @@ are, so that the parts fill them well.
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import parts_solids as solids
 from realsim.geometry.parts import part
 from realsim.records import Mesh
 
-Array = NDArray[np.float64]
 FACETS = 16
 """Around a turned shape."""
 FEWER = 12

@@ -23,10 +23,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, MissingLibraryError
 from realsim.geometry import se3
-
-Array = NDArray[np.float64]
 
 APT_PACKAGES = {
     "libEGL": "libegl1", "libGL": "libgl1", "libusb": "libusb-1.0-0", "libgomp": "libgomp1",

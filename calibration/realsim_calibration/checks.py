@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.records import ArmErrorMap, Check
 from realsim_calibration.results import HandEyeReport
 
-Array = NDArray[np.float64]
 Verdict = Literal["good", "warn", "bad", "unknown"]
 
 

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, HandEye, Target
@@ -21,8 +20,6 @@ from realsim_calibration.screening import (
     screen,
 )
 from realsim_calibration.views import BoardView
-
-Array = NDArray[np.float64]
 
 
 def calibrate_hand_eye(

@@ -4,14 +4,13 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check, HandEye, RobotErrorMap, Target
 from realsim.records.checked_arrays import frozen
 from realsim.untrusted.own_json import Real
 
-Array = NDArray[np.float64]
 Mode = Literal["eye_in_hand", "eye_to_hand"]
 
 
@@ -68,7 +67,7 @@ class ViewReport:
     """(4, 4) as the controller gave it [m]."""
     joints: Array | None
     """(n,) joint angles [rad]; None where they are not known."""
-    point_ids: NDArray[np.int64]
+    point_ids: Int64
     """(n,) which points of the target were detected."""
     uv: Array
     """(n, 2) detected points [px]."""

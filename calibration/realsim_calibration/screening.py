@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
@@ -36,7 +36,6 @@ from realsim_calibration.fit.robot_error import RobotErrorConfig
 from realsim_calibration.results import Mode
 from realsim_calibration.views import BoardView
 
-Array = NDArray[np.float64]
 TWIN_FLOOR_PX = 0.1
 """Poses that fit the corners to a tenth of a pixel are equally good."""
 

@@ -3,20 +3,19 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Target
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class TargetDetection:
     """The points of a target that were found in one image; integer pixels are pixel centres."""
 
-    point_ids: NDArray[np.int64]
+    point_ids: Int64
     """(n,) rows of `target.points_board`, ascending."""
     uv: Array
     """(n, 2) where they are in the image [px]."""

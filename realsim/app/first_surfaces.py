@@ -3,13 +3,11 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32
 from realsim.records import CameraIntrinsics
 from realsim.rendering.casting.pixel_caster import PixelCaster
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
-
-Array = NDArray[np.float64]
 
 
 class FirstSurfaces:
@@ -21,9 +19,7 @@ class FirstSurfaces:
         # The last entry answers "nothing".
         self._instances = np.array([*(p.instance for p in placed), BACKGROUND], np.int32)
 
-    def look(
-        self, intrinsics: CameraIntrinsics, T_world_cam: Array
-    ) -> tuple[NDArray[np.int32], Array]:
+    def look(self, intrinsics: CameraIntrinsics, T_world_cam: Array) -> tuple[Int32, Array]:
         """Return instance (H, W), -1 = none, and depth along z (H, W) [m], NaN = nothing.
 
         Args:

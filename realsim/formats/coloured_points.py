@@ -4,16 +4,15 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
 from realsim.geometry import se3
 from realsim.geometry.clouds import voxel_mean
 from realsim.geometry.depth import edge_mask, points_from_depth
 
-Array = NDArray[np.float64]
 FRAMES = 64
 """Images taken of a long scene, evenly; more see the same surfaces again."""
 POINTS_PER_FRAME = 30_000
@@ -32,7 +31,7 @@ class ColouredPoints(NamedTuple):
 
     points: Array
     """(N, 3) in world [m]."""
-    colours: NDArray[np.uint8]
+    colours: UInt8
     """(N, 3) RGB."""
 
 

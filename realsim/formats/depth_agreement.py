@@ -9,15 +9,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.depth import points_from_depth
 from realsim.records import CameraIntrinsics
 
-Array = NDArray[np.float64]
-DepthImage = NDArray[np.float32]
+DepthImage = Array32
 DepthOf = Callable[[int], tuple[DepthImage, CameraIntrinsics]]
 """Of a view's place: its depth (H, W) [m], 0 = none, and its camera."""
 SAMPLED_VIEWS = 24

@@ -25,6 +25,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.formats.depth_agreement import DepthOf, disagreement_mm, near_pairs, sampled_views
 from realsim.formats.labelled_scene import LabelledFrame
@@ -33,7 +34,6 @@ from realsim.geometry.camera import project
 from realsim.interop import T_CAM_GL
 from realsim.records import CameraIntrinsics
 
-Array = NDArray[np.float64]
 Direction = Literal["as stated", "inverted", "other axes", "inverted, other axes"]
 STATED: Direction = "as stated"
 WORSE_BY = 3.0
@@ -396,7 +396,7 @@ def poses_checked_by_depth(
 
 def depth_ratio(
     depth_m: NDArray[Any],
-    mask: NDArray[np.bool_] | None,
+    mask: Mask | None,
     intrinsics: CameraIntrinsics,
     T_cam_obj: Array,
     *,

@@ -8,12 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import Array, UInt8, UInt16
 from realsim.records import CameraIntrinsics
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -24,9 +20,9 @@ class SourceFrame:
     """What messages call it: a file name, or topic and time."""
     time_s: float
     """Time stamp [s] of the source's clock; its number where the source has no clock."""
-    rgb: NDArray[np.uint8]
+    rgb: UInt8
     """(H, W, 3) colour."""
-    depth_counts: NDArray[np.uint16] | None = None
+    depth_counts: UInt16 | None = None
     """(H, W) counts of the source's depth unit on the colour image's pixels, 0 = none."""
     joints: Array | None = None
     """(n,) joint angles [rad] at the time of the frame."""

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.errors import InputError
 from realsim.untrusted.json_text import parsed_json
 
@@ -60,19 +60,19 @@ class CheckedGroup:
             raise self.wrong(f"'{name}' is no group.")
         return CheckedGroup(found, self._path)
 
-    def numbers(self, name: str, shape: Shape) -> NDArray[np.float64]:
+    def numbers(self, name: str, shape: Shape) -> Array:
         """Return an array of numbers as float64; None in the shape = any length."""
         dataset = self._dataset(name, "fiu", shape)
         return np.asarray(self._read(name, dataset), dtype=np.float64)
 
-    def integers(self, name: str, shape: Shape) -> NDArray[np.int64]:
+    def integers(self, name: str, shape: Shape) -> Int64:
         """Return an array of whole numbers."""
         dataset = self._dataset(name, "iu", shape)
         if dataset.dtype == np.uint64:
             raise self.wrong(f"'{name}' is uint64; numbers of up to 63 bits are expected.")
         return np.asarray(self._read(name, dataset), dtype=np.int64)
 
-    def booleans(self, name: str, shape: Shape) -> NDArray[np.bool_]:
+    def booleans(self, name: str, shape: Shape) -> Mask:
         """Return an array of yes and no."""
         dataset = self._dataset(name, "b", shape)
         return np.asarray(self._read(name, dataset)).view(np.uint8) != 0

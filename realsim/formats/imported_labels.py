@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 
 from realsim import images
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.bop.labels import mask_path
 from realsim.formats.labelled_scene import LabelledObject, LabelledScene
 from realsim.records import bop_units as units
-from realsim.records.checked_arrays import Array, rigid
+from realsim.records.checked_arrays import rigid
 from realsim.store import SessionStore
 from realsim.store.atomic import json_bytes
 

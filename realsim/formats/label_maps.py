@@ -7,18 +7,18 @@ normals       three channels: round((n + 1) * 32767.5), camera axes; 0 0 0 = not
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array32, Counts, Int32
 from realsim.errors import InputError
 
-Counts = NDArray[np.uint16]
 FULL = 65535
 NO_OBJECT = -1
 BLOCK_PX = 1 << 13
 """Pixels converted at a time: what is computed in between stays in the cache."""
 
 
-def instance_counts(ids: NDArray[np.int32]) -> Counts:
+def instance_counts(ids: Int32) -> Counts:
     """Return the instance map (H, W) of instances (H, W), -1 = none.
 
     Raises:
@@ -32,7 +32,7 @@ def instance_counts(ids: NDArray[np.int32]) -> Counts:
     return (ids + 1).astype(np.uint16)
 
 
-def instances_of(counts: Counts) -> NDArray[np.int32]:
+def instances_of(counts: Counts) -> Int32:
     """Return instances (H, W), -1 = none, of an instance map."""
     return counts.astype(np.int32) - 1
 
@@ -58,7 +58,7 @@ def coordinate_counts(points_m: ArrayLike, low_m: ArrayLike, high_m: ArrayLike) 
     return out
 
 
-def coordinates_of(counts: Counts, low_m: ArrayLike, high_m: ArrayLike) -> NDArray[np.float32]:
+def coordinates_of(counts: Counts, low_m: ArrayLike, high_m: ArrayLike) -> Array32:
     """Return points (..., 3) [m] of an object's counts; NaN where there is no object.
 
     Args:
@@ -72,7 +72,7 @@ def coordinates_of(counts: Counts, low_m: ArrayLike, high_m: ArrayLike) -> NDArr
     return points
 
 
-def normal_counts(normals: NDArray[np.float32]) -> Counts:
+def normal_counts(normals: Array32) -> Counts:
     """Return unit normals (..., 3) as counts; zero vectors (nothing) become 0 0 0."""
     flat = np.ascontiguousarray(normals).reshape(-1, 3)
     out = np.empty(flat.shape, np.uint16)
@@ -87,7 +87,7 @@ def normal_counts(normals: NDArray[np.float32]) -> Counts:
     return out.reshape(normals.shape)
 
 
-def normals_of(counts: Counts) -> NDArray[np.float32]:
+def normals_of(counts: Counts) -> Array32:
     """Return normals (..., 3) of counts, unit to 3e-5; zeros where there is nothing."""
     normals = (counts / np.float32(FULL / 2) - 1).astype(np.float32)
     normals[~counts.any(axis=-1)] = 0

@@ -10,14 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import Array, Mask
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.records import CameraIntrinsics, ObjectModel
-from realsim.records.checked_arrays import Array, rigid
-
-Mask = NDArray[np.bool_]
+from realsim.records.checked_arrays import rigid
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.errors import InputError
 from realsim.untrusted.json_text import parsed_json
 from realsim.untrusted.values import mapping
@@ -60,15 +61,15 @@ class CheckedTable:
             raise self.wrong(f"there is no metadata '{key.decode()}' in JSON.") from error
         return mapping(parsed_json(text, where), where)
 
-    def numbers(self, name: str, rows: slice) -> NDArray[np.float64]:
+    def numbers(self, name: str, rows: slice) -> Array:
         """Return rows of a column of float64."""
         return self._filled(name, "double", rows).to_numpy(zero_copy_only=False)
 
-    def integers(self, name: str, rows: slice) -> NDArray[np.int64]:
+    def integers(self, name: str, rows: slice) -> Int64:
         """Return rows of a column of int64."""
         return self._filled(name, "int64", rows).to_numpy(zero_copy_only=False)
 
-    def booleans(self, name: str, rows: slice) -> NDArray[np.bool_]:
+    def booleans(self, name: str, rows: slice) -> Mask:
         """Return rows of a column of yes and no."""
         return self._filled(name, "bool", rows).to_numpy(zero_copy_only=False)
 
@@ -76,21 +77,21 @@ class CheckedTable:
         """Return rows of a column of texts."""
         return tuple(self._filled(name, "string", rows).to_pylist())
 
-    def lists(self, name: str, length: int, rows: slice) -> NDArray[np.float64]:
+    def lists(self, name: str, length: int, rows: slice) -> Array:
         """Return rows of a column of fixed lists, (rows, length)."""
         kind = f"fixed_size_list<element: double>[{length}]"
         flat = self._filled(name, kind, rows).flatten()
         self._require_full(name, flat)
         return flat.to_numpy(zero_copy_only=False).reshape(-1, length)
 
-    def ragged(self, name: str, rows: slice) -> tuple[NDArray[np.int64], NDArray[Any]]:
+    def ragged(self, name: str, rows: slice) -> tuple[Int64, NDArray[Any]]:
         """Return (starts, values) of rows of a column of lists."""
         column = self._filled(name, "list<element: ", rows)
         flat = column.flatten()
         self._require_full(name, flat)
         return _starts(column), flat.to_numpy(zero_copy_only=False)
 
-    def inner(self, name: str, rows: slice, length: int) -> NDArray[np.float64]:
+    def inner(self, name: str, rows: slice, length: int) -> Array:
         """Return all inner lists (samples, length) of rows of a column of lists of lists."""
         column = self._filled(name, "list<element: list<element: double>>", rows)
         samples = column.flatten()
@@ -123,7 +124,7 @@ class CheckedTable:
             )
 
 
-def _starts(column: Any) -> NDArray[np.int64]:
+def _starts(column: Any) -> Int64:
     """Return where each list begins, and the end, counted from the first."""
     # A slice keeps the offsets of the whole.
     offsets = column.offsets.to_numpy(zero_copy_only=False).astype(np.int64)

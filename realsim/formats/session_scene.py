@@ -14,14 +14,14 @@ from typing import Any, Literal
 import numpy as np
 
 from realsim import images
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.formats.bop.labels import mask_path
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.imported_labels import ImportedLabels, load_imported
-from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, Mask
+from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.records import GraspSet, ObjectModel
 from realsim.records import bop_units as units
-from realsim.records.checked_arrays import Array
 from realsim.store import SessionStore, load_grasps, load_scene
 from realsim.store.session_store import depth_path, rgb_path
 from realsim.store.trajectories import load_trajectories

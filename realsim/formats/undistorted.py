@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Array, Array32, Mask, UInt16
 from realsim.formats.folders.depth_evidence import read_counts
 from realsim.formats.grasps.scene_grasps import SceneGrasps
-from realsim.formats.labelled_scene import LabelledFrame, LabelledScene, Mask
+from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
 from realsim.records import CameraIntrinsics, ObjectModel
-from realsim.records.checked_arrays import Array
 
 
 class UndistortedScene:
@@ -133,7 +132,7 @@ def camera_key(camera: CameraIntrinsics) -> Key:
 
 
 @lru_cache(maxsize=2)
-def _looked_up(key: Key) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _looked_up(key: Key) -> tuple[Array32, Array32]:
     """Return where each pixel of the ideal camera lies in the raw image, x and y (H, W) [px]."""
     import cv2
 
@@ -145,7 +144,7 @@ def _looked_up(key: Key) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     return maps[0], maps[1]
 
 
-def nearest(image: NDArray[np.uint16], camera: CameraIntrinsics) -> NDArray[np.uint16]:
+def nearest(image: UInt16, camera: CameraIntrinsics) -> UInt16:
     """Return a single-channel image (H, W) undistorted, each pixel from the nearest raw one."""
     import cv2
 

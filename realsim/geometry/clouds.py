@@ -3,13 +3,13 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.robust import tukey_weights
 
-Array = NDArray[np.float64]
 REFINE_STEPS = 8
 """Re-weighted least squares settles to 1e-9 m in 4 to 6 steps on every plane tried."""
 
@@ -21,7 +21,7 @@ class VoxelMeans(NamedTuple):
     """(M, 3) weighted means [m]."""
     weights: Array
     """(M,) sum of the weights."""
-    counts: NDArray[np.int64]
+    counts: Int64
     """(M,) how many points fell into the voxel."""
     attributes: Array
     """(M, K) weighted means of the attributes."""
@@ -32,7 +32,7 @@ def voxel_mean(
     size: float,
     weights: ArrayLike | None = None,
     attributes: ArrayLike | None = None,
-    labels: NDArray[np.int64] | None = None,
+    labels: Int64 | None = None,
 ) -> VoxelMeans:
     """Return the weighted mean of the points in each voxel.
 
@@ -69,7 +69,7 @@ def fit_plane_ransac(
     rng: np.random.Generator,
     tolerance_m: float,
     iterations: int = 300,
-) -> tuple[Array, float, NDArray[np.bool_]]:
+) -> tuple[Array, float, Mask]:
     """Return the plane n.p = offset with the most points within `tolerance_m`.
 
     Args:
@@ -108,7 +108,7 @@ def fit_plane_ransac(
 
 def refine_plane(
     points: ArrayLike, normal: ArrayLike, offset: float, tolerance_m: float
-) -> tuple[Array, float, NDArray[np.bool_]]:
+) -> tuple[Array, float, Mask]:
     """Return the plane after re-weighted least squares with Tukey's weights.
 
     Each step is the eigenvector of least variance of the weighted points; Tukey's weight

@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from realsim.arrays import Array
+
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Of linear red, green and blue."""
 

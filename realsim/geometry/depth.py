@@ -1,14 +1,14 @@
 """From a depth image to points and normals, and where a depth image is not to be trusted."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Array32, Int64, Mask
 from realsim.errors import InputError, UnitError
 from realsim.geometry.camera import ray_table
 from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim.records import CameraIntrinsics
 
-Array = NDArray[np.float64]
 SECOND_DIFFERENCE_STEP_PX = 8
 """Stereo noise is correlated over a few pixels: at 4 px differences still missed three tenths."""
 FARTHEST_M = 20.0
@@ -17,7 +17,7 @@ UNIT_STRIDE = 16
 """Every so many rows and columns tell the unit."""
 
 
-def check_depth(depth_m: NDArray[np.float32], intrinsics: CameraIntrinsics) -> None:
+def check_depth(depth_m: Array32, intrinsics: CameraIntrinsics) -> None:
     """Check that a depth image belongs to the camera and is in metres.
 
     Raises:
@@ -46,8 +46,8 @@ def check_depth(depth_m: NDArray[np.float32], intrinsics: CameraIntrinsics) -> N
 
 
 def points_from_depth(
-    depth_m: NDArray[np.float32], intrinsics: CameraIntrinsics, stride: int = 1
-) -> tuple[Array, NDArray[np.int64]]:
+    depth_m: Array32, intrinsics: CameraIntrinsics, stride: int = 1
+) -> tuple[Array, Int64]:
     """Return the measured points of a depth image and the pixels they come from.
 
     Args:
@@ -67,9 +67,7 @@ def points_from_depth(
     return points, np.stack([u, v], -1).astype(np.int64) * stride
 
 
-def edge_mask(
-    depth_m: NDArray[np.float32], jump: ArrayLike, margin_px: int = 1
-) -> NDArray[np.bool_]:
+def edge_mask(depth_m: Array32, jump: ArrayLike, margin_px: int = 1) -> Mask:
     """Return where (H, W) a depth image jumps: flying pixels live there.
 
     A pixel is at an edge if the measured depths within `margin_px` of it span more than `jump`.
@@ -88,7 +86,7 @@ def edge_mask(
     return np.asarray((far > 0) & (far - near > np.asarray(jump)), dtype=bool)
 
 
-def depth_noise_per_m(depths_m: list[NDArray[np.float32]]) -> float:
+def depth_noise_per_m(depths_m: list[Array32]) -> float:
     """Return k of the stereo noise model sigma_z = k z^2 [1/m], measured from the images.
 
     Of a plane, however it lies, the inverse depth w = 1 / z is linear in the pixel, so the second

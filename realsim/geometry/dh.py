@@ -12,12 +12,12 @@ deltas to the nominal numbers (a UR controller's calibration.conf).
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 
-Array = NDArray[np.float64]
 DH_NUMBERS = ("theta", "alpha", "a", "d")
 """Order in which the 4 n errors of an arm are numbered, joint by joint inside each."""
 DIFFERENCE = 1e-6

@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Array32
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.interop import import_open3d
 from realsim.records import Mesh
 
-Array = NDArray[np.float64]
 MARGIN_CELLS = 6
 """Cells around the bounding box in which the field is interpolated, not extended."""
 NEAR_CELLS = 7
@@ -39,7 +39,7 @@ _memory: "OrderedDict[str, DistanceField]" = OrderedDict()
 
 @njit(inline="always")
 def sample(
-    grid: NDArray[np.float32], origin: Array, cell: float, x: float, y: float, z: float
+    grid: Array32, origin: Array, cell: float, x: float, y: float, z: float
 ) -> tuple[float, float, float, float]:
     """Return distance and gradient (d, gx, gy, gz) at one point of the mesh's frame."""
     nx, ny, nz = grid.shape
@@ -75,7 +75,7 @@ def sample(
 
 @njit
 def _sample_all(
-    grid: NDArray[np.float32], origin: Array, cell: float, points: Array, T: Array
+    grid: Array32, origin: Array, cell: float, points: Array, T: Array
 ) -> tuple[Array, Array]:
     """Return distances (N,) and gradients (N, 3), in the mesh's frame, of points mapped by T."""
     n = len(points)
@@ -95,7 +95,7 @@ def _sample_all(
 class DistanceField:
     """The signed distance to one mesh."""
 
-    grid: NDArray[np.float32]
+    grid: Array32
     """(X, Y, Z) signed distance at the nodes, inside negative [m]."""
     origin: Array
     """(3,) position of node (0, 0, 0) in the mesh's frame [m]."""
@@ -133,7 +133,7 @@ class DistanceField:
         return known
 
     @property
-    def lattice(self) -> tuple[NDArray[np.float32], Array, float]:
+    def lattice(self) -> tuple[Array32, Array, float]:
         """Grid, origin and cell: what compiled loops take (see `sample`)."""
         return self.grid, self.origin, self.cell
 
@@ -201,7 +201,7 @@ def _compute(mesh: Mesh, cells: int) -> DistanceField:
     return DistanceField(grid=grid, origin=origin, cell=cell)
 
 
-def _signed_distance(scene: Any, points: Array) -> NDArray[np.float32]:
+def _signed_distance(scene: Any, points: Array) -> Array32:
     """Return the exact signed distance at points (..., 3), inside negative."""
     o3d = import_open3d()
     query = o3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32))

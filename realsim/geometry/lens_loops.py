@@ -1,12 +1,9 @@
 """The lens in compiled loops; `camera` is (12,) fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6, or longer."""
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import Array
 from realsim.compiled import njit
 from realsim.geometry import lens
 
-Array = NDArray[np.float64]
 _bent = njit(lens.bent)
 _bent_slopes = njit(lens.bent_slopes)
 

@@ -10,8 +10,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh_files import check_unit, load_mesh, ply_bytes, save_ply
@@ -50,7 +51,6 @@ __all__ = [
     "welded_mesh",
 ]
 
-Array = NDArray[np.float64]
 GREY = 160
 """Colour of a part without colour when it is merged with parts that have one."""
 
@@ -61,7 +61,7 @@ def transformed(mesh: Mesh, T: ArrayLike) -> Mesh:
     return replace(mesh, vertices=se3.transform(T, mesh.vertices))
 
 
-def vertex_colors(mesh: Mesh) -> NDArray[np.uint8] | None:
+def vertex_colors(mesh: Mesh) -> UInt8 | None:
     """Return RGB per vertex (V, 3): its own, or the texture's at its coordinates, or None."""
     if mesh.colors is not None or mesh.texture is None or mesh.uv is None:
         return mesh.colors

@@ -15,11 +15,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, UInt8
 from realsim.errors import InputError, UnitError
 from realsim.geometry.mesh_shape import vertex_normals, welded_mesh
 from realsim.records import Mesh
 
-Array = NDArray[np.float64]
 Unit = Literal["m", "mm"]
 
 METRES: dict[str, float] = {"m": 1.0, "mm": 1e-3}
@@ -180,8 +180,8 @@ def _quiet(name: str) -> Generator[None]:
 def _missing_looks(
     path: Path,
     beside: Any,
-    colors: NDArray[np.uint8] | None,
-    texture: NDArray[np.uint8] | None,
+    colors: UInt8 | None,
+    texture: UInt8 | None,
 ) -> list[str]:
     """Return in words what is missing of a mesh's look, and what stands for it."""
     if texture is not None:
@@ -209,7 +209,7 @@ def _missing_looks(
 
 def _appearance(
     loaded: Any, n: int, broken: list[str]
-) -> tuple[NDArray[np.uint8] | None, Array | None, NDArray[np.uint8] | None]:
+) -> tuple[UInt8 | None, Array | None, UInt8 | None]:
     """Return colours, texture coordinates and texture of a trimesh mesh, where it has them.
 
     A texture that cannot be decoded is added to `broken`.
@@ -229,7 +229,7 @@ def _appearance(
     return None, None, None
 
 
-def _texels(image: Any, broken: list[str]) -> NDArray[np.uint8] | None:
+def _texels(image: Any, broken: list[str]) -> UInt8 | None:
     """Return a picture that lies in the mesh file, or was opened by its reader, as RGB."""
     try:
         if image.width * image.height > MOST_TEXELS:

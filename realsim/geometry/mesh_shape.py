@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.interop import import_open3d
 from realsim.records import Mesh
 
-Array = NDArray[np.float64]
 LEAST_FILL = 1e-6
 """A closed mesh that fills less of its hull than this is a folded sheet, not a solid."""
 
@@ -35,7 +35,7 @@ class MassProperties:
     """volume_m3 / volume of the convex hull: 1 = convex, or taken for convex."""
 
 
-def welded(mesh: Mesh) -> tuple[Array, NDArray[np.int64]]:
+def welded(mesh: Mesh) -> tuple[Array, Int64]:
     """Return vertices and faces with equal positions merged and collapsed faces dropped."""
     vertices, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[mesh.faces].astype(np.int64)
@@ -165,7 +165,7 @@ def sample_surface(mesh: Mesh, n: int, rng: np.random.Generator) -> tuple[Array,
     return points, _unit(normals[face])
 
 
-def _is_closed(faces: NDArray[np.int64], n: int) -> bool:
+def _is_closed(faces: Int64, n: int) -> bool:
     """Whether every directed edge has its opposite as often: then the surface bounds a solid."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     there = np.sort(edges[:, 0] * n + edges[:, 1])

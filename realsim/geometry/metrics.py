@@ -10,8 +10,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3, symmetric_poses
 from realsim.geometry.camera import project
@@ -20,7 +21,6 @@ from realsim.geometry.symmetric_poses import nearest_symmetry
 from realsim.interop import import_open3d
 from realsim.records import CameraIntrinsics, Mesh, ObjectModel
 
-Array = NDArray[np.float64]
 CHUNK = 2_000_000
 """Symmetries times vertices that are held at once (48 MB)."""
 SURFACE_SAMPLES = 4000

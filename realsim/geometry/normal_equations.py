@@ -7,12 +7,9 @@ are eliminated one by one (Schur's complement): what is left is as small for 256
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.compiled import njit
-
-Array = NDArray[np.float64]
-Places = NDArray[np.int64]
 
 
 @njit(inline="always")
@@ -45,7 +42,7 @@ class System:
     """(V, 6) right side."""
 
 
-def add_prior(system: System, at: slice | Places, value: Array, W: Array) -> None:
+def add_prior(system: System, at: slice | Int64, value: Array, W: Array) -> None:
     """Add that shared unknowns, which stand at `value`, are zero with the precision W."""
     rows = np.arange(len(system.a))[at]
     system.A[np.ix_(rows, rows)] += W

@@ -5,11 +5,11 @@ lies further off. Everything here takes the square (r / c)^2.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.compiled import njit
 
-Array = NDArray[np.float64]
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution in units of its median absolute deviation."""
 

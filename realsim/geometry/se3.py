@@ -8,11 +8,11 @@ Pose3), and perturb on the right: `T <- T @ exp(xi)`.
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import NotRigidError
 
-Array = NDArray[np.float64]
 RIGID_TOLERANCE = 1e-5
 """How far R^T R may be from the identity: float32 files pass, a scaled or sheared matrix fails."""
 IDENTITY_3 = np.eye(3)

@@ -6,13 +6,12 @@ it; what is measured is the distance of the point itself to the tangent plane th
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32
 from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
 
-Array = NDArray[np.float64]
-Lattice = tuple[NDArray[np.float32], Array, float]
+Lattice = tuple[Array32, Array, float]
 """Grid, origin and cell of a distance field: `DistanceField.lattice`."""
 Vector = tuple[float, float, float]
 FRONT_STEPS = 6
@@ -92,7 +91,7 @@ def seen_distances(
     lattice: Lattice,
     scale: float,
     points: Array,
-    views: NDArray[np.int32],
+    views: Int32,
     cameras: tuple[Array, Array],
     without_edges: bool,
 ) -> tuple[Array, Array, Array]:

@@ -10,13 +10,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh_shape import hull_vertices
 
-Array = NDArray[np.float64]
 Axes = Sequence[tuple[ArrayLike, ArrayLike]]
 """Continuous symmetries as in `ObjectModel.symmetry_axes`: (direction, point on the axis [m])."""
 CHUNK = 2_000_000

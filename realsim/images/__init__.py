@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array32, UInt8, UInt16
 from realsim.errors import InputError
 from realsim.images import png
 
@@ -61,7 +62,7 @@ def _decoded(path: Path, flags: int) -> NDArray[Any]:
     return np.asarray(image)
 
 
-def read_rgb(path: Path | str) -> NDArray[np.uint8]:
+def read_rgb(path: Path | str) -> UInt8:
     """Return an image file as (H, W, 3) uint8 RGB; grey images have three equal channels.
 
     Raises:
@@ -83,14 +84,14 @@ def read_image(path: Path | str) -> NDArray[Any]:
     return np.asarray(cv2.cvtColor(image[..., :RGB_CHANNELS], cv2.COLOR_BGR2RGB))
 
 
-def read_grey(path: Path | str) -> NDArray[np.uint8]:
+def read_grey(path: Path | str) -> UInt8:
     """Return an image file as (H, W) uint8, e.g. a mask."""
     import cv2
 
     return np.asarray(_decoded(Path(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
 
-def read_depth(path: Path | str, unit_m: float) -> NDArray[np.float32]:
+def read_depth(path: Path | str, unit_m: float) -> Array32:
     """Return a 16-bit depth image as (H, W) float32 metres, 0 = no measurement.
 
     Args:
@@ -112,7 +113,7 @@ def read_depth(path: Path | str, unit_m: float) -> NDArray[np.float32]:
     return (counts * np.float64(unit_m)).astype(np.float32)
 
 
-def depth_counts(depth_m: NDArray[Any], unit_m: float) -> NDArray[np.uint16]:
+def depth_counts(depth_m: NDArray[Any], unit_m: float) -> UInt16:
     """Return depth (H, W) [m] as 16-bit counts; what does not fit becomes 0 = no measurement.
 
     Counted in the type of `depth_m`: of float32, whole counts come back exactly (to 0.004 of one).

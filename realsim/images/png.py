@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import UInt8
 from realsim.errors import InputError
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -123,7 +124,7 @@ def encode_window(
 
 def _window_rows(
     window: NDArray[Any], origin: tuple[int, int], size: tuple[int, int], row_filter: int
-) -> NDArray[np.uint8]:
+) -> UInt8:
     """Return the filtered rows of the image, each after the byte that names its filter."""
     (x, y), (width, height) = origin, size
     h, w = window.shape[:2]
@@ -157,14 +158,14 @@ def _bytes_per_pixel(image: NDArray[Any]) -> int:
     return image.dtype.itemsize * (RGB_CHANNELS if image.ndim == 3 else 1)
 
 
-def _bytes_of(image: NDArray[Any]) -> NDArray[np.uint8]:
+def _bytes_of(image: NDArray[Any]) -> UInt8:
     """Return the image as the rows of bytes of the specification, big-endian: (H, bytes)."""
     if image.dtype.itemsize == 2:
         image = image.astype(">u2")
     return np.ascontiguousarray(image).view(np.uint8).reshape(len(image), -1)
 
 
-def _filtered(rows: NDArray[np.uint8], step: int, row_filter: int) -> NDArray[np.uint8]:
+def _filtered(rows: UInt8, step: int, row_filter: int) -> UInt8:
     """Return the rows (H, N) filtered, each after the byte that names the filter: (H, N + 1).
 
     The arithmetic is modulo 256, as the specification asks; a byte outside the image is 0.

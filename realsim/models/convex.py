@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32
 from realsim.errors import InputError
 from realsim.geometry.mesh import decimated, hull_vertices, mass_properties, welded_mesh
 from realsim.models.convex_config import ConvexConfig
@@ -30,8 +31,6 @@ from realsim.models.convex_worker import decompose, light, passes, step_path
 from realsim.models.model_records import ConvexParts
 from realsim.records import Mesh
 from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
-
-Array = NDArray[np.float64]
 
 __all__ = ["ConvexConfig", "collision_obj", "convex_parts", "parts_from_collision_obj"]
 
@@ -144,7 +143,7 @@ def _chosen(
     return min(found, key=lambda result: abs(math.log(max(result[1]["ratio"], 1e-9))))
 
 
-def _outward(mesh: Mesh, closed: bool) -> NDArray[np.int32]:
+def _outward(mesh: Mesh, closed: bool) -> Int32:
     """Return the faces with their normals out of the solid; CoACD takes no others."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces] - mesh.vertices.mean(axis=0), 1, 0)
     inward = closed and float(np.einsum("ij,ij->", a, np.cross(b, c))) < 0

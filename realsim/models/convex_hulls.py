@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.models.model_records import ConvexParts
 
-Array = NDArray[np.float64]
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
@@ -54,7 +54,7 @@ def fewest(vertices: Array, count: int, most: int, loss: float) -> Array:
         count *= 2
 
 
-def hull_triangles(vertices: Array) -> tuple[Array, NDArray[np.int64]]:
+def hull_triangles(vertices: Array) -> tuple[Array, Int64]:
     """Return the corners (H, 3) of the hull, in the order given, and its outward faces (F, 3).
 
     Raises:
@@ -66,15 +66,12 @@ def hull_triangles(vertices: Array) -> tuple[Array, NDArray[np.int64]]:
     corners = np.sort(hull.vertices)
     number = np.full(len(vertices), -1)
     number[corners] = np.arange(len(corners))
-    faces: NDArray[np.int64] = number[hull.simplices].astype(np.int64)
+    faces: Int64 = number[hull.simplices].astype(np.int64)
     at = vertices[corners]
     a, b, c = np.moveaxis(at[faces], 1, 0)
     inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
     faces[inward] = faces[inward][:, ::-1]
     return at, faces
-
-
-Array = NDArray[np.float64]
 
 
 def collision_obj(parts: ConvexParts | Sequence[ArrayLike]) -> bytes:

@@ -14,15 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32
 from realsim.errors import InputError
 from realsim.geometry.mesh_shape import hull_vertices
 from realsim.models.convex_config import ConvexConfig
 from realsim.models.convex_hulls import fewest, hull_volume, outermost
 from realsim.store.arrays_on_disk import read_arrays, write_arrays
-
-Array = NDArray[np.float64]
 
 
 def step_path(folder: Path, step: int) -> Path:
@@ -87,7 +85,7 @@ def light(hulls: list[Array], volume_m3: float, config: ConvexConfig) -> list[Ar
 
 
 def _coacd(
-    vertices: Array, faces: NDArray[np.int32], closed: bool, threshold: float, config: ConvexConfig
+    vertices: Array, faces: Int32, closed: bool, threshold: float, config: ConvexConfig
 ) -> list[Array]:
     """Return the vertices of CoACD's parts [m]."""
     import coacd

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.models.model_records import (
     ConvexParts,
@@ -16,7 +16,6 @@ from realsim.models.model_records import (
 )
 from realsim.records import Mesh, ObjectModel, Verdict
 
-Array = NDArray[np.float64]
 PROPERTIES_FORMAT = 1
 """Of the properties files; a newer one is refused, not guessed at."""
 

@@ -10,16 +10,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Image, Int32, Int64
 from realsim.geometry.colors import light_of_bytes, srgb_encoded
 from realsim.geometry.mesh import GREY
 from realsim.models.mesh_topology import equal_rows
 from realsim.models.model_records import ScanUnit, UpAxis
 from realsim.records import Mesh
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -30,7 +28,7 @@ class Piece:
     """What the file calls it."""
     vertices: Array
     """(V, 3)."""
-    faces: NDArray[np.int32]
+    faces: Int32
     """(F, 3), outside counter-clockwise as far as the file says."""
     colors: Image | None = None
     """(V, 3) RGB per vertex."""
@@ -210,7 +208,7 @@ def _repeats(piece: Piece) -> bool:
     return uv is not None and bool(uv.min() < -TILE_SLACK or uv.max() > 1.0 + TILE_SLACK)
 
 
-def _split(piece: Piece, kind: NDArray[np.int64]) -> tuple[Piece, NDArray[np.int64]]:
+def _split(piece: Piece, kind: Int64) -> tuple[Piece, Int64]:
     """Split vertices whose faces differ in kind (F,); return the piece and a face per vertex."""
     corners = np.stack([piece.faces.ravel(), np.repeat(kind, 3)], axis=-1).astype(np.int64)
     first, index = equal_rows(corners)

@@ -10,13 +10,10 @@ as fine as they were.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32, Int64
 from realsim.models.mesh_topology import Topology, equal_rows, face_areas_and_volumes, topology
 from realsim.records import Mesh
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 GREATEST_CELL_SHARE = 0.002
 """Cells are at most this share of the mesh's size [-]: 0.2 mm at 10 cm, so that what is lost is
@@ -54,7 +51,7 @@ def clustered(
     return _mended(topo, index, found, given)
 
 
-def _cells(points: Array, cell: float) -> NDArray[np.int32]:
+def _cells(points: Array, cell: float) -> Int32:
     """Return the number (N,) of the occupied cell of every point."""
     at = ((points - points.min(axis=0)) / cell).astype(np.int64)
     most = at.max(axis=0) + 1
@@ -62,7 +59,7 @@ def _cells(points: Array, cell: float) -> NDArray[np.int32]:
     return equal_rows(key[:, None])[1].astype(np.int32)
 
 
-def _surface(index: NDArray[np.int32], faces: NDArray[np.int32]) -> NDArray[np.int32]:
+def _surface(index: Int32, faces: Int32) -> Int32:
     """Return the faces over clusters; of those on the same three, only what does not cancel."""
     moved = index[faces]
     a, b, c = moved.T
@@ -76,7 +73,7 @@ def _surface(index: NDArray[np.int32], faces: NDArray[np.int32]) -> NDArray[np.i
     return moved[keep]
 
 
-def _first_of(kind: Ints, sign: NDArray[np.int64]) -> Ints:
+def _first_of(kind: Int64, sign: Int64) -> Int64:
     """Return for every row the first row of the same kind and sign (N,)."""
     both = 2 * kind + (sign > 0)
     first = np.full(int(both.max(initial=-1)) + 1, len(both), dtype=np.int64)
@@ -85,9 +82,7 @@ def _first_of(kind: Ints, sign: NDArray[np.int64]) -> Ints:
     return first[both]
 
 
-def _mended(
-    topo: Topology, index: NDArray[np.int32], faces: NDArray[np.int32], given: NDArray[np.int32]
-) -> Mesh | None:
+def _mended(topo: Topology, index: Int32, faces: Int32, given: Int32) -> Mesh | None:
     """Return the clustered mesh, its bad places as fine as before; None if some stay bad."""
     for _ in range(MENDING_ROUNDS):
         mesh = Mesh(vertices=_means(topo.positions, index), faces=faces)
@@ -112,7 +107,7 @@ def _mended(
     return None
 
 
-def _means(points: Array, index: NDArray[np.int32]) -> Array:
+def _means(points: Array, index: Int32) -> Array:
     """Return the mean (K, 3) of the points of every cluster."""
     count = np.bincount(index)
     return np.stack([np.bincount(index, points[:, k]) / count for k in range(3)], axis=-1)

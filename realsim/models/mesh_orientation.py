@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from realsim.models.mesh_topology import Array, Bools, Ints, Topology, face_pairs, patches
+from realsim.arrays import Array, Int32, Int64, Mask
+from realsim.models.mesh_topology import Topology, face_pairs, patches
 
 LEAST_THICKNESS_SHARE = 1e-5
 """A closed patch whose mean thickness 2 V / A is below this share of the mesh's size is a folded
@@ -38,21 +38,21 @@ START_SHARE = 1e-5
 class Orientation:
     """How the faces of a mesh wind and how they should."""
 
-    patch: NDArray[np.int32]
+    patch: Int32
     """(F,) the patch of every face, -1 where the face is not a proper one."""
-    against: Bools
+    against: Mask
     """(F,) faces that wind against the rest of their patch (the smaller area of it)."""
-    inward: Bools
+    inward: Mask
     """(F,) faces of patches whose larger part points inwards."""
-    is_one_sided: Bools
+    is_one_sided: Mask
     """(N,) patches that no winding makes consistent (a Moebius band)."""
-    is_closed: Bools
+    is_closed: Mask
     """(N,) patches that bound a volume by themselves."""
-    depth: NDArray[np.int32]
+    depth: Int32
     """(N,) in how many other closed patches a closed patch lies; odd: the wall of a cavity."""
 
     @property
-    def flip(self) -> Bools:
+    def flip(self) -> Mask:
         """(F,) faces whose winding must be turned for the surface to be outward everywhere."""
         return self.against ^ self.inward
 
@@ -90,7 +90,7 @@ def orientation(topo: Topology, areas: Array, volumes: Array) -> Orientation:
     )
 
 
-def _against(topo: Topology, patch: NDArray[np.int32], n: int, areas: Array) -> tuple[Bools, Bools]:
+def _against(topo: Topology, patch: Int32, n: int, areas: Array) -> tuple[Mask, Mask]:
     """Return which faces wind against the larger part of their patch, and one-sided patches.
 
     Every face stands in a graph twice, as it is and turned; a pair of faces links the copies that
@@ -128,7 +128,7 @@ def _against(topo: Topology, patch: NDArray[np.int32], n: int, areas: Array) -> 
     return against, one_sided
 
 
-def _closed(topo: Topology, patch: NDArray[np.int32], n: int, against: Bools) -> Bools:
+def _closed(topo: Topology, patch: Int32, n: int, against: Mask) -> Mask:
     """Return which patches are closed once consistent; other patches may touch their edges."""
     closed = np.ones(n, dtype=bool)
     uses = topo.edge_uses[topo.half_edge]
@@ -163,7 +163,7 @@ class _Scene:
         rays = np.concatenate([(starts - self.center) / self.scale, directions], axis=-1)
         return self._o3d.core.Tensor(np.ascontiguousarray(rays, dtype=np.float32))
 
-    def is_free(self, starts: Array, directions: Array) -> Bools:
+    def is_free(self, starts: Array, directions: Array) -> Mask:
         """Return which rays (N,) meet nothing."""
         free = np.empty(len(starts), dtype=bool)
         step = 1 << 18
@@ -172,7 +172,7 @@ class _Scene:
             free[s : s + step] = ~self._scene.test_occlusions(rays, nthreads=1).numpy()
         return free
 
-    def hits(self, starts: Array, directions: Array) -> tuple[Ints, Ints]:
+    def hits(self, starts: Array, directions: Array) -> tuple[Int64, Int64]:
         """Return (ray, face) of every face that a ray meets on its way."""
         found = self._scene.list_intersections(self._rays(starts, directions), nthreads=1)
         ray = found["ray_ids"].numpy().astype(np.int64)
@@ -187,7 +187,7 @@ def _directions(n: int) -> Array:
     return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=-1)
 
 
-def _spread_faces(patch: NDArray[np.int32], n: int, areas: Array, wanted: Bools, k: int) -> Ints:
+def _spread_faces(patch: Int32, n: int, areas: Array, wanted: Mask, k: int) -> Int64:
     """Return k faces of every wanted patch, evenly by area: (number of wanted patches, k)."""
     rows = np.flatnonzero(np.r_[wanted, False][patch])
     rows = rows[np.argsort(patch[rows], kind="stable")]
@@ -202,16 +202,14 @@ def _spread_faces(patch: NDArray[np.int32], n: int, areas: Array, wanted: Bools,
     return rows[np.clip(place, last - count[:, None] + 1, last)]
 
 
-def _centers_and_normals(topo: Topology, faces: Ints) -> tuple[Array, Array]:
+def _centers_and_normals(topo: Topology, faces: Int64) -> tuple[Array, Array]:
     a, b, c = np.moveaxis(topo.positions[topo.faces[faces]], -2, 0)
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     return (a + b + c) / 3.0, normal / np.where(length > 0, length, 1.0)
 
 
-def _depths(
-    topo: Topology, scene: _Scene, patch: NDArray[np.int32], is_solid: Bools, areas: Array
-) -> NDArray[np.int32]:
+def _depths(topo: Topology, scene: _Scene, patch: Int32, is_solid: Mask, areas: Array) -> Int32:
     """Return for each solid patch in how many others it lies with all its points.
 
     A point is inside a closed surface where a ray from it crosses that surface an odd number of
@@ -240,8 +238,8 @@ def _depths(
 
 
 def _voted_inward(
-    topo: Topology, scene: _Scene, patch: NDArray[np.int32], n: int, areas: Array, against: Bools
-) -> Bools:
+    topo: Topology, scene: _Scene, patch: Int32, n: int, areas: Array, against: Mask
+) -> Mask:
     """Return which patches (N,) have the freer side at the back of their faces."""
     per_patch = min(VOTE_RAYS, VOTE_RAYS_IN_ALL // n) // VOTE_DIRECTIONS
     k = max(per_patch, 1)

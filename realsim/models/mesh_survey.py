@@ -3,17 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32, Mask
 from realsim.models.mesh_orientation import Orientation, orientation
-from realsim.models.mesh_topology import (
-    Array,
-    Bools,
-    Topology,
-    bodies,
-    face_areas_and_volumes,
-    topology,
-)
+from realsim.models.mesh_topology import Topology, bodies, face_areas_and_volumes, topology
 from realsim.records import Mesh
 
 FLAT_SHARE = 1e-4
@@ -33,7 +26,7 @@ class Survey:
     volumes: Array
     """(F,) signed volumes of the cones to one point, as the faces wind [m^3]."""
     body_count: int
-    body: NDArray[np.int32]
+    body: Int32
     """(F,) the connected piece of every face, -1 where the face is not a proper one."""
     body_areas: Array
     """(B,) [m^2]."""
@@ -42,7 +35,7 @@ class Survey:
     thickness: Array
     """(3,) extents along the principal axes, greatest first [m]."""
 
-    def specks(self, size_share: float, area_share: float) -> Bools:
+    def specks(self, size_share: float, area_share: float) -> Mask:
         """Return which bodies (B,) are stray specks: small, not the largest, and little in all."""
         areas, sizes = self.body_areas, self.body_sizes
         small = sizes < size_share * self.topology.size

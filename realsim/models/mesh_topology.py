@@ -11,11 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32, Int64, Mask
 from realsim.records import Mesh
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 FOLD_AREA_SHARE = 0.01
 """Faces back to back with at most this share of the area are folds, which bound nothing and go
@@ -33,37 +30,37 @@ class Topology:
 
     positions: Array
     """(P, 3) distinct positions that a face uses [m]."""
-    index: NDArray[np.int32]
+    index: Int32
     """(V,) the position of every vertex of the mesh; -1 where no face uses the vertex."""
-    faces: NDArray[np.int32]
+    faces: Int32
     """(F, 3) position numbers: row i belongs to row i of the mesh's faces. May have collapsed
     and repeated rows, see `proper`."""
-    collapsed: Bools
+    collapsed: Mask
     """(F,) faces with fewer than three distinct positions."""
-    repeated: Bools
+    repeated: Mask
     """(F,) faces on the same three positions as an earlier one, which stands for both."""
-    folded: Bools
+    folded: Mask
     """(F,) faces back to back with another one in an otherwise simple surface: folds without
     volume, as decimation leaves them. Without both, the surface is closed as before."""
-    two_sided: Bools
+    two_sided: Mask
     """(F,) faces back to back with another one where much of the mesh is so: a double-sided sheet,
     of which one side stands for both."""
-    proper: Bools
+    proper: Mask
     """(F,) all others. Edges, patches and bodies are those of the proper faces."""
     size: float
     """Twice the greatest distance of a position from their mean [m]: the extent of the mesh, but
     the same however it is turned."""
-    half_edge: NDArray[np.int32]
+    half_edge: Int32
     """(H,) number of the edge of every half edge of a proper face."""
-    half_face: NDArray[np.int32]
+    half_face: Int32
     """(H,) the face it belongs to."""
     half_sign: NDArray[np.int8]
     """(H,) +1 where the face runs along the edge from the lower position number to the higher."""
-    edge_uses: NDArray[np.int32]
+    edge_uses: Int32
     """(E,) number of faces at the edge: 1 on a rim, 2 inside a surface."""
-    edge_net: NDArray[np.int32]
+    edge_net: Int32
     """(E,) sum of the signs: 0 where the faces run in opposite directions."""
-    edge_ends: NDArray[np.int32]
+    edge_ends: Int32
     """(E, 2) position numbers, the lower first."""
 
     @property
@@ -74,7 +71,7 @@ class Topology:
         )
 
 
-def equal_rows(rows: NDArray[Any]) -> tuple[Ints, Ints]:
+def equal_rows(rows: NDArray[Any]) -> tuple[Int64, Int64]:
     """Return the first row of every kind (G,), in order, and the kind of every row (N,).
 
     Rows (N, K) of numbers of 8 bytes or less are compared bit by bit, 0 and -0 being the same.
@@ -138,7 +135,7 @@ def topology(mesh: Mesh) -> Topology:
     return Topology(positions=positions, index=index, faces=faces, size=size, **edges)
 
 
-def _edges(positions: Array, faces: NDArray[np.int32]) -> dict[str, Any]:
+def _edges(positions: Array, faces: Int32) -> dict[str, Any]:
     """Return proper faces, half edges and edges of faces (F, 3) over positions (P, 3)."""
     n = len(positions)
     improper = _improper(positions, faces)
@@ -172,7 +169,7 @@ def _edges(positions: Array, faces: NDArray[np.int32]) -> dict[str, Any]:
     }
 
 
-def _improper(positions: Array, faces: NDArray[np.int32]) -> dict[str, Bools]:
+def _improper(positions: Array, faces: Int32) -> dict[str, Mask]:
     """Return which faces are collapsed, repeated, folded and two-sided."""
     a, b, c = faces.T
     collapsed = (a == b) | (b == c) | (c == a)
@@ -199,7 +196,7 @@ def _improper(positions: Array, faces: NDArray[np.int32]) -> dict[str, Bools]:
 
 def _merged_rims(
     positions: Array, edges: dict[str, Any], distance: float
-) -> tuple[Ints, Ints] | None:
+) -> tuple[Int64, Int64] | None:
     """Return which positions stay and the new number of each, or None if no rims touch."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -219,7 +216,7 @@ def _merged_rims(
     return first, new_index
 
 
-def components(n: int, i: NDArray[Any], j: NDArray[Any]) -> tuple[int, NDArray[np.int32]]:
+def components(n: int, i: NDArray[Any], j: NDArray[Any]) -> tuple[int, Int32]:
     """Return how many components n nodes with the links i-j have, and the one of each node."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -229,7 +226,7 @@ def components(n: int, i: NDArray[Any], j: NDArray[Any]) -> tuple[int, NDArray[n
     return int(count), label.astype(np.int32)
 
 
-def face_pairs(topo: Topology, edges: Bools) -> tuple[NDArray[np.int32], NDArray[np.int32], Ints]:
+def face_pairs(topo: Topology, edges: Mask) -> tuple[Int32, Int32, Int64]:
     """Return pairs of faces that share one of the marked edges, and the half edges of the first.
 
     An edge of k faces gives k - 1 pairs, which is enough to link them.
@@ -242,7 +239,7 @@ def face_pairs(topo: Topology, edges: Bools) -> tuple[NDArray[np.int32], NDArray
     return topo.half_face[left], topo.half_face[right], left
 
 
-def bodies(topo: Topology) -> tuple[int, NDArray[np.int32]]:
+def bodies(topo: Topology) -> tuple[int, Int32]:
     """Return the number of connected pieces of surface and the one of every face (F,).
 
     Faces that share an edge, however many they are, belong together; a common corner alone does
@@ -251,7 +248,7 @@ def bodies(topo: Topology) -> tuple[int, NDArray[np.int32]]:
     return _labelled(topo, topo.edge_uses >= 2)
 
 
-def patches(topo: Topology) -> tuple[int, NDArray[np.int32]]:
+def patches(topo: Topology) -> tuple[int, Int32]:
     """Return the number of patches and the patch of every face (F,); -1 for collapsed faces.
 
     A patch hangs together across edges of exactly two faces: within it the winding of one face
@@ -260,7 +257,7 @@ def patches(topo: Topology) -> tuple[int, NDArray[np.int32]]:
     return _labelled(topo, topo.edge_uses == 2)
 
 
-def _labelled(topo: Topology, edges: Bools) -> tuple[int, NDArray[np.int32]]:
+def _labelled(topo: Topology, edges: Mask) -> tuple[int, Int32]:
     i, j, _ = face_pairs(topo, edges)
     _, label = components(len(topo.faces), i, j)
     out = np.full(len(label), -1, dtype=np.int32)
@@ -269,7 +266,7 @@ def _labelled(topo: Topology, edges: Bools) -> tuple[int, NDArray[np.int32]]:
     return int(kind.max(initial=-1)) + 1, out
 
 
-def face_areas(positions: Array, faces: NDArray[np.int32]) -> Array:
+def face_areas(positions: Array, faces: Int32) -> Array:
     """Return the area (F,) of every face [m^2]."""
     a, b, c = np.moveaxis(positions[faces], 1, 0)
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -290,7 +287,7 @@ def face_areas_and_volumes(topo: Topology) -> tuple[Array, Array]:
     return areas, volumes
 
 
-def rims(topo: Topology) -> tuple[int, NDArray[np.int32], Array]:
+def rims(topo: Topology) -> tuple[int, Int32, Array]:
     """Return the number of holes, the hole of every rim edge, and the size (N,) of each [m].
 
     Rim edges in the order of the edges; a hole's size is twice the greatest distance of its

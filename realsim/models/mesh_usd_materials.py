@@ -9,23 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Image, Int64
 from realsim.errors import InputError
-from realsim.models.mesh_atlas import (
-    Array,
-    Image,
-    Piece,
-    image_array,
-    rgb8,
-    srgb8,
-    transformed_uv,
-)
+from realsim.models.mesh_atlas import Piece, image_array, rgb8, srgb8, transformed_uv
 from realsim.models.mesh_loading import escape_error
-from realsim.models.mesh_topology import Ints, equal_rows
+from realsim.models.mesh_topology import equal_rows
 
 
-def triangles_of(counts: Ints, holes: Sequence[int]) -> tuple[Ints, Ints]:
+def triangles_of(counts: Int64, holes: Sequence[int]) -> tuple[Int64, Int64]:
     """Return the corners (T, 3) of fans over polygons, and the polygon (T,) of each triangle.
 
     Args:
@@ -43,7 +35,7 @@ def triangles_of(counts: Ints, holes: Sequence[int]) -> tuple[Ints, Ints]:
 
 
 def corner_values(
-    primvars: Any, name: str, counts: Ints, indices: Ints, face: Ints, corners: Ints
+    primvars: Any, name: str, counts: Int64, indices: Int64, face: Int64, corners: Int64
 ) -> Array | None:
     """Return a primvar's values (T, 3, D) at the corners of triangles, or None if there is none.
 
@@ -97,7 +89,7 @@ def vertex_colors_of(piece: Piece, linear: Array) -> Piece:
 def with_corner_uv(piece: Piece, uv: Array) -> Piece:
     """Return the piece with texture coordinates (T, 3, 2) at its corners, split at seams."""
     _, kind = equal_rows(uv.reshape(-1, 2))
-    vertex: NDArray[np.int64] = piece.faces.ravel().astype(np.int64)
+    vertex: Int64 = piece.faces.ravel().astype(np.int64)
     first, index = equal_rows(np.column_stack([vertex, kind]))
     return replace(
         piece,
@@ -148,9 +140,7 @@ class Materials:
         self._known: dict[str, Material] = {}
         self._images: dict[str, Image | None] = {}
 
-    def parts(
-        self, prim: Any, face_count: int
-    ) -> Iterator[tuple[NDArray[np.int64] | None, Material]]:
+    def parts(self, prim: Any, face_count: int) -> Iterator[tuple[Int64 | None, Material]]:
         """Yield the faces and the material of every part of a mesh; None: all faces."""
         binding = self._pxr.UsdShade.MaterialBindingAPI(prim)
         left = np.ones(face_count, dtype=bool)

@@ -6,8 +6,8 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Image, Mask, UInt8
 from realsim.geometry import camera, se3
 from realsim.geometry.mesh_shape import welded
 from realsim.models.model_records import Symmetries
@@ -15,8 +15,6 @@ from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.photo import Lighting, PhotoRenderer
 from realsim.rendering.rays import PlacedMesh
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 PAPER, INK, MUTED = "#f7f7f5", "#22303c", "#6b7a88"
 PAPER_RGB = (247, 247, 245)
 PART_COLORS = (
@@ -78,7 +76,7 @@ def drawn_size(mesh: Mesh) -> tuple[Mesh, float]:
     return replace(painted, vertices=mesh.vertices * factor), factor
 
 
-def painted_all(vertices: Array, color: tuple[int, int, int]) -> NDArray[np.uint8]:
+def painted_all(vertices: Array, color: tuple[int, int, int]) -> UInt8:
     """Return one colour for every vertex (V, 3)."""
     return np.tile(np.array(color, dtype=np.uint8), (len(vertices), 1))
 
@@ -102,7 +100,7 @@ def view_of(points: Array, direction: Sequence[float], size: tuple[int, int]) ->
     return View(intrinsics=intrinsics, T_obj_cam=T_obj_cam, px_per_m=focal / distance)
 
 
-def rendered(meshes: Sequence[Mesh], view: View) -> tuple[Image, NDArray[np.float32]]:
+def rendered(meshes: Sequence[Mesh], view: View) -> tuple[Image, Array32]:
     """Return the shaded picture on paper and its depth; the light comes over the left shoulder."""
     R = view.T_obj_cam[:3, :3]
     sun = R @ np.array([-0.45, -0.75, -0.75])
@@ -138,7 +136,7 @@ def parts_mesh(vertices: Array, color: tuple[int, int, int]) -> Mesh:
 SEAM = 0.985
 
 
-def draw_layer(ax: Any, layer: Layer, view: View, depth: NDArray[np.float32]) -> None:
+def draw_layer(ax: Any, layer: Layer, view: View, depth: Array32) -> None:
     """Draw a layer over a rendered view: full in front of the surface, faint behind it."""
     from matplotlib.collections import LineCollection
 
@@ -176,7 +174,7 @@ def _subdivided(line: Array) -> Array:
     return np.concatenate([*parts, line[-1:]])
 
 
-def _is_behind(uv: Array, z: Array, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _is_behind(uv: Array, z: Array, depth: Array32) -> Mask:
     """Return which points lie behind the drawn surface."""
     height, width = depth.shape
     column = np.clip(np.rint(uv[:, 0]).astype(int), 0, width - 1)
@@ -196,7 +194,6 @@ def _mass_mark(ax: Any, uv: Array) -> None:
         ax.add_patch(Wedge((u, v), radius, first, first + 90, fc=INK, ec="none", zorder=10))
 
 
-Array = NDArray[np.float64]
 ROUND_LENGTHS = (1.0, 2.0, 5.0)
 BAR_SHARE = 0.22
 """Greatest length of the scale bar [share of the picture's width]."""

@@ -3,12 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import Array
 from realsim.records import Mesh
 
-Array = NDArray[np.float64]
 ScanUnit = Literal["m", "cm", "mm", "inch", "none"]
 """What one unit of a mesh file is; 'none': the file has no metric scale (a generated mesh)."""
 UpAxis = Literal["x", "y", "z", "-x", "-y", "-z"]

@@ -10,8 +10,8 @@ from io import BytesIO
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Image
 from realsim.models.library_records import ModelProperties
 from realsim.models.model_picture_views import (
     INK,
@@ -33,8 +33,6 @@ from realsim.models.model_picture_views import (
 from realsim.models.model_records import ConvexParts
 from realsim.records import Mesh
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 VIEWS: tuple[tuple[str, tuple[float, float, float]], ...] = (
     ("front", (0.9, -1.5, 0.8)),
     ("back, with its symmetries", (-1.1, 1.4, 0.7)),

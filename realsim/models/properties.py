@@ -3,15 +3,13 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.geometry.mesh import MassProperties, diameter, hull_vertices, mass_properties
 from realsim.models.convex_hulls import hull_triangles, hull_volume
 from realsim.models.model_records import ConvexParts, PhysicalProperties
 from realsim.records import Mesh
-
-Array = NDArray[np.float64]
 
 DEFAULT_DENSITY = 1000.0
 """[kg/m^3]: the paper's for every object."""

@@ -18,8 +18,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.models.mesh_atlas import FileContent, Piece, one_mesh
 from realsim.models.mesh_loading import TRIMESH_FORMATS, load_pieces
@@ -27,8 +27,6 @@ from realsim.models.mesh_topology import equal_rows
 from realsim.models.model_records import ReadScan, ScanUnit, UpAxis
 from realsim.models.usd_reading import USD_FORMATS, load_usd
 from realsim.records import Mesh
-
-Array = NDArray[np.float64]
 
 SCAN_FORMATS = (*TRIMESH_FORMATS, *USD_FORMATS)
 METRES: dict[ScanUnit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}

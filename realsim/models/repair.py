@@ -8,8 +8,8 @@ simplification of a mesh of millions of faces.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32, Int64, Mask
 from realsim.errors import DegenerateError
 from realsim.models.inspect import (
     GIGANTIC_FACES,
@@ -19,7 +19,7 @@ from realsim.models.inspect import (
     report,
 )
 from realsim.models.mesh_survey import FLAT_SHARE, Survey, survey
-from realsim.models.mesh_topology import Array, Bools, Topology, equal_rows, rims
+from realsim.models.mesh_topology import Topology, equal_rows, rims
 from realsim.models.model_records import Repair
 from realsim.models.simplify import deviation, simplified
 from realsim.records import Mesh
@@ -29,9 +29,9 @@ from realsim.records import Mesh
 class Fillers:
     """The triangles that close the small holes of a mesh."""
 
-    rim: NDArray[np.int32]
+    rim: Int32
     """(N, 2) vertices of the mesh: each rim edge as its triangle runs along it."""
-    hole: NDArray[np.int32]
+    hole: Int32
     """(N,) the filled hole, 0 .. len(centers) - 1, of each rim edge."""
     centers: Array
     """(H, 3) tips of the fans [m]."""
@@ -43,8 +43,8 @@ class Fillers:
 
 def find_fillers(
     topo: Topology,
-    faces: NDArray[np.int32],
-    turned: Bools,
+    faces: Int32,
+    turned: Mask,
     largest: Array,
     unevenness: float,
 ) -> Fillers:
@@ -111,9 +111,6 @@ def find_fillers(
         sizes=sizes[fill],
         left=tuple(f"{int(np.sum(which))}: {why}" for which, why in reasons if np.any(which)),
     )
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -335,7 +332,7 @@ def _merged_rows(mesh: Mesh, actions: list[str]) -> Mesh:
     )
 
 
-def _firsts(kind: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _firsts(kind: Int64) -> tuple[Int64, Int64]:
     return equal_rows(kind[:, None])
 
 

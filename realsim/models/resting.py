@@ -11,15 +11,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry.mesh import hull_vertices, mass_properties
 from realsim.records import Mesh
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 ANY_DENSITY = 1.0
 """The centre of mass of a uniform body does not depend on its density."""
 
@@ -94,7 +92,7 @@ class _Facets:
     """(F,) of the centre of mass when the facet lies on the table."""
     shares: Array
     """(F,) solid angle seen from the centre of mass / 4 pi."""
-    edges: Ints
+    edges: Int64
     """(E, 2) neighbouring facets."""
     barriers: Array
     """(E,) greatest height of the centre of mass while rolling from one to the other."""
@@ -193,7 +191,7 @@ def _hull_center(corners: Array, hull: Any) -> Array:
     return inner + volumes @ triangles.sum(1) / (4 * volumes.sum())
 
 
-def _barriers(points: Array, normals: Array, heights: Array, edges: Ints, sides: Ints) -> Array:
+def _barriers(points: Array, normals: Array, heights: Array, edges: Int64, sides: Int64) -> Array:
     """Return the greatest height (E,) of the centre of mass while rolling over each edge.
 
     While the body stands on an edge, the height is q . d, with d the down direction between the two
@@ -220,7 +218,7 @@ def _slopes(facets: _Facets) -> Array:
 
 
 @njit
-def _flood(heights: Array, edges: Ints, barriers: Array, tolerance: float) -> Ints:
+def _flood(heights: Array, edges: Int64, barriers: Array, tolerance: float) -> Int64:
     """Return the lowest facet (F,) of the basin of each facet.
 
     Edges are met in ascending order of their barriers; two basins stay apart if the barrier lies
@@ -250,7 +248,7 @@ def _flood(heights: Array, edges: Ints, barriers: Array, tolerance: float) -> In
     return lowest
 
 
-def _representatives(facets: _Facets, members: Ints, reach: float, config: RestingConfig) -> Ints:
+def _representatives(facets: _Facets, members: Int64, reach: float, config: RestingConfig) -> Int64:
     """Return facets that stand for a basin: its minimum, and others as low and far enough away."""
     order = members[np.argsort(facets.heights[members], kind="stable")]
     low = order[facets.heights[order] <= facets.heights[order[0]] + reach]
@@ -262,7 +260,7 @@ def _representatives(facets: _Facets, members: Ints, reach: float, config: Resti
         spacing *= 1.15
 
 
-def _spaced(directions: Array, nearest_cos: float) -> Ints:
+def _spaced(directions: Array, nearest_cos: float) -> Int64:
     """Return indices of directions, in their order, none nearer to an earlier one than allowed."""
     free = np.ones(len(directions), dtype=bool)
     chosen: list[int] = []

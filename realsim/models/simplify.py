@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, UInt8
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry.mesh import decimated, sample_surface, tensor_mesh
 from realsim.interop import import_open3d
@@ -12,7 +12,6 @@ from realsim.models.mesh_clustering import clustered
 from realsim.models.mesh_topology import Topology, topology
 from realsim.records import Mesh
 
-Array = NDArray[np.float64]
 LEAST_FACES = 4
 """A tetrahedron: no closed surface has fewer."""
 SECOND_CHANCES = (1.0, 1.5, 2.5)
@@ -79,7 +78,7 @@ def _still_closed(bare: Mesh, topo: Topology, faces: int) -> Mesh:
     return bare
 
 
-def _closest(mesh: Mesh, points: Array) -> tuple[Array, NDArray[np.int64], Array]:
+def _closest(mesh: Mesh, points: Array) -> tuple[Array, Int64, Array]:
     """Return distance (N,), face (N,) and barycentric coordinates (N, 3) of the closest points."""
     o3d = import_open3d()
     center = mesh.vertices.mean(axis=0)
@@ -96,7 +95,7 @@ def _closest(mesh: Mesh, points: Array) -> tuple[Array, NDArray[np.int64], Array
     return distance, found["primitive_ids"].numpy().astype(np.int64), weights
 
 
-def colors_at(mesh: Mesh, points: Array) -> NDArray[np.uint8]:
+def colors_at(mesh: Mesh, points: Array) -> UInt8:
     """Return the RGB (N, 3) of the mesh's surface at the points of it closest to these (N, 3).
 
     Texture coordinates and colours are interpolated over the face; the texture is read at the

@@ -24,8 +24,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.models.model_records import Symmetries
@@ -47,8 +47,6 @@ from realsim.models.symmetry_search import (
 )
 from realsim.models.symmetry_surface import Surface, refinement, surface_of, texture_breaks
 from realsim.records import Mesh
-
-Array = NDArray[np.float64]
 
 __all__ = ["SymmetryConfig", "find_symmetries"]
 

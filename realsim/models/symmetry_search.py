@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.models.symmetry_config import SymmetryConfig
 from realsim.models.symmetry_surface import Surface, refinement
-
-Array = NDArray[np.float64]
 
 GOLDEN = (1 + math.sqrt(5)) / 2
 SAME_ROTATION = 1e-6
@@ -111,8 +110,6 @@ def frame_on(name: str, first: Array, second: Array, off: float) -> Array | None
     R: Array = basis(first, second) @ basis(u, v).T
     return R
 
-
-Array = NDArray[np.float64]
 
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 CAP = 0.1

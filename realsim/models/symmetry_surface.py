@@ -5,16 +5,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.geometry import se3
 from realsim.geometry.distance_field import DistanceField, raycasting_scene
 from realsim.geometry.mesh import diameter, face_normals, sample_surface
 from realsim.interop import import_open3d
 from realsim.models.symmetry_config import SymmetryConfig
 from realsim.records import Mesh
-
-Array = NDArray[np.float64]
 
 FIELD_CELLS = 40
 """Cells along the longest side of the field that screens candidates: 2.5 % of it, 0.1 CPU-s."""
@@ -65,7 +63,7 @@ class Surface:
         found: Any = self.scene.compute_distance(query, 1).numpy()
         return np.asarray(found, dtype=np.float64).reshape(len(Ts), -1)
 
-    def closest(self, points: Array) -> tuple[Array, NDArray[np.int64], Array]:
+    def closest(self, points: Array) -> tuple[Array, Int64, Array]:
         """Return the closest surface points (N, 3), their faces (N,) and barycentric uv (N, 2)."""
         o3d = import_open3d()
         query = o3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32))
@@ -133,8 +131,6 @@ def _planes(surface: Surface, q: Array) -> tuple[Array, Array]:
     normals = surface.normals[face]
     return np.einsum("ni,ni->n", q - at, normals), normals
 
-
-Array = NDArray[np.float64]
 
 POINTS = 600
 """Surface points whose colours are compared."""

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, MissingLibraryError
 from realsim.interop import quiet_output
 from realsim.models.mesh_atlas import FileContent, Piece, placed
@@ -28,7 +28,6 @@ from realsim.models.mesh_usd_materials import (
 )
 from realsim.models.model_records import ScanUnit, UpAxis
 
-Array = NDArray[np.float64]
 USD_FORMATS = (".usd", ".usda", ".usdc", ".usdz")
 UNITS: tuple[tuple[ScanUnit, float], ...] = (
     ("m", 1.0),

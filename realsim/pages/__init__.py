@@ -22,9 +22,9 @@ and the page says how many. Plots are drawn in one style with `realsim.pages.plo
 """
 
 from realsim.pages.page import BUDGET_BYTES, VERDICT_KIND, Cell, Page, template
-from realsim.pages.pictures import Image, Picture, View, jpeg_bytes, spread
+from realsim.pages.pictures import Picture, View, jpeg_bytes, spread
 
 __all__ = [
-    "BUDGET_BYTES", "VERDICT_KIND", "Cell", "Image", "Page", "Picture", "View",
+    "BUDGET_BYTES", "VERDICT_KIND", "Cell", "Page", "Picture", "View",
     "jpeg_bytes", "spread", "template",
 ]  # fmt: skip

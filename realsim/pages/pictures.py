@@ -6,11 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
+from realsim.arrays import Image
 from realsim.errors import InputError
 
-Image = NDArray[np.uint8]
 Picture = bytes | Image | Callable[[], Image]
 """PNG or JPEG, (H, W, 3) RGB or (H, W) grey, or what makes it: only shown views are made."""
 WIDTH_PX = 1280

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from realsim.arrays import Int64, UInt8
 
 INK, MUTED, FAINT = "#22303c", "#8a99a8", "#dfe5ea"
 GOOD, WARN, BAD = "#1b9e8a", "#e69f00", "#c8502f"
@@ -77,7 +78,7 @@ def whole_numbers(*axis: Any) -> None:
         a.set_major_locator(MaxNLocator(integer=True, nbins=8))
 
 
-def share_bars(ax: Any, counts: NDArray[np.int64], title: str, x: str, y: str) -> None:
+def share_bars(ax: Any, counts: Int64, title: str, x: str, y: str) -> None:
     """Draw how many values lie in each of equal bins from 0 to 1, those below 0.5 red."""
     width = 1 / len(counts)
     left = width * np.arange(len(counts))
@@ -110,7 +111,7 @@ def png(drawn: Any) -> bytes:
     return buffer.getvalue()
 
 
-def rgb(drawn: Any) -> NDArray[np.uint8]:
+def rgb(drawn: Any) -> UInt8:
     """Return the figure as a picture (H, W, 3)."""
     import cv2
 

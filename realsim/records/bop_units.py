@@ -6,14 +6,14 @@ The only place, together with `models`, where BOP's units change.
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.untrusted.values import number, numbers
 
-Array = NDArray[np.float64]
 MM_PER_M = 1000.0
 NEAREST_MM = 10.0
 """An object whose origin is nearer than this to the camera is not seen by any depth camera: the

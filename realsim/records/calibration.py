@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim.records.capture import CameraIntrinsics
-from realsim.records.checked_arrays import Array, frozen, rigid
+from realsim.records.checked_arrays import frozen, rigid
 from realsim.untrusted.own_json import Real, Tagged
 
 MAP_FEATURES = 12

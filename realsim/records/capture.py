@@ -5,8 +5,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.records.checked_arrays import Array, frozen, rigid
+from realsim.records.checked_arrays import frozen, rigid
 
 DISTORTION_TERMS = 8
 """OpenCV order k1 k2 p1 p2 k3 k4 k5 k6; the Brown model leaves k4 k5 k6 at zero."""

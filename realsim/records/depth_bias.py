@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.records.checked_arrays import Array, frozen
+from realsim.records.checked_arrays import frozen
 from realsim.untrusted.own_json import Real
 
 LARGEST_SCALE_ERROR = 0.5

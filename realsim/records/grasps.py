@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.records.checked_arrays import Array, frozen
+from realsim.records.checked_arrays import frozen
 
 STAGES = ("close", "lift", "oscillate", "pendulum")
 """The four stages of the slip test, in order."""
@@ -132,7 +132,7 @@ class GraspSet:
     """(N, 4) slip relative to the gripper in each stage [m]; NaN = not executed, inf = lost."""
     slip_rad: Array
     """(N, 4) rotation relative to the gripper in each stage [rad]; NaN, inf likewise."""
-    reachable: NDArray[np.bool_]
+    reachable: Mask
     """(N,) whether the arm has a collision-free trajectory to closure."""
     failures: tuple[str, ...]
     """(N,) why the grasp stopped where it stopped; '' = passed all."""
@@ -198,7 +198,7 @@ class GraspSet:
         return np.where(np.isnan(p) & out_of_reach, 0.0, p)
 
     @property
-    def unsure(self) -> NDArray[np.bool_]:
+    def unsure(self) -> Mask:
         """(N,) whether p_hold is known of too few draws, or with too large an error."""
         nothing = np.full(len(self), np.nan)
         few = self.measures.get("p_hold_draws", nothing) < FEW_DRAWS
@@ -206,7 +206,7 @@ class GraspSet:
         return few & ~np.isnan(self.measures.get("p_hold", nothing))
 
     @property
-    def good(self) -> NDArray[np.bool_]:
+    def good(self) -> Mask:
         """(N,) whether the grasp is good: score >= 0.5."""
         return np.nan_to_num(self.scores, nan=-1.0) >= 0.5
 

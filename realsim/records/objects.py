@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32, UInt8
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.records.checked_arrays import Array, frozen, rigid
+from realsim.records.checked_arrays import frozen, rigid
 from realsim.untrusted.own_json import Real
 
 Verdict = Literal["accepted", "doubtful", "rejected", "unchecked"]
@@ -21,13 +21,13 @@ class Mesh:
 
     vertices: Array
     """(V, 3) [m]."""
-    faces: NDArray[np.int32]
+    faces: Int32
     """(F, 3) vertex numbers, counter-clockwise seen from outside."""
-    colors: NDArray[np.uint8] | None = None
+    colors: UInt8 | None = None
     """(V, 3) RGB per vertex."""
     uv: Array | None = None
     """(V, 2) texture coordinates, v up (OBJ's convention)."""
-    texture: NDArray[np.uint8] | None = None
+    texture: UInt8 | None = None
     """(H, W, 3) RGB texture, first row at v = 1."""
 
     def __post_init__(self) -> None:

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
-from realsim.records.checked_arrays import Array
 
 TagFamily = Literal["tag16h5", "tag25h9", "tag36h10", "tag36h11"]
 TAG_CELLS: dict[str, int] = {"tag16h5": 6, "tag25h9": 7, "tag36h10": 8, "tag36h11": 8}
@@ -79,7 +78,7 @@ class TagBoard:
             )
 
     @property
-    def ids(self) -> NDArray[np.int64]:
+    def ids(self) -> Int64:
         """(rows * columns,) tag ids, row by row from the top of the page."""
         row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
         if self.ids_from == "bottom":

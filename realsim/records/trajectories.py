@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
-from realsim.records.checked_arrays import Array, frozen
+from realsim.records.checked_arrays import frozen
 
 PHASES = ("reach", "approach", "close", "lift", "oscillate", "pendulum")
 """The parts of an attempt, in order: from home to the pre-grasp, straight on, and the stages."""
@@ -16,9 +16,9 @@ PHASES = ("reach", "approach", "close", "lift", "oscillate", "pendulum")
 class GraspTrajectories:
     """The attempts of one grasp set; samples of attempt a are starts[a] to starts[a + 1]."""
 
-    rows: NDArray[np.int64]
+    rows: Int64
     """(A,) row of the grasp set that each attempt belongs to, increasing."""
-    starts: NDArray[np.int64]
+    starts: Int64
     """(A + 1,) first sample of each attempt; the last is the number of samples."""
     time_s: Array
     """(S,) since the attempt's start [s], not decreasing within an attempt."""
@@ -26,7 +26,7 @@ class GraspTrajectories:
     """(S, J) angles of the arm's joints [rad]."""
     opening_m: Array
     """(S,) commanded distance of the finger faces [m]."""
-    phase: NDArray[np.int64]
+    phase: Int64
     """(S,) number in PHASES."""
 
     def __post_init__(self) -> None:

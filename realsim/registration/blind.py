@@ -17,16 +17,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import ObjectModel
 from realsim.registration.body import Body
 from realsim.registration.compare import Comparer
 from realsim.registration.evidence import Cloud
 from realsim.registration.solver import FreeSpace, PoseFit, SolverConfig, solve_pose
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -6,15 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.geometry import se3
 from realsim.geometry.camera import project, ray_table
 from realsim.geometry.distance_field import DistanceField, raycasting_scene
 from realsim.geometry.mesh import sample_surface
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose
 
-Array = NDArray[np.float64]
 SAMPLE_SEED = 0
 """Surface samples are part of the model: always the same."""
 
@@ -86,9 +85,9 @@ def make_body(
 class Footprint:
     """The pixels at which one object would be seen, were nothing in front of it."""
 
-    rows: NDArray[np.int64]
+    rows: Int64
     """(N,) image rows, multiples of the stride."""
-    columns: NDArray[np.int64]
+    columns: Int64
     """(N,) image columns, multiples of the stride."""
     z: Array
     """(N,) depth of the surface along the camera's z [m]."""

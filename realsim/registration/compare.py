@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.geometry.depth import edge_mask
@@ -13,8 +14,6 @@ from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.body import Body, footprint, pixel_box
 from realsim.registration.evidence import DepthFrame, DepthNoise
 from realsim.registration.table_planes import table_depth
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -42,7 +41,7 @@ class Comparer:
 
     intrinsics: CameraIntrinsics
     frames: tuple[DepthFrame, ...]
-    edges: tuple[NDArray[np.bool_], ...]
+    edges: tuple[Mask, ...]
     """Per frame (H, W): pixels at depth jumps, which are not compared."""
     noise: DepthNoise
     plane: SupportPlane | None
@@ -65,9 +64,7 @@ class Comparer:
         value = 1.0 - 2.0 * np.square(d / self.tau(measured))
         return np.maximum(value, np.where(d < 0, -self.config.front_penalty, -1.0))
 
-    def table(
-        self, frame: DepthFrame, rows: NDArray[np.int64], columns: NDArray[np.int64]
-    ) -> Array:
+    def table(self, frame: DepthFrame, rows: Int64, columns: Int64) -> Array:
         """Return the table's depth (N,) at pixels [m]; inf without a table."""
         if self.plane is None:
             return np.full(len(rows), np.inf)
@@ -111,7 +108,7 @@ def make_comparer(
     config: CompareConfig,
 ) -> Comparer:
     """Return a comparer for these frames."""
-    edges: list[NDArray[np.bool_]] = []
+    edges: list[Mask] = []
     for frame in frames:
         z = frame.depth_m
         # Within 3 px a surface seen at 70 degrees spans about 6 pixel pitches.

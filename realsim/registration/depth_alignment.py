@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, UInt8
 from realsim.errors import InputError
 from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim.records import CameraIntrinsics
@@ -20,8 +21,6 @@ from realsim.registration.outlines import AlignmentConfig, edge_distance, outlin
 
 __all__ = ["AlignmentConfig", "AlignmentFinding", "check_alignment", "pooled_alignment"]
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 Kind = Literal["aligned", "not_aligned", "unknown", "other_size"]
 LEAST_VOTES = 3
 """Two views may agree by chance."""
@@ -57,8 +56,8 @@ class AlignmentFinding:
 
 
 def check_alignment(
-    rgb: NDArray[np.uint8],
-    depth_m: NDArray[np.float32],
+    rgb: UInt8,
+    depth_m: Array32,
     intrinsics: CameraIntrinsics,
     config: AlignmentConfig,
 ) -> AlignmentFinding:
@@ -272,9 +271,7 @@ def _words(kind: Kind, shift: Array, stretch: Array, count: tuple[int, int]) -> 
     )
 
 
-def _size_words(
-    rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], intrinsics: CameraIntrinsics
-) -> str:
+def _size_words(rgb: UInt8, depth_m: Array32, intrinsics: CameraIntrinsics) -> str:
     """Return in words that the sizes differ."""
     return (
         f"depth is {depth_m.shape[1]}x{depth_m.shape[0]}, colour {rgb.shape[1]}x{rgb.shape[0]} "

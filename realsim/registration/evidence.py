@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.clouds import voxel_mean
@@ -14,8 +15,6 @@ from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.records.depth_bias import DepthBias
 from realsim.registration.body import Body
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class DepthFrame:
@@ -23,7 +22,7 @@ class DepthFrame:
 
     index: int
     """Number of the view."""
-    depth_m: NDArray[np.float32]
+    depth_m: Array32
     """(H, W) depth along z [m]; 0 = none."""
     T_world_cam: Array
     """(4, 4) camera in world [m]."""
@@ -38,9 +37,9 @@ class LazyFrame(DepthFrame):
         self,
         index: int,
         T_world_cam: Array,
-        read: Callable[[], NDArray[np.float32]] | None = None,
+        read: Callable[[], Array32] | None = None,
         *,
-        depth_m: NDArray[np.float32] | None = None,
+        depth_m: Array32 | None = None,
     ) -> None:
         """Keep how the image is read; nothing is read.
 
@@ -57,9 +56,9 @@ class LazyFrame(DepthFrame):
         object.__setattr__(self, "_read", read or (lambda: depth_m))
 
     @property
-    def depth_m(self) -> NDArray[np.float32]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def depth_m(self) -> Array32:  # pyright: ignore[reportIncompatibleVariableOverride]
         """(H, W) depth along z [m]; 0 = none."""
-        read: Callable[[], NDArray[np.float32]] = object.__getattribute__(self, "_read")
+        read: Callable[[], Array32] = object.__getattribute__(self, "_read")
         return read()
 
 
@@ -123,7 +122,7 @@ class Cloud:
     sigmas: Array
     """(N,) 1-sigma [m]."""
 
-    def select(self, keep: NDArray[np.bool_]) -> "Cloud":
+    def select(self, keep: Mask) -> "Cloud":
         """Return the points where `keep` (N,)."""
         return Cloud(points=self.points[keep], towards=self.towards[keep], sigmas=self.sigmas[keep])
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.registration.blind import Kept, keep_start
@@ -31,8 +31,6 @@ from realsim.registration.intake import Intake
 from realsim.registration.near_start import BestStart, joint_fit, search
 from realsim.registration.solver import FreeSpace
 from realsim.registration.table_planes import find_support_plane
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, slots=True)

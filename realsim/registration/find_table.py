@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import SupportPlane
@@ -23,8 +24,6 @@ __all__ = [
     "TableFound", "TableSearchConfig", "ViewTable", "find_table", "looked_at",
     "region_of_interest", "view_table",
 ]  # fmt: skip
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -187,7 +186,7 @@ def view_table(
 
 def _best_sheet(
     p: Array, tolerance: Array, config: TableSearchConfig, rng: np.random.Generator
-) -> tuple[Array, NDArray[np.bool_]] | None:
+) -> tuple[Array, Mask] | None:
     """Return (a, b, c) of z = a x + b y + c with most points (N, 3), and which they are."""
     triples = p[rng.integers(0, len(p), size=(config.view_triples, 3))]
     A = np.concatenate([triples[..., :2], np.ones((*triples.shape[:2], 1))], axis=-1)

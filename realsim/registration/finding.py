@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose, names_of
@@ -21,7 +21,6 @@ from realsim.registration.reports import search_report
 from realsim.registration.search.find import find_objects
 from realsim.registration.search.records import NotPlaced, Placed, Region, SearchResult, Wanted
 
-Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 NO_INSTANCE = -1
 """Number of what was not asked for by number."""

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.registration.evidence import DepthNoise
@@ -22,7 +22,6 @@ from realsim.registration.view_agreement import (
 )
 from realsim.registration.views import ViewPoints
 
-Array = NDArray[np.float64]
 T_CAM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL's camera (y up, z backward) in OpenCV's."""
 OVERDRAWN = 20
@@ -35,7 +34,7 @@ class HeldViews:
 
     views: tuple[ViewPoints, ...]
     maps: ViewMaps
-    partners: NDArray[np.int64]
+    partners: Int64
     """(F, P) the views that each is held against."""
     above: tuple[Array, ...]
     """Per view: (N, 3) points above the table in camera axes [m]; any if there is no table."""
@@ -78,7 +77,7 @@ def hold_views(
 def contradiction(
     held: HeldViews,
     k: int,
-    others: Sequence[int] | NDArray[np.int64],
+    others: Sequence[int] | Int64,
     config: ViewCheckConfig,
     T_world_cam: Array | None = None,
 ) -> float:
@@ -108,7 +107,7 @@ def contradiction(
 def support(
     held: HeldViews,
     k: int,
-    others: Sequence[int] | NDArray[np.int64],
+    others: Sequence[int] | Int64,
     config: ViewCheckConfig,
     T_world_cam: Array,
 ) -> float:

@@ -8,16 +8,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, ObjectModel, SupportPlane
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.search.records import Region
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -43,7 +41,7 @@ class Marked:
     """Pixels of the object, roughly: a network's mask."""
 
     view: int
-    inside: NDArray[np.bool_]
+    inside: Mask
     """(H, W)."""
 
 
@@ -145,7 +143,7 @@ def region_of(
 
 def _pixels(
     where: Click | Box | Marked, camera: CameraIntrinsics, name: str, config: HintConfig
-) -> tuple[NDArray[np.bool_], tuple[float, float]]:
+) -> tuple[Mask, tuple[float, float]]:
     """Return the pixels (H, W) that a hint speaks of, and their middle (column, row).
 
     Raises:
@@ -185,7 +183,7 @@ def _pixels(
 
 def _from_depth(
     where: Click | Box | Marked,
-    measured: NDArray[np.bool_],
+    measured: Mask,
     model: ObjectModel,
     scene: HintScene,
     config: HintConfig,

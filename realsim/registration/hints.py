@@ -25,8 +25,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError, RealsimError, UnitError
 from realsim.geometry import se3
 from realsim.images import read_image
@@ -236,7 +237,7 @@ def _numbers(values: Any, count: int, label: str) -> list[float]:
     return [float(x) for x in array]
 
 
-def _rigid(values: ArrayLike, label: str) -> NDArray[np.float64]:
+def _rigid(values: ArrayLike, label: str) -> Array:
     """Return a rigid (4, 4) transform in metres."""
     try:
         T = se3.check_rigid(np.asarray(values, dtype=np.float64), f"{label}: T_world_obj")

@@ -4,8 +4,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry.depth import check_depth
 from realsim.records import CameraIntrinsics, SupportPlane
@@ -32,7 +33,6 @@ from realsim.registration.views import (
     world_cloud,
 )
 
-Array = NDArray[np.float64]
 SCENE_POINTS = 400_000
 """Points of all views that are averaged into the scene's cloud at most."""
 SCENE_VOXEL_M = 0.003

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.records import ObjectPose, SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.compare import Comparer
@@ -24,7 +24,6 @@ from realsim.registration.judging.verdict import probability_right, verdict_of
 from realsim.registration.table_planes import support_checks
 from realsim.registration.verify import Checked, verify_objects
 
-Array = NDArray[np.float64]
 ONE_VIEW_CHECKS = ("residual_bound_mm",)
 """What the surface residuals of a single view are good for."""
 COMMON = ("common shift", "common sinking")

@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.records.depth_bias import DepthBias
@@ -30,7 +30,6 @@ from realsim.registration.refinement.uncertainty import SeenPose, object_covaria
 from realsim.registration.solver import PoseFit, solve_pose
 from realsim.registration.views import ViewPoints
 
-Array = NDArray[np.float64]
 CLOUD_POINTS = 400_000
 """Points of all views that are averaged into the objects' clouds at most."""
 AGAIN_DEG = 3.0

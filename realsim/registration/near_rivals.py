@@ -10,16 +10,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.metrics import mssd_symmetric
 from realsim.registration.body import Body
 from realsim.registration.evidence import Cloud
 from realsim.registration.judging.verdict import CONTRAST_DECIDED
 from realsim.registration.solver import SolverConfig, solve_pose
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

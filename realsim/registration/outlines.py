@@ -3,12 +3,9 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, UInt8
 from realsim.compiled import njit
-
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 
 
 def _stretches() -> tuple[float, ...]:
@@ -73,11 +70,11 @@ class AlignmentConfig:
     """Of the choice of outline pixels."""
 
 
-def outlines_of(depth_m: NDArray[np.float32], config: AlignmentConfig) -> Array32:
+def outlines_of(depth_m: Array32, config: AlignmentConfig) -> Array32:
     """Return outline points (N, 3): x, y, and 0 where depth jumps along x, 1 along y."""
     import cv2
 
-    found: list[NDArray[np.float32]] = []
+    found: list[Array32] = []
     full = _without_pinholes(np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, 0))
     for axis, z in ((0, full), (1, full.T)):
         columns = np.arange(z.shape[1])
@@ -104,7 +101,7 @@ def outlines_of(depth_m: NDArray[np.float32], config: AlignmentConfig) -> Array3
     return np.concatenate(found)
 
 
-def _without_pinholes(depth_m: NDArray[np.float32]) -> Array:
+def _without_pinholes(depth_m: Array32) -> Array:
     """Return the depth (H, W) with holes of a pixel filled: depth mapped onto a larger image."""
     z = depth_m.astype(np.float64)
     for axis in (1, 0):
@@ -113,7 +110,7 @@ def _without_pinholes(depth_m: NDArray[np.float32]) -> Array:
     return z
 
 
-def edge_distance(rgb: NDArray[np.uint8], factor: int, config: AlignmentConfig) -> Array32:
+def edge_distance(rgb: UInt8, factor: int, config: AlignmentConfig) -> Array32:
     """Return the distance (2, H, W) to the nearest colour edge along x and along y [px]."""
     import cv2
 

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.records import ObjectPose, SupportPlane
@@ -16,8 +15,6 @@ from realsim.registration.many_views import ManyViews
 from realsim.registration.refinement.equations import BIAS, HAND_EYE
 from realsim.registration.search.records import Placed
 from realsim.registration.verify import common_offset, common_sinking
-
-Array = NDArray[np.float64]
 
 
 def plane_report(plane: SupportPlane | None, reason: str) -> dict[str, Any]:

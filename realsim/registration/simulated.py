@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, UInt16
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
@@ -42,7 +42,6 @@ __all__ = [
     "resized", "scatter_objects", "seen_instances", "table_scene", "with_found_symmetries",
 ]  # fmt: skip
 
-Array = NDArray[np.float64]
 DEPTH_UNIT_M = 1e-4
 """Depth images are stored in 0.1 mm, as sessions store them [m]."""
 LOOK_AT_M = 0.03
@@ -165,7 +164,7 @@ def render_depth(
     sensor: DepthSensorModel,
     seed: int,
     keep: Path | None = None,
-) -> NDArray[np.uint16]:
+) -> UInt16:
     """Return what a depth camera measures (F, H, W), in units of 0.1 mm, 0 = none.
 
     The noise of a view depends on the seed and the view's number only.
@@ -196,7 +195,7 @@ def render_depth(
     return images
 
 
-def seen_instances(scene: TableScene, views: Sequence[int], stride: int = 1) -> NDArray[np.int32]:
+def seen_instances(scene: TableScene, views: Sequence[int], stride: int = 1) -> Int32:
     """Return which instance each pixel really shows (V, H', W'); -1 = the table or nothing.
 
     Args:
@@ -212,7 +211,7 @@ def seen_instances(scene: TableScene, views: Sequence[int], stride: int = 1) -> 
     # The last entry answers -1, nothing.
     instances = np.array([*(p.instance for p in things), BACKGROUND], np.int32)
     rays = np.ascontiguousarray(ray_table(scene.intrinsics)[::stride, ::stride])
-    images: list[NDArray[np.int32]] = []
+    images: list[Int32] = []
     for k in views:
         T_world_cam = scene.Ts_world_cam[k]
         directions = rotated(rays, T_world_cam[:3, :3]).reshape(-1, 3)
@@ -255,7 +254,7 @@ def _cleared(Ts_world_cam: Array, points: Array, clearance_m: float) -> Array:
     return moved
 
 
-def _in_metres(depth: NDArray[np.uint16]) -> NDArray[np.float32]:
+def _in_metres(depth: UInt16) -> Array32:
     """Return a depth image (H, W) in metres, not to be written."""
     metres = depth.astype(np.float32) * np.float32(DEPTH_UNIT_M)
     metres.setflags(write=False)

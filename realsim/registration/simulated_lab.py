@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.models.resting import Resting, resting_orientations
@@ -17,7 +17,6 @@ from realsim.models.symmetry import SymmetryConfig, find_symmetries
 from realsim.records import CameraIntrinsics, Mesh, ObjectModel, ObjectPose
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 
-Array = NDArray[np.float64]
 T_EE_CAM = se3.from_translation([0.0, -0.065, 0.035])
 """(4, 4) the camera on the hand as drawn [m]."""
 LOWEST_DEG = 25.0

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
@@ -19,8 +19,6 @@ from realsim.interop import import_open3d
 from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.body import Body, footprint
 from realsim.registration.evidence import DepthFrame
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.distance_field import sample
@@ -24,7 +24,6 @@ from realsim.geometry.seen_surface import GATE_COS, follow_to_camera
 from realsim.registration.body import Body
 from realsim.registration.evidence import Cloud
 
-Array = NDArray[np.float64]
 LEAST_POINTS = 6
 """Fewer points than unknowns determine nothing: the pose is left where it is."""
 
@@ -75,7 +74,7 @@ class SolverConfig:
 class FreeSpace:
     """The depth images against which model samples are checked."""
 
-    depths: NDArray[np.float32]
+    depths: Array32
     """(F, H, W) [m]; 0 = none."""
     Ts_cam_world: Array
     """(F, 4, 4)."""
@@ -113,7 +112,7 @@ class PoseFit:
 
 @njit
 def accumulate_points(
-    lattice: tuple[NDArray[np.float32], Array, float],
+    lattice: tuple[Array32, Array, float],
     T: Array,
     cloud: tuple[Array, Array, Array],
     limits: tuple[float, float, bool],
@@ -170,7 +169,7 @@ def accumulate_points(
 def _accumulate_free_space(
     surface: tuple[Array, Array],
     T: Array,
-    images: tuple[NDArray[np.float32], Array, Array],
+    images: tuple[Array32, Array, Array],
     limits: tuple[float, float, float, float, float],
     center: Array,
     system: tuple[Array, Array],

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.geometry import se3
 from realsim.geometry.clouds import fit_plane_ransac, plane_frame, refine_plane
 from realsim.records import SupportPlane
 from realsim.registration.body import Body
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -128,14 +127,14 @@ def best_plane(
 
 def _largest_plane(
     points: Array, tolerance: float, config: TableSearchConfig, rng: np.random.Generator
-) -> tuple[Array, float, NDArray[np.bool_]]:
+) -> tuple[Array, float, Mask]:
     """Return normal, offset and inliers of the plane with most points, out of several searches.
 
     Three noisy points close together are a plane turned by degrees: one refinement begins with a
     tolerance wide enough to turn it back. In clutter that width pulls a good plane up into the
     objects, so another keeps to the tolerance.
     """
-    found: list[tuple[int, Array, float, NDArray[np.bool_]]] = []
+    found: list[tuple[int, Array, float, Mask]] = []
     for _ in range(config.searches):
         few = points[rng.integers(0, len(points), size=min(len(points), config.triple_points))]
         normal, offset, _ = fit_plane_ransac(few, rng, tolerance, config.iterations)
@@ -184,7 +183,7 @@ def _judged(
 
 def _pierced(
     normal: Array, offset: float, points: Array, eyes: Array, height: Array,
-    on: NDArray[np.bool_], config: TableSearchConfig,
+    on: Mask, config: TableSearchConfig,
 ) -> int:  # fmt: skip
     """Return how many rays pass through cells of the plane where other points lie on it."""
     T = se3.invert(table_frame(normal, offset, points[on].mean(0)))

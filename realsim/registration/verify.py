@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import SupportPlane, Verdict
@@ -13,8 +13,6 @@ from realsim.registration.body import Body, footprint
 from realsim.registration.compare import Comparer
 from realsim.registration.evidence import Cloud, DepthFrame
 from realsim.registration.table_planes import lowest_height, support_checks
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -144,7 +142,7 @@ def _without_doubles(
 
 def _seen_in(
     frame: DepthFrame,
-    edges: NDArray[np.bool_],
+    edges: Mask,
     bodies: Sequence[Body],
     poses: Sequence[Array],
     comparer: Comparer,

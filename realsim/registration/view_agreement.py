@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Int64
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
@@ -20,8 +20,6 @@ from realsim.registration.evidence import DepthNoise
 from realsim.registration.find_table import TableSearchConfig
 from realsim.registration.views import ViewPoints
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 CELL_STRIDES = 2.0
 """Cells of the depth maps are so many sampling strides wide: four samples fill one."""
 NEAREST_M = 0.02
@@ -132,7 +130,7 @@ def compare(maps: ViewMaps, k: int, points_world: Array, margin_m: float, sigmas
     return Counts(agree=int(agree), through=int(through), points=len(p))
 
 
-def partners(Ts_world_cam: Array, near: int, spread: int) -> NDArray[np.int64]:
+def partners(Ts_world_cam: Array, near: int, spread: int) -> Int64:
     """Return for every view (F, near + spread) those it is held against, itself never.
 
     The nearest by position see the same surfaces; those spread evenly over the session break the
@@ -155,7 +153,7 @@ def partners(Ts_world_cam: Array, near: int, spread: int) -> NDArray[np.int64]:
 
 
 @njit
-def _fill(pixels: NDArray[np.int32], z: Array32, cell: float, low: Array32, high: Array32) -> None:
+def _fill(pixels: Int32, z: Array32, cell: float, low: Array32, high: Array32) -> None:
     """Enter the depths (N,) [m] into the cells of one view's maps."""
     for n in range(len(z)):
         i, j = int(pixels[n, 1] / cell), int(pixels[n, 0] / cell)

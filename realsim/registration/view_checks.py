@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.robust import MAD_TO_SIGMA
@@ -32,7 +32,6 @@ from realsim.registration.views import ViewPoints
 
 __all__ = ["ViewCheckConfig", "ViewFinding", "check_views"]
 
-Array = NDArray[np.float64]
 LEVER_M = 0.1
 """A tilt moves the table by its tangent times this: half the width of what stands there [m]."""
 LISTED = 12

@@ -7,16 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics
 from realsim.registration.evidence import Cloud, DepthFrame, DepthNoise
-
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -45,7 +42,7 @@ class ViewPoints:
     """(4, 4) where the camera is said to be [m]."""
     points: Array32
     """(N, 3) in camera axes [m]."""
-    pixels: NDArray[np.int32]
+    pixels: Int32
     """(N, 2) their column and row."""
     area_px: float
     """Pixels that each of them stands for."""
@@ -61,7 +58,7 @@ class ViewPoints:
 @njit
 def _trusted_pixels(
     depth: Array32, stride: int, reach: int, limits: tuple[float, float, float, float, float]
-) -> tuple[NDArray[np.int32], int]:
+) -> tuple[Int32, int]:
     """Return the columns and rows (N, 2) of trusted sampled pixels, and how many hold depth.
 
     Args:

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32, UInt8
 from realsim.errors import InputError
 from realsim.records.checked_arrays import frozen
 
-Array32 = NDArray[np.float32]
 Color = tuple[float, float, float]
 LEAST_ROUGHNESS = 0.04
 """Smoother surfaces are mirrors, which neither renderer can sample."""
@@ -26,15 +25,15 @@ class Material:
 
     base_color: Color = (0.8, 0.8, 0.8)
     """Linear reflectance [0, 1]; multiplies the image where there is one."""
-    base_color_image: NDArray[np.uint8] | None = None
+    base_color_image: UInt8 | None = None
     """(H, W, 3) sRGB, first row at v = 1; None = the base colour alone."""
     roughness: float = 0.5
     """Perceptual roughness [0.04, 1] (alpha = roughness^2); multiplies its image."""
-    roughness_image: NDArray[np.uint8] | None = None
+    roughness_image: UInt8 | None = None
     """(H, W) linear, 255 = `roughness` itself; None = even."""
     metallic: float = 0.0
     """0 = plastic, wood, stone; 1 = metal."""
-    normal_image: NDArray[np.uint8] | None = None
+    normal_image: UInt8 | None = None
     """(H, W, 3) tangent-space normals (glTF, OpenGL's y up): (value - 128) / 127, so that 128 is
     exactly "not tilted" and (128, 128, 255) is flat; None = flat."""
     projection: Literal["uv", "box"] = "box"

@@ -3,8 +3,8 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
 from realsim.records import Mesh, TagBoard
 
@@ -14,7 +14,7 @@ FAMILY_SIZE = 587
 """Number of tags in the 36h11 family."""
 
 
-def tag_pattern(tag_id: int) -> NDArray[np.uint8]:
+def tag_pattern(tag_id: int) -> UInt8:
     """Return the (8, 8) modules of a 36h11 tag, 0 = black, 255 = white, first row at the top.
 
     Raises:
@@ -84,7 +84,7 @@ def board_mesh(board: TagBoard, margin_m: float = 0.02, px_per_m: float = 5000.0
 
 def _grid_lines(
     tags: int, sizes_m: tuple[float, float, float], sizes_px: tuple[int, int, int]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array]:
     """Return the cuts along one side, in metres from the first tag and in texels from the edge.
 
     Args:
@@ -92,7 +92,7 @@ def _grid_lines(
         sizes_m: tag, gap and margin [m].
         sizes_px: tag, gap and margin in texels.
     """
-    lines: list[NDArray[np.float64]] = []
+    lines: list[Array] = []
     for tag, gap, margin in (sizes_m, sizes_px):
         steps = [margin, *([tag, gap] * tags)[:-1], margin]
         lines.append(np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)]))

@@ -21,8 +21,9 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array32, Int32, Mask
 from realsim.geometry.colors import luminance
 from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment, Material
@@ -32,7 +33,6 @@ from realsim.rendering.depth_sensors.profiles import PROFILES, DepthProfile
 from realsim.rendering.rays import PlacedMesh, RayScene
 from realsim.rendering.stereo.config import StereoConfig
 
-Array32 = NDArray[np.float32]
 LEAST_LOSS = 0.005
 """A material that loses a smaller share than this loses nothing: looking it up is spared."""
 
@@ -46,7 +46,7 @@ class ExactView(Protocol):
         ...
 
     @property
-    def geometry(self) -> NDArray[np.int32]:
+    def geometry(self) -> Int32:
         """(H, W) number of the placed mesh; -1 = nothing."""
         ...
 
@@ -162,7 +162,7 @@ class DepthCamera:
         return share if share >= LEAST_LOSS else 0.0
 
 
-def exposed(reflectance: Array32, seen: NDArray[np.bool_]) -> Array32:
+def exposed(reflectance: Array32, seen: Mask) -> Array32:
     """Return reflectance (H, W) as a camera that sets its own exposure finds it, white = 1.
 
     The range of a fitted model was found before one wall or table, which the camera exposed for; so

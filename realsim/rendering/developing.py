@@ -1,12 +1,11 @@
 """From linear light to the picture: exposure, noise of the sensor, highlights, sRGB."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32, UInt8
 from realsim.compiled import njit
 from realsim.geometry.colors import srgb_encoded
 
-Array32 = NDArray[np.float32]
 SHOULDER = 0.8
 """Above this share of white the picture approaches white instead of clipping, so that highlights
 keep their shape; below it, it is linear light in sRGB. A value of 1 becomes 247 of 255."""
@@ -27,7 +26,7 @@ def developed(
     rng: np.random.Generator | None = None,
     full_well: float = 9000.0,
     read_noise: float = 8.0,
-) -> NDArray[np.uint8]:
+) -> UInt8:
     """Return the picture (H, W, 3) of exposed linear light (H, W, 3), 1 = white.
 
     Args:
@@ -51,7 +50,7 @@ def _develop(
     is_noisy: bool,
     sensor: tuple[float, float],
     encoding: Array32,
-    out: NDArray[np.uint8],
+    out: UInt8,
 ) -> None:
     """Fill the picture (H, W, 3); `noise` (H, W, 3) has the standard deviation 1."""
     full_well, dark = np.float32(sensor[0]), np.float32(sensor[1] * sensor[1])

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Array32, Int32, Int64, Mask
 from realsim.errors import InputError
 from realsim.geometry import camera, mesh_shape, se3
 from realsim.records import CameraIntrinsics
@@ -25,9 +26,6 @@ from realsim.rendering.rays import BACKGROUND, HitBuffer, PlacedMesh, RayScene
 
 __all__ = ["HitBuffer", "LabelRenderer", "Labels", "PlacedMesh"]
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 COORDINATES, NORMALS = 0, 1
 """The maps of `surface_maps`."""
 
@@ -39,7 +37,7 @@ class _Surfaces:
     rays: Array32
     Ts_obj_cam: Array
     normals: Array32
-    starts: NDArray[np.int64]
+    starts: Int64
     is_object: Mask
 
 
@@ -47,7 +45,7 @@ class _Surfaces:
 class Labels:
     """The labels of one view."""
 
-    ids: NDArray[np.int32]
+    ids: Int32
     """(H, W) instance seen; -1 = no object (background or nothing)."""
     depth_m: Array32
     """(H, W) depth along z of the first surface, background included [m]; 0 = nothing."""
@@ -61,9 +59,9 @@ class Labels:
     3x canvas), where the lens model can be inverted."""
     px_count_visib: dict[int, int]
     """Visible pixels per instance."""
-    geometry: NDArray[np.int32]
+    geometry: Int32
     """(H, W) number of the placed mesh seen; -1 = nothing."""
-    face: NDArray[np.int32]
+    face: Int32
     """(H, W) its face; -1 = nothing."""
     unknown: Mask
     """(H, W) pixels whose ray does not exist: the lens model cannot be inverted there. They carry

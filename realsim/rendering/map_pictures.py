@@ -8,10 +8,10 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Image
 from realsim.errors import InputError
 from realsim.rendering.overlay import Color, instance_color
 
-Image = NDArray[np.uint8]
 NOTHING: Color = (18, 20, 24)
 """Where a map says nothing: nearly black, but not the black of a missing picture."""
 

@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Image, Int32, Int64, Mask
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, GraspSet
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
 INSTANCE_COLORS: tuple[Color, ...] = (
     (0, 158, 230), (230, 159, 0), (0, 180, 130), (240, 228, 66), (213, 94, 0), (204, 121, 167),
@@ -75,16 +74,14 @@ def score_hex(score: float) -> str:
     return "#{:02x}{:02x}{:02x}".format(*score_color(score))
 
 
-def grasp_rgb(grasps: GraspSet, rows: NDArray[np.int64]) -> Image:
+def grasp_rgb(grasps: GraspSet, rows: Int64) -> Image:
     """Return the colours (N, 3) of some grasps by their label, pale where p_hold is not sure."""
     rgb = score_rgb(grasps.labels[rows])
     pale = np.rint((1 - PALE) * rgb + PALE * 255.0).astype(np.uint8)
     return np.where(grasps.unsure[rows, None], pale, rgb)
 
 
-def evenly_ranked(
-    grasps: GraspSet, most: int, rows: NDArray[np.int64] | None = None
-) -> NDArray[np.int64]:
+def evenly_ranked(grasps: GraspSet, most: int, rows: Int64 | None = None) -> Int64:
     """Return `most` rows evenly through the ranking by label, best first, unknown ones last.
 
     So that what is drawn has the colours of the whole set.
@@ -116,7 +113,7 @@ def dashed(lines: Sequence[Array], length_m: float = DASH_M) -> list[Array]:
 
 def draw_outlines(
     rgb: Image,
-    ids: NDArray[np.int32],
+    ids: Int32,
     colors: Mapping[int, Color] | None = None,
     thickness: int = 2,
 ) -> Image:
@@ -147,7 +144,7 @@ def draw_outlines(
 
 
 def draw_hatched(
-    rgb: Image, mask: NDArray[np.bool_], color: Color, spacing_px: int = 0, thickness: int = 2
+    rgb: Image, mask: Mask, color: Color, spacing_px: int = 0, thickness: int = 2
 ) -> Image:
     """Return the picture with a mask hatched by diagonal lines and outlined.
 
@@ -190,7 +187,7 @@ def _polyline(
     uv = camera.project(intrinsics, line)
     reach = 8 * max(intrinsics.width, intrinsics.height)
     # A point behind the camera is NaN, and NaN is less than nothing.
-    seen: NDArray[np.bool_] = np.all(np.abs(uv) < reach, axis=-1)
+    seen: Mask = np.all(np.abs(uv) < reach, axis=-1)
     for run in np.split(np.arange(len(uv)), np.flatnonzero(~seen)):
         kept = run[seen[run]]
         if len(kept) < 2:
@@ -217,7 +214,7 @@ def draw_grasps(
     intrinsics: CameraIntrinsics,
     T_cam_obj: ArrayLike,
     grasps: GraspSet,
-    indices: Sequence[int] | NDArray[np.int64] | None = None,
+    indices: Sequence[int] | Int64 | None = None,
     color_by: Literal["label", "instance"] = "label",
 ) -> Image:
     """Return the picture with grippers drawn far to near, nearer ones with wider lines.

@@ -3,11 +3,9 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from realsim.rendering.overlay import INK, PAPER, Color, Image, score_rgb
-
-Ids = NDArray[np.int32]
+from realsim.arrays import Image, Int32, Mask
+from realsim.rendering.overlay import INK, PAPER, Color, score_rgb
 
 
 def text_scale(shape: Sequence[int]) -> float:
@@ -16,7 +14,7 @@ def text_scale(shape: Sequence[int]) -> float:
 
 
 def write_names(
-    rgb: Image, ids: Ids, names: Mapping[int, str], colors: Mapping[int, Color]
+    rgb: Image, ids: Int32, names: Mapping[int, str], colors: Mapping[int, Color]
 ) -> Image:
     """Return the picture with every object's name under it; names that would overlap move away.
 
@@ -55,7 +53,7 @@ def write_names(
 def write_legend(
     rgb: Image,
     entries: Sequence[tuple[str, Color]],
-    busy: NDArray[np.bool_],
+    busy: Mask,
     *,
     ramp: str = "",
     lines: Sequence[str] = (),
@@ -100,7 +98,7 @@ def write_legend(
     return out
 
 
-def _free_corner(busy: NDArray[np.bool_], h: int, w: int) -> tuple[int, int]:
+def _free_corner(busy: Mask, h: int, w: int) -> tuple[int, int]:
     """Return top and left of a box (h, w) in the corner with the fewest busy pixels."""
     height, width = busy.shape
     corners = [(height - h, 0), (height - h, width - w), (0, 0), (0, width - w)]

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array, Array32, Int32, Mask, UInt8
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics
@@ -27,9 +28,6 @@ from realsim.rendering.rays import PlacedMesh, RayScene, rotated
 
 __all__ = ["Environment", "LightSampling", "Lighting", "Photo", "PhotoRenderer", "PlacedMesh"]
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
 Color = tuple[float, float, float]
 BLOCK_RAYS = 1 << 17
 """Rays shaded at a time: the working arrays stay near the processor's cache."""
@@ -91,7 +89,7 @@ class Lighting:
 class Photo:
     """A rendered photograph."""
 
-    rgb: NDArray[np.uint8]
+    rgb: UInt8
     """(H, W, 3) encoded colours."""
     depth_m: Array32
     """(H, W) exact depth along z at the pixel centres [m]; 0 = nothing."""
@@ -206,7 +204,7 @@ class PhotoRenderer:
             color.reshape(-1, 3)[known[rows]] = self._supersampled(frame, rows, pixel_rad)
         return color
 
-    def _busy(self, color: Array32, geometry: Int32) -> NDArray[np.bool_]:
+    def _busy(self, color: Array32, geometry: Int32) -> Mask:
         """Return (H, W) where the neighbourhood has contrast or the edge of a mesh."""
         import cv2
 
@@ -317,7 +315,7 @@ class PhotoRenderer:
         color = color + down * (np.array(light.floor, np.float32) - horizon)
         return np.asarray(color, np.float32)
 
-    def _expose(self, color: Array32, rng: np.random.Generator | None) -> NDArray[np.uint8]:
+    def _expose(self, color: Array32, rng: np.random.Generator | None) -> UInt8:
         """Return the encoded picture: shot and read noise, saturation, gamma."""
         light = self.lighting
         value = np.clip(color, 0.0, 1.0)

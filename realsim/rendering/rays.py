@@ -10,16 +10,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Array32, Int32, Mask
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Material
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 GRID_M = 4.0
 """Float32 coordinates have their origin on a grid of this pitch [m]: 2 m cost 0.1 um."""
 BACKGROUND = -1
@@ -56,11 +54,11 @@ class HitBuffer:
 
     t: Array32
     """(N,) parameter along the ray's direction; inf = nothing was met."""
-    geometry: NDArray[np.int32]
+    geometry: Int32
     """(N,) index of the placed mesh; -1 = nothing was met."""
-    instance: NDArray[np.int32]
+    instance: Int32
     """(N,) its instance; -1 = background or nothing."""
-    face: NDArray[np.int32]
+    face: Int32
     """(N,) face of that mesh; -1 = nothing was met."""
     uv: Array32
     """(N, 2) barycentric weights of the face's second and third vertex."""
@@ -74,7 +72,7 @@ class DepthView:
 
     depth_m: Array32
     """(H, W) depth along z [m]; 0 = nothing."""
-    geometry: NDArray[np.int32]
+    geometry: Int32
     """(H, W) index of the placed mesh; -1 = nothing."""
 
 
@@ -123,7 +121,7 @@ class RayScene:
         rays[:, 3:] = directions
         return self._core.Tensor(rays)
 
-    def first_hits(self, origins: Array, directions: Array32) -> tuple[Array32, NDArray[np.int32]]:
+    def first_hits(self, origins: Array, directions: Array32) -> tuple[Array32, Int32]:
         """Return t (N,), inf = nothing, and the placed mesh (N,), -1 = nothing, of rays.
 
         Args:

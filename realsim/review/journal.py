@@ -16,13 +16,12 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import ObjectPose
-
-Array = NDArray[np.float64]
 
 JOURNAL_FILE = "review/journal.jsonl"
 """Where in a session the decisions stand."""

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import UInt8
 from realsim.errors import InputError, RealsimError
 from realsim.formats.bop.models import model_file
 from realsim.records import ObjectModel, ObjectPose, Scene
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from realsim.review.placing.depth_residuals import CloudResiduals
     from realsim.review.placing.snapping import Snapper
 
-Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 """Called with (done, total)."""
 
@@ -393,7 +392,7 @@ class ReviewedSession:
             self._snapper[1].scene = scene
             return self._snapper[1]
 
-    def residual_rgb(self, objects: Sequence[ObjectPose]) -> NDArray[np.uint8]:
+    def residual_rgb(self, objects: Sequence[ObjectPose]) -> UInt8:
         """Return the colours (N, 3) of the measured points by their distance from the models.
 
         Args:

@@ -5,14 +5,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel
 from realsim.review.journal import ReviewState
 
-Array = NDArray[np.float64]
 Axes = tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 MOST_FOLD = 36

@@ -11,8 +11,8 @@ from functools import cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
@@ -26,7 +26,6 @@ from realsim.robots.shapes import Shape
 from realsim.robots.urdf import UrdfChain, UrdfShape, read_chain
 from realsim.untrusted.own_json import OwnFile
 
-Array = NDArray[np.float64]
 Row = tuple[float, ...]
 WRIST_JOINTS = 3
 """The last joints of most arms are the wrist."""

@@ -3,15 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.robots.arm import ArmFile, RobotArm, find_arm
 from realsim.robots.coal_geometry import Body, Geometry
 from realsim.robots.inverse import NO_CLOSED_FORM, held_joint
 from realsim.robots.robot_files import robot_file
 
-Array = NDArray[np.float64]
 SAMPLES = 400
 """Random joints at which the chains are compared and the inverse is asked."""
 SAME_M, SAME_RAD = 2e-5, 2e-5

@@ -4,8 +4,8 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, MissingLibraryError
 from realsim.geometry import se3
 from realsim.robots.check_arm import Finding
@@ -15,7 +15,6 @@ from realsim.robots.robot_files import RobotFolder, robot_file
 from realsim.robots.urdf import floats, origin_of
 from realsim.untrusted.xml_tree import read_xml
 
-Array = NDArray[np.float64]
 MEET_M = 1e-3
 """Closed pads that are farther apart do not meet [m]."""
 PATH_M = 2e-4

@@ -4,13 +4,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Shape
 
-Array = NDArray[np.float64]
 Pair = tuple[int, int]
 
 

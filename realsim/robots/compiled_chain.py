@@ -7,13 +7,11 @@ rows (3, 4). Frames of n joints are (n + 2, 3, 4): DH frames 0 to n, then the to
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.compiled import njit
 from realsim.geometry.dh import DhArm
 from realsim.robots.limits import LimitedArm
-
-Array = NDArray[np.float64]
 
 NEWTON_STEPS = 6
 """Most Newton steps per followed pose: 2 cm apart, the error is below 1e-9 after three."""

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
@@ -31,7 +31,6 @@ from realsim.robots.dh_of_chain import Screws, normals, screws
 from realsim.robots.kinematics import DhChain
 from realsim.untrusted.files import checked_text
 
-Array = NDArray[np.float64]
 LISTS = ("theta", "a", "d", "alpha")
 """What the controller's file holds as delta_theta, delta_a, ..."""
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")

@@ -13,12 +13,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 
-Array = NDArray[np.float64]
 PARALLEL_RAD = 1e-6
 """Axes nearer to parallel than this count as parallel [rad]: 1 micrometre at the arm's length.
 Their common normal would lie a thousand kilometres away, where 64 bits do not hold micrometres."""

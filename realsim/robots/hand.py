@@ -18,15 +18,14 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand_file import STIFFEST_N_PER_M, HandFile, Point, soft_n_per_m
 from realsim.robots.robot_files import RobotFolder, robot_file
 from realsim.untrusted.own_json import from_json
 
-Array = NDArray[np.float64]
 Box = tuple[Point, Point]
 """Least and greatest corner [m]."""
 Bar = tuple[float, float, float, float, float, float, float, float]
@@ -119,14 +118,14 @@ class Hand:
 
     # --- the law of the fingers ---------------------------------------------------------------
 
-    def z_pad(self, openings_m: NDArray[np.float64] | float) -> Array:
+    def z_pad(self, openings_m: Array | float) -> Array:
         """Return z of the pads' middles (N,) [m] at openings (N,) [m]; 0 for a slide."""
         w = np.asarray(openings_m, dtype=np.float64)
         if not self.arc_radius_m:
             return np.zeros_like(w)
         return self._height(w / 2.0 - self.arc_axis_y_m) - self._height(-self.arc_axis_y_m)
 
-    def grasps_of_pads(self, Ts_a_pads: Array, widths_m: NDArray[np.float64] | float) -> Array:
+    def grasps_of_pads(self, Ts_a_pads: Array, widths_m: Array | float) -> Array:
         """Return T_a_grasp (N, 4, 4) of hands whose pads, closed to widths (N,) [m], stand there.
 
         Args:
@@ -145,14 +144,14 @@ class Hand:
             top = np.where(passed, self.z_pad(upright), top)
         return np.minimum(*ends), top
 
-    def slope(self, fingers_m: NDArray[np.float64] | float) -> Array:
+    def slope(self, fingers_m: Array | float) -> Array:
         """Return dz / dy (N,) of the finger at +y at distances (N,) of its face from y = 0 [m]."""
         y = np.asarray(fingers_m, dtype=np.float64)
         if not self.arc_radius_m:
             return np.zeros_like(y)
         return (self.arc_axis_y_m - y) / self._height(y - self.arc_axis_y_m)
 
-    def joint_position(self, openings_m: NDArray[np.float64] | float) -> Array:
+    def joint_position(self, openings_m: Array | float) -> Array:
         """Return the driven joint's position (N,) at openings (N,) [m].
 
         Of a slide half the opening [m]; of an arc how far the crank has closed since zero [rad].
@@ -162,7 +161,7 @@ class Hand:
             return half
         return self._crank(half) - self._crank(self.joint_zero_m / 2.0)
 
-    def _height(self, across: NDArray[np.float64] | float) -> Array:
+    def _height(self, across: Array | float) -> Array:
         """Return how far above its axis the crank ends [m], so far beside it."""
         return np.sqrt(self.arc_radius_m**2 - np.asarray(across, dtype=np.float64) ** 2)
 
@@ -173,7 +172,7 @@ class Hand:
         """Number of boxes of each finger: its own, then one around each bar."""
         return len(self.finger_boxes) + len(self.bars)
 
-    def boxes(self, openings_m: NDArray[np.float64] | float) -> Array:
+    def boxes(self, openings_m: Array | float) -> Array:
         """Return the hand's boxes (N, B, 2, 3) [m]: palm, finger at -y, finger at +y.
 
         A finger's are its own, then one around each bar of the linkage as it is turned there.
@@ -204,7 +203,7 @@ class Hand:
         right[..., 0, 1], right[..., 1, 1] = -left[..., 1, 1], -left[..., 0, 1]
         return boxes
 
-    def bar_boxes(self, openings_m: NDArray[np.float64] | float) -> Array:
+    def bar_boxes(self, openings_m: Array | float) -> Array:
         """Return those of `boxes` (N, b, 2, 3) [m] that are around bars of the linkage."""
         boxes, side, own = self.boxes(openings_m), self.side_boxes, len(self.finger_boxes)
         right, left = boxes[:, -2 * side : -side], boxes[:, -side:]
@@ -247,7 +246,7 @@ def _cosines(began: Array, ended: Array) -> tuple[Array, Array]:
     )
 
 
-def along_approach(Ts_a_b: Array, distances_m: NDArray[np.float64] | float) -> Array:
+def along_approach(Ts_a_b: Array, distances_m: Array | float) -> Array:
     """Return poses (N, 4, 4), moved along their z by distances (N,) or one for all [m]."""
     moved = np.array(Ts_a_b, dtype=np.float64)
     moved[:, :3, 3] += np.asarray(distances_m, dtype=np.float64)[..., None] * moved[:, :3, 2]

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.compiled_chain import chain_numbers, solve_from
 from realsim.robots.limits import LimitedArm
 
-Array = NDArray[np.float64]
 CLOSED = 6
 """Joints of which a pose leaves none free."""
 HELD_VALUES = 24

@@ -13,11 +13,11 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.geometry import se3
 from realsim.robots import inverse
 from realsim.robots.limits import LimitedArm
 
-Array = NDArray[np.float64]
 NEWTON_STEPS = 25
 """Quadratic convergence takes 3-5 from a calibration delta; more only at singular poses."""
 POSE_TOLERANCE = 1e-10
@@ -89,7 +89,7 @@ class DhChain(LimitedArm):
         q = np.where((q < low) & (q + 2 * np.pi <= high), q + 2 * np.pi, q)
         return np.where((q > high) & (q - 2 * np.pi >= low), q - 2 * np.pi, q)
 
-    def refine(self, joints: ArrayLike, Ts_base_ee: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+    def refine(self, joints: ArrayLike, Ts_base_ee: ArrayLike) -> tuple[Array, Mask]:
         """Return joints (M, n) moved by Newton steps onto poses (M, 4, 4), and which arrived."""
         q = np.array(joints, dtype=np.float64)
         T = np.asarray(Ts_base_ee, dtype=np.float64)
@@ -120,7 +120,7 @@ class DhChain(LimitedArm):
         return np.concatenate(rows) if rows else np.zeros((0, self.joints))
 
 
-def _repeated(q: Array, owner: NDArray[np.intp]) -> NDArray[np.bool_]:
+def _repeated(q: Array, owner: NDArray[np.intp]) -> Mask:
     """Return (M,) whether an earlier solution of the same pose is the same branch."""
     repeated = np.zeros(len(q), dtype=bool)
     for lag in range(1, 8):

@@ -4,12 +4,11 @@ from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.geometry.dh import DhArm, checked_row
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -36,7 +35,7 @@ class JointLimits:
         if np.any(self.speed <= 0) or np.any(self.acceleration <= 0):
             raise InputError("joint limits: speeds and accelerations must be positive.")
 
-    def contains(self, joints: ArrayLike) -> NDArray[np.bool_]:
+    def contains(self, joints: ArrayLike) -> Mask:
         """Return (...) whether joints (..., n) [rad] are inside the limits."""
         q = np.asarray(joints, dtype=np.float64)
         return np.all((q >= self.lower) & (q <= self.upper), axis=-1)

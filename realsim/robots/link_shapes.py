@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.mesh_files import load_mesh
@@ -23,7 +23,6 @@ from realsim.robots.urdf import UrdfShape
 if TYPE_CHECKING:
     from realsim.robots.arm import RobotArm
 
-Array = NDArray[np.float64]
 Axis = Literal["x", "y", "z"]
 Rod = tuple[
     str, int, Literal["cylinder", "capsule"], Axis, float, float, float, tuple[float, float]

@@ -4,14 +4,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, MissingLibraryError
 from realsim.geometry import se3
 from realsim.robots.robot_files import RobotFolder
 from realsim.robots.urdf import UrdfChain, UrdfShape, onto_z
-
-Array = NDArray[np.float64]
 
 
 def read_mjcf_chain(folder: RobotFolder, file: str, base: str, flange: str) -> UrdfChain:

@@ -4,12 +4,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.records.checked_arrays import frozen, rigid
 
-Array = NDArray[np.float64]
 Kind = Literal["box", "capsule", "cylinder", "sphere", "convex"]
 SIZES = {"box": 3, "capsule": 2, "cylinder": 2, "sphere": 1, "convex": 0}
 """How many lengths each kind has: box x y z; capsule and cylinder radius and length (of the

@@ -6,14 +6,14 @@ from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.robot_files import PACKAGE, RobotFolder
 from realsim.untrusted.xml_tree import read_xml
 
-Array = NDArray[np.float64]
 TURNING = ("revolute", "continuous")
 MOST_TURNS_RAD = 4 * np.pi
 """A joint that turns farther than two turns each way has its limits in degrees."""

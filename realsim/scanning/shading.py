@@ -4,15 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Image, Int32
 from realsim.geometry.mesh import vertex_normals
 from realsim.records import Mesh
 from realsim.rendering.rays import PlacedMesh, RayScene
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
-Paint = Callable[[NDArray[np.int32], Array], Array]
+Paint = Callable[[Int32, Array], Array]
 """Colours (N, 3) of points by the vertices (N, 3) of their faces and their weights (N, 3)."""
 UNSEEN = (118, 123, 130)
 """Grey of a surface of which nothing is known."""
@@ -112,7 +110,7 @@ def value_paint(values: Array, limit: float) -> Paint:
     with one unseen corner would else lose all that was measured on them.
     """
 
-    def paint(corners: NDArray[np.int32], weights: Array) -> Array:
+    def paint(corners: Int32, weights: Array) -> Array:
         found = values[corners]
         known = np.isfinite(found)
         w = np.where(known, weights, 0.0)

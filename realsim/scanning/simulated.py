@@ -7,8 +7,8 @@ same errors serve the tests, the benchmark, and whoever asks which accuracy a sh
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.geometry import se3
 from realsim.geometry.mesh import transformed
 from realsim.records import CameraIntrinsics, Mesh
@@ -23,7 +23,6 @@ from realsim.registration.simulated_lab import (
 )
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 
-Array = NDArray[np.float64]
 __all__ = [
     "DISC_M", "EDGES_PER_LENGTH", "FIELD_POINTS", "LOWEST_DEG", "T_EE_CAM", "ScanLabConfig",
     "ScanViews", "distorted", "scan_views", "standing",
@@ -210,7 +209,7 @@ def _short_edged(mesh: Mesh, longest: float) -> Mesh:
     )
 
 
-def _halved(faces: NDArray[np.int64], middle: NDArray[np.int64]) -> NDArray[np.int64]:
+def _halved(faces: Int64, middle: Int64) -> Int64:
     """Return triangles cut at the middles (F, 3) of their edges ab, bc, ca; -1 = not cut."""
     cuts = np.sum(middle >= 0, axis=1)
     # Turned so that one cut is on ab, two are on ab and bc.
@@ -220,7 +219,7 @@ def _halved(faces: NDArray[np.int64], middle: NDArray[np.int64]) -> NDArray[np.i
     ab, bc, ca = np.take_along_axis(middle, order, 1).T
     one, two, three = cuts == 1, cuts == 2, cuts == 3
 
-    def pick(which: NDArray[np.bool_], *corners: NDArray[np.int64]) -> NDArray[np.int64]:
+    def pick(which: Mask, *corners: Int64) -> Int64:
         return np.stack([x[which] for x in corners], -1)
 
     return np.concatenate([

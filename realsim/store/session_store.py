@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim import images
+from realsim.arrays import Array32, UInt8, UInt16
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, CaptureSession, View, bop_units
 from realsim.store import atomic
@@ -51,7 +52,6 @@ if TYPE_CHECKING:
 
 __all__ = ["ROBOT_FILE", "SESSION_FILE", "SessionStore", "depth_path", "rgb_path"]
 
-Array = NDArray[np.float64]
 
 EAGER_VIEWS = 256
 """Up to so many views scene_camera.json is written anew with each; beyond, ..."""
@@ -214,10 +214,10 @@ class SessionStore:
     def add_view(
         self,
         view: View,
-        rgb: NDArray[np.uint8],
+        rgb: UInt8,
         depth_m: NDArray[Any] | None = None,
         *,
-        depth_counts: NDArray[np.uint16] | None = None,
+        depth_counts: UInt16 | None = None,
     ) -> None:
         """Write one view: colour, then depth, then its robot line, then the checksums.
 
@@ -265,7 +265,7 @@ class SessionStore:
             # The list of views comes last: where its line is missing, a run was interrupted.
             self._manifest.add_sealed([*entries, self._lines.entry(ROBOT_FILE)])
 
-    def rgb(self, index: int) -> NDArray[np.uint8]:
+    def rgb(self, index: int) -> UInt8:
         """Return the colour image (H, W, 3) uint8 of a view."""
         self._require(index)
         return images.read_rgb(self.folder / rgb_path(index))
@@ -275,7 +275,7 @@ class SessionStore:
         self._require(index)
         return bool(self._robot[index]["depth"])
 
-    def depth_m(self, index: int) -> NDArray[np.float32]:
+    def depth_m(self, index: int) -> Array32:
         """Return the depth image (H, W) float32 [m] of a view, 0 = no measurement.
 
         Raises:

@@ -3,7 +3,7 @@
     class Note(OwnFile, kw_only=True):         # unknown fields are told; dataclasses do as well
         format: Literal["realsim note 1"] = "realsim note 1"
         depth_unit_m: Annotated[float, Meta(gt=0, le=0.02)]
-        T_world_obj: NDArray[np.float64]       # nested lists; NaN is null
+        T_world_obj: Array       # nested lists; NaN is null
         sigma_px: Real = math.nan              # any double: NaN is null, infinity "inf"
         scenes: dict[str, Scene] = {}          # records of realsim.records as they are
 
@@ -24,8 +24,8 @@ import msgspec
 import numpy as np
 from msgspec import inspect
 from msgspec.inspect import type_info
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.untrusted import json_text
 
@@ -87,7 +87,7 @@ def number_from_json(value: Any) -> float:
     return math.nan if value is None else float(value)
 
 
-def array_from_json(values: Any, shape: tuple[int, ...] | None = None) -> NDArray[np.float64]:
+def array_from_json(values: Any, shape: tuple[int, ...] | None = None) -> Array:
     """Return the array that `to_json` made JSON of, in a shape if one is given."""
     array = np.array(values, dtype=np.float64)
     return array if shape is None else array.reshape(shape)

@@ -11,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 
 EXACT_WHOLE = 2**53
@@ -56,7 +57,7 @@ def whole(value: Any, name: str, low: float = -math.inf, high: float = math.inf)
     return found
 
 
-def numbers(value: Any, count: int | None, name: str) -> NDArray[np.float64]:
+def numbers(value: Any, count: int | None, name: str) -> Array:
     """Return a flat list of finite numbers as (count,) float64; None = any count.
 
     Raises:

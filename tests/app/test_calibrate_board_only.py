@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from numpy.typing import NDArray
 
 from realsim.app.cli import commands
+from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession, TagBoard, View
@@ -25,11 +25,10 @@ T_EE_CAM = se3.from_rt(se3.exp_so3([0.02, -0.03, 0.9]), [0.01, -0.065, 0.035])
 VIEWS = 12
 MODULES, TEXTURE, FINE = 8, 10, 2
 """Modules of a tag with its border, texture pixels a module, supersampling."""
-Array = NDArray[np.float64]
 
 
 @cache
-def printed_sheet() -> tuple[NDArray[np.uint8], float, int]:
+def printed_sheet() -> tuple[UInt8, float, int]:
     """Return the sheet, its pixels per metre, and the width of its margin [pixels]."""
     from cv2 import aruco
 
@@ -48,7 +47,7 @@ def printed_sheet() -> tuple[NDArray[np.uint8], float, int]:
     return sheet, per_m, margin
 
 
-def photograph(T_cam_board: Array, rng: np.random.Generator) -> NDArray[np.uint8]:
+def photograph(T_cam_board: Array, rng: np.random.Generator) -> UInt8:
     """Return a picture (H, W, 3) of the board on grey."""
     import cv2
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from franka_server import FrankaServer
 from realsim.app.doctor.devices import robot_findings
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.interop import import_pyrealsense2
 from realsim.records import CaptureSession
@@ -22,7 +22,6 @@ from realsim_capture_plans.plan_files.plan_json import save_plan
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 from typed_commands import realsim
 
-Array = NDArray[np.float64]
 VIEWS = 2
 
 

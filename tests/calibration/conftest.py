@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import camera, se3
 from realsim.geometry.dh import DhArm
 from realsim.records import (
@@ -21,8 +21,6 @@ from realsim.records import (
 from realsim_calibration.hand_eye import HandEyeConfig, calibrate_hand_eye_report
 from realsim_calibration.results import BoardShape, HandEyeReport, Mode, ViewReport
 from realsim_calibration.views import BoardView, TargetDetection
-
-Array = NDArray[np.float64]
 
 
 def camera_at(

@@ -18,6 +18,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_calibration.exports import (
@@ -31,7 +32,6 @@ from realsim_calibration.exports import (
 )
 from realsim_calibration.results import HandEyeReport, Mode
 
-Array = NDArray[np.float64]
 EXACT = 1e-9
 Maker = Callable[..., HandEyeReport]
 axis = hnp.arrays(np.float64, 3, elements=st.floats(-1, 1)).filter(

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 from cv2 import aruco
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, UInt8
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim_calibration.sheets import (
     PAPERS_MM,
@@ -53,7 +53,7 @@ class Raster:
         self.preferences = path.read_bytes()
         document.close()
 
-    def to_mm(self, uv: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_mm(self, uv: Array) -> Array:
         """Pixel centres are integers; the page's corner is the outer corner of the first pixel."""
         return (np.asarray(uv, dtype=np.float64) + 0.5) * self.mm_per_px
 
@@ -76,7 +76,7 @@ def printed(tmp_path_factory: pytest.TempPathFactory):
 # --- OpenCV's own detectors -------------------------------------------------------------------
 
 
-def found_points(target: Target, gray: NDArray[np.uint8]) -> NDArray[np.float64]:
+def found_points(target: Target, gray: UInt8) -> Array:
     """(n, 2) all points of the target in the order of its records, NaN where not found."""
     if isinstance(target, TagBoard):
         return found_tags(target, gray)
@@ -105,7 +105,7 @@ def found_points(target: Target, gray: NDArray[np.uint8]) -> NDArray[np.float64]
     return np.reshape(corners, (-1, 2)).astype(np.float64)
 
 
-def found_tags(board: TagBoard, gray: NDArray[np.uint8]) -> NDArray[np.float64]:
+def found_tags(board: TagBoard, gray: UInt8) -> Array:
     family = f"DICT_APRILTAG_{board.family[3:]}"
     parameters = aruco.DetectorParameters()
     parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
@@ -117,7 +117,7 @@ def found_tags(board: TagBoard, gray: NDArray[np.uint8]) -> NDArray[np.float64]:
     return np.concatenate([by_id.get(int(i), missing) for i in board.ids])
 
 
-def up_to_turns(target: Target, found: NDArray[np.float64], expected: NDArray[np.float64]):
+def up_to_turns(target: Target, found: Array, expected: Array):
     """OpenCV's order of a grid that has no first point is any of its turns: take the nearest."""
     if isinstance(target, (TagBoard, CharucoBoard)):
         return found
@@ -154,7 +154,7 @@ def test_rulers_and_page_have_their_length(line: str, printed) -> None:
         assert np.abs(np.diff(ticks) - 1.0).max() < WITHIN_MM
 
 
-def ruler_ticks_mm(ruler, raster: Raster) -> NDArray[np.float64]:
+def ruler_ticks_mm(ruler, raster: Raster) -> Array:
     """Centres of the dark marks along a line that crosses the ruler a millimetre off its base."""
     x, y = ruler.zero_mm
     if ruler.upward:

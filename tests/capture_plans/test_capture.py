@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
@@ -51,8 +52,8 @@ CAMERA = CameraIntrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.
 class KinematicArm:
     """A UR5 that is where it was sent, at once; remembers the path of its joints."""
 
-    joints: NDArray[np.float64]
-    path: list[NDArray[np.float64]] = field(default_factory=list)
+    joints: Array
+    path: list[Array] = field(default_factory=list)
     speeds: list[tuple[float, float]] = field(default_factory=list)
     clock_s: float = 0.0
     name: str = "UR5 of the test"
@@ -114,7 +115,7 @@ def plan() -> CapturePlan:
     """A ring of views that look down at the middle of the table, every third over a via point."""
     center, config = np.array([0.40, 0.0, 0.0]), PlanConfig()
     home = UR5_HOME + np.pi * np.eye(6)[0]  # turned to the side where the table is
-    joints: list[NDArray[np.float64]] = []
+    joints: list[Array] = []
     for turn in np.linspace(0.0, 2 * np.pi, VIEWS, endpoint=False):
         eye = center + 0.32 * np.array([0.25 * np.cos(turn), 0.25 * np.sin(turn), 1.0])
         z = (center - eye) / np.linalg.norm(center - eye)
@@ -169,9 +170,7 @@ def load_plan_of(store: SessionStore) -> CapturePlan:
     return load_plan(store.path(PLAN_FILE))
 
 
-def driven_clear(
-    path: list[NDArray[np.float64]], start: NDArray[np.float64], of: CapturePlan | None = None
-) -> bool:
+def driven_clear(path: list[Array], start: Array, of: CapturePlan | None = None) -> bool:
     p = plan() if of is None else of
     corners = np.stack([start, *path])
     model = p.collision_model()

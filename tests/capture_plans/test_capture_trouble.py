@@ -13,8 +13,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession, Mesh
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
@@ -38,7 +39,6 @@ from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 UR5_HOME = find_arm("ur5").home
 
-Array = NDArray[np.float64]
 VIEWS = 9
 RENDERED: dict[bytes, Frame] = {}
 CLOCK = count(1)

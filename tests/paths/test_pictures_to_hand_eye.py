@@ -11,15 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from documented_commands import as_arguments, documented
+from realsim.arrays import Array, Array32, UInt8
 from realsim.geometry import camera, se3
 from realsim.images.png import encode_png
 from realsim.records import CameraIntrinsics
 
 pytestmark = pytest.mark.slow
-Array = NDArray[np.float64]
 README = "README.md"
 GOAL_MM, GOAL_DEG = 0.5, 0.1
 """What the demo asks of a hand-eye."""
@@ -43,7 +42,7 @@ def run(line: str, here: Path, *more: str, **replaced: str) -> "subprocess.Compl
     )  # fmt: skip
 
 
-def printed(sheet: Path) -> NDArray[np.float32]:
+def printed(sheet: Path) -> Array32:
     """Return the printed page: how light it is, 0.12 ink to 0.85 paper."""
     import pypdfium2
 
@@ -54,7 +53,7 @@ def printed(sheet: Path) -> NDArray[np.float32]:
 class Camera:
     """Photographs a page through the bent lens; integer pixels are pixel centres."""
 
-    def __init__(self, page: NDArray[np.float32]) -> None:
+    def __init__(self, page: Array32) -> None:
         steps = (np.arange(RAYS) - (RAYS - 1) / 2) / RAYS
         v = (np.arange(LENS.height)[:, None] + steps).ravel()
         u = (np.arange(LENS.width)[:, None] + steps).ravel()
@@ -63,7 +62,7 @@ class Camera:
         self.page = page
         self.page_m = np.array(page.shape[::-1]) * INCH_M / DPI
 
-    def photograph(self, T_cam_page: Array, rng: np.random.Generator) -> NDArray[np.uint8]:
+    def photograph(self, T_cam_page: Array, rng: np.random.Generator) -> UInt8:
         """Return the picture; the page's x goes along its rows, its origin is its middle."""
         import cv2
 

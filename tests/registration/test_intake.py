@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records.depth_bias import DepthBias
@@ -17,7 +17,6 @@ from table_faults import without_any_depth
 from table_scenes import SMALL_LAB, small_scene
 
 CONFIG = RegistrationConfig()
-Image = NDArray[np.float32]
 
 
 def scene() -> TableScene:
@@ -34,10 +33,10 @@ def taken(frames, config: RegistrationConfig = CONFIG):
 class Reader:
     """An image on disk, so to speak: it counts how often it is read."""
 
-    def __init__(self, image: Image) -> None:
+    def __init__(self, image: Array32) -> None:
         self.image, self.times = image, 0
 
-    def __call__(self) -> Image:
+    def __call__(self) -> Array32:
         self.times += 1
         return self.image
 

@@ -5,8 +5,8 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.metrics import mssd_symmetric
 from realsim.records.depth_bias import DepthBias
@@ -23,7 +23,6 @@ from realsim.registration.many_views import (
 from realsim.registration.simulated import TableScene
 from table_scenes import named_scene
 
-Array = NDArray[np.float64]
 CONFIG = RegistrationConfig(field_cells=64)
 NAMES = ("cylinder_can", "wedge", "elbow")
 """The first is round: nothing shows how it is turned about its axis."""

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.metrics import mssd_symmetric
@@ -27,7 +27,6 @@ from realsim.registration.simulated import (
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from table_scenes import SMALL_LAB, part_models, small_scene
 
-Array = NDArray[np.float64]
 NAMES = ("box", "wedge", "l_bracket", "elbow", "flange")
 DISPARITY_PER_M = 648 * 0.018
 """Focal length [px] times baseline [m]: pixels of disparity per inverse depth."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.normal_equations import System, covariances, solve
 from realsim.geometry.parts import part
@@ -31,7 +31,6 @@ from realsim.registration.refinement.equations import (
 )
 from realsim.registration.refinement.points import exact_residuals, thin_share
 
-Array = NDArray[np.float64]
 TINY_M = 1e-9
 """A residual so small that the ray meets the surface at the point itself."""
 STEP = 1e-5

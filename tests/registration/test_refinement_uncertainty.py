@@ -4,8 +4,8 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.registration.body import Body, make_body
@@ -21,7 +21,6 @@ from realsim.registration.refinement.uncertainty import (
 from realsim.registration.simulated import TableScene
 from table_scenes import named_scene
 
-Array = NDArray[np.float64]
 NAMES = ("wedge", "l_bracket", "elbow", "t_profile")
 """Parts without a symmetry about an axis: every turn is seen."""
 SEEDS = range(3)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics
 from realsim.registration.evidence import DepthFrame, DepthNoise
 from realsim.registration.views import SampleConfig, sample_view, sample_views, world_cloud
 
-Array = NDArray[np.float64]
 CAMERA = CameraIntrinsics(width=160, height=90, fx=115.0, fy=112.0, cx=80.3, cy=44.1)
 NOISE = DepthNoise(per_m=0.007, floor_m=2e-4)
 
@@ -24,7 +24,7 @@ def frame(depth: NDArray, T: Array | None = None, index: int = 0) -> DepthFrame:
     )  # fmt: skip
 
 
-def plane_depth(camera: CameraIntrinsics, T_world_cam: Array) -> NDArray[np.float32]:
+def plane_depth(camera: CameraIntrinsics, T_world_cam: Array) -> Array32:
     """Exact depth of the plane z = 0 of the world (no lens distortion)."""
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = np.stack(

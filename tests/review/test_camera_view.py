@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask, UInt8
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, CaptureSession, ObjectPose, View
@@ -16,7 +16,6 @@ from realsim.review.placing.camera_view import CameraViews, pinhole_of, straight
 from realsim.store import SessionStore
 from tests.support.synthetic_scenes import MODELS, TABLE, placed
 
-Array = NDArray[np.float64]
 LENS = CameraIntrinsics(
     width=640, height=480, fx=430.0, fy=436.0, cx=309.0, cy=251.0,
     distortion=np.array([-0.32, 0.12, 0.002, -0.003, -0.02]),
@@ -72,7 +71,7 @@ def farthest(points: Array, among: Array) -> float:
     return float(KDTree(among).query(points)[0].max())
 
 
-def drawn_in(rgb: NDArray[np.uint8], verdict: str) -> NDArray[np.bool_]:
+def drawn_in(rgb: UInt8, verdict: str) -> Mask:
     """Return the pixels (H, W) of a verdict's colour, softened edges left out."""
     return np.all(np.abs(rgb.astype(int) - VERDICT_RGB[verdict]) < 30, axis=-1)
 

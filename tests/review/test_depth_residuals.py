@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh_shape import sample_surface
@@ -14,7 +14,6 @@ from realsim.review.placing.depth_residuals import (
     residuals,
 )
 
-Array = NDArray[np.float64]
 WEDGE = part("wedge").mesh
 FLANGE = part("flange").mesh
 T_WEDGE = se3.from_translation([0.5, 0.1, 0.0]) @ se3.exp(np.array([0.1, -0.3, 0.5, 0, 0, 0]))

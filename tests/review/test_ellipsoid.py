@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import mesh_shape, se3
 from realsim.geometry.parts import part
@@ -17,7 +17,6 @@ from realsim.review.placing.ellipsoid import (
     unit_sphere,
 )
 
-Array = NDArray[np.float64]
 MUG = part("mug")
 TUBE = replace(part("tube"), symmetry_axes=(((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)),))
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.distance_field import raycasting_scene
@@ -11,7 +11,6 @@ from realsim.geometry.parts import part
 from realsim.interop import import_open3d
 from realsim.review.placing.picking import ray_on_cloud, ray_on_mesh
 
-Array = NDArray[np.float64]
 MUG = part("mug")
 WEDGE = part("wedge")
 
@@ -61,7 +60,7 @@ def test_what_lies_behind_the_eye_is_not_met() -> None:
 # --- clouds -----------------------------------------------------------------------------------
 
 
-def sheet(z: float, slope: float = 0.0, n: int = 120) -> NDArray[np.float32]:
+def sheet(z: float, slope: float = 0.0, n: int = 120) -> Array32:
     """Return a sheet of points 1 mm apart that rises along x."""
     x, y = np.meshgrid(np.arange(n) * 1e-3 - 0.06, np.arange(n) * 1e-3 - 0.06)
     return np.stack([x.ravel(), y.ravel(), (z + slope * x).ravel()], -1).astype(np.float32)

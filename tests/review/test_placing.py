@@ -2,15 +2,14 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import SupportPlane
 from realsim.review.placing import placing
 
-Array = NDArray[np.float64]
 MUG = part("mug").mesh
 MIDDLE = placing.middle_of(MUG)
 KINDS: tuple[placing.Kind, ...] = ("move", "turn")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.parts import part
@@ -27,7 +27,6 @@ from tests.support.registered_sessions import (
 )
 from tests.support.synthetic_scenes import box
 
-Array = NDArray[np.float64]
 MODELS = models_of()
 TUBE = part("tube")
 TRUTH = {o.instance: o for o in true_poses()}

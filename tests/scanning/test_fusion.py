@@ -5,9 +5,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from fusion_frames import exact_frames
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.mesh import to_trimesh, transformed
 from realsim.geometry.parts import object_model
@@ -16,7 +16,6 @@ from realsim.scanning.fusion.fuse import FusedObject, FusionConfig, FusionFrame,
 from realsim.scanning.fusion.picture import fusion_picture
 from realsim.scanning.simulated import ScanLabConfig, scan_views, standing
 
-Array = NDArray[np.float64]
 CAMERA = CameraIntrinsics(width=640, height=360, fx=324.0, fy=324.0, cx=319.5, cy=179.5)
 AS_GIVEN = FusionConfig(refine=False, rounds=2, voxel_m=0.0015)
 RADIUS = 0.045

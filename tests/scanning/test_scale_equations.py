@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.normal_equations import System, symmetric
 from realsim.registration.refinement.equations import OBJECTS, TABLE_AT, Blocks, Offsets, assemble
@@ -30,7 +30,6 @@ from realsim.scanning.scale.state import (
 )
 from scanned_objects import evidence_of, shape_of
 
-Array = NDArray[np.float64]
 STEP = 1e-6
 SHARED = PATCHES + 1
 """Unknowns of one patch: registration's, size, outlines' offset, the patch's offset."""

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.distance_field import DistanceField
@@ -19,8 +19,6 @@ from scanned_objects import (
     shape_of,
     true_state,
 )
-
-Array = NDArray[np.float64]
 
 
 def outline_px(name: str, lab: str) -> list[tuple[ScanView, Array, Array]]:

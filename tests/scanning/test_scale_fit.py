@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim.registration.evidence import DepthFrame
@@ -33,8 +33,6 @@ from scanned_objects import (
     true_state,
     wrong,
 )
-
-Array = NDArray[np.float64]
 
 
 def z_of(fit: ScaleFit) -> float:

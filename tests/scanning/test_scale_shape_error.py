@@ -1,8 +1,8 @@
 """The error of the mesh's shape: patches, their covariance, and how probable each size of it is."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.scanning.scale.config import ShapeConfig
 from realsim.scanning.scale.shape import (
     INNER_EXTENT,
@@ -13,7 +13,6 @@ from realsim.scanning.scale.shape import (
 )
 from scanned_objects import shape_of
 
-Array = NDArray[np.float64]
 CONFIG = ShapeConfig()
 
 

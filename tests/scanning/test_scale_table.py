@@ -6,8 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import Mesh, SupportPlane
@@ -24,7 +24,6 @@ from scanned_objects import (
     shifted,
 )
 
-Array = NDArray[np.float64]
 CONFIG = TableConfig()
 SMALL = replace(LAB, views=6, width=320, height=180, focal_px=162.0)
 

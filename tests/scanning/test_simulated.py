@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import Mesh
@@ -18,7 +18,6 @@ from realsim.scanning.simulated import (
     standing,
 )
 
-Array = NDArray[np.float64]
 HALF_M = np.array([0.03, 0.02, 0.05])
 SMALL = ScanLabConfig(width=64, height=36, focal_px=32.4, sensor=DepthSensorModel.noiseless())
 """A lab whose images cost nothing: poses do not depend on them."""

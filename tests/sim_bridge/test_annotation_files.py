@@ -8,7 +8,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from realsim import (
     CameraIntrinsics,
@@ -22,6 +21,7 @@ from realsim import (
     View,
     images,
 )
+from realsim.arrays import Mask, UInt16
 from realsim.formats import label_maps
 from realsim.formats.bop.labels import mask_of, rle_area_and_bbox
 from realsim.geometry import camera, se3
@@ -106,7 +106,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> SessionStore:
     return store
 
 
-def deep_rgb(store: SessionStore, name: str, view: int) -> NDArray[np.uint16]:
+def deep_rgb(store: SessionStore, name: str, view: int) -> UInt16:
     data = np.frombuffer(store.path(f"labels/{name}/{view:06d}.png").read_bytes(), np.uint8)
     return np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED)[..., ::-1])
 
@@ -115,7 +115,7 @@ def part(store: SessionStore, view: int) -> dict[str, Any]:
     return store.read_json(f"annotations/{view:06d}.json")
 
 
-def mask(store: SessionStore, folder: str, view: int, k: int) -> NDArray[np.bool_]:
+def mask(store: SessionStore, folder: str, view: int, k: int) -> Mask:
     return images.read_grey(store.path(f"{folder}/{view:06d}_{k:06d}.png")) > 0
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from realsim import CameraIntrinsics, GraspSet, ObjectModel, ObjectPose, Scene, SupportPlane
+from realsim.arrays import Array, Array32
 from realsim.geometry import se3
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.labels import LabelRenderer, Labels, PlacedMesh
@@ -15,7 +15,7 @@ from realsim_sim_bridge.annotation.inputs import FrameInputs, FrameView, table_s
 from synthetic_scenes import box
 
 CAMERA = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
-Depth = NDArray[np.float32]
+Depth = Array32
 
 
 MODELS = {
@@ -58,16 +58,16 @@ def inputs_of(occluder: OccluderConfig | None = None) -> FrameInputs:
 INPUTS = inputs_of()
 
 
-def camera_at(distance_m: float, azimuth: float = 0.7, up: float = 1.2) -> NDArray[np.float64]:
+def camera_at(distance_m: float, azimuth: float = 0.7, up: float = 1.2) -> Array:
     eye = np.array([np.cos(azimuth), np.sin(azimuth), up])
     return se3.look_at(distance_m * eye / np.linalg.norm(eye), [0.0, 0.0, 0.03])
 
 
-def rendered(T: NDArray[np.float64], *things: PlacedMesh) -> Labels:
+def rendered(T: Array, *things: PlacedMesh) -> Labels:
     return LabelRenderer([*INPUTS.placed(), *things]).render(CAMERA, T)
 
 
-def annotated(T: NDArray[np.float64], depth_m: Depth, inputs: FrameInputs = INPUTS):
+def annotated(T: Array, depth_m: Depth, inputs: FrameInputs = INPUTS):
     """Return the objects' entries by name, and the visible masks by name."""
     view = FrameView(index=0, T_world_cam=T, digest="")
     frame = frame_files(inputs, view, depth_m)
@@ -84,7 +84,7 @@ def annotated(T: NDArray[np.float64], depth_m: Depth, inputs: FrameInputs = INPU
     return entries, masks
 
 
-def hand(T: NDArray[np.float64], over: list[float], size: tuple[float, float], before: float):
+def hand(T: Array, over: list[float], size: tuple[float, float], before: float):
     """Return a slab before a point (3,) of the world, on its line of sight [m]."""
     x, y, z = se3.transform(se3.invert(T), np.array([over]))[0]
     near = (z - before) / z

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from realsim import CameraIntrinsics, GraspSet, ObjectPose
+from realsim.arrays import Array
 from realsim.formats.bop.labels import bbox_of
 from realsim.geometry import camera, se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
@@ -27,7 +27,7 @@ INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5
 SIDE = 0.05
 
 
-def grasp_set(Ts: NDArray[np.float64], width: float = SIDE) -> GraspSet:
+def grasp_set(Ts: Array, width: float = SIDE) -> GraspSet:
     n = len(Ts)
     nan4 = np.full((n, 4), np.nan)
     return GraspSet(

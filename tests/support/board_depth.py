@@ -3,8 +3,8 @@
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32
 from realsim.geometry import se3
 from realsim.geometry.camera import pixel_grid, project, undistort
 from realsim.records import CameraIntrinsics, TagBoard
@@ -14,7 +14,6 @@ from realsim_calibration.depth.board import DepthBoardView
 from realsim_calibration.depth.fit import DepthBiasConfig
 from realsim_calibration.views import TargetDetection
 
-Array = NDArray[np.float64]
 BOARD = TagBoard(rows=5, columns=7, tag_size_m=0.03, gap_m=0.01)
 CAMERA = CameraIntrinsics(width=320, height=200, fx=162.0, fy=161.0, cx=161.0, cy=98.0)
 BASELINE = 0.018
@@ -64,7 +63,7 @@ def exact_depth(T: Array, camera: CameraIntrinsics, warp: Array | None = None) -
 
 def sensed(
     depth: Array, truth: DepthBias, rng: np.random.Generator, noise_px: float = 0.08
-) -> NDArray[np.float32]:
+) -> Array32:
     """Return what a stereo camera with this bias reports: correlated noise, holes, fliers."""
     from scipy.ndimage import gaussian_filter
 

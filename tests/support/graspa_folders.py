@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 
-Array = NDArray[np.float64]
 T_BOARD_BOX = se3.from_rt(se3.exp_so3([0.0, 0.0, 0.4]), [-0.3, 0.12, 0.03])
 DOWN = np.diag([1.0, -1.0, -1.0])
 

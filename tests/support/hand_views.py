@@ -6,14 +6,13 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics, Check, TagBoard, Target
 from realsim_calibration.results import BoardShape, HandEyeReport, ViewReport
 
-Array = NDArray[np.float64]
 BOARD = TagBoard(rows=3, columns=4, tag_size_m=0.03, gap_m=0.01)
 CAMERA = CameraIntrinsics(width=1280, height=720, fx=648.0, fy=648.0, cx=639.5, cy=359.5)
 SIGMA, RATIO, DISTANCE = 0.1, 3.0, 0.4

@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.register.results import CameraChange, Registered, Remark
+from realsim.arrays import Array
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.parts import part
@@ -24,7 +24,6 @@ from realsim.registration.search.records import NotPlaced
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore
 
-Array = NDArray[np.float64]
 CAMERA = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
 NAMES = ("mug", "wedge")
 PLACES = ((0.07, 0.0, 0.3), (-0.08, 0.03, 1.2))

@@ -8,8 +8,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.parts import object_model
 from realsim.records import Mesh
@@ -30,7 +30,6 @@ from realsim.scanning.simulated import (
     standing,
 )
 
-Array = NDArray[np.float64]
 UNIT_M = 0.1
 """Metres per unit of the scans made here: the scale that a fit should find."""
 SENSOR = DepthSensorModel(disparity_noise_px=0.04, correlation_px=1.0, quantum_px=1 / 64)

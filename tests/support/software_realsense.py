@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from realsim.arrays import Array, UInt8, UInt16
 
 WIDTH, HEIGHT, FOCAL = 640, 360, 320.0
 FRAME_MS = 1000 / 30
@@ -21,11 +22,11 @@ def raw_intrinsics(rs: Any, model: Any, coefficients: list[float], focal: float 
     return raw
 
 
-def depth_of(number: int) -> NDArray[np.uint16]:
+def depth_of(number: int) -> UInt16:
     return np.random.default_rng(number).integers(3000, 3900, (HEIGHT, WIDTH)).astype(np.uint16)
 
 
-def color_of(number: int) -> NDArray[np.uint8]:
+def color_of(number: int) -> UInt8:
     return np.full((HEIGHT, WIDTH, 3), number % 200, np.uint8)
 
 
@@ -38,14 +39,14 @@ class Software:
     serial: str = "SW0001"
     two_sensors: bool = False
     color_focal: float = FOCAL
-    T_color_depth: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    T_color_depth: Array = field(default_factory=lambda: np.eye(4))
     color_lag: int = 0
     """Frames by which colour comes later than its depth."""
     color_count: int = 0
     """What colour's frame counter is ahead of depth's."""
     color_delay_ms: float = 0.0
     """What colour's time stamp is later than that of its depth."""
-    depth: Callable[[int], NDArray[np.uint16]] = depth_of
+    depth: Callable[[int], UInt16] = depth_of
     exposure_us: int = 8123
 
     def __post_init__(self) -> None:

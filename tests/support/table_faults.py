@@ -6,8 +6,8 @@ Each fault is a pure function: it returns spoilt frames and leaves those it was 
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.simulated import TableScene, seen_instances
 
@@ -40,7 +40,7 @@ def foreign(frame: DepthFrame, other: DepthFrame) -> DepthFrame:
     return replace(frame, depth_m=other.depth_m)
 
 
-def _with_depth(frame: DepthFrame, depth_m: NDArray[np.float32]) -> DepthFrame:
+def _with_depth(frame: DepthFrame, depth_m: Array32) -> DepthFrame:
     """Return the view with another image, not to be written."""
     image = np.asarray(depth_m, dtype=np.float32)
     image.setflags(write=False)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from realsim.arrays import Array, UInt8
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.mesh import save_ply
@@ -16,7 +16,6 @@ from realsim.geometry.parts import part
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.labels import LabelRenderer, Labels, PlacedMesh
 
-Array = NDArray[np.float64]
 CAMERA = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
 NAMES = ("box", "wedge")
 EYES = ([0.0, -0.45, 0.45], [0.3, -0.35, 0.42])
@@ -49,7 +48,7 @@ def looks(placed: Sequence[PlacedMesh], views: int) -> list[Labels]:
     return [renderer.render(CAMERA, T) for T in cameras(views)]
 
 
-def grey_of(labels: Labels) -> NDArray[np.uint8]:
+def grey_of(labels: Labels) -> UInt8:
     """Return a photograph of sorts."""
     grey = np.clip(255 * (1 - labels.depth_m), 0, 255).astype(np.uint8)
     return np.repeat(grey[..., None], 3, -1)

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import Meta
-from numpy.typing import NDArray
 
 from realsim import store as stores
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import (
@@ -168,7 +168,7 @@ def test_bare_records_and_either_error_map_come_back(record):
 def test_numbers_that_json_lacks():
     values = np.array([[1.5, np.nan], [np.inf, -np.inf]])
     assert to_json(values) == [[1.5, None], ["inf", "-inf"]]
-    back = from_json(through_text(to_json(values)), NDArray[np.float64], "an array")
+    back = from_json(through_text(to_json(values)), Array, "an array")
     np.testing.assert_array_equal(back, values)
 
 

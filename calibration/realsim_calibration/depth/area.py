@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.geometry import se3
 from realsim.geometry.camera import project, undistort
 from realsim.geometry.robust import mad_sigma, tukey_weights
@@ -21,7 +22,6 @@ from realsim_calibration.depth.board import (
     PosedBoard,
     board_poses,
 )
-from realsim_calibration.views import Array
 
 POSE_STEP = 1e-5
 """Step of the numerical derivatives by the pose [rad, m]: errors of 1e-9 relative."""
@@ -125,7 +125,7 @@ def _outline(view: DepthBoardView, setup: DepthSetup, shrink: float) -> Array:
     return centre + (1 - 2 * shrink) * (corners - centre)
 
 
-def _inside(xy: Array, corners: Array) -> NDArray[np.bool_]:
+def _inside(xy: Array, corners: Array) -> Mask:
     """Return which places (n, 2) lie inside a convex polygon (k, 2), counter-clockwise."""
     edge = np.roll(corners, -1, axis=0) - corners
     away = xy[:, None] - corners

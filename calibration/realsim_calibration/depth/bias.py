@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Check, Target
@@ -29,7 +30,6 @@ from realsim_calibration.depth.board import DepthBoardView, DepthSetup
 from realsim_calibration.depth.checks import depth_checks, refuse_misaligned, refuse_unit
 from realsim_calibration.depth.fit import DepthBiasConfig, ViewFit, common_errors, fit_views
 from realsim_calibration.results import BoardShape
-from realsim_calibration.views import Array
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project, projection_jacobian
 from realsim.records import CameraIntrinsics, Target
 from realsim_calibration.fit.board_pose import planar_poses
 from realsim_calibration.results import BoardShape
-from realsim_calibration.views import Array, TargetDetection
+from realsim_calibration.views import TargetDetection
 
 NEWTON_STEPS = 4
 """A lift of millimetres over a decimetre converges in two."""

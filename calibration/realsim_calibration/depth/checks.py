@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.records import Check
 from realsim_calibration.depth.area import BoardDepth
 from realsim_calibration.depth.fit import DepthBiasConfig, ViewFit
 from realsim_calibration.results import BoardShape
-from realsim_calibration.views import Array
 
 if TYPE_CHECKING:
     from realsim_calibration.depth.bias import DepthBiasReport

@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.camera import projection_jacobian
 from realsim.records import CameraIntrinsics
 from realsim_calibration.depth.area import BoardDepth
 from realsim_calibration.depth.board import BoardAreaConfig, DepthSetup, pose_jacobian
-from realsim_calibration.views import Array
 
 ROUNDS = 15
 """Rounds of reweighting views; five are typical."""

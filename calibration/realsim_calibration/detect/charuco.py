@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask, UInt8
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import CharucoBoard
 from realsim_calibration.detect.homography import (
@@ -22,7 +22,6 @@ from realsim_calibration.detect.markers import (
 from realsim_calibration.detect.saddles import OUTSIDE, SaddleConfig, Saddles, refine_saddles
 from realsim_calibration.views import TargetDetection
 
-Array = NDArray[np.float64]
 REASONS_TOLD = 6
 """Corners named one by one in `rejected`; the rest is counted."""
 
@@ -64,7 +63,7 @@ def white_parity(board: CharucoBoard) -> int:
 
 
 def find_charuco(
-    rgb: NDArray[np.uint8],
+    rgb: UInt8,
     board: CharucoBoard,
     config: CharucoConfig | None = None,
     *,
@@ -105,7 +104,7 @@ def find_charuco(
     )
 
 
-def _nothing(gray: NDArray[np.uint8], rejected: list[str]) -> TargetDetection:
+def _nothing(gray: UInt8, rejected: list[str]) -> TargetDetection:
     return TargetDetection(
         point_ids=np.zeros(0, np.int64),
         uv=np.zeros((0, 2)),
@@ -115,8 +114,8 @@ def _nothing(gray: NDArray[np.uint8], rejected: list[str]) -> TargetDetection:
 
 
 def _refined(
-    gray: NDArray[np.uint8],
-    expected: tuple[NDArray[np.int64], Array, Array],
+    gray: UInt8,
+    expected: tuple[Int64, Array, Array],
     board: CharucoBoard,
     how: tuple[CharucoConfig, CameraIntrinsics | None],
 ) -> Saddles:
@@ -138,8 +137,8 @@ def _told(faults: dict[int, str]) -> list[str]:
 
 
 def _on_board(
-    ids: NDArray[np.int64], quads: Array, board: CharucoBoard, config: CharucoConfig
-) -> tuple[NDArray[np.bool_], Array, list[str]]:
+    ids: Int64, quads: Array, board: CharucoBoard, config: CharucoConfig
+) -> tuple[Mask, Array, list[str]]:
     """Return which markers (n,) lie on the board, all corners as it counts them, and faults."""
     known = charuco_markers(board)
     values, counts = np.unique(ids, return_counts=True)
@@ -180,9 +179,7 @@ def _on_board(
     return np.zeros(len(ids), dtype=bool), quads, rejected
 
 
-def _agreeing(
-    ids: NDArray[np.int64], quads: Array, known: Array, usable: NDArray[np.bool_], limit: float
-) -> NDArray[np.bool_]:
+def _agreeing(ids: Int64, quads: Array, known: Array, usable: Mask, limit: float) -> Mask:
     """Return which markers (n,) one map of the plane explains, seen from the printed side."""
     good = np.zeros(len(ids), dtype=bool)
     board = known[ids[usable]].reshape(-1, 2)
@@ -194,10 +191,10 @@ def _agreeing(
 
 
 def _remedy(
-    ids: NDArray[np.int64],
+    ids: Int64,
     quads: Array,
     board: CharucoBoard,
-    usable: NDArray[np.bool_],
+    usable: Mask,
     limit: float,
     least: int,
 ) -> str:
@@ -218,8 +215,8 @@ def _remedy(
 
 
 def _expected(
-    ids: NDArray[np.int64], quads: Array, board: CharucoBoard, config: CharucoConfig
-) -> tuple[NDArray[np.int64], Array, Array]:
+    ids: Int64, quads: Array, board: CharucoBoard, config: CharucoConfig
+) -> tuple[Int64, Array, Array]:
     """Return the inner corners next to a marker, where to expect them, and their arms [px]."""
     known = charuco_markers(board)[ids]
     middle = known.mean(1)
@@ -238,7 +235,7 @@ def _expected(
 
 def _beside(
     uv: Array, tried: dict[int, str], board: CharucoBoard, config: CharucoConfig
-) -> tuple[NDArray[np.int64], Array, Array]:
+) -> tuple[Int64, Array, Array]:
     """Return corners not tried yet beside those found (uv, NaN where not), as `_expected` does."""
     places: list[tuple[int, Array]] = []
     found = np.flatnonzero(np.isfinite(uv[:, 0]))
@@ -255,9 +252,7 @@ def _beside(
     return _starts(places, board)
 
 
-def _starts(
-    places: list[tuple[int, Array]], board: CharucoBoard
-) -> tuple[NDArray[np.int64], Array, Array]:
+def _starts(places: list[tuple[int, Array]], board: CharucoBoard) -> tuple[Int64, Array, Array]:
     """Return numbers (n,), rough corners (n, 2) and arms (n, 4, 2) [px] under maps (3, 3)."""
     step = np.array([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]]) * board.square_m
     seen = [apply_homography(H, board.points_board[k, :2] + step) for k, H in places]

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, UInt8
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import Chessboard
 from realsim_calibration.detect.edges import bilinear
@@ -12,7 +12,6 @@ from realsim_calibration.detect.images import gray_image, size_of
 from realsim_calibration.detect.saddles import SaddleConfig, grid_arms, refine_saddles
 from realsim_calibration.views import TargetDetection
 
-Array = NDArray[np.float64]
 MIN_PART = (3, 3)
 """Least part of a chessboard that OpenCV looks for, in inner corners."""
 LINE_SHARE = 0.6
@@ -35,7 +34,7 @@ class ChessboardConfig:
 
 
 def find_chessboard(
-    rgb: NDArray[np.uint8],
+    rgb: UInt8,
     board: Chessboard,
     config: ChessboardConfig | None = None,
     *,
@@ -78,7 +77,7 @@ def find_chessboard(
     )
 
 
-def _nothing(gray: NDArray[np.uint8], *reasons: str) -> TargetDetection:
+def _nothing(gray: UInt8, *reasons: str) -> TargetDetection:
     return TargetDetection(
         point_ids=np.zeros(0, np.int64),
         uv=np.zeros((0, 2)),
@@ -87,9 +86,7 @@ def _nothing(gray: NDArray[np.uint8], *reasons: str) -> TargetDetection:
     )
 
 
-def _whole(
-    gray: NDArray[np.uint8], board: Chessboard, config: ChessboardConfig
-) -> tuple[Array | None, str]:
+def _whole(gray: UInt8, board: Chessboard, config: ChessboardConfig) -> tuple[Array | None, str]:
     """Return the corners (rows, columns, 2) in an order of the right shape, or what is wrong."""
     shapes = {(board.rows, board.columns), (board.columns, board.rows)}
     grid = largest_chessboard(gray, config.search_px)
@@ -138,7 +135,7 @@ def _partly(grid: Array | None, board: Chessboard) -> str:
     )
 
 
-def largest_chessboard(gray: NDArray[np.uint8], search_px: int) -> Array | None:
+def largest_chessboard(gray: UInt8, search_px: int) -> Array | None:
     """Return the corners (r, c, 2) of the largest chessboard in view [px], whatever its size."""
     import cv2
 
@@ -152,7 +149,7 @@ def largest_chessboard(gray: NDArray[np.uint8], search_px: int) -> Array | None:
     return None
 
 
-def _classic(gray: NDArray[np.uint8], board: Chessboard) -> Array | None:
+def _classic(gray: UInt8, board: Chessboard) -> Array | None:
     """Return the corners (rows, columns, 2) as the older search of one exact size finds them."""
     import cv2
 
@@ -163,7 +160,7 @@ def _classic(gray: NDArray[np.uint8], board: Chessboard) -> Array | None:
     return np.asarray(corners, dtype=np.float64).reshape(board.rows, board.columns, 2)
 
 
-def _sizes(gray: NDArray[np.uint8], search_px: int) -> list[tuple[NDArray[np.uint8], float]]:
+def _sizes(gray: UInt8, search_px: int) -> list[tuple[UInt8, float]]:
     """Return the image shrunk to `search_px` if it is larger, then as it is; with pixel sizes."""
     import cv2
 
@@ -177,7 +174,7 @@ def _sizes(gray: NDArray[np.uint8], search_px: int) -> list[tuple[NDArray[np.uin
     return [(small, float(scale)), (gray, 1.0)]
 
 
-def _covered(gray: NDArray[np.uint8], grid: Array) -> NDArray[np.uint8]:
+def _covered(gray: UInt8, grid: Array) -> UInt8:
     """Return the image with the board painted over, a square's width around it included."""
     import cv2
 
@@ -190,7 +187,7 @@ def _covered(gray: NDArray[np.uint8], grid: Array) -> NDArray[np.uint8]:
     )
 
 
-def _goes_on(gray: NDArray[np.uint8], grid: Array) -> bool:
+def _goes_on(gray: UInt8, grid: Array) -> bool:
     """Return whether a further line of corners follows on any side."""
     for turn in range(4):
         turned = np.rot90(grid, turn)
@@ -200,14 +197,14 @@ def _goes_on(gray: NDArray[np.uint8], grid: Array) -> bool:
     return False
 
 
-def _line_share(gray: NDArray[np.uint8], grid: Array) -> float:
+def _line_share(gray: UInt8, grid: Array) -> float:
     """Return the share of the first row (c, 2) of a grid that is corners of a chessboard."""
     arms = grid_arms(grid)[0]
     dark = np.arange(len(arms)) % 2 == 0
     return max(float(refine_saddles(gray, grid[0], arms, d).good.mean()) for d in (dark, ~dark))
 
 
-def _without_clutter(gray: NDArray[np.uint8], grid: Array) -> Array:
+def _without_clutter(gray: UInt8, grid: Array) -> Array:
     """Return the grid without outer lines that are no corners, such as the paper's edge."""
     for turn in range(4):
         turned = np.rot90(grid, turn)
@@ -217,7 +214,7 @@ def _without_clutter(gray: NDArray[np.uint8], grid: Array) -> Array:
     return grid
 
 
-def number_corners(gray: NDArray[np.uint8], grid: Array) -> tuple[Array, bool]:
+def number_corners(gray: UInt8, grid: Array) -> tuple[Array, bool]:
     """Return the corners (rows, columns, 2) numbered, and whether the first square is dark.
 
     The first square is the one between the first corner's +x and +y.
@@ -240,7 +237,7 @@ def _same_shape(grid: Array) -> list[Array]:
     return [g for g in turns if g.shape == grid.shape]
 
 
-def _first_is_dark(gray: NDArray[np.uint8], grid: Array) -> bool:
+def _first_is_dark(gray: UInt8, grid: Array) -> bool:
     """Return whether the squares of the first one's colour are the dark ones."""
     middle = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     level = bilinear(gray.astype(np.float64), middle)

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, UInt8
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import CircleGrid
 from realsim_calibration.detect.edges import bend, straighten
@@ -21,7 +21,6 @@ from realsim_calibration.detect.images import gray_image, size_of
 from realsim_calibration.detect.lattice import Laid, Node, grow_lattices, lay_pattern
 from realsim_calibration.views import TargetDetection
 
-Array = NDArray[np.float64]
 BIAS_ROUNDS = 2
 """Map, bias, map without bias: the second bias differs from the third by 1e-4 px."""
 MIN_CUBIC = 30
@@ -43,10 +42,10 @@ class CirclesConfig:
     """Least share of the dots that must be measurable."""
 
 
-def grid_nodes(grid: CircleGrid) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
+def grid_nodes(grid: CircleGrid) -> tuple[Int64, list[Int64]]:
     """Return the dots as nodes (n, 2) of a lattice, and the lines a larger grid would add."""
 
-    def nodes(r: NDArray[np.int64], c: NDArray[np.int64]) -> NDArray[np.int64]:
+    def nodes(r: Int64, c: Int64) -> Int64:
         if not grid.asymmetric:
             return np.stack([c, r], -1)
         # The steps of the lattice are (1, 1) and (-1, 1).
@@ -61,7 +60,7 @@ def grid_nodes(grid: CircleGrid) -> tuple[NDArray[np.int64], list[NDArray[np.int
 
 
 def find_circles(
-    rgb: NDArray[np.uint8],
+    rgb: UInt8,
     grid: CircleGrid,
     config: CirclesConfig | None = None,
     *,
@@ -100,7 +99,7 @@ def _dots_told(reason: str) -> int:
 
 
 def _of_one_shade(
-    gray: NDArray[np.uint8],
+    gray: UInt8,
     grid: CircleGrid,
     config: CirclesConfig,
     intrinsics: CameraIntrinsics | None,
@@ -173,10 +172,10 @@ def _numbered(
     axes: Array,
     board: Array,
     how: tuple[CircleGrid, CirclesConfig],
-) -> tuple[NDArray[np.int64] | None, str]:
+) -> tuple[Int64 | None, str]:
     """Return the point of every dot, or why none of the numberings will do."""
     grid, config = how
-    best: tuple[float, NDArray[np.int64]] | None = None
+    best: tuple[float, Int64] | None = None
     ratios: list[float] = []
     for one in laid:
         uv = middles[one.points]
@@ -221,7 +220,7 @@ def _gaps(middles: Array, axes: Array) -> Array:
 
 
 def _measured(
-    gray: NDArray[np.uint8],
+    gray: UInt8,
     dots: Dots,
     grid: CircleGrid,
     config: CirclesConfig,

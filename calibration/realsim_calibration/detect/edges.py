@@ -8,13 +8,12 @@ meet. Integer pixels are pixel centres throughout; nothing is shifted by half a 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask, UInt8
 from realsim.geometry.camera import distort, undistort
 from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim.records import CameraIntrinsics
 
-Array = NDArray[np.float64]
 GAUSS_NEWTON_STEPS = 3
 """The profile fit starts from the gradient centroid, within 0.2 px; it converges in three."""
 INNER_PRIOR = 0.0025
@@ -70,7 +69,7 @@ class RefinedQuads:
 
 
 def refine_quads(
-    gray: NDArray[np.uint8],
+    gray: UInt8,
     quads: Array,
     clear: tuple[float, float],
     config: EdgeConfig,
@@ -228,9 +227,7 @@ def _gauss_newton(t: Array, gray: Array, border: Array, p: Array, *, free_blur: 
     return p
 
 
-def fit_lines(
-    points: Array, usable: NDArray[np.bool_], config: EdgeConfig
-) -> tuple[Array, Array, Array, Array]:
+def fit_lines(points: Array, usable: Mask, config: EdgeConfig) -> tuple[Array, Array, Array, Array]:
     """Return total-least-squares lines through edge points, outliers dropped.
 
     Args:

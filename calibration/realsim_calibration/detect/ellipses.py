@@ -8,12 +8,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask, UInt8
 from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim_calibration.detect.edges import bilinear, fit_blurred_steps
 
-Array = NDArray[np.float64]
 NO_PATTERN_PX = 1e3
 """Distance of the next edge behind a dot's edge: beyond any profile [px]."""
 MIN_OUTLINE = 6
@@ -97,7 +96,7 @@ class Dots:
         return np.pi * np.abs(np.linalg.det(self.axes))
 
 
-def find_blobs(gray: NDArray[np.uint8], config: DotConfig) -> tuple[Array, Array]:
+def find_blobs(gray: UInt8, config: DotConfig) -> tuple[Array, Array]:
     """Return middles (n, 2) and axes (n, 2, 2) of dark ellipses in an image, roughly [px]."""
     import cv2
 
@@ -146,9 +145,7 @@ def _ellipse_of(
     return misfit, np.array([m["m10"], m["m01"]]) / area, (V * axes) @ V.T
 
 
-def refine_dots(
-    gray: NDArray[np.uint8], middles: Array, axes: Array, gap: Array, config: DotConfig
-) -> Dots:
+def refine_dots(gray: UInt8, middles: Array, axes: Array, gap: Array, config: DotConfig) -> Dots:
     """Return the dots' outlines, to a few hundredths of a pixel.
 
     Args:
@@ -210,7 +207,7 @@ def _symmetric(c: Array) -> Array:
 
 
 def _fit_change(
-    u: Array, normal: Array, shift: Array, usable: NDArray[np.bool_], config: DotConfig
+    u: Array, normal: Array, shift: Array, usable: Mask, config: DotConfig
 ) -> tuple[Array, Array, Array]:
     """Return the change (n, 5) of middle and A that moves the outline by `shift`.
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import UInt8
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
@@ -31,7 +31,7 @@ class FindConfig:
 
 
 def find_target(
-    image: NDArray[np.uint8],
+    image: UInt8,
     target: Target,
     *,
     intrinsics: CameraIntrinsics | None = None,

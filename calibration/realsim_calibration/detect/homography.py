@@ -1,9 +1,8 @@
 """The map from a flat board to its image: fit, apply, and which side of the board is seen."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from realsim.arrays import Array, Mask
 
 
 def fit_homography(board: Array, uv: Array) -> Array:
@@ -52,7 +51,7 @@ def seen_from_front(H: Array, board: Array) -> bool:
     return bool(np.all(np.linalg.det(H) * w > 0))
 
 
-def fit_trimmed(board: Array, uv: Array, limit_px: float) -> tuple[Array, NDArray[np.bool_]]:
+def fit_trimmed(board: Array, uv: Array, limit_px: float) -> tuple[Array, Mask]:
     """Return H and which points (n,) it brings to within `limit_px`; RANSAC, then least squares."""
     import cv2
 

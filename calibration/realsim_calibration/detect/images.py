@@ -1,15 +1,15 @@
 """What every finder takes: a gray 8-bit image. Integer pixels are pixel centres."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import UInt8
 from realsim.errors import InputError
 
 MIN_IMAGE_PX = 32
 """Least width and height [px]; no target has its points apart in less."""
 
 
-def gray_image(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def gray_image(rgb: UInt8) -> UInt8:
     """Return the (H, W) gray image of an RGB (H, W, 3) or gray (H, W) one.
 
     Raises:
@@ -34,6 +34,6 @@ def gray_image(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
-def size_of(gray: NDArray[np.uint8]) -> tuple[int, int]:
+def size_of(gray: UInt8) -> tuple[int, int]:
     """Return width and height [px]."""
     return int(gray.shape[1]), int(gray.shape[0])

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from realsim.arrays import Array, Int64
+
 Node = tuple[int, int]
 SEEDS = 24
 """Points that are tried as the first one; a grid of dots offers far more than clutter does."""
@@ -105,7 +105,7 @@ def _grown(points: Array, seed: int, basis: tuple[Array, Array]) -> dict[Node, i
 class Laid:
     """A pattern laid over a lattice."""
 
-    points: NDArray[np.int64]
+    points: Int64
     """(n,) the point under each node of the pattern, -1 where there is none."""
     larger: bool
     """Whether the lattice goes on beyond the pattern."""
@@ -116,7 +116,7 @@ class Laid:
         return int((self.points >= 0).sum())
 
 
-def unimodular(*, mirrored: bool = False) -> list[NDArray[np.int64]]:
+def unimodular(*, mirrored: bool = False) -> list[Int64]:
     """Return the (2, 2) changes of basis with entries -1, 0, 1 and determinant 1 (-1: mirrored)."""
     wanted = -1 if mirrored else 1
     return [
@@ -128,8 +128,8 @@ def unimodular(*, mirrored: bool = False) -> list[NDArray[np.int64]]:
 
 def lay_pattern(
     lattice: dict[Node, int],
-    pattern: NDArray[np.int64],
-    beyond: list[NDArray[np.int64]],
+    pattern: Int64,
+    beyond: list[Int64],
     *,
     mirrored: bool = False,
 ) -> list[Laid]:

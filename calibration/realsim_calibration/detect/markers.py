@@ -4,11 +4,10 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask, UInt8
 from realsim.errors import InputError
 
-Array = NDArray[np.float64]
 FAMILY_DICTIONARY = {
     "tag16h5": "DICT_APRILTAG_16h5",
     "tag25h9": "DICT_APRILTAG_25h9",
@@ -26,7 +25,7 @@ TWICE_SHARE = 0.15
 """Share of the markers seen more than once from which two boards are in view; one is clutter."""
 
 
-def several_boards(ids: NDArray[np.int64]) -> bool:
+def several_boards(ids: Int64) -> bool:
     """Return whether so many markers (n,) are seen more than once that it must be two boards."""
     values, counts = np.unique(ids, return_counts=True)
     twice = int((counts > 1).sum())
@@ -79,8 +78,8 @@ def _detector(name: str, border: int) -> Any:
 
 
 def decode_markers(
-    gray: NDArray[np.uint8], name: str, *, touching: bool = False, border: int = 1
-) -> tuple[NDArray[np.int64], Array]:
+    gray: UInt8, name: str, *, touching: bool = False, border: int = 1
+) -> tuple[Int64, Array]:
     """Return ids (n,) and rough corners (n, 4, 2), clockwise from the code's top left [px].
 
     Args:
@@ -108,7 +107,7 @@ def decode_markers(
     return ids, corners
 
 
-def _decoded(detector: Any, gray: NDArray[np.uint8]) -> tuple[NDArray[np.int64], Array]:
+def _decoded(detector: Any, gray: UInt8) -> tuple[Int64, Array]:
     quads, found, _ = detector.detectMarkers(gray)
     ids = np.zeros(0, np.int64) if found is None else np.asarray(found, np.int64).ravel()
     return ids, np.asarray(quads, dtype=np.float64).reshape(-1, 4, 2)
@@ -124,7 +123,7 @@ def _grown(quads: Array, by: float) -> Array:
     return quads + by * (before + after) / (1 + cosine)
 
 
-def _near(quads: Array, others: Array) -> NDArray[np.bool_]:
+def _near(quads: Array, others: Array) -> Mask:
     """Return which quads (n,) have their middle inside half a side of another's."""
     if not len(others) or not len(quads):
         return np.zeros(len(quads), dtype=bool)

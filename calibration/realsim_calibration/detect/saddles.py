@@ -11,8 +11,8 @@ centres.
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask, UInt8
 from realsim.records import CameraIntrinsics
 from realsim_calibration.detect.edges import (
     EdgeConfig,
@@ -24,7 +24,6 @@ from realsim_calibration.detect.edges import (
     straighten,
 )
 
-Array = NDArray[np.float64]
 NO_PATTERN_PX = 1e3
 """Distance of the next edge behind a chessboard's edge: beyond any profile [px]."""
 OUTSIDE = "outside the image"
@@ -85,7 +84,7 @@ class Saddles:
     """(n,) why a corner cannot be used, '' where it can."""
 
     @property
-    def good(self) -> NDArray[np.bool_]:
+    def good(self) -> Mask:
         """(n,) whether the corner can be used."""
         return np.array([not f for f in self.faults], dtype=bool)
 
@@ -105,10 +104,10 @@ class _Pass:
 
 
 def refine_saddles(
-    gray: NDArray[np.uint8],
+    gray: UInt8,
     start: Array,
     arms: Array,
-    dark: NDArray[np.bool_],
+    dark: Mask,
     clear: float = 1.0,
     config: SaddleConfig | None = None,
     intrinsics: CameraIntrinsics | None = None,
@@ -153,7 +152,7 @@ def refine_saddles(
 def _measure(
     image: Array,
     where: tuple[Array, Array, Array, Array],
-    dark: NDArray[np.bool_],
+    dark: Mask,
     blur: Array | None,
     how: tuple[SaddleConfig, CameraIntrinsics | None],
 ) -> _Pass:

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask, UInt8
 from realsim.records import TagBoard
 from realsim_calibration.detect.edges import bilinear
 from realsim_calibration.detect.homography import (
@@ -16,7 +16,6 @@ from realsim_calibration.detect.homography import (
 )
 from realsim_calibration.detect.markers import FAMILY_DICTIONARY, predefined_dictionary
 
-Array = NDArray[np.float64]
 MIN_SHARE = 0.7
 """Least share of the tags that must agree: fewer, and the board file does not fit the picture. With
 rows counted from the wrong end a skewed map can explain half of them."""
@@ -34,7 +33,7 @@ MIN_STEP = 20.0
 class TagLayout:
     """Which tags lie where the board has them."""
 
-    good: NDArray[np.bool_]
+    good: Mask
     """(n,)."""
     roll: int
     """Quarter turns of the codes on the page."""
@@ -42,9 +41,7 @@ class TagLayout:
     """What is wrong with the others."""
 
 
-def check_layout(
-    ids: NDArray[np.int64], corners: Array, board: TagBoard, share: float
-) -> TagLayout:
+def check_layout(ids: Int64, corners: Array, board: TagBoard, share: float) -> TagLayout:
     """Return which of two or more tags (n, 4, 2) agree with the board to within `share` sides."""
     side = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=-1)
     limit = share * float(np.median(side))
@@ -65,9 +62,7 @@ def check_layout(
     return TagLayout(good=np.zeros(len(ids), dtype=bool), roll=0, reason=reason)
 
 
-def _agreeing(
-    ids: NDArray[np.int64], corners: Array, board: TagBoard, limit: float
-) -> NDArray[np.bool_]:
+def _agreeing(ids: Int64, corners: Array, board: TagBoard, limit: float) -> Mask:
     """Return the tags (n,) that one map of the plane explains, seen from the printed side."""
     at = {int(tag): k for k, tag in enumerate(board.ids)}
     rows = np.array([at.get(int(i), -1) for i in ids])
@@ -79,9 +74,7 @@ def _agreeing(
     return good
 
 
-def _remedy(
-    ids: NDArray[np.int64], corners: Array, board: TagBoard, limit: float, least: int
-) -> str:
+def _remedy(ids: Int64, corners: Array, board: TagBoard, limit: float, least: int) -> str:
     """Return how they do lie, where a usual mistake explains it."""
     other = "top" if board.ids_from == "bottom" else "bottom"
     turned = replace(board, rows=board.columns, columns=board.rows)
@@ -106,12 +99,12 @@ def _remedy(
 
 
 def read_missing_tags(
-    gray: NDArray[np.uint8],
+    gray: UInt8,
     board: TagBoard,
-    seen: tuple[NDArray[np.int64], Array],
-    missing: NDArray[np.int64],
+    seen: tuple[Int64, Array],
+    missing: Int64,
     code: tuple[int, int],
-) -> tuple[NDArray[np.int64], Array]:
+) -> tuple[Int64, Array]:
     """Return ids (n,) and rough corners (n, 4, 2) of tags that are where the board has them.
 
     Args:
@@ -144,7 +137,7 @@ def read_missing_tags(
 
 
 @lru_cache(maxsize=1024)
-def _code(family: str, tag: int, border: int) -> NDArray[np.bool_]:
+def _code(family: str, tag: int, border: int) -> Mask:
     """Return the white cells (cells, cells) of a tag, its black border included."""
     from cv2 import aruco
 
@@ -154,7 +147,7 @@ def _code(family: str, tag: int, border: int) -> NDArray[np.bool_]:
     return np.asarray(drawn) > 127
 
 
-def _reads(image: Array, corners: Array, white: NDArray[np.bool_]) -> bool:
+def _reads(image: Array, corners: Array, white: Mask) -> bool:
     """Return whether the cells within corners (4, 2) read as they should."""
     n = len(white)
     unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float64)

@@ -9,8 +9,9 @@ pixel off that in both axes).
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Int64, UInt8
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, TagBoard
 from realsim.records.targets import TAG_CELLS
@@ -24,7 +25,6 @@ from realsim_calibration.detect.markers import (
 )
 from realsim_calibration.detect.tag_layout import check_layout, read_missing_tags
 
-Array = NDArray[np.float64]
 WEAK_FAMILIES = ("tag16h5",)
 """Families whose codes turn up by chance in any picture: one tag of a board proves nothing."""
 
@@ -76,7 +76,7 @@ def _per_tag(value: ArrayLike | None, n: int, name: str) -> Array:
 class TagDetections:
     """The tags seen in one image, sorted by id."""
 
-    ids: NDArray[np.int64]
+    ids: Int64
     """(n,) tag ids, ascending."""
     corners_px: Array
     """(n, 4, 2) corners, clockwise from the top left as printed [px]."""
@@ -117,7 +117,7 @@ class TagDetections:
 
 
 def detect_tags(
-    rgb: NDArray[np.uint8],
+    rgb: UInt8,
     board: TagBoard,
     config: DetectionConfig | None = None,
     *,
@@ -173,8 +173,8 @@ def _no_tags(rejected: list[tuple[int, str]]) -> TagDetections:
 
 
 def _measured(
-    gray: NDArray[np.uint8],
-    ids: NDArray[np.int64],
+    gray: UInt8,
+    ids: Int64,
     corners: Array,
     border: int,
     how: tuple[TagBoard, DetectionConfig, CameraIntrinsics | None],
@@ -221,7 +221,7 @@ def _both(a: TagDetections, b: TagDetections) -> TagDetections:
     )
 
 
-def _decode(gray: NDArray[np.uint8], board: TagBoard) -> tuple[NDArray[np.int64], Array, int]:
+def _decode(gray: UInt8, board: TagBoard) -> tuple[Int64, Array, int]:
     """Return ids, quads (n, 4, 2) and the width of the black border in modules."""
     name = FAMILY_DICTIONARY[board.family]
     ids, corners = decode_markers(gray, name, touching=board.corner_squares)
@@ -235,8 +235,8 @@ def _decode(gray: NDArray[np.uint8], board: TagBoard) -> tuple[NDArray[np.int64]
 
 
 def _on_board(
-    ids: NDArray[np.int64], corners: Array, board: TagBoard, config: DetectionConfig
-) -> tuple[NDArray[np.int64], Array, list[tuple[int, str]], int]:
+    ids: Int64, corners: Array, board: TagBoard, config: DetectionConfig
+) -> tuple[Int64, Array, list[tuple[int, str]], int]:
     """Return the tags on the board, corners in its order, others' faults, the codes' turns."""
     if len(ids) == 1 and board.rows * board.columns > 1 and board.family in WEAK_FAMILIES:
         return ids[:0], corners[:0], [(int(ids[0]), f"one {board.family} alone may be chance")], 0

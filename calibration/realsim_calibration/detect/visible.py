@@ -1,8 +1,8 @@
 """What does a picture show, whatever the board file says? For messages where nothing was found."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, UInt8
 from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim_calibration.detect.chessboard import largest_chessboard
 from realsim_calibration.detect.ellipses import DotConfig, find_blobs
@@ -46,7 +46,7 @@ SIZE_SPREAD = 0.35
 """Median departure of dots' radii from their median: a target's dots are of one size."""
 
 
-def what_is_visible(image: NDArray[np.uint8]) -> str:
+def what_is_visible(image: UInt8) -> str:
     """Return what an image shows of any kind of target, as a clause: "17 markers of DICT_6X6_100".
 
     All dictionaries are tried, plain and mirrored, then chessboards, then grids of dots: about a
@@ -72,9 +72,7 @@ def what_is_visible(image: NDArray[np.uint8]) -> str:
     return f"nothing that looks like a target ({_exposure(gray)})"
 
 
-def explain_missing(
-    image: NDArray[np.uint8], target: Target, detection: TargetDetection | None = None
-) -> str:
+def explain_missing(image: UInt8, target: Target, detection: TargetDetection | None = None) -> str:
     """Return why a target was not found: what was asked for, what is there, what to do.
 
     Raises:
@@ -110,7 +108,7 @@ def describe(target: Target) -> str:
     return f"{shape} grid of {target.columns}x{target.rows} dots{large}"
 
 
-def _halved(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _halved(gray: UInt8) -> UInt8:
     """Return the picture at a size that is searched quickly."""
     import cv2
 
@@ -120,7 +118,7 @@ def _halved(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return gray
 
 
-def _chessboard(gray: NDArray[np.uint8], marker_px: float) -> NDArray[np.float64] | None:
+def _chessboard(gray: UInt8, marker_px: float) -> Array | None:
     """Return the corners (r, c, 2) of a real chessboard with squares larger than the markers."""
     grid = largest_chessboard(gray, SEARCH_PX)
     if grid is None:
@@ -136,9 +134,9 @@ def _chessboard(gray: NDArray[np.uint8], marker_px: float) -> NDArray[np.float64
     return grid if share >= MIN_SADDLES else None
 
 
-def _markers(gray: NDArray[np.uint8]) -> tuple[str, float]:
+def _markers(gray: UInt8) -> tuple[str, float]:
     """Return the markers of the dictionary that explains most, and their median side [px]."""
-    best: tuple[int, str, NDArray[np.int64], float] | None = None
+    best: tuple[int, str, Int64, float] | None = None
     for name in LARGEST:
         ids, quads = decode_markers(gray, name)
         different = len(np.unique(ids))
@@ -169,7 +167,7 @@ def _smallest(name: str, most: int) -> str:
     return next(n for size, n in sizes if most < size) + " (or larger)"
 
 
-def _dots(gray: NDArray[np.uint8]) -> tuple[str, int]:
+def _dots(gray: UInt8) -> tuple[str, int]:
     """Return the grid of dots in words, '' where there is none, and how many there are."""
     best: dict[tuple[int, int], int] = {}
     for shade in (gray, 255 - gray):
@@ -196,7 +194,7 @@ def _dots(gray: NDArray[np.uint8]) -> tuple[str, int]:
     return f"a grid of at least {len(nodes)} dots, not all of it", len(nodes)
 
 
-def _exposure(gray: NDArray[np.uint8]) -> str:
+def _exposure(gray: UInt8) -> str:
     """Return how bright the picture is: most failures are too dark, too bright or out of focus."""
     low, high = np.percentile(gray, [1, 99])
     return f"gray levels {low:.0f} to {high:.0f} of 255"

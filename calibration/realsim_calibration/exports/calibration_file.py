@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any, TypeVar, cast, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import __version__
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check, RobotErrorMap, Target
@@ -17,7 +17,6 @@ from realsim.untrusted.own_json import OwnFile, Real, from_json, read_object, to
 from realsim_calibration.exports.frames import FrameNames, parent_frame, quaternion_xyzw
 from realsim_calibration.results import BoardShape, HandEyeReport, Mode, ViewReport
 
-Array = NDArray[np.float64]
 Record = TypeVar("Record")
 SCHEMA = "realsim.calibration"
 VERSION = 2

@@ -10,15 +10,14 @@ import re
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import __version__
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import metrics, se3
 from realsim.records.checked_arrays import rigid
 from realsim_calibration.results import HandEyeReport
 
-Array = NDArray[np.float64]
 FRAME_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.\-]*(/[A-Za-z0-9_.\-]+)*")
 """What tf2 takes for a frame: no spaces, no leading slash."""
 FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*")

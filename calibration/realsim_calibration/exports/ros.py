@@ -3,10 +3,8 @@
 import re
 import shlex
 
-import numpy as np
-from numpy.typing import NDArray
-
 from realsim import __version__
+from realsim.arrays import Array
 from realsim_calibration.exports.frames import (
     FrameNames,
     comments,
@@ -18,8 +16,6 @@ from realsim_calibration.exports.frames import (
 )
 from realsim_calibration.lens.camera_files import number, ros_yaml
 from realsim_calibration.results import HandEyeReport
-
-Array = NDArray[np.float64]
 
 
 def ros2_command(report: HandEyeReport, frames: FrameNames) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.store import atomic
 from realsim_calibration.exports import ros
 from realsim_calibration.exports.calibration_file import write_calibration
@@ -22,8 +23,6 @@ from realsim_calibration.exports.frames import (
 )
 from realsim_calibration.lens.camera_files import yaml_matrix
 from realsim_calibration.results import HandEyeReport
-
-Array = NDArray[np.float64]
 
 
 def opencv_text(report: HandEyeReport, frames: FrameNames) -> str:

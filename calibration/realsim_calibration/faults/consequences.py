@@ -2,9 +2,7 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.records import Check, Target
 from realsim_calibration.faults.diagnose import diagnose
@@ -15,7 +13,6 @@ from realsim_calibration.faults.motion_check import check_motion
 from realsim_calibration.results import Mode
 from realsim_calibration.views import TargetDetection
 
-Array = NDArray[np.float64]
 SINGLE_VIEWS = (
     "mispaired_image", "swapped_images", "frozen_pose", "repeated_image", "duplicated_views",
 )  # fmt: skip

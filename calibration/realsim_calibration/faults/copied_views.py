@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim_calibration.faults.diagnosis import DiagnosisConfig
 from realsim_calibration.faults.frame_fit import chord_angle
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -46,13 +44,13 @@ def _length_unit(T: Array) -> float:
     return 1000.0 if float(np.median(np.linalg.norm(T[:, :3, 3], axis=-1))) > 20.0 else 1.0
 
 
-def _near(T: Array, length: float, angle: float) -> NDArray[np.bool_]:
+def _near(T: Array, length: float, angle: float) -> Mask:
     far = np.linalg.norm(T[:, None, :3, 3] - T[None, :, :3, 3], axis=-1)
     turn = chord_angle(T[:, None, :3, :3], T[None, :, :3, :3])
     return (far < length) & (turn < angle)
 
 
-def _groups(linked: NDArray[np.bool_]) -> tuple[tuple[int, ...], ...]:
+def _groups(linked: Mask) -> tuple[tuple[int, ...], ...]:
     """Return the rows that are linked with each other, groups of two and more."""
     n = len(linked)
     free, groups = set(range(n)), list[tuple[int, ...]]()

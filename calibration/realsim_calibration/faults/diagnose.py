@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Target
@@ -43,7 +44,6 @@ from realsim_calibration.faults.tool_offset import tool_offset
 from realsim_calibration.fit.closed_forms import motions, principal_turns
 from realsim_calibration.results import Mode
 
-Array = NDArray[np.float64]
 UNITS = (("millimetres", 1000.0), ("centimetres", 100.0), ("inches", 39.3701))
 """Units of length that are taken for metres."""
 UNIT_TOLERANCE = 1.15
@@ -113,7 +113,7 @@ def diagnose(
     return _diagnosis(p, found, tried, config)
 
 
-def _with_rows(h: Hypothesis, rows: NDArray[np.int64]) -> Hypothesis:
+def _with_rows(h: Hypothesis, rows: Int64) -> Hypothesis:
     """Return a hypothesis on a part of the views in rows of the whole."""
     return replace(h, rows=rows[h.rows], views=tuple(int(rows[k]) for k in h.views))
 
@@ -137,7 +137,7 @@ def _diagnosis(
 
 def _without_copies(
     p: Poses, copies: Copies, config: DiagnosisConfig
-) -> tuple[NDArray[np.int64], Hypothesis | None]:
+) -> tuple[Int64, Hypothesis | None]:
     """Return the rows that repeat nothing, and what the others are."""
     groups = {"duplicated_views": copies.duplicates, "frozen_pose": copies.frozen,
               "repeated_image": copies.repeated}  # fmt: skip

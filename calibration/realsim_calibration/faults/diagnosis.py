@@ -3,9 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import Array, Int64
 from realsim_calibration.faults.frame_fit import FitConfig
 from realsim_calibration.faults.gates import GateConfig
 from realsim_calibration.faults.half_turns import HalfTurnConfig
@@ -14,7 +12,6 @@ from realsim_calibration.faults.rotation_readings import ReadingConfig
 from realsim_calibration.faults.tool_offset import ToolOffsetConfig
 from realsim_calibration.results import Mode
 
-Array = NDArray[np.float64]
 Fault = Literal[
     "none", "unknown", "untestable",
     "duplicated_views", "frozen_pose", "repeated_image",
@@ -124,7 +121,7 @@ class Diagnosis:
     only with a loud warning."""
     repaired_cam_board: Array | None = None
     """(k, 4, 4) the board poses that belong to them."""
-    repaired_rows: NDArray[np.int64] | None = None
+    repaired_rows: Int64 | None = None
     """(k, 2) row of the given hand pose and of the given board pose of every repaired view."""
     note: str = ""
     """What the repair did."""

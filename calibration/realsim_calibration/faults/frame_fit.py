@@ -17,14 +17,13 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_calibration.fit.closed_forms import clear_of_half_turns, motions
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 RIDGE = 1e-9
 """Share of the mean curvature that decides what the views do not determine."""
 SETTLED = 1e-9
@@ -162,7 +161,7 @@ def _nearest_rotations(M: Array) -> Array:
     return U @ Vt
 
 
-def _draw(n: int, size: int, samples: int, rng: np.random.Generator) -> Indices:
+def _draw(n: int, size: int, samples: int, rng: np.random.Generator) -> Int64:
     """Return (samples, size) different views each; all groups where there are few."""
     if n <= size:
         return np.arange(n)[None]

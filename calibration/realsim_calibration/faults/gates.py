@@ -10,12 +10,11 @@ fit worse than no fit. Angles alone do not see inverted poses: tr(R_i^T R_j) = t
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim_calibration.faults.frame_fit import FitConfig, fit_frames, hand_side, mismatch
 from realsim_calibration.fit.closed_forms import clear_of_half_turns, motions, nearest_rotation
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -14,13 +14,11 @@ All views turned alike is no fault, so the fewer views are called turned.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
-
-Array = NDArray[np.float64]
-Flips = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -41,7 +39,7 @@ class HalfTurnConfig:
 class HalfTurns:
     """Which boards were read turned."""
 
-    flips: Flips
+    flips: Mask
     """(n,) whether the board was read turned."""
     before_deg: float
     """RMS difference of the turns of hand and camera over the pairs as given, at most 60 each."""
@@ -111,7 +109,7 @@ def _differences(A: Array, C: Array) -> Array:
     return np.abs(np.stack([same, other]) - hand)
 
 
-def _synchronise(off: Array, soft: float) -> Flips:
+def _synchronise(off: Array, soft: float) -> Mask:
     """Return the turns (n,) that the pairwise answers agree on best."""
     answer = (off[1] - off[0]) / (off[1] + off[0] + soft)
     np.fill_diagonal(answer, 0)
@@ -119,7 +117,7 @@ def _synchronise(off: Array, soft: float) -> Flips:
     return leading * leading[np.argmax(np.abs(leading))] < 0
 
 
-def _polish(off: Array, flips: Flips, sweeps: int) -> Flips:
+def _polish(off: Array, flips: Mask, sweeps: int) -> Mask:
     """Return the turns after every view was turned to where it fits best, a few times."""
     flips = flips.copy()
     others = ~np.eye(len(flips), dtype=bool)
@@ -135,7 +133,7 @@ def _polish(off: Array, flips: Flips, sweeps: int) -> Flips:
     return flips
 
 
-def _rms(off: Array, flips: Flips) -> float:
+def _rms(off: Array, flips: Mask) -> float:
     """Return the RMS over the pairs under these turns, each at most 60 deg [deg]."""
     degrees = np.degrees(np.where(flips[None] == flips[:, None], off[0], off[1]))
     degrees = degrees[~np.eye(len(flips), dtype=bool)]

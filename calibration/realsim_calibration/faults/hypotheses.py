@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Rows
 from realsim.geometry import se3
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim_calibration.faults.diagnosis import DiagnosisConfig, Evidence, Fault
@@ -21,9 +21,6 @@ from realsim_calibration.faults.rotation_readings import (
 )
 from realsim_calibration.faults.tool_offset import describe_offset
 from realsim_calibration.fit.closed_forms import motions
-
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -9,8 +9,9 @@ axis, distance, places in the image.
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_calibration.faults.frame_fit import (
@@ -23,7 +24,6 @@ from realsim_calibration.faults.frame_fit import (
 )
 from realsim_calibration.fit.closed_forms import principal_turns, relative
 
-Array = NDArray[np.float64]
 UNSEEN = 1e-8
 """Information below this, in 1 / degree^2 or 1 / mm^2, is none: 1-sigma 10 m."""
 UNKNOWN_MM = 1e3

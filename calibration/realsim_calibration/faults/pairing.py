@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask, Rows
 from realsim.geometry import se3
 from realsim_calibration.faults.frame_fit import (
     MIN_VIEWS,
@@ -22,8 +22,6 @@ from realsim_calibration.faults.frame_fit import (
     mismatch,
 )
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 MovedFrame = Literal["X", "Z"]
 MOVED_FRAMES: tuple[MovedFrame, ...] = ("X", "Z")
 PREFER_TOOL = np.radians(3.0)
@@ -219,7 +217,7 @@ def _mutual(elsewhere: list[tuple[int, int]], shifts: Rows) -> list[tuple[int, i
 
 
 def _swaps(
-    table: Array, pose: Rows, own: Array, inside: NDArray[np.bool_], config: PairingConfig
+    table: Array, pose: Rows, own: Array, inside: Mask, config: PairingConfig
 ) -> tuple[tuple[int, int], ...]:
     """Return pairs of images that fit far better exchanged, the clearest first."""
     suspects = [int(j) for j in np.flatnonzero(inside & (own > config.swap_floor))]

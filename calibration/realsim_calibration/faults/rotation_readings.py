@@ -18,11 +18,10 @@ from functools import partial
 from itertools import permutations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 
-Array = NDArray[np.float64]
 AXES = "xyz"
 JUDGES = 12
 """Views that judge the pairs of the first two Euler angles: chance passes one in 10^5."""

@@ -9,13 +9,12 @@ frames come from the same robust fit as a hand-eye, with the nominal poses in th
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_calibration.faults.frame_fit import FitConfig, fit_frames
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -47,7 +46,7 @@ class ToolOffset:
     """Whether the nominal poses fit at all; else nothing is claimed."""
     offsets: tuple[Array, ...]
     """(4, 4) T_flange_ee of every stretch of views; one where it is constant [m]."""
-    groups: NDArray[np.int64]
+    groups: Int64
     """(n,) which of the offsets a view has."""
     T_base_nominal: Array
     """(4, 4) the nominal base in the controller's; identity where they agree [m]."""
@@ -98,7 +97,7 @@ def tool_offset(
 
 def _simplest(
     A: Array, N: Array, config: ToolOffsetConfig
-) -> tuple[Array, tuple[Array, ...], NDArray[np.int64], Array]:
+) -> tuple[Array, tuple[Array, ...], Int64, Array]:
     """Return L, offsets, groups, errors (n, 6) of the simplest model that fits nearly as well."""
     one = np.zeros(len(A), dtype=np.int64)
     I4 = np.eye(4)
@@ -107,7 +106,7 @@ def _simplest(
     E = se3.invert(fit.X)
     turn = se3.from_rt(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     # Typical cases first, each with an exact base: a tool, the base turned by 180 deg, then any.
-    models: list[tuple[Array, tuple[Array, ...], NDArray[np.int64]]] = [
+    models: list[tuple[Array, tuple[Array, ...], Int64]] = [
         (I4, (I4,), one),
         (I4, (_middle(se3.invert(N) @ A),), one),
         (turn, (_middle(se3.invert(turn @ N) @ A),), one),
@@ -119,7 +118,7 @@ def _simplest(
         # Offsets of a view or two are wrong poses, not tools.
         if len(offsets) > 1 and np.bincount(groups).min() >= config.min_group:
             models.append((base, offsets, groups))
-    results: list[tuple[float, tuple[Array, tuple[Array, ...], NDArray[np.int64], Array]]] = []
+    results: list[tuple[float, tuple[Array, tuple[Array, ...], Int64, Array]]] = []
     for base, offsets, groups in models:
         ends = np.array(offsets)[groups]
         error = se3.log(se3.invert(base @ N @ ends) @ A)
@@ -136,7 +135,7 @@ def _middle(Ts: Array) -> Array:
     return se3.from_rt(se3.mean_rotation(Ts[:, :3, :3]), np.median(Ts[:, :3, 3], 0))
 
 
-def _groups(Ts: Array, config: ToolOffsetConfig) -> tuple[tuple[Array, ...], NDArray[np.int64]]:
+def _groups(Ts: Array, config: ToolOffsetConfig) -> tuple[tuple[Array, ...], Int64]:
     """Return the different transforms among (n, 4, 4) and which one each view has."""
     groups = np.full(len(Ts), -1)
     offsets: list[Array] = []
@@ -178,7 +177,7 @@ def describe_offset(T: Array) -> str:
 
 
 def _sentence(
-    L: Array, offsets: tuple[Array, ...], groups: NDArray[np.int64], rms: tuple[float, float],
+    L: Array, offsets: tuple[Array, ...], groups: Int64, rms: tuple[float, float],
     known: bool, config: ToolOffsetConfig,
 ) -> tuple[str, str]:  # fmt: skip
     rest = f"what remains is {rms[0]:.1f} mm and {rms[1]:.2f} deg RMS"

@@ -8,14 +8,13 @@ reprojection; the hand-eye gates may choose the twin where the motion of the han
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.camera import undistort
 from realsim.records import CameraIntrinsics
 from realsim_calibration.fit.view_system import camera_vector, refined_pose
 
-Array = NDArray[np.float64]
 REFINE_STEPS = 15
 """Gauss-Newton from IPPE's solution converges in four; the twin may take longer."""
 FIRST_DAMPING = 1e-4

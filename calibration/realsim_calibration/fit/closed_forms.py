@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Mask
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 
-Array = NDArray[np.float64]
 HALF_TURN = np.radians(175.0)
 """Pairs that turn further are left out: near 180 deg the sign of the axis is decided by noise."""
 
@@ -242,7 +242,7 @@ def nearest_rotation(M: Array) -> Array:
 
 def _clear_motions(
     Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike
-) -> tuple[Relative, Relative, NDArray[np.bool_]]:
+) -> tuple[Relative, Relative, Mask]:
     """Return the motions of hand and camera and which (P,) are clear of half turns.
 
     Near 180 deg the axis has no sure sign.
@@ -256,13 +256,13 @@ def _clear_motions(
     return A, B, clear
 
 
-def clear_of_half_turns(hand: Relative, cam: Relative) -> NDArray[np.bool_]:
+def clear_of_half_turns(hand: Relative, cam: Relative) -> Mask:
     """Return which pairs (P,) turn neither hand nor camera by nearly 180 deg."""
     turn = np.maximum(*(np.linalg.norm(m.turns, axis=-1) for m in (hand, cam)))
     return turn < HALF_TURN
 
 
-def _dual_quaternion(m: Relative, rows: NDArray[np.bool_], length: float) -> tuple[Array, Array]:
+def _dual_quaternion(m: Relative, rows: Mask, length: float) -> tuple[Array, Array]:
     """Return real and dual part (N, 4) of some motions, lengths in units of `length`."""
     turns, t = m.turns[rows], m.Ts[rows, :3, 3] / length
     angle = np.linalg.norm(turns, axis=-1, keepdims=True)

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
@@ -32,7 +32,6 @@ from realsim_calibration.fit.view_system import (
     camera_vector,
 )
 
-Array = NDArray[np.float64]
 MOST_DAMPING = 1e6
 """A step that is still no gain with this much of the curvature added is none: the fit has ended."""
 HELD_SD = 1e-3

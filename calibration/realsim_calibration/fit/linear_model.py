@@ -18,14 +18,13 @@ Patterson & Thompson 1971):
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim_calibration.fit.joint_solve import JointProblem, JointState
 from realsim_calibration.fit.robot_error import ErrorBasis
 from realsim_calibration.fit.view_system import SHARED
 
-Array = NDArray[np.float64]
 ROBOT = slice(SHARED, SHARED + 6)
 SIGMA_ROUNDS = 3
 """Rounds of sigma inside one evaluation of the likelihood; the fourth changes it by 1e-4."""

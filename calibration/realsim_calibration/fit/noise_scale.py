@@ -14,13 +14,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim_calibration.fit.joint_solve import JointProblem, JointState
 from realsim_calibration.fit.linear_model import LinearModel
 from realsim_calibration.fit.robot_error import ErrorBasis, RobotErrorConfig
 
-Array = NDArray[np.float64]
 CURVATURE_STEP = 0.3
 """Step of a logarithm for the likelihood's curvature: a third of a factor e is about its sigma."""
 

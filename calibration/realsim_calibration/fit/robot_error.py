@@ -12,14 +12,13 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.dh import DH_NUMBERS, DhArm
 from realsim.records import ArmErrorMap, RobotErrorMap
 from realsim.records.calibration import MAP_FEATURES
 
-Array = NDArray[np.float64]
 LEAST_SPREAD_M = 1e-4
 """Positions that differ by less carry no feature."""
 MIN_ARM_VIEWS = 6

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim.records import ArmErrorMap, RobotErrorMap
@@ -41,7 +41,6 @@ from realsim_calibration.fit.view_system import SHARED
 if TYPE_CHECKING:
     from realsim_calibration.screening import HandEyeConfig
 
-Array = NDArray[np.float64]
 X = slice(0, 6)
 
 

@@ -16,13 +16,12 @@ gives the columns of the poses. A view costs the same with 20 corners or with 2,
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.compiled import njit
 from realsim.geometry import lens_loops
 from realsim.records import CameraIntrinsics
 
-Array = NDArray[np.float64]
 CAMERA_TERMS = 12
 """fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6."""
 BOARD_TERMS = 5

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim_calibration.inputs.raw_poses import (
     ANGLE_ROTATIONS,
@@ -21,7 +21,6 @@ from realsim_calibration.inputs.raw_poses import (
 )
 from realsim_calibration.inputs.readings import PoseReading
 
-Array = NDArray[np.float64]
 WIDTHS = (6, 7, 12, 16)
 """Numbers a pose may have without names."""
 ACCEPTED = (

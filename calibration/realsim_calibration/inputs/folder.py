@@ -4,9 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim_calibration.inputs.image_files import content_of, list_images
 from realsim_calibration.inputs.pairing import Pairing, pair
@@ -14,7 +12,6 @@ from realsim_calibration.inputs.pose_file import read_pose_file
 from realsim_calibration.inputs.raw_poses import RawPoses, listed_readings
 from realsim_calibration.inputs.readings import PoseReading
 
-Array = NDArray[np.float64]
 NOT_MEASURED = "its pose holds NaN or infinite numbers: it was not measured"
 
 

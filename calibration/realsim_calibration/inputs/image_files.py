@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import UInt8
 from realsim.errors import InputError
 from realsim_calibration.inputs.pairing import natural_key
 
@@ -168,7 +168,7 @@ def _opened(path: Path, action: Callable[[Path, Any], Any]) -> Any:
         ) from error
 
 
-def load_image(path: Path | str) -> NDArray[np.uint8]:
+def load_image(path: Path | str) -> UInt8:
     """Return an image as (H, W, 3) uint8 RGB, exactly the stored pixels.
 
     Grey images get three equal channels. Nothing is turned, scaled or filled in.
@@ -190,7 +190,7 @@ def load_image(path: Path | str) -> NDArray[np.uint8]:
     return _opened(path, _pixels)
 
 
-def _pixels(path: Path, image: Any) -> NDArray[np.uint8]:
+def _pixels(path: Path, image: Any) -> UInt8:
     """Return the pixels of an opened image as RGB."""
     if _deep(path, image):
         raise InputError(

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim_calibration.inputs.columns import ACCEPTED, LABEL_NAMES, PoseTable, role_of
 
-Array = NDArray[np.float64]
 LAST = np.array([0.0, 0.0, 0.0, 1.0])
 """The last row of a 4x4 matrix."""
 COMMENT = ("#", "//", "%")

@@ -6,8 +6,8 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError, NotRigidError, UnitError
 from realsim.geometry.se3 import RIGID_TOLERANCE
 from realsim.records.checked_arrays import frozen
@@ -20,7 +20,6 @@ from realsim_calibration.inputs.readings import (
     both_directions,
 )
 
-Array = NDArray[np.float64]
 ANGLE_ROTATIONS: tuple[str, ...] = ("rotation_vector", *(f"euler_{o}" for o in EULER_ORDERS))
 """Every rotation that is three angles."""
 QUATERNIONS = ("quaternion_xyzw", "quaternion_wxyz")
@@ -98,7 +97,7 @@ class RawPoses:
         return len(self.values)
 
     @property
-    def measured(self) -> NDArray[np.bool_]:
+    def measured(self) -> Mask:
         """(n,) whether all numbers of the pose are finite."""
         return np.all(np.isfinite(self.values), axis=1)
 

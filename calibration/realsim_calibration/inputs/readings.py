@@ -13,10 +13,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError, NotRigidError, UnitError
 from realsim.geometry import se3
 
-Array = NDArray[np.float64]
 AngleUnit = Literal["rad", "deg"]
 LengthUnit = Literal["m", "mm"]
 
@@ -157,7 +157,7 @@ class PoseReading:
         """Return (n,) whether each row of (n, k) numbers is a pose in this reading."""
         limits = tolerance or RotationTolerance()
         values = np.atleast_2d(np.asarray(raw, dtype=np.float64))
-        good: NDArray[np.bool_] = np.all(np.isfinite(values), axis=1)
+        good: Mask = np.all(np.isfinite(values), axis=1)
         safe = np.where(good[:, None], values, 0.0)
         if self.has_angles:
             return good
@@ -219,7 +219,7 @@ class PoseReading:
                 "given. Is the rotation stored in another format?"
             )
         names = [f"row {k}" for k in range(len(values))] if rows is None else rows
-        bad: NDArray[np.bool_] = ~np.all(np.isfinite(values), axis=1)
+        bad: Mask = ~np.all(np.isfinite(values), axis=1)
         if bad.any():
             raise InputError(
                 f"{_listed(names, bad)} hold NaN or infinite numbers: these poses were not "
@@ -304,7 +304,7 @@ def both_directions(reading: PoseReading) -> tuple[PoseReading, PoseReading]:
     return replace(reading, inverted=False), replace(reading, inverted=True)
 
 
-def _listed(names: Sequence[str], bad: NDArray[np.bool_], most: int = 8) -> str:
+def _listed(names: Sequence[str], bad: Mask, most: int = 8) -> str:
     """Return the names of the bad rows for a message, at most so many."""
     chosen = [names[int(k)] for k in np.flatnonzero(bad)]
     more = f" and {len(chosen) - most} more" if len(chosen) > most else ""

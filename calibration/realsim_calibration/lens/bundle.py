@@ -16,16 +16,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.compiled import njit
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.camera import projection_jacobian
 from realsim_calibration.fit.view_system import camera_record
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 CAMERA_TERMS = 12
 """fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6."""
 BOARD_TERMS = 4
@@ -63,7 +61,7 @@ class Observations:
     """(N, 2) where it was seen [px]."""
     weight: Array
     """(N,) relative inverse variance, about 1."""
-    offsets: NDArray[np.int64]
+    offsets: Int64
     """(views + 1,) first corner of every view."""
     half_extent_m: float
     """L of the board's shape."""
@@ -75,7 +73,7 @@ class Observations:
         return len(self.offsets) - 1
 
     @property
-    def view(self) -> NDArray[np.int64]:
+    def view(self) -> Int64:
         """(N,) view of every corner."""
         return np.repeat(np.arange(self.views), np.diff(self.offsets))
 
@@ -204,7 +202,7 @@ class _Normal:
 
 @njit
 def _accumulate(
-    offsets: NDArray[np.int64],
+    offsets: Int64,
     derivatives: tuple[Array, Array],
     rotations: Array,
     board: tuple[Array, Array, float],

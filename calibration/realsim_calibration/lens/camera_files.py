@@ -21,15 +21,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.interop import opencv_from_colmap_px
 from realsim.records import CameraIntrinsics
 from realsim.untrusted.own_json import from_json, to_json
 from realsim_calibration.lens.camera_file_syntax import Fields, first_line, named_values, read_text
 
-Array = NDArray[np.float64]
 Format = Literal["realsim", "ros", "opencv"]
 SMALLEST_SIDE = 8
 """An image this small is no image [px]."""

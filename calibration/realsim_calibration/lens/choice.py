@@ -8,8 +8,8 @@ errors always prefer the largest model; this does not.
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.errors import DegenerateError
 from realsim_calibration.fit.view_system import camera_record
 from realsim_calibration.lens.bundle import (
@@ -25,8 +25,6 @@ from realsim_calibration.lens.bundle import (
 from realsim_calibration.lens.models import MODELS
 from realsim_calibration.lens.start import is_line
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 TINY_PX2 = 1e-20
 """Perfect corners have errors of rounding only, which have no logarithm worth comparing [px^2]."""
 HALF_POINTS = 4
@@ -67,7 +65,7 @@ class ModelScore:
     chosen: bool = False
 
 
-def fold_of_views(obs: Observations, folds: int) -> NDArray[np.int64]:
+def fold_of_views(obs: Observations, folds: int) -> Int64:
     """Return the fold (views,) of every view, whatever the order they are given in.
 
     Views are dealt out by how far from the image's middle their corners lie, so that every fold has
@@ -93,7 +91,7 @@ def halves(obs: Observations) -> tuple[Mask, Mask]:
 
 def predict_unseen(
     state: State, obs: Observations, sigma_px: float, config: SolverConfig
-) -> tuple[Array, NDArray[np.int64]]:
+) -> tuple[Array, Int64]:
     """Return squared errors [px^2] of corners predicted from their view's other half, and counts.
 
     Args:
@@ -139,9 +137,7 @@ def _without(fit: LensFit, train: Mask) -> State:
     return fit.state.moved(step)
 
 
-def held_out_errors(
-    fit: LensFit, obs: Observations, folds: NDArray[np.int64], config: ChoiceConfig
-) -> Array:
+def held_out_errors(fit: LensFit, obs: Observations, folds: Int64, config: ChoiceConfig) -> Array:
     """Return the mean squared error [px^2] of every view (views,), its lens from other folds.
 
     NaN where a view is too small, infinite where the others do not determine the model.
@@ -168,7 +164,7 @@ def held_out_errors(
 def score_models(
     fits: dict[str, tuple[LensFit, tuple[tuple[str, str], ...]]],
     obs: Observations,
-    folds: NDArray[np.int64],
+    folds: Int64,
     config: ChoiceConfig,
 ) -> tuple[ModelScore, ...]:
     """Return the table of models (given smallest first), with the chosen one marked.

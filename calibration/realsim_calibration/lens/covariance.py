@@ -19,14 +19,14 @@ found with it absorbs the rotation), so the best-fitting rotation is taken out, 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry.camera import projection_jacobian, undistort
 from realsim.records import CameraIntrinsics
 from realsim_calibration.lens.bundle import CAMERA_TERMS, GLOBALS, LensFit
 
-Array = NDArray[np.float64]
 BLEND = 4.0
 """Views per free term at which jackknife and marginal weigh the same. Simulated joint 95 % regions
 of 12 to 40 views hold 92 to 99 %; with 1 they hold 80 to 96 %, with the jackknife alone 27 to 79 %:

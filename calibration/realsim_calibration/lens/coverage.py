@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 
-Array = NDArray[np.float64]
 QUARTERS = ("upper left", "upper right", "lower left", "lower right")
 
 
@@ -35,7 +34,7 @@ class CoverageConfig:
 class Coverage:
     """Where corners were, and how the board stood."""
 
-    counts: NDArray[np.int64]
+    counts: Int64
     """(rows, columns) corners in every cell of the image."""
     share: float
     """Share of cells with corners."""
@@ -95,7 +94,7 @@ def measure_coverage(
 
 
 def _advice(
-    counts: NDArray[np.int64],
+    counts: Int64,
     share: float,
     reach: float,
     tilt: Array,

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim_calibration.fit.view_system import camera_record
@@ -23,7 +23,6 @@ from realsim_calibration.lens.coverage import CoverageConfig
 from realsim_calibration.lens.models import MODELS, TERM_NAMES, LensBeliefs, free_terms
 from realsim_calibration.lens.observations import OutlierConfig
 
-Array = NDArray[np.float64]
 HOLD_ORDER = ((("k6",), ("k5",), ("k4",), ("k3",), ("k2",), ("k1",)), (("p1", "p2"),))
 """In which order terms are asked whether the views determine them."""
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
@@ -54,8 +53,6 @@ from realsim_calibration.lens.start import choose_twins, start_state, view_error
 from realsim_calibration.results import BoardShape
 from realsim_calibration.views import TargetDetection
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 REFERENCE = "Brown 5"
 """The model that everybody expects: its undetermined terms are named even where a smaller one is
 chosen, and it says how uncertain the lens is where there were no corners."""

@@ -3,14 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim_calibration.fit.view_system import camera_vector
 from realsim_calibration.lens.bundle import CAMERA_TERMS, GLOBALS, Prior
 
-Array = NDArray[np.float64]
 TERM_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Order of every camera vector and covariance (OpenCV's)."""
 MODELS: dict[str, tuple[str, ...]] = {
@@ -88,7 +87,7 @@ def lens_prior(
     return Prior(mean=mean, sd=sd, aspect_sd=beliefs.aspect_sd, free=np.ones(GLOBALS, dtype=bool))
 
 
-def free_terms(model: str, held: tuple[str, ...] = (), board: bool = True) -> NDArray[np.bool_]:
+def free_terms(model: str, held: tuple[str, ...] = (), board: bool = True) -> Mask:
     """Return the mask (16,) of the globals that a model estimates.
 
     Args:

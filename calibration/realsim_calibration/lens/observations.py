@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.errors import InputError
 from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim.records import CameraIntrinsics, Target
@@ -13,8 +13,6 @@ from realsim_calibration.lens.bundle import LensFit, Observations
 from realsim_calibration.lens.start import is_line
 from realsim_calibration.views import TargetDetection
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 NAMED = 6
 """Views that a message names before it says how many more there are."""
 OUTSIDE_PX = 2.0
@@ -47,9 +45,9 @@ class Corners:
     """The corners in use, and what became of the others."""
 
     obs: Observations
-    indices: NDArray[np.int64]
+    indices: Int64
     """(views in use,) their places in the list that was given."""
-    ids: NDArray[np.int64]
+    ids: Int64
     """(N,) points of the target."""
     middle: Array
     """(2,) the board's middle on the drawing [m]."""

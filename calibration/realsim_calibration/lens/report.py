@@ -3,16 +3,15 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.records import CameraIntrinsics, Check, Target
 from realsim_calibration.lens.choice import ModelScore
 from realsim_calibration.lens.covariance import projection_sd
 from realsim_calibration.lens.coverage import Coverage
 from realsim_calibration.lens.models import TERM_NAMES
 from realsim_calibration.results import BoardShape
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

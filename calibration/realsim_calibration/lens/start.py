@@ -13,8 +13,8 @@ and the one of least median reprojection starts.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.camera import undistort
 from realsim_calibration.detect.homography import fit_homography
@@ -30,7 +30,6 @@ from realsim_calibration.lens.bundle import (
     refine_poses,
 )
 
-Array = NDArray[np.float64]
 FAN = np.geomspace(0.3, 8.0, 18)
 """Focal lengths that are tried, in longer image sides: from 118 deg of field of view to 7 deg."""
 TWIN_STEPS = 8

@@ -9,6 +9,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError, RealsimError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Target
@@ -29,7 +30,7 @@ from realsim_calibration.planning.view_proposals import (
     propose_views,
 )
 from realsim_calibration.results import HandEyeReport
-from realsim_calibration.views import Array, BoardView
+from realsim_calibration.views import BoardView
 
 State = Literal["collecting", "improving", "done", "bad"]
 

@@ -25,16 +25,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Mask
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import projection_jacobian, undistort
 from realsim.records import Chessboard, CircleGrid, RobotErrorMap, Target
 from realsim_calibration.results import HandEyeReport
-from realsim_calibration.views import Array
 
-Mask = NDArray[np.bool_]
 SHARED = 29
 """X 6, Z 6, camera 12, board 5."""
 

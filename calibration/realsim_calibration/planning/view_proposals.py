@@ -6,12 +6,13 @@ from typing import Literal
 
 import numpy as np
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Target
 from realsim_calibration.planning.next_view import BoardGeometry, board_geometry, target_middle
 from realsim_calibration.results import HandEyeReport
-from realsim_calibration.views import Array, BoardView
+from realsim_calibration.views import BoardView
 
 SMALL_MOVE_DEG = 10.0
 """Angles that are not worth a word to the operator [deg]."""

@@ -4,12 +4,13 @@ from typing import Any
 
 import numpy as np
 
+from realsim.arrays import Array
 from realsim.geometry.camera import undistort
 from realsim.records import CameraIntrinsics
 from realsim_calibration.depth.bias import DepthBiasReport
 from realsim_calibration.lens.covariance import projection_sd
 from realsim_calibration.report import style
-from realsim_calibration.report.summary import Array, amount, rest_of_map
+from realsim_calibration.report.summary import amount, rest_of_map
 from realsim_calibration.results import HandEyeReport
 
 CAMERA_AXES = ("x (right)", "y (down)", "z (forward)")

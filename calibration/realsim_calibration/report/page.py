@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.pages import Cell, Page, plots
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check
 from realsim.store import atomic
@@ -256,12 +256,12 @@ def _lens_section(
         _checks_of(page, intrinsics_report.checks, "Checks of the lens alone")
 
 
-def _points(views: Sequence[ViewReport] | Sequence[LensView]) -> NDArray[np.float64]:
+def _points(views: Sequence[ViewReport] | Sequence[LensView]) -> Array:
     """Return the points (n, 2) of some views [px]."""
     return np.concatenate([v.uv for v in views] or [np.zeros((0, 2))])
 
 
-def _lens_column(i: CameraIntrinsics, covariance: NDArray[np.float64]) -> list[str]:
+def _lens_column(i: CameraIntrinsics, covariance: Array) -> list[str]:
     """Return the twelve terms of a lens with 1 sigma."""
     sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     values = [i.fx, i.fy, i.cx, i.cy, *i.distortion]

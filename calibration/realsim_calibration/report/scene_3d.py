@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim_calibration.report import style
-from realsim_calibration.report.summary import Array, carrier, corrected, looks_along
+from realsim_calibration.report.summary import carrier, corrected, looks_along
 from realsim_calibration.results import HandEyeReport, ViewReport
 
 FLANGE_RADIUS_M = 0.0315

@@ -7,13 +7,13 @@ from functools import cache
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.pages.plots import AXIS_COLORS, BAD, FAINT, GOOD, INK, MUTED, WARN
 
 __all__ = ["AXIS_COLORS", "BAD", "FAINT", "GOOD", "INK", "MUTED", "WARN"]
 
-Array = NDArray[np.float64]
 BLUE, PALE = "#2b6ca3", "#a9c7e0"
 ERROR_MAP = "viridis"
 """Colour map of errors: dark is small, bright is large."""

@@ -5,14 +5,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import metrics, se3
 from realsim.records import ArmErrorMap, Check, RobotErrorMap
 from realsim_calibration.exports.frames import quaternion_xyzw, roll_pitch_yaw
 from realsim_calibration.results import HandEyeReport, ViewReport
 
-Array = NDArray[np.float64]
 Verdict = Literal["good", "warn", "bad", "unknown"]
 NOT_KNOWN = "not known"
 WORST_FIRST: tuple[Verdict, ...] = ("bad", "warn", "unknown", "good")

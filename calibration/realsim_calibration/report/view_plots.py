@@ -4,13 +4,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, UInt8
 from realsim_calibration.report import style
-from realsim_calibration.report.summary import Array, amount, viewpoint
+from realsim_calibration.report.summary import amount, viewpoint
 from realsim_calibration.results import HandEyeReport, ViewReport
 
-Images = Callable[[int], NDArray[np.uint8] | None]
+Images = Callable[[int], UInt8 | None]
 """Gives the photograph (height, width, 3) of a view, None where there is none."""
 MOST_ARROWS = 4000
 """Arrows that are still told apart on one picture."""
@@ -123,7 +123,7 @@ def _window(uv: Array, width: int, height: int) -> tuple[Array, float]:
     return corner - 0.5, share * width
 
 
-def _draw_photo(ax: Any, rgb: NDArray[np.uint8] | None, width: int, height: int) -> str:
+def _draw_photo(ax: Any, rgb: UInt8 | None, width: int, height: int) -> str:
     """Draw a photograph, paler than it is; return what must be said of it."""
     import cv2
 

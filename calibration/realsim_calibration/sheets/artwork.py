@@ -8,8 +8,8 @@ modules are one area without a seam, and the pictures, where each pixel is its e
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Mask, UInt8
 from realsim.errors import InputError
 from realsim.records import TAG_CELLS, CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim_calibration.targets.marker_sets import (
@@ -18,8 +18,6 @@ from realsim_calibration.targets.marker_sets import (
     marker_modules,
     tag_dictionary,
 )
-
-Array = NDArray[np.float64]
 
 DOT_SHARE = 0.5
 """Diameter of a dot as a share of the distance to its nearest neighbour: large for accurate
@@ -40,7 +38,7 @@ class Artwork:
     """(nx + 1,) lines across x, ascending."""
     y_m: Array
     """(ny + 1,) lines across y, ascending."""
-    black: NDArray[np.bool_]
+    black: Mask
     """(ny, nx) whether the rectangle between the lines is black."""
     dots: Array
     """(n, 3) x, y and radius of the dots."""
@@ -231,7 +229,7 @@ def _shares(lines: Array, origin: float, px_per_m: float, pixels: int) -> Array:
 
 def black_share(
     artwork: Artwork, px_per_m: float, corner_m: tuple[float, float], size: tuple[int, int]
-) -> NDArray[np.float32]:
+) -> Array32:
     """Return (H, W) the share of each pixel that is black, integrated exactly.
 
     Args:
@@ -244,14 +242,14 @@ def black_share(
     across = _shares(artwork.x_m, corner_m[0], px_per_m, width).astype(np.float32)
     down = _shares(artwork.y_m, corner_m[1], px_per_m, height).astype(np.float32)
     black = artwork.black.astype(np.float32)
-    share: NDArray[np.float32] = np.asarray(down @ black @ across.T, dtype=np.float32)
+    share: Array32 = np.asarray(down @ black @ across.T, dtype=np.float32)
     for x, y, radius in artwork.dots:
         u, v = (x - corner_m[0]) * px_per_m, (y - corner_m[1]) * px_per_m
         _add_dot(share, u, v, radius * px_per_m)
     return np.clip(share, np.float32(0), np.float32(1))
 
 
-def _add_dot(share: NDArray[np.float32], u: float, v: float, radius: float) -> None:
+def _add_dot(share: Array32, u: float, v: float, radius: float) -> None:
     """Add one dot's share; each of its sub-rows is a chord, whose ends are exact."""
     height, width = share.shape
     top, bottom = max(0, int(v - radius)), min(height, int(np.ceil(v + radius)) + 1)
@@ -268,7 +266,7 @@ def _add_dot(share: NDArray[np.float32], u: float, v: float, radius: float) -> N
 
 def target_image(
     target: Target, px_per_m: float, margin_m: float
-) -> tuple[NDArray[np.uint8], tuple[float, float]]:
+) -> tuple[UInt8, tuple[float, float]]:
     """Return a picture of the printed target, and where its board frame's origin is.
 
     Each pixel is the exact share of white of its area. With a whole number of pixels per module and

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import UInt8
 from realsim_calibration.sheets.artwork import Artwork, black_share, outlines
 
 POINT_MM = 25.4 / 72
@@ -163,7 +163,7 @@ def png_bytes(page: Page, longest_px: int) -> bytes:
     for mark in page.marks:
         _paint_mark(ink, mark, per_mm * FINER)
     marks = np.asarray(ink.resize((width, height), Image.Resampling.BOX), np.float32) / 255
-    gray: NDArray[np.uint8] = np.rint(255 * (1 - np.maximum(target, marks))).astype(np.uint8)
+    gray: UInt8 = np.rint(255 * (1 - np.maximum(target, marks))).astype(np.uint8)
     buffer = io.BytesIO()
     Image.fromarray(gray).save(buffer, format="PNG", dpi=(per_mm * 25.4, per_mm * 25.4))
     return buffer.getvalue()

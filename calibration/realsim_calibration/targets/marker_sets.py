@@ -4,8 +4,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Mask
 from realsim.errors import InputError
 from realsim.records import TAG_CELLS, CharucoBoard, TagBoard, Target
 
@@ -63,7 +63,7 @@ def marker_cells(name: str) -> int:
     return int(load_dictionary(name).markerSize) + 2
 
 
-def marker_modules(name: str, marker_id: int) -> NDArray[np.bool_]:
+def marker_modules(name: str, marker_id: int) -> Mask:
     """Return (cells, cells) modules of a marker, True = black, first row at the top."""
     from cv2 import aruco
 

@@ -15,10 +15,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, UInt8
 from realsim.geometry import se3
 from realsim_capture_plans.devices.interfaces import ArmState, Frame
 
-Array = NDArray[np.float64]
 Mark = Literal["good", "doubt", "fault"]
 
 STRIDE = 4
@@ -126,7 +126,7 @@ def measured(frame: Frame, config: CheckConfig) -> Measured:
     )
 
 
-def sharpness(rgb: NDArray[np.uint8]) -> float:
+def sharpness(rgb: UInt8) -> float:
     """Return how steep the steepest edges are: near 1 for a step, lower for every blur.
 
     The steepest slopes of the image's middle three quarters are divided by those of the same
@@ -244,7 +244,7 @@ def check_size(frame: Frame, size: tuple[int, int]) -> Check:
 class Earlier:
     """What is kept of the frame before, to notice a camera that repeats itself."""
 
-    samples: NDArray[np.uint8]
+    samples: UInt8
     """Every fourth pixel of every fourth row."""
     time_s: float
     joints: Array

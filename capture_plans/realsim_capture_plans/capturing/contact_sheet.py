@@ -5,14 +5,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Image, UInt8
 from realsim_capture_plans.capturing.log import CaptureLog
 
 if TYPE_CHECKING:
     from realsim.store import SessionStore
 
-Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 SHEET_FILE = "reports/contact_sheet.png"
 
@@ -165,7 +164,7 @@ def _plain(text: str) -> str:
 
 
 def _fill_cell(
-    cell: NDArray[np.uint8],
+    cell: UInt8,
     k: int,
     image: Image | None,
     entry: Mapping[str, Any],
@@ -198,7 +197,7 @@ def _first_words(note: str) -> str:
 
 
 def _label(
-    image: NDArray[np.uint8],
+    image: UInt8,
     text: str,
     at: tuple[int, int],
     colour: tuple[int, int, int],
@@ -214,7 +213,7 @@ def _label(
 
 
 def _write(
-    image: NDArray[np.uint8],
+    image: UInt8,
     text: str,
     at: tuple[int, int],
     colour: tuple[int, int, int],

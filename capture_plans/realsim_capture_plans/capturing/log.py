@@ -9,9 +9,7 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import Array32, UInt8
 from realsim.records import View
 from realsim.store.session_store import depth_path, rgb_path
 
@@ -66,9 +64,7 @@ FOLDER = "retaken"
 """Where in a session the earlier images of a view lie: `retaken/000017_1_rgb.png` and so on."""
 
 
-def replace_view(
-    store: "SessionStore", view: View, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]
-) -> str:
+def replace_view(store: "SessionStore", view: View, rgb: UInt8, depth_m: Array32) -> str:
     """Store a view that is there already; return where the earlier one went.
 
     The earlier images and the robot's state are on the disk under their new names before the old

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
 from realsim.robots.arm import known_chains
 from realsim_capture_plans.capturing import checks
@@ -74,7 +74,7 @@ def until_still(
         sleep(config.interval_s)
 
 
-BoardCheck = Callable[[NDArray[np.uint8]], str]
+BoardCheck = Callable[[UInt8], str]
 """Returns what is wrong with a colour image (H, W, 3) of the board, or an empty text."""
 Seen = Callable[[str, tuple[Check, ...]], None]
 """Called with what is being done and what was found."""
@@ -153,7 +153,7 @@ class Looker:
         *,
         board_check: BoardCheck | None = None,
         earlier: Mapping[int, Mapping[str, Any]] | None = None,
-        T_ee_tcp: NDArray[np.float64] | None = None,
+        T_ee_tcp: Array | None = None,
     ) -> None:
         """Set up.
 

@@ -12,8 +12,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, UInt8
 from realsim.records import View
 from realsim_capture_plans.capturing.checks import Check
 from realsim_capture_plans.capturing.log import CaptureLog, replace_view
@@ -31,8 +31,6 @@ from realsim_capture_plans.planning.record import CapturePlan
 
 if TYPE_CHECKING:
     from realsim.store import SessionStore
-
-Array = NDArray[np.float64]
 
 
 class NoWayError(DeviceError):
@@ -88,7 +86,7 @@ class Route:
         return list(stack[goal : nearest + 1][::-1])
 
 
-OnView = Callable[[int, NDArray[np.uint8]], None]
+OnView = Callable[[int, UInt8], None]
 """Called with the number and the colour image of every view stored."""
 Outcome = Literal["stored", "skipped", "stopped"]
 

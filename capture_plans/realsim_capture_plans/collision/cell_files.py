@@ -33,8 +33,8 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.robots.shapes import SIZES, Box, Kind, Mount, Shape
@@ -110,7 +110,6 @@ def _shown(value: Any) -> str:
     return "missing" if value is None else repr(value)
 
 
-Array = NDArray[np.float64]
 ROTATIONS = ("rotation_vector_rad", "quaternion_xyzw", "matrix")
 MOUNT_KEYS = ("name", "camera", "translation_m", *ROTATIONS, "cover_m", "bracket")
 PIECE_KEYS = ("kind", "size_m", "position_m", "rotation_vector_rad", "file", "unit")

@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.robots.arm import RobotArm, arm_of
 from realsim.robots.coal_geometry import Body, Geometry
@@ -24,7 +25,6 @@ from realsim.robots.shapes import Mount, WorkCell
 from realsim_capture_plans.collision.mount import camera_shape
 from realsim_capture_plans.collision.pairs import choose_pairs
 
-Array = NDArray[np.float64]
 GROUPS = ("self", "tool", "table", "scene")
 """`self`: the arm's links among themselves; `tool`: camera and bracket against the links; `table`;
 `scene`: the keep-out box and the obstacles."""
@@ -98,7 +98,7 @@ class CollisionModel:
             for group in GROUPS
         }
 
-    def free(self, joints: ArrayLike) -> NDArray[np.bool_]:
+    def free(self, joints: ArrayLike) -> Mask:
         """Return (N,) whether joints (N, n) keep the clearance in every group."""
         hits = self._hits
         return np.array(
@@ -114,7 +114,7 @@ class CollisionModel:
         i, j = self._pairs[k]
         return str(self._groups[k]), self._bodies[i].part, self._bodies[j].part, float(distance[k])
 
-    def edges_free(self, q_from: ArrayLike, q_to: ArrayLike, step_rad: float) -> NDArray[np.bool_]:
+    def edges_free(self, q_from: ArrayLike, q_to: ArrayLike, step_rad: float) -> Mask:
         """Return (E,) whether straight joint-space moves (E, n) -> (E, n) stay free.
 
         The ends are checked first, then the middle, then the quarters, until the first hit: what

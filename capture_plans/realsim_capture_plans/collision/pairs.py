@@ -9,13 +9,12 @@ not depend on the joints, such as shoulder and table.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.robots.arm import RobotArm
 from realsim.robots.coal_geometry import Body, Geometry, Pair
 
-Array = NDArray[np.float64]
 SWEEP_STEPS = 18
 """Angles of each of two joints over which a pair is swept."""
 TURN_STEPS = 72

@@ -10,15 +10,15 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Mask
 from realsim.errors import MissingLibraryError
 from realsim.robots.arm import UR5, arm_of
 from realsim.robots.coal_geometry import coal_shape
 from realsim.robots.shapes import Mount, WorkCell
 from realsim_capture_plans.collision.model import CollisionModel, bodies_of
 
-Array = NDArray[np.float64]
 URDF = "ur_description/urdf/ur5_robot.urdf"
 """Inside the wheel's folder of robots."""
 URDF_LINKS = (
@@ -95,7 +95,7 @@ class MeshModel:
         for (i, j), request in zip(pairs, self._work.collisionRequests, strict=True):
             request.security_margin = mount.cover_m if i in mounts or j in mounts else 0.0
 
-    def touches(self, joints: ArrayLike) -> NDArray[np.bool_]:
+    def touches(self, joints: ArrayLike) -> Mask:
         """Return (N,) whether any two parts touch at joints (N, 6)."""
         import pinocchio as pin  # pyright: ignore[reportMissingImports]
 

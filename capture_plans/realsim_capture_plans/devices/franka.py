@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError, MissingLibraryError, RealsimError
 from realsim.geometry import se3
 from realsim.robots.kinematics import DhChain
@@ -29,7 +30,6 @@ from realsim.robots.limits import JointLimits
 from realsim_capture_plans.devices.franka_messages import lost, named, off_goal, stopped, trouble
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, checked_goal
 
-Array = NDArray[np.float64]
 Answer = TypeVar("Answer")
 REALTIME_KERNEL = Path("/sys/kernel/realtime")
 """Is there where the kernel is a real-time one; libfranka looks for it, too."""

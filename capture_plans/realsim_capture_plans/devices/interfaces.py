@@ -13,15 +13,13 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Array32, UInt8
 from realsim.errors import InputError, RealsimError
 from realsim.records import CameraIntrinsics
 from realsim.records.checked_arrays import rigid
 from realsim.robots.limits import JointLimits
-
-Array = NDArray[np.float64]
-
 
 Stop = Literal["protective stop", "emergency stop", "connection lost", "not ready", "off goal"]
 """What keeps an arm from moving; a person clears it, then `Arm.recover` goes on."""
@@ -70,9 +68,9 @@ class ArmState:
 class Frame:
     """One colour image with its depth."""
 
-    rgb: NDArray[np.uint8]
+    rgb: UInt8
     """(H, W, 3) colour."""
-    depth_m: NDArray[np.float32]
+    depth_m: Array32
     """(H, W) depth along z [m], 0 = no measurement."""
     time_s: float
     """Time stamp of the exposure [s]."""

@@ -3,8 +3,8 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
@@ -60,7 +60,7 @@ def raw_intrinsics_json(raw: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def T_of(extrinsics: Any) -> NDArray[np.float64]:
+def T_of(extrinsics: Any) -> Array:
     """Return T_to_from (4, 4) [m] of the SDK's `from.get_extrinsics_to(to)`.
 
     The SDK's rotation is column-major; it is float32, so that the nearest rotation is taken.

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array32
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics
 
@@ -203,7 +204,7 @@ class Alignment:
         self._scale = np.nan_to_num(1.0 / along, nan=0.0).astype(np.float32)
         self._offset = float(axis @ t)
 
-    def depth_m(self, pair: Pair, unit_m: float) -> NDArray[np.float32]:
+    def depth_m(self, pair: Pair, unit_m: float) -> Array32:
         """Return the depth (H, W) [m] on the colour image's pixels, along its z axis."""
         self._color[:] = [pair.color]
         self._join.invoke(pair.depth)

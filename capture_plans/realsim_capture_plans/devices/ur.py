@@ -14,8 +14,9 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.interop import T_from_rotation_vector_pose
@@ -24,8 +25,6 @@ from realsim.robots.kinematics import DhChain
 from realsim.robots.limits import JointLimits
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, checked_goal
 from realsim_capture_plans.devices.ur_connection import Identity, UrConfig, UrConnection
-
-Array = NDArray[np.float64]
 
 
 class UrArm:

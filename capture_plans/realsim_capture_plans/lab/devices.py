@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from realsim.records import CameraIntrinsics
 from realsim.robots.arm import UR5, find_arm
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from realsim.rendering.depth_camera import DepthCamera
     from realsim.rendering.photo import PhotoRenderer
     from realsim.rendering.rays import PlacedMesh
-
-Array = NDArray[np.float64]
 
 
 class SimulatedArm:

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.parts import object_model, part_names
@@ -27,7 +28,6 @@ from realsim_capture_plans.planning.elbow import reach_m
 if TYPE_CHECKING:
     from realsim.rendering.rays import PlacedMesh
 
-Array = NDArray[np.float64]
 
 BOARD = TagBoard(rows=5, columns=7, tag_size_m=0.03, gap_m=0.01)
 """270 x 190 mm of tags: what an A4 sheet holds."""

@@ -12,11 +12,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel
-
-Array = NDArray[np.float64]
 
 
 class CrowdedError(InputError):

@@ -11,16 +11,15 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectPose
 from realsim.robots.arm import find_arm
 from realsim.robots.kinematics import DhChain
 from realsim.untrusted.own_json import OwnFile, read_own, to_json
-
-Array = NDArray[np.float64]
 
 TRUTH_FILE = "truth.json"
 T_EE_CAM_NOMINAL = se3.from_translation([0.0, -0.065, 0.035])

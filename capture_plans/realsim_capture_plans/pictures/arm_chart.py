@@ -3,8 +3,8 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.robots.shapes import Box
@@ -22,7 +22,6 @@ from realsim_capture_plans.pictures.drawing import (
 from realsim_capture_plans.planning.view_quality import scene_box
 from realsim_capture_plans.planning.viewpoints import farthest_points
 
-Array = NDArray[np.float64]
 ARMS_SHOWN = 3
 """Arms drawn, those whose cameras are farthest apart; more hide each other."""
 ARM_COLORS = (BLUE, GREEN, PURPLE)
@@ -140,7 +139,7 @@ def _shown(curves: PlanCurves) -> list[int]:
     return sorted(int(k) for k in farthest_points(places, n, curves.plan.reference_view))
 
 
-def _posed(curves: PlanCurves, view: int) -> list[tuple[Array, NDArray[np.int64]]]:
+def _posed(curves: PlanCurves, view: int) -> list[tuple[Array, Int64]]:
     """Return vertices (V, 3) in base [m] and triangles of every body of the arm at a view."""
     frames = part_frames(curves.plan, curves.plan.joints[view])
     return [(se3.transform(frames[p.frame], p.vertices), p.faces) for p in arm_parts(curves.plan)]

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import MissingLibraryError, RealsimError
 from realsim.geometry import se3
 from realsim.geometry.mesh_files import load_mesh
@@ -18,7 +18,6 @@ from realsim_capture_plans.collision.mount import camera_shape
 from realsim_capture_plans.collision.ur5_meshes import BASE_LINK_FROM_BASE, URDF, robots_folder
 from realsim_capture_plans.planning.record import CapturePlan
 
-Array = NDArray[np.float64]
 ROUND_SIDES = 24
 """Sides that a drawn cylinder has."""
 ROUND_RINGS = 5
@@ -35,7 +34,7 @@ class Part:
     """The frame of `part_frames` that it is fixed in."""
     vertices: Array
     """(V, 3) in that frame [m]."""
-    faces: NDArray[np.int64]
+    faces: Int64
     """(F, 3) corners of triangles, counter-clockwise from outside."""
 
 
@@ -72,7 +71,7 @@ def _part(shape: Shape) -> Part:
     )
 
 
-def shape_mesh(shape: Shape) -> tuple[Array, NDArray[np.int64]]:
+def shape_mesh(shape: Shape) -> tuple[Array, Int64]:
     """Return vertices (V, 3) [m] in the shape's own frame and triangles (F, 3).
 
     Every shape is convex: its mesh is the hull of points on it. Round ones are drawn a little
@@ -117,7 +116,7 @@ def arm_looks(plan: CapturePlan) -> list[Part] | None:
         return None
 
 
-def _look(shape: UrdfShape) -> tuple[Array, NDArray[np.int64]]:
+def _look(shape: UrdfShape) -> tuple[Array, Int64]:
     """Return vertices (V, 3) in the link's frame [m] and triangles (F, 3) of a URDF's shape."""
     if shape.file is None:
         body = link_shape(shape, shape.link, 0, np.eye(4))

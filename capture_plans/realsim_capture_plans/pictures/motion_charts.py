@@ -3,8 +3,8 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim_capture_plans.pictures.drawing import (
     BLACK,
     GREY,
@@ -18,7 +18,6 @@ from realsim_capture_plans.pictures.drawing import (
 from realsim_capture_plans.planning.metrics import joint_names
 from realsim_capture_plans.planning.record import CapturePlan
 
-Array = NDArray[np.float64]
 GROUP_LABELS = {
     "self": "arm to itself",
     "tool": "arm to camera",

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import local_pages
+from realsim.arrays import Array, UInt8
 from realsim.geometry import se3
 from realsim.interop import viser_wxyz_position
 from realsim.robots.shapes import Box
@@ -29,7 +29,6 @@ from realsim_capture_plans.planning.record import CapturePlan
 from realsim_capture_plans.planning.tour_time import TourTime
 from realsim_capture_plans.planning.view_quality import Sensor, scene_box, sensor_of
 
-Array = NDArray[np.float64]
 SPEEDS = {"1 x": 1.0, "2 x": 2.0, "5 x": 5.0, "10 x": 10.0, "30 x": 30.0}
 FRAME_S = 1 / 25
 """Between two drawn positions while playing [s]."""
@@ -351,7 +350,7 @@ class ReplayScene:
         )
 
 
-def order_rgb(n: int) -> NDArray[np.uint8]:
+def order_rgb(n: int) -> UInt8:
     """Return n colours (n, 3) from the first view (dark blue) to the last (yellow)."""
     from matplotlib import colormaps
 

@@ -3,8 +3,8 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim_capture_plans.pictures.drawing import (
@@ -28,7 +28,6 @@ from realsim_capture_plans.planning.view_quality import (
     spacing_deg,
 )
 
-Array = NDArray[np.float64]
 AZIMUTHS, TILTS = 361, 91
 """Cells of the map of holes: one degree each."""
 HOLE_COLOR_DEG = 12.0

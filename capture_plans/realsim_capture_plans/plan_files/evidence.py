@@ -9,14 +9,14 @@ from itertools import product
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.arm import known_chains
 from realsim.robots.kinematics import DhChain
 
-Array = NDArray[np.float64]
 JointUnit = Literal["rad", "deg"]
 FULL_TURN_RAD = 2 * np.pi
 """No joint of the usual arms turns farther than this from zero."""

@@ -14,8 +14,8 @@ itself lies beside the two files, so that a robot can drive it again.
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.graspnet.cameras import FIRST, POSES
 from realsim.geometry import se3
@@ -24,7 +24,6 @@ from realsim_capture_plans.plan_files.plan_json import save_plan
 from realsim_capture_plans.planning.metrics import UR_JOINTS, joint_names
 from realsim_capture_plans.planning.record import CapturePlan
 
-Array = NDArray[np.float64]
 AT_HOME_RAD = 0.05
 """The script starts only with every joint this near to home [rad]: nothing else was checked."""
 JOINT_DIGITS = 15

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError, UnitError
 from realsim.geometry import se3
 from realsim.robots.arm import known_chains
@@ -21,7 +22,6 @@ from realsim_capture_plans.plan_files.joint_paths import JointPath, read_path
 from realsim_capture_plans.planning.metrics import Meaning, joint_names
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
-Array = NDArray[np.float64]
 LEAST_AXIS_SPREAD = 0.02
 """Least eigenvalue, relative to the number of views, of the system for the point that the optical
 axes meet at: axes within 8 degrees of each other do not determine it."""

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.robots.arm import known_chains
@@ -28,7 +28,6 @@ from realsim_capture_plans.plan_files.evidence import (
 )
 from realsim_capture_plans.plan_files.plan_json import LARGEST_BYTES
 
-Array = NDArray[np.float64]
 YES = ("1", "true", "yes")
 NO = ("0", "false", "no", "")
 CAMERA_COLUMNS = ("cam_x_m", "cam_y_m", "cam_z_m", "cam_qw", "cam_qx", "cam_qy", "cam_qz")
@@ -50,7 +49,7 @@ class JointPath:
     """The file, for messages."""
     joints: Array
     """(N, n) [rad]."""
-    via: NDArray[np.bool_]
+    via: Mask
     """(N,) rows that are only passed; the others are views."""
     rows: tuple[str, ...]
     """What each row is called in the file, for messages."""

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, RealsimError, UnitError
 from realsim.robots.arm import known_chains
 from realsim.untrusted.json_text import read_json
@@ -32,7 +32,6 @@ from realsim_capture_plans.planning.record import (
     segments,
 )
 
-Array = NDArray[np.float64]
 SCHEMA = "realsim capture plan"
 SCHEMA_VERSION = 2
 LARGEST_BYTES = 64_000_000

@@ -10,9 +10,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.robots.kinematics import DhChain
 
-Array = NDArray[np.float64]
 SHOULDER, BEFORE_FLANGE = 1, 2
 """Links whose distance counts: the first, which the second joint turns about, and so many before
 the flange, where most arms have the middle of their wrist."""

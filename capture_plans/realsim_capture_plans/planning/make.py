@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.robots.arm import UR5
@@ -46,7 +47,6 @@ from realsim_capture_plans.planning.viewpoints import (
     with_turns,
 )
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 SECOND_TRY = 6
 """Times as many poses are tried in directions that seemed out of reach."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from realsim.robots.kinematics import DhChain
 from realsim_capture_plans.collision.model import GROUPS, CollisionModel
@@ -250,7 +250,6 @@ METRIC_MEANINGS: dict[str, Meaning] = {
 
 
 __all__ = ["METRIC_MEANINGS", "Meaning", "plan_metrics"]
-Array = NDArray[np.float64]
 CAP_ELEVATION_DEG = (15.0, 90.0)
 """The cap that plans of different least elevations are compared on."""
 

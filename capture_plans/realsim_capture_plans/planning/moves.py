@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim_capture_plans.collision.model import CollisionModel
@@ -14,7 +15,6 @@ from realsim_capture_plans.planning.elbow import raised
 from realsim_capture_plans.planning.ordering import Clusters, move_seconds, tour, tour_seconds
 from realsim_capture_plans.planning.record import PlanConfig
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 REROUTES = 8
 """Rounds of the tour with the colliding moves made dear; the rest goes over via points."""

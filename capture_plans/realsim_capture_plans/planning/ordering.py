@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim_capture_plans.planning.tour_search import (
     COLLISION_SECONDS,
@@ -29,7 +30,6 @@ from realsim_capture_plans.planning.tour_search import (
 if TYPE_CHECKING:
     from realsim_capture_plans.planning.record import PlanConfig
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 HOME = -1
 """The view number that stands for where the tour begins."""

@@ -11,17 +11,15 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Literal, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.records.checked_arrays import frozen
 from realsim.robots.kinematics import DhChain
 from realsim.robots.limits import JointLimits
 from realsim.robots.shapes import Box, Mount, Shape, WorkCell
 from realsim_capture_plans.collision.model import CollisionModel
-
-Array = NDArray[np.float64]
-
 
 LEAST_DEGREES = 2.0
 """A cap that ends below this elevation was given in radians [deg]."""

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
@@ -18,7 +19,6 @@ from realsim_capture_plans.planning.record import PlanConfig
 from realsim_capture_plans.planning.view_quality import SENSORS
 from realsim_capture_plans.planning.viewpoints import Candidates, reachable
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 Kind = Literal["hemisphere", "calibration"]
 Progress = Callable[[str, int, int], None]

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.compiled import njit
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 COLLISION_SECONDS = 5.0
 """Charged for a move that is known to collide [s]: more than a detour over via points takes."""
@@ -39,9 +39,9 @@ class Problem(NamedTuple):
     """(N + 2,) first row of every cluster, and one past the last."""
     owner: Ints
     """(M,) cluster of every row."""
-    suspects: NDArray[np.bool_]
+    suspects: Mask
     """(N + 1, N + 1) whether any move between two clusters is known to collide."""
-    keys: NDArray[np.int64]
+    keys: Int64
     """(K,) sorted, smaller row * M + larger row of every move that is known to collide."""
     speed: float
     """Of the leading joint [rad/s]."""
@@ -165,7 +165,7 @@ def best_candidates(path: Ints, least: Array, p: Problem) -> Ints:
 
 
 @njit
-def _taken_out(place: Ints, nearest: Ints, rng: np.random.Generator) -> NDArray[np.bool_]:
+def _taken_out(place: Ints, nearest: Ints, rng: np.random.Generator) -> Mask:
     """Return (N,) which places of the tour go out: strings round a view and its neighbours."""
     n = len(place)
     out = np.zeros(n, dtype=np.bool_)

@@ -7,8 +7,9 @@ up and the pictures draw it.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
@@ -17,8 +18,6 @@ from realsim.robots.shapes import Box
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 from realsim_capture_plans.planning.viewpoints import board_roll, golden_cap, plane_axes
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 CAP_POINTS = 4000
 """Directions of a cap that are tried besides the exact corners of the views' cells."""
 RIM_POINTS = 1440
@@ -194,7 +193,7 @@ def scene_points(plan: CapturePlan) -> Array:
     return np.asarray(grid.reshape(-1, 3), dtype=np.float64)
 
 
-def seen(plan: CapturePlan, points: Array, sensor: Sensor) -> Bools:
+def seen(plan: CapturePlan, points: Array, sensor: Sensor) -> Mask:
     """Return (N, P) whether each view has each point (P, 3) [m] in its image.
 
     Nothing hides anything: the scene's objects are not known when a plan is made.
@@ -218,7 +217,7 @@ def depth_of(plan: CapturePlan, points: Array) -> Array:
     return np.asarray(axis @ points.T - at, dtype=np.float64)
 
 
-def direction_spread_deg(plan: CapturePlan, points: Array, visible: Bools) -> Array:
+def direction_spread_deg(plan: CapturePlan, points: Array, visible: Mask) -> Array:
     """Return the greatest angle (P,) [deg] between two views that see each point; 0 below two."""
     to_camera = plan.Ts_base_cam[None, :, :3, 3] - points[:, None]
     unit = to_camera / np.linalg.norm(to_camera, axis=-1, keepdims=True)

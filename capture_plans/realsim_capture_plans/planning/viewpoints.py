@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.geometry import se3
 from realsim.robots.kinematics import DhChain
 from realsim_capture_plans.collision.model import CollisionModel
 from realsim_capture_plans.planning.elbow import bend
 from realsim_capture_plans.planning.record import PlanConfig
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 GOLDEN_RATIO = (np.sqrt(5.0) - 1.0) / 2.0
@@ -42,7 +42,7 @@ class Candidates:
     Ts_base_cam: Array
     """(M, 4, 4) camera pose reached [m]."""
 
-    def where(self, keep: NDArray[np.bool_]) -> "Candidates":
+    def where(self, keep: Mask) -> "Candidates":
         """Return the candidates (M,) that are kept."""
         return Candidates(
             joints=self.joints[keep], item=self.item[keep], Ts_base_cam=self.Ts_base_cam[keep]
@@ -302,7 +302,7 @@ def well_seen(found: Candidates, seen: Array, least: float) -> Candidates:
     return _preferred(found, seen >= least)
 
 
-def _preferred(found: Candidates, good: NDArray[np.bool_]) -> Candidates:
+def _preferred(found: Candidates, good: Mask) -> Candidates:
     """Return the good candidates (M,), and all of items that have no good one."""
     served = np.zeros(int(found.item.max(initial=0)) + 1, dtype=np.bool_)
     served[found.item[good]] = True

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.report.sliders import registration_pairs
+from realsim.arrays import Image
 from realsim.pages import Page, Picture, View
 from realsim.rendering.overlay import VERDICT_RGB
 from realsim.store import SessionStore
@@ -47,7 +47,6 @@ def _percent(share: float, digits: int = 0) -> str:
 if TYPE_CHECKING:
     from realsim_sim_bridge.annotation.annotate import AnnotationSummary
 
-Image = NDArray[np.uint8]
 PAGE_FILE = "reports/annotated.html"
 MAP_VIEWS = 6
 """Views whose maps are shown: four pictures each."""

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.annotate.current import annotate_session
 from realsim.app.annotate.page import HEADER, object_row, write_page
@@ -16,13 +15,13 @@ from realsim.app.stages import (
     registered_views,
     session_models,
 )
+from realsim.arrays import Image
 from realsim.store import SessionStore
 from realsim.store.lock import only_run_in
 
 if TYPE_CHECKING:
     from realsim_sim_bridge.annotation.annotate import AnnotationSummary
 
-Image = NDArray[np.uint8]
 MOST_NOTES = 12
 """So many notes are shown; the rest are in the annotations."""
 PAGE_PICTURES = 12

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.calibrate.board_views import arm_of
 from realsim.app.console import Console
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Target
@@ -38,7 +38,6 @@ from realsim_calibration import (
 if TYPE_CHECKING:
     from realsim_calibration.inputs import FolderInput, PoseReading, RawPoses
 
-Array = NDArray[np.float64]
 CALIBRATED = ("exports/calibration.json", "calibration_report.html")
 """What a folder holds that somebody has calibrated into."""
 MADE_OF = "calibrated_of.json"

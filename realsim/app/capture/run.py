@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.calibrate.board_views import BOARD_FILE
 from realsim.app.capture.devices import open_devices
 from realsim.app.console import Console
 from realsim.app.stages import BOARD_VIEWS, save_starts
+from realsim.arrays import UInt8
 from realsim.errors import InputError
 from realsim.records import CaptureSession, Target
 from realsim.store import SessionStore
@@ -264,7 +264,7 @@ def _line_writer(console: Console) -> Callable[[str], None]:
     return write
 
 
-def _board_check(target: Target | None) -> Callable[[NDArray[np.uint8]], str] | None:
+def _board_check(target: Target | None) -> Callable[[UInt8], str] | None:
     """Return what says whether the target can be seen; None without a target."""
     if target is None:
         return None
@@ -273,7 +273,7 @@ def _board_check(target: Target | None) -> Callable[[NDArray[np.uint8]], str] | 
     total = len(target.points_board)
     needed = min(BOARD_POINTS, total)
 
-    def check(rgb: NDArray[np.uint8]) -> str:
+    def check(rgb: UInt8) -> str:
         import cv2
 
         half = cv2.resize(rgb, None, fx=BOARD_SHRINK, fy=BOARD_SHRINK, interpolation=cv2.INTER_AREA)

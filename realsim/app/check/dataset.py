@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
 from realsim.app.check.agreement import AgreementConfig, SceneAgreement
@@ -23,12 +22,12 @@ from realsim.app.check.tally import (
 )
 from realsim.app.upgrade.config import UpgradeConfig
 from realsim.app.upgrade.dataset import SceneRef, open_scene, scenes_of
+from realsim.arrays import Array32, Mask
 from realsim.errors import InputError, RealsimError
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
 from realsim.records import ObjectModel
 from realsim.rendering.labels import LabelRenderer, Labels, PlacedMesh
 
-Mask = NDArray[np.bool_]
 DEPTH_FINDINGS = ("depth in front", "depth behind")
 """What the check of the format says of depth, which it holds against a model's vertices."""
 
@@ -213,7 +212,7 @@ def _outline(mask: Mask) -> int:
 
 def _depth_difference(
     image: int,
-    depth_m: NDArray[np.float32],
+    depth_m: Array32,
     labels: Labels,
     seen: Mask,
     config: AgreementConfig,

@@ -8,11 +8,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.check.agreement import AgreementConfig, ObjectAgreement
+from realsim.arrays import Array
 
-Array = NDArray[np.float64]
 LISTED = 5
 """Images that are told one by one; more of one kind are told in one line."""
 

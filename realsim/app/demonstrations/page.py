@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.export.card import DatasetCard, SceneFacts, card_bytes
+from realsim.arrays import Rgb
 from realsim.formats.export_folder import Content
 from realsim.formats.labelled_scene import WrittenScene
 from realsim.formats.lerobot import episodes as layout
@@ -17,7 +17,6 @@ from realsim.formats.lerobot.spool import read_video
 from realsim.pages import Page
 from realsim.pages.pictures import Picture
 
-Rgb = NDArray[np.uint8]
 SHOWN = 4
 """Successful attempts, and as many failed ones, that are shown."""
 COLUMNS = 8

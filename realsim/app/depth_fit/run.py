@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.outputs import require_free_file
+from realsim.arrays import Array32
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
@@ -29,7 +29,7 @@ OUT = {"disparity": Path("depth_sensor.json"), "stereo": Path("stereo_sensor.jso
 class DepthFrames:
     """The depth images that a sensor is fitted to."""
 
-    depths_m: tuple[NDArray[np.float32], ...]
+    depths_m: tuple[Array32, ...]
     names: tuple[str, ...]
     intrinsics: CameraIntrinsics
     unit_m: float

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.generate.tables import FiguresTable
 from realsim.app.render.compare import fitted, layers
+from realsim.arrays import Rgb
 from realsim.images import read_rgb
 from realsim.pages import Page, View
 from realsim.pages import spread as spread_order
@@ -17,7 +17,6 @@ from realsim.store.atomic import write_bytes
 from realsim_sim_bridge.table_scenes.sample import Layout
 from realsim_sim_bridge.table_scenes.scene import scene_name
 
-Rgb = NDArray[np.uint8]
 SHEET_FILE = "contact_sheet.png"
 PAGE_FILE = "index.html"
 SHEET_PICTURES = 24

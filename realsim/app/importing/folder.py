@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.folders import (
     FolderChoice,
@@ -29,7 +29,6 @@ from realsim.formats.folders.source import require_one_size
 from realsim.records import CameraIntrinsics
 from realsim.robots.arm import find_arm, known_chains
 
-Array = NDArray[np.float64]
 CAMERA_NAME = re.compile(r"cam|intrin|calib|^k$", re.IGNORECASE)
 """Names of files that may hold a camera."""
 CAMERA_ENDINGS = (".json", ".yaml", ".yml", ".xml", ".txt")

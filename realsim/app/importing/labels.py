@@ -8,6 +8,7 @@ import numpy as np
 
 from realsim.app.console import Console
 from realsim.app.stages import save_starts
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.bop.models import save_models
 from realsim.formats.bop.source import BopSource
@@ -17,7 +18,6 @@ from realsim.formats.imported_labels import load_imported, save_imported
 from realsim.formats.labelled_frames import LabelledFrames
 from realsim.formats.labelled_scene import LabelledScene
 from realsim.records import ObjectPose
-from realsim.records.checked_arrays import Array
 from realsim.store import SessionStore
 from realsim.store.lock import only_run_in
 

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.console import Console, Tick
 from realsim.errors import InputError, UnitError
@@ -32,7 +31,6 @@ from realsim_capture_plans.capturing.contact_sheet import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-Array = NDArray[np.float64]
 KEY = "import"
 """Entry of the session's extra under which the source is described."""
 KEY_IN_SOURCE = "content_key"

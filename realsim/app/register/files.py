@@ -30,7 +30,6 @@ from realsim.app.register.results import (
     STAGE_FILE,
     TABLE_FILE,
     VIEWS_FILE,
-    Array,
     CameraChange,
     Json,
     Registered,
@@ -41,6 +40,7 @@ from realsim.app.register.results import (
     poses_from_json,
 )
 from realsim.app.register.uncertainty import sigmas
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import ObjectModel, Scene, bop_units
 from realsim.store import SessionStore, atomic

@@ -4,18 +4,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.first_surfaces import FirstSurfaces
 from realsim.app.register.results import Registered
+from realsim.arrays import Array, Image, Mask
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, ObjectModel
 from realsim.rendering.overlay import contact_sheet, draw_outlines
 from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 CLAIMED_RGB, REFINED_RGB = (255, 92, 205), (58, 188, 92)
 """Outlines through the camera as it was claimed to be, and as it was refined."""
 
@@ -130,7 +128,7 @@ def zoomed_camera(
     )  # fmt: skip
 
 
-def _edge_corner(rgb: Image, mask: NDArray[np.bool_], side_px: int) -> tuple[int, int]:
+def _edge_corner(rgb: Image, mask: Mask, side_px: int) -> tuple[int, int]:
     """Return the corner of the square around the outline's strongest edge in the photograph."""
     import cv2
 

@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import __version__
 from realsim.app.register.config import RegisterRequest, config_of
@@ -15,6 +14,7 @@ from realsim.app.register.from_review import review_starts
 from realsim.app.register.results import claimed_cameras, load_cameras
 from realsim.app.reviewed import exclusion_words, review_of
 from realsim.app.stages import content_key, session_models, take_models
+from realsim.arrays import Array, Array32
 from realsim.errors import InputError, UnitError
 from realsim.records import ObjectModel, View
 from realsim.records.depth_bias import DepthBias
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from realsim.registration.config import RegistrationConfig
     from realsim.registration.evidence import DepthFrame
 
-Array = NDArray[np.float64]
 STARTS_FILE = "registration/starts.json"
 MASKS = "registration/masks"
 """Where masks lie that starts speak of."""
@@ -242,7 +241,7 @@ def _hand_held(store: SessionStore, tick: "Tick | None") -> dict[int, Array]:
     indices = [v.index for v in store.session.views if store.has_depth(v.index)]
     if not indices:
         raise InputError(f"session '{store.folder}' has no view with depth.")
-    depths: list[NDArray[np.float32]] = []
+    depths: list[Array32] = []
     for done, index in enumerate(indices, start=1):
         depths.append(store.depth_m(index))
         if tick is not None:

@@ -5,14 +5,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.register.results import Registered
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose
 from realsim.scanning.scale.pictures import INK, VERDICT_COLORS
 
-Array = NDArray[np.float64]
 DPI = 110
 MAGNIFIED = (1, 2, 5, 10, 20, 50, 100)
 """By which the ellipses are enlarged: a tenth of a millimetre is nothing on a map of a table."""

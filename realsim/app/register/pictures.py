@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.first_surfaces import FirstSurfaces
 from realsim.app.register.results import Registered
+from realsim.arrays import Array, Image, Int32
 from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel, ObjectPose
 from realsim.records.depth_bias import DepthBias
@@ -19,9 +19,6 @@ from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.scanning.shading import diverging
 from realsim.store import SessionStore
 
-Array = NDArray[np.float64]
-Ids = NDArray[np.int32]
-Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
 Window = tuple[slice, slice]
 OUTLINE: Color = (70, 78, 88)
@@ -60,7 +57,7 @@ class _Look:
     """One view as it should be by the result."""
 
     index: int
-    ids: Ids
+    ids: Int32
     """(H, W) instance; -1 = table or nothing."""
     depth_m: Array
     """(H, W) of objects and table [m]; NaN = nothing."""
@@ -111,7 +108,7 @@ def spread_views(result: Registered, n: int) -> list[int]:
     return [views[k] for k in pick]
 
 
-def window_of(ids: Ids, config: PictureConfig) -> Window:
+def window_of(ids: Int32, config: PictureConfig) -> Window:
     """Return the part of a picture around all objects, of the picture's own proportions.
 
     The whole picture where no object is in it.
@@ -160,7 +157,7 @@ def _resized(rgb: Image, config: PictureConfig) -> Image:
     return np.ascontiguousarray(np.asarray(sized, dtype=np.uint8))
 
 
-def _resized_ids(ids: Ids, config: PictureConfig) -> Ids:
+def _resized_ids(ids: Int32, config: PictureConfig) -> Int32:
     """Return instances (H, W) at the width of the sheet."""
     import cv2
 
@@ -230,7 +227,7 @@ def _residual_sheet(
     return np.concatenate([sheet, _color_bar(sheet.shape[1], config.range_mm)], axis=0)
 
 
-def _averaged(values: Array, ids: Ids, config: PictureConfig) -> Array:
+def _averaged(values: Array, ids: Int32, config: PictureConfig) -> Array:
     """Return values (H, W) averaged over the pixels around that see the same thing; NaN stays."""
     import cv2
 

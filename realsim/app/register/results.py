@@ -5,15 +5,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.records import Scene, View
 from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.registration.search.records import NotPlaced
 from realsim.store import SessionStore, load_scene
 from realsim.untrusted.own_json import array_from_json, number_from_json
 
-Array = NDArray[np.float64]
 Json = dict[str, Any]
 FOLDER = "registration"
 SCENE_FILE = f"{FOLDER}/scene.json"

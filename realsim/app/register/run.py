@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.console import Console
 from realsim.app.register.colour import colour_remark
@@ -33,13 +32,13 @@ from realsim.app.register.results import (
 )
 from realsim.app.reviewed import damage_words, review_of, stray_words
 from realsim.app.stages import is_current, mark_current, require_sound, take_models
+from realsim.arrays import Array
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, ObjectModel, Scene
 from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.registration.register import Registration
 from realsim.store import SessionStore
 
-Array = NDArray[np.float64]
 STAGE = "register"
 PIXEL_POINTS = 40
 """Vertices of a mesh over which the pixel uncertainty is averaged."""

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.records import ObjectModel
 
-Array = NDArray[np.float64]
 DEPENDENT = 1e-3
 """An axis whose direction the others give to this adds no freedom."""
 

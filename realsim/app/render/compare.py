@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32, Int32, Mask, Rgb, UInt8
 from realsim.formats.bop.labels import mask_path
 from realsim.geometry.metrics import mask_iou
 from realsim.pages import View
@@ -14,8 +14,6 @@ from realsim.rendering.depth_sensors.profiles import profile
 from realsim.rendering.depth_sensors.statistics import hole_share, local_noise
 from realsim.store import SessionStore
 
-Mask = NDArray[np.bool_]
-Ids = NDArray[np.int32]
 MOST_VIEWS = 24
 """Views that are compared, spread over the session: each costs a second."""
 NEAR_EDGE_PX = 3.0
@@ -102,7 +100,7 @@ def compare_twins(
     intrinsics, baseline_m = store.session.intrinsics, profile(camera).baseline_m
     pairs = compared_views(real)
     ious: list[float] = []
-    edges: tuple[list[NDArray[np.float32]], ...] = ([], [])
+    edges: tuple[list[Array32], ...] = ([], [])
     noise: tuple[list[float], list[float]] = ([], [])
     holes: tuple[list[float], list[float]] = ([], [])
     colors: list[float] = []
@@ -134,7 +132,7 @@ def compare_twins(
     )  # fmt: skip
 
 
-def label_ids(store: SessionStore, view: int) -> Ids:
+def label_ids(store: SessionStore, view: int) -> Int32:
     """Return the instance (H, W) that the session's masks say is seen, -1 = none."""
     i = store.session.intrinsics
     ids = np.full((i.height, i.width), -1, np.int32)
@@ -149,7 +147,7 @@ def _entries(store: SessionStore, view: int) -> Sequence[Mapping[str, int]]:
     return store.read_json(path)["objects"] if store.has(path) else ()
 
 
-def _ious(store: SessionStore, view: int, ids: Ids) -> list[float]:
+def _ious(store: SessionStore, view: int, ids: Int32) -> list[float]:
     """Return the IoU of each object's annotated visible mask with what the twin's labels say."""
     found: list[float] = []
     for k, row in enumerate(_entries(store, view)):
@@ -160,7 +158,7 @@ def _ious(store: SessionStore, view: int, ids: Ids) -> list[float]:
     return found
 
 
-def rim_distances_px(ids: Ids, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+def rim_distances_px(ids: Int32, rgb: UInt8) -> Array32:
     """Return how far each pixel of the labels' rims is from the nearest edge of a picture [px].
 
     Args:
@@ -183,7 +181,7 @@ def rim_distances_px(ids: Ids, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.asarray(away, np.float32)[rim]
 
 
-def _eroded(ids: Ids) -> Mask:
+def _eroded(ids: Int32) -> Mask:
     """Return (H, W) the insides of the objects, away from every rim."""
     import cv2
 
@@ -201,7 +199,6 @@ def _mean(values: Sequence[float]) -> float:
 # --- Pictures of synthetic views beside the real ones: a contact sheet, and a page with sliders --
 
 
-Rgb = NDArray[np.uint8]
 SHEET_VIEWS = 6
 """Rows of the sheet."""
 CELL_WIDTH_PX = 480
@@ -250,7 +247,7 @@ def sheet(twin: SessionStore, store: SessionStore | None, real: Sequence[int] | 
     return overlay.contact_sheet(cells, columns, captions)
 
 
-def label_picture(rgb: Rgb, ids: NDArray[np.int32]) -> Rgb:
+def label_picture(rgb: Rgb, ids: Int32) -> Rgb:
     """Return the picture with every object painted and outlined in the colour of its instance."""
     colors = {int(i): overlay.instance_color(int(i)) for i in np.unique(ids[ids >= 0])}
     out = rgb.astype(np.float64)

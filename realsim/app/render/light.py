@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.render.compare import label_ids
+from realsim.arrays import Array, Int32, Mask, Rgb
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, View
@@ -23,10 +23,6 @@ from realsim.review.content.content import spread, strided
 from realsim.store import SessionStore
 from realsim_sim_bridge.synthetic.scene import SyntheticScene
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Rgb = NDArray[np.uint8]
-Ids = NDArray[np.int32]
 VIEWS = 3
 """Real views that are looked at, spread over the session."""
 SMALL_PX = 320
@@ -224,7 +220,7 @@ def _pose(view: View) -> Array:
 class _Regions:
     """What a small view shows."""
 
-    ids: Ids
+    ids: Int32
     """(H, W) instance, without the rims of objects; -1 = none, or a rim."""
     table: Mask
     """(H, W) the table near the objects."""
@@ -235,7 +231,7 @@ def _seen(regions: _Regions, instances: set[int]) -> Mask:
     return np.isin(regions.ids, sorted(instances))
 
 
-def _annotated(store: SessionStore, view: View, stride: int) -> Ids | None:
+def _annotated(store: SessionStore, view: View, stride: int) -> Int32 | None:
     """Return the instances (H, W) of a real view's visible masks; None = it is not annotated.
 
     They leave out what something unknown, such as a hand, hides.
@@ -250,7 +246,7 @@ def _regions(
     labels: Labels,
     camera: CameraIntrinsics,
     view: View,
-    annotated: Ids | None,
+    annotated: Int32 | None,
 ) -> _Regions:
     """Return where the objects are seen, without their rims, and the table near them."""
     import cv2

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.generate.request import depth_model_of
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Scene
@@ -16,7 +16,6 @@ from realsim.store import SessionStore
 from realsim_sim_bridge.synthetic.cameras import hemisphere_cameras
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
 
-Array = NDArray[np.float64]
 LARGEST_VIEWS = 100_000
 """More views than this are a typing error."""
 LARGEST_PX = 8192

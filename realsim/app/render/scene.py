@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.render.light import ObservedLook, matched_look, neutral_environment, upright
 from realsim.app.render.request import RenderRequest
@@ -16,7 +15,6 @@ from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.store import SessionStore
 from realsim_sim_bridge.synthetic.scene import SyntheticScene
 
-Array = NDArray[np.float64]
 TABLE_M = 4.0
 """Edge of the rendered table [m]: the label transfer's, larger than what any view sees."""
 TABLE_THICKNESS_M = 0.02

@@ -4,11 +4,11 @@ import json
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count
 from realsim.app.report.section import READING, Section, attempted, counted, drawn
+from realsim.arrays import UInt8
 from realsim.store import SessionStore
 from realsim.store.atomic import complete_lines
 
@@ -164,7 +164,7 @@ def _sheet(section: Section, store: SessionStore) -> None:
     section.page.picture(sheet, f"{len(shown)} of {len(indices)} captured views")
 
 
-def _thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _thumbnail(rgb: UInt8) -> UInt8:
     """Return a picture at the width of a thumbnail."""
     import cv2
 

@@ -6,16 +6,15 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.report.catalogue import CATALOGUE
 from realsim.app.report.figures import Figure, shown
 from realsim.app.report.sources import Source
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.symmetric_poses import nearest_symmetry
 from realsim.records import ObjectModel
 
-Array = NDArray[np.float64]
 SIGMAS = 2.0
 """A difference of more than so many sigmas is more than noise: 1 in 20 is so by chance."""
 Outcome = Literal["better", "worse", "same", "other", "unknown"]

@@ -4,15 +4,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count
 from realsim.app.report.section import Section, drawn
+from realsim.arrays import Array
 from realsim.pages import Cell, Picture
 from realsim.store import SessionStore
 
-Array = NDArray[np.float64]
 OVERLAY_VIEWS = 4
 """Annotated photographs in a report: the first view and others spread over the session."""
 GRASPS = 15

@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.pages.plots import (
     BAD,
@@ -24,7 +24,6 @@ from realsim.pages.plots import (
 )
 from realsim.records import STAGES, GraspSet, HandEye
 
-Array = NDArray[np.float64]
 OUTLIER = 2.5
 """Board views beyond so many medians are drawn in another colour."""
 

@@ -9,17 +9,16 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.register.inputs import STARTS_FILE
 from realsim.app.register.results import claimed_cameras, is_same_pose
 from realsim.app.stages import registered_views, session_models
+from realsim.arrays import Array, UInt8
 from realsim.geometry import se3
 from realsim.pages import View
 from realsim.records import ObjectModel, ObjectPose
 from realsim.store import SessionStore
 
-Array = NDArray[np.float64]
 VIEWS = 3
 """Sliders in a report, spread over the session."""
 
@@ -95,7 +94,7 @@ def _outlined(
     T_world_cam: Array,
     poses: Sequence[tuple[ObjectPose, Array]],
     models: Mapping[int, ObjectModel],
-) -> NDArray[np.uint8]:
+) -> UInt8:
     """Return a photograph with the outlines of objects at given poses, by instance colours."""
     from realsim.rendering.labels import LabelRenderer, PlacedMesh
     from realsim.rendering.overlay import draw_outlines

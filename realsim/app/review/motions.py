@@ -15,8 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError, RealsimError
 from realsim.formats.grasps.hand_frames import hand_of_set
 from realsim.formats.grasps.scene_grasps import SceneGrasps
@@ -32,7 +32,6 @@ from realsim_sim_bridge.demonstrations.records import DemonstrationConfig
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of
 from realsim_sim_bridge.demonstrations.source import DemonstrationSource
 
-Array = NDArray[np.float64]
 NO_TRAJECTORY = "no arm trajectory stored: the hand's approach only"
 FIXED_IN_HAND = "the object is drawn as if it were fixed in the hand"
 SAME_GRASP = 1e-5
@@ -283,7 +282,7 @@ def _base_of(s: GraspSet) -> tuple[Array, GraspingArm]:
     return base_on_table((x, y), config.reach, arm), arm
 
 
-def _shown_until(s: GraspSet, row: int, times: Array, phases: NDArray[np.int64]) -> float:
+def _shown_until(s: GraspSet, row: int, times: Array, phases: Int64) -> float:
     """Return when the last stage that was passed ends [s]: beyond it, the hand lost the object."""
     base = float(np.nan_to_num(s.base_scores[row]))
     # Before anything is passed, the closing hand is shown.

@@ -3,8 +3,8 @@
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Image
 from realsim.geometry import se3
 from realsim.models.model_picture_views import parts_mesh, rendered, view_of
 from realsim.records import Mesh
@@ -12,8 +12,6 @@ from realsim.robots.arm import RobotArm
 from realsim.robots.hand import Hand
 from realsim_capture_plans.pictures.arm_looks import shape_mesh
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 SIZE_PX = (420, 420)
 LINKS = ((96, 112, 128), (176, 188, 200))
 """Colours of the links, by turns."""

@@ -8,17 +8,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.console import Console
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectModel, Scene, names_of
 from realsim.robots.hand_file import STIFFEST_N_PER_M
 from realsim.store import SessionStore
 from realsim.store.opening import require_header
-
-Array = NDArray[np.float64]
 
 CACHE = "grasps/cache"
 """Where in the results' folder pieces of work and convex parts are kept."""

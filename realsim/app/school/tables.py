@@ -7,14 +7,13 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.console import Console
 from realsim.app.register.files import plain
+from realsim.arrays import Array
 from realsim.records import STAGES, GraspSet, ObjectModel
 
 Rows = list[list[str]]
-Array = NDArray[np.float64]
 Names = Mapping[int, ObjectModel]
 
 SCHOOL_HEADER = [

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.stages import judged_scene, open_session
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.bop.models import model_file
 from realsim.formats.imported_labels import FOLDER as IMPORTED
@@ -18,7 +18,6 @@ from realsim.store import SessionStore, load_grasps
 from realsim.store.results import GRASP_FOLDER
 from realsim.store.session_store import rgb_path
 
-Array = NDArray[np.float64]
 Kind = Literal["real", "simulated"]
 SIMULATED = "synthetic"
 """Key of a session's `extra` that only rendered ones have; the simulated lab's camera says it."""

@@ -6,13 +6,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.stats.collect import ObjectFacts, SessionFacts
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim_sim_bridge.school.summary import SchoolSummary, summarise
 
-Array = NDArray[np.float64]
 NOTHING = "-"
 SEEN_FROM = 0.1
 """BOP counts an instance as a test target from a tenth of its silhouette on."""

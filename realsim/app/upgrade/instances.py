@@ -4,12 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose
 
-Array = NDArray[np.float64]
 LEAST_APART_M = 0.02
 """Two things of one model stand at least so far apart, however flat they are [m]."""
 TOLD_APART_M = 0.01

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.first_surfaces import FirstSurfaces
 from realsim.app.upgrade.analytic import LEVEL_HEADER, correlation_line, level_rows
@@ -20,14 +19,14 @@ from realsim.app.upgrade.tables import (
     summary_of,
     worst_first,
 )
-from realsim.pages import Image, Page, View
+from realsim.arrays import Image, Int32
+from realsim.pages import Page, View
 from realsim.records import ObjectModel
 from realsim.rendering.overlay import VERDICT_RGB, draw_outlines
 from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore
 from realsim.store.atomic import write_bytes
 
-Array = NDArray[np.float64]
 PAIRS = 60
 """Objects with pictures, the worst; a page of more is not looked at."""
 ROWS = 400
@@ -140,9 +139,7 @@ def _scene(folder: Path) -> tuple[SessionStore, dict[int, ObjectModel]]:
     return SessionStore.open(folder), load_models(folder / "models", notes=[])
 
 
-def _cropped(
-    rgb: Image, masks: Sequence[NDArray[np.int32]], colors: Sequence[tuple[int, int, int]]
-) -> Image:
+def _cropped(rgb: Image, masks: Sequence[Int32], colors: Sequence[tuple[int, int, int]]) -> Image:
     """Return the part of a photograph around all outlines, enlarged.
 
     Args:

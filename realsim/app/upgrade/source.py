@@ -5,18 +5,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
 from realsim.app.upgrade.config import GT, UpgradeConfig
 from realsim.app.upgrade.dataset import SceneRef
 from realsim.app.upgrade.instances import Seen, told_apart
+from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel
 
-Array = NDArray[np.float64]
 DEPTH_UNIT_FACTOR = 1.5
 """The objects may be so much nearer or farther than all measured depth; units differ by 10."""
 CAMERA_SPREAD_LIMIT_M = 0.010

@@ -3,15 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.errors import InputError
-from realsim.formats.bags.clocks import Times, check_overlap
+from realsim.formats.bags.clocks import check_overlap
 from realsim.formats.bags.joints import UR_JOINTS
 from realsim.formats.bags.scan import Scan
 from realsim.formats.bags.tf_tree import arm_frames
 from realsim.formats.bags.topics import BagChoice, Topics
-from realsim.records.checked_arrays import Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -28,7 +27,7 @@ class ArmAtFrames:
     """(N,) how fast the arm moved [rad/s or m/s]; NaN where not known."""
     notes: tuple[str, ...]
 
-    def still(self, speed: float) -> NDArray[np.bool_]:
+    def still(self, speed: float) -> Mask:
         """Return (N,) whether the arm is known to have stood."""
         with np.errstate(invalid="ignore"):
             return np.asarray(self.speeds <= speed)
@@ -38,7 +37,7 @@ class ArmAtFrames:
         return None if values is None or np.isnan(values[n]).any() else values[n]
 
 
-def arm_at(times_ns: Times, scan: Scan, topics: Topics, choice: BagChoice) -> ArmAtFrames:
+def arm_at(times_ns: Int64, scan: Scan, topics: Topics, choice: BagChoice) -> ArmAtFrames:
     """Return where the arm was at the times of the frames.
 
     Raises:
@@ -82,7 +81,7 @@ def arm_at(times_ns: Times, scan: Scan, topics: Topics, choice: BagChoice) -> Ar
 
 
 def _joints(
-    times_ns: Times, scan: Scan, topics: Topics, gap: float, speeds: Array, notes: list[str]
+    times_ns: Int64, scan: Scan, topics: Topics, gap: float, speeds: Array, notes: list[str]
 ) -> Array | None:
     """Return joints (N, n) with NaN in gaps, and fill in the speeds; None without a track."""
     track = scan.joints
@@ -99,7 +98,7 @@ def _joints(
     return joints
 
 
-def _poses(scan: Scan, times_ns: Times, a: str, b: str, gap: float) -> Array:
+def _poses(scan: Scan, times_ns: Int64, a: str, b: str, gap: float) -> Array:
     """Return T_a_b (N, 4, 4), NaN in gaps."""
     Ts = np.full((len(times_ns), 4, 4), np.nan)
     for n, t in enumerate(times_ns):
@@ -110,7 +109,7 @@ def _poses(scan: Scan, times_ns: Times, a: str, b: str, gap: float) -> Array:
 
 
 def _world(
-    scan: Scan, times_ns: Times, world: str, camera: str, gap: float, notes: list[str]
+    scan: Scan, times_ns: Int64, world: str, camera: str, gap: float, notes: list[str]
 ) -> Array:
     """Return T_world_cam (N, 4, 4), NaN in gaps.
 
@@ -127,7 +126,7 @@ def _world(
     return Ts
 
 
-def _unknown(name: str, missing: NDArray[np.bool_], gap: float) -> list[str]:
+def _unknown(name: str, missing: Mask, gap: float) -> list[str]:
     if not np.any(missing):
         return []
     return [

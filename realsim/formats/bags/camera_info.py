@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
-from realsim.records.checked_arrays import Array
 
 OPENCV_MODELS = ("plumb_bob", "rational_polynomial", "brown conrady", "brown_conrady")
 """Models whose coefficients are OpenCV's k1 k2 p1 p2 k3 (k4 k5 k6)."""

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.bags import camera_info as ci
 from realsim.formats.bags import realsense as rs
@@ -11,7 +12,6 @@ from realsim.formats.bags.recording import Recording
 from realsim.formats.bags.tf_tree import TfTree
 from realsim.formats.bags.topics import CAMERA_INFO, BagChoice, ImageTopic, Topics
 from realsim.records import CameraIntrinsics
-from realsim.records.checked_arrays import Array
 
 SAME_PIXEL = 0.01
 """Cameras that differ by less than this everywhere are one [px]."""

@@ -3,10 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Int64
 from realsim.errors import InputError
 from realsim.formats.bags.wire import NS_PER_S
-
-Times = NDArray[np.int64]
 
 MAX_PAIR_GAP_S = 0.1
 """Colour and depth farther apart than this are not one frame, however slow the camera runs."""
@@ -16,13 +15,13 @@ CLOCK_GAP_S = 2.0
 """Recordings of one moment start and end within this; farther apart they have different clocks."""
 
 
-def period_s(times_ns: Times) -> float:
+def period_s(times_ns: Int64) -> float:
     """Return the usual time between two frames [s]: the median, so that gaps do not count."""
     steps = np.diff(np.unique(times_ns))
     return float(np.median(steps)) / NS_PER_S if len(steps) else DEFAULT_PERIOD_S
 
 
-def nearest(sorted_ns: Times, times_ns: Times) -> NDArray[np.intp]:
+def nearest(sorted_ns: Int64, times_ns: Int64) -> NDArray[np.intp]:
     """Return the number of the nearest entry of `sorted_ns` (N >= 1) to every time."""
     right = np.clip(np.searchsorted(sorted_ns, times_ns), 1, max(1, len(sorted_ns) - 1))
     right = np.minimum(right, len(sorted_ns) - 1)
@@ -31,7 +30,7 @@ def nearest(sorted_ns: Times, times_ns: Times) -> NDArray[np.intp]:
     return np.where(is_left, left, right).astype(np.intp)
 
 
-def pairs(a_ns: Times, b_ns: Times, max_gap_s: float) -> NDArray[np.intp]:
+def pairs(a_ns: Int64, b_ns: Int64, max_gap_s: float) -> NDArray[np.intp]:
     """Return (M, 2) numbers of entries of a and b that are each other's nearest in time.
 
     Both are sorted; mutual nearest neighbours make the join one to one whatever is missing.
@@ -46,12 +45,12 @@ def pairs(a_ns: Times, b_ns: Times, max_gap_s: float) -> NDArray[np.intp]:
     return np.stack([a[keep], to_b[keep]], -1).astype(np.intp)
 
 
-def span(times_ns: Times) -> str:
+def span(times_ns: Int64) -> str:
     """Return a range of time for a message to a person."""
     return f"{times_ns.min() / NS_PER_S:.3f} .. {times_ns.max() / NS_PER_S:.3f} s"
 
 
-def check_overlap(a_name: str, a_ns: Times, b_name: str, b_ns: Times, clock: str) -> None:
+def check_overlap(a_name: str, a_ns: Int64, b_name: str, b_ns: Int64, clock: str) -> None:
     """Check that two topics can have been stamped by one clock.
 
     Raises:

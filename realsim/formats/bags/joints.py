@@ -5,10 +5,9 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
-from realsim.formats.bags.clocks import Times
 from realsim.formats.bags.wire import NS_PER_S, JointMessage
-from realsim.records.checked_arrays import Array
 
 UR_JOINTS = (
     "shoulder_pan_joint",
@@ -43,7 +42,7 @@ class JointTrack:
         self._q = array("d")
         self._dq = array("d")
         self._has_velocity = True
-        self.times_ns: Times = np.zeros(0, dtype=np.int64)
+        self.times_ns: Int64 = np.zeros(0, dtype=np.int64)
         self.q: Array = np.zeros((0, len(self._names)))
         self.dq: Array | None = None
 
@@ -111,7 +110,7 @@ class JointTrack:
         return float(np.abs(self.q[high] - self.q[low]).max() / seconds)
 
 
-def between(times_ns: Times, time_ns: int, max_gap_s: float) -> tuple[int, int, float] | None:
+def between(times_ns: Int64, time_ns: int, max_gap_s: float) -> tuple[int, int, float] | None:
     """Return the neighbours i, j of a time and how far it is from i to j, or None in a gap.
 
     A time beyond the ends takes the end itself, up to half the gap.

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array32, UInt8, UInt16
 from realsim.errors import InputError, UnitError
 from realsim.formats.bags.wire import ImageMessage
 from realsim.images import require_decodable
@@ -77,7 +78,7 @@ def kind_of(message: ImageMessage, compressed: bool) -> ImageKind:
     return ImageKind("depth", width, height, "32FC1" if is_float else "16UC1")
 
 
-def rgb_of(message: ImageMessage, compressed: bool, name: str) -> NDArray[np.uint8]:
+def rgb_of(message: ImageMessage, compressed: bool, name: str) -> UInt8:
     """Return (H, W, 3) uint8 RGB; a view of the message where it is rgb8 already.
 
     Raises:
@@ -136,7 +137,7 @@ def depth_of(message: ImageMessage, compressed: bool, name: str) -> NDArray[Any]
     )
 
 
-def _rows(message: ImageMessage, used: int, name: str) -> NDArray[np.uint8]:
+def _rows(message: ImageMessage, used: int, name: str) -> UInt8:
     """Return the rows (H, used) of a raw image without their padding, as a view.
 
     Raises:
@@ -184,7 +185,7 @@ def _decompressed(message: ImageMessage, name: str = "image") -> NDArray[Any]:
     return np.asarray(image)
 
 
-def _inverse_depth(message: ImageMessage, quantised: NDArray[Any]) -> NDArray[np.float32]:
+def _inverse_depth(message: ImageMessage, quantised: NDArray[Any]) -> Array32:
     """Return metres of compressedDepth's 32FC1: depth = A / (value - B), 0 = none.
 
     The two parameters are in the 12 bytes before the PNG (compressed_depth_image_transport).
@@ -268,7 +269,7 @@ def _check_median(median_m: float, topic: str, assumed: str) -> None:
         )
 
 
-def counts_of(depth: NDArray[Any], unit_m: float) -> NDArray[np.uint16]:
+def counts_of(depth: NDArray[Any], unit_m: float) -> UInt16:
     """Return depth as counts of a unit; float metres that do not fit become 0 = none."""
     if depth.dtype == np.uint16:
         return depth

@@ -10,13 +10,12 @@ image back, count for count.
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, UInt16
 from realsim.compiled import njit
 from realsim.geometry.camera import ray_table
 from realsim.geometry.lens_loops import pixel
 from realsim.records import CameraIntrinsics
-from realsim.records.checked_arrays import Array
 
 COUNT_MAX = 65535
 MAX_FOOTPRINT_PX = 8.0
@@ -72,12 +71,12 @@ def _project(
 
 
 def depth_in_colour(
-    counts: NDArray[np.uint16],
+    counts: UInt16,
     depth_camera: CameraIntrinsics,
     colour_camera: CameraIntrinsics,
     T_colour_depth: Array,
     unit_m: float,
-) -> NDArray[np.uint16]:
+) -> UInt16:
     """Return depth (H, W) on the colour camera's pixels, in the same unit, 0 = none.
 
     Args:

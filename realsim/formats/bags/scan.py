@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Int64, Mask
 from realsim.errors import InputError
 from realsim.formats.bags import realsense as rs
-from realsim.formats.bags.clocks import Times
 from realsim.formats.bags.joints import JointTrack
 from realsim.formats.bags.recording import Recording
 from realsim.formats.bags.tf_tree import TfTree
@@ -41,11 +41,11 @@ class ImageTimes:
     receives: "array[int]" = field(default_factory=lambda: array("q"))
     frames: "rs.FrameTimes | None" = None
     """librealsense's metadata, where the header does not have the frame's time."""
-    stamp_ns: Times = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    stamp_ns: Int64 = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(N,) sorted, each once."""
-    header_ns: Times = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    header_ns: Int64 = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(N,) stamp in the message, by which it is found again."""
-    receive_ns: Times = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    receive_ns: Int64 = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(N,) when each was recorded."""
 
     def finish(self, by_receive: bool) -> list[str]:
@@ -66,8 +66,8 @@ class ImageTimes:
 
 
 def _true_stamps(
-    header: Times, receive: Times, frames: "rs.FrameTimes | None", by_receive: bool
-) -> tuple[Times, NDArray[np.bool_]]:
+    header: Int64, receive: Int64, frames: "rs.FrameTimes | None", by_receive: bool
+) -> tuple[Int64, Mask]:
     """Return the time of every image and whether it is known."""
     if by_receive:
         return receive, np.ones(len(receive), dtype=bool)
@@ -229,11 +229,11 @@ class StoredImages:
 
     topic: str
     compressed: bool
-    stamp_ns: Times
+    stamp_ns: Int64
     """(N,) when each was taken [ns]."""
-    header_ns: Times
+    header_ns: Int64
     """(N,) stamp in its message [ns]."""
-    receive_ns: Times
+    receive_ns: Int64
     """(N,) when it was recorded [ns]."""
 
     @classmethod

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import UInt16
 from realsim.errors import InputError
 from realsim.formats.bags import cameras, clocks, pixels
 from realsim.formats.bags import realsense as rs
@@ -86,7 +87,7 @@ class BagSource:
             T_world_cam=self.arm.row(self.arm.Ts_world_cam, n),
         )
 
-    def _depth(self, n: int, message: ImageMessage) -> NDArray[np.uint16]:
+    def _depth(self, n: int, message: ImageMessage) -> UInt16:
         depth, unit = self.depth, self.depth_unit_m
         assert depth is not None and unit is not None
         name = f"{depth.topic} at {int(depth.stamp_ns[n]) / NS_PER_S:.6f} s"

@@ -9,13 +9,12 @@ from array import array
 
 import numpy as np
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
-from realsim.formats.bags.clocks import Times
 from realsim.formats.bags.joints import SPEED_WINDOW_NS, UR_JOINTS, between
 from realsim.formats.bags.wire import NS_PER_S, TransformMessage
 from realsim.geometry import se3
 from realsim.interop import R_from_quaternion_xyzw
-from realsim.records.checked_arrays import Array
 
 TOOL = "tool0"
 """ROS-Industrial's name of the bare flange with z out of it; `flange` has x out of it."""
@@ -36,7 +35,7 @@ class _Edge:
         self.static: Array | None = None
         self.stamps = array("q")
         self.values = array("d")
-        self.times_ns: Times = np.zeros(0, dtype=np.int64)
+        self.times_ns: Int64 = np.zeros(0, dtype=np.int64)
         self.Ts: Array = np.zeros((0, 4, 4))
 
 
@@ -101,7 +100,7 @@ class TfTree:
             return None
         return up_b[: up_b.index(common)], up_a[: up_a.index(common)]
 
-    def times_ns(self, a: str, b: str) -> Times:
+    def times_ns(self, a: str, b: str) -> Int64:
         """Return all time stamps of the moving edges between two frames; empty if none moves."""
         chain = self.chain(a, b)
         edges = [self._edges[f] for f in (chain[0] + chain[1] if chain else [])]

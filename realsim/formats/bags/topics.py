@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.bags import camera_info as ci
 from realsim.formats.bags.joints import UR_JOINTS, prefixes
@@ -14,7 +15,6 @@ from realsim.formats.bags.recording import Recording
 from realsim.formats.bags.wire import image_of, joints_of
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
-from realsim.records.checked_arrays import Array
 
 Clock = Literal["header", "receive"]
 """The stamp that the sender put into the message, or the time at which the recorder got it."""

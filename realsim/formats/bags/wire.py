@@ -9,8 +9,8 @@ import struct
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
 
 NS_PER_S = 1_000_000_000
@@ -37,7 +37,7 @@ class ImageMessage(NamedTuple):
     frame_id: str
     encoding: str
     """Of a compressed image its `format`."""
-    pixels: NDArray[np.uint8]
+    pixels: UInt8
     """(N,) bytes as they were sent."""
     width: int = 0
     """0 for a compressed image: its own header says it."""
@@ -52,8 +52,8 @@ class JointMessage(NamedTuple):
 
     stamp_ns: int
     names: tuple[str, ...]
-    position: NDArray[np.float64]
-    velocity: NDArray[np.float64]
+    position: Array
+    velocity: Array
 
 
 class TransformMessage(NamedTuple):
@@ -128,13 +128,13 @@ class Cursor:
         start = self._take(length)
         return self._data[start : self.at].rstrip(b"\0").decode("utf-8", "replace")
 
-    def bytes_view(self) -> NDArray[np.uint8]:
+    def bytes_view(self) -> UInt8:
         """Return a sequence of bytes as a view of the message."""
         length = self.u32()
         start = self._take(length)
         return np.frombuffer(self._data, np.uint8)[start : self.at]
 
-    def doubles(self) -> NDArray[np.float64]:
+    def doubles(self) -> Array:
         """Return a sequence of doubles."""
         length = self.u32()
         if length == 0:

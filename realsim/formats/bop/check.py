@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Array, Array32, Mask
 from realsim.errors import InputError
 from realsim.formats.bop.check_poses import Silhouette, pose_findings, silhouette
 from realsim.formats.bop.labels import bbox_of
 from realsim.formats.bop.layout import Document, SceneLayout
-from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, LabelledScene, Mask
+from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, LabelledScene
 from realsim.records import ObjectModel
 
 DELTA_M = 0.015
@@ -153,7 +153,7 @@ def check_bop_scene(
     )
 
 
-def _depth(scene: LabelledScene, frame: LabelledFrame) -> NDArray[np.float32] | None:
+def _depth(scene: LabelledScene, frame: LabelledFrame) -> Array32 | None:
     file = scene.depth_file(frame.index)
     if file is None or frame.depth_unit_m is None:
         return None
@@ -172,7 +172,7 @@ def _check_object(
     frame: LabelledFrame,
     k: int,
     o: LabelledObject,
-    depth_m: NDArray[np.float32] | None,
+    depth_m: Array32 | None,
     model: ObjectModel | None,
     delta_m: float,
     sheet: Sheet,
@@ -195,7 +195,7 @@ def check_info(
     info: Mapping[str, Any],
     whole: Mask | None,
     visible: Mask | None,
-    depth_m: NDArray[np.float32] | None,
+    depth_m: Array32 | None,
     shape: Silhouette | None,
     sheet: Sheet,
 ) -> None:
@@ -236,7 +236,7 @@ def check_info(
         compare("bbox_obj", f"{found} of projected vertices", agree=agree)
 
 
-def _box_difference(said: Any, box: NDArray[np.float64]) -> float | None:
+def _box_difference(said: Any, box: Array) -> float | None:
     """Return the greatest difference of a side of x, y, w, h to x0, y0, x1, y1; None = no box."""
     try:
         x, y, w, h = (float(v) for v in said)

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Mask
 from realsim.formats.bop.labels import bbox_of
-from realsim.formats.labelled_scene import Mask
 from realsim.geometry import se3
 from realsim.geometry.camera import project, turning_radius
 from realsim.geometry.mesh import hull_vertices
@@ -16,7 +15,6 @@ from realsim.records import CameraIntrinsics, Mesh
 if TYPE_CHECKING:
     from realsim.formats.bop.check import Sheet
 
-Array = NDArray[np.float64]
 GROWN_PX = 2
 """By which the projected hull is grown [px] before a mask is asked to lie in it: pixels belong to a
 mask by their centres, and the edge of a lens-bent hull is bent between its corners."""
@@ -88,7 +86,7 @@ def pose_findings(
     shape: Silhouette,
     whole: Mask | None,
     visible: Mask | None,
-    depth_m: NDArray[np.float32] | None,
+    depth_m: Array32 | None,
     delta_m: float,
     sheet: "Sheet",
 ) -> None:

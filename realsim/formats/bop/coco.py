@@ -9,8 +9,8 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+from realsim.arrays import Mask
 from realsim.formats.bop.labels import bbox_of, rle_area_and_bbox, rle_of
-from realsim.formats.labelled_scene import Mask
 
 Json = dict[str, Any]
 IGNORED_BELOW = 0.1

@@ -8,8 +8,8 @@ view to view, or what was measured at an object is not where the object is said 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError, UnitError
 from realsim.formats.evidence import (
     AGREES_MM,
@@ -23,7 +23,6 @@ from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics
 from realsim.records.bop_units import MM_PER_M
 
-Array = NDArray[np.float64]
 Thing = list[tuple[int, Array]]
 COLUMNS_FIRST = "cam_R_w2c is written column by column"
 IN_METRES = "cam_t_w2c is in metres"
@@ -216,9 +215,7 @@ def require_projection(found: Sequence[bool], where: str) -> None:
         )
 
 
-def is_seen_in_box(
-    mask: NDArray[np.bool_], intrinsics: CameraIntrinsics, T: Array, corners: Array
-) -> bool:
+def is_seen_in_box(mask: Mask, intrinsics: CameraIntrinsics, T: Array, corners: Array) -> bool:
     """Return whether the middle of a visible mask (H, W) lies in the projected box of a model.
 
     Args:

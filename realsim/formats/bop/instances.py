@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from realsim.arrays import Array
+
 Json = dict[str, Any]
 INSTANCE = "instance"
 """Key, ours, of a row of scene_gt.json: equal numbers in one scene are one thing. It is written for

@@ -10,13 +10,12 @@ objects with symmetries it may be turned by up to 180 degrees.
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.untrusted.files import checked_text
 
-Array = NDArray[np.float64]
 YCB_OBJECTS = (
     "002_master_chef_can", "003_cracker_box", "004_sugar_box", "005_tomato_soup_can",
     "006_mustard_bottle", "007_tuna_fish_can", "008_pudding_box", "009_gelatin_box",

@@ -10,10 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from realsim import images
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.formats.bop.layout import SceneLayout
 from realsim.formats.bop.models import INFO_FILE, load_models
@@ -22,12 +20,10 @@ from realsim.formats.bop.run_lengths import decoded
 from realsim.formats.bop.scene import BopSceneRef
 from realsim.formats.folders.listing import shown
 from realsim.formats.grasps.scene_grasps import SceneGrasps
-from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, Mask
+from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.records import CameraIntrinsics, ObjectModel
 from realsim.records import bop_units as units
 from realsim.untrusted.json_text import read_json
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Mask
 from realsim.errors import InputError
 from realsim.records import bop_units
 from realsim.store.atomic import json_bytes
@@ -17,7 +18,6 @@ from realsim.store.session_store import SessionStore, rgb_path
 
 Bbox = tuple[int, int, int, int]
 """x, y, width, height [px]."""
-Mask = NDArray[np.bool_]
 Json = dict[str, Any]
 
 NO_BBOX: Bbox = (-1, -1, -1, -1)

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.mesh import diameter, load_mesh, ply_bytes
@@ -17,7 +17,6 @@ from realsim.store import atomic
 from realsim.untrusted.json_text import read_json
 from realsim.untrusted.values import mapping, number, numbers, text
 
-Array = NDArray[np.float64]
 INFO_FILE = "models_info.json"
 LARGEST_DIAMETER_M = 3.0
 """An object on a table is smaller: a larger one was read in the wrong unit."""

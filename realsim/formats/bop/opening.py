@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.bop import evidence
 from realsim.formats.bop.instances import stated_instances, tell_apart
@@ -30,7 +30,6 @@ from realsim.records import bop_units as units
 from realsim.records.capture import CaptureSession
 from realsim.untrusted.values import number
 
-Array = NDArray[np.float64]
 MODEL_FOLDERS = ("models", "models_cad", "models_reconst", "models_eval")
 """T-LESS has two kinds of models; those made in CAD are its default."""
 DEPTH_SAMPLES = 3

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.formats.bop.instances import INSTANCE
 from realsim.formats.bop.labels import gt_info_entry
-from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, Mask
+from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.geometry import se3
 from realsim.records import bop_units as units
 
-Array = NDArray[np.float64]
 Json = dict[str, Any]
 SAME = 1e-12
 """Rotations (their entries) and positions [m] that differ by less are the row's own: reading makes

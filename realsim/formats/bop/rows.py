@@ -10,15 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError, NotRigidError
 from realsim.geometry import se3
 from realsim.records import bop_units as units
 from realsim.untrusted.json_text import read_json
 from realsim.untrusted.values import whole
 
-Array = NDArray[np.float64]
 Json = dict[str, Any]
 GT_KEYS = ("obj_id", "cam_R_m2c", "cam_t_m2c")
 LARGEST_OBJECT_ID = 999_999
@@ -34,7 +33,7 @@ class GroundTruth:
     """Image -> its rows."""
     start: Mapping[int, int]
     """Image -> place of its first row in the arrays."""
-    obj_ids: NDArray[np.int64]
+    obj_ids: Int64
     """(N,)."""
     Ts_cam_obj: Array
     """(N, 4, 4) [m]."""

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Int64, Mask
 from realsim.errors import InputError
 from realsim.formats.bop.labels import mask_of
 from realsim.untrusted.json_text import read_json
@@ -67,7 +67,7 @@ def read_coco_masks(
     return paired, tuple(sorted(set(ambiguous)))
 
 
-def decoded(rle: Json, name: str) -> NDArray[np.bool_]:
+def decoded(rle: Json, name: str) -> Mask:
     """Return the mask (H, W) of run lengths, plain or compressed.
 
     Raises:
@@ -86,14 +86,14 @@ def decoded(rle: Json, name: str) -> NDArray[np.bool_]:
     return mask_of({"counts": runs, "size": [height, width]})
 
 
-def _whole_runs(counts: Any, name: str) -> NDArray[np.int64]:
+def _whole_runs(counts: Any, name: str) -> Int64:
     runs = numbers(counts, None, f"counts of {name}")
     if np.any(runs != np.floor(runs)) or np.any(np.abs(runs) > MOST_PIXELS):
         raise InputError(f"{name} has run lengths that are not whole numbers of pixels.")
     return runs.astype(np.int64)
 
 
-def uncompressed(text: str, name: str) -> NDArray[np.int64]:
+def uncompressed(text: str, name: str) -> Int64:
     """Return the run lengths of COCO's compressed string.
 
     Each number is written five bits a character, the lowest first, from '0' on; bit 6 says that

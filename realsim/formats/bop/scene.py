@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Array, Array32, UInt8
 from realsim.errors import InputError
 from realsim.formats.bop.keyframes import read_keyframe_poses
 from realsim.formats.bop.layout import SceneLayout, cameras_of, scene_number
@@ -35,7 +35,6 @@ __all__ = [
     "read_scene",
 ]
 
-Array = NDArray[np.float64]
 GT_FILE = "scene_gt.json"
 NOT_GT = ("scene_gt_info", "scene_gt_coco")
 """Other files that begin like the ground truth."""
@@ -118,11 +117,11 @@ class BopScene:
         """Return whether the image has depth."""
         return index in self.depth_files
 
-    def rgb(self, index: int) -> NDArray[np.uint8]:
+    def rgb(self, index: int) -> UInt8:
         """Return the image (H, W, 3) uint8."""
         return images.read_rgb(self.rgb_path(index))
 
-    def depth_m(self, index: int) -> NDArray[np.float32]:
+    def depth_m(self, index: int) -> Array32:
         """Return the depth (H, W) float32 [m], 0 = no measurement."""
         return images.read_depth(self.depth_path(index), self.session.depth_unit_m)
 

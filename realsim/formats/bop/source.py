@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import UInt16
 from realsim.errors import InputError
 from realsim.formats.bop.scene import BopScene, BopSceneRef, find_scenes, read_scene
 from realsim.formats.folders.depth_evidence import read_counts
@@ -205,7 +205,7 @@ def _require_sizes(scene: BopScene, indices: Sequence[int]) -> None:
 
 def _median_depth_m(scene: BopScene, indices: Sequence[int]) -> float | None:
     deep = [i for i in indices if scene.has_depth(i)][:TYPICAL_DEPTHS]
-    counts: list[NDArray[np.uint16]] = [read_counts(scene.depth_path(i)) for i in deep]
+    counts: list[UInt16] = [read_counts(scene.depth_path(i)) for i in deep]
     values = [c[c > 0] for c in counts if np.any(c)]
     if not values:
         return None

@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from realsim import images
+from realsim.arrays import Mask
 from realsim.errors import InputError
 from realsim.formats.bop import coco
 from realsim.formats.bop.image_copies import ColourFormat, colour_content, depth_content
 from realsim.formats.bop.layout import ONBOARDING, SceneLayout, scene_number
 from realsim.formats.bop.row_writing import camera_row, info_rows, object_row
 from realsim.formats.export_folder import Content, ExportFolder
-from realsim.formats.labelled_scene import LabelledFrame, LabelledScene, Mask, WrittenScene
+from realsim.formats.labelled_scene import LabelledFrame, LabelledScene, WrittenScene
 from realsim.untrusted.values import number
 
 Json = dict[str, Any]

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.plausible_camera import require_plausible
 from realsim.geometry import se3
@@ -238,7 +238,6 @@ def _frame_line(words: list[str], where: str) -> None:
     require_unit(_numbers(words[:9], where, "a frame")[2:6], where)
 
 
-Array = NDArray[np.float64]
 PLACES = ("", "sparse/0", "sparse", "model", "colmap", "dense/sparse", "colmap/sparse/0")
 """Where in a project's folder the model may be."""
 FILES = ("cameras", "images")

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
 from realsim.formats.coloured_points import coloured_points
 from realsim.formats.export_folder import Content, ExportFolder
@@ -30,7 +30,6 @@ from realsim.geometry import se3
 from realsim.interop import colmap_from_opencv_px, quaternion_xyzw_from_R
 from realsim.records import CameraIntrinsics
 
-Array = NDArray[np.float64]
 MODELS: dict[str, tuple[int, int]] = {"PINHOLE": (1, 4), "OPENCV": (4, 8), "FULL_OPENCV": (6, 12)}
 """Number and parameter count of the camera models that are written."""
 NO_ERROR = -1.0
@@ -91,7 +90,7 @@ def image_row(image_id: int, camera_id: int, T_cam_world: Array, name: str) -> I
 
 def binary_files(
     cameras: Sequence[CameraRow], images: Sequence[ImageRow], points: Array,
-    colours: NDArray[np.uint8],
+    colours: UInt8,
 ) -> dict[str, bytes]:  # fmt: skip
     """Return the five binary files of a model, by name.
 
@@ -135,7 +134,7 @@ def _frame_bytes(i: ImageRow) -> bytes:
     return struct.pack("<II7dIiIQ", i.image_id, i.camera_id, *i.pose, 1, 0, i.camera_id, i.image_id)
 
 
-def _point_bytes(points: Array, colours: NDArray[np.uint8]) -> bytes:
+def _point_bytes(points: Array, colours: UInt8) -> bytes:
     rows = np.zeros(len(points), dtype=POINT)
     rows["id"] = np.arange(1, len(points) + 1)
     rows["xyz"], rows["rgb"], rows["error"] = points, colours, NO_ERROR
@@ -147,7 +146,7 @@ def _point_bytes(points: Array, colours: NDArray[np.uint8]) -> bytes:
 
 def text_files(
     cameras: Sequence[CameraRow], images: Sequence[ImageRow], points: Array,
-    colours: NDArray[np.uint8],
+    colours: UInt8,
 ) -> dict[str, bytes]:  # fmt: skip
     """Return the five text files of a model, by name; arguments as `binary_files`."""
     rigs = [f"{c.camera_id} 1 CAMERA {c.camera_id}" for c in cameras]

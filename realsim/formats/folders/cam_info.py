@@ -9,14 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.formats.folders.listing import FrameState
 from realsim.geometry import se3
 from realsim.untrusted.files import checked_bytes
 
-Array = NDArray[np.float64]
 FILE = "cam.info.txt"
 COLOUR_TITLE = "color camera intrinsic matrix"
 POSE_TITLE = re.compile(r"camera-to-world extrinsic matrix.* for (\S+)\s*$", re.IGNORECASE)

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Counts
 from realsim.errors import InputError, UnitError
 
 DepthCoding = Literal["plain", "apc"]
-Counts = NDArray[np.uint16]
 ROTATION_BITS = 3
 """The apc coding turns the 16 bits by three: d = (v >> 3) | (v << 13)."""
 LOW_BITS_ZERO_SHARE = 0.9

@@ -11,8 +11,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.images import MOST_PIXELS
 
@@ -246,7 +246,6 @@ def shown(names: Sequence[str], most: int = 6) -> str:
     return f"{', '.join(names[: most - 1])}, ... and {len(names) - most + 1} more"
 
 
-Array = NDArray[np.float64]
 KIND_WORDS = frozenset(
     "aligned color colour rgb image img depth d pose poses joint joints robot tcp cam".split()
 )

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Array, Array32
 from realsim.errors import InputError
 from realsim.formats.evidence import poses_checked_by_depth
 from realsim.formats.folders.depth_evidence import depth_evidence, read_counts, require_unit
@@ -22,7 +22,6 @@ from realsim.formats.folders.source import file_digest, require_one_size
 from realsim.formats.frame_source import SourceFrame
 from realsim.records import CameraIntrinsics
 
-Array = NDArray[np.float64]
 SAME_CAMERA = 1e-9
 """Cameras whose parameters differ by less are one camera, written once for every image."""
 
@@ -154,7 +153,7 @@ def checked_by_depth(
     evidence = depth_evidence(paths)
     unit = require_unit(unit_m, evidence, "plain", where)
 
-    def depth_of(k: int) -> tuple[NDArray[np.float32], CameraIntrinsics]:
+    def depth_of(k: int) -> tuple[Array32, CameraIntrinsics]:
         return images.read_depth(paths[k], unit), camera
 
     Ts = np.stack([image.T_metric(metres_per_unit) for image in deep])

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.hdf5_checked import opened
 from realsim.geometry import se3
@@ -15,7 +15,6 @@ from realsim.geometry.mesh import tensor_mesh
 from realsim.interop import import_open3d
 from realsim.records import Mesh, ObjectModel, Scene, SupportPlane
 
-Array = NDArray[np.float64]
 Axis = Literal["x", "y", "z"]
 OUTSIDE_M = 0.3
 """Rays start so far from the grasp [m]: outside of everything that a hand holds."""

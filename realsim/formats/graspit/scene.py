@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.graspit.grasps import (
     GRASP_FILE,
@@ -32,7 +32,6 @@ from realsim.geometry.mesh import load_mesh
 from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.untrusted.yaml_text import read_yaml
 
-Array = NDArray[np.float64]
 QuaternionOrder = Literal["wxyz", "xyzw"]
 ORDERS: tuple[QuaternionOrder, ...] = get_args(QuaternionOrder)
 SCENE_FILE, TABLE = "scene.yaml", "table"

@@ -14,8 +14,8 @@ from pathlib import PurePosixPath
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspit.grasps import GRASP_FILE, WorldGrasps
@@ -33,7 +33,6 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import face_normals
 from realsim.records import GraspSet, Mesh
 
-Array = NDArray[np.float64]
 ASSETS = "assets"
 UPRIGHT_RAD = 0.02
 """A table that leans less in world is level: calibrations are off by so much."""

@@ -17,14 +17,13 @@ from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.records.checked_arrays import rigid
 from realsim.untrusted.xml_tree import read_xml
 
-Array = NDArray[np.float64]
 ANNOTATIONS = "annotations"
 DECIMALS = 4
 LARGEST_XML = 1_000_000

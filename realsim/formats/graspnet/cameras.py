@@ -14,13 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.untrusted.arrays import read_npy
-
-Array = NDArray[np.float64]
 
 POSES, FIRST, MATRIX = "camera_poses.npy", "cam0_wrt_table.npy", "camK.npy"
 MOST_VIEWS = 100_000

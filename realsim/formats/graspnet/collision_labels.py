@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Mask
 from realsim.errors import InputError
 from realsim.formats.graspnet.grasp_labels import BLOCK, GRID, MOST_POINTS, GraspLabels
 from realsim.formats.graspnet.npz_blocks import NpzArray, opened, write_blocks
-
-Mask = NDArray[np.bool_]
 
 
 def collision_points(path: Path | str) -> tuple[int, ...]:
@@ -64,9 +63,7 @@ def read_collision_labels(path: Path | str, number: int, labels: GraspLabels) ->
     return np.concatenate(found)
 
 
-def write_collision_labels(
-    path: Path | str, objects: Sequence[tuple[GraspLabels, NDArray[np.bool_]]]
-) -> Path:
+def write_collision_labels(path: Path | str, objects: Sequence[tuple[GraspLabels, Mask]]) -> Path:
     """Write the collision labels of a scene, whole or not at all.
 
     Args:

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, UInt16
 from realsim.errors import InputError, UnitError
 from realsim.formats.evidence import depth_ratio
 from realsim.formats.graspnet.image_objects import ImageObject
@@ -17,7 +17,6 @@ from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics
 
-Array = NDArray[np.float64]
 ON_TABLE_M = 0.25
 """Origins of things on a table are not farther from its plane than this."""
 STANDS_M = 0.010
@@ -55,9 +54,9 @@ class SeenImage:
     index: int
     intrinsics: CameraIntrinsics
     objects: tuple[ImageObject, ...]
-    label: NDArray[np.uint16] | None
+    label: UInt16 | None
     """(H, W)."""
-    depth_m: NDArray[np.float32] | None
+    depth_m: Array32 | None
     """(H, W) [m]."""
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.export_folder import Content
 from realsim.formats.graspnet.annotations import annotation_bytes, object_fields, pose_of
@@ -19,7 +19,6 @@ from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, Labell
 from realsim.geometry import se3
 from realsim.images import png
 
-Array = NDArray[np.float64]
 UNIT_M = 1.0 / FACTOR_DEPTH
 SAME_UNIT = 1e-9
 """Relative; 0.001 and 1 / 1000 are the same unit."""

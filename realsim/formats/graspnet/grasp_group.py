@@ -21,14 +21,14 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.formats.graspnet.gripper_frame import HEIGHT_M, grasp_poses, graspnet_poses
 from realsim.formats.grasps.scene_grasps import measures_of_json, untried_set
 from realsim.geometry import se3
 from realsim.records import GraspSet
-from realsim.records.checked_arrays import Array, frozen
+from realsim.records.checked_arrays import frozen
 from realsim.records.grasps import MEASURES, joined_measure
 from realsim.store import atomic
 from realsim.untrusted.arrays import read_npy, read_npz
@@ -65,7 +65,7 @@ class GraspGroup:
     """(N,) extent of the gripper across the closing axis [m]."""
     depths_m: Array
     """(N,) how far the fingertips are beyond GraspNet's translation [m]."""
-    obj_ids: NDArray[np.int64]
+    obj_ids: Int64
     """(N,) realsim's ids: GraspNet's number + 1; 0 = not known."""
     known: dict[str, Array] = field(default_factory=dict[str, Array])
     """(N,) or (N, 4) what else is known, by the names of OWN and MEASURES; empty of others'."""
@@ -151,7 +151,7 @@ def grasp_group(
     known = {k: np.concatenate([np.zeros(0), *(g.known[k] for g in groups)]) for k in OWN}
     measured = [k for k in MEASURES if any(k in s.measures for s in sets)]
 
-    def column(name: str) -> NDArray[np.float64]:
+    def column(name: str) -> Array:
         return np.concatenate([np.zeros(0), *(getattr(g, name) for g in groups)])
 
     return GraspGroup(

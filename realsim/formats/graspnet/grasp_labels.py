@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Int64, Mask
 from realsim.errors import InputError
 from realsim.formats.graspnet.gripper_frame import (
     ANGLES,
@@ -32,9 +33,8 @@ from realsim.formats.graspnet.gripper_frame import (
 from realsim.formats.graspnet.npz_blocks import NpzArray, opened, write_blocks
 from realsim.formats.grasps.scene_grasps import untried_set
 from realsim.records import GraspSet
-from realsim.records.checked_arrays import Array, frozen
+from realsim.records.checked_arrays import frozen
 
-Floats = NDArray[np.float32]
 GRID = (VIEWS, ANGLES, DEPTHS)
 BLOCK = 16
 """Points read or written at a time: 4 MB."""
@@ -55,19 +55,19 @@ class GraspLabels:
 
     points: Array
     """(P, 3) all points that grasps were looked for at [m]."""
-    index: NDArray[np.int32]
+    index: Int32
     """(N, 4) number of point, view, angle and depth of each candidate; increasing."""
-    angles_rad: Floats
+    angles_rad: Array32
     """(N,) turn about the approach axis."""
-    depths_m: Floats
+    depths_m: Array32
     """(N,) how far the fingertips are beyond the point."""
-    openings_m: Floats
+    openings_m: Array32
     """(N,) distance of the fingers before closing."""
-    friction: Floats
+    friction: Array32
     """(N,) smallest friction that closes; lower is better."""
-    collision: NDArray[np.bool_]
+    collision: Mask
     """(N,) whether the gripper is in the object."""
-    view_tried: NDArray[np.bool_] = field(default_factory=lambda: np.ones(VIEWS, dtype=np.bool_))
+    view_tried: Mask = field(default_factory=lambda: np.ones(VIEWS, dtype=np.bool_))
     """(300,) which views were looked at; nothing is known of the others."""
 
     def __post_init__(self) -> None:
@@ -176,10 +176,10 @@ class _Kept:
     """The candidates of a file that were worth keeping."""
 
     def __init__(self) -> None:
-        self._index: list[NDArray[np.int32]] = [np.zeros((0, 4), dtype=np.int32)]
-        self._offsets: list[Floats] = [np.zeros((0, 3), dtype=np.float32)]
-        self._friction: list[Floats] = [np.zeros(0, dtype=np.float32)]
-        self._collision: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
+        self._index: list[Int32] = [np.zeros((0, 4), dtype=np.int32)]
+        self._offsets: list[Array32] = [np.zeros((0, 3), dtype=np.float32)]
+        self._friction: list[Array32] = [np.zeros(0, dtype=np.float32)]
+        self._collision: list[Mask] = [np.zeros(0, dtype=np.bool_)]
         self._count = 0
 
     def add(
@@ -217,7 +217,7 @@ class _Kept:
         self._friction.append(friction[rows].astype(np.float32))
         self._collision.append(collision[rows])
 
-    def labels(self, points: Array, view_tried: NDArray[np.bool_]) -> GraspLabels:
+    def labels(self, points: Array, view_tried: Mask) -> GraspLabels:
         offsets = np.concatenate(self._offsets)
         return GraspLabels(
             points=points,
@@ -241,7 +241,7 @@ def _checked_points(points: NDArray[Any], path: Path) -> Array:
     return points
 
 
-def _require_metres(offsets: Floats, path: Path) -> None:
+def _require_metres(offsets: Array32, path: Path) -> None:
     """Check angle, depth and width (N, 3) of candidates that close."""
     limits = (
         ("angles", -2 * np.pi, 2 * np.pi, "rad"),
@@ -312,7 +312,7 @@ def _block_rows(labels: GraspLabels) -> Iterator[tuple[int, slice]]:
         yield first, slice(int(low), int(high))
 
 
-def _flat(index: NDArray[np.int32]) -> NDArray[np.int64]:
+def _flat(index: Int32) -> Int64:
     """Return one number (N,) for point, view, angle and depth (N, 4)."""
     return index.astype(np.int64) @ np.array(
         [VIEWS * ANGLES * DEPTHS, ANGLES * DEPTHS, DEPTHS, 1], dtype=np.int64

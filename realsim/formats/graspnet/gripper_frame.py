@@ -19,9 +19,8 @@ graspnetAPI has them in single precision: they differ from these by up to 1e-4.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
-
-Array = NDArray[np.float64]
 
 VIEWS, ANGLES, DEPTHS = 300, 12, 4
 """Orientations and depths of GraspNet's labels."""

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Array, UInt16
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 
@@ -48,7 +49,7 @@ def same_size(files: list[Path]) -> tuple[int, int]:
     return width, height
 
 
-def intrinsics_of(K: NDArray[np.float64], size: tuple[int, int], where: str) -> CameraIntrinsics:
+def intrinsics_of(K: Array, size: tuple[int, int], where: str) -> CameraIntrinsics:
     """Return the camera of an image.
 
     Raises:
@@ -66,7 +67,7 @@ def intrinsics_of(K: NDArray[np.float64], size: tuple[int, int], where: str) -> 
     return camera
 
 
-def read_label(path: Path) -> NDArray[np.uint16]:
+def read_label(path: Path) -> UInt16:
     """Return a label image (H, W): object numbers + 1, 0 = none.
 
     Raises:

@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.graspnet.annotations import ANNOTATIONS, AnnotatedObject, read_objects
 from realsim.formats.graspnet.meta import META, Meta, read_meta
 from realsim.geometry import se3
 
-Array = NDArray[np.float64]
 SAME_POSITION_M = 1.01e-4
 """Of one axis: half of the fourth decimal for each of the two files, and single precision."""
 SAME_ROTATION_RAD = 4e-4

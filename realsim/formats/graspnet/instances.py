@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.graspnet.annotations import LARGEST_NUMBER
 from realsim.untrusted.files import checked_text
 
-Array = NDArray[np.float64]
 OBJECT_LIST = "object_id_list.txt"
 MOST_OBJECTS = 10_000
 LARGEST_LIST = 100_000

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask, UInt16
 from realsim.errors import InputError
 from realsim.formats.graspnet import image_files
 from realsim.formats.graspnet.cameras import CameraFiles
@@ -23,11 +23,10 @@ from realsim.formats.graspnet.image_objects import ImageObject, ImageObjects, re
 from realsim.formats.graspnet.instances import Instances
 from realsim.formats.graspnet.models import load_models
 from realsim.formats.grasps.scene_grasps import SceneGrasps
-from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, Mask
+from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.geometry import se3
 from realsim.records import ObjectModel
 
-Array = NDArray[np.float64]
 FACTOR_DEPTH = 1000.0
 """Counts per metre where no meta file says it; graspnetAPI takes nothing else."""
 FIRST_TEST_SCENE = 100
@@ -68,7 +67,7 @@ class GraspnetLabelledScene:
         self._instances = instances
         self._notes = notes
         self._models: dict[int, ObjectModel] | None = None
-        self._label: tuple[int, NDArray[np.uint16]] | None = None
+        self._label: tuple[int, UInt16] | None = None
         self._objects: tuple[int, ImageObjects] | None = None
         poses = cameras.poses
         self._Ts_0_cam = None if poses is None else se3.check_rigid(poses, "camera_poses")
@@ -158,7 +157,7 @@ class GraspnetLabelledScene:
         path = image_files.image_file(self.ref.folder, image_files.LABEL, index)
         return path if path.is_file() else None
 
-    def label(self, index: int) -> NDArray[np.uint16] | None:
+    def label(self, index: int) -> UInt16 | None:
         """Return the label image (H, W) of object ids, 0 = none; None = there is none.
 
         Raises:

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.formats.graspnet.annotations import FARTHEST_M, LARGEST_NUMBER
 from realsim.geometry import se3
 from realsim.untrusted.mat_files import read_mat
 
-Array = NDArray[np.float64]
 META = "meta"
 NAMES = ("poses", "cls_indexes", "intrinsic_matrix", "factor_depth")
 LARGEST_MAT = 10e6

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
 from realsim.errors import InputError
@@ -22,7 +21,6 @@ from realsim.formats.graspnet.meta import META
 from realsim.formats.graspnet.models import mesh_file
 from realsim.geometry import se3
 
-Array = NDArray[np.float64]
 COMPARED = 12
 """Images whose objects are compared with each other, spread over the scene."""
 LOOKED_AT = 3

@@ -1,13 +1,12 @@
 """Where the cameras stood: as the source tells, or from objects that stand still."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.geometry import se3
 
-Array = NDArray[np.float64]
 SPREAD_LIMIT_M = 0.010
 """Camera poses by several objects may differ by so much, no more."""
 

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.formats.graspnet.grasp_group import GraspGroup
 from realsim.formats.graspnet.gripper_frame import BASE_M, HEIGHT_M, graspnet_poses
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
-from realsim.records.checked_arrays import Array, frozen
+from realsim.records.checked_arrays import frozen
 from realsim.store import atomic
 from realsim.untrusted.arrays import read_npy
 
@@ -45,7 +45,7 @@ class RectGrasps:
     """(N,) extent across the closing axis."""
     scores: Array
     """(N,) higher is better."""
-    obj_ids: NDArray[np.int64]
+    obj_ids: Int64
     """(N,) realsim's ids: GraspNet's number + 1; 0 = not known."""
 
     def __post_init__(self) -> None:

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.graspnet.annotations import ANNOTATIONS, read_objects
 from realsim.formats.graspnet.cameras import POSES, read_camera_poses
@@ -27,7 +27,6 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import load_mesh
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
 
-Array = NDArray[np.float64]
 CHECKED_VIEWS = 8
 """Other images whose annotations are compared with the one that is used."""
 AGREE_M = 0.005

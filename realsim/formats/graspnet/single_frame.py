@@ -8,10 +8,8 @@ No annotation, no camera pose, no label image: the meta file has the poses and t
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from realsim import images
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.formats.graspnet import evidence, image_files
 from realsim.formats.graspnet.image_objects import joined_objects
@@ -20,10 +18,9 @@ from realsim.formats.graspnet.labelled import ENTRY
 from realsim.formats.graspnet.meta import read_meta
 from realsim.formats.graspnet.models import load_models
 from realsim.formats.grasps.scene_grasps import SceneGrasps
-from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, Mask
+from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.records import ObjectModel
 
-Array = NDArray[np.float64]
 COLOUR_FILE, DEPTH_FILE, META_FILE = "color.png", "depth.png", "meta.mat"
 WORKSPACE_FILE = "workspace_mask.png"
 

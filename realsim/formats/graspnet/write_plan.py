@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.graspnet.annotations import LARGEST_NUMBER
 from realsim.formats.graspnet.frame_files import own_values
@@ -18,7 +18,6 @@ from realsim.geometry import se3
 from realsim.geometry.camera import pixel_grid, undistort
 from realsim.records import CameraIntrinsics
 
-Array = NDArray[np.float64]
 LARGEST_OFFICIAL = 87
 """GraspNet-1Billion has the objects 0 to 87; loops of graspnetAPI end there."""
 SAME_POSE = 1e-6

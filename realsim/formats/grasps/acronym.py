@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.formats.grasps.hand_frames import grasp_poses, hand_poses, require_panda
 from realsim.formats.grasps.hdf5 import get_set, put_set
 from realsim.formats.grasps.scene_grasps import (
@@ -39,7 +39,6 @@ from realsim.records import GraspSet
 from realsim.robots.hand import find_hand
 from realsim.store import atomic
 
-Array = NDArray[np.float64]
 FLEX = "grasps/qualities/flex"
 OURS = "grasps/qualities/realsim"
 MOTIONS = tuple(
@@ -76,7 +75,7 @@ class AcronymGrasps:
     obj: AcronymObject
     Ts_obj_grasp: Array
     """(N, 4, 4) [m], frame `grasp`."""
-    object_in_gripper: NDArray[np.bool_]
+    object_in_gripper: Mask
     """(N,) whether the simulator of the file found the object held."""
     simulator: str
     """Whose label it is."""

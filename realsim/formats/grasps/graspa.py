@@ -20,8 +20,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh_files import load_mesh
@@ -29,7 +29,6 @@ from realsim.records import Mesh
 from realsim.untrusted import values
 from realsim.untrusted.xml_tree import read_xml
 
-Array = NDArray[np.float64]
 MM = 1e-3
 ROUNDED = 0.02
 """Greatest entry of R^T R - 1 that rounding explains; the worst of the open trials has 0.001."""
@@ -76,7 +75,7 @@ class TriedObject:
     """(4, 4) as the board was printed; nobody measured where it really stood [m]."""
     Ts_board_grasp: Array
     """(N, 4, 4) frame `grasp` [m]."""
-    held: NDArray[np.bool_]
+    held: Mask
     """(N,) whether the robot lifted the object."""
     planners: tuple[str, ...]
     """(N,) the run that a trial is of."""

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.formats.grasps.hand_frames import (
     HandFrame,
@@ -46,7 +46,6 @@ from realsim.robots.hand import find_hand
 from realsim.store import atomic
 from realsim.untrusted.own_json import array_from_json, read_object, to_json
 
-Array = NDArray[np.float64]
 MOST_BYTES = 1 << 30
 """Largest file that is read [bytes]: 3 million grasps."""
 
@@ -61,7 +60,7 @@ class GraspGenGrasps:
     """What the mesh is multiplied by to be in metres."""
     Ts_obj_grasp: Array
     """(N, 4, 4) [m], frame `grasp`."""
-    object_in_gripper: NDArray[np.bool_]
+    object_in_gripper: Mask
     """(N,) whether the simulator of the file found the object held."""
     scores: Array | None = None
     """(N,) our score, where realsim wrote the file."""

@@ -14,14 +14,14 @@ fingertips are at z = 0.1122 m. The frames of other hands are named after the Pa
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import GraspSet
 from realsim.robots.hand import FRANKA, Hand, find_hand, hand_of_json
 
-Array = NDArray[np.float64]
 HandFrame = Literal["grasp", "panda_hand", "acronym"]
 
 _QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.formats.grasps.scene_grasps import SceneGrasps, parameters_json
 from realsim.formats.hdf5_checked import CheckedGroup, opened
 from realsim.records import STAGES, GraspSet
@@ -117,7 +118,7 @@ def read_grasps_hdf5(path: Path | str) -> SceneGrasps:
         table = file.numbers("T_world_table", (4, 4)) if file.has("T_world_table") else None
         sets: list[GraspSet] = []
         names: dict[int, str] = {}
-        poses: dict[int, NDArray[np.float64]] = {}
+        poses: dict[int, Array] = {}
         trajectories: dict[int, GraspTrajectories] = {}
         groups = file.group("sets")
         for name in groups.names():
@@ -140,7 +141,7 @@ def read_grasps_hdf5(path: Path | str) -> SceneGrasps:
 # --- one set ----------------------------------------------------------------------------------
 
 
-def put_set(group: Any, s: GraspSet, rows: NDArray[np.int64]) -> None:
+def put_set(group: Any, s: GraspSet, rows: Int64) -> None:
     """Write some rows of a set into a group, all but the poses."""
     group.attrs["obj_id"] = s.obj_id
     group.attrs["instance"] = s.instance
@@ -189,7 +190,7 @@ def _text(text: str) -> NDArray[np.bytes_]:
     return np.array(data, dtype=f"S{max(1, len(data))}")
 
 
-def get_set(group: CheckedGroup, Ts: NDArray[np.float64]) -> GraspSet:
+def get_set(group: CheckedGroup, Ts: Array) -> GraspSet:
     """Return the set of these poses (N, 4, 4) [m] that `put_set` wrote."""
     n, stages = len(Ts), len(STAGES)
     columns = {

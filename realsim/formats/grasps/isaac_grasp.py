@@ -31,9 +31,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import interop
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.grasps.hand_frames import HandFrame, grasp_poses, hand_of_set, hand_poses
 from realsim.formats.grasps.scene_grasps import (
@@ -51,7 +51,6 @@ from realsim.untrusted.own_json import to_json
 from realsim.untrusted.values import mapping, number, numbers
 from realsim.untrusted.yaml_text import read_yaml
 
-Array = NDArray[np.float64]
 FORMAT_VERSION = 1.0
 FINGER = "panda_finger_joint1"
 WIDEST_M = 1.0

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.grasps.hdf5 import COLUMNS, FORMAT, FORMAT_VERSION, FRAMES, SAMPLES
 from realsim.formats.grasps.scene_grasps import SceneGrasps, parameters_json
@@ -32,7 +32,6 @@ from realsim.records.grasps import MEASURES
 from realsim.records.trajectories import GraspTrajectories
 from realsim.store import atomic
 
-Array = NDArray[np.float64]
 GRASPS_FILE = "grasps.parquet"
 TRAJECTORIES_FILE = "trajectories.parquet"
 HEAD = b"realsim"

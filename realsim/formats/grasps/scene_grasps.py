@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet
-from realsim.records.checked_arrays import Array, rigid
+from realsim.records.checked_arrays import rigid
 from realsim.records.grasps import MEASURES, require_one_hand
 from realsim.records.trajectories import GraspTrajectories
 from realsim.untrusted.own_json import array_from_json, to_json
@@ -149,7 +149,7 @@ def parameters_json(grasps: GraspSet) -> str:
     return text
 
 
-def measures_json(grasps: GraspSet, rows: NDArray[np.int64]) -> dict[str, Any]:
+def measures_json(grasps: GraspSet, rows: Int64) -> dict[str, Any]:
     """Return what was measured of some rows as plain JSON values, by name."""
     return {name: to_json(values[rows]) for name, values in grasps.measures.items()}
 
@@ -176,18 +176,18 @@ def measures_of_json(told: Any, n: int, where: str) -> dict[str, Array]:
     return found
 
 
-def executed(grasps: GraspSet) -> NDArray[np.bool_]:
+def executed(grasps: GraspSet) -> Mask:
     """Return (N,) which grasps physics has tried: the first stage was executed."""
     return ~np.isnan(grasps.slip_m[:, 0])
 
 
-def labelled(grasps: GraspSet) -> NDArray[np.bool_]:
+def labelled(grasps: GraspSet) -> Mask:
     """Return (N,) which grasps have a label of their own: tried by physics, or with a p_hold."""
     known = ~np.isnan(grasps.measures.get("p_hold", np.full(len(grasps), np.nan)))
     return (executed(grasps) | known) & ~np.isnan(grasps.labels)
 
 
-def held(grasps: GraspSet) -> NDArray[np.bool_]:
+def held(grasps: GraspSet) -> Mask:
     """Return (N,) which grasps still held the object after all four stages, however it slipped."""
     return np.all(np.isfinite(grasps.slip_m) & np.isfinite(grasps.slip_rad), axis=1)
 
@@ -226,11 +226,11 @@ def untried_set(
     )
 
 
-def _within(values: Array, low: float, high: float) -> NDArray[np.bool_]:
+def _within(values: Array, low: float, high: float) -> Mask:
     return (values >= low) & (values <= high)
 
 
-def _require(values: Array, right: NDArray[np.bool_], who: str, what: str, wanted: str) -> None:
+def _require(values: Array, right: Mask, who: str, what: str, wanted: str) -> None:
     """Check that every value is right or NaN."""
     wrong = ~right & ~np.isnan(values)
     if np.any(wrong):

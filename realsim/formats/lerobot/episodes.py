@@ -19,9 +19,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Rgb
 from realsim.errors import InputError
 
-Rgb = NDArray[np.uint8]
 DTYPES = ("float32", "int64", "bool")
 GIVEN_BY_WRITER = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """Columns that every data set has; the writer fills them."""

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Rgb
 from realsim.errors import InputError
 from realsim.formats.export_folder import STATE, ExportFolder
 from realsim.formats.lerobot.episodes import PIXELS, LeRobotEpisode, LeRobotSource, checked_columns
 from realsim.formats.lerobot.tables import PictureStats, Stats
 from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
 
-Rgb = NDArray[np.uint8]
 ENCODER = "libx264"
 OPTIONS = {"g": "2", "crf": "23", "bf": "0", "mbtree": "0"}
 """Key frames, quality (x264's own default), and no frames that refer to later ones.

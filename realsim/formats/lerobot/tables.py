@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, UInt8
 from realsim.formats.lerobot.episodes import LeRobotFeature
 
-Array = NDArray[np.float64]
 Stats = dict[str, dict[str, Any]]
 """Feature -> 'min', 'max', 'mean', 'std', 'count' -> nested lists of numbers."""
 
@@ -44,7 +44,7 @@ class PictureStats:
         self._low, self._high = np.full(3, 255.0), np.zeros(3)
         self._sum, self._squares = np.zeros(3), np.zeros(3)
 
-    def add(self, rgb: NDArray[np.uint8]) -> None:
+    def add(self, rgb: UInt8) -> None:
         """Add a picture (H, W, 3)."""
         flat = rgb.reshape(-1, 3)
         levels = np.arange(256.0)

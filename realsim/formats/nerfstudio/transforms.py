@@ -19,8 +19,9 @@ from pathlib import Path, PurePosixPath
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.folders.listing import ENDINGS, image_header, natural_key, shown
 from realsim.formats.folders.posed_images import PosedImage
@@ -35,7 +36,6 @@ from realsim.interop import (
 from realsim.records import CameraIntrinsics
 from realsim.untrusted import json_text, values
 
-Array = NDArray[np.float64]
 LENS = ("k1", "k2", "p1", "p2", "k3")
 """Coefficients that nerfstudio and OpenCV share, in OpenCV's order."""
 CAMERA_KEYS = (

@@ -8,12 +8,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, UInt8
 from realsim.images.png import encode_png
 from realsim.records import Mesh
 
-Array = NDArray[np.float64]
 PLAIN_RGB = (0.7, 0.7, 0.7)
 """Of meshes without colours."""
 TABLE_RGB = (0.72, 0.66, 0.58)
@@ -29,7 +28,7 @@ class Look:
 
     corner_uv: Array | None
     """(F, 3, 2) texture coordinates of the faces' corners, v up; None = there is no texture."""
-    texture: NDArray[np.uint8] | None
+    texture: UInt8 | None
     """(H, W, 3) RGB, first row at v = 1."""
 
 

@@ -4,16 +4,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError, UnitError
 from realsim.formats.robot_scenes.placed_scene import RigidBody
 from realsim.geometry.mesh import load_mesh, mass_properties
 from realsim.records import Mesh
 from realsim.untrusted.files import checked_text, file_bytes
 from realsim.untrusted.values import path_inside
-
-Array = NDArray[np.float64]
 
 
 def convex_part(points: ArrayLike, name: str) -> Mesh:
@@ -32,7 +31,7 @@ def convex_part(points: ArrayLike, name: str) -> Mesh:
             f"{name} ({len(points)} points) is flat: it has no volume that could be collided with. "
             "Leave it out."
         ) from error
-    corners: NDArray[np.int64] = np.sort(hull.vertices)
+    corners: Int64 = np.sort(hull.vertices)
     number = np.full(len(points), -1)
     number[corners] = np.arange(len(corners))
     faces = number[hull.simplices]

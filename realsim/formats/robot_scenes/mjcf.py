@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import interop
+from realsim.arrays import Array
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.labelled_scene import WrittenScene
 from realsim.formats.robot_scenes.mesh_obj import (
@@ -36,7 +36,6 @@ from realsim.formats.robot_scenes.placed_scene import (
 )
 from realsim.geometry import se3
 
-Array = NDArray[np.float64]
 SCENE_FILE, ASSETS = "scene.xml", "assets"
 SEEN, COLLIDING = "2", "3"
 """Groups of shapes; MuJoCo's viewer shows the first and hides the second."""

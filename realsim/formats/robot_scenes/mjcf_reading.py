@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, MissingLibraryError, UnitError
 from realsim.formats.robot_scenes.mesh_reading import convex_part
 from realsim.formats.robot_scenes.mjcf_worker import FAILED, FOUND, MOST_CPU_S, SHAPES
@@ -34,7 +35,6 @@ from realsim.untrusted.files import file_bytes
 from realsim.untrusted.json_text import read_json
 from realsim.untrusted.xml_tree import read_xml
 
-Array = NDArray[np.float64]
 MOST_FILES = 10_000
 MOST_FILE_BYTES = 500e6
 """Of a mesh or a texture."""

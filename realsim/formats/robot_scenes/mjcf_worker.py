@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import UInt8
+
 MOST_MEMORY = 4_000_000_000
 """Address space of the process [bytes]: MuJoCo itself maps 1 GB, mostly of nothing."""
 MOST_CPU_S = 30
@@ -96,14 +98,14 @@ def _mesh(model: Any, k: int) -> dict[str, NDArray[Any]]:
     return shapes
 
 
-def _texture(model: Any, k: int) -> NDArray[np.uint8] | None:
+def _texture(model: Any, k: int) -> UInt8 | None:
     """Return a picture (H, W, 3), None if it is another kind of texture."""
     start, channels = int(model.tex_adr[k]), int(model.tex_nchannel[k])
     height, width = int(model.tex_height[k]), int(model.tex_width[k])
     if channels not in (3, 4):
         return None
     data: Any = model.tex_data[start : start + height * width * channels]
-    picture: NDArray[np.uint8] = np.array(data, dtype=np.uint8).reshape(height, width, channels)
+    picture: UInt8 = np.array(data, dtype=np.uint8).reshape(height, width, channels)
     return picture[..., :3].copy()
 
 

@@ -10,14 +10,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Mesh, ObjectModel
 from realsim.records.checked_arrays import frozen, rigid
 
-Array = NDArray[np.float64]
 GRAVITY = 9.81
 """[m/s^2]."""
 TRIANGLE_TOLERANCE = 1e-6

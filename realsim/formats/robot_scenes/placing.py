@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.robot_scenes.mesh_reading import convex_part
 from realsim.formats.robot_scenes.placed_scene import (
@@ -20,8 +20,6 @@ from realsim.formats.robot_scenes.placed_scene import (
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 from realsim.records import ObjectModel, Scene, names_of
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

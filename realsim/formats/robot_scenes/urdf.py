@@ -7,9 +7,10 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from realsim import interop
+from realsim.arrays import Array
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.labelled_scene import WrittenScene
 from realsim.formats.robot_scenes.mesh_obj import TABLE_RGB, VISUAL, part_file, visual_files
@@ -26,8 +27,6 @@ from realsim.formats.robot_scenes.placed_scene import (
 )
 from realsim.geometry import se3
 from realsim.store import atomic
-
-Array = NDArray[np.float64]
 
 
 def rpy_from_R(R: ArrayLike) -> Array:

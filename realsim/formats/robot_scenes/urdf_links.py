@@ -10,8 +10,8 @@ from typing import Literal
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.robot_scenes.mesh_reading import colliding, scene_mesh
 from realsim.geometry.mesh import mass_properties, merged, transformed
@@ -19,7 +19,6 @@ from realsim.records import Mesh
 from realsim.robots.urdf import floats, origin_of, sizes
 from realsim.untrusted.xml_tree import read_xml
 
-Array = NDArray[np.float64]
 MOST_LINKS = 10_000
 ROUND_SIDES = 48
 """Of a cylinder that is made a mesh."""

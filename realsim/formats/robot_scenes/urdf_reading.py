@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.robot_scenes.placed_scene import (
     GRAVITY,
@@ -25,7 +25,6 @@ from realsim.records import CameraIntrinsics, ObjectModel
 from realsim.untrusted import values
 from realsim.untrusted.json_text import read_json
 
-Array = NDArray[np.float64]
 MOST_OBJECTS = 10_000
 SAME_POSE = 1e-5
 """Position [m] and rotation entries of two ways to say one pose agree to this."""

@@ -4,7 +4,6 @@ import importlib
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.errors import MissingLibraryError
 from realsim.formats.robot_scenes.mesh_obj import PLAIN_RGB, Look, look_of
@@ -44,7 +43,6 @@ class Pixar:
         self.Vt: Any = found["Vt"]
 
 
-Array = NDArray[np.float64]
 LABEL = "class"
 """Kind of the semantic label; Isaac's Replicator takes its classes from it."""
 COMBINE_MODE = "physxMaterial:frictionCombineMode"

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import interop
+from realsim.arrays import Array
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.labelled_scene import WrittenScene
 from realsim.formats.robot_scenes.mesh_obj import TABLE_RGB
@@ -37,7 +37,6 @@ from realsim.formats.robot_scenes.usd_body import (
 )
 from realsim.geometry import se3
 
-Array = NDArray[np.float64]
 SCENE_FILE, OBJECTS = "scene.usda", "objects"
 ROOT = "/World"
 APERTURE = 20.955

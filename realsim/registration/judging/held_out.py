@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, SupportPlane
@@ -20,8 +20,7 @@ from realsim.registration.judging.surface_residuals import thinning
 from realsim.registration.solver import SolverConfig, solve_pose
 from realsim.registration.views import ViewPoints
 
-Array = NDArray[np.float64]
-HalfFit = Callable[[NDArray[np.int64]], Sequence[Array]]
+HalfFit = Callable[[Int64], Sequence[Array]]
 """From the numbers (N,) of the views that may be used to the poses (4, 4) of all objects."""
 
 
@@ -66,7 +65,7 @@ class OwnedPoints:
     """The points of all views that lie nearest to one object."""
 
     cloud: Cloud
-    views: NDArray[np.int64]
+    views: Int64
     """(N,) which view each is of."""
 
 
@@ -79,7 +78,7 @@ def box_shift_m(body: Body, T_a: Array, T_b: Array) -> float:
     return float(np.linalg.norm(apart, axis=1).max())
 
 
-def halves(views: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def halves(views: int) -> tuple[Int64, Int64]:
     """Return the even and the odd views: neighbours in time, so both see all sides.
 
     Raises:
@@ -103,7 +102,7 @@ def owned_points(
     """Return per object the points nearest to it, thinned out to what two halves need."""
     step = thinning(bodies, poses, (intrinsics, views, Ts_world_cam), 2 * config.points)
     claims = make_claims(bodies, poses, plane, config.reach_m)
-    parts: list[list[tuple[Array, Array, Array, NDArray[np.int64]]]] = [[] for _ in bodies]
+    parts: list[list[tuple[Array, Array, Array, Int64]]] = [[] for _ in bodies]
     for v, (view, T) in enumerate(zip(views, Ts_world_cam, strict=True)):
         seen = view.points[v % step :: step].astype(np.float64)
         points, sigmas = se3.transform(T, seen), noise.sigma(seen[:, 2])
@@ -130,7 +129,7 @@ def half_fit(
 ) -> HalfFit:
     """Return a fit of every object alone, from its final pose, on the points of some views."""
 
-    def fit(used: NDArray[np.int64]) -> Sequence[Array]:
+    def fit(used: Int64) -> Sequence[Array]:
         found: list[Array] = []
         for body, T, mine in zip(bodies, poses, owned, strict=True):
             cloud = mine.cloud.select(np.isin(mine.views, used))
@@ -182,7 +181,7 @@ def held_out(
 def _unused_agree(
     body: Body,
     owned: OwnedPoints,
-    tests: Sequence[tuple[Array, NDArray[np.int64]]],
+    tests: Sequence[tuple[Array, Int64]],
     config: HeldOutConfig,
 ) -> float:
     """Return the share of points that agree, each tested with the pose its view was not used for.
@@ -193,7 +192,7 @@ def _unused_agree(
         tests: pairs of a pose (4, 4) and the views (N,) to test it on.
         config: see there.
     """
-    agree: list[NDArray[np.bool_]] = []
+    agree: list[Mask] = []
     for T, unused in tests:
         cloud = owned.cloud.select(np.isin(owned.views, unused))
         if np.all(np.isfinite(T)) and len(cloud.points):

@@ -4,25 +4,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.distance_field import sample
 from realsim.records import SupportPlane
 from realsim.registration.body import Body
 
-Array = NDArray[np.float64]
-
 
 @njit
 def claim_points(
     points: Array,
-    lattice: tuple[NDArray[np.float32], Array, float],
+    lattice: tuple[Array32, Array, float],
     T_obj_world: Array,
     bounds: tuple[Array, Array, float],
     number: int,
-    taken: tuple[Array, NDArray[np.int32]],
+    taken: tuple[Array, Int32],
 ) -> None:
     """Give to an object the points that are nearer to it than to what has them so far.
 
@@ -67,7 +65,7 @@ class Claims:
     """Points further from every surface belong to none [m]."""
     T_table_world: Array | None
     """(4, 4); the table claims points too."""
-    objects: tuple[tuple[tuple[NDArray[np.float32], Array, float], Array, Array, Array], ...]
+    objects: tuple[tuple[tuple[Array32, Array, float], Array, Array, Array], ...]
     """Per object: distance field, T_obj_world (4, 4), box (2, 3), its centre in world (3,)."""
     radii: tuple[float, ...]
     """Per object: radius beyond which it claims nothing [m]."""
@@ -93,7 +91,7 @@ def make_claims(
     )
 
 
-def owners(claims: Claims, points: Array) -> NDArray[np.int32]:
+def owners(claims: Claims, points: Array) -> Int32:
     """Return for points (N, 3) in world the number of the object each is nearest to; -1 = none."""
     best = np.full(len(points), claims.reach_m)
     owner = np.full(len(points), -1, dtype=np.int32)

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Int64
 from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
 from realsim.geometry.lens_loops import pixel
@@ -12,7 +12,6 @@ from realsim.geometry.mesh import sample_surface
 from realsim.geometry.seen_surface import GATE_COS, follow_to_camera
 from realsim.registration.body import Body
 
-Array = NDArray[np.float64]
 SIDES = 6
 """Ways a patch may face: along +x -x +y -y +z -z. The two sides of a thin wall stay apart."""
 PATCH_SEED = 0
@@ -27,7 +26,7 @@ class Patches:
     """Edge of a cell [m]."""
     origin: Array
     """(3,) corner of the grid in the object's frame [m]."""
-    index: NDArray[np.int32]
+    index: Int32
     """(X, Y, Z, 6) number of the patch of a cell and side; -1 = no surface there."""
     centers: Array
     """(P, 3) mean of the surface in the patch [m]."""
@@ -35,7 +34,7 @@ class Patches:
     """(P, 3) mean outward normal."""
     areas_mm2: Array
     """(P,) surface in the patch."""
-    cells: NDArray[np.int64]
+    cells: Int64
     """(P, 3) cell of each patch."""
 
 
@@ -82,9 +81,9 @@ def make_patches(body: Body, size_m: float, samples_per_patch: float) -> Patches
 @njit
 def add_to_patches(
     points: tuple[Array, Array],
-    lattice: tuple[NDArray[np.float32], Array, float],
+    lattice: tuple[Array32, Array, float],
     pose: tuple[Array, Array],
-    patches: tuple[NDArray[np.int32], Array, float],
+    patches: tuple[Int32, Array, float],
     sums: Array,
 ) -> None:
     """Add the residuals of an object's points to the patches they lie on.
@@ -145,9 +144,9 @@ def look_at_patches(
     surface: tuple[Array, Array],
     T_cam_obj: Array,
     camera: Array,
-    image: tuple[NDArray[np.float32], int],
+    image: tuple[Array32, int],
     limits: tuple[float, float, float, float, float, float],
-    looks: NDArray[np.int32],
+    looks: Int32,
 ) -> None:
     """Count for every patch whether one view saw it, looked through it, or was hidden from it.
 

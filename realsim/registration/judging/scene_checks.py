@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import ObjectModel, SupportPlane
 from realsim.registration.body import Body
@@ -25,7 +25,6 @@ from realsim.registration.verify import (
     common_sinking,
 )
 
-Array = NDArray[np.float64]
 FindingKind = Literal["common shift", "common sinking", "swapped ids", "not in the scene", "unit"]
 
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.robust import mad_sigma
@@ -31,8 +31,6 @@ from realsim.registration.judging.patches import (
     make_patches,
 )
 from realsim.registration.views import ViewPoints
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -88,7 +86,7 @@ class SurfaceResiduals:
     """(P,) its standard error [m]."""
     counts: Array
     """(P,) points."""
-    looks: NDArray[np.int32]
+    looks: Int32
     """(P, 3) views that saw the patch, looked through it, saw something in front of it."""
     depth_m: float
     """Median depth at which the object was seen [m]; NaN = never."""
@@ -96,7 +94,7 @@ class SurfaceResiduals:
     """How many views there were."""
 
     @property
-    def measured(self) -> NDArray[np.bool_]:
+    def measured(self) -> Mask:
         """(P,) whether a patch has a mean."""
         return np.isfinite(self.mean_m)
 
@@ -216,7 +214,7 @@ def _look(
     view: ViewPoints,
     T_world_cam: Array,
     noise: DepthNoise,
-    looks: Sequence[NDArray[np.int32]],
+    looks: Sequence[Int32],
     config: ResidualConfig,
 ) -> None:
     """Count which patches one view saw, looked through, or was hidden from."""
@@ -241,7 +239,7 @@ def _look(
 def _means_of(
     patches: Patches,
     sums: Array,
-    looks: NDArray[np.int32],
+    looks: Int32,
     depths: Array,
     views: int,
     config: ResidualConfig,
@@ -338,19 +336,19 @@ def residual_checks(
     }
 
 
-def _share(areas: Array, part: NDArray[np.bool_], whole: NDArray[np.bool_]) -> float:
+def _share(areas: Array, part: Mask, whole: Mask) -> float:
     """Return the area of `part` over that of `whole`; NaN if that is nothing."""
     total = float(areas[whole].sum())
     return float(areas[part & whole].sum()) / total if total > 0 else float("nan")
 
 
-def _looked_through(r: SurfaceResiduals, config: ResidualConfig) -> NDArray[np.bool_]:
+def _looked_through(r: SurfaceResiduals, config: ResidualConfig) -> Mask:
     """Return the patches (P,) through which more views saw than ended on them."""
     least = config.through_looks if r.views > config.through_looks else 1
     return (r.looks[:, 1] >= least) & (r.looks[:, 1] > r.looks[:, 0])
 
 
-def _largest_piece(r: SurfaceResiduals, wrong: NDArray[np.bool_]) -> float:
+def _largest_piece(r: SurfaceResiduals, wrong: Mask) -> float:
     """Return the area [mm^2] of the largest connected set of wrong patches of one sign.
 
     Patches are connected if their cells touch, corners included.
@@ -366,7 +364,7 @@ def _largest_piece(r: SurfaceResiduals, wrong: NDArray[np.bool_]) -> float:
         full = np.zeros(r.patches.index.shape[:3], dtype=np.bool_)
         full[cells] = True
         labelled: Any = label(full, structure=np.ones((3, 3, 3)))
-        pieces: NDArray[np.int32] = labelled[0]
+        pieces: Int32 = labelled[0]
         areas = np.bincount(pieces[cells], weights=r.patches.areas_mm2[chosen])
         largest = max(largest, float(areas.max()))
     return largest

@@ -5,11 +5,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.records import Verdict
 
-Array = NDArray[np.float64]
 Kind = Literal["views", "no_held_out", "single_view"]
 LEAST_ODDS = 0.003
 """Added to both sides of a share before its odds are taken: 3 of 1000 pixels are always off."""

@@ -12,8 +12,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import SupportPlane
@@ -96,9 +96,6 @@ def unmatched_words(view: int) -> str:
         f"view {view}: its depth fits nothing that the views around it see; it is of another "
         "scene, something was moved, or its pose is off by more than 3 cm."
     )
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -14,10 +14,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.registration.odometry.pairs import Edge, relative
 
-Array = NDArray[np.float64]
 Kind = Literal["view", "mount", "world"]
 NOISE_QUANTILE = 0.3
 """Share of the pairs that are surely free of faults: after a slip half of them may not be."""

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.clouds import plane_frame
@@ -37,7 +37,6 @@ from realsim.registration.odometry.pairs import (
 )
 from realsim.registration.views import SampleConfig, sample_view
 
-Array = NDArray[np.float64]
 FREE = 1.0
 """Sigma of what the table does not tell (place on it [m] and turn about its normal [rad])."""
 FIXED = 1e-6
@@ -205,7 +204,7 @@ class HandHeld:
 
 
 def hand_held_poses(
-    intrinsics: CameraIntrinsics, depths: Sequence[NDArray[np.float32]], config: HandHeldConfig
+    intrinsics: CameraIntrinsics, depths: Sequence[Array32], config: HandHeldConfig
 ) -> HandHeld:
     """Return the camera's poses from its depth images alone.
 
@@ -248,7 +247,7 @@ def hand_held_poses(
 
 
 def _clouds(
-    intrinsics: CameraIntrinsics, depths: Sequence[NDArray[np.float32]], config: HandHeldConfig
+    intrinsics: CameraIntrinsics, depths: Sequence[Array32], config: HandHeldConfig
 ) -> list[ViewCloud]:
     """Return every view split into its table and what stands on it."""
     frames = check_frames(

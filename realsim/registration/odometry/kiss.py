@@ -16,13 +16,12 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, MissingLibraryError
 from realsim.geometry import se3
 from realsim.geometry.clouds import voxel_mean
 
-Array = NDArray[np.float64]
 LEAST_POINTS = 30
 """Fewer points have no shape."""
 GATE_SIGMAS = 3.0

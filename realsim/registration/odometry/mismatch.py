@@ -9,14 +9,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.geometry import se3
 from realsim.registration.odometry.faults import differences
 from realsim.registration.odometry.pairs import Edge, PairMeter
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -82,7 +79,7 @@ def suspects(Ts_world_cam: Array, edges: Sequence[Edge], config: MismatchConfig)
 def find_mismatches(
     meter: PairMeter, Ts_world_cam: Array, edges: Sequence[Edge], angles: Array,
     config: MismatchConfig,
-) -> tuple[tuple[Mismatch, ...], Ints]:  # fmt: skip
+) -> tuple[tuple[Mismatch, ...], Int64]:  # fmt: skip
     """Return the images at wrong poses, and the pose (F,) that fits each; -1 = none is left.
 
     Args:
@@ -114,7 +111,7 @@ def find_mismatches(
 def _singles(
     doubted: Sequence[int], meter: PairMeter, Ts: Array, angles: Array, fits: float,
     config: MismatchConfig,
-) -> tuple[tuple[Mismatch, ...], Ints]:  # fmt: skip
+) -> tuple[tuple[Mismatch, ...], Int64]:  # fmt: skip
     """Return the doubted images that fit other poses, one by one, and every view's pose (F,)."""
     poses = np.arange(len(Ts))
     for k in doubted:

@@ -4,16 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.clouds import fit_plane_ransac, refine_plane
 from realsim.records import SupportPlane
 from realsim.registration.odometry.kiss import FitConfig, LocalMap, thin_points
 from realsim.registration.views import ViewPoints
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -32,31 +32,29 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32, Int64
 from realsim.compiled import njit
 from realsim.geometry import se3
-from realsim.geometry.normal_equations import Places, System, add_row
+from realsim.geometry.normal_equations import System, add_row
 from realsim.geometry.robust import tukey
 from realsim.registration.body import Body
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
 HAND_EYE, BIAS, TABLE = slice(0, 6), slice(6, 8), slice(8, 11)
 """Where shared unknowns stand; the objects follow, six each."""
 OBJECTS = 11
 TABLE_ROWS = (0, 1, 5)
 """Of the table's twist: turns about its x and y, shift along its z."""
-BIAS_AT: Places = np.arange(BIAS.start, BIAS.stop)
-TABLE_AT: Places = np.arange(TABLE.start, TABLE.stop)
-HAND_EYE_AT: Places = np.arange(HAND_EYE.start, HAND_EYE.stop)
+BIAS_AT: Int64 = np.arange(BIAS.start, BIAS.stop)
+TABLE_AT: Int64 = np.arange(TABLE.start, TABLE.stop)
+HAND_EYE_AT: Int64 = np.arange(HAND_EYE.start, HAND_EYE.stop)
 BLOCK = 8
 """Columns of a block: twist and bias. A ninth is the logarithm of the body's size."""
 LEAST_ALONG = 0.15
 """Least cosine between ray and normal at which the ray is followed to the surface."""
 
 
-def object_at(k: int) -> Places:
+def object_at(k: int) -> Int64:
     """Return the places (6,) of an object's twist among the shared unknowns."""
     return np.arange(OBJECTS + 6 * k, OBJECTS + 6 * k + 6)
 
@@ -64,7 +62,7 @@ def object_at(k: int) -> Places:
 @njit
 def add_blocks(
     surface: tuple[Array, Array, Array],
-    views: Ints,
+    views: Int32,
     frame: tuple[Array, Array, Array],
     precision: tuple[Array, Array],
     system: tuple[Array, Array],
@@ -138,10 +136,10 @@ def fill_row(
 @njit
 def add_offsets(
     surface: tuple[Array, Array, Array],
-    views: Ints,
+    views: Int32,
     frame: tuple[Array, Array, Array],
     weights: Array,
-    patches: Places,
+    patches: Int64,
     system: tuple[Array, Array, Array],
 ) -> None:
     """Add what the points say of offsets of the surface: r - delta of the patch a point lies in.
@@ -180,7 +178,7 @@ class Offsets:
     """(K,) diagonal: a point lies in one patch."""
     right: Array
     """(K,)."""
-    at: Places
+    at: Int64
     """(K,) places among the shared unknowns."""
 
 
@@ -194,11 +192,11 @@ class Blocks:
     """(V, n)."""
     Ms: Array
     """(V, 4, 4) T_body_cam, the body's frame moved to its centre."""
-    own: Places
+    own: Int64
     """Places of the body's own unknowns among the shared ones."""
     rows: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
     """Which components of the twist these are."""
-    further: Places = field(default_factory=BIAS_AT.copy)
+    further: Int64 = field(default_factory=BIAS_AT.copy)
     """(n - 6,) places of the further columns."""
     offsets: Offsets | None = None
     """None = the surface is as the model says."""
@@ -252,7 +250,7 @@ def _add(system: System, blocks: Blocks) -> None:
         B[:, at] += np.swapaxes(ck, 1, 2)
 
 
-def _couple(A: Array, left: Places, right: Places, value: Array) -> None:
+def _couple(A: Array, left: Int64, right: Int64, value: Array) -> None:
     """Add a piece of a symmetric matrix on both sides of its diagonal."""
     A[np.ix_(left, right)] += value
     A[np.ix_(right, left)] += value.T

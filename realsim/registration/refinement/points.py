@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Int64, Mask
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.distance_field import sample
@@ -17,9 +17,6 @@ from realsim.registration.refinement.config import PointConfig
 from realsim.registration.refinement.equations import State
 from realsim.registration.views import ViewPoints
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Ints = NDArray[np.int32]
 NOBODY, TABLE = -1, -2
 
 
@@ -29,7 +26,7 @@ class AllPoints:
 
     points: Array32
     """(N, 3) in their camera's axes, as measured [m]."""
-    views: Ints
+    views: Int32
     """(N,) which view (its place in the list)."""
     area_px: Array
     """(V,) pixels that each point of a view stands for."""
@@ -41,7 +38,7 @@ class Owned:
 
     points: Array
     """(N, 3) in their camera's axes, as measured [m]."""
-    views: Ints
+    views: Int32
     """(N,)."""
     area_px: Array
     """(N,) pixels that each stands for, those left out for it included."""
@@ -59,11 +56,11 @@ def join_views(views: Sequence[ViewPoints]) -> AllPoints:
 @njit
 def _sorted_in(
     points: Array32,
-    views: Ints,
+    views: Int32,
     cameras: Array,
     bias: tuple[float, float],
     spheres: tuple[Array, Array, Array],
-) -> tuple[Array32, NDArray[np.bool_], Ints, NDArray[np.int64]]:
+) -> tuple[Array32, Mask, Int32, Int64]:
     """Return points in world, which are around a body, and each body's candidates.
 
     Args:
@@ -121,12 +118,12 @@ def _sorted_in(
 
 @njit
 def _claim(
-    lattice: tuple[NDArray[np.float32], Array, float],
+    lattice: tuple[Array32, Array, float],
     world: Array32,
-    index: Ints,
+    index: Int32,
     T_obj_world: Array,
     number: int,
-    nearest: tuple[Array32, Ints],
+    nearest: tuple[Array32, Int32],
 ) -> None:
     """Give a body the points that are nearer to it than to those before.
 
@@ -201,7 +198,7 @@ def assign_views(
     return own, _thinned(points, table, most)
 
 
-def _thinned(points: AllPoints, mine: NDArray[np.bool_], most: int) -> Owned:
+def _thinned(points: AllPoints, mine: Mask, most: int) -> Owned:
     """Return the points where `mine`, every so many of them."""
     index = np.flatnonzero(mine)
     every = max(1, -(-len(index) // most))
@@ -214,7 +211,7 @@ def _thinned(points: AllPoints, mine: NDArray[np.bool_], most: int) -> Owned:
 
 
 def exact_residuals(
-    body: Body, points: Array, views: Ints, Ms: Array, eyes: Array
+    body: Body, points: Array, views: Int32, Ms: Array, eyes: Array
 ) -> tuple[Array, Array, Array]:
     """Return what `seen_distances` does, from the triangles: for walls thinner than its cells.
 

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.normal_equations import (
@@ -55,7 +55,6 @@ from realsim.registration.refinement.points import (
 )
 from realsim.registration.views import ViewPoints
 
-Array = NDArray[np.float64]
 LEAST_SIGMA = (np.radians(1e-3), 1e-5)
 """Least prior 1-sigma of a turn [rad] and a shift [m]: nothing is perfect."""
 FIXED = 1e-9

@@ -9,15 +9,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.registration.body import Body
 from realsim.registration.refinement.equations import HAND_EYE_AT, centre_pose, object_at
 from realsim.registration.refinement.refine import Refined
 
-Array = NDArray[np.float64]
 PIXEL_SAMPLES = 40
 """Points of the surface over which the pixel uncertainty is averaged."""
 

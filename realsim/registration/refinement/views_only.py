@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.robust import mad_sigma, tukey_weights
@@ -24,7 +24,6 @@ from realsim.registration.evidence import DepthNoise
 from realsim.registration.refinement.config import CameraPrior, NoiseConfig
 from realsim.registration.views import ViewPoints
 
-Array = NDArray[np.float64]
 GAPS = 3.0
 """A partner may be so many spacings of its surface's points away."""
 
@@ -76,7 +75,7 @@ class RefinedViews:
     """(V, 6, 6) of the cameras' right perturbations, rotation first [rad, m]."""
     view_sigma: tuple[float, float]
     """1-sigma of the views' own errors as found [deg, mm]."""
-    overlaps: NDArray[np.int64]
+    overlaps: Int64
     """(V,) number of views each was compared with; 0 = it kept the robot's word but for the
     hand-eye."""
     misfit_m: float
@@ -96,7 +95,7 @@ class _Surface:
     """(N,) 1-sigma along the normal [m]."""
     tree: Any
     """KD-tree of the points; None = there are none."""
-    few: NDArray[np.int64]
+    few: Int64
     """Those that are compared with other views."""
     spacing_m: float
     """Typical distance of neighbours [m]."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, SupportPlane
@@ -30,13 +30,7 @@ from realsim.registration.search.peel import ExchangeConfig, PeelConfig
 from realsim.registration.search.polish import ContrastConfig, PolishConfig
 from realsim.registration.search.records import Region, Wanted
 from realsim.registration.search.sameness import make_sameness
-from realsim.registration.search.scoring import (
-    Array32,
-    Canvas,
-    ScoreConfig,
-    make_canvas,
-    without_far,
-)
+from realsim.registration.search.scoring import Canvas, ScoreConfig, make_canvas, without_far
 from realsim.registration.search.selection import SelectionConfig
 from realsim.registration.search.templates import (
     ModelTemplates,
@@ -44,8 +38,6 @@ from realsim.registration.search.templates import (
     model_templates,
 )
 from realsim.registration.views import ViewPoints, world_cloud
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -246,7 +238,7 @@ def _shown(
 
 
 def resting_starts(
-    bench: Bench, obj_id: int, region: Region | None, taken: NDArray[np.bool_] | None = None
+    bench: Bench, obj_id: int, region: Region | None, taken: Mask | None = None
 ) -> list[tuple[Array, str]]:
     """Return where a model may rest on the table: poses (4, 4) and their names."""
     found = match_templates(

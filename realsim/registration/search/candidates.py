@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int64
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.distance_field import sample
@@ -18,7 +18,7 @@ from realsim.records import SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.evidence import Cloud, DepthNoise, average_cloud, without_table
 from realsim.registration.search.sameness import Sameness, distinct
-from realsim.registration.search.scoring import Array32, Canvas, Render, Score, render, score
+from realsim.registration.search.scoring import Canvas, Render, Score, render, score
 from realsim.registration.solver import (
     LEAST_POINTS,
     SolverConfig,
@@ -26,8 +26,6 @@ from realsim.registration.solver import (
     accumulate_points,
 )
 from realsim.registration.views import ViewPoints, world_cloud
-
-Array = NDArray[np.float64]
 
 
 def quick_fit(
@@ -62,7 +60,7 @@ def quick_fit(
 
 @njit
 def _fit(
-    lattice: tuple[NDArray[np.float32], Array, float],
+    lattice: tuple[Array32, Array, float],
     T: Array,
     cloud: tuple[Array, Array, Array],
     rules: Array,
@@ -272,8 +270,8 @@ def _near(
     T: Array,
     center: Array,
     limit: tuple[float, float],
-    lattice: tuple[NDArray[np.float32], Array, float],
-) -> NDArray[np.int64]:
+    lattice: tuple[Array32, Array, float],
+) -> Int64:
     """Return the indices of points within the radius of the centre and near the surface."""
     grid, origin, cell = lattice
     radius, margin = limit

@@ -13,9 +13,7 @@ contrast                 near-symmetric poses against each other
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, ObjectModel, SupportPlane
 from realsim.registration.evidence import DepthFrame, DepthNoise
@@ -36,8 +34,6 @@ from realsim.registration.search.state import Search, exchange_places, seek_unsu
 from realsim.registration.views import ViewPoints
 
 __all__ = ["FindConfig", "find_objects"]
-
-Array = NDArray[np.float64]
 
 
 def find_objects(  # noqa: PLR0913 - the stage's inputs, all of them needed

@@ -9,16 +9,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int64, Mask
 from realsim.compiled import njit
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.registration.evidence import Cloud
-
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -65,7 +62,7 @@ class HeightGrid:
     cell_m: float
     """Edge of a cell [m]."""
 
-    def cells(self, xy: Array) -> NDArray[np.int64]:
+    def cells(self, xy: Array) -> Int64:
         """Return the cells (..., 2) in which points (..., 2) of the table's frame [m] lie."""
         return np.floor((xy - self.origin) / self.cell_m).astype(np.int64)
 
@@ -192,8 +189,6 @@ def _top(z: Array32, rule: tuple[float, float, float]) -> float:
 
 if TYPE_CHECKING:
     from realsim.registration.search.matching import MatchConfig
-Mask = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 UNKNOWN_M = 1e3
 """Height that stands for 'never measured' [m]."""
 OCCUPIED_M = 10.0
@@ -253,7 +248,7 @@ def _standing(own: Array32, config: "MatchConfig") -> Mask:
     return above & (uniform_filter(above.astype(np.float32), 3) > 0.5)
 
 
-def _box(standing: Mask, margin: int) -> tuple[Ints, Ints]:
+def _box(standing: Mask, margin: int) -> tuple[Int64, Int64]:
     """Return the first and the last cell (2,), exclusive, of what stands, and a margin around."""
     low, high = np.zeros(2, np.int64), np.zeros(2, np.int64)
     for k in range(2):

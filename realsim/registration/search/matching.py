@@ -11,8 +11,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int64, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import SupportPlane
@@ -21,10 +21,6 @@ from realsim.registration.search.matching_kernels import climbed, correlated, ma
 from realsim.registration.search.records import Hypothesis, Region
 from realsim.registration.search.templates import ModelTemplates, turned
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 CLIMB_HALVINGS = 3
 """The steps of the climb are halved so often: 3 mm to 0.4 mm, 5 deg to 0.6 deg."""
 
@@ -114,14 +110,14 @@ class MatchConfig:
 class _Candidates:
     """Placed templates; N of them."""
 
-    pose: Ints
+    pose: Int64
     """(N,) resting pose."""
     place: Array
     """(N, 3) x and y of the reference point in the table's frame [m], yaw [rad]."""
     score: Array
     """(N,)."""
 
-    def select(self, index: Ints) -> "_Candidates":
+    def select(self, index: Int64) -> "_Candidates":
         """Return the candidates of these numbers."""
         return _Candidates(pose=self.pose[index], place=self.place[index], score=self.score[index])
 
@@ -199,7 +195,7 @@ def _searched(
     # Half a template may lie outside of what was measured.
     rows, columns = (maps.pad + np.arange(0, n, config.step_cells) for n in inner)
     x, y = (maps.origin[k] + (c + 0.5) * maps.cell for k, c in enumerate((rows, columns)))
-    poses: list[Ints] = [np.zeros(0, np.int64)]
+    poses: list[Int64] = [np.zeros(0, np.int64)]
     places: list[Array] = [np.zeros((0, 3))]
     scores: list[Array] = [np.zeros(0)]
     for d in range(len(templates.rotations)):
@@ -295,7 +291,7 @@ def _least_angles(Rs: Array, R: Array, symmetries: Array) -> Array:
 
 
 def _distinct(
-    Ts: Array, order: Ints, templates: ModelTemplates, config: MatchConfig, most: int
+    Ts: Array, order: Int64, templates: ModelTemplates, config: MatchConfig, most: int
 ) -> list[int]:
     """Return the numbers of the first poses that differ, modulo symmetry."""
     centers = se3.transform(Ts, templates.center_obj[None])[:, 0]

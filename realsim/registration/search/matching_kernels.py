@@ -7,16 +7,13 @@ for 'never measured', 10 m for 'another object'. A rule is what `rule_of` makes.
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int64, Mask
 from realsim.compiled import njit
 
 if TYPE_CHECKING:
     from realsim.registration.search.matching import MatchConfig
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Ints = NDArray[np.int64]
 Rule = tuple[np.float32, ...]
 ZERO, ONE = np.float32(0), np.float32(1)
 """Everything is single precision: twice as fast, and heights are known to 0.1 mm at best."""
@@ -60,7 +57,7 @@ def _goes_on(h: np.float32, measured: np.float32, rule: Rule) -> np.float32:
 
 @njit(error_model="numpy")
 def _score_at(
-    flat: Array32, base: int, shifts: Ints, heights: Array32, around: int, rule: Rule
+    flat: Array32, base: int, shifts: Int64, heights: Array32, around: int, rule: Rule
 ) -> float:
     """Return the score of a template at one cell; NOTHING if it was given up.
 
@@ -98,9 +95,9 @@ def _score_at(
 @njit
 def correlated(
     maps: Array32,
-    rows: Ints,
-    columns: Ints,
-    wanted: NDArray[np.bool_],
+    rows: Int64,
+    columns: Int64,
+    wanted: Mask,
     points: Array32,
     outside: Array32,
     yaws: Array,
@@ -141,7 +138,7 @@ def correlated(
 
 
 @njit
-def maxima(volume: Array32, least: float, slack: float) -> Ints:
+def maxima(volume: Array32, least: float, slack: float) -> Int64:
     """Return the local maxima (N, 3) of a volume (Y, R, C) that is cyclic in its first axis.
 
     Of neighbours that are equal the first one counts; those at another yaw may be greater by
@@ -177,7 +174,7 @@ def maxima(volume: Array32, least: float, slack: float) -> Ints:
 def climbed(
     maps: Array32,
     frame: Array,
-    pose: Ints,
+    pose: Int64,
     places: Array,
     points: Array32,
     outside: Array32,
@@ -238,7 +235,7 @@ def _score_near(
     frame: Array,
     maps: Array32,
     place: Array,
-    template: tuple[Array32, Array32, Ints, int],
+    template: tuple[Array32, Array32, Int64, int],
     rule: Rule,
 ) -> float:
     """Return the score of a template at any place; NOTHING where it leaves the maps."""

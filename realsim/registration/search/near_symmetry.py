@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.distance_field import DistanceField, raycasting_scene
@@ -26,7 +26,6 @@ from realsim.records import ObjectModel
 from realsim.registration.search.templates import content_key, is_ball
 from realsim.store.arrays_on_disk import read_arrays, write_arrays
 
-Array = NDArray[np.float64]
 GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 PARALLEL = 0.998
 """Cosine from which on two axes are one (3.6 deg)."""

@@ -9,16 +9,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.geometry import se3
 from realsim.registration.evidence import Cloud
 from realsim.registration.search.candidates import Candidate, Sought
 from realsim.registration.search.height_grid import HeightGrid
 from realsim.registration.search.polish import NOBODY, owners
 from realsim.registration.search.scoring import Score
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -77,9 +75,7 @@ class ExchangeConfig:
     """Of the random turns."""
 
 
-def taken_cells(
-    grid: HeightGrid, T_table_world: Array, cloud: Cloud, explained: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def taken_cells(grid: HeightGrid, T_table_world: Array, cloud: Cloud, explained: Mask) -> Mask:
     """Return the cells (X, Y) of the grid whose top point is explained by sure objects."""
     p = se3.transform(T_table_world, cloud.points)
     cells = grid.cells(p[:, :2])
@@ -97,7 +93,7 @@ def taken_cells(
 
 def explained_points(
     cloud: Cloud, placed: Sequence[tuple[Sought, Candidate]], config: PeelConfig
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Return which points (N,) lie on one of these objects."""
     Ts = [c.T_world_obj for _, c in placed]
     return owners(cloud, [s for s, _ in placed], Ts, config.explained_m) != NOBODY

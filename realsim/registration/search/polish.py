@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int64
 from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
 from realsim.registration.evidence import Cloud
@@ -24,7 +24,6 @@ from realsim.registration.search.candidates import (
 )
 from realsim.registration.search.sameness import distinct
 from realsim.registration.search.scoring import (
-    Array32,
     Canvas,
     Render,
     ScoreConfig,
@@ -36,7 +35,6 @@ from realsim.registration.search.scoring import (
 )
 from realsim.registration.solver import Stage
 
-Array = NDArray[np.float64]
 NOBODY = -1
 """Owner of a point that is near to no object."""
 
@@ -55,9 +53,7 @@ class PolishConfig:
     """Share of the rendered gain that must remain."""
 
 
-def owners(
-    cloud: Cloud, soughts: Sequence[Sought], Ts: Sequence[Array], reach_m: float
-) -> NDArray[np.int64]:
+def owners(cloud: Cloud, soughts: Sequence[Sought], Ts: Sequence[Array], reach_m: float) -> Int64:
     """Return for every point (N,) the place of the object whose surface is nearest; -1 = none.
 
     Args:
@@ -83,8 +79,8 @@ def _claim(
     T: Array,
     center: Array,
     radius: float,
-    lattice: tuple[NDArray[np.float32], Array, float],
-    state: tuple[Array, NDArray[np.int64]],
+    lattice: tuple[Array32, Array, float],
+    state: tuple[Array, Int64],
     number: int,
 ) -> None:
     """Give an object the points that are nearer to it than to those before it."""

@@ -11,12 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import ObjectModel
 
-Array = NDArray[np.float64]
 PARALLEL = 0.99
 """Cosine above which two continuous axes are one."""
 CHUNK = 4096

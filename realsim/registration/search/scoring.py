@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Int64
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.camera import project, ray_table
@@ -25,9 +25,6 @@ from realsim.registration.evidence import DepthFrame, DepthNoise
 from realsim.registration.table_planes import table_depth
 from realsim.registration.views import SampleConfig, sample_view
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Cells = NDArray[np.int32]
 FAR = np.float32(1e6)
 """Depth of a buffer's cell in which nothing is rendered [m]."""
 BORDER = 1
@@ -89,7 +86,7 @@ class Canvas:
 class Render(NamedTuple):
     """Where one pose is seen, were there nothing but the table: only cells that are compared."""
 
-    cells: Cells
+    cells: Int32
     """(N,) cells of the canvas."""
     z: Array32
     """(N,) depth of the surface [m]."""
@@ -204,7 +201,7 @@ def compose(buffer: Array32, rendered: Sequence[Render]) -> Array32:
     return out
 
 
-def likelihoods(canvas: Canvas, buffer: Array32, cells: Cells) -> Array:
+def likelihoods(canvas: Canvas, buffer: Array32, cells: Int32) -> Array:
     """Return l (N,) of the buffer at cells (N,); 0 where nothing is rendered or compared."""
     return _likelihoods(cells, buffer, _known(canvas), canvas.front_penalty)
 
@@ -214,7 +211,7 @@ def _known(canvas: Canvas) -> tuple[Array32, Array32, Array32, Array32]:
     return canvas.measured, canvas.tau, canvas.table, canvas.table_likelihood
 
 
-def _boxes(canvas: Canvas, body: Body, Ts_obj_cam: Array) -> NDArray[np.int64]:
+def _boxes(canvas: Canvas, body: Body, Ts_obj_cam: Array) -> Int64:
     """Return the lattice boxes (F, 4) top, bottom, left, right (exclusive) that hold the body."""
     low, high = body.model.mesh.bounds
     unit = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
@@ -236,8 +233,8 @@ def _boxes(canvas: Canvas, body: Body, Ts_obj_cam: Array) -> NDArray[np.int64]:
 
 @njit
 def _box_rays(
-    boxes: NDArray[np.int64], table: Array32, Ts_obj_cam: Array, measured: Array32
-) -> tuple[Array32, Cells]:
+    boxes: Int64, table: Array32, Ts_obj_cam: Array, measured: Array32
+) -> tuple[Array32, Int32]:
     """Return rays (N, 6) in the object's frame, and their cells, of the boxes' compared cells."""
     height, width = table.shape[:2]
     most = 0
@@ -272,7 +269,7 @@ def _likelihood(m: float, z: float, tau: float, front: float) -> float:
 
 @njit
 def _likelihoods(
-    cells: Cells, buffer: Array32, known: tuple[Array32, Array32, Array32, Array32], front: float
+    cells: Int32, buffer: Array32, known: tuple[Array32, Array32, Array32, Array32], front: float
 ) -> Array:
     """Return l (N,) of the buffer at cells."""
     measured, tau, table, table_likelihood = known
@@ -289,7 +286,7 @@ def _likelihoods(
 
 @njit
 def _gain(
-    cells: Cells,
+    cells: Int32,
     z: Array32,
     buffer: Array32,
     known: tuple[Array32, Array32, Array32, Array32],

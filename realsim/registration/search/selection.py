@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from realsim.arrays import Array32
 from realsim.registration.search.candidates import Candidate
-from realsim.registration.search.scoring import Array32, Canvas, Score, compose, score
+from realsim.registration.search.scoring import Canvas, Score, compose, score
 
 Clash = Callable[[int, int], bool]
 """Tells of two poses of the pool whether they cannot both be."""

@@ -4,15 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32
 from realsim.geometry import se3
 from realsim.registration.search import peel
 from realsim.registration.search.bench import Bench, fitted_candidates, resting_starts
 from realsim.registration.search.candidates import Candidate, Fused, Sought, inside_share
 from realsim.registration.search.polish import owners
 from realsim.registration.search.records import Region, Wanted
-from realsim.registration.search.scoring import Array32, compose
+from realsim.registration.search.scoring import compose
 from realsim.registration.search.selection import Selection, Slot, select, select_any, select_pair
 
 
@@ -79,9 +79,6 @@ class Search:
             else:
                 free.setdefault(w.obj_id, []).append(n)
         return out + [(obj_id, None, ns) for obj_id, ns in free.items()]
-
-
-Array = NDArray[np.float64]
 
 
 def seek_unsure(search: Search, selection: Selection) -> Selection:

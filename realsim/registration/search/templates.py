@@ -11,8 +11,8 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int64, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import hull_vertices, symmetry_transforms
@@ -21,8 +21,6 @@ from realsim.records import ObjectModel
 from realsim.rendering.rays import PlacedMesh, RayScene
 from realsim.store.arrays_on_disk import read_arrays, write_arrays
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 VERSION = 1
 """Of the files' content; older files are computed again."""
 
@@ -77,7 +75,7 @@ class ModelTemplates:
     stand for all."""
     outside: Array32
     """(D, L, 3) around the footprint; z = height of the nearest point of the top surface [m]."""
-    yaw_counts: NDArray[np.int64]
+    yaw_counts: Int64
     """(D,) how many yaws differ..."""
     yaw_steps: Array
     """(D,) ...and their step [rad]."""
@@ -235,13 +233,11 @@ def _sampled(
     return -reference, points.astype(np.float32), outside.astype(np.float32)
 
 
-def _around(
-    cell: Array, top: Array, hit: NDArray[np.bool_], pitch: float, c: TemplateConfig
-) -> Array:
+def _around(cell: Array, top: Array, hit: Mask, pitch: float, c: TemplateConfig) -> Array:
     """Return points (N, 3) just outside of a footprint, z = height of its nearest point."""
     from scipy.ndimage import distance_transform_edt
 
-    found: tuple[Array, NDArray[np.int64]] = distance_transform_edt(~hit, return_indices=True)  # pyright: ignore[reportAssignmentType]
+    found: tuple[Array, Int64] = distance_transform_edt(~hit, return_indices=True)  # pyright: ignore[reportAssignmentType]
     distance, nearest = found[0] * pitch, found[1]
     ring = (distance >= c.outside_low_m) & (distance <= c.outside_high_m)
     return np.concatenate([cell[ring], top[tuple(nearest[:, ring])][:, None]], -1)

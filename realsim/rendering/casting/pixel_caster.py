@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Array32, Int32, Mask
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.casting.triangle_rays import (
@@ -20,10 +21,6 @@ from realsim.rendering.casting.triangle_rays import (
 )
 from realsim.rendering.rays import PlacedMesh
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
-Mask = NDArray[np.bool_]
 NOT_WANTED = np.zeros((0, 0), np.bool_)
 """In place of a mask that nobody asked for."""
 INSIDE_SHARE = 0.5
@@ -228,7 +225,6 @@ def body_of(mesh: Mesh) -> Body:
     return Body(np.ascontiguousarray(vertices), faces.astype(np.int32), mesh.bounds, solid)
 
 
-Array32 = NDArray[np.float32]
 CANVAS = 1
 """Image sizes that the canvas reaches beyond each border: BOP's 3x canvas."""
 BLOCK_PX = 128

@@ -1,14 +1,9 @@
 """Maps of the surfaces that a view sees: where on its object a pixel lies, and how it is turned."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Int64, Mask
 from realsim.compiled import njit
-
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
-Mask = NDArray[np.bool_]
 
 
 @njit
@@ -17,7 +12,7 @@ def surface_maps(
     hits: tuple[Array32, Int32, Int32],
     Ts_obj_cam: Array,
     normals: Array32,
-    starts: NDArray[np.int64],
+    starts: Int64,
     labelled: Mask,
     wanted: int,
 ) -> Array32:

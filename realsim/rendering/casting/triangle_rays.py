@@ -10,15 +10,11 @@ by rays, at twice the digits.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Mask
 from realsim.compiled import njit
 from realsim.geometry.lens_loops import pixel
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
-Mask = NDArray[np.bool_]
 Placed = tuple[Array, Array, Int32]
 Sides = tuple[float, float, float, float, float, float, float, float, float]
 Box = tuple[float, float, float, float]

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from realsim.arrays import Array, Array32, Mask
+
 LAGS = 16
 """Distances that are looked at [px]."""
 TILE_PX = 64

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array, Array32, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.autocovariance import (
@@ -43,8 +44,6 @@ from realsim.rendering.depth_sensors.plane_faults import (
 from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
 from realsim.rendering.depth_sensors.statistics import Step, disparity_step
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 HEAVY_TAILS = 1.15
 """Typical noise that differs by more than this factor from the standard deviation's."""
 
@@ -288,7 +287,7 @@ def _rounding(step_px: float, unit_m: float, fB: float, planes: Sequence[PlaneVi
     return (step_px**2 + float(np.mean(np.square(by_unit)))) / 12
 
 
-def _frame(name: str, plane: PlaneView, fast: NDArray[np.float32], fB: float) -> FrameFit:
+def _frame(name: str, plane: PlaneView, fast: Array32, fB: float) -> FrameFit:
     angles = plane.angle_deg[plane.area]
     sigma = float(np.nanstd(fast))
     area = int(plane.area.sum())

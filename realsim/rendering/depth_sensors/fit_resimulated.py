@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array32, Mask
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.plane import PlaneView
 from realsim.rendering.depth_sensors.plane_faults import Estimate
 from realsim.rendering.depth_sensors.statistics import local_noise
 
-Mask = NDArray[np.bool_]
 MOST_FRAMES = 3
 """Frames that are simulated: resampling is the same in all."""
 LEAST_PITCH = 1.15
@@ -55,7 +55,7 @@ def scaled(estimate: Estimate, ratio: float) -> Estimate:
 
 def _resimulated(
     model: DepthSensorModel, plane: PlaneView, intrinsics: CameraIntrinsics, seed: int
-) -> NDArray[np.float32]:
+) -> Array32:
     """Return what the model makes of a plane that was found."""
     exact = np.where(plane.area, intrinsics.fx * model.baseline_m / plane.disparity, 0)
     plain = replace(model, occlusion=False, bias_px=0.0)

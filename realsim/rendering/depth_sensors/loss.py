@@ -7,15 +7,13 @@ from place to place: a normal distribution in the logarithm of the signal.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Mask, UInt8
 from realsim.geometry.colors import light_of_bytes, luminance
 from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Material
 from realsim.rendering.rays import PlacedMesh
 
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 DARK_REFLECTANCE, DARK_SPREAD = 0.03, 0.6
 """Linear reflectance at which half of a dark surface is lost, and how soft that limit is [ln]:
 sRGB 48 of 255, black plastic and rubber, which projected patterns show in patches."""
@@ -135,14 +133,14 @@ def look_of(placed: PlacedMesh) -> Material:
     return Material(base_color=(r, g, b), roughness=look.roughness, metallic=look.metallic)
 
 
-def _mean_color(material: Material) -> NDArray[np.float64]:
+def _mean_color(material: Material) -> Array:
     """Return the linear base colour (3,), averaged over the image where there is one."""
     base = np.array(material.base_color)
     image = material.base_color_image
     return base if image is None else base * _mean_srgb(image)
 
 
-def _mean_srgb(values: NDArray[np.uint8]) -> NDArray[np.float64]:
+def _mean_srgb(values: UInt8) -> Array:
     """Return the mean linear light (3,) of 8-bit sRGB values (..., 3)."""
     flat = values.reshape(-1, 3)
     flat = flat[:: max(1, len(flat) // TEXELS)]

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.loss import cosine_of_view
@@ -21,9 +21,6 @@ from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.shadow import require_same_size, shadow_mask
 from realsim.rendering.rays import BACKGROUND, RayScene
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 LARGEST_LOSS = 0.95
 """More than this share is not given to a material: a whole object without depth was no measure."""
 ROUNDS = 4
@@ -43,7 +40,7 @@ class KnownView:
     """(H, W) the sensor's depth [m], 0 = no measurement."""
     exact_m: Array32
     """(H, W) rendered depth [m], 0 = unknown there."""
-    ids: NDArray[np.int32]
+    ids: Int32
     """(H, W) instance, -1 = background."""
     kinds: Mapping[int, str]
     """What each instance is: the same name in several views is the same material."""

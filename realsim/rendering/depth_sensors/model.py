@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Array32, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.loss import (
@@ -33,9 +34,6 @@ from realsim.rendering.depth_sensors.profiles import DepthProfile, SensorRecord,
 from realsim.rendering.depth_sensors.shadow import half_occluded, require_same_size, shadow_mask
 from realsim.rendering.rays import RayScene
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 ASSUMED_BY_PATTERN: dict[str, dict[str, float]] = {
     "none": {},
     "dots": {"disparity_noise_px": 0.06, "correlation_px": 2.5},

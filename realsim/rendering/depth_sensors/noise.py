@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from realsim.arrays import Array32
+
 WARP_SHARE = 1 / 8
 """Radius of the slow part of the fixed pattern, as a share of the image's width."""
 STRONGEST_SHRINK = 4

@@ -7,17 +7,15 @@ plane is found, and its residual taken, in disparity, where a stereo sensor's no
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Array32, Mask
 from realsim.errors import InputError
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.shadow import require_same_size
 from realsim.rendering.depth_sensors.statistics import require_metres
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 BENT_SHARE = 0.35
 """Pixels between one and two tolerances from the best plane, as a share of those within one, from
 which on the surface is bent: a sphere has half as many, noise one in 16 000."""

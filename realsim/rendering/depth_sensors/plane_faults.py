@@ -6,8 +6,8 @@ from math import isfinite
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int64
 from realsim.rendering.depth_sensors.plane import PlaneView
 
 
@@ -29,7 +29,6 @@ class Estimate:
         return asdict(self) | {"uncertainty": known}
 
 
-Array = NDArray[np.float64]
 LEAST_LINES = 25
 """Pixels of a row or column that its mean needs."""
 STRIPE_PX = 60.0
@@ -102,7 +101,7 @@ def _without_bowl(plane: PlaneView) -> Array:
     return _bowl(plane)[1]
 
 
-def without_bands(plane: PlaneView, bands: Mapping[str, Estimate]) -> NDArray[np.float32]:
+def without_bands(plane: PlaneView, bands: Mapping[str, Estimate]) -> Array32:
     """Return the residual (H, W) [px] less the mean of each line, where there are stripes."""
     r = _without_bowl(plane)
     for name, axis in (("column_band_px", 0), ("row_band_px", 1)):
@@ -138,7 +137,6 @@ def warp_of(planes: Sequence[PlaneView]) -> Estimate:
     return Estimate(sigma, spread / (2 * sigma), True)
 
 
-Array = NDArray[np.float64]
 BIN_DEG = 3.0
 """Width of a bin of the angle between ray and normal [deg]."""
 LEAST_PX = 2000
@@ -155,7 +153,7 @@ class HoleCount:
 
     angle_deg: Array
     """(N,) middle of each bin [deg]."""
-    pixels: NDArray[np.int64]
+    pixels: Int64
     """(N,) pixels of the planes in it."""
     share: Array
     """(N,) of them that are holes; NaN where there are none."""

@@ -7,14 +7,12 @@ rows, which knows nothing of what the image does not show.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array, Array32, Mask
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics
 from realsim.rendering.rays import RayScene, rotated
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 LIFT = 3e-4
 """Share of the way to the eye by which rays start above the surface: more than float32 and the
 rendered depth are off (1e-6), less than a sheet of paper at half a metre (0.15 mm)."""

@@ -7,15 +7,13 @@ something. Inverse depth is linear in the pixel on every plane, so noise is meas
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Array32, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.shadow import require_same_size
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 WINDOW_PX = 9
 """Side of the small planes [px]."""
 FLAT_PX = 1.5

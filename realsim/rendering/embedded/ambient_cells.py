@@ -5,15 +5,12 @@ filter that stops at edges; each pixel then takes from the cells of its own surf
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Rows
 from realsim.compiled import njit
 from realsim.rendering.embedded.sky_light import SkyArrays, map_at
 from realsim.rendering.embedded.surface_table import SurfacePoints
 
-Array32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
-Rows = NDArray[np.int64]
 CELL_PX = 2
 """Edge of a cell [px]."""
 FILTER_SLOPE = 0.15
@@ -194,7 +191,7 @@ def spread_cells(
 
 
 @njit(inline="always", error_model="numpy")
-def _add(values: Array32, j: int, w: float, found: NDArray[np.float64]) -> None:
+def _add(values: Array32, j: int, w: float, found: Array) -> None:
     """Add the values of cell j by the weight w."""
     found[0] += w * values[j, 0]
     found[1] += w * values[j, 2]
@@ -207,7 +204,7 @@ def _add_from_afar(
     cells: tuple[SurfacePoints, Int32, Array32],
     pixel: tuple[SurfacePoints, int, int],
     at: tuple[int, int, int, int],
-    found: NDArray[np.float64],
+    found: Array,
 ) -> float:
     """Add what cells further away give to a pixel without one on its surface; return the weight.
 

@@ -6,8 +6,8 @@ gathers those of a window. Nothing here is random: the same view gives the same 
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Int64, Mask
 from realsim.compiled import njit
 from realsim.rendering.embedded.sky_light import (
     SkyArrays,
@@ -19,9 +19,6 @@ from realsim.rendering.embedded.sky_light import (
 from realsim.rendering.embedded.surface_table import SurfaceArrays, SurfacePoints
 from realsim.rendering.embedded.texture_atlas import TextureArrays, color_at, footprint
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
 BUMPS_UNTIL = 0.25
 """Roughness from which reflected rays do not follow the normal image."""
 NEIGHBOUR_OPENNESS = 0.7
@@ -55,7 +52,7 @@ def _axes(x: float, y: float, z: float) -> tuple[float, float, float, float, flo
 def ambient_rays(
     sky: SkyArrays,
     points: SurfacePoints,
-    cells: tuple[NDArray[np.int64], int, int],
+    cells: tuple[Int64, int, int],
     lift: float,
     rays: tuple[Array, Array32, Array32],
 ) -> None:
@@ -103,7 +100,7 @@ def ambient_rays(
 def sun_rays(
     sky: SkyArrays,
     points: SurfacePoints,
-    which: tuple[NDArray[np.int64], NDArray[np.int64], int, int],
+    which: tuple[Int64, Int64, int, int],
     lift: float,
     rays: tuple[Array, Array32],
 ) -> None:
@@ -138,7 +135,7 @@ def sun_rays(
 @njit(error_model="numpy")
 def mirror_rays(
     points: SurfacePoints,
-    rows: NDArray[np.int64],
+    rows: Int64,
     eye: Array,
     lift: float,
     rays: tuple[Array, Array32],
@@ -195,8 +192,8 @@ def face_light(sky: SkyArrays, surfaces: SurfaceArrays, out: Array32) -> None:
 def gather_ambient(
     sky: SkyArrays,
     face_radiance: Array32,
-    rays: tuple[Array32, Array32, Int32, NDArray[np.bool_]],
-    cells: tuple[NDArray[np.int64], int],
+    rays: tuple[Array32, Array32, Int32, Mask],
+    cells: tuple[Int64, int],
     out: Array32,
 ) -> None:
     """Average what the ambient rays of each cell met.

@@ -3,21 +3,18 @@
 from math import gcd
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Int64, Mask
 from realsim.compiled import njit
 from realsim.rendering.embedded.sky_light import SkyArrays, map_at
 from realsim.rendering.embedded.surface_table import SAME_DIRECTION, SurfacePoints
-
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 
 
 @njit(error_model="numpy")
 def world_rays(
     table: Array32,
     camera: tuple[Array, float, float],
-    pixels: NDArray[np.int64],
+    pixels: Int64,
     offsets: Array32,
     scale: float,
 ) -> tuple[Array32, Array32, Array32]:
@@ -60,12 +57,6 @@ def world_rays(
                 along_u[i, k] = scale * (R[k, 0] * ux + R[k, 1] * uy)
                 along_v[i, k] = scale * (R[k, 0] * vx + R[k, 1] * vy)
     return rays, along_u, along_v
-
-
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
-Mask = NDArray[np.bool_]
 
 
 def pixel_lattice(samples: int) -> Array32:
@@ -130,8 +121,8 @@ def busy_pixels(
 
 @njit(error_model="numpy")
 def settle_by_neighbours(
-    geometry: Int32, rows: NDArray[np.int64], size: tuple[int, int], values: Array32
-) -> NDArray[np.int64]:
+    geometry: Int32, rows: Int64, size: tuple[int, int], values: Array32
+) -> Int64:
     """Fill the values of pixels whose neighbours are on their mesh and agree; return the others.
 
     Args:
@@ -169,7 +160,7 @@ def _alike(p: SurfacePoints, i: int, q: SurfacePoints, j: int) -> bool:
 @njit(error_model="numpy")
 def borrow_light(
     sky: SkyArrays,
-    samples: tuple[SurfacePoints, Int32, NDArray[np.int64]],
+    samples: tuple[SurfacePoints, Int32, Int64],
     pixels: tuple[SurfacePoints, Int32, Array32, Array32],
     size: tuple[int, int],
     out: tuple[Array32, Array32],

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Mask, Rows
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import camera
@@ -43,10 +43,6 @@ from realsim.rendering.embedded.surface_table import (
 )
 from realsim.rendering.rays import HitBuffer, PlacedMesh, RayScene
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
-Rows = NDArray[np.int64]
 BLOCK_RAYS = 1 << 18
 """Rays cast at a time: their arrays stay below 30 MB."""
 LIFT_M = 1e-4
@@ -246,9 +242,7 @@ class EnvironmentRenderer:
             met = (rays[1], weights, face, lit)
             bounce_light.gather_ambient(self._sky, self._face_light, met, (of, n), out)
 
-    def _neighbours(
-        self, rays: tuple[Array, Array32]
-    ) -> tuple[Int32, NDArray[np.bool_], HitBuffer]:
+    def _neighbours(self, rays: tuple[Array, Array32]) -> tuple[Int32, Mask, HitBuffer]:
         """Return face in the scene (N,), -1 = sky, whether the sun shines there, and the hits."""
         hits = self._scene.cast(*rays)
         face = np.full(len(hits.t), -1, np.int32)
@@ -355,7 +349,7 @@ def _number_faces(first_face: Rows, geometry: Int32, face: Int32, out: Int32) ->
 
 
 @njit(error_model="numpy")
-def _find_facing(face_light: Array32, face: Int32, out: NDArray[np.bool_]) -> None:
+def _find_facing(face_light: Array32, face: Int32, out: Mask) -> None:
     """Fill whether each face (N,) looks towards the sun."""
     for i in range(len(face)):
         f = face[i]
@@ -382,7 +376,7 @@ def _arrivals(
 @njit(error_model="numpy")
 def _fill_mirrored(
     face_light: Array32,
-    hits: tuple[Int32, NDArray[np.bool_], Array32],
+    hits: tuple[Int32, Mask, Array32],
     rows: Rows,
     out: Array32,
 ) -> None:

@@ -1,11 +1,10 @@
 """Geometry of one face under a ray: where it is met, how it is rounded, how its normal bends."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32
 from realsim.compiled import njit
 
-Array32 = NDArray[np.float32]
 Edges = tuple[float, float, float, float, float, float]
 """The two edges of a face from its first corner [m]."""
 

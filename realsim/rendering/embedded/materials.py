@@ -7,16 +7,14 @@ Reflectances are linear light in [0, 1]. Texture look-ups average over the footp
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, UInt8
 from realsim.errors import InputError
 from realsim.geometry.colors import srgb_decoded, srgb_encoded
 from realsim.records import Mesh
 from realsim.rendering.appearance import Material
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 
-Array32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
 CREASE_COS = float(np.cos(np.radians(30.0)))
 """Faces that meet at a sharper angle keep their edge instead of being shaded as one surface."""
 REMAP_COLUMNS = 4096
@@ -39,7 +37,7 @@ TABLE_ROUGHNESS = 0.62
 class MipTexture:
     """A texture and its successive halvings, looked up by area."""
 
-    def __init__(self, image: NDArray[np.uint8], gamma: float, wrap: bool) -> None:
+    def __init__(self, image: UInt8, gamma: float, wrap: bool) -> None:
         """Build the halvings.
 
         Args:
@@ -139,7 +137,7 @@ def _spectral_noise(rng: np.random.Generator, size: int, fx: float, fy: float) -
 
 
 @lru_cache(maxsize=4)
-def wood_texture(size: int = 1024, seed: int = 7) -> NDArray[np.uint8]:
+def wood_texture(size: int = 1024, seed: int = 7) -> UInt8:
     """Return a tileable picture (size, size, 3) of light wood, its grain along u."""
     rng = np.random.default_rng(seed)
     y = np.arange(size, dtype=np.float32)[:, None] / size
@@ -154,7 +152,7 @@ def wood_texture(size: int = 1024, seed: int = 7) -> NDArray[np.uint8]:
 
 
 @lru_cache(maxsize=4)
-def speckle_texture(size: int = 512, seed: int = 11) -> NDArray[np.uint8]:
+def speckle_texture(size: int = 512, seed: int = 11) -> UInt8:
     """Return a tileable grey picture (size, size, 3) of slight unevenness, mean near 228."""
     rng = np.random.default_rng(seed)
     coarse, fine = _spectral_noise(rng, size, 6.0, 6.0), _spectral_noise(rng, size, 60.0, 60.0)
@@ -233,7 +231,7 @@ def check_projection(number: int, placed: PlacedMesh) -> None:
         )
 
 
-def look_of(number: int, placed: PlacedMesh) -> tuple[Material, NDArray[np.uint8] | None]:
+def look_of(number: int, placed: PlacedMesh) -> tuple[Material, UInt8 | None]:
     """Return the material of a placed mesh and its vertex colours (V, 3), None = they are unused.
 
     Its own material; else the mesh's texture, its vertex colours, wood for the background, or
@@ -281,7 +279,7 @@ def _shared_texture(name: str, gamma: float) -> MipTexture:
     return MipTexture(wood_texture() if name == "wood" else speckle_texture(), gamma, wrap=True)
 
 
-def repeats(uv: NDArray[np.float64]) -> bool:
+def repeats(uv: Array) -> bool:
     """Return whether texture coordinates leave [0, 1], so that the texture must repeat."""
     return bool(uv.min() < -1e-6 or uv.max() > 1 + 1e-6)
 
@@ -299,7 +297,7 @@ def box_uv(mesh: Mesh, period_m: float) -> Array32:
     return (np.take_along_axis(corners, kept[:, None, :], axis=2) / period_m).astype(np.float32)
 
 
-def _texel_density(corners: NDArray[np.float64], uv: Array32, shape: tuple[int, ...]) -> Array32:
+def _texel_density(corners: Array, uv: Array32, shape: tuple[int, ...]) -> Array32:
     """Return texels per metre (F,) of each face: the root of the ratio of the two areas."""
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     texels = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) * shape[0] * shape[1]

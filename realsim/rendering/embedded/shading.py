@@ -7,14 +7,12 @@ surface in a white room is white at any roughness.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32, Int32
 from realsim.compiled import njit
 from realsim.rendering.embedded.sky_light import SkyArrays, lobe_at
 from realsim.rendering.embedded.surface_table import SurfacePoints
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 DIELECTRIC = 0.04
 """Reflectance of plastic, wood and paper seen head on (refractive index 1.5)."""
 MIRROR_UNTIL, MIRROR_FADES = 0.5, 0.2
@@ -72,7 +70,7 @@ def highlight(
 def shade(
     sky: SkyArrays,
     points: SurfacePoints,
-    geometry: NDArray[np.int32],
+    geometry: Int32,
     directions: Array32,
     light: tuple[Array32, Array32, Array32],
     out: Array32,

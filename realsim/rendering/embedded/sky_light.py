@@ -11,13 +11,11 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int64
 from realsim.compiled import njit
 from realsim.rendering.appearance import Environment
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 LOBES = ((0.1, 128), (0.2, 64), (0.3, 64), (0.45, 32), (0.6, 32), (0.8, 16), (1.0, 16))
 """Roughness and rows of the averaged panoramas: a texel is finer than its lobe."""
 MIRROR_ROWS = 512
@@ -39,7 +37,7 @@ class MapStack(NamedTuple):
 
     texels: Array32
     """(T, 3) linear radiance."""
-    layout: NDArray[np.int64]
+    layout: Int64
     """(K, 2) first texel and number of rows; twice as many columns."""
     roughness: Array
     """(K,) roughness of each picture's lobe, ascending from 0; halvings count up from 0."""

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Int64, Rows
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.colors import srgb_decoded
@@ -27,10 +27,6 @@ from realsim.rendering.embedded.texture_atlas import (
 )
 from realsim.rendering.rays import PlacedMesh
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
-Rows = NDArray[np.int64]
 SAME_DIRECTION = 0.98
 """Cosine of normals (11 deg) within which a part of a pixel is what its centre is."""
 WIDEST_FOOTPRINT = 4.0
@@ -40,7 +36,7 @@ WIDEST_FOOTPRINT = 4.0
 class SurfaceArrays(NamedTuple):
     """Faces of all placed meshes one after another, G meshes, F faces."""
 
-    first_face: NDArray[np.int64]
+    first_face: Int64
     """(G + 1,) first face of each mesh."""
     corners: Array32
     """(F, 3, 3) in world, relative to the scene's centre [m]."""
@@ -50,7 +46,7 @@ class SurfaceArrays(NamedTuple):
     """(F, 3, 2) texture coordinates; zeros where there is no image."""
     colors: Array32
     """(C, 3, 3) linear colours of the corners of meshes with vertex colours."""
-    first_color: NDArray[np.int64]
+    first_color: Int64
     """(G,) row of the mesh's first face in `colors`; -1 = none."""
     base: Array32
     """(G, 3) linear base colour."""
@@ -58,7 +54,7 @@ class SurfaceArrays(NamedTuple):
     """(G,)."""
     metallic: Array32
     """(G,)."""
-    images: NDArray[np.int64]
+    images: Int64
     """(G, 3) numbers of the images of base colour, roughness and normals; -1 = none."""
     mean_color: Array32
     """(G, 3) linear base colour, averaged over the mesh: what it sends back to its neighbours."""

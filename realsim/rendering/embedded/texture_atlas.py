@@ -8,13 +8,11 @@ between two halvings, with several probes along the longer side where the surfac
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int64, Mask, UInt8
 from realsim.compiled import njit
 from realsim.geometry.colors import srgb_decoded
 
-Array32 = NDArray[np.float32]
-UInt8 = NDArray[np.uint8]
 MOST_HALVINGS = 16
 SAME_HALVING = 0.25
 """A colour so close to one halving is read from that one alone, else from two."""
@@ -27,11 +25,11 @@ class TextureArrays(NamedTuple):
 
     texels: UInt8
     """(T, 4) texels of all halvings of all images, four values each."""
-    layout: NDArray[np.int64]
+    layout: Int64
     """(I, MOST_HALVINGS, 3) first texel, rows and columns of each halving."""
-    halvings: NDArray[np.int64]
+    halvings: Int64
     """(I,) number of halvings, the image itself included."""
-    wraps: NDArray[np.bool_]
+    wraps: Mask
     """(I,) whether the image repeats; else its border continues."""
 
 
@@ -112,7 +110,7 @@ class TextureAtlas:
             wraps=np.array(self._wraps or [False], np.bool_),
         )
 
-    def mean_color(self, index: int) -> NDArray[np.float64]:
+    def mean_color(self, index: int) -> Array:
         """Return the mean (3,) of a colour image in linear light."""
         coarse = self._images[index][-1][..., :3] / 255.0
         return np.square(coarse).reshape(-1, 3).mean(0)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, UInt8
 from realsim.geometry import se3
 from realsim.geometry.colors import srgb_decoded
 from realsim.rendering.appearance import LEAST_ROUGHNESS, Environment, Material
@@ -17,9 +18,6 @@ from realsim.rendering.embedded.materials import (
     repeats,
 )
 from realsim.rendering.rays import GRID_M, PlacedMesh, rotated
-
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -53,7 +51,7 @@ def scene_center(placed: tuple[PlacedMesh, ...]) -> Array:
 
 
 def mesh_parts(
-    placed: PlacedMesh, material: Material, colors: NDArray[np.uint8] | None, center: Array
+    placed: PlacedMesh, material: Material, colors: UInt8 | None, center: Array
 ) -> list[MeshPart]:
     """Return a placed mesh as one part, or as two where a normal map meets mirrored coordinates.
 
@@ -112,7 +110,6 @@ def _signed_area(uv: Array32) -> Array32:
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], np.float32)
 
 
-UInt8 = NDArray[np.uint8]
 Bsdf = dict[str, Any]
 
 
@@ -170,7 +167,6 @@ def bsdf_of(mi: Any, material: Material, options: BsdfOptions) -> Bsdf:
     return {"type": "twosided", "of": surface}
 
 
-Array = NDArray[np.float64]
 SUN_FAR = 1000.0
 """Distance of the sun's disc in radii of the scene: it is seen under the same angle to 0.06 deg
 from everywhere."""
@@ -187,7 +183,7 @@ class MitsubaScene:
     """mitsuba.Scene, in world axes about `center`."""
     center: Array
     """(3,) origin of the scene's coordinates in world [m]."""
-    geometry_of_shape: NDArray[np.int32]
+    geometry_of_shape: Int32
     """(S + 1,) index of the placed mesh of each of Mitsuba's shapes; -1 = the sun, and the last
     entry, which answers shape -1 (nothing)."""
 
@@ -253,7 +249,7 @@ def _shape(mi: Any, part: MeshPart, bsdf: Any, name: str) -> Any:
     return mesh
 
 
-def _rows_to_the_poles(panorama: NDArray[np.float32]) -> NDArray[np.float32]:
+def _rows_to_the_poles(panorama: Array32) -> Array32:
     """Return a panorama (H, W, 3) with 2 H + 1 rows, the first and last of them at the poles.
 
     Mitsuba's first row looks straight up; ours half a row beside it. Between the rows' borders and

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array32, Int32
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
@@ -27,8 +28,6 @@ from realsim.rendering.photoreal.tracing import (
 from realsim.rendering.photoreal.variant import Wanted, load_mitsuba
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 
-Array32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
 NO_DENOISER = (
     "photoreal pictures are not denoised, because Open Image Denoise is not installed "
     "(`pip install 'realsim[photo]'` brings it as pyoidn); 64 samples or more then look clean."

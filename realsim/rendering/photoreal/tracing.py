@@ -6,13 +6,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32
 from realsim.geometry import camera
 from realsim.records import CameraIntrinsics
 from realsim.rendering.photoreal.variant import MitsubaVariant
 from realsim.rendering.rays import rotated
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 LATTICE = (0.7548776662466927, 0.5698402909980532)
 """Steps of the R2 sequence (Roberts 2018): 1 / g and 1 / g^2 with g^3 = g + 1."""
 
@@ -72,7 +71,6 @@ def in_world(rays: Array32, R_world_cam: Array) -> tuple[Array32, Array32]:
     return rotated(rays / length[:, None], R_world_cam), length
 
 
-Array32 = NDArray[np.float32]
 RIM_PX = 16
 """Mirrored pixels around the picture while it is denoised: the network errs by a tenth of the
 light in the last pixels of a corner."""
@@ -107,9 +105,6 @@ def denoised(color: Array32, albedo: Array32, normal: Array32) -> Array32:
     return np.maximum(inside, 0.0)
 
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
 BLOCK_RAYS = 1 << 20
 """Rays traced at a time: 100 MB of working arrays."""
 KEPT = (0, 1, 2, 4, 5, 6, 7, 8, 9)

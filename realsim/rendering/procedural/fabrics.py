@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from realsim.arrays import Array32
 from realsim.rendering.appearance import Material
 from realsim.rendering.procedural.noise import (
-    Field,
     Tint,
     blurred,
     cells,
@@ -31,7 +31,7 @@ HIDES: tuple[Tint, ...] = (
 )  # fmt: skip
 
 
-def _moulded(rng: np.random.Generator) -> Field:
+def _moulded(rng: np.random.Generator) -> Array32:
     """Return a colour (3,) of moulded parts: mostly bright, sometimes white, grey or black."""
     if rng.random() < 0.3:
         tint = hsv_tint(rng.random(), rng.uniform(0.0, 0.08), rng.uniform(0.15, 0.95))
@@ -117,7 +117,7 @@ def cutting_mat(rng: np.random.Generator) -> Material:
     return finished("cutting mat", period_m, color, rng.uniform(0.55, 0.8), height_m=1.5e-5 * grain)
 
 
-def _weave(rng: np.random.Generator, n: int, threads: int) -> tuple[Field, Field]:
+def _weave(rng: np.random.Generator, n: int, threads: int) -> tuple[Array32, Array32]:
     """Return a plain weave: 1 where the thread along v lies on top (n, n), and the height (n, n).
 
     Height is in widths of a thread, from 0 in the gaps to 1 on the crowns.

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array32
 from realsim.errors import InputError
 from realsim.geometry.colors import light_of_bytes, luminance
 from realsim.rendering.appearance import Color, Environment
@@ -61,7 +62,7 @@ def _rgb(image: NDArray[Any], bgra: bool) -> NDArray[Any]:
     return np.ascontiguousarray(image)
 
 
-def _read_exr(path: Path) -> NDArray[np.float32]:
+def _read_exr(path: Path) -> Array32:
     """Return an OpenEXR picture, by Mitsuba's reader.
 
     Raises:
@@ -89,7 +90,6 @@ def _read_exr(path: Path) -> NDArray[np.float32]:
         ) from error
 
 
-Array = NDArray[np.float64]
 LARGEST_ROWS = 1024
 """Panoramas are reduced to this height: 0.18 deg a texel."""
 ASPECT_SLACK = 0.01
@@ -152,7 +152,7 @@ def read_environment(
     return made if exposure is not None else exposed(made)
 
 
-def _mended(radiance: NDArray[np.float32], path: Path, notes: list[str]) -> NDArray[np.float32]:
+def _mended(radiance: Array32, path: Path, notes: list[str]) -> Array32:
     """Return radiances that are finite and not negative; what was mended is noted."""
     bad = ~np.isfinite(radiance)
     infinite = np.isposinf(radiance)
@@ -176,7 +176,7 @@ def _mended(radiance: NDArray[np.float32], path: Path, notes: list[str]) -> NDAr
     return out.astype(np.float32)
 
 
-def _decoded(image: NDArray[Any], path: Path, notes: list[str]) -> NDArray[np.float32]:
+def _decoded(image: NDArray[Any], path: Path, notes: list[str]) -> Array32:
     """Return the linear light of an sRGB picture of 8 or 16 bits."""
     top = float(np.iinfo(image.dtype).max)
     linear = light_of_bytes(image.astype(np.float64) * (255.0 / top))
@@ -189,7 +189,7 @@ def _decoded(image: NDArray[Any], path: Path, notes: list[str]) -> NDArray[np.fl
     return linear.astype(np.float32)
 
 
-def _fitted(radiance: NDArray[np.float32], path: Path, notes: list[str]) -> NDArray[np.float32]:
+def _fitted(radiance: Array32, path: Path, notes: list[str]) -> Array32:
     """Return the panorama at exactly 2:1 and at most 1024 rows, its light averaged by area."""
     import cv2
 
@@ -203,8 +203,8 @@ def _fitted(radiance: NDArray[np.float32], path: Path, notes: list[str]) -> NDAr
 
 
 def split_sun(
-    panorama: NDArray[np.float32],
-) -> tuple[NDArray[np.float32], Color, Color, float]:
+    panorama: Array32,
+) -> tuple[Array32, Color, Color, float]:
     """Take a small, very bright light above the horizon out of a panorama.
 
     The excess over the sky around it moves from the panorama into the sun, and the sun stands in

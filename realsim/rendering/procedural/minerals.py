@@ -6,9 +6,9 @@ about 0.55 and aluminium about 0.91, after Lagarde's tables for metallic-roughne
 
 import numpy as np
 
+from realsim.arrays import Array32
 from realsim.rendering.appearance import Material
 from realsim.rendering.procedural.noise import (
-    Field,
     Tint,
     cells,
     fine,
@@ -50,7 +50,7 @@ HOLE_RADIUS_M = 0.0033
 """Half the mouth of an M6 thread [m]."""
 
 
-def _veins(rng: np.random.Generator, n: int, slope: float, width: float) -> Field:
+def _veins(rng: np.random.Generator, n: int, slope: float, width: float) -> Array32:
     """Return thin wandering lines (n, n), 1 in their middle: where a cloud crosses zero."""
     cloud = fractal(rng, n, slope, 1.5)
     swirl = 0.05
@@ -160,7 +160,7 @@ def ceramic_tiles(rng: np.random.Generator) -> Material:
     )  # fmt: skip
 
 
-def _scratches(rng: np.random.Generator, n: int) -> Field:
+def _scratches(rng: np.random.Generator, n: int) -> Array32:
     """Return the lines (n, n) of brushing along u: a long grain of all finenesses."""
     coarse = smooth(rng, n, 1.2, 60.0)
     hair = smooth(rng, n, 5.0, 400.0)

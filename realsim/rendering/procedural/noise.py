@@ -12,22 +12,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array32, Image, Int32
 from realsim.rendering.appearance import Material
 
-Field = NDArray[np.float32]
-Labels = NDArray[np.int32]
 Values = NDArray[np.floating[Any]]
 """What numpy's mixed arithmetic makes of fields: of either precision."""
 
 
-def _waves(n: int) -> tuple[Field, Field]:
+def _waves(n: int) -> tuple[Array32, Array32]:
     """Return the waves per side (1, n/2+1) along u and (n, 1) along v of a real spectrum."""
     fu = np.arange(n // 2 + 1, dtype=np.float32)[None, :]
     fv = np.fft.fftfreq(n, 1.0 / n).astype(np.float32)[:, None]
     return fu, fv
 
 
-def _filtered(rng: np.random.Generator, gain: Field) -> Field:
+def _filtered(rng: np.random.Generator, gain: Array32) -> Array32:
     """Return white noise after a filter (n, n/2+1), normalised."""
     from scipy import fft
 
@@ -39,7 +38,9 @@ def _filtered(rng: np.random.Generator, gain: Field) -> Field:
     return field / max(float(field.std()), 1e-12)
 
 
-def smooth(rng: np.random.Generator, n: int, waves_u: float, waves_v: float | None = None) -> Field:
+def smooth(
+    rng: np.random.Generator, n: int, waves_u: float, waves_v: float | None = None
+) -> Array32:
     """Return noise with features of about 1 / waves of the side, Gaussian in frequency.
 
     Args:
@@ -59,7 +60,7 @@ def fractal(
     slope: float = 1.8,
     lowest: float = 1.0,
     stretch_v: float = 1.0,
-) -> Field:
+) -> Array32:
     """Return clouds: the amplitude falls as frequency^-slope (fractional Brownian surface).
 
     Args:
@@ -75,20 +76,20 @@ def fractal(
     return _filtered(rng, gain.astype(np.float32))
 
 
-def fine(rng: np.random.Generator, n: int, waves: float) -> Field:
+def fine(rng: np.random.Generator, n: int, waves: float) -> Array32:
     """Return an even grain with features of about 1 / waves of the side and nothing coarser."""
     fu, fv = _waves(n)
     f = np.sqrt(fu**2 + fv**2)
     return _filtered(rng, np.exp(-(((f - waves) / (0.35 * waves)) ** 2)).astype(np.float32))
 
 
-def grid(n: int) -> tuple[Field, Field]:
+def grid(n: int) -> tuple[Array32, Array32]:
     """Return u (1, n) and v (n, 1) in [0, 1) at the texel centres; v grows with the row."""
     at = ((np.arange(n) + 0.5) / n).astype(np.float32)
     return at[None, :], at[:, None]
 
 
-def warped(field: Values, shift_u: Values, shift_v: Values) -> Field:
+def warped(field: Values, shift_u: Values, shift_v: Values) -> Array32:
     """Return the field looked up where the shifts (in tiles) lead, around the edges."""
     import cv2
 
@@ -100,7 +101,7 @@ def warped(field: Values, shift_u: Values, shift_v: Values) -> Field:
     return np.asarray(out, np.float32)
 
 
-def blurred(field: Values, sigma_px: float) -> Field:
+def blurred(field: Values, sigma_px: float) -> Array32:
     """Return the field after a Gaussian blur that goes around the edges."""
     import cv2
 
@@ -112,7 +113,7 @@ def blurred(field: Values, sigma_px: float) -> Field:
 
 def cells(
     rng: np.random.Generator, n: int, per_side: int, jitter: float = 0.9
-) -> tuple[Labels, Field]:
+) -> tuple[Int32, Array32]:
     """Return a Voronoi division of the tile: grains, chips, pebbles.
 
     Args:
@@ -154,18 +155,17 @@ def cells(
     return label[middle, middle].copy(), distance[middle, middle] * np.float32(per_side / n)
 
 
-def step(field: Values, low: float, high: float) -> Field:
+def step(field: Values, low: float, high: float) -> Array32:
     """Return 0 below `low`, 1 above `high`, and a smooth ramp between (smoothstep)."""
     t = np.clip((field - low) / (high - low), 0.0, 1.0)
     return (t * t * (3.0 - 2.0 * t)).astype(np.float32)
 
 
-Image = NDArray[np.uint8]
 Tint = Sequence[float]
 """An sRGB colour (r, g, b), each 0 to 255."""
 
 
-def mixed(low: ArrayLike, high: ArrayLike, share: Values) -> Field:
+def mixed(low: ArrayLike, high: ArrayLike, share: Values) -> Array32:
     """Return colours (n, n, 3) between two colours or colour fields; share (n, n) of `high`."""
     a, b = np.asarray(low, np.float32), np.asarray(high, np.float32)
     return (a + (b - a) * np.clip(share, 0.0, 1.0)[..., None]).astype(np.float32)
@@ -241,7 +241,7 @@ def random_tint(
     return hsv_tint(rng.random(), rng.uniform(*saturation), rng.uniform(*value))
 
 
-def shaded(rng: np.random.Generator, tint: Tint, spread: float = 6.0) -> NDArray[np.float32]:
+def shaded(rng: np.random.Generator, tint: Tint, spread: float = 6.0) -> Array32:
     """Return a colour (3,) near another: lighter or darker, a little warmer or colder."""
     light, warm = spread * rng.standard_normal(2)
     return np.clip(np.asarray(tint) + light + 0.3 * warm * np.array([1, 0, -1]), 2, 253).astype(

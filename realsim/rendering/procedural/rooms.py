@@ -8,13 +8,12 @@ Radiances are in kcd/m^2.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry.colors import light_of_bytes
 from realsim.rendering.appearance import Environment
 from realsim.rendering.procedural.skies import directions, planck
 
-Array = NDArray[np.float64]
 HEIGHT = 256
 EYE_M = 1.1
 """Height of the panorama's middle over the floor: a camera over a table [m]."""

@@ -9,14 +9,13 @@ Sources: A. Preetham, P. Shirley, B. Smits, "A Practical Analytic Model for Dayl
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.geometry.colors import luminance
 from realsim.rendering.appearance import Color, Environment
 from realsim.rendering.procedural.noise import fractal, step
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 XYZ_TO_RGB = np.array(
     [[3.2404542, -1.5371385, -0.4985314], [-0.9692660, 1.8760108, 0.0415560],
      [0.0556434, -0.2040259, 1.0572252]]
@@ -106,7 +105,6 @@ def planck(kelvin: float) -> Array:
     return rgb / luminance(rgb)
 
 
-Array = NDArray[np.float64]
 HEIGHT = 256
 """Rows of a sky: 0.7 deg each, finer than what a rough surface mirrors."""
 SUN_KLX = 128.0

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Image
 from realsim.errors import InputError
 from realsim.geometry.colors import srgb_encoded
 from realsim.rendering.appearance import LEAST_ROUGHNESS, Material
 from realsim.rendering.procedural.hdri import HDR, PICTURES, read_picture
 
-Image = NDArray[np.uint8]
 LARGEST_PX = 2048
 """Larger pictures are reduced to this."""
 PLAIN_ROUGHNESS = 0.6

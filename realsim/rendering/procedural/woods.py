@@ -8,11 +8,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32, Int64
 from realsim.rendering.appearance import Material
 from realsim.rendering.procedural.noise import (
-    Field,
     Tint,
     blurred,
     fine,
@@ -26,7 +25,6 @@ from realsim.rendering.procedural.noise import (
     step,
 )
 
-Boards = NDArray[np.int64]
 WOOD_PX = 1024
 """Side of wooden tiles [px]: 0.6 mm a texel, about a pixel of a view from a metre."""
 LAMINATE_PX = 512
@@ -104,7 +102,7 @@ def _boards(rng: np.random.Generator, timber: Timber) -> Material:
     )  # fmt: skip
 
 
-def _board_of(rng: np.random.Generator, v: Field, count: int) -> tuple[Boards, Field]:
+def _board_of(rng: np.random.Generator, v: Array32, count: int) -> tuple[Int64, Array32]:
     """Return the board (n, 1) of every row and the place (n, 1) across it, -0.5 to 0.5."""
     width = rng.uniform(0.8, 1.2, count)
     edges = np.concatenate([[0.0], np.cumsum(width / width.sum())])
@@ -114,8 +112,8 @@ def _board_of(rng: np.random.Generator, v: Field, count: int) -> tuple[Boards, F
 
 
 def _rings(
-    rng: np.random.Generator, u: Field, across: Field, board: Boards, count: int, per_tile: float
-) -> Field:
+    rng: np.random.Generator, u: Array32, across: Array32, board: Int64, count: int, per_tile: float
+) -> Array32:
     """Return the age (n, n) in years at every texel, by the distance to the trunk's axis."""
     n = u.shape[1]
     axis = rng.uniform(-0.9, 0.9, (count, 1))[board[:, 0]]

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Array32, UInt8
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment
@@ -27,8 +28,6 @@ from realsim.rendering.stereo.rectified import on_raw_grid, rectified_pinhole
 from realsim.rendering.stereo.stripes import decoded
 from realsim.rendering.stereo.surfaces import packed_surfaces
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 FULL_WIDTH_PX = 1280
 """Width for which a profile's nearest depth holds; the chip's search ends at a disparity, so at
 fewer pixels it sees nearer (D400 data sheet, min-Z by resolution)."""
@@ -46,9 +45,9 @@ class StereoDepth:
     """(H, W) depth along z [m]; 0 = no measurement."""
     disparity_px: Array32
     """(H, W) disparity [px]; 0 = none."""
-    left: NDArray[np.uint8]
+    left: UInt8
     """(H', W') the left eye, rectified; H', W' = H, W where the camera has no distortion."""
-    right: NDArray[np.uint8]
+    right: UInt8
     """(H', W') the right eye. Structured light: the scene in the projector's even light."""
 
 
@@ -120,7 +119,7 @@ class StereoCamera:
 
     def _matched(
         self, pinhole: CameraIntrinsics, T: Array, hits: FirstHits, rng: np.random.Generator
-    ) -> tuple[Array32, NDArray[np.uint8], NDArray[np.uint8]]:
+    ) -> tuple[Array32, UInt8, UInt8]:
         """Return the matched disparity [px] and both eyes' pictures."""
         baseline = self.profile.baseline_m
         T_right = _shifted(T, baseline)
@@ -152,7 +151,7 @@ class StereoCamera:
 
     def _decoded(
         self, pinhole: CameraIntrinsics, T: Array, hits: FirstHits, rng: np.random.Generator
-    ) -> tuple[Array32, NDArray[np.uint8], NDArray[np.uint8]]:
+    ) -> tuple[Array32, UInt8, UInt8]:
         """Return the decoded disparity [px], the eye's picture and that in even pattern light."""
         config, baseline = self.config, self.profile.baseline_m
         shadow = self._caster.cast(pinhole, _shifted(T, baseline)).depth_m

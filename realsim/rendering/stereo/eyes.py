@@ -9,17 +9,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, UInt8, UInt16
 from realsim.compiled import njit
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.light import RoomLight
 from realsim.rendering.stereo.shading import shade
 from realsim.rendering.stereo.surfaces import SurfaceTables, block_axes, packed_noise
-
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -85,9 +81,7 @@ def radiance(
     return out
 
 
-def exposed(
-    light: Array32, gain: float, config: StereoConfig, rng: np.random.Generator
-) -> NDArray[np.uint8]:
+def exposed(light: Array32, gain: float, config: StereoConfig, rng: np.random.Generator) -> UInt8:
     """Return the sensor's bytes (H, W) uint8 of incoming light, times `gain` 1 = white.
 
     Lens blur, photon noise (Poisson's is Gaussian at tens of electrons and more), read noise.
@@ -117,10 +111,10 @@ def _quantiles() -> Array32:
 @njit(fastmath=True)
 def _to_bytes(
     light: Array32,
-    noise: NDArray[np.uint16],
+    noise: UInt16,
     normal: Array32,
     sensor: Array32,
-    out: NDArray[np.uint8],
+    out: UInt8,
 ) -> None:
     """Write bytes from light: value + sqrt(dark + value per_value) noise, clipped and rounded."""
     gain, dark, per_value = sensor

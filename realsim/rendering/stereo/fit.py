@@ -13,8 +13,9 @@ from math import isfinite
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Array32
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.plane import find_plane
@@ -22,8 +23,6 @@ from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.twins import PlaneFigures, PlaneTwin, plane_twin
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 MOST_TWINS = 5
 """Frames that are simulated: evenly over the measured distances."""
 ROUNDS = 5

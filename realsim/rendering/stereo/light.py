@@ -9,13 +9,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32
 from realsim.geometry.colors import LUMINANCE
 from realsim.rendering.appearance import Environment
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 MAP_SIDE = 64
 """Edge of the octahedral maps [texels]: 3 deg each, finer than what a roughness of 0.1 keeps."""
 ROUGH_ROWS = 32

@@ -7,14 +7,12 @@ finds is refined and judged on the images by `subpixel`.
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32, UInt8
 from realsim.compiled import njit
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.subpixel import refined
 
-Array32 = NDArray[np.float32]
-Image8 = NDArray[np.uint8]
 SEARCH_BLOCK_PX = 5
 """Edge of the window of the search [px]; small, because the smoothness does the rest."""
 SMALL_STEP = 8
@@ -38,7 +36,7 @@ ALIASING = 0.06
 at different places."""
 
 
-def matched(left: Image8, right: Image8, exact: Array32, config: StereoConfig) -> Array32:
+def matched(left: UInt8, right: UInt8, exact: Array32, config: StereoConfig) -> Array32:
     """Return the disparity (H, W) [px] of the left eye's pixels, 0 = none.
 
     Args:
@@ -62,7 +60,7 @@ def matched(left: Image8, right: Image8, exact: Array32, config: StereoConfig) -
 
 @njit
 def _judge(
-    disparity: Array32, texture: Array32, residual: Array32, level: Image8, limits: Array32
+    disparity: Array32, texture: Array32, residual: Array32, level: UInt8, limits: Array32
 ) -> None:
     """Set to 0 what has too little texture, fits badly, or lies left of the right eye's picture."""
     dark, per_value, least_texture, greatest_residual = limits
@@ -81,9 +79,7 @@ def _judge(
                 disparity[v, u] = f(0.0)
 
 
-def _searched_in_bands(
-    left: Image8, right: Image8, exact: Array32, config: StereoConfig
-) -> Array32:
+def _searched_in_bands(left: UInt8, right: UInt8, exact: Array32, config: StereoConfig) -> Array32:
     """Return the semi-global match (H, W) [px], 0 = none, searched band by band of rows.
 
     On a table the distance changes from top to bottom: a band spans half the disparities.
@@ -109,7 +105,7 @@ def _searched_in_bands(
 
 
 def _searched(
-    left: Image8, right: Image8, search: tuple[float, float], config: StereoConfig
+    left: UInt8, right: UInt8, search: tuple[float, float], config: StereoConfig
 ) -> Array32:
     """Return the semi-global match (H, W) [px], to sixteenths, 0 = none.
 

@@ -3,11 +3,10 @@
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32
 from realsim.compiled import njit
 
-Array32 = NDArray[np.float32]
 TEXEL_RAD = 0.9e-3
 """Texel of the pattern on the plane at distance 1 [m]: finer than a pixel at f = 920 px."""
 HALF_WIDTH = 1.15
@@ -56,7 +55,6 @@ def even_field() -> Array32:
     return out
 
 
-Array32 = NDArray[np.float32]
 SAME_SURFACE_PX = np.float32(1.0)
 """Neighbours whose disparities differ by more are not joined [px]."""
 

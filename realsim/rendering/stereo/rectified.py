@@ -1,12 +1,11 @@
 """The rectified pair in which a stereo camera matches, and the way back to a distorted image."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32
 from realsim.geometry import camera
 from realsim.records import CameraIntrinsics
 
-Array32 = NDArray[np.float32]
 GREATEST_GROWTH = 1.5
 """The rectified picture is at most this many times as wide and high as the raw one: the rim of a
 strong lens would need a boundless one, and is left without depth."""

@@ -7,8 +7,8 @@ counters are unsigned, because a signed index may count from the end.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32
 from realsim.compiled import njit
 from realsim.rendering.stereo.light import MAP_ROUGHNESS
 from realsim.rendering.stereo.projector import HALF_HEIGHT, HALF_WIDTH, TEXEL_RAD
@@ -42,7 +42,6 @@ from realsim.rendering.stereo.texture import (
     pixel_octave,
 )
 
-Array32 = NDArray[np.float32]
 Scalar = float | np.float32
 F0_PLASTIC = 0.04
 """Reflectance of a dielectric at normal incidence, glTF 2.0's value."""

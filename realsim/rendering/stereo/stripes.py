@@ -7,14 +7,13 @@ the projector does not reach has none.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32
 from realsim.compiled import njit
 from realsim.rendering.depth_sensors.noise import correlated
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.shading import SHADOW_SLACK
 
-Array32 = NDArray[np.float32]
 SATURATION = 6.0
 """Pattern light beyond which a pixel is overexposed; 1 = white paper at 1 m, facing. The highest
 level that automatic exposure leaves room for."""

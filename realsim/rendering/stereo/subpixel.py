@@ -11,11 +11,10 @@ compared at its own smoothed disparity, so tilted surfaces are as good as facing
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32, UInt8
 from realsim.compiled import njit
 
-Array32 = NDArray[np.float32]
 SIMILAR_PX = np.float32(1.0)
 """Neighbours whose disparity differs by more are another surface [px]."""
 STEPS = 2
@@ -25,7 +24,7 @@ GREATEST_STEP_PX = np.float32(0.75)
 
 
 def refined(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], disparity: Array32, window_px: int
+    left: UInt8, right: UInt8, disparity: Array32, window_px: int
 ) -> tuple[Array32, Array32, Array32]:
     """Return the disparity on sub-pixels and how well it is founded.
 

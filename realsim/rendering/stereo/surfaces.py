@@ -17,6 +17,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Int64, UInt8, UInt16
 from realsim.geometry.colors import LUMINANCE, light_of_bytes
 from realsim.records import Mesh
 from realsim.rendering.appearance import Material
@@ -59,7 +60,7 @@ def noise_block() -> NDArray[np.int8]:
 
 
 @lru_cache(maxsize=1)
-def packed_noise() -> NDArray[np.int32]:
+def packed_noise() -> Int32:
     """Return the block (BLOCK^3,) with four neighbours in every number.
 
     The bytes of (i, j, k), from the lowest, are the noise + 128 at (j, k), (j, k + 1), (j + 1, k)
@@ -75,15 +76,13 @@ def packed_noise() -> NDArray[np.int32]:
 
 
 @lru_cache(maxsize=1)
-def block_axes() -> NDArray[np.float64]:
+def block_axes() -> Array:
     """Return the rotation (3, 3) of the block against the object: no plane of it is aligned."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_rotvec([0.61, -0.43, 1.07]).as_matrix()
 
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 LEVELS = 14
 """Halvings kept of an image: enough for 8192 texels."""
 WOOD_PERIOD_M = 0.5
@@ -100,16 +99,16 @@ class SurfaceTables:
     faces: Array32
     """(F, 24) affine functions of the point in mesh axes (x, y, z, 1): normal x, y, z, texture u,
     v, brightness of the vertex colours."""
-    first_face: NDArray[np.int64]
+    first_face: Int64
     """(G,) where a placed mesh's faces begin."""
     looks: Array32
     """(G, 9) tint, roughness, metallic, micro texture, level of its reflections, three offsets of
     its grain [m], binary logarithm of its image's texels per metre."""
-    images: NDArray[np.int64]
+    images: Int64
     """(G,) image of a placed mesh; -1 = none."""
-    texels: NDArray[np.uint16]
+    texels: UInt16
     """(T,) linear brightness of all images and their halvings, 65535 = 1."""
-    levels: NDArray[np.int64]
+    levels: Int64
     """(I, LEVELS, 3) start, height and width of each halving; beyond the last it is repeated."""
 
 
@@ -157,7 +156,7 @@ def packed_surfaces(placed: Sequence[PlacedMesh], texture_contrast: float) -> Su
     )
 
 
-def _look(p: PlacedMesh) -> tuple[Material, NDArray[np.uint8] | None]:
+def _look(p: PlacedMesh) -> tuple[Material, UInt8 | None]:
     """Return the material of a placed mesh and its image (H, W, 3), sRGB, if it has one."""
     mesh = p.mesh
     if p.material is not None:
@@ -234,12 +233,12 @@ class _ImageStore:
     def __init__(self) -> None:
         """Begin empty."""
         self._numbers: dict[int, int] = {}
-        self._kept: list[NDArray[np.uint8]] = []  # keeps the ids above from being used again
-        self._parts: list[NDArray[np.uint16]] = []
+        self._kept: list[UInt8] = []  # keeps the ids above from being used again
+        self._parts: list[UInt16] = []
         self._levels: list[list[tuple[int, int, int]]] = []
         self._end = 0
 
-    def add(self, image: NDArray[np.uint8]) -> int:
+    def add(self, image: UInt8) -> int:
         """Return the number of an image (H, W, 3), sRGB."""
         import cv2
 
@@ -265,7 +264,7 @@ class _ImageStore:
         self._kept.append(image)
         return len(self._kept) - 1
 
-    def packed(self) -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
+    def packed(self) -> tuple[UInt16, Int64]:
         """Return all texels and where each image's halvings begin."""
         if not self._kept:
             return np.zeros(1, np.uint16), np.zeros((1, LEVELS, 3), np.int64)

@@ -7,8 +7,8 @@ are slower than noise have the same effect on both.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Material
@@ -19,9 +19,6 @@ from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.rendering.stereo.camera import StereoCamera
 from realsim.rendering.stereo.config import StereoConfig
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 WINDOW_PX = (288, 216)
 """Width and height of the piece of a frame that is simulated: it holds thousands of independent
 places, and a search simulates it dozens of times."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32, Int64, Rgb
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, View
 from realsim.review.content import quick_png
@@ -14,9 +14,6 @@ from realsim.review.content.views import Region, strided
 from realsim.store import SessionStore
 from realsim.store.session_store import depth_path, rgb_path
 
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int64]
-Rgb = NDArray[np.uint8]
 SAMPLES_PER_POINT = 4
 """Depth samples fused per point wanted: on overlapping views about as many fall into one voxel."""
 MOST_SAMPLES = 4_000_000
@@ -33,7 +30,7 @@ LEVEL_GROWTH = 4
 class LeveledCloud:
     """A coloured cloud in levels: level k is `points[: ends[k]]`, and so holds those before it."""
 
-    points: Floats
+    points: Array32
     """(N, 3) in world [m]."""
     colors: Rgb
     """(N, 3) as photographed."""
@@ -119,8 +116,8 @@ def fused_cloud(
 
 
 def _seen(
-    depth_m: Floats, camera: CameraIntrinsics, view: View, region: Region
-) -> tuple[Floats, tuple[Ints, Ints]]:
+    depth_m: Array32, camera: CameraIntrinsics, view: View, region: Region
+) -> tuple[Array32, tuple[Int64, Int64]]:
     """Return the points (N, 3) of a view in the region [m], and their pixels (x, y)."""
     rays = ray_table(camera)
     v, u = np.nonzero((depth_m > 0) & np.isfinite(depth_m) & np.isfinite(rays[..., 0]))
@@ -133,7 +130,7 @@ def _seen(
     return points, (u[near], v[near])
 
 
-def _cells(points: Floats, size_m: float) -> Ints:
+def _cells(points: Array32, size_m: float) -> Int64:
     """Return the number (N,) of the grid cell that holds each point."""
     key = np.zeros(len(points), np.int64)
     for axis in range(3):
@@ -145,7 +142,7 @@ def _cells(points: Floats, size_m: float) -> Ints:
     return key
 
 
-def _voxel_points(points: Floats, rgb: Rgb, voxel_m: float) -> tuple[Floats, Rgb, Ints]:
+def _voxel_points(points: Array32, rgb: Rgb, voxel_m: float) -> tuple[Array32, Rgb, Int64]:
     """Return a point and a colour per occupied voxel, and how many samples it had."""
     if len(points) == 0:
         return points, rgb, np.zeros(0, np.int64)
@@ -171,7 +168,7 @@ def _voxel_points(points: Floats, rgb: Rgb, voxel_m: float) -> tuple[Floats, Rgb
     return means, colors, counts
 
 
-def _means(points: Floats, rgb: Rgb, first: Ints, voxel_m: float) -> tuple[Floats, Rgb]:
+def _means(points: Array32, rgb: Rgb, first: Int64, voxel_m: float) -> tuple[Array32, Rgb]:
     """Return point and colour of every voxel.
 
     Args:
@@ -198,7 +195,7 @@ def _means(points: Floats, rgb: Rgb, first: Ints, voxel_m: float) -> tuple[Float
     return means, np.rint(colors).astype(np.uint8)
 
 
-def _coarse_first(points: Floats, voxel_m: float, coarse: int) -> tuple[Ints, tuple[int, ...]]:
+def _coarse_first(points: Array32, voxel_m: float, coarse: int) -> tuple[Int64, tuple[int, ...]]:
     """Return an order of the points in which the first ones are spread evenly, and its levels.
 
     The coarse level has one point in each cell of a grid that leaves about so many. The others

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
 from realsim.formats.bop.models import require_meshes
 from realsim.records import CameraIntrinsics, GraspSet, ObjectModel, Scene, View
@@ -35,7 +35,6 @@ __all__ = [
     "placed_views", "region_of", "spread", "strided", "worst_first",
 ]  # fmt: skip
 
-Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 
@@ -94,7 +93,7 @@ class SceneContent:
         with_depth = [v for v in views if store.has_depth(v.index)]
         numbers = {v.index for v in shown}
 
-        def take(index: int, rgb: NDArray[np.uint8]) -> None:
+        def take(index: int, rgb: UInt8) -> None:
             if index in numbers:
                 thumbnails.take(index, rgb)
 

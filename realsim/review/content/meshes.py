@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, UInt8, UInt16
 from realsim.errors import DegenerateError
 from realsim.geometry import mesh as mesh_tools
 from realsim.records import Mesh
 from realsim.review.content.config import SceneConfig
 
-Floats = NDArray[np.float32]
 PLAIN_RGB = (176, 182, 190)
 """Colour of a mesh without colours of its own."""
 ROUGH = 0.9
@@ -39,15 +39,15 @@ VERTICES, INDICES = 34962, 34963
 class DisplayMesh:
     """A model as it is sent."""
 
-    vertices: Floats
+    vertices: Array32
     """(V, 3) in the object's frame [m]."""
     faces: NDArray[np.uint32]
     """(F, 3)."""
     glb: bytes
     """The same with its looks, as binary glTF."""
-    low: NDArray[np.float64]
+    low: Array
     """(3,) least corner of its bounds [m]."""
-    high: NDArray[np.float64]
+    high: Array
     """(3,) greatest corner [m]."""
     triangles_given: int
     """Triangles of the model itself."""
@@ -94,9 +94,7 @@ def within_budget(mesh: Mesh, config: SceneConfig) -> Mesh:
     return few if colors is None else replace(few, colors=_nearest(mesh, colors, few.vertices))
 
 
-def _nearest(
-    mesh: Mesh, colors: NDArray[np.uint8], points: NDArray[np.float64]
-) -> NDArray[np.uint8]:
+def _nearest(mesh: Mesh, colors: UInt8, points: Array) -> UInt8:
     """Return the colours (N, 3) of the mesh's vertices nearest to points (N, 3)."""
     from scipy.spatial import KDTree
 
@@ -193,7 +191,7 @@ class _Parts:
         ))  # fmt: skip
 
 
-def _texture_jpeg(texture: NDArray[np.uint8], most_texels: int) -> bytes:
+def _texture_jpeg(texture: UInt8, most_texels: int) -> bytes:
     import cv2
 
     factor = most_texels / max(texture.shape[:2])
@@ -205,13 +203,13 @@ def _texture_jpeg(texture: NDArray[np.uint8], most_texels: int) -> bytes:
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, TEXTURE_QUALITY])[1].tobytes()
 
 
-def _linear(rgb: NDArray[Any]) -> NDArray[np.float64]:
+def _linear(rgb: NDArray[Any]) -> Array:
     """Return 8-bit sRGB colours as linear light, white = 1 (IEC 61966-2-1)."""
     c = np.asarray(rgb, dtype=np.float64) / 255.0
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
 
 
-def _colors16(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
+def _colors16(rgb: UInt8) -> UInt16:
     """Return vertex colours (V, 4) as glTF wants them: linear, of 16 bit, opaque."""
     table = np.rint(65535 * _linear(np.arange(256))).astype(np.uint16)
     opaque = np.full((len(rgb), 1), 65535, np.uint16)

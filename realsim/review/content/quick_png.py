@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Array32, UInt8
 from realsim.compiled import njit
 from realsim.images import MOST_PIXELS, png
 
-Bytes = NDArray[np.uint8]
 CHUNK_BYTES = 12
 """Length, name and sum of a chunk."""
 IHDR = struct.Struct(">IIBBBBB")
@@ -28,7 +27,7 @@ RGB, DEPTH = (8, png.COLOUR), (16, png.GREY)
 """Bits and colour type of what sessions hold."""
 
 
-def read_rgb(path: Path) -> Bytes:
+def read_rgb(path: Path) -> UInt8:
     """Return a photograph (H, W, 3) uint8.
 
     Raises:
@@ -40,7 +39,7 @@ def read_rgb(path: Path) -> Bytes:
     return rows.reshape(len(rows), -1, 3)
 
 
-def read_depth(path: Path, unit_m: float) -> NDArray[np.float32]:
+def read_depth(path: Path, unit_m: float) -> Array32:
     """Return a 16-bit depth image as (H, W) float32 [m], 0 = no measurement.
 
     Args:
@@ -58,12 +57,12 @@ def read_depth(path: Path, unit_m: float) -> NDArray[np.float32]:
 
 
 @lru_cache(maxsize=4)
-def _metres(unit_m: float) -> NDArray[np.float32]:
+def _metres(unit_m: float) -> Array32:
     """Return the depth (65536,) of every count [m]."""
     return (np.arange(images.DEPTH_MAX + 1) * np.float64(unit_m)).astype(np.float32)
 
 
-def _rows(path: Path, kind: tuple[int, int], step: int) -> Bytes | None:
+def _rows(path: Path, kind: tuple[int, int], step: int) -> UInt8 | None:
     """Return the rows (H, bytes) of an image; None = it is for the other reader.
 
     Args:

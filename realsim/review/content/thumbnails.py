@@ -11,9 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import UInt8
 from realsim.errors import InputError
 from realsim.review.content import quick_png
 from realsim.store import SessionStore, atomic
@@ -49,7 +47,7 @@ class Thumbnails:
         self._width_px, self._quality = width_px, quality
         self._made: dict[int, bytes] = {}
 
-    def take(self, index: int, rgb: NDArray[np.uint8]) -> None:
+    def take(self, index: int, rgb: UInt8) -> None:
         """Make that of a view whose photograph (H, W, 3) is decoded anyway, if none is kept."""
         if self.kept(index) is None:
             self._make(index, rgb)
@@ -85,7 +83,7 @@ class Thumbnails:
                 progress(len(found), len(indices))
         return found
 
-    def _make(self, index: int, rgb: NDArray[np.uint8]) -> bytes:
+    def _make(self, index: int, rgb: UInt8) -> bytes:
         jpeg = thumbnail(rgb, self._width_px, self._quality)
         self._made[index] = jpeg
         # A session that may not be written is shown all the same.
@@ -110,7 +108,7 @@ class Thumbnails:
         return f"{self._sums[index]} {self._width_px} {self._quality} {WAY}"
 
 
-def thumbnail(rgb: NDArray[np.uint8], width_px: int, quality: int) -> bytes:
+def thumbnail(rgb: UInt8, width_px: int, quality: int) -> bytes:
     """Return a photograph (H, W, 3) as a small JPEG.
 
     Args:

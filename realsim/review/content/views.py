@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, ObjectPose, View
 from realsim.store import SessionStore
 
-Array = NDArray[np.float64]
 VERDICT_ORDER = ("rejected", "doubtful", "unchecked", "accepted")
 """Worst first."""
 LOOK_NEARER = 0.8
@@ -71,7 +71,7 @@ class Region:
     """(3,) [m]."""
     radius_m: float
 
-    def holds(self, points: ArrayLike) -> NDArray[np.bool_]:
+    def holds(self, points: ArrayLike) -> Mask:
         """Return (N,) which points (N, 3) [m] are inside."""
         offset = np.asarray(points, dtype=np.float64) - self.center
         return np.sum(offset * offset, axis=-1) <= self.radius_m**2

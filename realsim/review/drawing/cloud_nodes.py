@@ -6,13 +6,12 @@ from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
+from realsim.arrays import Rgb
 from realsim.errors import InputError
 from realsim.review.content.clouds import LeveledCloud
 from realsim.review.content.config import SceneConfig
 
-Rgb = NDArray[np.uint8]
 POINT_SHARE = 0.8
 """Size of a point over the distance of neighbours: a surface looks closed, its points apart."""
 PAUSE_S = 0.02

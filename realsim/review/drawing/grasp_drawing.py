@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array, Array32, Mask, Rgb, Rows
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import STAGES, GraspSet
@@ -18,10 +19,6 @@ from realsim.store.session_store import depth_path
 if TYPE_CHECKING:
     from realsim.review.content.content import SceneContent
 
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Rows = NDArray[np.int64]
-Rgb = NDArray[np.uint8]
 BARS = 3
 """Sides of a bar: the fewest that can be seen from everywhere."""
 FINGER_SHARE = 0.04
@@ -138,7 +135,7 @@ def visible_grasps(
     return found
 
 
-def _unhidden(points: Array, depth_m: Floats, content: "SceneContent") -> NDArray[np.bool_]:
+def _unhidden(points: Array, depth_m: Array32, content: "SceneContent") -> Mask:
     """Return (N,) which points (N, 3) in the camera [m] no measured surface hides."""
     i = content.intrinsics
     seen = np.zeros(len(points), np.bool_)
@@ -159,7 +156,7 @@ def linear_rgb(rgb: Rgb) -> Rgb:
     return np.rint(255.0 * linear).astype(np.uint8)
 
 
-def gripper_mesh(drawing: GripperDrawing) -> tuple[Floats, NDArray[np.uint32]]:
+def gripper_mesh(drawing: GripperDrawing) -> tuple[Array32, NDArray[np.uint32]]:
     """Return the gripper of width 1 as vertices (24, 3) in its grasp frame and faces (24, 3).
 
     Two fingers, palm and stem, each a bar of three sides. Scaled along y by a grasp's width it is
@@ -203,7 +200,7 @@ def _bar(start: list[float], along: list[int], length: float, across: list[float
     return np.concatenate([begin, begin + length * axis])
 
 
-def gripper_scales(widths_m: ArrayLike) -> Floats:
+def gripper_scales(widths_m: ArrayLike) -> Array32:
     """Return the scales (N, 3) of the gripper of width 1 for grasps of widths (N,) [m]."""
     widths = np.maximum(np.asarray(widths_m, dtype=np.float64), LEAST_WIDTH_M)
     return np.stack([np.ones_like(widths), widths, np.ones_like(widths)], -1).astype(np.float32)

@@ -5,16 +5,14 @@ from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Rows
 from realsim.interop import viser_wxyz_position
 from realsim.records import GraspSet
 from realsim.rendering.overlay import grasp_rgb
 from realsim.review.content.config import SceneConfig
 from realsim.review.drawing.grasp_drawing import gripper_mesh, gripper_scales, linear_rgb
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 NAME = "/grasps"
 
 

@@ -11,8 +11,8 @@ from typing import Literal
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, UInt8
 from realsim.errors import InputError
 from realsim.interop import viser_wxyz_position
 from realsim.records import ObjectModel
@@ -26,7 +26,6 @@ from realsim.review.placing.ellipsoid import Ellipsoid, unit_sphere
 
 __all__ = ["GraspFilter", "SceneConfig", "SceneNodes"]
 
-Array = NDArray[np.float64]
 Look = Literal["appearance", "verdict", "hidden"]
 OnInstance = Callable[[int], None]
 OnGrasp = Callable[[int, int], None]
@@ -249,7 +248,7 @@ class SceneNodes:
         """Wait until what was asked for of the cloud is sent; return whether it is."""
         return self._cloud.wait(timeout_s)
 
-    def set_cloud_colors(self, colors: NDArray[np.uint8] | None) -> None:
+    def set_cloud_colors(self, colors: UInt8 | None) -> None:
         """Colour the points; None = as photographed.
 
         Args:
@@ -338,7 +337,7 @@ class SceneNodes:
             callback(number)
 
 
-def _box_lines(low: Array, high: Array) -> NDArray[np.float32]:
+def _box_lines(low: Array, high: Array) -> Array32:
     """Return the edges (12, 2, 3) of a box of these corners (3,)."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     edges = [(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1]

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Array32, Int32, Mask, Rgb
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose
@@ -22,11 +23,6 @@ from realsim.rendering.overlay import INK, VERDICT_RGB
 from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Rgb = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
-Pixels = NDArray[np.int32]
 WIDEST_TAN = 3.0
 """Tangent of the widest half angle that is shown: a pinhole cannot show 90 degrees."""
 BORDER_SAMPLES = 33
@@ -72,7 +68,7 @@ class _Cast:
     window: tuple[slice, slice]
     depth_m: Array32
     """(h, w) within the window; inf = not there."""
-    contours: tuple[Pixels, ...]
+    contours: tuple[Int32, ...]
     """(N, 2) column and row of each contour's pixels, in the picture, closed."""
 
 
@@ -276,7 +272,7 @@ def _seen(cast: _Cast, nearest: Array32) -> list[Mask]:
 
 def _draw(
     rgb: Rgb,
-    contours: Sequence[Pixels],
+    contours: Sequence[Int32],
     seen: Sequence[Mask],
     color: tuple[int, int, int],
     width_px: int,
@@ -286,8 +282,8 @@ def _draw(
 
     dim = (round(DIM * color[0]), round(DIM * color[1]), round(DIM * color[2]))
     height, width = rgb.shape[:2]
-    solid: list[Pixels] = []
-    dashes: list[Pixels] = []
+    solid: list[Int32] = []
+    dashes: list[Int32] = []
     for contour, visible in zip(contours, seen, strict=True):
         # Where the object is cut by the border there is no outline.
         x, y = contour[:, 0], contour[:, 1]
@@ -303,7 +299,7 @@ def _draw(
         cv2.polylines(canvas, lines, False, ink, thick, cv2.LINE_AA)
 
 
-def _runs(contour: Pixels, on: Mask) -> list[Pixels]:
+def _runs(contour: Int32, on: Mask) -> list[Int32]:
     """Return the unbroken runs of a closed contour's pixels (N, 2) that are `on`."""
     if on.all():
         return [np.concatenate([contour, contour[:1]])]
@@ -313,7 +309,7 @@ def _runs(contour: Pixels, on: Mask) -> list[Pixels]:
     first = int(np.argmin(on))
     contour, on = np.roll(contour, -first, axis=0), np.roll(on, -first)
     steps = np.flatnonzero(np.diff(on)) + 1
-    parts: Iterator[tuple[Pixels, Mask]] = zip(
+    parts: Iterator[tuple[Int32, Mask]] = zip(
         np.split(contour, steps), np.split(on, steps), strict=True
     )
     return [np.ascontiguousarray(p) for p, o in parts if o[0]]

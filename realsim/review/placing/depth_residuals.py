@@ -10,17 +10,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Array32, Int64, Rgb
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.distance_field import DistanceField, sample
 from realsim.records import Mesh
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Rgb = NDArray[np.uint8]
 FIELD_CELLS = 96
 """Cells of a distance field along the longest side: those of the registration, which keeps them."""
 FULL_M = 0.005
@@ -39,7 +37,7 @@ class _Near(NamedTuple):
     """The points near one object at one pose."""
 
     T_world_obj: Array
-    which: NDArray[np.int64]
+    which: Int64
     """(M,) numbers of the points."""
     distance_m: Array32
     """(M,) their signed distances [m]."""
@@ -205,7 +203,7 @@ def _near_points(
     T: Array,
     box: tuple[Array, Array],
     within: float,
-) -> tuple[NDArray[np.int64], Array32]:
+) -> tuple[Int64, Array32]:
     """Return which points (N, 3), mapped by T, are near a surface, and their signed distances.
 
     Args:

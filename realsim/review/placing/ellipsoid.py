@@ -12,13 +12,12 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel, ObjectPose
 
-Array = NDArray[np.float64]
 PARALLEL = 1e-3
 """Sine below which two axes of revolution are one."""
 
@@ -160,7 +159,7 @@ def unit_sphere(divisions: int = 2) -> Mesh:
     return Mesh(vertices=v, faces=f.astype(np.int32))
 
 
-def _halved(v: Array, f: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+def _halved(v: Array, f: Int64) -> tuple[Array, Int64]:
     """Return the sphere with every edge halved and every triangle made four."""
     edges = np.sort(f[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     unique, index = np.unique(edges, axis=0, return_inverse=True)

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Int64
 from realsim.errors import InputError, RealsimError
 from realsim.records import Scene
 from realsim.records.depth_bias import DepthBias
@@ -21,7 +21,6 @@ from realsim.registration.intake import sampling
 from realsim.registration.views import ViewPoints, sample_view
 from realsim.store import SessionStore
 
-Array = NDArray[np.float64]
 REPORT_FILE = "registration/report.json"
 MOST_VIEWS = 24
 """Views that are looked at: more of a spread add nothing that a person would see."""
@@ -36,11 +35,11 @@ class MeasuredViews:
     comparer: Comparer
     """On all of them."""
     views: tuple[ViewPoints, ...]
-    points: NDArray[np.float32]
+    points: Array32
     """(N, 3) of all views in world [m]."""
-    view: NDArray[np.int32]
+    view: Int32
     """(N,) which of the views saw it."""
-    sigmas: NDArray[np.float32]
+    sigmas: Array32
     """(N,) 1-sigma [m]."""
 
     @property
@@ -48,7 +47,7 @@ class MeasuredViews:
         """Every how many pixels one was used."""
         return round(float(np.sqrt(self.views[0].area_px)))
 
-    def cloud(self, index: NDArray[np.int64]) -> Cloud:
+    def cloud(self, index: Int64) -> Cloud:
         """Return some of the points with their directions and sigmas."""
         points = self.points[index].astype(np.float64)
         eyes = np.stack([v.T_world_cam[:3, 3] for v in self.views])
@@ -56,7 +55,7 @@ class MeasuredViews:
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         return Cloud(points=points, towards=towards, sigmas=self.sigmas[index].astype(np.float64))
 
-    def views_with(self, index: NDArray[np.int64]) -> list[ViewPoints]:
+    def views_with(self, index: Int64) -> list[ViewPoints]:
         """Return the views with only some of the points."""
         ends = np.cumsum([len(v.points) for v in self.views])
         out: list[ViewPoints] = []

@@ -1,14 +1,14 @@
 """What a click meets: the ray from the browser's camera against models and measured points."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Array32, Int32
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Mesh
 
-Array = NDArray[np.float64]
 SLOPE = 3.0
 """How steeply a surface may run away from the eye [m per m across the ray]: 72 degrees. A point
 beside the ray hides one on it only if it is nearer by more than that."""
@@ -55,7 +55,7 @@ def ray_on_mesh(
 def ray_on_cloud(
     origin: ArrayLike,
     direction: ArrayLike,
-    points: NDArray[np.float32],
+    points: Array32,
     *,
     radius_m: float = CLICK_M,
     angle_rad: float = CLICK_RAD,
@@ -111,7 +111,7 @@ def _meets_ball(o: Array, d: Array, center: Array, radius: float) -> bool:
 
 
 @njit
-def _first_triangle(o: Array, d: Array, vertices: Array, faces: NDArray[np.int32]) -> float:
+def _first_triangle(o: Array, d: Array, vertices: Array, faces: Int32) -> float:
     """Return the parameter of the first triangle on a ray; inf = none.
 
     Args:
@@ -146,7 +146,7 @@ def _first_triangle(o: Array, d: Array, vertices: Array, faces: NDArray[np.int32
 
 
 @njit
-def _in_cone(o: Array, d: Array, points: NDArray[np.float32], radius: float, tangent: float) -> int:
+def _in_cone(o: Array, d: Array, points: Array32, radius: float, tangent: float) -> int:
     """Return which of the points (N, 3) a ray means; -1 = none. See `ray_on_cloud`."""
     best, least = -1, np.inf
     for k in range(len(points)):

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Mesh, SupportPlane
 
-Array = NDArray[np.float64]
 Axis = Literal["x", "y", "z"]
 Kind = Literal["move", "turn"]
 Frame = Literal["table", "object", "camera"]

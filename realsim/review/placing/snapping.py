@@ -11,8 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Int64
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
@@ -36,7 +37,6 @@ from realsim.review.placing.measured_views import (
 from realsim.review.placing.placing import moved
 from realsim.store import SessionStore
 
-Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 CACHE = "registration/cache"
 """Where a registration keeps what is derived from meshes."""
@@ -171,7 +171,7 @@ class _Task:
     """The neighbours that may touch it, or own its points."""
     hiding: tuple[Body, ...]
     """Those and the ones that may hide it in a view that is rendered."""
-    index: NDArray[np.int64]
+    index: Int64
     """Measured points around it."""
     near: Cloud
     """Those within reach, less the table's."""

@@ -16,11 +16,11 @@ from typing import Any, Protocol
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.records import Mesh
-from realsim.records.checked_arrays import Array, frozen
+from realsim.records.checked_arrays import frozen
 from realsim.records.trajectories import PHASES
 from realsim.review.replay.grasp_words import escaped
 from realsim.review.replay.replay_nodes import ReplayNodes
@@ -51,7 +51,7 @@ class GraspMotion:
     """(S, 4, 4) the hand's grasp frame [m]."""
     opening_m: Array
     """(S,) distance of the finger faces [m]."""
-    phase: NDArray[np.int64]
+    phase: Int64
     """(S,) number in PHASES."""
     Ts_world_obj: Array
     """(S, 4, 4) the grasped object [m]."""

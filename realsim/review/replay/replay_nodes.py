@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import viser
 
+from realsim.arrays import Array
 from realsim.geometry import mesh as mesh_tools
 from realsim.geometry import se3
 from realsim.interop import viser_wxyz_position
 from realsim.records import Mesh
-from realsim.records.checked_arrays import Array
 from realsim.robots.hand import Hand, find_hand
 
 PLAIN_RGB = (176, 182, 190)

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import local_pages
+from realsim.arrays import Array, Int64
 from realsim.interop import viser_wxyz_position
 from realsim.records import GraspSet, Scene
 from realsim.rendering.overlay import VERDICT_RGB, evenly_ranked, grasp_rgb
@@ -22,7 +22,6 @@ from realsim.review.content.meshes import glb_of, within_budget
 from realsim.review.content.views import spread
 from realsim.review.drawing.grasp_drawing import gripper_mesh, gripper_scales, linear_rgb
 
-Array = NDArray[np.float64]
 LABEL_EDGES = (0.0, 0.25, 0.5, 0.75)
 """Lower ends of the classes of p_hold or score that the page can show or hide."""
 BOX_LINE_M = 0.0015
@@ -214,12 +213,12 @@ def _add_grasps(
             )
 
 
-def drawn_grasps(grasps: GraspSet, most: int) -> NDArray[np.int64]:
+def drawn_grasps(grasps: GraspSet, most: int) -> Int64:
     """Return the rows that are drawn: all, or evenly spread over the ranking by label."""
     return np.sort(evenly_ranked(grasps, most))
 
 
-def label_class(labels: Array) -> NDArray[np.int64]:
+def label_class(labels: Array) -> Int64:
     """Return the class (N,) of labels (N,): number in LABEL_EDGES; -1 = not known."""
     found = np.searchsorted(LABEL_EDGES, np.nan_to_num(labels, nan=-1.0), side="right") - 1
     return np.where(np.isnan(labels), -1, np.maximum(found, 0)).astype(np.int64)

@@ -19,9 +19,9 @@ from string import Template
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import __version__
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.bop.models import model_file
 from realsim.geometry import se3
@@ -40,7 +40,6 @@ from realsim.review.static.page_nodes import (
 )
 from realsim.review.static.page_text import caption_html, counts_words, object_items, photo_items
 
-Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; "

@@ -5,8 +5,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.interop import viser_wxyz_position
 from realsim.review.window.latest import LatestOnly
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from realsim.review.placing.camera_view import CameraPicture
     from realsim.review.window.window import Window
 
-Array = NDArray[np.float64]
 JPEG_QUALITY = 85
 """Of the photograph in the browser [%]: no block is seen at this, at 150 kB for 1280x720."""
 WIDTH_PX = (320, 1280)

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.interop import viser_wxyz_position
 from realsim.records import ObjectModel, ObjectPose
@@ -14,7 +14,6 @@ from realsim.review.placing import placing
 if TYPE_CHECKING:
     from realsim.review.window.window import Window
 
-Array = NDArray[np.float64]
 NODE = "/correction"
 COPY_RGB = (51, 154, 240)
 OPACITY = 0.55

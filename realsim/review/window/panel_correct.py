@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.records import ObjectModel, ObjectPose
 from realsim.review.placing import placing
@@ -20,7 +20,6 @@ from realsim.review.window.three_points import PointPlacer
 if TYPE_CHECKING:
     from realsim.review.window.window import Window
 
-Array = NDArray[np.float64]
 STEPS_MM, STEPS_DEG = ("1", "5", "20"), ("1", "5", "90")
 FRAMES: dict[str, placing.Frame] = {"table": "table", "object": "object", "camera": "camera"}
 SIGNS = ("\u2212x", "+x", "\u2212y", "+y", "\u2212z", "+z")

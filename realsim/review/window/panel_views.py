@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.review.window import window_text
@@ -105,7 +105,7 @@ class ViewsPanel:
         center = se3.transform(placed.T_world_obj, mesh.bounds.mean(0)[None])[0]
         self._stand.look_at(center, 0.5 * float(np.linalg.norm(mesh.extent)))
 
-    def look_past(self, base: NDArray[np.float64]) -> None:
+    def look_past(self, base: Array) -> None:
         """Look at the selected object so that an arm on this base (3,) is not in the way [m]."""
         window = self._window
         mesh = window.model_of(window.placed).mesh

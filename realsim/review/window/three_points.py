@@ -4,8 +4,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Mesh
@@ -14,7 +14,6 @@ from realsim.review.placing import picking, placing
 if TYPE_CHECKING:
     from realsim.review.window.window import Window
 
-Array = NDArray[np.float64]
 PAIRS = 3
 """Three points hold an object."""
 NODE = "/picked"

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.records import ObjectModel, ObjectPose
 from realsim.rendering.overlay import VERDICT_RGB
 from realsim.review.journal import Entry
@@ -67,7 +67,7 @@ def verdict_rgb(verdict: str) -> tuple[int, int, int]:
     return r, g, b
 
 
-def _luminance(rgb: NDArray[np.float64]) -> float:
+def _luminance(rgb: Array) -> float:
     """Return the relative luminance of an sRGB colour, white = 1 (WCAG 2.1)."""
     c = rgb / 255.0
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, SupportPlane
@@ -18,7 +18,6 @@ from realsim.scanning.fusion.region import Region
 from realsim.scanning.fusion.result import FusionConfig, FusionFrame, ViewCorrection
 from realsim.scanning.fusion.volume import Volume, fused_volume
 
-Array = NDArray[np.float64]
 COARSE_CELLS = 2.0
 """The surface that views are aligned to has voxels so much larger: an eighth of the time."""
 TABLE_MARGIN_M = 0.06

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Int64
 from realsim.compiled import njit
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
@@ -19,7 +19,6 @@ from realsim.records import CameraIntrinsics
 from realsim.registration.evidence import DepthNoise
 from realsim.scanning.fusion.result import FusionConfig, FusionFrame
 
-Array = NDArray[np.float64]
 LEAST_FRAMES = 3
 """Two views neither check each other nor see around an object."""
 LONGEST_M = 20.0
@@ -129,11 +128,11 @@ def fitted_to_noise(
 
 
 def trusted_depth(
-    depth_m: NDArray[np.float32],
+    depth_m: Array32,
     intrinsics: CameraIntrinsics,
     noise: DepthNoise,
     config: FusionConfig,
-) -> NDArray[np.float32]:
+) -> Array32:
     """Return the depth (h, w) that is trusted; 0 = none, negative = an edge.
 
     At an edge, where pixels fly, the surface is not known, but the view still sees through what is
@@ -169,7 +168,7 @@ def trusted_depth(
 
 def sparse_cloud(
     frames: Sequence[FusionFrame], intrinsics: CameraIntrinsics, config: FusionConfig
-) -> tuple[Array, Array, NDArray[np.int32]]:
+) -> tuple[Array, Array, Int32]:
     """Return points (N, 3) in world, their depth (N,) [m] and the number (N,) of their frame.
 
     Every fourth pixel of 1280 is used, edges and all: enough to find a plane and what stands on it.
@@ -179,7 +178,7 @@ def sparse_cloud(
     near, far = config.depth_limits_m
     points: list[Array] = []
     depths: list[Array] = []
-    owners: list[NDArray[np.int32]] = []
+    owners: list[Int32] = []
     for number, frame in enumerate(frames):
         z = frame.depth_m[::s, ::s]
         good = (z >= near) & (z <= far) & np.isfinite(rays[..., 0])
@@ -198,9 +197,6 @@ def cloud_stride(intrinsics: CameraIntrinsics) -> int:
 # --- the parts that are used ---------------------------------------------------------------------
 
 
-Array32 = NDArray[np.float32]
-
-
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Crops:
     """The part of every depth image in which the object can be, trusted pixels only."""
@@ -208,7 +204,7 @@ class Crops:
     depths: Array32
     """(F, h, w) depth [m], 0 = none, negative = an edge (see `trusted_depth`);
     parts smaller than the largest are filled up with 0."""
-    corners: NDArray[np.int64]
+    corners: Int64
     """(F, 2) pixel x, y of the parts' first pixel."""
     camera: Array
     """(13,) fx fy cx cy, the eight distortion terms, and the greatest squared radius of the
@@ -238,7 +234,7 @@ def cropped(
     corners_world = se3.transform(T_world_table, low + grid * (high - low))
     size = np.array([intrinsics.width, intrinsics.height])
     parts: list[Array32] = []
-    starts: list[NDArray[np.int64]] = []
+    starts: list[Int64] = []
     for frame in frames:
         local = se3.transform(se3.invert(frame.T_world_cam), corners_world)
         uv = project(intrinsics, local[local[:, 2] > 0.02])

@@ -9,8 +9,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32, Mask
 from realsim.geometry import se3
 from realsim.geometry.mesh import vertex_normals
 from realsim.records import CameraIntrinsics, Mesh, SupportPlane, Verdict
@@ -49,7 +49,6 @@ __all__ = [
     "fuse_object",
 ]
 
-Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 HOPELESS_SHARE = 0.4
 """With less than this of the surface above the cut measured the mesh is rejected."""
@@ -168,7 +167,7 @@ def _judged(
     )  # fmt: skip
 
 
-def _sigma(seen: VertexEvidence, pose_sigma_m: float, measured: NDArray[np.bool_]) -> Array:
+def _sigma(seen: VertexEvidence, pose_sigma_m: float, measured: Mask) -> Array:
     """Return the 1-sigma (V,) of the measured vertices along their normals [m].
 
     The noise of the mean, as the depth model says or as the views' spread says, whichever is
@@ -183,16 +182,16 @@ def _sigma(seen: VertexEvidence, pose_sigma_m: float, measured: NDArray[np.bool_
 
 def _coverage(
     surface: Surface,
-    down: NDArray[np.bool_],
-    measured: NDArray[np.bool_],
-    views: NDArray[np.int32],
+    down: Mask,
+    measured: Mask,
+    views: Int32,
 ) -> Coverage:
     """Return the shares of the area that were measured and invented."""
     a, b, c = np.moveaxis(surface.vertices[surface.faces], 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     total = float(area.sum())
 
-    def share(vertices: NDArray[np.bool_]) -> float:
+    def share(vertices: Mask) -> float:
         return float(area @ vertices[surface.faces].mean(axis=1) / total)
 
     invented = ~measured & ~surface.below_cut

@@ -8,8 +8,8 @@ some ten thousand numbers, and their noise known.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.geometry.distance_field import DistanceField
@@ -18,7 +18,6 @@ from realsim.scanning.fusion.evidence import Crops
 from realsim.scanning.fusion.result import FusionConfig
 from realsim.scanning.fusion.volume import Volume, smoothed
 
-Array = NDArray[np.float64]
 STRIDE_PX = 2
 """Every how many pixels one is used; stereo noise is correlated over more."""
 SOUND_PX = 2
@@ -58,9 +57,9 @@ LEAST_SLOPE = 0.5
 class Observations:
     """Mean distances of views to patches; rows of a linear system in the views' twists."""
 
-    patch: NDArray[np.int64]
+    patch: Int64
     """(N,) number of the patch."""
-    view: NDArray[np.int64]
+    view: Int64
     """(N,) number of the view in the list of frames."""
     residual: Array
     """(N,) mean distance to the surface along its normal [m]."""
@@ -282,7 +281,7 @@ def _averaged(
     )
 
 
-def _flat(cell: NDArray[np.int64], normal: Array) -> NDArray[np.bool_]:
+def _flat(cell: Int64, normal: Array) -> Mask:
     """Return which points (N,) lie in cells without an edge.
 
     Judged by the largest eigenvalue of the mean of n n': the two sides of a wall are no edge.

@@ -5,14 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim.scanning.fusion.result import FusedObject
 from realsim.scanning.shading import ShadingConfig, color_paint, shaded_views
 
-Array = NDArray[np.float64]
 SIDES = ("front, from 25° above", "right, from 25° above", "back, from 25° above", "from above")
 LOOK = ShadingConfig(
     sides_deg=((-90.0, 25.0), (0.0, 25.0), (90.0, 25.0), (-90.0, 89.0)), margin=0.02, ambient=0.45

@@ -15,13 +15,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.geometry.robust import mad_sigma, tukey_weights
 from realsim.scanning.fusion.patches import Observations
 from realsim.scanning.fusion.result import FusionConfig
 
-Array = NDArray[np.float64]
 KERNEL = 4.0
 """Cut-off of Tukey's kernel in sigmas of a patch (robustly scaled)."""
 KEPT = 0.2
@@ -54,7 +53,7 @@ class PoseState:
     """(F,) the same in sigmas of the patches."""
     support: Array
     """(F,) share of these patches that the kernel keeps; NaN without."""
-    shared: NDArray[np.int64]
+    shared: Int64
     """(F,) number of patches of the object that the view shares with others."""
     surface_sigma_m: float = float("nan")
     """1-sigma by which the pose errors that are left move the surface [m]."""
@@ -104,7 +103,7 @@ def refined_twists(
     several = _several(seen)
     n = np.bincount(seen.view[several], minlength=frames)
 
-    def mean(values: Array | NDArray[np.bool_]) -> Array:
+    def mean(values: Array | Mask) -> Array:
         total = np.bincount(seen.view[several], values[several], minlength=frames)
         return np.where(n > 0, total / np.maximum(n, 1), np.nan)
 
@@ -216,7 +215,7 @@ def _table_residuals(table: Observations, step: Array) -> Array:
     return moved - (a + b * table.place[:, 0] + c * table.place[:, 1])
 
 
-def _several(seen: Observations) -> NDArray[np.bool_]:
+def _several(seen: Observations) -> Mask:
     """Return which observations (N,) are of a patch that other views see too."""
     return np.bincount(seen.patch)[seen.patch] > 1 if len(seen.patch) else np.zeros(0, dtype=bool)
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, SupportPlane
@@ -15,7 +15,6 @@ from realsim.registration.table_planes import PlaneConfig, find_support_plane
 from realsim.scanning.fusion.evidence import cloud_stride, sparse_cloud
 from realsim.scanning.fusion.result import FusionConfig, FusionFrame
 
-Array = NDArray[np.float64]
 CELL_M = 0.004
 """Cells in which things are told apart [m]..."""
 CELL_PX = 2.0
@@ -137,7 +136,7 @@ def _holes_text(frames: Sequence[FusionFrame]) -> str:
 
 
 def _things(
-    points: Array, owners: NDArray[np.int32], sizes: tuple[float, int], config: FusionConfig
+    points: Array, owners: Int32, sizes: tuple[float, int], config: FusionConfig
 ) -> list[tuple[Array, Array]]:
     """Return the boxes (low, high) of the things among points above the table, largest first.
 

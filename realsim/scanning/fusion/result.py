@@ -4,11 +4,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Mask, UInt8
 from realsim.records import Mesh, SupportPlane, Verdict
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -17,11 +15,11 @@ class FusionFrame:
 
     index: int
     """Number of the view in its session."""
-    depth_m: NDArray[np.float32]
+    depth_m: Array32
     """(H, W) depth along z [m]; 0 = none. Distorted as the camera sees it."""
     T_world_cam: Array
     """(4, 4) camera in world [m]."""
-    rgb: NDArray[np.uint8] | None = None
+    rgb: UInt8 | None = None
     """(H, W, 3) colours of the same pixels."""
 
 
@@ -147,9 +145,9 @@ class FusedObject:
     """Watertight, faces outward, in the WORLD frame [m]; vertex colours if images were given."""
     plane: SupportPlane
     """The table it stands on, after refinement, in world."""
-    measured: NDArray[np.bool_]
+    measured: Mask
     """(V,) whether a camera measured the surface at the vertex; the rest is invented."""
-    support: NDArray[np.int32]
+    support: Int32
     """(V,) number of views that measured it."""
     sigma_m: Array
     """(V,) 1-sigma of the vertex along its normal [m]; NaN where it is invented."""

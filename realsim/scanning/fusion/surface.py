@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int32, Int64, Mask, UInt8
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
@@ -22,8 +22,6 @@ from realsim.scanning.fusion.evidence import Crops, pixel_of
 from realsim.scanning.fusion.result import FusionConfig, FusionFrame
 from realsim.scanning.fusion.volume import Volume
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 SMOOTH_STEPS = 12
 """Steps of Laplacian smoothing of invented patches, whose raw shape is the staircase of voxels."""
 BAND_LAYERS = 2
@@ -38,11 +36,11 @@ class Surface:
 
     vertices: Array
     """(V, 3) [m]."""
-    faces: NDArray[np.int32]
+    faces: Int32
     """(F, 3) counter-clockwise seen from outside."""
-    known: NDArray[np.bool_]
+    known: Mask
     """(V,) whether the volume around the vertex was seen on both sides of the surface."""
-    below_cut: NDArray[np.bool_]
+    below_cut: Mask
     """(V,) part of the underside or of the band that was extended down to the plane."""
     specks: int
     """Pieces that were removed."""
@@ -75,9 +73,7 @@ def closed_surface(volume: Volume, cut_m: float, config: FusionConfig) -> Surfac
     )  # fmt: skip
 
 
-def _extended(
-    volume: Volume, cut_m: float, config: FusionConfig
-) -> tuple[Array32, NDArray[np.bool_]]:
+def _extended(volume: Volume, cut_m: float, config: FusionConfig) -> tuple[Array32, Mask]:
     """Return the field of a solid on the plane and where (X, Y, Z) its nodes were not seen."""
     unknown = np.isnan(volume.distance)
     inside = np.float32(-config.truncation_m)
@@ -121,7 +117,7 @@ def _one_piece(field: Array32, cell: float) -> tuple[Array32, int, int]:
     return out.astype(np.float32), count - 1, holes - 1
 
 
-def _zero_level(field: Array32, volume: Volume) -> tuple[Array, NDArray[np.int32]]:
+def _zero_level(field: Array32, volume: Volume) -> tuple[Array, Int32]:
     """Return vertices (V, 3) [m] and faces of the field's zero level, faces outward.
 
     Open3D's `create_isosurfaces` (flying edges) shares vertices and is closed; its coordinates are
@@ -157,7 +153,7 @@ def _zero_level(field: Array32, volume: Volume) -> tuple[Array, NDArray[np.int32
     return vertices, faces
 
 
-def _touches(unknown: NDArray[np.bool_], volume: Volume, vertices: Array) -> NDArray[np.bool_]:
+def _touches(unknown: Mask, volume: Volume, vertices: Array) -> Mask:
     """Return which vertices (V,) lie on an edge of the grid with an end that was not seen."""
     node = (vertices - volume.origin) / volume.cell
     low = np.clip(np.floor(node + 1e-6).astype(np.int64), 0, np.array(unknown.shape) - 1)
@@ -165,7 +161,7 @@ def _touches(unknown: NDArray[np.bool_], volume: Volume, vertices: Array) -> NDA
     return unknown[tuple(low.T)] | unknown[tuple(high.T)]
 
 
-def _smoothed(vertices: Array, faces: NDArray[np.int32], free: NDArray[np.bool_]) -> Array:
+def _smoothed(vertices: Array, faces: Int32, free: Mask) -> Array:
     """Return the vertices with the free ones moved to the mean of their neighbours, repeatedly."""
     if not free.any():
         return vertices
@@ -181,7 +177,7 @@ def _smoothed(vertices: Array, faces: NDArray[np.int32], free: NDArray[np.bool_]
     return out
 
 
-def patch_widths(surface: Surface, patch: NDArray[np.bool_]) -> Array:
+def patch_widths(surface: Surface, patch: Mask) -> Array:
     """Return the widths (K,) [m] of the connected patches of vertices: of discs of their area."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -216,24 +212,24 @@ AGREE_SIGMAS = 4.0
 class VertexEvidence:
     """Per vertex, from all views."""
 
-    views: NDArray[np.int32]
+    views: Int32
     """(V,) number of views that measured it."""
     noise_sigma_m: Array
     """(V,) 1-sigma of the mean distance from the depth noise [m]; inf without views."""
     spread_m: Array
     """(V,) standard deviation of the views' distances along the normal [m]; 0 below two views."""
-    colors: NDArray[np.uint8] | None
+    colors: UInt8 | None
     """(V, 3) mean RGB of the views that measured it; grey where none did."""
 
 
 @njit
 def _look(
-    view: tuple[NDArray[np.float32], NDArray[np.int64], Array],
+    view: tuple[Array32, Int64, Array],
     camera: Array,
     noise: Array,
     surface: tuple[Array, Array],
     limits: tuple[float, float, float],
-    image: NDArray[np.uint8],
+    image: UInt8,
     sums: Array,
 ) -> None:
     """Add one view to sums (V, 8): views, sum w, sum w r, sum w r^2, sum of weights and RGB."""

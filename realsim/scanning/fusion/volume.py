@@ -13,15 +13,13 @@ of all that is around; that word counts only where too few views measured anythi
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int64, UInt8
 from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
 from realsim.scanning.fusion.evidence import Crops, pixel_of
 from realsim.scanning.fusion.result import FusionConfig
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 NEAREST_M = 0.02
 """Nothing nearer to a camera than this is seen [m]."""
 LEAST_SLOPE = 0.3
@@ -43,13 +41,13 @@ class Volume:
     distance: Array32
     """(X, Y, Z) mean signed distance, positive outside, cut off at the truncation [m]; NaN where
     too few views looked."""
-    seen: NDArray[np.uint8]
+    seen: UInt8
     """(X, Y, Z) number of views that say something about the voxel."""
 
 
 @njit(inline="always")
 def _one_view(  # noqa: PLR0911 - seven ways to see nothing, in a row
-    view: tuple[Array32, NDArray[np.int64], Array],
+    view: tuple[Array32, Int64, Array],
     lens: tuple[Array, Array],
     node: tuple[float, float, float],
     normal: tuple[float, float, float, float],
@@ -116,13 +114,13 @@ def _one_view(  # noqa: PLR0911 - seven ways to see nothing, in a row
 
 @njit
 def _fuse(
-    crops: tuple[Array32, NDArray[np.int64], tuple[Array, Array]],
+    crops: tuple[Array32, Int64, tuple[Array, Array]],
     Ts_cam_table: Array,
     origin: Array,
     before: tuple[Array32, Array, float],
     limits: tuple[float, float, float],
     needed: int,
-    out: tuple[Array32, NDArray[np.uint8]],
+    out: tuple[Array32, UInt8],
 ) -> None:
     """Fill the mean distance and the number of views of every node."""
     depths, corners, lens = crops

@@ -8,8 +8,8 @@ touches the table; hand-eye, arm, depth bias and the outlines' offset have prior
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32, Int64
 from realsim.geometry import se3
 from realsim.geometry.normal_equations import (
     System,
@@ -46,8 +46,6 @@ from realsim.scanning.scale.state import (
     stacked,
 )
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
 Seen = tuple[Array, Array, Array]
 """Places (N, 3) in the body's frame, distances (N,) and normals (N, 3); NaN = unseen."""
 TABLE_CUT = 8.0
@@ -70,13 +68,13 @@ class Round:
 
     points: Array
     """(N, 3) of the object, all views, camera axes."""
-    views: Ints
+    views: Int32
     """(N,)."""
     variance: Array
     """(N,) of one point along the normal [m^2]."""
     crowding: Array
     """(N,) points that share one piece of independent noise."""
-    ids: NDArray[np.int64]
+    ids: Int64
     """(N,) patch."""
     rims: Rims
 
@@ -109,7 +107,7 @@ class Reduced:
 
 
 def object_distances(shape: ScanShape, state: ScaleState, cameras: Array, points: Array,
-                     views: Ints) -> tuple[Seen, Array]:  # fmt: skip
+                     views: Int32) -> tuple[Seen, Array]:  # fmt: skip
     """Return how far points in camera axes lie from the object, and T_body_cam (V, 4, 4)."""
     Ms = se3.invert(state.poses[0]) @ cameras
     eyes = np.ascontiguousarray(Ms[:, :3, 3])

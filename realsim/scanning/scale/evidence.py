@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Mask, UInt8
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.camera import project, ray_table
@@ -21,9 +21,6 @@ from realsim.registration.evidence import Cloud, DepthFrame, DepthNoise
 from realsim.scanning.scale.config import ScaleConfig
 from realsim.scanning.scale.table import Footprint
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 EDGE_M = 0.006
 """Depth span within 3 px beyond which pixels may be flying [m]; plus slope and noise."""
 LEAST_HEIGHT_M = 0.003
@@ -153,7 +150,7 @@ def _marks(
     T: Array32,
     cells: tuple[Mask, Mask, Array32, float],
     limits: tuple[float, float, float],
-) -> NDArray[np.uint8]:
+) -> UInt8:
     """Return the marks (H, W) of every pixel.
 
     Args:

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, Mesh, SupportPlane, Verdict
 from realsim.registration.evidence import DepthFrame, check_frames, measure_noise
@@ -30,7 +30,6 @@ from realsim.scanning.scale.verdict import Explained, Judged, explain, judge, li
 
 __all__ = ["DepthFrame", "ScaleConfig", "ScaleFit", "Similarity", "fit_scale"]
 
-Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 LEAST_VIEWS = 3
 """Fewer views leave the scale to the shape of one side."""
@@ -179,7 +178,7 @@ def _joint(
 
 def _against_all(
     shape: ScanShape, evidence: ScanEvidence, state: ScaleState, config: ScaleConfig
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Return which views (V,) are out of line: their camera, or what they see of the object."""
     v = config.verdict
     twist = np.sqrt(np.mean(np.square(state.views / priors_of(config).arm), axis=1))

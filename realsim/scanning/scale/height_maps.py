@@ -11,13 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.compiled import njit
 from realsim.errors import DegenerateError
 from realsim.scanning.scale.shape import ScanShape
 
-Array = NDArray[np.float64]
 FILL_NEIGHBOURS = 5
 """An empty cell with so many of its 8 neighbours measured is a gap of the measurement."""
 NEIGHBOURS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
@@ -151,7 +150,7 @@ def make_templates(
     return found
 
 
-def _of_the_object(above: Array, config: HeightMapConfig) -> NDArray[np.bool_]:
+def _of_the_object(above: Array, config: HeightMapConfig) -> Mask:
     """Return which points (N, 3) stand on the largest connected areas, (N,).
 
     Leftovers of the table far away must not set the size of the cells.
@@ -168,7 +167,7 @@ def _of_the_object(above: Array, config: HeightMapConfig) -> NDArray[np.bool_]:
     return inside & (_without_islands(marked, config.least_island)[tuple(index.T)] > 0)
 
 
-def _percentiles(keys: NDArray[np.int64], z: Array, n: int, config: HeightMapConfig) -> Array:
+def _percentiles(keys: Int64, z: Array, n: int, config: HeightMapConfig) -> Array:
     """Return the percentile (n,) of the heights with each key, 0 where there is none."""
     order = np.lexsort((z, keys))
     first = np.searchsorted(keys[order], np.arange(n + 1))

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32
 from realsim.geometry.normal_equations import System, inverse, view_steps
 from realsim.records import Mesh
 from realsim.registration.refinement.equations import BIAS_AT, HAND_EYE_AT, TABLE_AT
@@ -44,7 +44,6 @@ from realsim.scanning.scale.state import (
     moved_state,
 )
 
-Array = NDArray[np.float64]
 CUTS = (6.0, 4.5, 4.0, 4.0)
 """Tukey's cut-offs of the rounds [sigma of noise and shape]."""
 STEPS = 3
@@ -74,7 +73,7 @@ class Outlook:
     """(N,) of the surface points [m]; NaN = the camera cannot have seen that surface."""
     kernels: Array
     """(N,) Tukey's weights; 0 = not used."""
-    view_of: NDArray[np.int32]
+    view_of: Int32
     """(N,) which view (its place in the list) a surface point belongs to."""
     local: Array
     """(N, 3) the surface points in the inner mesh's axes."""

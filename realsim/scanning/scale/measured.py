@@ -17,12 +17,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError, UnitError
 from realsim.records import Mesh
 
-Array = NDArray[np.float64]
 Point = tuple[float, float, float]
 Kind = Literal["longest", "x", "y", "z", "diameter", "height", "between"]
 KINDS: tuple[Kind, ...] = ("longest", "x", "y", "z", "diameter", "height", "between")

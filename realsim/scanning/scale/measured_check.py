@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.records import Mesh
@@ -23,7 +23,6 @@ from realsim.scanning.scale.measured import (
 )
 from realsim.scanning.scale.result import ScaleFit
 
-Array = NDArray[np.float64]
 LOG_SCALE = 6
 """Row of the logarithm of the scale in a fit's covariance."""
 TO_SIGMA = 1.4826

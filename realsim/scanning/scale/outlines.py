@@ -10,8 +10,8 @@ Where the real surface lies outside by delta, so does the outline: r + delta.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int64
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.lens_loops import pixel
@@ -23,8 +23,6 @@ from realsim.scanning.scale.evidence import Rim, ScanEvidence
 from realsim.scanning.scale.shape import INNER_EXTENT, ScanShape
 from realsim.scanning.scale.state import OBJECT, PATCHES, RIM, SIZE, ScaleState, metre_per_px
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
 COLUMNS = 8
 """Of a block of outlines: twist, size, the outlines' offset."""
 WIDEST_GAP_PX = 5.0
@@ -43,7 +41,7 @@ class Rims:
 
     points: list[Array]
     """(N, 3) in the inner mesh's axes."""
-    ids: list[NDArray[np.int64]]
+    ids: list[Int64]
     """(N,) patch."""
     factors: list[Array]
     """(N,) by which they count less, since all outlines of a patch may be off by the same."""
@@ -55,7 +53,7 @@ def outlines_of(
     """Return the points of the model's outline in every view that its depth can show."""
     T_table_world = se3.invert(state.table)
     points: list[Array] = []
-    ids: list[NDArray[np.int64]] = []
+    ids: list[Int64] = []
     offered = np.zeros(len(shape.patches.areas))
     for T in cameras:
         found = outline(shape, state, T, evidence.intrinsics.fx, config.samples.rim_points)
@@ -147,7 +145,7 @@ def add_outline(  # noqa: PLR0915 - one pass over the points, in compiled code
     rim: tuple[Array32, Array32, float, float],
     data: tuple[Array, float, float],
     limits: tuple[float, float, float, bool],
-    patches: tuple[NDArray[np.int64], Array],
+    patches: tuple[Int64, Array],
     system: tuple[Array, Array, Array, Array, Array],
 ) -> None:
     """Add points of the model in one view: those of its outline, or those outside of the measured.

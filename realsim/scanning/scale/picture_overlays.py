@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Image
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
@@ -16,8 +16,6 @@ from realsim.scanning.scale.pictures import INK, MUTED, diverging_map, new_figur
 from realsim.scanning.scale.result import ScaleFit, ViewAgreement
 from realsim.scanning.shading import diverging
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 Window = tuple[slice, slice]
 OUTLINE = (255, 196, 0)
 """Colour of the model's outline: none of an object's usual ones."""
@@ -31,7 +29,7 @@ class Photograph:
     """Number of the view."""
     rgb: Image
     """(H, W, 3)."""
-    depth_m: NDArray[np.float32]
+    depth_m: Array32
     """(H, W) depth along z [m]; 0 = none."""
     T_world_cam: Array
     """(4, 4) camera in world [m]."""

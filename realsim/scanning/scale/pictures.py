@@ -7,8 +7,8 @@ import io
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Mesh
@@ -21,7 +21,6 @@ from realsim.scanning.shading import (
     value_paint,
 )
 
-Array = NDArray[np.float64]
 INK, MUTED, GOOD, WARN, BAD = "#22303c", "#8a99a8", "#1f8a7d", "#b26a00", "#c03f26"
 VERDICT_COLORS = {"accepted": GOOD, "doubtful": WARN, "rejected": BAD, "unchecked": MUTED}
 DPI = 110
@@ -245,7 +244,7 @@ def candidates_png(fit: ScaleFit) -> bytes:
 
 
 def _name_rivals(
-    ax: Any, fit: ScaleFit, scale: Array, score: Array, same: NDArray[np.bool_], names: list[str]
+    ax: Any, fit: ScaleFit, scale: Array, score: Array, same: Mask, names: list[str]
 ) -> None:
     """Write beside the best three of the other scales where they come from."""
     rivals = [k for k in np.argsort(-score) if not same[k]][:3]

@@ -3,14 +3,10 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import Mesh, SupportPlane, Verdict
 from realsim.untrusted.own_json import Real
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.normal_equations import symmetric
 from realsim.registration.refinement.equations import BLOCK, add_blocks
@@ -33,7 +33,6 @@ from realsim.scanning.scale.state import (
 )
 from realsim.scanning.scale.verdict import explain
 
-Array = NDArray[np.float64]
 WIDTHS = (0.25, 0.12, 0.06)
 """Tukey's cut-offs as shares of the object's size: 25, 12 and 6 mm of 10 cm."""
 STEPS = 8

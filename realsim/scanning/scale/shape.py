@@ -22,17 +22,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int64
 from realsim.errors import DegenerateError
 from realsim.geometry.distance_field import DistanceField, raycasting_scene
 from realsim.geometry.mesh import decimated, face_normals, hull_vertices, sample_surface
 from realsim.records import Mesh
 from realsim.scanning.scale.config import ScaleConfig, ShapeConfig
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 JITTER = 1e-12
 """Share of the variance that keeps conditioned covariances positive."""
 
@@ -52,7 +49,7 @@ class SurfacePatches:
     radius: float
     """Typical distance of a patch's points from its middle [inner unit]."""
 
-    def of(self, points: Array, normals: Array) -> NDArray[np.int64]:
+    def of(self, points: Array, normals: Array) -> Int64:
         """Return the patch (N,) of points (N, 3) with the normals (N, 3) of their surface."""
         from scipy.spatial import KDTree
 
@@ -216,7 +213,7 @@ class ScanShape:
     normals: Array
     """(S, 3) outward."""
     patches: SurfacePatches
-    edges: NDArray[np.int64]
+    edges: Int64
     """(E, 2) vertices of every edge with two faces."""
     edge_normals: Array
     """(E, 2, 3) normals of its two faces."""
@@ -312,7 +309,7 @@ def mirrored(shape: ScanShape) -> ScanShape:
     )
 
 
-def _two_faced_edges(mesh: Mesh) -> tuple[NDArray[np.int64], Array]:
+def _two_faced_edges(mesh: Mesh) -> tuple[Int64, Array]:
     """Return the edges (E, 2) that two faces share, and those faces' normals (E, 2, 3)."""
     f = mesh.faces.astype(np.int64)
     edges = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)

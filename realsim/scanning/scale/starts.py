@@ -7,8 +7,8 @@ that differ are starts. `starts_near` gives the alternatives of a start that som
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.models.resting import RestingConfig, resting_orientations, turned_down
@@ -25,7 +25,6 @@ from realsim.scanning.scale.height_maps import (
 from realsim.scanning.scale.result import Similarity
 from realsim.scanning.scale.shape import INNER_EXTENT, ScanShape
 
-Array = NDArray[np.float64]
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 COMPARED_POINTS = 150
 """Points of the surface by which two starts are told apart."""

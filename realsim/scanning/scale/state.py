@@ -3,14 +3,13 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32
 from realsim.geometry import se3
 from realsim.registration.refinement.equations import OBJECTS, State, object_at, step_state
 from realsim.scanning.scale.config import ScaleConfig
 from realsim.scanning.scale.evidence import ScanEvidence, ScanView
 
-Array = NDArray[np.float64]
 OBJECT = object_at(0)
 SIZE, RIM, PATCHES = OBJECTS + 6, OBJECTS + 7, OBJECTS + 8
 """Where the unknowns stand that a scale fit adds to registration's: the logarithm of the size, the
@@ -111,7 +110,7 @@ def moved_state(state: ScaleState, shared: Array, views: Array) -> ScaleState:
     )  # fmt: skip
 
 
-def stacked(points: list[Array]) -> tuple[Array, NDArray[np.int32]]:
+def stacked(points: list[Array]) -> tuple[Array, Int32]:
     """Return the points of all views in one piece, and which view each is of."""
     counts = [len(p) for p in points]
     return np.concatenate(points), np.repeat(np.arange(len(points), dtype=np.int32), counts)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.clouds import fit_plane_ransac, plane_frame, refine_plane
@@ -15,7 +15,6 @@ from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.evidence import DepthFrame, DepthNoise
 from realsim.scanning.scale.config import TableConfig
 
-Array = NDArray[np.float64]
 COARSE_STRIDE = 8
 """Every eighth row and column finds a table and what stands on it."""
 NEAR_AT_M = 0.1
@@ -31,9 +30,9 @@ class Footprint:
     origin: Array
     """(2,) corner of cell (0, 0) in the table's frame [m]."""
     cell_m: float
-    near: NDArray[np.bool_]
+    near: Mask
     """(X, Y) cells of the object and around it, where measured points above the table are its."""
-    around: NDArray[np.bool_]
+    around: Mask
     """(X, Y) cells whose table is used."""
     box: Array
     """(2, 3) box of the object's points in the table's frame [m]."""
@@ -196,7 +195,7 @@ def _middle(points: Array, plane: SupportPlane) -> tuple[float, float, float]:
     return float(x), float(y), height
 
 
-def _grown(cells: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+def _grown(cells: Mask, radius: int) -> Mask:
     """Return the cells (X, Y) and all within `radius` of them."""
     import cv2
 

@@ -14,8 +14,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.records import SupportPlane, Verdict
 from realsim.registration.table_planes import table_depth
 from realsim.rendering.rays import rotated
@@ -26,8 +26,6 @@ from realsim.scanning.scale.result import Limit
 from realsim.scanning.scale.shape import ScanShape
 from realsim.scanning.scale.state import SIZE, ScaleState, claimed_cameras
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 TAU_M = 0.003
 """Depth difference that agrees whatever the noise [m]."""
 TAU_SHAPE = 0.02

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.robust import MAD_TO_SIGMA
@@ -28,7 +28,6 @@ from realsim.scanning.sfm.config import AlignmentConfig
 from realsim.scanning.sfm.result import Alignment, ViewResidual
 from realsim.scanning.sfm.uncertainty import view_residuals
 
-Array = NDArray[np.float64]
 STEPS = 30
 """Gauss-Newton steps at most; four are usual."""
 CONVERGED = 1e-7

@@ -22,15 +22,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.geometry import se3
 from realsim.geometry.camera import project, projection_jacobian
 from realsim.geometry.robust import mad_sigma
 from realsim.scanning.sfm.config import MappingConfig, RobotNoise
 from realsim.scanning.sfm.result import Geometry
 
-Array = NDArray[np.float64]
 LEAST_SIGMA_PX = 0.1
 """No photograph is measured better than this [px]."""
 DAMPING = 1e-6
@@ -330,7 +329,7 @@ def halves(geometry: Geometry) -> tuple[Geometry, Geometry]:
         block = _split(geometry.points, block)
         # Blocks that touch across any of the cuts go to different halves.
         parity = (parity + block) % 2
-    odd: NDArray[np.bool_] = parity.astype(np.bool_)
+    odd: Mask = parity.astype(np.bool_)
     return _with_points(geometry, np.logical_not(odd)), _with_points(geometry, odd)
 
 
@@ -345,7 +344,7 @@ def reliability(first: Array, second: Array) -> float:
     return max(signal, 0.0) / max(max(signal, 0.0) + noise, 1e-300)
 
 
-def _split(points: Array, block: NDArray[np.int64]) -> NDArray[np.int64]:
+def _split(points: Array, block: Int64) -> Int64:
     """Return block numbers after halving each block along its longest side."""
     finer = 2 * block
     for b in np.unique(block):
@@ -356,7 +355,7 @@ def _split(points: Array, block: NDArray[np.int64]) -> NDArray[np.int64]:
     return finer
 
 
-def _with_points(geometry: Geometry, keep: NDArray[np.bool_]) -> Geometry:
+def _with_points(geometry: Geometry, keep: Mask) -> Geometry:
     """Return the geometry with some of its points; all cameras stay."""
     place = np.cumsum(keep) - 1
     use = keep[geometry.points_of]

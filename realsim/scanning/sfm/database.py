@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import DegenerateError
 from realsim.interop import colmap_from_opencv_px, quiet_output
 from realsim.records import CameraIntrinsics
@@ -69,7 +69,7 @@ def build_database(
     intrinsics: CameraIntrinsics | None,
     config: SfmConfig,
     folder: Path,
-    masks: Mapping[str, NDArray[np.bool_]] | None,
+    masks: Mapping[str, Mask] | None,
     tick: Tick,
 ) -> MatchDatabase:
     """Extract the features of every image, those done before left as they are.
@@ -188,7 +188,7 @@ def _claim(
     intrinsics: CameraIntrinsics | None,
     config: SfmConfig,
     folder: Path,
-    masks: Mapping[str, NDArray[np.bool_]] | None,
+    masks: Mapping[str, Mask] | None,
 ) -> dict[str, Any]:
     """Return the note of the database that fits these inputs; another one is deleted."""
     import pycolmap
@@ -266,9 +266,6 @@ def _require_texture(database: MatchDatabase, masked: bool) -> None:
 
 
 # --- which images to match -----------------------------------------------------------------------
-
-
-Array = NDArray[np.float64]
 
 
 def pairs_to_match(

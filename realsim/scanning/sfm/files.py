@@ -15,15 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.scanning.sfm.config import SfmConfig
 from realsim.scanning.sfm.result import Alignment, SfmResult
 from realsim.store.atomic import write_bytes, write_json
 from realsim.untrusted.own_json import read_object, to_json
 
-Array = NDArray[np.float64]
 RESULT, CAMERAS, CLOUD = "sfm.json", "cameras.json", "sparse.ply"
 VERSION = 1
 PACKAGES = ("realsim", "pycolmap", "numpy", "scipy", "opencv-python-headless")

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32
 from realsim.geometry import se3
 from realsim.geometry.depth import edge_mask
 from realsim.geometry.robust import mad_sigma
@@ -209,7 +209,6 @@ def _depth(depth: DepthScale | None, trust: TrustConfig) -> Iterator[Finding]:
 # --- the depth images' scale ---------------------------------------------------------------------
 
 
-Array = NDArray[np.float64]
 EDGE_SHARE = 0.03
 """Depth that changes by more than this share within the margin is an edge: 12 mm at 0.4 m."""
 EDGE_MARGIN_PX = 3
@@ -224,7 +223,7 @@ MEDIAN_OF_NORMAL = 1.2533
 
 def depth_scale(
     geometry: Geometry,
-    depth_of: Callable[[str], NDArray[np.float32] | None],
+    depth_of: Callable[[str], Array32 | None],
     config: TrustConfig,
 ) -> DepthScale | None:
     """Compare measured depth with the depth of the sparse points, both along z.
@@ -274,7 +273,7 @@ def depth_scale(
     )
 
 
-def _at(depth_m: NDArray[np.float32], uv_px: Array) -> Array:
+def _at(depth_m: Array32, uv_px: Array) -> Array:
     """Return the depth (K,) at the nearest pixels [m]; 0 at edges, holes and outside."""
     height, width = depth_m.shape
     measured = np.where(np.isfinite(depth_m), depth_m, 0).astype(np.float32)

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.formats.colmap.model import read_model
 from realsim.geometry import se3
@@ -20,7 +20,6 @@ from realsim.scanning.sfm.database import MatchDatabase
 from realsim.scanning.sfm.result import Geometry
 from realsim.store.atomic import write_bytes
 
-Array = NDArray[np.float64]
 Tick = Callable[[int, int], None]
 LEAST_MODEL = 3
 """Views of the smallest model that is kept."""

@@ -4,11 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.scanning.sfm.result import SfmResult
 
-Array = NDArray[np.float64]
 INK, MUTED, GOOD, BAD = "#22303c", "#8a99a8", "#2a9d8f", "#c8553d"
 MOST_POINTS = 20_000
 """Points drawn; more only make the file larger."""
@@ -100,9 +99,7 @@ def _short(names: tuple[str, ...]) -> list[str]:
     return [Path(n).stem.lstrip("0") or "0" for n in names]
 
 
-def _bars(
-    ax: Any, names: tuple[str, ...], values: Array, wrong: NDArray[np.bool_], label: str
-) -> None:
+def _bars(ax: Any, names: tuple[str, ...], values: Array, wrong: Mask, label: str) -> None:
     place = np.arange(len(names))
     ax.bar(place, values, color=np.where(wrong, BAD, GOOD))
     ax.set_ylabel(label, fontsize=8)

@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Mask
 from realsim.errors import DegenerateError, InputError
 from realsim.records import CameraIntrinsics
 from realsim.scanning.sfm.bundle import point_covariances, reprojection_errors, robust_sigma
@@ -22,8 +22,6 @@ from realsim.scanning.sfm.photographs import Photographs, checked_photographs
 from realsim.scanning.sfm.result import Geometry, Matching, Poses, Progress, SfmResult
 from realsim.scanning.sfm.ways import LEAST_IN_VIEW, MODEL, Job, Mapped, map_at_poses, map_free
 
-Array = NDArray[np.float64]
-
 
 def reconstruct(
     images: Sequence[Path],
@@ -32,7 +30,7 @@ def reconstruct(
     *,
     poses: Poses,
     Ts_world_cam: Sequence[Array | None] | None = None,
-    masks: Mapping[str, NDArray[np.bool_]] | None = None,
+    masks: Mapping[str, Mask] | None = None,
     folder: Path,
     progress: Progress = lambda step, done, total: None,
 ) -> SfmResult:
@@ -74,7 +72,7 @@ def reconstruct(
 
 def with_depth(
     result: SfmResult,
-    depth_of: Callable[[str], NDArray[np.float32] | None],
+    depth_of: Callable[[str], Array32 | None],
     config: SfmConfig,
 ) -> SfmResult:
     """Return the result with the depth images' scale beside the robot's, judged anew.

@@ -4,12 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import Array, Int64, UInt8
 from realsim.records import CameraIntrinsics, Verdict
 
-Array = NDArray[np.float64]
 Poses = Literal["unknown", "known", "refined"]
 """How the robot's poses are used: only for the scale; held as they are; as a start with a prior."""
 Progress = Callable[[str, int, int], None]
@@ -28,15 +25,15 @@ class Geometry:
     """(V, 4, 4)"""
     points: Array
     """(P, 3)"""
-    colors: NDArray[np.uint8]
+    colors: UInt8
     """(P, 3) RGB."""
-    cameras_of: NDArray[np.int64]
+    cameras_of: Int64
     """(K,) camera of each observation, as its place in `names`."""
-    points_of: NDArray[np.int64]
+    points_of: Int64
     """(K,) point of each observation."""
     uv_px: Array
     """(K, 2) where it was seen; integers are pixel centres."""
-    point_ids: NDArray[np.int64]
+    point_ids: Int64
     """(P,) numbers of the points in the COLMAP model."""
 
 
@@ -144,7 +141,7 @@ class SfmResult:
     """(P,) RMS reprojection error of each point."""
     point_sigma_mm: Array
     """(P,) 1-sigma of each point along its worst direction [mm], cameras taken as right."""
-    track_lengths: NDArray[np.int64]
+    track_lengths: Int64
     """(P,) views that see each point."""
     reprojection_px: float
     """Median reprojection error."""

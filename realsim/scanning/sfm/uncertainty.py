@@ -7,14 +7,13 @@ of what is left after a similarity to the robot ("inner constraints", Triggs et 
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.scanning.sfm.bundle import Bundle, picture_information, prior_sigmas
 from realsim.scanning.sfm.config import AlignmentConfig, MappingConfig, RobotNoise
 from realsim.scanning.sfm.result import Alignment, Geometry, ViewResidual
 
-Array = NDArray[np.float64]
 LEAST_REDUNDANCY = 0.05
 """Share of a prior's variance that a test of it is left with, at least: where the pictures know
 nothing of a camera, its residual is zero and so is its variance."""

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
@@ -27,7 +27,6 @@ from realsim.scanning.sfm.photographs import Photographs
 from realsim.scanning.sfm.result import Alignment, Poses, Progress
 from realsim.scanning.sfm.uncertainty import tested_freely, tested_refined
 
-Array = NDArray[np.float64]
 MODEL = "model"
 """Folder of the COLMAP model, in metres where the scale is known."""
 WORK = ".work"

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Array32
 from realsim.errors import InputError
 from realsim.geometry import mesh_shape
 from realsim.records import GraspSet, Mesh, ObjectModel, Scene, View
@@ -205,7 +205,7 @@ def _depth(store: SessionStore, view: FrameView) -> Path | None:
     return store.path(depth_path(view.index)) if store.has_depth(view.index) else None
 
 
-def _measured(inputs: FrameInputs, path: Path | None) -> NDArray[np.float32]:
+def _measured(inputs: FrameInputs, path: Path | None) -> Array32:
     """Return the depth of a view; no measurement anywhere if it was recorded without."""
     if path is not None:
         return images.read_depth(path, inputs.depth_unit_m)

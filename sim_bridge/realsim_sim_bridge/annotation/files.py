@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.bop import labels as bop_labels
 from realsim.records.grasps import LABEL_MEASURES, joined_measure
@@ -148,7 +149,7 @@ def _json(record: Any) -> dict[str, Any]:
     }
 
 
-def _pixels(uv: NDArray[np.float64]) -> list[list[float] | None]:
+def _pixels(uv: Array) -> list[list[float] | None]:
     """Return pixels (N, 2) to a thousandth; null = behind the camera."""
     return [
         [round(float(u), 3), round(float(v), 3)] if np.isfinite(u) and np.isfinite(v) else None

@@ -9,8 +9,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32
 from realsim.formats.bop.labels import mask_path
 from realsim.images.png import encode_window
 from realsim.rendering.labels import LabelRenderer, Labels
@@ -38,7 +38,7 @@ from realsim_sim_bridge.annotation.unmodelled import (
     unmodelled_region,
 )
 
-Depth = NDArray[np.float32]
+Depth = Array32
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -68,7 +68,7 @@ def renderer_of(inputs: FrameInputs) -> LabelRenderer:
 
 
 @lru_cache(maxsize=1)
-def boxes_of(inputs: FrameInputs) -> NDArray[np.float64]:
+def boxes_of(inputs: FrameInputs) -> Array:
     """Return (G, 2, 3) the box of every mesh of the renderer's scene in its own frame [m].
 
     Kept like the renderer: finding a box walks all vertices of the mesh.

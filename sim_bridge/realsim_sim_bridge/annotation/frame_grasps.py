@@ -13,16 +13,15 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Mask, UInt8
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, GraspSet
 from realsim.rendering.labels import LabelRenderer
 from realsim_sim_bridge.annotation.config import SightConfig
 from realsim_sim_bridge.annotation.unmodelled import UnmodelledRegion
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 LENS_ROUND_TRIP = 1e-3
 """How far [normalised] a projected point may come back from the lens model: a point far out of
 view can be folded into the image by the distortion polynomial, and then does not come back."""
@@ -51,7 +50,7 @@ class GraspsInView:
     """(N, 2) whether the contact at -y and at +y is seen."""
 
     @property
-    def visibility(self) -> NDArray[np.uint8]:
+    def visibility(self) -> UInt8:
         """(N,) codes of `GraspVisibility`: how many contacts are seen."""
         return np.sum(self.contact_seen, axis=1).astype(np.uint8)
 

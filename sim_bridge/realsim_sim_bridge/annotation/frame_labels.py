@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Array32, Mask
 from realsim.formats.bop.labels import NO_BBOX, Bbox, bbox_of, gt_info_entry, rle_of
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh, ObjectPose
@@ -17,8 +18,6 @@ from realsim.rendering.labels import Labels
 from realsim_sim_bridge.annotation.config import OccluderConfig
 from realsim_sim_bridge.annotation.unmodelled import ObjectMasks
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Finding = Literal["none", "occluder", "pose or occluder"]
 
 
@@ -115,8 +114,8 @@ def silhouette_box(
 
 def depth_agreement(
     visible: Mask,
-    rendered_m: NDArray[np.float32],
-    measured_m: NDArray[np.float32],
+    rendered_m: Array32,
+    measured_m: Array32,
     tolerance_m: float,
 ) -> DepthAgreement:
     """Return how measured and rendered depth (H, W) [m] agree inside a mask (H, W)."""
@@ -141,8 +140,8 @@ def depth_agreement(
 
 def unknown_occluder(
     masks: ObjectMasks,
-    rendered_m: NDArray[np.float32],
-    measured_m: NDArray[np.float32],
+    rendered_m: Array32,
+    measured_m: Array32,
     agreement: DepthAgreement,
     config: OccluderConfig,
 ) -> UnknownOccluder:
@@ -179,7 +178,7 @@ def label_object(
     mesh: tuple[Mesh, ArrayLike],
     masks: ObjectMasks,
     labels: Labels,
-    depth_m: NDArray[np.float32],
+    depth_m: Array32,
     camera_pose: tuple[CameraIntrinsics, ArrayLike],
     evidence: tuple[DepthAgreement, UnknownOccluder],
 ) -> FrameLabel:

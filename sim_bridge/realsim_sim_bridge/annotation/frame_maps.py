@@ -7,9 +7,9 @@ instances and coordinates are set where the object is visible.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Array, Array32, Counts, Int32, Int64, Mask
 from realsim.compiled import njit
 from realsim.formats import label_maps
 from realsim.images.png import encode_window
@@ -29,7 +29,7 @@ def map_files(
     view: int,
     labels: Labels,
     masks: Masks,
-    boxes: NDArray[np.float64],
+    boxes: Array,
     depth_unit_m: float,
 ) -> dict[str, bytes]:
     """Return the maps wanted of a view, by path.
@@ -79,7 +79,7 @@ def _inner(window: Window, outer: Window) -> Window:
     )
 
 
-def _instances(masks: Masks, window: Window) -> NDArray[np.int32]:
+def _instances(masks: Masks, window: Window) -> Int32:
     """Return the instances (h, w) visible in a window that holds all masks, -1 = none."""
     ids = np.full(_shape(window), label_maps.NO_OBJECT, np.int32)
     for instance, m in masks:
@@ -94,15 +94,11 @@ def _instances(masks: Masks, window: Window) -> NDArray[np.int32]:
 # them.
 
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
-Counts = NDArray[np.uint16]
 FULL = np.float32(label_maps.FULL)
 
 
 def coordinate_counts(
-    labels: Labels, window: tuple[slice, slice], seen: NDArray[np.bool_], boxes: Array
+    labels: Labels, window: tuple[slice, slice], seen: Mask, boxes: Array
 ) -> Counts:
     """Return the object coordinates of a window as counts (h, w, 3) over each object's box.
 
@@ -128,7 +124,7 @@ def _coordinates(
     depth: Array32,
     geometry: Int32,
     Ts_obj_cam: Array,
-    seen: NDArray[np.bool_],
+    seen: Mask,
     low: Array32,
     scale: Array32,
 ) -> Counts:
@@ -168,7 +164,7 @@ def _normals(
     face: Int32,
     Ts_obj_cam: Array,
     normals: Array32,
-    starts: NDArray[np.int64],
+    starts: Int64,
 ) -> Counts:
     """Return the counts (H, W, 3) of the faces' normals towards the eye, 0 0 0 where nothing is."""
     height, width = geometry.shape

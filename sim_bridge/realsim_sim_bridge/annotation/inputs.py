@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import images
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.records import (
     CameraIntrinsics,
@@ -61,7 +61,7 @@ class FrameView:
     """One view to annotate."""
 
     index: int
-    T_world_cam: NDArray[np.float64]
+    T_world_cam: Array
     """(4, 4) camera in world [m]."""
     digest: str
     """Of everything its annotation depends on."""

@@ -8,8 +8,8 @@ not in the scene hides it is hatched in magenta.
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32, Mask, Rgb
 from realsim.errors import InputError
 from realsim.formats.bop.labels import mask_path
 from realsim.geometry import se3
@@ -20,9 +20,6 @@ from realsim.rendering.overlay import VERDICT_RGB, Color
 from realsim.store import SessionStore
 from realsim_sim_bridge.annotation.files import part_path
 
-Rgb = NDArray[np.uint8]
-Ids = NDArray[np.int32]
-Array = NDArray[np.float64]
 UNKNOWN_RGB = (255, 0, 200)
 """What hides an object and is not in the scene: a colour that no object and no verdict has."""
 AXIS_SHARE = 0.3
@@ -110,8 +107,8 @@ def _with_scene(
     objects: Sequence[ObjectPose],
     models: Mapping[int, ObjectModel],
     poses: Mapping[int, Array],
-    ids: Ids,
-    hidden: NDArray[np.bool_],
+    ids: Int32,
+    hidden: Mask,
 ) -> Rgb:
     """Return a photograph with the outlines and axes of objects, and what hides them hatched."""
     from realsim.rendering import overlay
@@ -150,7 +147,7 @@ def _with_grasps(
 
 
 def _with_names(
-    picture: Rgb, objects: Sequence[ObjectPose], models: Mapping[int, ObjectModel], ids: Ids
+    picture: Rgb, objects: Sequence[ObjectPose], models: Mapping[int, ObjectModel], ids: Int32
 ) -> Rgb:
     """Return the picture with the objects' names, and their verdicts where not accepted."""
     from realsim.rendering.overlay_words import write_names
@@ -166,8 +163,8 @@ def _with_legend(
     picture: Rgb,
     objects: Sequence[ObjectPose],
     models: Mapping[int, ObjectModel],
-    ids: Ids,
-    hidden: NDArray[np.bool_],
+    ids: Int32,
+    hidden: Mask,
     grasp_sets: Sequence[GraspSet],
 ) -> Rgb:
     """Return the picture with its colours explained, and the objects that are not to be seen."""
@@ -188,9 +185,7 @@ def _with_legend(
     return write_legend(picture, entries, ids >= 0, ramp=ramp, lines=lines)
 
 
-def _hidden_by_unknown(
-    store: SessionStore, index: int, ids: NDArray[np.int32]
-) -> NDArray[np.bool_]:
+def _hidden_by_unknown(store: SessionStore, index: int, ids: Int32) -> Mask:
     """Return (H, W) what the annotation of a view took out of masks; nothing if there is none."""
     hidden = np.zeros(ids.shape, np.bool_)
     if not store.has(part_path(index)):

@@ -8,15 +8,13 @@ around it, wider than a fattened edge and larger than speckle is taken for a thi
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array32, Mask
 from realsim.formats.bop.labels import NO_BBOX, Bbox
 from realsim.records import CameraIntrinsics
 from realsim.rendering.labels import Labels
 from realsim_sim_bridge.annotation.config import OccluderConfig
 
-Array32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 Window = tuple[slice, slice]
 CLOSING_PX = 2
 """Holes of the measurement up to twice this width inside a thing belong to it [px]."""

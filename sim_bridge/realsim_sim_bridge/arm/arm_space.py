@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
@@ -24,9 +24,6 @@ from realsim.robots.compiled_chain import ChainNumbers, frames_into
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.link_spheres import Spheres, arm_spheres, hand_spheres, joined
 from realsim_sim_bridge.arm.obstacles import Obstacles, least_distance, nearest_within
-
-Array = NDArray[np.float64]
-Codes = NDArray[np.int64]
 
 FREE, IN_TABLE, IN_ITSELF, AT_LIMITS = -1, -2, -3, -4
 """What stops a configuration; an instance number (0 or more) is the object that it touches."""
@@ -76,7 +73,7 @@ class _Body(NamedTuple):
     chain: ChainNumbers
     T_table_base: Array
     """(4, 4) [m]."""
-    links: NDArray[np.int64]
+    links: Int64
     """(S,) link of each sphere, not decreasing."""
     centers: Array
     """(S, 3) link frame [m]."""
@@ -90,13 +87,13 @@ class _Body(NamedTuple):
     """(S, n) greatest distance of the centre from each joint's axis [m]; 0 = not moved by it."""
     clearances: Array
     """(2,) from others, from itself [m]."""
-    starts: NDArray[np.int64]
+    starts: Int64
     """(n + 3,) first sphere of each link."""
     balls: Array
     """(n + 2, 4) centre, link frame, and radius of a ball around each link's spheres [m]."""
     ball_levers: Array
     """(n + 2, n) greatest of the link's levers [m]."""
-    pairs: NDArray[np.int64]
+    pairs: Int64
     """(P, 2) links that can meet, the nearer to the base first."""
 
 
@@ -124,7 +121,7 @@ class ArmSpace:
         """The arm without and with the hand's spheres: near an object they are too coarse and the
         hand's boxes are checked instead."""
 
-    def blame(self, q: Array, openings_m: Array, *, with_hand: bool) -> Codes:
+    def blame(self, q: Array, openings_m: Array, *, with_hand: bool) -> Int64:
         """Return what stops each configuration (N, n), or FREE.
 
         Args:
@@ -134,7 +131,7 @@ class ArmSpace:
         """
         return self.blame_moves(q[:, None], openings_m, with_hand=with_hand)
 
-    def blame_moves(self, paths: Array, openings_m: Array, *, with_hand: bool) -> Codes:
+    def blame_moves(self, paths: Array, openings_m: Array, *, with_hand: bool) -> Int64:
         """Return what stops each path (N, W, n) of straight joint moves, or FREE."""
         return _blame_paths(
             np.ascontiguousarray(paths), openings_m, self.bodies[with_hand], self.obstacles

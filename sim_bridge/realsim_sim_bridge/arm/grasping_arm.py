@@ -5,14 +5,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.geometry import se3
 from realsim.robots.arm import RobotArm
 from realsim.robots.compiled_chain import ChainNumbers, chain_numbers
 from realsim.robots.hand import Hand
 from realsim.robots.inverse import seeds_of
 from realsim.robots.limits import JointLimits
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -56,7 +55,7 @@ class GraspingArm:
         """Return T_base_grasp (..., 4, 4) at joint angles q (..., n) [rad]."""
         return self.arm.chain.forward(q) @ self.hand.T_ee_grasp
 
-    def within_limits(self, q: Array, margin: float = 0.0) -> NDArray[np.bool_]:
+    def within_limits(self, q: Array, margin: float = 0.0) -> Mask:
         """Return whether all joints (..., n) keep the margin [rad] from their limits."""
         return np.all(
             (q >= self.limits.lower + margin) & (q <= self.limits.upper - margin), axis=-1

@@ -10,12 +10,11 @@ sides, that is in each of eight directions around it.
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.compiled import njit
 from realsim_sim_bridge.grasping.candidates import Surroundings
 
-Array = NDArray[np.float64]
 SECTORS = 8
 """Directions around a neighbour's point. Where all hold points of the object, the point is at least
 0.7 clearances inside its outline: the nearest wall is seen at no more than 45 deg."""
@@ -51,7 +50,7 @@ def touched_when_lifted(
     return None
 
 
-def _column_grid(points: Array, size_m: float) -> tuple[Array, NDArray[np.int64], Array, float]:
+def _column_grid(points: Array, size_m: float) -> tuple[Array, Int64, Array, float]:
     """Return the points sorted by square columns, the columns' starts, their origin and size."""
     # A clearance far below the points' spacing would make more columns than there are points.
     extent = np.ptp(points[:, :2], axis=0)

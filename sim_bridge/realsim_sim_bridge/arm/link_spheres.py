@@ -12,16 +12,14 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.geometry import se3
 from realsim.robots.arm import RobotArm
 from realsim.robots.compiled_chain import in_dh_frame
 from realsim.robots.hand import Hand
 from realsim.robots.shapes import Shape
-
-Array = NDArray[np.float64]
 
 BULGES_M = (0.02, 0.025, 0.03, 0.04, 0.055, 0.08)
 """How far the balls of a link may stand out of its bodies before they shrink [m]: a little more
@@ -45,7 +43,7 @@ PALM_CELL_M, FINGER_CELL_M = 0.036, 0.018
 class Spheres(NamedTuple):
     """Spheres fixed in links."""
 
-    links: NDArray[np.int64]
+    links: Int64
     """(S,) link, not decreasing: 0 = base, 1 to n = behind that joint, n + 1 = the hand."""
     centers: Array
     """(S, 3) [m], in the DH frame of the link's number; of the hand in frame `grasp`."""
@@ -126,7 +124,7 @@ def _squares(points: Array, others: Array) -> Array:
     return apart + np.sum(points**2, axis=1)[:, None] + np.sum(others**2, axis=1)
 
 
-def _cover_of(held: NDArray[np.bool_], area: Array, most: int | None) -> list[int]:
+def _cover_of(held: Mask, area: Array, most: int | None) -> list[int]:
     """Return balls that together hold all triangles; none where that cannot be.
 
     Args:

@@ -8,11 +8,9 @@ themselves are asked, which lie sorted by cell.
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Array32, Int64, Mask
 from realsim.compiled import njit
-
-Array = NDArray[np.float64]
 
 CELL_M = 0.0125
 """Edge of a cell [m]: the bound is short of the distance by a cell or so."""
@@ -25,21 +23,21 @@ class Obstacles(NamedTuple):
 
     origin: Array
     """(3,) corner of the grid [m]."""
-    bound_m: NDArray[np.float32]
+    bound_m: Array32
     """(X, Y, Z) least distance from anywhere in the cell to a point [m]."""
-    starts: NDArray[np.int64]
+    starts: Int64
     """(X Y Z + 1,) first point of each cell."""
     points: Array
     """(P, 3) sorted by cell [m]."""
-    instances: NDArray[np.int64]
+    instances: Int64
     """(P,) instance number of each."""
-    own: NDArray[np.bool_]
+    own: Mask
     """(P,) whether the point is on the object that is to be grasped."""
     box: Array
     """(2, 3) least and greatest corner of the points [m]."""
 
 
-def obstacles_of(points: Array, instances: NDArray[np.int64], own: NDArray[np.bool_]) -> Obstacles:
+def obstacles_of(points: Array, instances: Int64, own: Mask) -> Obstacles:
     """Return the points (P, 3) [m] of instances (P,) in a grid."""
     if len(points) == 0:
         nowhere = np.full((1, 3), 1e6)

@@ -9,13 +9,13 @@ first; the first whose moves are free and that can be reached from home is kept.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records.trajectories import GraspTrajectories
 from realsim.robots.compiled_chain import follow_lines
-from realsim_sim_bridge.arm.arm_space import AT_LIMITS, FREE, IN_TABLE, ArmSpace, Codes, in_words
+from realsim_sim_bridge.arm.arm_space import AT_LIMITS, FREE, IN_TABLE, ArmSpace, in_words
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.joint_path import connect
 from realsim_sim_bridge.arm.lifted_object import touched_when_lifted
@@ -35,9 +35,6 @@ from realsim_sim_bridge.grasping.hand_free import lowest_corner
 from realsim_sim_bridge.slip.motion import SlipMotion
 
 __all__ = ["Reach", "ReachConfig", "ReachTask", "base_on_table", "check_reach", "home_joints"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -181,7 +178,7 @@ class _ReachCheck:
 
     # --- before any joint angle ----------------------------------------------------------------
 
-    def _in_workspace(self) -> Codes:
+    def _in_workspace(self) -> Int64:
         """Return the rows whose wrist is within reach, and say of the others how far it is."""
         out, reach = self._arm.wrist_distance(self._Ts_base_grasp), self._arm.wrist_reach_m
         for row in np.nonzero(out > reach)[0].tolist():
@@ -191,7 +188,7 @@ class _ReachCheck:
             )
         return np.nonzero(out <= reach)[0].astype(np.int64)
 
-    def _hand_is_free(self, rows: Codes) -> Mask:
+    def _hand_is_free(self, rows: Int64) -> Mask:
         """Return whether hand and lifted object are free on the straight moves, and say if not."""
         task, config = self._task, self._config
         Ts = task.Ts_table_grasp[rows]
@@ -221,7 +218,7 @@ class _ReachCheck:
 
     # --- branch by branch ------------------------------------------------------------------------
 
-    def _try_branches(self, rows: Codes) -> dict[int, tuple[Array, Array]]:
+    def _try_branches(self, rows: Int64) -> dict[int, tuple[Array, Array]]:
         """Keep of each row the first branch that is free all the way from home.
 
         Returns:
@@ -261,7 +258,7 @@ class _ReachCheck:
         widest = np.array([self._task.openings_m.max(initial=0.0)])
         return int(self._space.blame(self._home[None], widest, with_hand=True)[0])
 
-    def _follow(self, at: Codes, q: Array) -> tuple[Codes, Array, Array]:
+    def _follow(self, at: Int64, q: Array) -> tuple[Int64, Array, Array]:
         """Follow approach and lift from q (B, n); return what is left: rows and both moves."""
         still = self._T_base_table[:3, :3]
         Ts = self._Ts_base_grasp[at]
@@ -272,7 +269,7 @@ class _ReachCheck:
         return at[free], approach[free], lift[free]
 
     def _line(
-        self, q: Array, Ts: Array, directions: Array, distances: Array, at: Codes, move: int
+        self, q: Array, Ts: Array, directions: Array, distances: Array, at: Int64, move: int
     ) -> tuple[Array, Mask]:
         """Return joints and slopes (B, 2, W, n) along lines, and which are free."""
         joints, slopes, inside = self._followed(q, Ts, directions, distances)
@@ -295,12 +292,12 @@ class _ReachCheck:
         within = self._arm.within_limits(joints, config.limit_margin_rad).all(axis=1)
         return joints, slopes, within & (error < config.tolerance)
 
-    def _blame(self, paths: Array, at: Codes, *, with_hand: bool = False) -> Codes:
+    def _blame(self, paths: Array, at: Int64, *, with_hand: bool = False) -> Int64:
         """Return what stops paths (B, W, n) of the rows `at`."""
         openings = np.ascontiguousarray(self._task.openings_m[at], dtype=np.float64)
         return self._space.blame_moves(paths, openings, with_hand=with_hand)
 
-    def _note(self, at: Codes, codes: Codes, move: int) -> Mask:
+    def _note(self, at: Int64, codes: Int64, move: int) -> Mask:
         """Return which branches are free, and note for the rows `at` why the others are not."""
         free = codes == FREE
         for row, code in zip(at[~free].tolist(), codes[~free].tolist(), strict=True):
@@ -309,7 +306,7 @@ class _ReachCheck:
                 self._reasons[row] = f"{_MOVES[move]} {in_words(code)}"
         return free
 
-    def _keep(self, at: Codes, approach: Array, lift: Array) -> None:
+    def _keep(self, at: Int64, approach: Array, lift: Array) -> None:
         """Keep branches of the rows `at`."""
         self._approach[at], self._lift[at], self._done[at] = approach, lift, True
 
@@ -346,7 +343,7 @@ class _ReachCheck:
             if row in self._bent:
                 at = np.array([row])
 
-                def is_free(q: Array, at: Codes = at) -> bool:
+                def is_free(q: Array, at: Int64 = at) -> bool:
                     return bool(self._blame(q[None], at, with_hand=True)[0] == FREE)
 
                 bent[attempt] = timed_path(self._bent[row], is_free, self._arm.limits, timing)

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.arm import ArmFile, RobotArm, find_arm
@@ -17,7 +17,6 @@ from realsim_sim_bridge.arm.joint_path import PlannerConfig
 from realsim_sim_bridge.arm.obstacles import obstacles_of
 from realsim_sim_bridge.arm.timing import TimingConfig
 
-Array = NDArray[np.float64]
 Pose = tuple[tuple[float, ...], ...]
 PANDA = "panda"
 """The arm that is meant where none is named."""

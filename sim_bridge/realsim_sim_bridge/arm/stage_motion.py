@@ -9,8 +9,8 @@ not the arm's: where a joint would have to be faster than it can, that is noted.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask, Rows
 from realsim.records.trajectories import PHASES, GraspTrajectories
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.timing import (
@@ -26,9 +26,6 @@ from realsim_sim_bridge.slip.motion import SlipMotion, min_jerk
 # With nodes 2 cm apart the hand leaves the straight line by h^4 / 384 times a fourth derivative,
 # less than a tenth of a millimetre. Because all lines of a kind share their nodes and times, a path
 # at many times is one matrix product.
-
-
-Array = NDArray[np.float64]
 
 
 def basis(at: Array, nodes: Array) -> tuple[Array, Array]:
@@ -78,14 +75,13 @@ def greatest_slopes(values: Array, slopes: Array, nodes: Array) -> tuple[Array, 
     return first.max(axis=-2), second.max(axis=-2)
 
 
-def _segment(at: Array, nodes: Array) -> tuple[NDArray[np.int64], Array, Array]:
+def _segment(at: Array, nodes: Array) -> tuple[Int64, Array, Array]:
     """Return left node, share of the segment from 0 to 1, and segment length."""
     left = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, len(nodes) - 2)
     h = np.diff(nodes)[left]
     return left, np.clip((at - nodes[left]) / h, 0.0, 1.0), h
 
 
-Rows = NDArray[np.int64]
 REACH, APPROACH, CLOSE, LIFT, OSCILLATE, PENDULUM = range(len(PHASES))
 MOVED_STAGES = ("lift", "oscillate", "pendulum")
 """The stages in which the arm moves."""
@@ -103,7 +99,7 @@ class Line:
     """(A, W, n) [rad]."""
     slopes: Array
     """(A, W, n) derivative of the joints by the distance [rad/m]."""
-    possible: NDArray[np.bool_]
+    possible: Mask
     """(A,) whether it is followed within the joint limits; only then the joints mean anything."""
 
     def at(self, distances: Array) -> Array:
@@ -147,7 +143,7 @@ class StageMotions:
     """The attempts over time, and what the arm cannot do of them."""
 
     trajectories: GraspTrajectories
-    possible: NDArray[np.bool_]
+    possible: Mask
     """(A, 3) whether lift, oscillation and swing stay within joint limits and speeds."""
     notes: tuple[str, ...]
     """(A,) why not; '' = all is possible."""
@@ -247,9 +243,7 @@ def _close(attempts: Attempts, config: TimingConfig) -> _Part:
     return _Part(durations, counts, attempts.approach.joints[row, 0], openings)
 
 
-def _stage(
-    attempts: Attempts, possible: NDArray[np.bool_], duration: float, joints: Array
-) -> _Part:
+def _stage(attempts: Attempts, possible: Mask, duration: float, joints: Array) -> _Part:
     """Return a stage that lasts equally long for all, or not at all: joints (A, S, n)."""
     count = joints.shape[1]
     return _Part(
@@ -309,7 +303,7 @@ def _swing(attempts: Attempts, motion: SlipMotion, config: TimingConfig) -> _Par
 # --- what the arm can do ------------------------------------------------------------------------
 
 
-def _possible(attempts: Attempts, motion: SlipMotion) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
+def _possible(attempts: Attempts, motion: SlipMotion) -> tuple[Mask, tuple[str, ...]]:
     """Return which stages (A, 3) stay within the arm's limits, and notes (A,) on the others."""
     count = len(attempts.rows)
     possible = np.zeros((count, len(MOVED_STAGES)), dtype=np.bool_)

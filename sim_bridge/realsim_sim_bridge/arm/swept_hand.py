@@ -8,12 +8,10 @@ Kay & Kajiya 1986). Nothing is stepped over.
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.compiled import njit
 from realsim_sim_bridge.arm.obstacles import CELL_M, Obstacles
-
-Array = NDArray[np.float64]
 
 
 def first_touched(
@@ -24,7 +22,7 @@ def first_touched(
     clearance_m: float,
     *,
     own_too: bool,
-) -> NDArray[np.int64]:
+) -> Int64:
     """Return the instance of an object (N,) that a hand's moving boxes touch, or -1.
 
     Args:

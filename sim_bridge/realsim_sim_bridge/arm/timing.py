@@ -13,12 +13,11 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.robots.limits import JointLimits
 
-Array = NDArray[np.float64]
 FreePath = Callable[[Array], bool]
 """(M, n) joint angles -> whether the straight moves between them are free."""
 

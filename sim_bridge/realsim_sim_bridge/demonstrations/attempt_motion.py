@@ -18,8 +18,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.geometry import se3
 from realsim.records.trajectories import PHASES, GraspTrajectories
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
@@ -27,7 +27,6 @@ from realsim_sim_bridge.demonstrations.falling import FallConfig, fall
 from realsim_sim_bridge.demonstrations.slip_replay import HeldStage, SlipReplay
 from realsim_sim_bridge.slip.world import SlipBody
 
-Array = NDArray[np.float64]
 CLOSE = PHASES.index("close")
 """Phase of the first stage; stage k of the slip test is phase CLOSE + k."""
 
@@ -44,9 +43,9 @@ class AttemptMotion:
     """(S,) distance of the finger faces [m]: they stop where the object is."""
     command_m: Array
     """(S,) what the hand is told [m]: it closes to 0 at its speed, and then presses."""
-    phase: NDArray[np.int64]
+    phase: Int64
     """(S,) number in PHASES."""
-    held: NDArray[np.bool_]
+    held: Mask
     """(S,) whether both fingers hold the object."""
     Ts_base_ee: Array
     """(S, 4, 4) the grasp frame of the hand in the arm's base [m]."""
@@ -134,7 +133,7 @@ def attempt_motion(
 
 
 def _clock(
-    attempt: Attempt, times: Array, phases: NDArray[np.int64], opened: float, fall_s: float
+    attempt: Attempt, times: Array, phases: Int64, opened: float, fall_s: float
 ) -> tuple[_Clock, list[str]]:
     """Return the stages' beginnings on the arm's clock, and which of them the arm does not do."""
     stages, notes = attempt.replay.stages, list[str]()

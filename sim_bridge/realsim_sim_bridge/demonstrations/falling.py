@@ -12,15 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import interop
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.models.convex import collision_obj
 from realsim_sim_bridge.slip.bullet_shapes import drawn_in
 from realsim_sim_bridge.slip.world import SlipBody
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

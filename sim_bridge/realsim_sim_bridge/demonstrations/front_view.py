@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.errors import InputError
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
@@ -29,7 +29,6 @@ from realsim_sim_bridge.demonstrations.records import DemonstrationCamera
 # distortion. The hand's camera is on Franka's usual mount unless another pose is given.
 
 
-Array = NDArray[np.float64]
 SIZE_PX = (320, 240)
 """Width and height of the pictures: what policies are fed with, or a little more."""
 FRONT, WRIST = "front", "wrist"
@@ -207,7 +206,7 @@ def nearest_camera(points: Array, towards: Array, intrinsics: CameraIntrinsics) 
     return se3.from_rt(R, R @ np.array([*c, c_z]))
 
 
-def hidden(seen: Happening, eye: Array) -> NDArray[np.bool_]:
+def hidden(seen: Happening, eye: Array) -> Mask:
     """Return (A,) which grasps are behind hand or arm for a camera at `eye` (3,) [m]."""
     out = np.zeros(len(seen.grasps), dtype=np.bool_)
     ways = eye - seen.grasps
@@ -269,7 +268,7 @@ def happening(
     )
 
 
-def _turning_points(phase: NDArray[np.int64]) -> NDArray[np.int64]:
+def _turning_points(phase: Int64) -> Int64:
     """Return the samples of an attempt at the ends of its straight ways: pre-grasp to lift.
 
     On its way to the pre-grasp the hand comes from wherever the arm rests.

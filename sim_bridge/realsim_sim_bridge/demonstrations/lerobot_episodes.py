@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim import interop
+from realsim.arrays import Array, Rgb
 from realsim.formats.lerobot.episodes import LeRobotEpisode, LeRobotFeature
 from realsim.geometry import se3
 from realsim.records.trajectories import PHASES
-from realsim_sim_bridge.demonstrations.records import Rgb
 from realsim_sim_bridge.demonstrations.source import Demonstration, DemonstrationSource
 
-Array = NDArray[np.float64]
 STATE, ACTION, GOAL = "observation.state", "action", "observation.goal.grasp_pose"
 EE, OBJECT, DELTA = "ee_pose", "object_pose", "delta_ee"
 IMAGES = "observation.images."

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from realsim.arrays import Array, Int32, Rgb
 from realsim.geometry import se3
 from realsim.geometry.mesh_files import load_mesh
 from realsim.models.simplify import colors_at, simplified
@@ -23,13 +23,12 @@ from realsim.robots.hand import FRANKA, Hand
 from realsim.robots.link_shapes import LARGEST_MM_SCALE
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.link_spheres import solid_points
-from realsim_sim_bridge.demonstrations.records import DemonstrationCamera, Rgb
+from realsim_sim_bridge.demonstrations.records import DemonstrationCamera
 
 # --- What arm and hand look like: an arm as its own meshes, drawn with few triangles, or as its
 # bodies; a hand as its boxes, but for Franka's, whose meshes come with PyBullet.
 
 
-Array = NDArray[np.float64]
 LINK_FACES = 1500
 """Triangles of a link: at 320 x 240 none is seen, and a frame is prepared in 30 instead of 600
 ms."""
@@ -136,13 +135,13 @@ def _drawn(path: Path, unit: Literal["m", "mm"]) -> Mesh:
     return Mesh(vertices=mesh.vertices, faces=mesh.faces, colors=colors)
 
 
-def _grey(vertices: Array, faces: NDArray[np.int32], level: int) -> Mesh:
+def _grey(vertices: Array, faces: Int32, level: int) -> Mesh:
     """Return a mesh of one grey."""
     colors = np.full((len(vertices), 3), level, np.uint8)
     return Mesh(vertices=vertices, faces=faces, colors=colors)
 
 
-def _outwards(hull: ConvexHull) -> NDArray[np.int32]:
+def _outwards(hull: ConvexHull) -> Int32:
     """Return the triangles of a hull, corners counter-clockwise seen from outside."""
     a, b, c = (hull.points[hull.simplices[:, k]] for k in range(3))
     inwards = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0

@@ -4,14 +4,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import Array, Rgb
 from realsim.records import CameraIntrinsics
 from realsim.records.checked_arrays import rigid
-
-Array = NDArray[np.float64]
-Rgb = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

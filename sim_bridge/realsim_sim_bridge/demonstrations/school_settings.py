@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry.mesh import mass_properties
 from realsim.models.convex import convex_parts
@@ -110,7 +110,6 @@ def _tuples(value: Any) -> Any:
 # --- An object as the school's engine had it, checked against what the school wrote down ---------
 
 
-Array = NDArray[np.float64]
 SAME_POSE = 1e-6
 """Largest difference of a pose's numbers that is rounding of the files it came through."""
 SAME_MATTER = 1e-6

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 from types import TracebackType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet
@@ -36,10 +36,6 @@ from realsim_sim_bridge.slip.world import (
 # It stands between the slip test and a real engine and passes everything on unchanged, so that a
 # grasp that is tried again with it ends as it did; what the test itself does not keep, the poses at
 # each look, is kept here.
-
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

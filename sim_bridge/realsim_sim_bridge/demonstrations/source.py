@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import overload
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
@@ -51,7 +51,6 @@ from realsim_sim_bridge.slip.engines import make_engine
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import SlipBody
 
-Array = NDArray[np.float64]
 STAGES_IN_ALL = 4
 
 

@@ -12,8 +12,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask, Rows
 from realsim.errors import InputError
 from realsim.formats.graspnet.grasp_labels import GraspLabels
 from realsim.formats.graspnet.gripper_frame import (
@@ -78,9 +78,6 @@ class AnalyticConfig:
                 "2, are needed."
             )
 
-
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 ROUNDING = 1e-6
 """A friction so little above a level still counts as the level: rays have single precision."""
@@ -205,9 +202,7 @@ def _contacts(
     return rows, 0.5 * opening_m - t[rows], np.sqrt(1.0 - cos**2) / cos
 
 
-def _in_object(
-    mesh: Mesh, points: Array, R: Array, depths_m: Array, openings_m: Array
-) -> NDArray[np.bool_]:
+def _in_object(mesh: Mesh, points: Array, R: Array, depths_m: Array, openings_m: Array) -> Mask:
     """Return whether GraspNet's gripper reaches into the object (N,)."""
     Ts = np.zeros((len(points), 4, 4))
     Ts[:, :3, :3], Ts[:, :3, 3], Ts[:, 3, 3] = R, points, 1.0

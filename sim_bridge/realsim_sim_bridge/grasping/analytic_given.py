@@ -8,8 +8,8 @@ approach by up to 6 mm, as generated candidates are, where the fingertips would 
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Rows
 from realsim.formats.graspnet.grasp_labels import GraspLabels
 from realsim.geometry import se3
 from realsim.records import Mesh
@@ -27,8 +27,6 @@ from realsim_sim_bridge.grasping.candidates import (
 from realsim_sim_bridge.grasping.pad_contacts import pad_contacts
 from realsim_sim_bridge.grasping.surroundings import Surroundings
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 MOST_TRIED = 20_000
 """Labels whose hands are placed in a scene; some seconds."""
 

@@ -1,8 +1,8 @@
 """A few of an object's many analytic grasps, far apart and of every friction level."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Rows
 from realsim.errors import InputError
 from realsim.formats.graspnet.grasp_labels import GraspLabels
 from realsim.records import GraspSet
@@ -10,9 +10,7 @@ from realsim.records import GraspSet
 # --- Rows far apart from one another -------------------------------------------------------------
 
 
-def farthest_rows(
-    features: NDArray[np.float64], count: int, first: int = 0, least: float = 0.0
-) -> NDArray[np.int64]:
+def farthest_rows(features: Array, count: int, first: int = 0, least: float = 0.0) -> Int64:
     """Return rows (N,) of features (M, D), each the farthest from those before.
 
     Args:
@@ -34,9 +32,6 @@ def farthest_rows(
         chosen.append(farthest)
     return np.array(chosen, dtype=np.int64)
 
-
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 SPREAD_M = 0.03
 """Distance [m] that counts as much as opposite approach directions, as of generated candidates."""

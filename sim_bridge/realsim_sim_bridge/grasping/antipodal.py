@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask, Rows
 from realsim.errors import InputError
 from realsim.geometry.mesh import face_normals, sample_surface, tensor_mesh, welded_mesh
 from realsim.interop import import_open3d
@@ -89,9 +90,6 @@ class CandidateConfig:
             )
 
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
-
 ESCAPE_RAYS = 16
 """Rays per side that ask which side of an open mesh is outside."""
 ESCAPE_LEAD = 4
@@ -153,7 +151,7 @@ class RaySurface:
         t = hits["t_hit"].numpy().astype(np.float64)
         return t, np.where(np.isfinite(t), _int(face), -1)
 
-    def contains(self, points: Array) -> NDArray[np.bool_]:
+    def contains(self, points: Array) -> Mask:
         """Return which points (N, 3) are inside a closed mesh; none is inside an open one."""
         if not self.is_closed:
             return np.zeros(len(points), dtype=np.bool_)

@@ -8,8 +8,8 @@ each filter took is counted.
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim.records.checked_arrays import rows_of
@@ -38,9 +38,6 @@ from realsim_sim_bridge.grasping.surroundings import (
 # fingers clear the table), and with several openings. The first free stand is the grasp.
 
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
 IN_TABLE, IN_OBJECT, IN_NEIGHBOUR, FREE = range(4)
 """How far a stand got, in the order of the checks."""
 
@@ -63,7 +60,7 @@ class HandPoses:
         """Return the number of grasps."""
         return len(self.Ts_obj_grasp)
 
-    def rows(self, rows: Mask | NDArray[np.int64]) -> "HandPoses":
+    def rows(self, rows: Mask | Int64) -> "HandPoses":
         """Return some of them."""
         return rows_of(self, rows)
 
@@ -108,7 +105,7 @@ class Stand:
         mesh = surface.mesh
         self._tree = surface_tree(mesh.vertices[mesh.faces])
 
-    def placed(self, poses: HandPoses) -> tuple[HandPoses, NDArray[np.int64]]:
+    def placed(self, poses: HandPoses) -> tuple[HandPoses, Int64]:
         """Return the poses in their first free stand, and how far the best stand of each got (N,).
 
         The poses that come have their origins between the contacts, in the middle of the pads.
@@ -145,7 +142,7 @@ class Stand:
             contact_depths_m=depths,
         )
 
-    def _outcome(self, poses: HandPoses) -> NDArray[np.int64]:
+    def _outcome(self, poses: HandPoses) -> Int64:
         """Return what stops each hand (N,): the first of table, object, neighbours, or FREE."""
         config, outcome = self._config, np.full(len(poses), IN_TABLE, dtype=np.int64)
         lowest = lowest_corner(
@@ -266,9 +263,7 @@ def _reach_of_hands(mesh: Mesh, T_table_obj: Array, geometry: Hand) -> tuple[Arr
     return se3.transform(T_table_obj, 0.5 * (low + high)), radius
 
 
-def _spread_out(
-    Ts: Array, config: CandidateConfig, limit: int, rng: np.random.Generator
-) -> NDArray[np.int64]:
+def _spread_out(Ts: Array, config: CandidateConfig, limit: int, rng: np.random.Generator) -> Int64:
     """Return the numbers of at most `limit` grasps, each the farthest from those before."""
     if len(Ts) <= limit:
         return np.arange(len(Ts))

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
@@ -42,7 +42,6 @@ from realsim_sim_bridge.grasping.pad_contacts import PadContacts, pad_contacts, 
 # facets. Hard point contacts (gamma = 0) have no volume in six dimensions: the quality is 0.
 
 
-Array = NDArray[np.float64]
 SPANLESS = 1e-10
 """Six points whose differences have a pivot below this span no hyperplane."""
 FLAT = 1e-9
@@ -90,7 +89,7 @@ def finger_wrenches(
     return np.concatenate([torque, force], axis=-1)
 
 
-def _double_pyramid(edges: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _double_pyramid(edges: int) -> tuple[Int64, Int64]:
     """Return the triangles (2 m, 3) and edges (3 m, 2) by the numbers of their corners."""
     a = np.arange(edges)
     b = (a + 1) % edges

@@ -6,11 +6,10 @@ Compiled, because thousands of hands meet thousands of points.
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.compiled import njit
 
-Array = NDArray[np.float64]
 STRIDE = 61
 """The points are looked at in steps of this (and then the rest), so that a hand that is not free is
 found out early; a matter of speed alone."""
@@ -23,9 +22,7 @@ def lowest_corner(boxes: Array, Ts_table_grasp: Array) -> Array:
     return least.min(axis=1) + Ts_table_grasp[:, 2, 3]
 
 
-def boxes_free(
-    boxes: Array, Ts_a_grasp: Array, points_a: Array, clearance_m: float
-) -> NDArray[np.bool_]:
+def boxes_free(boxes: Array, Ts_a_grasp: Array, points_a: Array, clearance_m: float) -> Mask:
     """Return whether no point is in any box or nearer than the clearance (N,).
 
     Args:
@@ -39,7 +36,7 @@ def boxes_free(
 
 def first_point_inside(
     boxes: Array, Ts_a_grasp: Array, points_a: Array, clearance_m: float
-) -> NDArray[np.int64]:
+) -> Int64:
     """Return the number (N,) of a point in one of hand n's grown boxes, or -1; as `boxes_free`."""
     grown = boxes.astype(np.float64, copy=True)
     grown[:, :, 0] -= clearance_m

@@ -14,15 +14,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.compiled import njit
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.grasping.antipodal import RaySurface
 from realsim_sim_bridge.grasping.pad_contacts import pad_rays
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 EDGES = 8
 """Of a friction cone; the polygon has the circle's area."""

@@ -3,13 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.geometry import se3
 from realsim.robots.hand import Hand, along_approach
 from realsim_sim_bridge.grasping.antipodal import RaySurface
 
-Array = NDArray[np.float64]
 STEPS = 40
 RAYS = 3
 """Steps in which a hand on an arc is closed to find where, and rays per side of a pad."""
@@ -29,7 +28,7 @@ class PadContacts:
     """(N, 2) mean distance of what touches from its middle [m]; NaN likewise."""
 
     @property
-    def both(self) -> NDArray[np.bool_]:
+    def both(self) -> Mask:
         """(N,) whether both fingers touch."""
         return np.asarray(np.isfinite(self.levers_m).all(axis=1))
 
@@ -42,7 +41,7 @@ class PadRays:
     """(N, 2, R, 3) [m]; on the pad where nothing is touched."""
     normals: Array
     """(N, 2, R, 3) unit normals towards the pad."""
-    touched: NDArray[np.bool_]
+    touched: Mask
     """(N, 2, R) whether the pad touches there when it has closed."""
 
 

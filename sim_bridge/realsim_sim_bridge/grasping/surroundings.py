@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask, Rows
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.mesh import sample_surface
@@ -20,8 +21,6 @@ from realsim_sim_bridge.grasping.hand_free import boxes_free
 # triangle.
 
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 LEAF = 4
 """Triangles at the end of a branch; a matter of speed alone."""
 PROBES = 500
@@ -113,7 +112,7 @@ def first_triangle_inside(
 
 def hands_free(
     boxes: Array, Ts_a_grasp: Array, tree: SurfaceTree | None, clearance_m: float
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Return whether no triangle reaches into any grown box (N,); as `first_triangle_inside`.
 
     Hands with the middle of a probe triangle inside are not free; the tree is asked for the others.
@@ -244,9 +243,6 @@ def _search_loops(
 _search = njit(_search_loops)
 
 
-Numbers = NDArray[np.int64]
-
-
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Surroundings:
     """Surfaces in the table's frame, as points and, where the meshes are at hand, as triangles.
@@ -256,14 +252,14 @@ class Surroundings:
 
     points: Array = field(default_factory=lambda: np.zeros((0, 3)))
     """(P, 3) on the surfaces [m]."""
-    instances: Numbers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    instances: Int64 = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(P,) instance number of each point."""
     triangles: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
     """(T, 3, 3) [m]; of instances that have some, all."""
-    triangle_instances: Numbers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    triangle_instances: Int64 = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(T,) instance number of each triangle."""
 
-    def tree(self) -> tuple[SurfaceTree | None, Numbers]:
+    def tree(self) -> tuple[SurfaceTree | None, Int64]:
         """Return the tree of all surfaces, and the instance (T,) of each of its numbers.
 
         Points are in it where their instance has no triangles.

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.store import atomic
 from realsim.untrusted.own_json import read_own
 
-Array = NDArray[np.float64]
 SHIPPED = Path(__file__).parent / "calibration.json"
 FAILURES = ("blocked", "missed", "skewed", "overloaded")
 SURE = 0.02
@@ -105,7 +105,7 @@ def p_hold_columns(
     }
 
 
-def fitted_curve(evidence: Array, held: NDArray[np.bool_]) -> Array:
+def fitted_curve(evidence: Array, held: Mask) -> Array:
     """Return intercept and slope of the logistic curve of greatest likelihood.
 
     Raises:
@@ -130,7 +130,7 @@ def fitted_curve(evidence: Array, held: NDArray[np.bool_]) -> Array:
     return w
 
 
-def left_out(evidence: Array, held: NDArray[np.bool_], groups: NDArray[np.str_]) -> Array:
+def left_out(evidence: Array, held: Mask, groups: NDArray[np.str_]) -> Array:
     """Return p_hold (N,) of each trial by a curve that was fitted on the other groups."""
     found = np.full(len(evidence), np.nan)
     for group in np.unique(groups):

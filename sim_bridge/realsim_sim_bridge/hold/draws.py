@@ -18,10 +18,10 @@ from dataclasses import dataclass, field, fields
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 from scipy.stats import qmc
 
+from realsim.arrays import Array, Mask, Rows
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import STAGES, Mesh
@@ -36,10 +36,6 @@ from realsim_sim_bridge.grasping.surroundings import (
 )
 from realsim_sim_bridge.slip.motion import Loads, stage_loads
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Rows = NDArray[np.int64]
 
 PALM_M = 0.0015
 """So deep the palm may reach into the object before the hand has stopped [m]."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.formats.grasps.graspa import TriedObject
 from realsim.models.convex import ConvexConfig, convex_parts
@@ -37,8 +38,6 @@ from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import SlipBody
 from realsim_sim_bridge.validation.specimens import ready_trial
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Names = NDArray[np.str_]
 
 RESAMPLES = 2000

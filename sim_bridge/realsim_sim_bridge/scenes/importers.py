@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.graspit.scene import (
     SCENE_FILE,
@@ -23,7 +23,6 @@ from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.store.session_store import CAMERA_FILE
 from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, Support, known_solids
 
-Array = NDArray[np.float64]
 TABLE_STRIDE = 6
 """Every how many rows and columns of a depth image is looked at for the table."""
 SUNK_M = 0.0015

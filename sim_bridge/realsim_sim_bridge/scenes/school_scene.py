@@ -5,17 +5,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.models.convex import ConvexConfig, convex_parts
 from realsim.models.library_records import KnownSolid
 from realsim.models.properties import physical_properties
 from realsim.records import Mesh, ObjectModel, Scene, names_of
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

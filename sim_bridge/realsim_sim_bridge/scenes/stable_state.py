@@ -8,14 +8,13 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
 from realsim.records import Scene
 from realsim_sim_bridge.scenes.table_world import TABLE, TableWorld
 
-Array = NDArray[np.float64]
 Standing = Literal["stands", "jumps", "falls", "inside another", "floats"]
 
 
@@ -195,7 +194,7 @@ def _distances(world: TableWorld, reach_m: float) -> dict[int, dict[str, float]]
     return found
 
 
-def _run(world: TableWorld, config: StandConfig) -> tuple[Array, float, NDArray[np.bool_]]:
+def _run(world: TableWorld, config: StandConfig) -> tuple[Array, float, Mask]:
     """Return every object's jump [m/s], the simulated time [s], and whether it rests."""
     jump = np.zeros(len(world.bodies))
     resting = np.zeros(len(world.bodies), dtype=np.bool_)

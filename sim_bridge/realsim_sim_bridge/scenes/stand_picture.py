@@ -4,15 +4,14 @@ import io
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int32
 from realsim.geometry import se3
 from realsim.geometry.mesh import welded_mesh
 from realsim.records import Mesh
 from realsim_sim_bridge.scenes.school_scene import SchoolScene
 from realsim_sim_bridge.scenes.stable_state import ObjectStand, Standing, StandReport
 
-Array = NDArray[np.float64]
 COLORS: dict[Standing, str] = {
     "stands": "#5b7f95",
     "jumps": "#d1495b",
@@ -98,7 +97,7 @@ def _draw(
     words.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
 
 
-def outline(vertices: Array, faces: NDArray[np.int32], along: int) -> Array:
+def outline(vertices: Array, faces: Int32, along: int) -> Array:
     """Return the edges (E, 2, 3) between a face towards the viewer and one away, and open edges."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     towards = np.cross(b - a, c - a)[:, along] > 0

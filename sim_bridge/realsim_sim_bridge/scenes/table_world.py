@@ -14,9 +14,9 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import interop
+from realsim.arrays import Array
 from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
 from realsim.models.convex import ConvexConfig, collision_obj, convex_parts
@@ -76,7 +76,6 @@ class WorldConfig:
             raise InputError("a collision margin below 0 m is none; 0 is accepted.")
 
 
-Array = NDArray[np.float64]
 TABLE = "the table"
 _INFO = {
     "mass": 0,

@@ -9,15 +9,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.records import GraspSet
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig, Slips, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import Engine
 
-Array = NDArray[np.float64]
 Z_95 = 1.959964
 """Of the normal distribution: 95 % lie within so many standard deviations."""
 EXACT = 1e-9

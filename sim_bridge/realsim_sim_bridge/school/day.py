@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Rows
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.geometry.mesh import hull_vertices
@@ -21,7 +21,7 @@ from realsim_sim_bridge.school.kept_sets import (
     write_prepared,
     write_result,
 )
-from realsim_sim_bridge.school.object_slips import Rows, in_words, result_of, stand_of
+from realsim_sim_bridge.school.object_slips import in_words, result_of, stand_of
 from realsim_sim_bridge.school.object_task import (
     ObjectTask,
     Prepared,
@@ -39,7 +39,6 @@ from realsim_sim_bridge.school.shards import (
 from realsim_sim_bridge.school.workers import WorkerDiedError, Workers
 from realsim_sim_bridge.slip.stand import Stand
 
-Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 MOST_DEATHS = 3

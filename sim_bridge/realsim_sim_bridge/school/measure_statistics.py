@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.formats.grasps.scene_grasps import executed, labelled
 from realsim.records import GraspSet
 from realsim.records.grasps import label_words
 
-Array = NDArray[np.float64]
 QUALITIES = ("score", "p_hold", "margin", "ferrari_canny", "closure_friction")
 """What is ranked; closure_friction is better where it is smaller, so its correlations are negative
 where it agrees."""
@@ -159,7 +159,7 @@ def closure_confusions(sets: Sequence[GraspSet]) -> tuple[ClosureConfusion, ...]
     return tuple(found)
 
 
-def label_histogram(sets: Sequence[GraspSet]) -> NDArray[np.int64]:
+def label_histogram(sets: Sequence[GraspSet]) -> Int64:
     """Return how many grasps have a p_hold, of sets without one a score, in each of ten bins.
 
     Counted are the grasps with a label of their own, not those that the arm does not reach.
@@ -168,7 +168,7 @@ def label_histogram(sets: Sequence[GraspSet]) -> NDArray[np.int64]:
     return np.histogram(values, LABEL_BINS, (0.0, 1.0))[0].astype(np.int64)
 
 
-def label_chart(sets: Sequence[GraspSet]) -> tuple[NDArray[np.int64], str, str]:
+def label_chart(sets: Sequence[GraspSet]) -> tuple[Int64, str, str]:
     """Return what a chart of `label_histogram` shows: the counts, its title, and their label."""
     counts, name, bits = label_histogram(sets), label_words(sets), p_hold_entropy_bits(sets)
     entropy = (

@@ -6,8 +6,8 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Rows
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet
 from realsim.records.grasps import MEASURES
@@ -20,9 +20,6 @@ from realsim_sim_bridge.slip.score import score_paper, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import SlipBody
-
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 
 def stand_of(

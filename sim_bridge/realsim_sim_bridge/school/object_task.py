@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.errors import InputError
 from realsim.formats.graspnet.grasp_labels import read_grasp_labels
 from realsim.geometry.mesh import MassProperties, mass_properties
@@ -32,9 +33,6 @@ from realsim_sim_bridge.slip.world import SlipBody
 
 # --- Analytic grasps as what the School tries: labels of an object, those that stand, a few of them
 # GraspNet's labels say from which friction on a grasp closes. The School says what becomes of it.
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -170,7 +168,7 @@ class Prepared:
     widths_m: Array
     openings_m: Array
     """(N,) [m]."""
-    reachable: NDArray[np.bool_]
+    reachable: Mask
     joints: Array
     """(N, n) at the grasp [rad]; NaN where not reachable."""
     joints_lifted: Array
@@ -187,7 +185,7 @@ class Prepared:
     """What the set's parameters say about the object."""
 
     @property
-    def tested(self) -> NDArray[np.int64]:
+    def tested(self) -> Int64:
         """The rows that go into the slip test."""
         if self.body is None:
             return np.zeros(0, dtype=np.int64)
@@ -240,7 +238,7 @@ def prepare(task: ObjectTask) -> Prepared:
 
 
 def trial_of(
-    task: ObjectTask, prepared: Prepared, rows: NDArray[np.int64], stand: Stand | None = None
+    task: ObjectTask, prepared: Prepared, rows: Int64, stand: Stand | None = None
 ) -> SlipTrial:
     """Return some rows of the candidates, ready for the slip test.
 

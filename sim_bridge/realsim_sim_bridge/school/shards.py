@@ -4,9 +4,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import Array, Rows
 from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.cross_check import cross_check
@@ -17,9 +15,6 @@ from realsim_sim_bridge.slip.slip_test import Slips, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import Engine
 
 # --- What else is measured of the grasps of a shard besides their slips --------------------------
-
-
-Array = NDArray[np.float64]
 
 
 def shard_measures(
@@ -52,8 +47,6 @@ def shard_measures(
         found |= cross_check(trial, slips, slip, limits, hand, second)
     return found
 
-
-Rows = NDArray[np.int64]
 
 SHARD_S = 7.0
 """Work in a shard [s]: what a dead worker loses; handing out a job takes some ms."""

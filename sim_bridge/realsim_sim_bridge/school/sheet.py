@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.formats.grasps.scene_grasps import labelled
 from realsim.models.model_picture_views import INK, MUTED, PAPER
@@ -30,7 +31,6 @@ from realsim_sim_bridge.school.sheet_object import (
     text_at,
 )
 
-Array = NDArray[np.float64]
 WIDTH_PX = 1600
 DPI = 100
 MARGIN_PX = 28
@@ -167,7 +167,7 @@ def _named(ax: Any, title: str, below: str, beside: str = "") -> None:
     ax.set_ylabel(beside, fontsize=10, color=MUTED)
 
 
-def left_after(sets: Sequence[GraspSet]) -> NDArray[np.int64]:
+def left_after(sets: Sequence[GraspSet]) -> Int64:
     """Return how many candidates are left: all, with a trajectory, and after each stage."""
     stops = _joined([stops_of(s) for s in sets])
     return np.array([len(stops), *(int(np.sum(stops > k)) for k in range(1, len(STOPS) - 1))])
@@ -221,7 +221,7 @@ def _margin_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
 
 
 def _ten_bars(
-    ax: Any, counts: NDArray[np.int64], colors: str | list[str], title: str, name: str, top: int = 1
+    ax: Any, counts: Int64, colors: str | list[str], title: str, name: str, top: int = 1
 ) -> None:
     """Draw counts of ten equal bins from 0 to 1; `top` is what is drawn there already."""
     ax.bar(np.arange(LABEL_BINS) / LABEL_BINS, counts, BAR, align="edge", color=colors)

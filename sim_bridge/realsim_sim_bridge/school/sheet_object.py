@@ -5,8 +5,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.formats.grasps.scene_grasps import executed, labelled
 from realsim.geometry import se3
 from realsim.models.model_picture_views import (
@@ -24,7 +24,6 @@ from realsim.records import STAGES, GraspSet, Mesh
 from realsim.rendering.overlay import dashed, evenly_ranked, score_hex
 from realsim_sim_bridge.school.measure_statistics import mean_label
 
-Array = NDArray[np.float64]
 Box = tuple[float, float, float, float]
 """Left, top, width and height of a part of the sheet [px]."""
 DIRECTION = (0.9, -1.5, 1.0)
@@ -57,7 +56,7 @@ NARROWEST = 0.075
 """Share of the bar from which a part carries its number."""
 
 
-def stops_of(s: GraspSet) -> NDArray[np.int64]:
+def stops_of(s: GraspSet) -> Int64:
     """Return (N,) where each grasp stopped: its number in STOPS."""
     judged = ~np.isnan(s.scores)
     passed = np.rint(np.nan_to_num(s.base_scores) * len(STAGES)).astype(np.int64)
@@ -65,7 +64,7 @@ def stops_of(s: GraspSet) -> NDArray[np.int64]:
     return np.where(judged, np.where(nowhere, 1, 2 + passed), 0)
 
 
-def shown_rows(s: GraspSet) -> NDArray[np.int64]:
+def shown_rows(s: GraspSet) -> Int64:
     """Return the rows drawn: evenly through the labelled grasps; where none has a label: of all."""
     rows = np.flatnonzero(labelled(s))
     return evenly_ranked(s, MOST_HANDS, rows if len(rows) else None)
@@ -159,7 +158,7 @@ def _figures(s: GraspSet) -> str:
     )
 
 
-def _bar(ax: Any, stops: NDArray[np.int64]) -> None:
+def _bar(ax: Any, stops: Int64) -> None:
     """Draw how many grasps stopped where."""
     ax.set_axis_off()
     ax.set_xlim(0, 1)

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.formats.grasps.scene_grasps import check_values, executed
 from realsim.records import STAGES, GraspSet
@@ -161,7 +162,6 @@ def _number(x: float) -> str:
     return NOTHING if math.isnan(x) else f"{x:.2f}"
 
 
-Array = NDArray[np.float64]
 OUTCOMES = (
     "not_tried", "no_trajectory", "fail_close", "fail_lift", "penalized", "fail_horizontal",
     "fail_pendulum", "full_success",
@@ -367,7 +367,7 @@ def _hands_on_same_objects(
     return tuple(results)
 
 
-def outcomes_of(s: GraspSet) -> NDArray[np.int64]:
+def outcomes_of(s: GraspSet) -> Int64:
     """Return (N,) the number in OUTCOMES of every candidate.
 
     Raises:
@@ -396,7 +396,7 @@ def outcomes_of(s: GraspSet) -> NDArray[np.int64]:
     return np.where(judged, stopped, OUTCOMES.index("not_tried")).astype(np.int64)
 
 
-def _penalized_by(sets: Sequence[GraspSet], outcome: Sequence[NDArray[np.int64]]) -> dict[str, int]:
+def _penalized_by(sets: Sequence[GraspSet], outcome: Sequence[Int64]) -> dict[str, int]:
     """Return at which stage the penalized grasps failed first."""
     names = (*STAGES, "none")
     counts = np.zeros(len(names), dtype=np.int64)

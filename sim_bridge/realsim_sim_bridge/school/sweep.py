@@ -20,17 +20,14 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask, Rows
 from realsim.errors import InputError
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig, Slips, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import STIFFNESS_N_PER_M, Engine, SlipPhysics
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Rows = NDArray[np.int64]
 Levels = tuple[float, ...]
 RunLevel = Callable[[float, Rows], Array]
 """Returns the scores of some rows at a level."""
@@ -227,7 +224,7 @@ def find_levels(
     return LevelScores(levels=ladder, scores=scores, passed=_passed(scores))
 
 
-def _bracket(scores: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _bracket(scores: Array) -> tuple[Int64, Int64]:
     """Return (N,) the lowest level seen to pass (-1: none) and the next failed below it (L: none).
 
     Levels descend, so higher columns are weaker settings.
@@ -239,7 +236,7 @@ def _bracket(scores: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return passing, np.where(failing, column, count).min(axis=1, initial=count)
 
 
-def _next_levels(scores: Array, search: str) -> NDArray[np.int64]:
+def _next_levels(scores: Array, search: str) -> Int64:
     """Return the column (N,) that each grasp is to be tried at next; -1 = it is known."""
     if search == "every":
         open_levels = np.isnan(scores)

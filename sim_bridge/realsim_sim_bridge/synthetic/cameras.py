@@ -1,12 +1,12 @@
 """Where synthetic cameras stand: spread over a hemisphere, or near cameras that are known."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 
-Array = NDArray[np.float64]
 GOLDEN_ANGLE_RAD = np.pi * (3.0 - np.sqrt(5.0))
 """Turn between neighbours on a Fibonacci lattice [rad] (Gonzalez, Math. Geosci. 42, 2010)."""
 JITTER = 0.35

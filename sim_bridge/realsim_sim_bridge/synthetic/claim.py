@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.bop.models import load_models, model_file, save_models
 from realsim.models.library_reading import LibraryReader
@@ -19,7 +19,6 @@ from realsim.store import SessionStore
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
 from realsim_sim_bridge.synthetic.scene import SyntheticScene
 
-Array = NDArray[np.float64]
 NOTE = "synthetic"
 """Key of a synthetic session's `extra`: what its views are made of."""
 RESULTS_VERSION = 3

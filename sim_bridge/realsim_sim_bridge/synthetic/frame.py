@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from realsim import images
+from realsim.arrays import UInt8, UInt16
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_camera import DepthCamera
@@ -42,9 +43,9 @@ class FrameJob:
 class SyntheticFrame:
     """One frame as it is stored."""
 
-    rgb: NDArray[np.uint8]
+    rgb: UInt8
     """(H, W, 3) encoded colours."""
-    depth_counts: NDArray[np.uint16]
+    depth_counts: UInt16
     """(H, W) what the depth camera reports, in the session's unit; 0 = none."""
     rgb_cpu_s: float
     """Cost of the photograph [s]."""

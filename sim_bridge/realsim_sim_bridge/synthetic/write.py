@@ -20,8 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, GraspSet, View
@@ -44,7 +45,6 @@ from realsim_sim_bridge.synthetic.frame import (
 )
 from realsim_sim_bridge.synthetic.scene import SyntheticScene, save_surroundings
 
-Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 ABOUT_FILE = "synthetic/scene.json"
 INSIDE_SHARE = 0.5

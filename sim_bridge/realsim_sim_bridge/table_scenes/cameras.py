@@ -5,13 +5,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim_sim_bridge.synthetic.cameras import hemisphere_cameras
 
-Array = NDArray[np.float64]
 RANGES: dict[str, tuple[float, float]] = {"far": (1.0, 2.0), "d405": (0.25, 0.50)}
 """Distances by name [m]: the paper's, and the one a D405 is made for."""
 FOCAL: dict[str, float] = {"d405": 0.506, "d415": 0.722, "d435": 0.722, "structured_light": 0.84}
@@ -113,7 +112,7 @@ def _planes(part: Array) -> Array:
     return np.asarray(hull.equations, dtype=np.float64)
 
 
-def _free(eyes: Array, solids: Sequence[Array], clearance_m: float) -> NDArray[np.bool_]:
+def _free(eyes: Array, solids: Sequence[Array], clearance_m: float) -> Mask:
     """Return (N,) whether eyes (N, 3) are above the table and clear of every convex part.
 
     The greatest signed distance to a hull's planes is at most the distance to the hull.

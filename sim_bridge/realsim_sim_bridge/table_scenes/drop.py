@@ -9,15 +9,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim_sim_bridge.slip.world import SlipBody
 from realsim_sim_bridge.table_scenes.config import DropConfig
 from realsim_sim_bridge.table_scenes.drop_world import DropWorld
 from realsim_sim_bridge.table_scenes.tables import TableModel
 
-Array = NDArray[np.float64]
 FELL_M = 0.05
 """What is so far below the top surface has left the table [m]."""
 CLEAR_M = 0.01

@@ -12,9 +12,9 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import interop
+from realsim.arrays import Array
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.models.convex import collision_obj
@@ -23,7 +23,6 @@ from realsim_sim_bridge.slip.world import SlipBody
 from realsim_sim_bridge.table_scenes.config import DropConfig
 from realsim_sim_bridge.table_scenes.tables import TableModel
 
-Array = NDArray[np.float64]
 GRAVITY = 9.81
 """[m/s^2]."""
 PLATE_M = 0.5

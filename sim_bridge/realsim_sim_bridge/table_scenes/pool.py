@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Literal, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.models.convex import ConvexConfig, convex_parts
 from realsim.models.convex_hulls import hull_triangles, hull_volume
@@ -171,7 +171,6 @@ def _content(folder: Path) -> tuple[Kind, tuple[str, ...]]:
 # --- An object of a pool as it is read: mesh, convex parts, and why it cannot be used ------------
 
 
-Array = NDArray[np.float64]
 CUT_SIZE_M = 0.1
 """Largest extent at which a mesh is cut into convex parts [m]: one result for all its sizes."""
 BYTES_PER_MB = 1e6
@@ -257,7 +256,7 @@ def _pybullet_mesh(path: Path) -> tuple[Mesh, ConvexParts]:
         raise InputError(f"{path} has no convex part with a volume.")
     kept = [p for p, v in zip(solid, volumes, strict=True) if v > LEAST_PART * volumes.sum()]
     corners: list[Array] = []
-    faces: list[NDArray[np.int64]] = []
+    faces: list[Int64] = []
     for part in kept:
         at, triangles = hull_triangles(part)
         faces.append(triangles + sum(len(c) for c in corners))

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.models.library_records import KnownSolid
@@ -26,7 +26,6 @@ from realsim_sim_bridge.table_scenes.tables import TableModel
 # --- What a scene is made of: table, objects, sizes and poses, as it is kept in the scene's folder
 
 
-Array = NDArray[np.float64]
 LAYOUT_FORMAT = 1
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import __version__
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.bop.models import INFO_FILE, info_of, model_files
 from realsim.geometry import se3
@@ -155,9 +155,6 @@ def _own_texture(rng: np.random.Generator, own: OwnLooks) -> Material | None:
 
     path = own.textures[int(rng.integers(len(own.textures)))]
     return material_from_images(path, float(rng.uniform(*PERIODS_M)))
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import parts_solids as solids
 from realsim_sim_bridge.table_scenes.tables import (
-    Array,
     TableModel,
     box,
     corners,

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array, Int32
 from realsim.geometry import parts_solids as solids
 from realsim.records import Mesh
 
-Array = NDArray[np.float64]
 Role = Literal["top", "frame", "detail", "floor", "wall"]
 
 
@@ -96,7 +96,7 @@ def rod(a: Sequence[float], b: Sequence[float], width: float) -> Array:
 def part(name: str, role: Role, pieces: Sequence[Array]) -> TablePart:
     """Return a part of several closed pieces, which may touch."""
     vertices: list[Array] = []
-    faces: list[NDArray[np.int32]] = []
+    faces: list[Int32] = []
     for piece in pieces:
         v, f = solids.weld([piece])
         faces.append(f + sum(len(a) for a in vertices))

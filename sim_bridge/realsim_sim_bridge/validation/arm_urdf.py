@@ -7,15 +7,12 @@ URDF in single precision, so that its link frames are right to 1e-7 and not to t
 
 from collections.abc import Iterable
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.robots.arm import RobotArm
 from realsim.robots.hand import Hand
-
-Array = NDArray[np.float64]
 
 PANDA_LINKS = (
     (0.629769, (-0.041018, -0.00014, 0.049974),

@@ -12,9 +12,9 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import interop
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import STAGES
 from realsim.robots.compiled_chain import follow_lines
@@ -32,9 +32,6 @@ from realsim_sim_bridge.validation.report import CheckResult
 from realsim_sim_bridge.validation.specimens import READY, SIDE_M, cube, panda, ready_trial
 
 # --- The joint angles of a Panda that move its hand as each stage of the slip test does ----------
-
-
-Array = NDArray[np.float64]
 
 
 def stage_joints(stage: int, q: Array, motion: SlipMotion, dt: float) -> Array:

@@ -1,8 +1,8 @@
 """Grasps through all four stages whose outcome is known: the symmetric box, and too weak a hand."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim_sim_bridge.slip.motion import (
     SlipMotion,
@@ -16,8 +16,6 @@ from realsim_sim_bridge.validation.config import ValidationConfig
 from realsim_sim_bridge.validation.loads import with_hand
 from realsim_sim_bridge.validation.report import CheckResult
 from realsim_sim_bridge.validation.specimens import DOWN, SIDE_M, cube_trial
-
-Array = NDArray[np.float64]
 
 
 def box_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
@@ -17,7 +17,6 @@ from realsim_sim_bridge.validation.reference_contact import ReferenceEngine
 from realsim_sim_bridge.validation.report import CheckResult
 from realsim_sim_bridge.validation.specimens import edge_trial, fits
 
-Mask = NDArray[np.bool_]
 Settings = BulletSettings | MujocoSettings
 MakeEngine = Callable[[Settings], Engine]
 
@@ -28,7 +27,7 @@ class EdgeLabels:
 
     passed: Mask
     """(N,)."""
-    masses_kg: NDArray[np.float64]
+    masses_kg: Array
     """(N,) of the object of each [kg]."""
 
 

@@ -3,8 +3,9 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.motion import min_jerk
@@ -25,8 +26,6 @@ from realsim_sim_bridge.validation.specimens import SIDE_M
 # the centre turn the object about an instantaneous centre between the two, and that is what is
 # searched.
 
-
-Array = NDArray[np.float64]
 
 SWEEPS = 400
 """Steps of the reweighted least squares; 60 reach 1e-6 away from a corner of the limit surface."""

@@ -15,9 +15,9 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import __version__
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
@@ -36,8 +36,6 @@ from realsim_sim_bridge.slip.world import (
     SlipPhysics,
 )
 from realsim_sim_bridge.validation import reference_loops as loops
-
-Array = NDArray[np.float64]
 
 SPACING_M = 0.003
 """Greatest distance of the points with which an object meets the hand's boxes [m]."""
@@ -108,7 +106,7 @@ class _Surface:
     """(T, 3, 3) [m]."""
     normals: Array
     """(T, 4) outward unit normal n and d: n . x + d <= 0 inside [m]."""
-    first: NDArray[np.int64]
+    first: Int64
     """(P + 1,) where each part begins."""
     points: Array
     """(N, 3) of the surface, no farther apart than `SPACING_M` [m]."""
@@ -285,9 +283,7 @@ class ReferenceWorld(HandWorld):
 
     # --- between here and the loop ------------------------------------------------------------
 
-    def _place(
-        self, k: NDArray[np.int64], Ts: Array, twists: Array, fingers: Array, speeds: Array
-    ) -> None:
+    def _place(self, k: Int64, Ts: Array, twists: Array, fingers: Array, speeds: Array) -> None:
         """Put objects (n, 4, 4), twists (n, 6) and fingers (n,) of pairs k there, hand axes."""
         state = self._state
         state[k, :3] = Ts[:, :3, 3]
@@ -323,7 +319,7 @@ class ReferenceWorld(HandWorld):
         Ts = se3.from_rt(R @ se3.from_quaternion_wxyz(turns), at)
         return np.where(known[..., None], Ts, np.nan)
 
-    def _motion(self, seen: Array, stops: NDArray[np.int64]) -> Motion:
+    def _motion(self, seen: Array, stops: Int64) -> Motion:
         """Return what was seen (K, S, SIZE) after so many loads (S,)."""
         return Motion(
             Ts_world_body=self._poses(seen),

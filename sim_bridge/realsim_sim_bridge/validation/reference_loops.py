@@ -12,12 +12,10 @@ hand. A contact that is d deep and slides at v_t presses and rubs by
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Rows
 from realsim.compiled import njit
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 Vector = tuple[float, float, float]
 Frame = tuple[Vector, Vector, Vector]
 

@@ -3,16 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim_sim_bridge.slip.slip_test import SlipConfig
 from realsim_sim_bridge.slip.world import Engine, PadModel, SlipBody
 from realsim_sim_bridge.validation.config import ValidationConfig
 from realsim_sim_bridge.validation.loads import LOST_M, Held, hand_patch, hold, with_hand
 from realsim_sim_bridge.validation.report import CheckResult, LimitRatio
 from realsim_sim_bridge.validation.specimens import DOWN, cube, cube_trial, specimen
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -217,7 +215,7 @@ def press_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
     ]  # fmt: skip
 
 
-def bracket(shares: Array, slipped: NDArray[np.bool_]) -> tuple[float, float]:
+def bracket(shares: Array, slipped: Mask) -> tuple[float, float]:
     """Return the largest share below which all were held, and the smallest above which all slipped.
 
     Args:
@@ -256,7 +254,7 @@ def _ratio(
     return LimitRatio(group=group, load=load.name, case=_case(slip), held=low, slipped=high)
 
 
-def _slipped(held: Held, config: ValidationConfig) -> NDArray[np.bool_]:
+def _slipped(held: Held, config: ValidationConfig) -> Mask:
     """Return whether each cube moved or turned further than a held one may (K,)."""
     limits = config.limits
     return (held.shift_m > limits.held_m) | (held.turn_rad > np.radians(limits.held_deg))

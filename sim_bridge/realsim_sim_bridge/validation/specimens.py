@@ -4,8 +4,8 @@ from functools import lru_cache
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import Mesh, mass_properties
@@ -14,8 +14,6 @@ from realsim.robots.hand import Hand, find_hand
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.slip.slip_test import SlipTrial
 from realsim_sim_bridge.slip.world import SlipBody
-
-Array = NDArray[np.float64]
 
 SIDE_M = 0.05
 """Side of the cube."""

@@ -6,7 +6,6 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.robots.hand import Hand
@@ -43,8 +42,6 @@ from realsim_sim_bridge.validation.specimens import (
 
 # --- What the engine says its settings are, whether it repeats itself, and whether pairs are alone
 
-
-Array = NDArray[np.float64]
 
 MASSES_KG = (0.013, 0.5)
 """On both sides of the mass floor."""

@@ -5,13 +5,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.interop import T_from_rotation_vector_pose, rotation_vector_pose_from_T
 from realsim.robots.kinematics import DhChain
-
-Array = NDArray[np.float64]
 
 
 class Motion:

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.scan.scale.inputs import NamedMesh
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.records import Mesh
 from realsim.scanning.scale.files import ScaleRecord, json_lines, load_record, record_to_json
@@ -17,7 +17,6 @@ from realsim.scanning.scale.result import ScaleFit
 from realsim.store import SessionStore, atomic
 from realsim.untrusted.own_json import to_json
 
-Array = NDArray[np.float64]
 FILE = "scale.json"
 MODEL_FILE = "model.ply"
 """The mesh at metric scale, in millimetres as every model file (BOP)."""

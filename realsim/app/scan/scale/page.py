@@ -7,13 +7,13 @@ from realsim.app.scan.scale.show import (
     MEANING,
     MEASURED_HEADER,
     VIEW_HEADER,
-    Array,
     limit_rows,
     limits_title,
     measured_rows,
     scale_rows,
     view_rows,
 )
+from realsim.arrays import Array
 from realsim.pages import VERDICT_KIND, Page
 from realsim.scanning.scale.files import ScaleRecord
 

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.console import Console
 from realsim.app.scan.scale.inputs import LIBRARY, NamedMesh
+from realsim.arrays import Array
 from realsim.records import Verdict
 from realsim.scanning.scale.measured import LengthScale
 from realsim.scanning.scale.measured_check import MeasuredCheck
@@ -28,7 +28,6 @@ CALIPER = (
     "check     nothing outside of this session has confirmed the scale: one length by caliper is "
     "the one independent check. Add --measured longest=...mm."
 )
-Array = NDArray[np.float64]
 Rows = list[list[str]]
 
 

@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.console import Console
 from realsim.app.scan.sfm.inputs import SfmInputs, SfmRequest
+from realsim.arrays import Array
 from realsim.errors import RealsimError
 from realsim.scanning.sfm.result import SfmResult
 
@@ -85,7 +85,7 @@ def _write_dense(fused: "FusedObject", out: Path) -> None:
     write_json(out / FUSION, document)
 
 
-def own_frame(fused: "FusedObject") -> NDArray[np.float64]:
+def own_frame(fused: "FusedObject") -> Array:
     """Return T_world_obj (4, 4): z up, the origin under the middle of the object on the table."""
     from realsim.geometry import se3
 

@@ -3,15 +3,12 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from realsim.arrays import Array, Array32, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.scanning.sfm.result import Poses
 from realsim.store import SessionStore
 
-Array = NDArray[np.float64]
 POSES: dict[str, Poses] = {"unknown": "unknown", "known": "known", "refined": "refined"}
 
 
@@ -51,7 +48,7 @@ class SfmInputs:
     """The session, None for a plain folder."""
     notes: tuple[str, ...]
 
-    def depth_of(self, name: str) -> NDArray[np.float32] | None:
+    def depth_of(self, name: str) -> Array32 | None:
         """Return the depth image of a photograph of the session, None where there is none."""
         index = int(Path(name).stem)
         if self.store is None or not self.store.has_depth(index):
@@ -131,13 +128,13 @@ def _session_inputs(request: SfmRequest) -> SfmInputs:
     )  # fmt: skip
 
 
-def sfm_masks(request: SfmRequest, inputs: SfmInputs) -> dict[str, NDArray[np.bool_]] | None:
+def sfm_masks(request: SfmRequest, inputs: SfmInputs) -> dict[str, Mask] | None:
     """Return the masks by the photographs' names."""
     from realsim.images import read_grey
 
     if request.masks is None:
         return None
-    found: dict[str, NDArray[np.bool_]] = {}
+    found: dict[str, Mask] = {}
     for path in inputs.paths:
         places = [request.masks / f"{stem}.png" for stem in (path.stem, path.name)]
         mask = next((p for p in places if p.is_file()), None)
