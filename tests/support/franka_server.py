@@ -70,22 +70,12 @@ class FrankaServer:
         return self._process.stdout.readline().strip()
 
 
-def serve(host: str) -> None:
-    """Serve the robot at an address until standard input ends."""
-    from franky_sim import SimulationServer, franka_robot_server, simulation_server
-    from franky_sim.franka_robot_protocol import (
-        AutomaticErrorRecoveryCommand,
-        AutomaticErrorRecoveryStatus,
-        BaseCommand,
-        MoveStatus,
-        RobotCommand,
-        RobotMode,
-    )
-    from franky_sim.mujoco_simulator import MUJOCO_DEFAULT_KV, MujocoSimulator
+def _server(words: queue.Queue[list[str]]) -> type:
+    """Return franky-sim's server of a robot, which obeys words, too."""
+    from franky_sim.franka_robot_protocol import BaseCommand, MoveStatus, RobotCommand, RobotMode
+    from franky_sim.franka_robot_server import FrankaRobotServer
 
-    words: queue.Queue[list[str]] = queue.Queue()
-
-    class Server(franka_robot_server.FrankaRobotServer):
+    class Server(FrankaRobotServer):
         mode: RobotMode | None = None
         error: int | None = None
         answer = ""
@@ -143,8 +133,19 @@ def serve(host: str) -> None:
                 )
                 self.reset_current_motion_id()
 
+    return Server
+
+
+def _recovery() -> type:
+    """Return the command that ends a reflex, and no other stop."""
+    from franky_sim.franka_robot_protocol import (
+        AutomaticErrorRecoveryCommand,
+        AutomaticErrorRecoveryStatus,
+        RobotMode,
+    )
+
     class Recovery(AutomaticErrorRecoveryCommand):
-        def handle(self, server: Server) -> None:
+        def handle(self, server: Any) -> None:
             status = AutomaticErrorRecoveryStatus
             if server.mode in (None, RobotMode.kReflex):
                 server.mode = server.error = None
@@ -152,13 +153,23 @@ def serve(host: str) -> None:
             else:
                 self.reply(status.kCommandNotPossibleRejected)
 
+    return Recovery
+
+
+def serve(host: str) -> None:
+    """Serve the robot at an address until standard input ends."""
+    from franky_sim import SimulationServer, franka_robot_server, simulation_server
+    from franky_sim.mujoco_simulator import MUJOCO_DEFAULT_KV, MujocoSimulator
+
+    words: queue.Queue[list[str]] = queue.Queue()
+
     def read() -> None:
         for line in sys.stdin:
             words.put(line.split())
         running.running = False
 
-    franka_robot_server.AutomaticErrorRecoveryCommand = Recovery
-    simulation_server.FrankaRobotServer = Server
+    franka_robot_server.AutomaticErrorRecoveryCommand = _recovery()
+    simulation_server.FrankaRobotServer = _server(words)
     with MujocoSimulator() as sim:
         sim.add_robot(kv=(*MUJOCO_DEFAULT_KV[:4], WRIST_KV, WRIST_KV, WRIST_KV))
         with SimulationServer(sim, hostname_candidates=[host]) as running:

@@ -9,6 +9,7 @@ says nothing: every call has a deadline here, after which it is let go with what
 Frames: `T_base_ee` is the flange (panda_link8, fr3_link8) in the robot's base (link0).
 """
 
+import logging
 import queue
 import re
 import threading
@@ -30,6 +31,7 @@ from realsim.robots.limits import JointLimits
 from realsim_capture_plans.devices.franka_messages import lost, named, off_goal, stopped, trouble
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, checked_goal
 
+log = logging.getLogger(__name__)
 Answer = TypeVar("Answer")
 REALTIME_KERNEL = Path("/sys/kernel/realtime")
 """Is there where the kernel is a real-time one; libfranka looks for it, too."""
@@ -237,11 +239,14 @@ class FrankaArm:
         """End whatever move is under way; a robot that does not hear this brakes by itself."""
         held, limit_s = self._held, self._config.call_s
         if held and held[0].is_in_control:
-            for call in (held[0].stop, lambda: held[0].join_motion(limit_s)):
-                try:
-                    _within(call, limit_s)
-                except Exception:  # the end of the move is told as an error, too
-                    continue
+            try:
+                _within(held[0].stop, limit_s)
+            except Exception as error:
+                log.warning("%s did not hear the stop (%s): it brakes by itself", self._who, error)
+            try:
+                _within(lambda: held[0].join_motion(limit_s), limit_s)
+            except Exception as error:  # the end of a move that was stopped is told as one, too
+                log.info("%s ended its move: %s", self._who, error)
 
     def _connect(self) -> None:
         """Connect anew, and see that it is the arm that is expected."""

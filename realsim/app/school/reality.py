@@ -11,7 +11,7 @@ from realsim.errors import InputError
 from realsim.store import atomic
 
 if TYPE_CHECKING:
-    from realsim_sim_bridge.hold.reality import Reality
+    from realsim_sim_bridge.hold.reality import Reality, RealityConfig
 
 HEADER = ["predictor", "AUC", "95 % by object", "within objects", "average precision"]
 WORDS = {
@@ -44,34 +44,16 @@ def judge(
         InputError: the folder is of another layout, or the trials cannot be judged.
     """
     from realsim.formats.grasps.graspa import read_graspa
-    from realsim.robots.hand import find_hand
     from realsim.untrusted.own_json import read_own
     from realsim_sim_bridge.hold.calibration import Calibration, shipped
-    from realsim_sim_bridge.hold.draws import HoldConfig
-    from realsim_sim_bridge.hold.reality import (
-        RealityConfig,
-        calibrate,
-        judge_trials,
-        reality_of,
-    )
-    from realsim_sim_bridge.slip.engines import settings_of
-    from realsim_sim_bridge.slip.slip_test import SlipConfig
+    from realsim_sim_bridge.hold.reality import calibrate, judge_trials, reality_of
 
-    masses = [named_mass(text) for text in options["masses"]]
-    if len(dict(masses)) < len(masses):
-        raise InputError("--mass names an object twice; give it once.")
-    if options["cache"] is not None and not options["cache"].is_dir() and options["cache"].exists():
-        raise InputError(f"--cache {options['cache']} is a file; a folder is expected.")
-    if fit is not None and options["calibration"] is not None:
+    given = options["calibration"]
+    if fit is not None and given is not None:
         raise InputError("--fit makes a calibration and --calibration takes one; give one of them.")
-    objects = read_graspa(folder, dict(masses))
+    objects = read_graspa(folder, _masses(options))
     names = {obj.name for obj in objects}
-    hand = find_hand()
-    hold = HoldConfig(draws=options["draws"], **spread_of(options["cell_error"]))
-    config = RealityConfig(
-        hand=hand, hold=hold,
-        slip=replace(SlipConfig.of(hand), engine=settings_of(options["engine"])),
-    )  # fmt: skip
+    config = _config(options)
     with console.stage("reality", "trials") as tick:
         judged = judge_trials(objects, config, options["cache"], tick)
     for note in judged.notes:
@@ -81,18 +63,61 @@ def judge(
         fitted = calibrate(judged, str(folder.resolve().name))
         fitted.write(fit)
         console.say(f"calibration {fit}")
-    given = options["calibration"]
     calibration = fitted or (read_own(given, Calibration) if given else shipped())
     found = reality_of(judged, calibration)
+    held = int(judged.held.sum())
+    if held in (0, len(judged.held)):
+        console.warn("all trials ended alike, so nothing can be told apart: no AUC is given.")
+    title = f"{len(judged.held)} trials of {len(names)} objects, {held} held; {judged.engine}"
+    _show(found, title, sorted(names & set(calibration.objects)), console)
+    document = _document(found, asdict(config), judged.notes)
+    if out is not None:
+        atomic.write_json(out / "reality.json", document)
+        atomic.write_bytes(out / "reliability.png", reliability_picture(found))
+        console.say(f"report    {out / 'reality.json'} and {out / 'reliability.png'}")
+    console.result(document)
+
+
+def _masses(options: dict[str, Any]) -> dict[str, float]:
+    """Return the masses given on the command line, by object [kg]; check the cache's folder."""
+    masses = [named_mass(text) for text in options["masses"]]
+    if len(dict(masses)) < len(masses):
+        raise InputError("--mass names an object twice; give it once.")
+    if options["cache"] is not None and not options["cache"].is_dir() and options["cache"].exists():
+        raise InputError(f"--cache {options['cache']} is a file; a folder is expected.")
+    return dict(masses)
+
+
+def _config(options: dict[str, Any]) -> "RealityConfig":
+    """Return what the options ask for, with the hand of the trials."""
+    from realsim.robots.hand import find_hand
+    from realsim_sim_bridge.hold.draws import HoldConfig
+    from realsim_sim_bridge.hold.reality import RealityConfig
+    from realsim_sim_bridge.slip.engines import settings_of
+    from realsim_sim_bridge.slip.slip_test import SlipConfig
+
+    hand = find_hand()
+    return RealityConfig(
+        hand=hand,
+        hold=HoldConfig(draws=options["draws"], **spread_of(options["cell_error"])),
+        slip=replace(SlipConfig.of(hand), engine=settings_of(options["engine"])),
+    )
+
+
+def _show(found: "Reality", title: str, shared: list[str], console: Console) -> None:
+    """Show the predictors, p_hold's own figures, and whether they are of trials that were fitted.
+
+    Args:
+        found: the figures.
+        title: of the table.
+        shared: objects that the calibration was fitted on, too.
+        console: takes them.
+    """
     rows = [
         [WORDS[row.name], _number(row.auc), f"{_number(row.auc_low)} to {_number(row.auc_high)}",
          _number(row.within), _number(row.average_precision)]
         for row in found.rows
     ]  # fmt: skip
-    held = int(judged.held.sum())
-    if held in (0, len(judged.held)):
-        console.warn("all trials ended alike, so nothing can be told apart: no AUC is given.")
-    title = f"{len(judged.held)} trials of {len(names)} objects, {held} held; {judged.engine}"
     console.table(title, HEADER, rows)
     console.say(
         f"p_hold: expected calibration error {found.ece:.3f}, balanced accuracy "
@@ -105,17 +130,11 @@ def judge(
             "The calibration was fitted on these very trials: both figures are of curves fitted "
             "on the other objects."
         )
-    elif shared := sorted(names & set(calibration.objects)):
+    elif shared:
         console.warn(
             f"the calibration was fitted on trials of {', '.join(shared)} too, though not on these "
             "alone or not on all of them: both figures may be too good."
         )
-    document = _document(found, asdict(config), judged.notes)
-    if out is not None:
-        atomic.write_json(out / "reality.json", document)
-        atomic.write_bytes(out / "reliability.png", reliability_picture(found))
-        console.say(f"report    {out / 'reality.json'} and {out / 'reliability.png'}")
-    console.result(document)
 
 
 def reliability_picture(found: "Reality") -> bytes:

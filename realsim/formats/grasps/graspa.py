@@ -29,6 +29,10 @@ from realsim.records import Mesh
 from realsim.untrusted import values
 from realsim.untrusted.xml_tree import read_xml
 
+Board = dict[str, tuple[Array, str]]
+"""Pose (4, 4) [m] and file of each object on a board, by its name there."""
+Trials = list[tuple[str, str, Array, bool]]
+"""Planner, name, pose (4, 4) of the hand [m] and result of each."""
 MM = 1e-3
 ROUNDED = 0.02
 """Greatest entry of R^T R - 1 that rounding explains; the worst of the open trials has 0.001."""
@@ -102,35 +106,9 @@ def read_graspa(
             result, an object is not on its board or not where its hands are, a mass is none or of
             no object; the file and what was expected are named.
     """
-    folder = Path(folder)
-    for need in ("layouts", "results", "objects"):
-        if not (folder / need).is_dir():
-            raise InputError(
-                f"{folder} has no folder '{need}'; GRASPA's layout is expected: layouts/layout_K"
-                ".xml, results/PLANNER/grasps_data/layout_K/NAME_grasp.xml, objects/NAME/*.stl."
-            )
-    files = sorted(folder.glob("results/*/grasps_data/*/*_grasp.xml"))
-    if not files:
-        raise InputError(
-            f"{folder / 'results'} holds no trials; files such as PLANNER/grasps_data/layout_0/"
-            "YcbHammer_grasp.xml are expected."
-        )
-    known = YCB_MASSES_KG | dict(masses_kg or {})
-    boards: dict[str, dict[str, tuple[Array, str]]] = {}
-    grasps: dict[tuple[str, str], list[tuple[str, str, Array, bool]]] = {}
-    for file in files:
-        layout, label = file.parent.name, file.name.removesuffix("_grasp.xml")
-        if layout not in boards:
-            boards[layout] = _board(folder / "layouts" / f"{layout}.xml")
-        if label not in boards[layout]:
-            raise InputError(
-                f"{file}: '{label}' is not on its board; {layout}.xml has "
-                f"{', '.join(boards[layout])}."
-            )
-        planner = file.parents[2].name
-        trials = [(planner, *trial) for trial in _trials(file)]
-        if trials:
-            grasps.setdefault((layout, label), []).extend(trials)
+    folder, given = Path(folder), dict(masses_kg or {})
+    known = YCB_MASSES_KG | given
+    boards, grasps = _read_trials(_trial_files(folder))
     meshes: dict[str, tuple[str, Mesh]] = {}
     found: list[TriedObject] = []
     for (layout, label), rows in sorted(grasps.items()):
@@ -153,19 +131,60 @@ def read_graspa(
                 trials=tuple(row[1] for row in rows),
             )
         )
-    for name, mass in (masses_kg or {}).items():
-        if name not in {obj.name for obj in found}:
-            told = ", ".join(sorted({obj.name for obj in found}))
-            raise InputError(
-                f"a mass is given for '{name}', which no trial is of; there are {told}."
-            )
-        values.number(mass, f"the mass of {name} [kg]", low=1e-6)
+    _check_masses(given, {obj.name for obj in found})
     return found
 
 
-def _board(path: Path) -> dict[str, tuple[Array, str]]:
+def _trial_files(folder: Path) -> list[Path]:
+    """Return the files of trials of a folder that has GRASPA's layout."""
+    for need in ("layouts", "results", "objects"):
+        if not (folder / need).is_dir():
+            raise InputError(
+                f"{folder} has no folder '{need}'; GRASPA's layout is expected: layouts/layout_K"
+                ".xml, results/PLANNER/grasps_data/layout_K/NAME_grasp.xml, objects/NAME/*.stl."
+            )
+    files = sorted(folder.glob("results/*/grasps_data/*/*_grasp.xml"))
+    if not files:
+        raise InputError(
+            f"{folder / 'results'} holds no trials; files such as PLANNER/grasps_data/layout_0/"
+            "YcbHammer_grasp.xml are expected."
+        )
+    return files
+
+
+def _read_trials(files: Iterable[Path]) -> tuple[dict[str, Board], dict[tuple[str, str], Trials]]:
+    """Return the boards by layout, and the trials by layout and the object's name on the board."""
+    boards: dict[str, Board] = {}
+    grasps: dict[tuple[str, str], Trials] = {}
+    for file in files:
+        layout, label = file.parent.name, file.name.removesuffix("_grasp.xml")
+        if layout not in boards:
+            boards[layout] = _board(file.parents[4] / "layouts" / f"{layout}.xml")
+        if label not in boards[layout]:
+            raise InputError(
+                f"{file}: '{label}' is not on its board; {layout}.xml has "
+                f"{', '.join(boards[layout])}."
+            )
+        trials = [(file.parents[2].name, *trial) for trial in _trials(file)]
+        if trials:
+            grasps.setdefault((layout, label), []).extend(trials)
+    return boards, grasps
+
+
+def _check_masses(given: Mapping[str, float], names: set[str]) -> None:
+    """Raise if a mass is none, or of an object that was not tried."""
+    for name, mass in given.items():
+        if name not in names:
+            raise InputError(
+                f"a mass is given for '{name}', which no trial is of; there are "
+                f"{', '.join(sorted(names))}."
+            )
+        values.number(mass, f"the mass of {name} [kg]", low=1e-6)
+
+
+def _board(path: Path) -> Board:
     """Return pose and file of every object of a board."""
-    objects: dict[str, tuple[Array, str]] = {}
+    objects: Board = {}
     for element in read_xml(path).iter("ManipulationObject"):
         name, file = element.get("name"), element.findtext("File")
         if name is None or file is None:

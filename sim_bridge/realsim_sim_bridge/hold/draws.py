@@ -14,8 +14,10 @@ Friction and force are uncertain as well, and a draw's contacts tell all of them
 is one of a few levels alike, the force is uniform in a range, to which the factor is proportional.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
@@ -27,7 +29,7 @@ from realsim.geometry import se3
 from realsim.records import STAGES, Mesh
 from realsim.robots.hand import Hand, along_approach
 from realsim_sim_bridge.grasping.antipodal import RaySurface
-from realsim_sim_bridge.grasping.limit_analysis import pad_patches, safety_factors
+from realsim_sim_bridge.grasping.limit_analysis import PadPatches, pad_patches, safety_factors
 from realsim_sim_bridge.grasping.pad_contacts import pad_heights
 from realsim_sim_bridge.grasping.surroundings import (
     SurfaceTree,
@@ -259,7 +261,7 @@ def draw_holds(
         InputError: the covariance is none.
     """
     config = config or HoldConfig()
-    n, count = len(trial), config.draws
+    count = config.draws
     normal = _normals(count, config.seed)
     Ts_moved = moved_objects(trial, covariance, config.spread, normal)
     mass = np.maximum(1.0 + config.mass_spread * normal[:, 12], 0.1)
@@ -272,37 +274,63 @@ def draw_holds(
         obj, trial, loads, hand, float(np.median(config.friction)), high, soft
     )
     at = _worst(factors, loads)
-    boxes, palms = hand.boxes(trial.openings_m), len(hand.palm_boxes)
-    holds, palm = np.zeros((n, count)), np.zeros((n, count))
-    counts = {name: np.zeros((n, count)) for name in ("blocked", "missed", "skewed")}
-    ones = np.ones(n)
+    palms = len(hand.palm_boxes)
+    fingers = hand.boxes(trial.openings_m)[:, palms:]
+    draws: list[_Draw] = []
     for k in range(count):
         Ts, touched = obj.stopped(Ts_moved[k], hand, PALM_M)
-        blocked = first_triangle_inside(boxes[:, palms:], Ts, obj.tree, -config.touch_m) >= 0
+        blocked = first_triangle_inside(fingers, Ts, obj.tree, -config.touch_m) >= 0
         pads = _pads(obj, trial, Ts, hand)
         patches = pad_patches(obj.rays, pads, trial.openings_m, hand, float(softness[k]))
         # The last load is none: it is borne wherever the squeeze is balanced.
         wrenches = np.pad(
             loads.about_grasp(_centers(trial, pads), at) * mass[k], ((0, 0), (0, 1), (0, 0))
         )
+        holds, skewed = _borne(patches, wrenches, config.friction, low, high)
         free = ~blocked & patches.both
-        skewed = np.zeros(n)
-        for friction in config.friction:
-            borne = safety_factors(patches, wrenches, friction * ones, ones)
-            with np.errstate(divide="ignore"):
-                needed = 1.0 / borne.min(axis=1)
-            holds[:, k] += free * np.clip((high - needed) / (high - low), 0.0, 1.0)
-            skewed += borne[:, -1] <= 0
-        holds[:, k] /= len(config.friction)
-        counts["blocked"][:, k] = blocked
-        counts["missed"][:, k] = ~blocked & ~patches.both
-        counts["skewed"][:, k] = free * skewed / len(config.friction)
-        palm[:, k] = touched
-    shares = {name: values.mean(axis=1) for name, values in counts.items()}
-    rest = 1.0 - holds.mean(axis=1) - sum(shares.values())
+        draws.append(_Draw(free * holds, blocked, ~blocked & ~patches.both, free * skewed, touched))
+    held = np.stack([draw.holds for draw in draws], axis=1)
+    blocked, missed, skewed, palm = (
+        np.stack(column, axis=1).mean(axis=1) for column in list(zip(*draws, strict=True))[1:]
+    )
+    rest = 1.0 - held.mean(axis=1) - (blocked + missed + skewed)
     return Drawn(
-        holds=holds, overloaded=np.maximum(rest, 0.0), palm=palm.mean(axis=1), **shares
+        holds=held, blocked=blocked, missed=missed, skewed=skewed,
+        overloaded=np.maximum(rest, 0.0), palm=palm,
     )  # fmt: skip
+
+
+class _Draw(NamedTuple):
+    """What one draw makes of N grasps, each (N,)."""
+
+    holds: Array
+    blocked: Mask
+    missed: Mask
+    skewed: Array
+    palm: Mask
+
+
+def _borne(
+    patches: PadPatches, wrenches: Array, frictions: Sequence[float], low: float, high: float
+) -> tuple[Array, Array]:
+    """Return for grasps (N,) the shares of forces and frictions that bear all loads, and none.
+
+    Args:
+        patches: where the pads touch.
+        wrenches: (N, L, 6) loads; the last is none.
+        frictions: equally likely.
+        low: least force on the object [N].
+        high: greatest [N].
+    """
+    ones = np.ones(len(wrenches))
+    holds, skewed = 0.0 * ones, 0.0 * ones
+    for friction in frictions:
+        borne = safety_factors(patches, wrenches, friction * ones, ones)
+        with np.errstate(divide="ignore"):
+            needed = 1.0 / borne.min(axis=1)
+        holds += np.clip((high - needed) / (high - low), 0.0, 1.0)
+        skewed += borne[:, -1] <= 0
+    return holds / len(frictions), skewed / len(frictions)
 
 
 def moved_objects(

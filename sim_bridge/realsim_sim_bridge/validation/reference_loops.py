@@ -237,7 +237,125 @@ def _press(  # noqa: PLR0913, PLR0917 - compiled code takes plain arrays
 
 
 @njit(error_model="numpy")
-def march(  # noqa: PLR0912, PLR0913, PLR0915, PLR0917 - compiled code takes plain arrays
+def _lift(state: Array, arc: Array) -> float:
+    """Put the pads at their height on an arc; return its slope over the finger's distance."""
+    if arc[0] <= 0.0:
+        return 0.0
+    height = np.sqrt(arc[0] ** 2 - (state[FINGER] - arc[1]) ** 2)
+    state[HEIGHT] = height - np.sqrt(arc[0] ** 2 - arc[1] ** 2)
+    return (arc[1] - state[FINGER]) / height
+
+
+@njit(error_model="numpy")
+def _in_object(state: Array, R: Frame, sphere: Array) -> Vector:
+    """Return where a finger's sphere (5,) is in the object's frame [m]."""
+    opened = (0.0, sphere[4] * state[FINGER], state[HEIGHT])
+    return _turn_back(R, _plus(_plus(_at(sphere), 1.0, opened), -1.0, _at(state)))
+
+
+@njit(error_model="numpy")
+def _list_met(
+    state: Array, R: Frame, surface: Array, boxes: Array, sides: Array, box: Array, met: Rows
+) -> int:
+    """List point and box of what is near enough to be looked at; return how many there are."""
+    meets = 0
+    for m in range(len(surface)):
+        place = _plus(_at(state), 1.0, _turn(R, _at(surface[m])))
+        for b in range(len(boxes)):
+            _shift(boxes[b], float(sides[b]), state, box)
+            if _below(place, box, _nearest(place, box)) > -SKIN_M:
+                met[meets, 0], met[meets, 1] = m, b
+                meets += 1
+    return meets
+
+
+@njit(error_model="numpy")
+def _press_parts(  # noqa: PLR0913, PLR0917 - compiled code takes plain arrays
+    state: Array, R: Frame, sums: Array, bristles: Array, depths: Array, points: Array,
+    outwards: Array, side: float, slope: float, dt: float, pad: Array,
+) -> None:  # fmt: skip
+    """Add what a sphere does in each part (P,) that it is in, as `_sink` found it."""
+    for p in range(len(depths)):
+        if depths[p] <= 0.0:
+            _put(bristles[p], 0, (0.0, 0.0, 0.0))
+            continue
+        n = _turn(R, _at(outwards[p]))
+        # The force acts in the middle of the overlap.
+        x = _plus(_turn(R, _at(points[p])), -0.5 * depths[p], n)
+        _press(state, sums, bristles[p], x, n, depths[p], side, slope, dt, pad)
+        state[DEEPEST] = max(state[DEEPEST], depths[p])
+
+
+@njit(error_model="numpy")
+def _press_box(  # noqa: PLR0913, PLR0917 - compiled code takes plain arrays
+    state: Array, sums: Array, bristle: Array, x: Vector, box: Array, came: int, side: float,
+    slope: float, dt: float, pad: Array,
+) -> int:  # fmt: skip
+    """Add what a point at x from the object's centre does in a box; return the face it came by."""
+    place = _plus(_at(state), 1.0, x)
+    face = _nearest(place, box)
+    if _below(place, box, face) <= 0.0:
+        _put(bristle, 0, (0.0, 0.0, 0.0))
+        return face
+    # Not the nearest face: a point that comes in beside an edge would be caught there.
+    face = came if came >= 0 else face
+    depth, toward = _below(place, box, face), -1.0 if face < 3 else 1.0
+    n = (
+        toward if face % 3 == 0 else 0.0,
+        toward if face % 3 == 1 else 0.0,
+        toward if face % 3 == 2 else 0.0,
+    )
+    x = _plus(x, -0.5 * depth, n)
+    _press(state, sums, bristle, x, n, depth, side, slope, dt, pad)
+    return came
+
+
+@njit(error_model="numpy")
+def _drive(
+    state: Array, sums: Array, dt: float, force: float, gain: float, speed: float, mass: float
+) -> None:
+    """Move the fingers by the drive's force and the contacts'; they stop where they are closed."""
+    drive = min(force, max(-force, gain * (-speed - state[FINGER_SPEED])))
+    state[FINGER_SPEED] += dt * (sums[6] + 2.0 * drive) / mass
+    state[FINGER] += dt * state[FINGER_SPEED]
+    if state[FINGER] < 0.0:
+        state[FINGER], state[FINGER_SPEED] = 0.0, max(0.0, state[FINGER_SPEED])
+
+
+@njit(error_model="numpy")
+def _step(
+    state: Array, R: Frame, sums: Array, dt: float, drag: float, slope: float, matter: Array
+) -> float:
+    """Move the object, note the energy; return how far anything may have moved [m]."""
+    at, v, w = _at(state), _at(state, 7), _at(state, 10)
+    # Euler's equations about the principal axes.
+    a, b, (ix, iy, iz) = _turn_back(R, w), _turn_back(R, _at(sums)), _at(matter, 1)
+    spin = (
+        a[0] + dt * (b[0] - (iz - iy) * a[1] * a[2]) / ix,
+        a[1] + dt * (b[1] - (ix - iz) * a[2] * a[0]) / iy,
+        a[2] + dt * (b[2] - (iy - ix) * a[0] * a[1]) / iz,
+    )
+    decay = 1.0 - drag * dt
+    v = _times(decay, _plus(v, dt / matter[0], _at(sums, 3)))
+    w = _times(decay, _turn(R, spin))
+    _put(state, 0, _plus(at, dt, v))
+    _put(state, 7, v)
+    _put(state, 10, w)
+    # q' = w q / 2, in quaternions.
+    real, q = state[3], _at(state, 4)
+    q = _plus(q, 0.5 * dt, _plus(_cross(w, q), real, w))
+    real -= 0.5 * dt * _dot(w, _at(state, 4))
+    state[3] = real / np.sqrt(real**2 + _dot(q, q))
+    _put(state, 4, _times(1.0 / np.sqrt(real**2 + _dot(q, q)), q))
+    state[ENERGY] = sums[7] + 0.5 * matter[4] * state[FINGER_SPEED] ** 2
+    state[ENERGY] += 0.5 * matter[0] * _dot(v, v)
+    state[ENERGY] += 0.5 * (ix * spin[0] ** 2 + iy * spin[1] ** 2 + iz * spin[2] ** 2)
+    moved = dt * (np.sqrt(_dot(v, v)) + matter[5] * np.sqrt(_dot(w, w)))
+    return moved + dt * (1.0 + abs(slope)) * abs(state[FINGER_SPEED])
+
+
+@njit(error_model="numpy")
+def march(  # noqa: PLR0913, PLR0917 - compiled code takes plain arrays
     state: Array, bristles: Array, bristles_box: Array, entered: Rows, wrenches: Array, inner: int,
     sample: int, dt: float, lost_m: float, seen: Array, drag: float, speed: float, matter: Array,
     pad: Array, spheres: Array, boxes: Array, sides: Array, triangles: Array, normals: Array,
@@ -270,104 +388,45 @@ def march(  # noqa: PLR0912, PLR0913, PLR0915, PLR0917 - compiled code takes pla
         surface: (N, 3) points of the object's surface [m].
         arc: (2,) radius and y of the axis of fingers on an arc [m]; radius 0 = they slide.
     """
-    count, parts, force = len(spheres), len(first) - 1, pad[4]
+    count, parts = len(spheres), len(first) - 1
     near, counts = np.zeros((count, len(triangles)), np.int64), np.zeros((count, parts), np.int64)
     depths, points, outwards = np.zeros(parts), np.zeros((parts, 3)), np.zeros((parts, 3))
     met, meets = np.zeros((len(surface) * len(boxes), 2), np.int64), 0
     box, sums = np.zeros((2, 3)), np.zeros(8)
-    start, moved, looks, gain = _at(state), np.inf, 0, 10.0 * force / speed
+    start, moved, looks, gain = _at(state), np.inf, 0, 10.0 * pad[4] / speed
     for load in range(len(wrenches)):
         for _ in range(inner):
             R = _rotation(state[3], state[4], state[5], state[6])
-            at, v, w = _at(state), _at(state, 7), _at(state, 10)
-            slope = 0.0
-            if arc[0] > 0.0:
-                height = np.sqrt(arc[0] ** 2 - (state[FINGER] - arc[1]) ** 2)
-                state[HEIGHT] = height - np.sqrt(arc[0] ** 2 - arc[1] ** 2)
-                slope = (arc[1] - state[FINGER]) / height
+            slope = _lift(state, arc)
             for i in range(6):
                 sums[i] = wrenches[load, i]
             sums[6] = sums[7] = state[16] = state[17] = 0.0
             fresh = moved > SKIN_M
             if fresh:
-                moved, meets = 0.0, 0
-                for m in range(len(surface)):
-                    place = _plus(at, 1.0, _turn(R, _at(surface[m])))
-                    for b in range(len(boxes)):
-                        _shift(boxes[b], float(sides[b]), state, box)
-                        if _below(place, box, _nearest(place, box)) > -SKIN_M:
-                            met[meets, 0], met[meets, 1] = m, b
-                            meets += 1
+                moved, meets = 0.0, _list_met(state, R, surface, boxes, sides, box, met)
             for s in range(count):
-                radius, side = spheres[s, 3], spheres[s, 4]
-                opened = (0.0, side * state[FINGER], state[HEIGHT])
-                place = _plus(_at(spheres[s]), 1.0, opened)
-                center = _turn_back(R, _plus(place, -1.0, at))
+                center = _in_object(state, R, spheres[s])
                 if fresh:
-                    _list_near(center, radius + SKIN_M, triangles, first, near[s], counts[s])
+                    reach = spheres[s, 3] + SKIN_M
+                    _list_near(center, reach, triangles, first, near[s], counts[s])
                 _sink(
-                    center, radius, triangles, normals, first, near[s], counts[s],
+                    center, spheres[s, 3], triangles, normals, first, near[s], counts[s],
                     depths, points, outwards,
                 )  # fmt: skip
-                for p in range(parts):
-                    if depths[p] <= 0.0:
-                        _put(bristles[s, p], 0, (0.0, 0.0, 0.0))
-                        continue
-                    n = _turn(R, _at(outwards[p]))
-                    # The force acts in the middle of the overlap.
-                    x = _plus(_turn(R, _at(points[p])), -0.5 * depths[p], n)
-                    _press(state, sums, bristles[s, p], x, n, depths[p], side, slope, dt, pad)
-                    state[DEEPEST] = max(state[DEEPEST], depths[p])
+                side = spheres[s, 4]
+                _press_parts(
+                    state, R, sums, bristles[s], depths, points, outwards, side, slope, dt, pad
+                )
             for k in range(meets):
                 m, b = met[k, 0], met[k, 1]
-                side = float(sides[b])
-                x = _turn(R, _at(surface[m]))
+                side, x = float(sides[b]), _turn(R, _at(surface[m]))
                 _shift(boxes[b], side, state, box)
-                place = _plus(at, 1.0, x)
-                face = _nearest(place, box)
-                if _below(place, box, face) <= 0.0:
-                    entered[m, b] = face
-                    _put(bristles_box[m, b], 0, (0.0, 0.0, 0.0))
-                    continue
-                # Not the nearest face: a point that comes in beside an edge would be caught there.
-                face = int(entered[m, b]) if entered[m, b] >= 0 else face
-                depth, toward = _below(place, box, face), -1.0 if face < 3 else 1.0
-                n = (
-                    toward if face % 3 == 0 else 0.0,
-                    toward if face % 3 == 1 else 0.0,
-                    toward if face % 3 == 2 else 0.0,
+                came = int(entered[m, b])
+                entered[m, b] = _press_box(
+                    state, sums, bristles_box[m, b], x, box, came, side, slope, dt, pad
                 )
-                x = _plus(x, -0.5 * depth, n)
-                _press(state, sums, bristles_box[m, b], x, n, depth, side, slope, dt, pad)
-            drive = min(force, max(-force, gain * (-speed - state[FINGER_SPEED])))
-            state[FINGER_SPEED] += dt * (sums[6] + 2.0 * drive) / matter[4]
-            state[FINGER] += dt * state[FINGER_SPEED]
-            if state[FINGER] < 0.0:
-                state[FINGER], state[FINGER_SPEED] = 0.0, max(0.0, state[FINGER_SPEED])
-            # Euler's equations about the principal axes.
-            a, b3, (ix, iy, iz) = _turn_back(R, w), _turn_back(R, _at(sums)), _at(matter, 1)
-            spin = (
-                a[0] + dt * (b3[0] - (iz - iy) * a[1] * a[2]) / ix,
-                a[1] + dt * (b3[1] - (ix - iz) * a[2] * a[0]) / iy,
-                a[2] + dt * (b3[2] - (iy - ix) * a[0] * a[1]) / iz,
-            )
-            decay = 1.0 - drag * dt
-            v = _times(decay, _plus(v, dt / matter[0], _at(sums, 3)))
-            w = _times(decay, _turn(R, spin))
-            _put(state, 0, _plus(at, dt, v))
-            _put(state, 7, v)
-            _put(state, 10, w)
-            # q' = w q / 2, in quaternions.
-            real, q = state[3], _at(state, 4)
-            q = _plus(q, 0.5 * dt, _plus(_cross(w, q), real, w))
-            real -= 0.5 * dt * _dot(w, _at(state, 4))
-            state[3] = real / np.sqrt(real**2 + _dot(q, q))
-            _put(state, 4, _times(1.0 / np.sqrt(real**2 + _dot(q, q)), q))
-            moved += dt * (np.sqrt(_dot(v, v)) + matter[5] * np.sqrt(_dot(w, w)))
-            moved += dt * (1.0 + abs(slope)) * abs(state[FINGER_SPEED])
-            state[ENERGY] = sums[7] + 0.5 * matter[4] * state[FINGER_SPEED] ** 2
-            state[ENERGY] += 0.5 * matter[0] * _dot(v, v)
-            state[ENERGY] += 0.5 * (ix * spin[0] ** 2 + iy * spin[1] ** 2 + iz * spin[2] ** 2)
+            _drive(state, sums, dt, pad[4], gain, speed, matter[4])
+            moved += _step(state, R, sums, dt, drag, slope, matter)
         if (load + 1) % sample == 0 or load + 1 == len(wrenches):
             for i in range(SIZE):
                 seen[looks, i] = state[i]
