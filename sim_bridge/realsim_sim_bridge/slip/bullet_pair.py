@@ -43,6 +43,10 @@ LIFT_PULL = 0.5
 """Share of the height's error that is taken back in a step."""
 FAR_AWAY = (0.0, 0.0, 50.0)
 """Where the object waits while contacts of the grasp before are forgotten [m]."""
+HULL = 0
+"""Link of the object that the table meets."""
+LINK_MARGIN_M = 0.001
+"""Bullet's collision margin of links [m]."""
 AWAY = (0.0, 0.0, -50.0)
 """Where the table and the neighbours are while loads are played [m]."""
 TABLE_M = (1.0, 1.0, 0.2)
@@ -92,9 +96,16 @@ class BulletPair:
             T_body_obj = se3.invert(self._T_obj_body)
             parts = [se3.transform(T_body_obj, part) for part in body.parts]
             cores, margin = drawn_in(parts, settings.collision_margin_m)
-            self.object = self._add_object(self._shape(cores, Path(folder) / "object.obj"), margin)
+            shape = self._shape(cores, Path(folder) / "object.obj")
+            whole = None
+            if stand is not None and len(parts) > 1:
+                hull, hull_margin = drawn_in([np.concatenate(parts)], LINK_MARGIN_M)
+                if hull_margin == LINK_MARGIN_M:  # what is thinner stands on its parts
+                    whole = self._shape(hull, Path(folder) / "hull.obj")
+            self.object = self._add_object(shape, margin, whole)
             self._stands = [] if stand is None else self._add_stand(stand, Path(folder))
         self.stand = stand
+        self.reach_m = body.reach()
         gravity = 0.0 if stand is None else stand.gravity
         self.weights_n = gravity * self._mass, gravity * body.mass_kg
         """Of the object in the engine while it stands, and its own from then [N]."""
@@ -157,20 +168,49 @@ class BulletPair:
             )
         return shape
 
-    def _add_object(self, shape: int, margin_m: float) -> int:
-        """Add the object; its frame in the engine is the principal one."""
-        obj: int = self.engine.createMultiBody(
-            baseMass=self._mass, baseCollisionShapeIndex=shape, basePosition=FAR_AWAY
+    def _add_object(self, shape: int, margin_m: float, whole: int | None) -> int:
+        """Add the object; its frame in the engine is the principal one.
+
+        Args:
+            shape: of its parts.
+            margin_m: around them [m].
+            whole: shape of their hull, a link without mass that the table alone meets: in four
+                points at most, where every part would touch in four.
+        """
+        engine, still, upright = self.engine, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
+        link: dict[str, list[Any]] = {}
+        if whole is not None:
+            link = {
+                "linkMasses": [0.0],
+                "linkCollisionShapeIndices": [whole],
+                "linkVisualShapeIndices": [-1],
+                "linkPositions": [still],
+                "linkOrientations": [upright],
+                "linkInertialFramePositions": [still],
+                "linkInertialFrameOrientations": [upright],
+                "linkParentIndices": [0],
+                "linkJointTypes": [engine.JOINT_FIXED],
+                "linkJointAxis": [[0.0, 0.0, 1.0]],
+            }
+        obj: int = engine.createMultiBody(
+            baseMass=self._mass, baseCollisionShapeIndex=shape, basePosition=FAR_AWAY, **link
         )
-        self.engine.changeDynamics(obj, -1, linearDamping=0.0, angularDamping=0.0)
+        engine.changeDynamics(obj, -1, linearDamping=0.0, angularDamping=0.0)
         wanted = {
             "lateralFriction": self._physics.friction,
             "spinningFriction": 0.0,
             "rollingFriction": 0.0,
             "collisionMargin": margin_m,
         }
-        self.engine.changeDynamics(obj, -1, localInertiaDiagonal=self._moments.tolist(), **wanted)
+        engine.changeDynamics(obj, -1, localInertiaDiagonal=self._moments.tolist(), **wanted)
         self._check(obj, -1, wanted)
+        if whole is not None:
+            # PyBullet sets a margin of the base alone; a link keeps Bullet's.
+            wanted["collisionMargin"] = LINK_MARGIN_M
+            engine.changeDynamics(obj, HULL, lateralFriction=self._physics.friction)
+            self._check(obj, HULL, wanted)
+            for link_of_hand in range(-1, engine.getNumJoints(self.hand)):
+                engine.setCollisionFilterPair(self.hand, obj, link_of_hand, HULL, 0)
         return obj
 
     def _add_stand(self, stand: Stand, folder: Path) -> list[int]:
@@ -191,6 +231,10 @@ class BulletPair:
             self._check(body, -1, values)
             for link in range(-1, engine.getNumJoints(self.hand)):
                 engine.setCollisionFilterPair(self.hand, body, link, -1, 0)
+            if engine.getNumJoints(self.object):
+                # The table meets the hull alone, neighbours the parts alone.
+                apart = -1 if not found else HULL
+                engine.setCollisionFilterPair(self.object, body, apart, -1, 0)
             found.append(body)
         return found
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+_PLACE, _AXES = np.s_[:3, 3], np.s_[:3, :3]
 
 
 class BulletEngine(Engine):
@@ -113,8 +114,8 @@ class BulletWorld(HandWorld):
         duration_s = float(self._fingers[k].max()) / closing.speed + closing.settle_s
         most = 0 if pair.stand is None else round(closing.release_s / (sample * self.dt))
         sunk, weight = -1, (pair.weights_n[0] * down).tolist()
-        start = before = self._Ts_hand_body[k, :3, 3]
-        fingers = self._fingers[k]
+        before, fingers = self._Ts_hand_body[k], self._fingers[k]
+        start = before[:3, 3]
         seen: list[tuple[Array, Array]] = []
         while sunk < most:
             for step in range(1, sample + 1):
@@ -126,12 +127,16 @@ class BulletWorld(HandWorld):
                     pair.push([0.0, 0.0, 0.0], weight)
                 pair.engine.stepSimulation()
             seen.append((pair.pose(), pair.finger_forces()))
-            at, forces = seen[-1][0][:3, 3], seen[-1][1]
+            at, forces = seen[-1]
             now = pair.fingers()[0]
-            moved = max(float(np.linalg.norm(at - before)), float(np.abs(now - fingers).max()))
+            shift, turn = (
+                float(np.linalg.norm(at[rows] - before[rows])) for rows in (_PLACE, _AXES)
+            )
+            # |R - R0| is 1.41 times the angle for small ones.
+            moved = max(shift + turn * pair.reach_m, float(np.abs(now - fingers).max()))
             pressed = bool(np.all(forces > self._physics.contact_n))
             rests = pressed and moved < closing.settled_m
-            if float(np.linalg.norm(at - start)) > closing.lost_m or (rests and sunk >= 0):
+            if float(np.linalg.norm(at[_PLACE] - start)) > closing.lost_m or (rests and sunk >= 0):
                 break
             if sunk >= 0 or rests or len(seen) * sample >= duration_s / self.dt:
                 if not pressed and sunk < 0:

@@ -19,6 +19,7 @@ from realsim.geometry import se3
 from realsim.records import STAGES
 from realsim.records.checked_arrays import rows_of
 from realsim.robots.hand import Hand, find_hand
+from realsim_sim_bridge.grasping.antipodal import RaySurface
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings, make_engine
 from realsim_sim_bridge.slip.motion import SlipMotion, stage_wrenches
 from realsim_sim_bridge.slip.safety import closed_safety, hull_surface, resting
@@ -201,9 +202,13 @@ class _SlipTest:
         self._played: Mask = self._going.copy()
         """Which of them are simulated in this stage."""
         self._safety, self._rests = np.zeros(shape), np.zeros(n, dtype=np.bool_)
+        self._borne = self._safety
+        """The safety where the objects were when they were last looked at."""
+        self._surface: RaySurface | None = None
 
     def run(self) -> Slips:
         """Go through all stages with all worlds side by side."""
+        config = self._config
         with ExitStack() as stack:
             worlds = [
                 (rows, stack.enter_context(self._world(rows)))
@@ -214,9 +219,12 @@ class _SlipTest:
                 self._observe(CLOSE, rows, start, world.close(self._config.closing))
                 self._judge(CLOSE, rows)
                 world.remove(~self._going[rows])
-            self._weigh(worlds)
+            self._weigh(worlds, self._going)
+            self._safety = self._borne.copy()
             for stage in (LIFT, OSCILLATE, PENDULUM):
                 self._stage(stage, worlds)
+                if config.sure is not None and stage != PENDULUM:
+                    self._weigh(worlds, self._going & self._played)
         return Slips(
             slip_m=self._slip_m,
             slip_rad=self._slip_rad,
@@ -226,17 +234,18 @@ class _SlipTest:
             safety=self._safety,
         )
 
-    def _weigh(self, worlds: list[tuple[Rows, HandWorld]]) -> None:
-        """Note the safety factors of what has been closed on."""
-        if not self._going.any():
-            return
-        surface, config = hull_surface(self._trial.body), self._config
+    def _weigh(self, worlds: list[tuple[Rows, HandWorld]], chosen: Mask) -> None:
+        """Note what some grasps (N,) bear where the fingers hold the object now."""
+        config = self._config
         for rows, world in worlds:
-            held = world.alive.copy()
+            held = world.alive & chosen[rows]
+            if not held.any():
+                continue
+            self._surface = self._surface or hull_surface(self._trial.body)
             states = world.states().rows(held)
             self._rests[rows[held]] = resting(self._trial.body, states)
-            self._safety[rows[held]] = closed_safety(
-                surface,
+            self._borne[rows[held]] = closed_safety(
+                self._surface,
                 self._trial.part(rows[held]),
                 states,
                 config.physics,
@@ -274,7 +283,7 @@ class _SlipTest:
         sure = self._config.sure
         if sure is None:
             return np.zeros_like(self._going)
-        held = self._going & self._rests & (self._safety[:, stage] >= sure)
+        held = self._going & self._rests & (self._borne[:, stage] >= sure)
         # A factor of 0, or one of what rests, contradicts the engine: it has to say.
         borne, falls = self._safety[:, CLOSE], self._going & ~self._rests & (stage == LIFT)
         dropped = falls & (borne > 0) & (borne <= 1.0 / sure)
@@ -291,9 +300,9 @@ class _SlipTest:
             stage, self._trial.part(rows), start, config.motion, speed * world.dt
         )
         sample = max(1, round(config.sample_s / world.dt / speed))
-        motion = world.play(
-            np.where(world.alive[:, None, None], wrenches, 0.0), sample, config.lost_m
-        )
+        # What is played again at true speed need not be played to its end.
+        far = config.lost_m if speed == 1 else min(self._engine.replay.trigger_m, config.lost_m)
+        motion = world.play(np.where(world.alive[:, None, None], wrenches, 0.0), sample, far)
         self._observe(stage, rows, start, motion, speed)
 
     def _moved(self, stage: int, rows: Rows, replay: Replay) -> Mask:

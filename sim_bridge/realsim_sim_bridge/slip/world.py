@@ -222,9 +222,9 @@ class Closing:
     it, and the outcome is chance."""
     settle_s: float = 0.2
     """Time at full force after the last finger can have arrived [s]."""
-    sample_s: float = 0.05
+    sample_s: float = 0.02
     """How often the object is looked at [s]."""
-    settled_m: float = 2e-5
+    settled_m: float = 8e-6
     """Closing ends when both fingers press and nothing moved more than this in a sample [m]."""
     lost_m: float = 0.05
     """An object that moved so far is lost [m]."""
