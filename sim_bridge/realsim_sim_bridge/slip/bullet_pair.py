@@ -26,7 +26,7 @@ from realsim import interop
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
-from realsim_sim_bridge.slip.bullet_shapes import drawn_in, hand_urdf
+from realsim_sim_bridge.slip.bullet_shapes import drawn_in, hand_urdf, massless_link, wavefront
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import SlipBody, SlipPhysics
 
@@ -177,21 +177,8 @@ class BulletPair:
             whole: shape of their hull, a link without mass that the table alone meets: in four
                 points at most, where every part would touch in four.
         """
-        engine, still, upright = self.engine, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
-        link: dict[str, list[Any]] = {}
-        if whole is not None:
-            link = {
-                "linkMasses": [0.0],
-                "linkCollisionShapeIndices": [whole],
-                "linkVisualShapeIndices": [-1],
-                "linkPositions": [still],
-                "linkOrientations": [upright],
-                "linkInertialFramePositions": [still],
-                "linkInertialFrameOrientations": [upright],
-                "linkParentIndices": [0],
-                "linkJointTypes": [engine.JOINT_FIXED],
-                "linkJointAxis": [[0.0, 0.0, 1.0]],
-            }
+        engine = self.engine
+        link = {} if whole is None else massless_link(whole, engine.JOINT_FIXED)
         obj: int = engine.createMultiBody(
             baseMass=self._mass, baseCollisionShapeIndex=shape, basePosition=FAR_AWAY, **link
         )
@@ -404,18 +391,3 @@ _INFO = {
     "collisionMargin": 11,
 }
 """Where getDynamicsInfo has each setting."""
-
-
-def wavefront(parts: list[Array]) -> str:
-    """Return an OBJ with one group per part (V, 3); the engine takes the convex hull of each.
-
-    The faces only name the vertices: a hull is made of points.
-    """
-    lines: list[str] = []
-    first = 1
-    for i, part in enumerate(parts):
-        lines.append(f"o part{i}")
-        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in part.tolist()]
-        lines += [f"f {first} {first + j} {first + j + 1}" for j in range(1, len(part) - 1)]
-        first += len(part)
-    return "\n".join(lines) + "\n"

@@ -151,3 +151,40 @@ def _core(part: Array, planes: Array, inside: Array, margin_m: float) -> Array:
     corners = np.asarray(found.intersections, dtype=np.float64)
     corners = corners[np.all(np.isfinite(corners), axis=1)]
     return np.unique(np.round(corners, 9), axis=0)
+
+
+def wavefront(parts: list[Array]) -> str:
+    """Return an OBJ with one group per part (V, 3); the engine takes the convex hull of each.
+
+    The faces only name the vertices: a hull is made of points.
+    """
+    lines: list[str] = []
+    first = 1
+    for i, part in enumerate(parts):
+        lines.append(f"o part{i}")
+        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in part.tolist()]
+        lines += [f"f {first} {first + j} {first + j + 1}" for j in range(1, len(part) - 1)]
+        first += len(part)
+    return "\n".join(lines) + "\n"
+
+
+def massless_link(shape: int, fixed: int) -> dict[str, list[Any]]:
+    """Return what `createMultiBody` takes for a link of a shape in the base's frame.
+
+    Args:
+        shape: PyBullet's number of it.
+        fixed: PyBullet's number of joints that do not move.
+    """
+    still, upright = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
+    return {
+        "linkMasses": [0.0],
+        "linkCollisionShapeIndices": [shape],
+        "linkVisualShapeIndices": [-1],
+        "linkPositions": [still],
+        "linkOrientations": [upright],
+        "linkInertialFramePositions": [still],
+        "linkInertialFrameOrientations": [upright],
+        "linkParentIndices": [0],
+        "linkJointTypes": [fixed],
+        "linkJointAxis": [[0.0, 0.0, 1.0]],
+    }

@@ -59,9 +59,9 @@ class SlipConfig:
     """Fingers that stand farther than this outside the object start here [m]: closing through air
     takes time and changes nothing."""
     sure: float | None = 3.0
-    """Safety factor from which a stage is not simulated: the object rests and does not slip in it.
-    One that is not at rest and weighs so many times what the grasp bears falls in the lift. None =
-    all are simulated."""
+    """Safety factor, where the last simulated stage left the object, from which a stage is not
+    simulated: what rests does not slip in it. One that is not at rest and weighs so many times what
+    the grasp bears falls in the lift. None = all are simulated."""
 
     def __post_init__(self) -> None:
         """Check the factor.
@@ -203,7 +203,7 @@ class _SlipTest:
         """Which of them are simulated in this stage."""
         self._safety, self._rests = np.zeros(shape), np.zeros(n, dtype=np.bool_)
         self._borne = self._safety
-        """The safety where the objects were when they were last looked at."""
+        """The safety where the last simulated stage left the objects."""
         self._surface: RaySurface | None = None
 
     def run(self) -> Slips:
