@@ -49,7 +49,7 @@ or a name or IPv4 address; and a port."""
 _patching = threading.Lock()
 log = logging.getLogger(__name__)
 _sockets_log = logging.getLogger(f"{__name__}.sockets")
-"""Of the websocket servers behind a door."""
+"""Log of the websocket servers behind a door."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -29,7 +29,8 @@ MOTION_RAD = 0.25
 """Motion between the views of a pair, as an angle: enough that a wrong pose shows, and little
 enough that most of the image is seen by both (14 deg of a field of view of 50 to 70)."""
 OVERLAP_PERCENTILE = 40.0
-"""Of the differences: two fifths of the points must be seen, and not hidden, in the neighbour."""
+"""Percentile of the differences: two fifths of the points must be seen, and not hidden, in the
+neighbour."""
 BESIDE_MM = 200.0
 """Difference [mm] of a point that the neighbour does not see, and the largest that is counted."""
 

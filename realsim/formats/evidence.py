@@ -46,8 +46,8 @@ AGREES_MM = 50.0
 MOST_VIEWS = 200
 """Views used of a long scene, evenly; more say no more."""
 SPREAD_PERCENTILE = 75.0
-"""Of the distances from the middle: a camera that stands still in half of the views hides nothing,
-and a quarter of wrong labels does not spoil it."""
+"""Percentile of the distances from the middle: a camera that stands still in half of the views
+hides nothing, and a quarter of wrong labels does not spoil it."""
 DECADES = 4
 """Scales from 1e-4 to 1e4 metres per unit are tried: millimetres, kilometres, and NeRF's boxes."""
 STEP = 1.12

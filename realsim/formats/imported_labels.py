@@ -41,7 +41,7 @@ class ImportedLabels:
     folder: Path
     """SESSION/imported."""
     name: str
-    """Of the scene in its data set."""
+    """Name of the scene in its data set."""
     number: int
     split: str
     camera: str

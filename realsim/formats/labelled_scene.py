@@ -49,7 +49,7 @@ class LabelledFrame:
     index: int
     """Number of the image in its scene."""
     intrinsics: CameraIntrinsics
-    """Of this image; data sets with cropped images have another one for each."""
+    """Intrinsics of this image; data sets with cropped images have another one for each."""
     depth_unit_m: float | None
     """Metres per count of its depth image; None = it has no depth."""
     objects: tuple[LabelledObject, ...]

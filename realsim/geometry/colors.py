@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.arrays import Array
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Of linear red, green and blue."""
+"""Weights of linear red, green and blue."""
 
 
 def srgb_encoded(value: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -18,7 +18,7 @@ RIGID_TOLERANCE = 1e-5
 IDENTITY_3 = np.eye(3)
 LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 LAST_ROW_TOLERANCE = np.array([1e-9, 1e-9, 1e-9, 1e-5])
-"""Of the last row: single precision may have written the one."""
+"""Greatest error of the last row: single precision may have written the one."""
 EXACT_TOLERANCE = 1e-14
 """A rotation this near to orthonormal is left as it is, so that checking twice changes nothing."""
 

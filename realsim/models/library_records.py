@@ -17,7 +17,7 @@ from realsim.models.model_records import (
 from realsim.records import Mesh, ObjectModel, Verdict
 
 PROPERTIES_FORMAT = 1
-"""Of the properties files; a newer one is refused, not guessed at."""
+"""Version of the properties files; a newer one is refused, not guessed at."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -67,7 +67,7 @@ class ReadScan:
     R_up: Array
     """(3, 3) by which the file's axes were turned: v = factor * R_up @ v_file."""
     sha256: str
-    """Of the file."""
+    """SHA-256 of the file."""
     declared: dict[str, str] = field(default_factory=dict[str, str])
     """What the file itself states: format, unit, up axis, generator, ..."""
     notes: tuple[str, ...] = ()
@@ -103,7 +103,7 @@ class PhysicalProperties:
     centroid: Array
     """(3,) centre of the surface's area [m]."""
     volume_m3: float
-    """Of the solid, see `volume_of` [m^3]."""
+    """Volume of the solid, see `volume_of` [m^3]."""
     volume_of: Literal["mesh", "convex parts", "hull"]
     """What the volume, the centre of mass and the inertia are of: an open mesh has none itself."""
     hull_volume_fraction: float

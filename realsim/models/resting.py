@@ -69,11 +69,11 @@ class Resting:
     """Chance that the body, set down quasi-statically in a random attitude, ends here: the solid
     angle of all facets that roll here, seen from the centre of mass, divided by 4 pi."""
     height: float
-    """Of the body in this pose [units of the mesh]."""
+    """Height of the body in this pose [units of the mesh]."""
     center_height: float
-    """Of the centre of mass above the plane [units of the mesh]."""
+    """Height of the centre of mass above the plane [units of the mesh]."""
     shadow_area: float
-    """Of the hull's vertical shadow on the plane [units of the mesh, squared]."""
+    """Area of the hull's vertical shadow on the plane [units of the mesh, squared]."""
     basin: int
     """Number of its basin: representatives of one rolling body share it."""
 

@@ -53,7 +53,7 @@ class SymmetryConfig:
     """Mean difference of the colours of points that a symmetry swaps from which on the texture
     breaks it [grey levels of 255], beyond what neighbouring points differ by."""
     seed: int = 0
-    """Of the surface points."""
+    """Seed of the surface points."""
 
     def __post_init__(self) -> None:
         """Check the tolerances."""

@@ -152,7 +152,7 @@ class Axis:
     point: Array
     """(3,) on it, near the centre [share of the diameter]."""
     fits: dict[int, IsometryFit]
-    """Of the turn by 2 pi / n, per order n."""
+    """How well the turn by 2 pi / n fits, per order n."""
     orders: tuple[int, ...]
     """Those worth pursuing, ascending."""
 

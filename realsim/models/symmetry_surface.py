@@ -17,7 +17,8 @@ from realsim.records import Mesh
 FIELD_CELLS = 40
 """Cells along the longest side of the field that screens candidates: 2.5 % of it, 0.1 CPU-s."""
 DAMPING = 1e-4
-"""Of the least squares, times the mean of the diagonal: a turn about the axis moves nothing."""
+"""Damping of the least squares, times the mean of the diagonal: a turn about the axis moves
+nothing."""
 LEAST_DAMPING = 1e-9
 """The same in absolute terms: a sphere has no gradient at all."""
 
@@ -31,7 +32,7 @@ class Surface:
     center: Array
     """(3,) of the original mesh's area [m]."""
     diameter_m: float
-    """Of the original mesh [m]."""
+    """Diameter of the original mesh [m]."""
     points: Array
     """(N, 3) evenly spread over the surface, in random order: any first k are a sample too."""
 

@@ -19,7 +19,7 @@ ABSOLUTE = re.compile(r"(?<![\w.:/<])(?:[A-Za-z]:\\|/)(?:[\w.@+~-]+[\\/])+([\w.@
 BUDGET_BYTES = 15_000_000
 """Largest page: a browser opens it at once, and mail servers let it pass."""
 MARKUP_BYTES = 250_000
-"""Of the budget kept for the text of the page."""
+"""Bytes of the budget kept for the text of the page."""
 PLOT_PX = 530
 """Width of a plot: two stand side by side."""
 VERDICT_KIND = {"accepted": "good", "doubtful": "warn", "rejected": "bad", "unchecked": "off"}

@@ -15,7 +15,7 @@ Picture = bytes | Image | Callable[[], Image]
 WIDTH_PX = 1280
 """Wider pictures are reduced to this: twice what a page's column shows on a plain screen."""
 QUALITY = 84
-"""Of the JPEGs: outlines two pixels wide stay clean."""
+"""Quality of the JPEGs: outlines two pixels wide stay clean."""
 LEAST_QUALITY = 40
 """Below this a picture does not show what it is to show."""
 

@@ -13,14 +13,14 @@ INK, MUTED, FAINT = "#22303c", "#8a99a8", "#dfe5ea"
 GOOD, WARN, BAD = "#1b9e8a", "#e69f00", "#c8502f"
 VERDICT_COLORS = {"accepted": GOOD, "doubtful": WARN, "rejected": BAD, "unchecked": MUTED}
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
-"""Of several series in one plot (Okabe and Ito, Color Universal Design, 2008)."""
+"""Colours of several series in one plot (Okabe and Ito, Color Universal Design, 2008)."""
 AXIS_COLORS = ("#c8553d", "#4c9a3f", "#2b6ca3")
 """x, y, z of a frame."""
 STYLES = ("-", "--", "-.", ":", "-", "--")
 """Lines of several series: colour is never the only difference."""
 MARKERS = ("o", "s", "^", "D", "v", "P")
 WIDTH_PX, HEIGHT_PX = 530, 300
-"""Of a plot on the page: two stand side by side."""
+"""Size of a plot on the page: two stand side by side."""
 WIDE_PX = 1060
 """Width of a plot that takes the whole page."""
 BAR_PX = 26

@@ -80,7 +80,7 @@ class RegistrationConfig:
     arm_sigma_deg: float | None = None
     """Likewise [deg]."""
     bias: DepthBias = field(default_factory=DepthBias.none)
-    """Of the depth camera, from its calibration; the images are given as measured."""
+    """Bias of the depth camera, from its calibration; the images are given as measured."""
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
     sample: SampleConfig = field(default_factory=SampleConfig)
     table: TableSearchConfig = field(default_factory=TableSearchConfig)

@@ -67,7 +67,7 @@ class AlignmentConfig:
     """A stretch or shift is believed if outlines lie on edges so many times as often beyond chance
     as they do unmoved."""
     seed: int = 0
-    """Of the choice of outline pixels."""
+    """Seed of the choice of outline pixels."""
 
 
 def outlines_of(depth_m: Array32, config: AlignmentConfig) -> Array32:

@@ -147,7 +147,7 @@ class _Fit:
     findings: list[Defect]
     """What does not fit the objects."""
     report: dict[str, Any]
-    """Of what all objects have in common, as JSON values."""
+    """Report of what all objects have in common, as JSON values."""
 
 
 def _fit_many(task: SceneTask, found: FoundObjects) -> _Fit:

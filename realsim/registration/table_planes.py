@@ -72,7 +72,7 @@ class TableSearchConfig:
     view_share: float = 0.10
     """A view whose best plane holds a smaller share of its points does not see the table."""
     seed: int = 0
-    """Of the random search."""
+    """Seed of the random search."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -250,7 +250,7 @@ class PlaneConfig:
     sunk_m: float = 0.02
     """How far an object's centre may lie below the plane (rough starts are off by 20 mm)."""
     seed: int = 0
-    """Of the random search."""
+    """Seed of the random search."""
 
 
 def find_support_plane(

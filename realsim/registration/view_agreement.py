@@ -268,7 +268,7 @@ class ViewCheckConfig:
     object_share: float = 0.35
     """A view with so much more of them than the median view does not fit the objects."""
     seed: int = 0
-    """Of the choice of points."""
+    """Seed of the choice of points."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

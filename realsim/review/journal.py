@@ -40,7 +40,7 @@ Rows = tuple[tuple[float, ...], ...]
 MOST_COMMENT, MOST_NAME = 2000, 80
 """Characters of a comment, of a name or another short text."""
 MOST_BYTES = 64_000_000
-"""Of a journal: a line has about 500, so this is more than a hundred thousand decisions."""
+"""Size of a journal: a line has about 500, so this is more than a hundred thousand decisions."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

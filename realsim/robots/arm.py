@@ -117,7 +117,7 @@ class RobotArm:
     kept_apart: frozenset[tuple[int, int]]
     joint_names: tuple[str, ...]
     urdf_mass_kg: float
-    """Of the URDF's base and links; 0 = not known."""
+    """Mass of the URDF's base and links; 0 = not known."""
 
     @property
     def name(self) -> str:

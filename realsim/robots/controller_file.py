@@ -42,7 +42,7 @@ of real arms move it by 1 to 5 mm, the numbers of another model by 64 mm and mor
 SPREAD = 96
 """Joint configurations that calibrated and nominal flange are compared at."""
 JOINTS = 6
-"""Of a UR."""
+"""Number of joints of a UR."""
 BASE_TILT = 1e-6
 """Most that the first joint's axis may differ from the base's z [rad, m]."""
 LARGEST_BYTES = 1_000_000

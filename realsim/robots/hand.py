@@ -66,14 +66,14 @@ class Hand:
     pad_stiffness_n_per_m: float
     """Normal stiffness of one pad on which a flat object lies whole [N/m]."""
     arc_radius_m: float
-    """Of the circle on which the pads run [m]; 0 = they slide along y."""
+    """Radius of the circle on which the pads run [m]; 0 = they slide along y."""
     arc_axis_y_m: float
     """y of that circle's middle for the pad at +y [m]."""
     palm_boxes: tuple[Box, ...]
     finger_boxes: tuple[Box, ...]
     """(F,) of the finger at +y, hand closed; the other one's are mirrored."""
     bars: tuple[Bar, ...]
-    """Of the linkage at +y."""
+    """Bars of the linkage at +y."""
     mount_z_m: float
     """z of the arm's flange [m]."""
     mount_turn_deg: float
@@ -82,7 +82,7 @@ class Hand:
     least_force_n: float
     greatest_force_n: float
     force_n: float
-    """Of each finger on the object [N]: the usual one."""
+    """Force of each finger on the object [N]: the usual one."""
     closing_speed: float
     """Greatest speed of each finger [m/s]."""
     frame_link: str

@@ -34,7 +34,8 @@ class PadFile(OwnFile, frozen=True, kw_only=True):
     friction: float = 1.0
     """Coulomb coefficient on the objects; 1.0 is the paper's."""
     normal_stiffness_n_per_m: float | None = None
-    """Of one pad on which a flat object lies whole [N/m]; `soft_n_per_m` where left away."""
+    """Stiffness of one pad on which a flat object lies whole [N/m]; `soft_n_per_m` where left
+    away."""
 
 
 class ArcFile(OwnFile, frozen=True, kw_only=True):
@@ -74,7 +75,7 @@ class MountFile(OwnFile, frozen=True, kw_only=True):
     distance_m: float | None = None
     """From the flange to the origin of `grasp` [m]; to the palm's back where it is left away."""
     turn_deg: float = 0.0
-    """Of `grasp` about the flange's z [deg], as the hand's maker mounts it."""
+    """Turn of `grasp` about the flange's z [deg], as the hand's maker mounts it."""
 
 
 class ForceFile(OwnFile, frozen=True, kw_only=True):
@@ -111,9 +112,9 @@ class HandFile(RobotFile, frozen=True, kw_only=True):
     mount: MountFile = MountFile()
     force: ForceFile = ForceFile()
     mass_kg: float = 0.7
-    """Of the whole hand [kg]; the default is about Franka's."""
+    """Mass of the whole hand [kg]; the default is about Franka's."""
     finger_mass_kg: float = 0.1
-    """Of a finger as the physics moves it [kg]."""
+    """Mass of a finger as the physics moves it [kg]."""
     closing_speed_m_s: float = 0.1
     """Greatest speed of each finger [m/s]; the default is Franka's."""
     frame_link: str = ""

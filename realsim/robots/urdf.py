@@ -55,7 +55,7 @@ class UrdfChain:
     """(n + 1) of the base and each moving link, in its joint's frame."""
     visual: tuple[tuple[UrdfShape, ...], ...]
     mass_kg: float
-    """Of base and links together; 0 = not given."""
+    """Mass of base and links together; 0 = not given."""
 
 
 def R_from_rpy(rpy: ArrayLike) -> Array:

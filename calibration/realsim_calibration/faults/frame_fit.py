@@ -54,7 +54,7 @@ class FitConfig:
     steps: int = 12
     """Gauss-Newton steps: the start is near, six are usual."""
     seed: int = 0
-    """Of the samples: the same data give the same answer."""
+    """Seed of the samples: the same data give the same answer."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -47,7 +47,7 @@ class ReadingConfig:
     number_tolerance: float = 1.25
     """Degrees that are known modulo 2 pi = 6.28 agree within this: twice the error that R_Z has."""
     seed: int = 0
-    """Of the starts."""
+    """Seed of the starts."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

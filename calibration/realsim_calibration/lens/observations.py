@@ -54,9 +54,9 @@ class Corners:
     half_sides_m: tuple[float, float]
     """Half the extent of the target's points along x and y [m]."""
     names: tuple[str, ...]
-    """Of all views given."""
+    """Names of all views given."""
     reasons: tuple[str, ...]
-    """Of all views given: why they are not in use, empty where they are."""
+    """Reasons of all views given: why they are not in use, empty where they are."""
     outliers: dict[int, tuple[tuple[int, float], ...]]
     """Corners left out of every view: (point, distance [px])."""
 

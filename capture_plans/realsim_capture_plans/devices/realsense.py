@@ -39,9 +39,9 @@ class RealSenseConfig:
     """How the camera streams."""
 
     width: int = 1280
-    """Of both streams [px]; the D405's full resolution, where its depth is best."""
+    """Width of both streams [px]; the D405's full resolution, where its depth is best."""
     height: int = 720
-    """Of both streams [px]."""
+    """Height of both streams [px]."""
     fps: int = 30
     """Frames per second."""
     exposure: Literal["auto", "locked"] | float = "auto"

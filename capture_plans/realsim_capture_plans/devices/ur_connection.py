@@ -24,7 +24,7 @@ READINGS = [
     "safety_status_bits", "runtime_state", "speed_scaling",
 ]  # fmt: skip
 FREQUENCY_HZ = 125.0
-"""Of the readings: a CB3's own rate, and a quarter of an e-Series'."""
+"""Frequency of the readings: a CB3's own rate, and a quarter of an e-Series'."""
 PAYLOAD_SINCE = {3: 11, 5: 6}
 """Minor version of PolyScope, per major, that tells its payload."""
 TOOL_OFFSET_SINCE = (3, 6)

@@ -59,7 +59,7 @@ class Placement:
     table_height_m: float
     """Top of the table in base [m]."""
     reachable_share: float
-    """Of the directions of the cap."""
+    """Share of the directions of the cap."""
     hole_deg: float
     """Greatest hole in the cap that n views leave [deg]; 180 where fewer than n are reachable."""
     one_elbow_hole_deg: float

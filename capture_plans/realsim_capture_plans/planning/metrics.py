@@ -40,7 +40,7 @@ class Meaning:
     text: str
     """In words."""
     unit: str
-    """Of the value; empty for counts and shares."""
+    """Unit of the value; empty for counts and shares."""
     good: str
     """What a plan of 256 views should have."""
     better: Literal["more", "less", "as asked"]

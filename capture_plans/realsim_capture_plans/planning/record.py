@@ -33,8 +33,8 @@ class PlanConfig:
     """Camera to scene centre [m]. A D405's depth noise grows with z^2: 0.45 mm at 0.25 m, 1.4 mm
     at 0.45 m."""
     elevation_deg: tuple[float, float] = (15.0, 90.0)
-    """Of the camera above the table, seen from the scene centre [deg]; lower views meet the table
-    and hide objects behind each other."""
+    """Elevation of the camera above the table, seen from the scene centre [deg]; lower views meet
+    the table and hide objects behind each other."""
     seen_share: float = 0.85
     """Share of the keep-out volume that a view should have in its image; less is taken only where
     a direction offers nothing better. It rules out the nearest radii unless they are needed."""
@@ -79,9 +79,9 @@ class PlanConfig:
     branch_limit: int = 200
     """Joint candidates kept per view, evenly taken from those in reach of home."""
     speed: float = 1.05
-    """Of the leading joint [rad/s] (ur_rtde's moveJ default)."""
+    """Speed of the leading joint [rad/s] (ur_rtde's moveJ default)."""
     acceleration: float = 1.4
-    """Of the leading joint [rad/s^2] (ur_rtde's moveJ default)."""
+    """Acceleration of the leading joint [rad/s^2] (ur_rtde's moveJ default)."""
     settle_s: float = 0.3
     """Waited at least at every view before the exposure [s]: a UR5 with a light camera rings for
     about 0.2 s after a stop."""

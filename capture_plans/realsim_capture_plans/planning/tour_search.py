@@ -44,9 +44,9 @@ class Problem(NamedTuple):
     keys: Int64
     """(K,) sorted, smaller row * M + larger row of every move that is known to collide."""
     speed: float
-    """Of the leading joint [rad/s]."""
+    """Speed of the leading joint [rad/s]."""
     acceleration: float
-    """Of the leading joint [rad/s^2]."""
+    """Acceleration of the leading joint [rad/s^2]."""
 
 
 @njit

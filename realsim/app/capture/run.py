@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from realsim_capture_plans.lab import SimulatedLab
 
 DRY_RUN_SPEED = 0.25
-"""Of the plan's speed, in a dry run: slow enough to reach the stop button."""
+"""Share of the plan's speed, in a dry run: slow enough to reach the stop button."""
 BOARD_POINTS = 12
 """Points of the target that a view must show, three tags: fewer hardly turn the fit."""
 BOARD_SHRINK = 0.5
@@ -81,7 +81,7 @@ class CaptureRequest:
     retake: tuple[int, ...] = ()
     """Views to take again although they are stored."""
     seed: int = 0
-    """Of the simulated lab."""
+    """Seed of the simulated lab."""
     objects: int = 5
     """In the simulated lab."""
 

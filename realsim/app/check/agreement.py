@@ -14,7 +14,8 @@ class AgreementConfig:
     least_visible_iou: float = 0.80
     """Likewise of the visible part: there BOP asks the measured depth, which is noisy."""
     least_single_iou: float = 0.50
-    """Of one frame, of silhouette and visible part: below it the mask is another thing's."""
+    """Least IoU of one frame's silhouette and visible part: below it the mask is another
+    thing's."""
     least_pixels: int = 200
     """Smaller silhouettes are not judged: their outline is too much of them [px]."""
     depth_mm: float = 15.0

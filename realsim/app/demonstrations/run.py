@@ -42,7 +42,7 @@ class DemonstrationRequest:
     """Attempts at most, spread over all that are left; None = all."""
     width: int = 320
     height: int = 240
-    """Of the pictures [px]."""
+    """Height of the pictures [px]."""
     view: int | None = None
     """View of the session that the fixed camera stands at; None = beside the table."""
     hand_eye: bool = False

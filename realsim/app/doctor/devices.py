@@ -9,9 +9,9 @@ from realsim.app.doctor.isolation import Outcome
 
 GROUP = "Devices"
 PORTS = {29999: "dashboard", 30004: "RTDE"}
-"""Of a Universal Robots controller: power and programs, real-time data."""
+"""Ports of a Universal Robots controller: power and programs, real-time data."""
 FRANKA_PORT = 1337
-"""Of a Franka controller, open where its control interface (FCI) is active."""
+"""Port of a Franka controller, open where its control interface (FCI) is active."""
 TIMEOUT_S = 2.0
 """For one port of the robot [s]: in a lab's network it answers within milliseconds."""
 

@@ -14,7 +14,8 @@ from realsim.app.doctor.isolation import Outcome
 GROUP = "Machine"
 GB = 1e9
 INSTRUCTIONS = ("avx2", "fma")
-"""Of the processor; without them the wheels' inner loops are slower, or do not start."""
+"""Instructions of the processor; without them the wheels' inner loops are slower, or do not
+start."""
 LEAST_MEMORY_GB = 2.0
 """A demo takes less; below, large scenes are killed by the system."""
 LITTLE_DISK_GB, LEAST_DISK_GB = 5.0, 0.5

@@ -15,7 +15,7 @@ from realsim.app.doctor.packages import EXTRAS, REQUIRED, Package
 PYTHON = (3, 11)
 """The only one that every required package has a wheel for."""
 LEAST_GLIBC = (2, 35)
-"""Of open3d's wheel."""
+"""Least version of glibc that open3d's wheel runs on."""
 LIBRARIES = {
     "libEGL.so.1": ("libegl1", "open3d"),
     "libGL.so.1": ("libgl1", "open3d"),

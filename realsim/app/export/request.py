@@ -24,7 +24,7 @@ class ExportRequest:
     split: str = ""
     """BOP's split to write; '' = the source's own."""
     camera: str = ""
-    """Of a source with several cameras, and the GraspNet folder to write."""
+    """Camera of a source with several cameras, and the GraspNet folder to write."""
     models: Path | None = None
     """Models of a data set that has none beside it."""
     colour: Colour = "copy"
@@ -42,9 +42,9 @@ class ExportRequest:
     points: int = 100_000
     """Coloured points in a COLMAP model, for programs that start from them; 0 = none."""
     least_score: float = 0.0
-    """Of the grasps that an isaac file takes."""
+    """Least score of the grasps that an isaac file takes."""
     name: str = ""
-    """Of the data set, on its card; '' = of the folder."""
+    """Name of the data set, on its card; '' = of the folder."""
     licence: str = ""
     """Licence of the images and labels as it is to stand on the card."""
     models_licence: str = ""

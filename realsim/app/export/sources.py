@@ -35,7 +35,7 @@ class SourceScene:
     kind: str
     """'session', 'bop' or 'graspnet'."""
     number: int
-    """Of the scene in its source."""
+    """Number of the scene in its source."""
     camera: str
     """'' = the source has one."""
     open: Callable[[], LabelledScene]

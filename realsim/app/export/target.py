@@ -18,7 +18,7 @@ class ScenePlace:
 
     number: int
     name: str
-    """Of its folder, in formats where a scene has one of its own."""
+    """Name of the scene's folder, in formats where a scene has one of its own."""
     camera: str
     """Where several cameras saw this scene; else ''."""
 
@@ -42,7 +42,7 @@ class RootJob:
 
     request: ExportRequest
     models: Mapping[int, ObjectModel]
-    """Of all scenes, by object id."""
+    """Models of all scenes, by object id."""
     infos: Mapping[int, Mapping[str, Any]]
     """BOP's own rows of models_info.json, where the sources have them."""
 

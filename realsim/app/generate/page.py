@@ -22,9 +22,9 @@ PAGE_FILE = "index.html"
 SHEET_PICTURES = 24
 """Pictures on the contact sheet at most."""
 SHEET_WIDTH_PX = 480
-"""Of each picture."""
+"""Width of each picture."""
 LEAST_COLUMNS, MOST_COLUMNS = 3, 6
-"""Of the contact sheet: few pictures are not strung out in one row."""
+"""Columns of the contact sheet: few pictures are not strung out in one row."""
 PAGE_SCENES = 12
 """Scenes whose views can be switched through on the page."""
 PAGE_VIEWS = 24

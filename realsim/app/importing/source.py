@@ -115,7 +115,7 @@ class ImportRequest:
     only_still: bool = False
     scene: int | None = None
     camera_name: str = ""
-    """Of a data set with several cameras: kinect, cam1 ..."""
+    """Camera of a data set with several cameras: kinect, cam1 ..."""
     models: Path | None = None
     """Folder of the models, when it is not in the data set."""
     no_labels: bool = False

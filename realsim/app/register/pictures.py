@@ -22,7 +22,7 @@ from realsim.store import SessionStore
 Color = tuple[int, int, int]
 Window = tuple[slice, slice]
 OUTLINE: Color = (70, 78, 88)
-"""Of objects under depth residuals: neither red nor blue."""
+"""Colour of the outlines of objects under depth residuals: neither red nor blue."""
 OVERLAY, GAIN, RESIDUALS, MAP = "overlay.jpg", "cameras.jpg", "residuals.jpg", "map.png"
 
 
@@ -33,7 +33,7 @@ class PictureConfig:
     views: int = 6
     """Photographs of a contact sheet."""
     columns: int = 2
-    """Of a contact sheet: on three, names are too small to read."""
+    """Columns of a contact sheet: on three, names are too small to read."""
     width_px: int = 960
     """Width of one photograph in a contact sheet [px]."""
     margin: float = 0.3
@@ -49,7 +49,7 @@ class PictureConfig:
     table_m: float = 0.25
     """Half the side of the piece of table that residuals are drawn on, beyond the objects [m]."""
     quality: int = 88
-    """Of JPEG files [percent]."""
+    """Quality of JPEG files [percent]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -43,7 +43,7 @@ STAGE = "register"
 PIXEL_POINTS = 40
 """Vertices of a mesh over which the pixel uncertainty is averaged."""
 STEP = 1e-6
-"""Of the numerical derivative [rad, m]."""
+"""Step of the numerical derivative [rad, m]."""
 
 
 def register_session(

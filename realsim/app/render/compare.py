@@ -207,7 +207,7 @@ LABEL_SHARE = 0.45
 SHEET_FILE = "reports/synthetic.png"
 PAGE_FILE = "reports/synthetic.html"
 PAGE_WIDTH_PX = 960
-"""Of the pictures in the page."""
+"""Width of the pictures in the page."""
 FULL = 65535.0
 """Greatest count of a label map."""
 

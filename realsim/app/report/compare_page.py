@@ -55,7 +55,7 @@ class Comparison:
 
     sources: tuple[Source, ...]
     figures: tuple[tuple[Difference, ...], ...]
-    """Of every other session."""
+    """Figures of every other session."""
     objects: tuple[tuple[ObjectDifference, ...], ...]
 
     @property

@@ -40,7 +40,7 @@ class SchoolRequest:
     sweep: bool = False
     """Whether margins are measured."""
     force_n: float | None = None
-    """Of each finger [N]."""
+    """Force of each finger [N]."""
     friction: float | None = None
     stiffness_n_per_m: float | None = None
     """Normal stiffness of one pad [N/m]."""
@@ -51,7 +51,7 @@ class SchoolRequest:
     calibration: Path | None = None
     """File of p_hold's calibration, as `realsim school reality --fit` writes it."""
     density: float | None = None
-    """Of all objects that are not weighed [kg/m^3]."""
+    """Density of all objects that are not weighed [kg/m^3]."""
     masses: tuple[str, ...] = ()
     """Weighed objects, each NAME=KG or ID=KG."""
     base_pose: Path | None = None

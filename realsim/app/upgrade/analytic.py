@@ -29,7 +29,7 @@ NOTE = "analytic.json"
 CACHE = "cache"
 """Folder of what the School has done, so that it goes on there."""
 LABEL_SEED = 0
-"""Of the surface points: the labels of a model are the same in every scene."""
+"""Seed of the surface points: the labels of a model are the same in every scene."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -40,7 +40,7 @@ class AnalyticJob:
     """GraspNet's own labels are used where the data set has them."""
     config: UpgradeConfig
     out: Path
-    """Of the whole upgrade, where computed labels are kept."""
+    """Folder of the whole upgrade, where computed labels are kept."""
     workers: int
     """Processes of the School."""
 

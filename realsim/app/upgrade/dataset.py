@@ -19,9 +19,9 @@ class SceneRef:
 
     kind: Literal["bop", "graspnet"]
     root: Path
-    """Of the data set."""
+    """Folder of the data set."""
     folder: Path
-    """Of the scene; GraspNet: of its camera."""
+    """Folder of the scene; GraspNet: of its camera."""
     number: int
     camera: str
     """Which of several; '' = the scene has one."""

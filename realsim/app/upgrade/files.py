@@ -23,7 +23,7 @@ from realsim.untrusted.own_json import read_object
 IMPORTED = "imported"
 NOTE = "stages/upgrade.json"
 IMAGE_FOLDERS = ("mask", "mask_visib", "label", "rect", "meta")
-"""Of a scene: not read, and no reason to upgrade it again."""
+"""Folders of a scene: not read, and no reason to upgrade it again."""
 DOCUMENTS = {
     "bop": ("scene_gt*.json", "scene_camera*.json"),
     "graspnet": ("annotations/*.xml", "*.npy"),

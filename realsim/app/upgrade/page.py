@@ -32,15 +32,15 @@ PAIRS = 60
 ROWS = 400
 """Objects in the page's table; upgrade.csv has all."""
 CROP_WIDTH_PX = 560
-"""Of a picture: an object's outline is seen in single pixels."""
+"""Width of a picture: an object's outline is seen in single pixels."""
 MARGIN = 0.35
 """Surroundings on each side of the object [share of its size in the picture]."""
 LEAST_SIDE_PX = 96
-"""Of what is cut out: a small object alone does not show where it stands."""
+"""Least side of what is cut out: a small object alone does not show where it stands."""
 THICKNESS_PX = (1, 2)
-"""Of the outlines of the given pose and of the refined one, which is drawn over it."""
+"""Thickness of the outlines of the given pose and of the refined one, which is drawn over it."""
 BEFORE_RGB = (245, 60, 200)
-"""Of the pose that was given: a colour that no verdict has."""
+"""Colour of the pose that was given: a colour that no verdict has."""
 
 
 def write_page(

@@ -39,7 +39,7 @@ class SceneJob:
     ref: SceneRef
     config: UpgradeConfig
     out: Path
-    """Of the whole upgrade."""
+    """Folder of the whole upgrade."""
     workers: int
     """Processes that the scene may use."""
 

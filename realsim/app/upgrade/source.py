@@ -30,7 +30,7 @@ class SceneSource:
 
     scene: LabelledScene
     indices: tuple[int, ...]
-    """Of the images that are used."""
+    """Places of the images that are used."""
     intrinsics: CameraIntrinsics
     depth_unit_m: float
     digests: dict[int, str]

@@ -10,7 +10,7 @@ from realsim.formats.bags.wire import NS_PER_S
 MAX_PAIR_GAP_S = 0.1
 """Colour and depth farther apart than this are not one frame, however slow the camera runs."""
 DEFAULT_PERIOD_S = 1 / 30
-"""Of a stream with a single frame, whose period nothing tells."""
+"""Period of a stream with a single frame, whose period nothing tells."""
 CLOCK_GAP_S = 2.0
 """Recordings of one moment start and end within this; farther apart they have different clocks."""
 

@@ -47,7 +47,7 @@ class ImageKind(NamedTuple):
     width: int
     height: int
     encoding: str
-    """Of the pixels once decoded: of a compressed depth image 16UC1 or 32FC1."""
+    """Encoding of the pixels once decoded: of a compressed depth image 16UC1 or 32FC1."""
 
 
 def kind_of(message: ImageMessage, compressed: bool) -> ImageKind:

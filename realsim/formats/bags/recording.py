@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 SUFFIXES = (".bag", ".db3", ".mcap")
 METADATA = "metadata.yaml"
 REASON_CHARACTERS = 200
-"""Of what the reader says; it may quote whole message definitions."""
+"""Most characters of what the reader says; it may quote whole message definitions."""
 REMEDY = {
     ".bag": "The recorder was probably stopped before it wrote the index: run `rosbag reindex "
     "FILE` (ROS1) and import the result, or copy the file again.",

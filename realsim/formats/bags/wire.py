@@ -36,7 +36,7 @@ class ImageMessage(NamedTuple):
     stamp_ns: int
     frame_id: str
     encoding: str
-    """Of a compressed image its `format`."""
+    """Encoding of the pixels; of a compressed image its `format`."""
     pixels: UInt8
     """(N,) bytes as they were sent."""
     width: int = 0

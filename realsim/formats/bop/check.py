@@ -25,7 +25,8 @@ from realsim.records import ObjectModel
 DELTA_M = 0.015
 """Tolerance of BOP's visibility [m]; 5 mm for ITODD and for BOP's rendered images."""
 FRACTION_TOLERANCE = 1e-6
-"""Of visib_fract against px_count_visib / px_count_all: files may have few digits."""
+"""Greatest difference of visib_fract against px_count_visib / px_count_all: files may have few
+digits."""
 BOX_PX = 2
 """By which bbox_obj and the box of projected vertices may differ on each side [px]: a pixel belongs
 to a silhouette by its centre, and renderers round either way."""
@@ -39,7 +40,7 @@ class BopFinding:
     """Which file says it, by its name in the scene."""
     image: int
     place: int
-    """Of the object in the image's list."""
+    """Place of the object in the image's list."""
     obj_id: int
     what: str
     """Key or quantity: 'bbox_visib', 'mask', 'pose' ..."""

@@ -45,7 +45,7 @@ LEAST_SEEN = 4
 """Objects that must be looked at before their places say anything."""
 SEEN_SHARE = 0.5
 SEEN_ROOM = 0.1
-"""Of the projected box's size: annotations are some pixels off."""
+"""Share of the projected box's size: annotations are some pixels off."""
 MOST_BOXES = 300
 FIT_MARGIN = 0.02
 """Overlaps that differ by less do not tell rows from columns."""

@@ -21,7 +21,7 @@ ONBOARDING = re.compile(r"obj_(\d+)(?:_(\w+))?")
 COLOUR_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 DEPTH_ENDINGS = (".png", ".tif", ".tiff")
 DIGITS = 6
-"""Of an image's number in its name, at least."""
+"""Digits of an image's number in its name, at least."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

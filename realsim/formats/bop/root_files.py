@@ -18,8 +18,8 @@ from realsim.records import ObjectModel
 Json = dict[str, Any]
 MODELS, MODELS_EVAL = "models", "models_eval"
 SAME_SHARE = 1e-4
-"""Of the diameter: numbers of models_info.json that differ by less from what the mesh has are kept
-as the source wrote them, to the last digit."""
+"""Share of the diameter: numbers of models_info.json that differ by less from what the mesh has are
+kept as the source wrote them, to the last digit."""
 SYMMETRIES = ("symmetries_discrete", "symmetries_continuous")
 
 

@@ -49,7 +49,7 @@ class BopWriteConfig:
     split: str | None = None
     """None = the scene's own."""
     number: int | None = None
-    """Of the scene; None = the scene's own."""
+    """Number of the scene; None = the scene's own."""
 
     def __post_init__(self) -> None:
         """Check what cannot be."""
@@ -130,7 +130,7 @@ class _Summary:
     masks: int = 0
     ids: set[int] = field(default_factory=set[int])
     camera: Json | None = None
-    """Of the first frame."""
+    """Camera of the first frame."""
     told: Counter[str] = field(default_factory=Counter[str])
     """Frames by what is to be told of them."""
 

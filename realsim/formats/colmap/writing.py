@@ -206,8 +206,8 @@ class ColmapWriteConfig:
     """How a scene is written as a COLMAP project."""
 
     encoding: Literal["binary", "text", "both"] = "binary"
-    """Of the model. Both hold every bit of a double; binary is a third of the size, and every
-    reader takes it."""
+    """Encoding of the model. Both hold every bit of a double; binary is a third of the size, and
+    every reader takes it."""
     images: Literal["copied", "referenced"] = "copied"
     """Referenced: no image is written and the model names them as their files are called, relative
     to the folder that a note says (COLMAP's --image_path)."""

@@ -20,7 +20,7 @@ FILE = "cam.info.txt"
 COLOUR_TITLE = "color camera intrinsic matrix"
 POSE_TITLE = re.compile(r"camera-to-world extrinsic matrix.* for (\S+)\s*$", re.IGNORECASE)
 MOST_BYTES = 20e6
-"""Of 50,000 poses [bytes]."""
+"""Most bytes of a file: 50,000 poses have so many."""
 FARTHEST_M = 50.0
 """A camera farther from the world's origin was written in millimetres."""
 

@@ -50,7 +50,7 @@ class PosedImages:
     """Images of one camera, opened and checked."""
 
     kind: str
-    """Of the file that places them."""
+    """Kind of the file that places them."""
     path: Path
     """That file, or its folder."""
     name: str
@@ -62,7 +62,7 @@ class PosedImages:
     depth_unit_m: float | None
     """Metres per count; None where depth is not imported."""
     metres_per_unit: float | None
-    """Of the file's world; None = not known."""
+    """Metres per unit of the file's world; None = not known."""
     notes: tuple[str, ...]
     """What was left out, undone and checked."""
 

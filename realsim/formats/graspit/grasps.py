@@ -51,7 +51,7 @@ def midway_error(mesh: Mesh, Ts_obj_grasp: Array, axis: Axis) -> Array:
 
 GRASP_FILE = "grasps.hdf5"
 MOST_GRASPS = 1_000_000
-"""Of one object."""
+"""Most grasps of one object."""
 SAMPLED_GRASPS = 40
 """Grasps of an object whose contacts are looked at: enough for a median."""
 ON_SURFACE_M = 0.005

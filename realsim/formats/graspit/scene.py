@@ -78,7 +78,7 @@ class GraspitScene:
     grasp_file: Path | None
     """None: there is none beside the scene."""
     names: dict[int, str]
-    """Of the objects in the file, by instance; grasps are kept under them."""
+    """Names of the objects in the file, by instance; grasps are kept under them."""
     source: SourceFile
     """What the file holds; a writer gives its numbers back to the last digit."""
     notes: tuple[str, ...]

@@ -29,7 +29,7 @@ DECIMALS = 4
 LARGEST_XML = 1_000_000
 """[bytes]: a scene of ten objects has 4 kB."""
 LARGEST_NUMBER = 99_999
-"""Of an object; GraspNet-1Billion has 0 to 87."""
+"""Largest number of an object; GraspNet-1Billion has 0 to 87."""
 LENGTH_TOLERANCE = 0.01
 """A quaternion with four decimals has the length 1 to 1e-4; another one is something else."""
 FARTHEST_M = 10.0

@@ -39,7 +39,7 @@ GRID = (VIEWS, ANGLES, DEPTHS)
 BLOCK = 16
 """Points read or written at a time: 4 MB."""
 MOST_POINTS = 5_000
-"""Of one object: 1.2 GB unpacked, 4 s; GraspNet has some hundred to a thousand."""
+"""Most points of one object: 1.2 GB unpacked, 4 s; GraspNet has some hundred to a thousand."""
 MOST_GRASPS = 5_000_000
 """Kept of one file: 170 MB."""
 LARGEST_M = 2.0

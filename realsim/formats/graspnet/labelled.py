@@ -30,7 +30,7 @@ from realsim.records import ObjectModel
 FACTOR_DEPTH = 1000.0
 """Counts per metre where no meta file says it; graspnetAPI takes nothing else."""
 FIRST_TEST_SCENE = 100
-"""Of the data set's own 190 scenes; those before are for training."""
+"""First scene for testing, of the data set's own 190; those before are for training."""
 ENTRY = "graspnet"
 """Key of a row's own values, so that no other format takes them for its own."""
 
@@ -43,7 +43,7 @@ class GraspnetSceneRef:
     camera: str
     """'kinect' or 'realsense'."""
     folder: Path
-    """Of the camera."""
+    """Folder of the camera."""
     models: Path | None
     """Folder of the models; None = there is none."""
 

@@ -31,7 +31,8 @@ class GraspnetWriteConfig:
     camera: str = "realsense"
     """'realsense' or 'kinect': the folder that the scene's camera becomes."""
     number: int | None = None
-    """Of the scene; None = the source's. Needed where scenes of several splits have one number."""
+    """Number of the scene; None = the source's. Needed where scenes of several splits have one
+    number."""
     numbers: Mapping[int, int] | None = None
     """Object id -> GraspNet's number; None = the id - 1. For ids beyond GraspNet's 0 to 87, and
     for several data sets in one tree."""
@@ -63,9 +64,9 @@ class WritePlan:
     """What a tree of a scene will hold."""
 
     number: int
-    """Of the scene."""
+    """Number of the scene."""
     indices: tuple[int, ...]
-    """Of the source's images; their places are the written numbers."""
+    """Places of the source's images; their places are the written numbers."""
     numbers: Mapping[int, int]
     """Object id -> GraspNet's number."""
     order: tuple[int, ...]

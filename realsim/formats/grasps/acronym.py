@@ -54,7 +54,7 @@ class AcronymObject:
     """The object of an ACRONYM file; None = the file does not say."""
 
     file: str
-    """Of the mesh, relative to the data set's folder."""
+    """File of the mesh, relative to the data set's folder."""
     scale: float = 1.0
     """What the mesh is multiplied by to be in metres; the grasps belong to the scaled mesh."""
     density: float | None = None

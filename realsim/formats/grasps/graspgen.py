@@ -55,7 +55,7 @@ class GraspGenGrasps:
     """What a GraspGen file says."""
 
     file: str
-    """Of the mesh."""
+    """File of the mesh."""
     scale: float
     """What the mesh is multiplied by to be in metres."""
     Ts_obj_grasp: Array

@@ -28,7 +28,7 @@ class SceneGrasps:
     sets: tuple[GraspSet, ...]
     """One per object instance; kept in the order of the instances."""
     name: str = ""
-    """Of the scene."""
+    """Name of the scene."""
     names: Mapping[int, str] = field(default_factory=dict[int, str])
     """Names of the objects, by object id; of objects without a set none is kept."""
     trajectories: Mapping[int, GraspTrajectories] = field(

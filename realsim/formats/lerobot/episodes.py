@@ -34,7 +34,7 @@ class LeRobotFeature:
     dtype: str
     """'float32', 'int64' or 'bool'."""
     names: tuple[str, ...] = ()
-    """Of its numbers; () = one number without a name of its own."""
+    """Names of its numbers; () = one number without a name of its own."""
 
     def __post_init__(self) -> None:
         """Check the type.
@@ -173,7 +173,7 @@ DATA_PATH = f"data/{_FILE}.parquet"
 VIDEO_PATH = f"videos/{{video_key}}/{_FILE}.mp4"
 EPISODES_PATH = f"meta/episodes/{_FILE}.parquet"
 CODEC, PIXELS = "h264", "yuv420p"
-"""Of the videos, as FFmpeg names them."""
+"""Codec and pixel format of the videos, as FFmpeg names them."""
 WRITTEN = {
     "timestamp": LeRobotFeature(dtype="float32"),
     "frame_index": LeRobotFeature(dtype="int64"),

@@ -246,7 +246,7 @@ class Transforms:
     """Those whose images are there, in natural order of their names; poses are in the original
     world, in the file's unit before `applied_scale`."""
     depth_unit: float
-    """Of the file's world per count of depth."""
+    """Units of the file's world per count of depth."""
     depth_unit_said: str
     """Who says so: a key of the file, or ''."""
     notes: tuple[str, ...]

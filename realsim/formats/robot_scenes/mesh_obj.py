@@ -14,7 +14,7 @@ from realsim.images.png import encode_png
 from realsim.records import Mesh
 
 PLAIN_RGB = (0.7, 0.7, 0.7)
-"""Of meshes without colours."""
+"""Colour of meshes without colours."""
 TABLE_RGB = (0.72, 0.66, 0.58)
 CELL_PX = 4
 """Side of a triangle's square: its middle is two pixels from the next colour, so that smoothing

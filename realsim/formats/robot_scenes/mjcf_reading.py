@@ -37,7 +37,7 @@ from realsim.untrusted.xml_tree import read_xml
 
 MOST_FILES = 10_000
 MOST_FILE_BYTES = 500e6
-"""Of a mesh or a texture."""
+"""Most bytes of a mesh or a texture."""
 WALL_S = 3.0 * MOST_CPU_S
 """The process is ended after so long by the clock."""
 REFUSED = ("extension", "plugin")

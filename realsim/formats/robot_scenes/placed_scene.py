@@ -70,7 +70,7 @@ class PlacedObject:
     name: str
     """Unique in the scene: letters, digits and underscores, no digit first."""
     obj_id: int
-    """Of its body."""
+    """Object id of its body."""
     T_world_obj: Array
     """(4, 4) [m]."""
     is_fixed: bool = False

@@ -21,7 +21,7 @@ from realsim.untrusted.xml_tree import read_xml
 
 MOST_LINKS = 10_000
 ROUND_SIDES = 48
-"""Of a cylinder that is made a mesh."""
+"""Sides of a cylinder that is made a mesh."""
 MADE_UP_DENSITY = 1000.0
 """[kg/m^3] of a link without matter."""
 Movement = Literal["root", "fixed", "floating"]

@@ -111,7 +111,7 @@ class CheckConfig:
     further_share: float = 0.35
     """Unless more than this share of the views is suspect: then there are pairs enough."""
     seed: int = 0
-    """Of the random search for a table that is not where it should be."""
+    """Seed of the random search for a table that is not where it should be."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

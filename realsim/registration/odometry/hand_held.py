@@ -166,7 +166,7 @@ class HandHeldConfig:
     loops: int = 3
     """So many others are tried for each key view."""
     seed: int = 0
-    """Of the random search for the table."""
+    """Seed of the random search for the table."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

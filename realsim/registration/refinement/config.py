@@ -56,11 +56,13 @@ class CameraPrior:
     """What the cameras' errors may be, 1-sigma per axis."""
 
     hand_eye_mm: float = 1.0
-    """Of the constant error of all cameras [mm]: loose, the depth knows it better."""
+    """Standard deviation of the constant error of all cameras [mm]: loose, the depth knows it
+    better."""
     hand_eye_deg: float = 0.25
     """Likewise [deg]."""
     view_mm: float = 0.2
-    """Of every view on its own [mm]: the repeatable part of an arm's error is in the hand-eye."""
+    """Standard deviation of each view on its own [mm]: the repeatable part of an arm's error is in
+    the hand-eye."""
     view_deg: float = 0.03
     """Likewise [deg]."""
     learn_views: bool = True
@@ -93,8 +95,8 @@ class RefineConfig:
     """1-sigma of how far an object may turn from its start [deg]: a body of revolution would turn
     as it likes."""
     bias: DepthBias = field(default_factory=DepthBias.none)
-    """Of the depth camera with its covariance, from its calibration; the images are as measured.
-    `none` has zero covariance and keeps the depth as it is."""
+    """Bias of the depth camera with its covariance, from its calibration; the images are as
+    measured. `none` has zero covariance and keeps the depth as it is."""
     fit_bias: bool = True
     """Whether the depth's bias is an unknown."""
     unmeasured_scale: float = 0.001

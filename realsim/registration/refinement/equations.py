@@ -44,7 +44,7 @@ HAND_EYE, BIAS, TABLE = slice(0, 6), slice(6, 8), slice(8, 11)
 """Where shared unknowns stand; the objects follow, six each."""
 OBJECTS = 11
 TABLE_ROWS = (0, 1, 5)
-"""Of the table's twist: turns about its x and y, shift along its z."""
+"""Rows of the table's twist: turns about its x and y, shift along its z."""
 BIAS_AT: Int64 = np.arange(BIAS.start, BIAS.stop)
 TABLE_AT: Int64 = np.arange(TABLE.start, TABLE.stop)
 HAND_EYE_AT: Int64 = np.arange(HAND_EYE.start, HAND_EYE.stop)

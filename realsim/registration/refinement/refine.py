@@ -72,7 +72,7 @@ class Refined:
     plane: SupportPlane | None
     state: State
     covariance: Covariances
-    """Of objects (about their centres), hand-eye, table, bias and views."""
+    """Covariance of objects (about their centres), hand-eye, table, bias and views."""
     misfit_m: Array
     """(K + 1,) what residuals of each body show beyond the noise [m]; the table's is last."""
     used: Array

@@ -65,7 +65,7 @@ class FindConfig:
     region_slack_deg: float = 10.0
     """...and by this [deg]."""
     seed: int = 0
-    """Of the random turns at clusters."""
+    """Seed of the random turns at clusters."""
     grid: GridConfig = field(default_factory=GridConfig)
     """Heights over the table."""
     templates: TemplateConfig = field(default_factory=TemplateConfig)

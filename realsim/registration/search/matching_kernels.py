@@ -24,7 +24,7 @@ MEASURED_M = np.float32(100.0)
 NOTHING = -1.0
 """Score of a place that was not compared to the end."""
 MOST_STEPS = 60
-"""Of a climb; it ends by itself after 10 to 20."""
+"""Most steps of a climb; it ends by itself after 10 to 20."""
 
 
 def rule_of(config: "MatchConfig") -> Rule:

@@ -30,7 +30,7 @@ GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 PARALLEL = 0.998
 """Cosine from which on two axes are one (3.6 deg)."""
 DAMPING = 1e-6
-"""Of the least squares: a turn about the axis of a lathe's work moves nothing."""
+"""Damping of the least squares: a turn about the axis of a lathe's work moves nothing."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -73,7 +73,7 @@ class NearSymmetryConfig:
     judged: int = 90
     """So many of the fitted ones are judged: 2 ms each."""
     cells: int = 36
-    """Of the distance field that ranks and fits, along the longest side."""
+    """Cells of the distance field that ranks and fits, along the longest side."""
     scales: tuple[float, ...] = (0.15, 0.12, 0.1, 0.08, 0.06, 0.05, 0.04, 0.03, 0.03)
     """Tukey's cut of each step of the fit [share of the longest side]."""
     distinct_share: float = 0.05
@@ -87,7 +87,7 @@ class NearSymmetryConfig:
     symmetry_step_deg: float = 3.0
     """Step at which continuous symmetries are sampled [deg]."""
     seed: int = 0
-    """Of the surface points."""
+    """Seed of the surface points."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -72,7 +72,7 @@ class ExchangeConfig:
     most_pairs: int = 8
     """Pairs tried at most, the least sure ones first."""
     seed: int = 1
-    """Of the random turns."""
+    """Seed of the random turns."""
 
 
 def taken_cells(grid: HeightGrid, T_table_world: Array, cloud: Cloud, explained: Mask) -> Mask:

@@ -42,7 +42,7 @@ class Hypothesis:
     T_world_obj: Array
     """(4, 4)."""
     score: float
-    """Of whatever made it; only comparable with others of the same maker."""
+    """Score of whatever made it; only comparable with others of the same maker."""
     source: str
     """For the report: 'resting 2, yaw 30', 'start', 'residual 1'."""
 

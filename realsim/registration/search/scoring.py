@@ -71,7 +71,7 @@ class Canvas:
     it. At a grazing view a camera that is tilted by 0.1 deg moves the table's depth by millimetres,
     but not its height."""
     front_penalty: float
-    """Of a pixel with something measured in front."""
+    """Penalty for a pixel with something measured in front."""
 
     @property
     def cells_per_frame(self) -> int:

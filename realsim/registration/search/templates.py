@@ -22,7 +22,7 @@ from realsim.rendering.rays import PlacedMesh, RayScene
 from realsim.store.arrays_on_disk import read_arrays, write_arrays
 
 VERSION = 1
-"""Of the files' content; older files are computed again."""
+"""Version of the files' content; older files are computed again."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -49,7 +49,7 @@ class TemplateConfig:
     symmetry_step_deg: float = 5.0
     """Step at which continuous symmetries are sampled [deg], less than `same_deg`."""
     seed: int = 0
-    """Of the choice of the points."""
+    """Seed of the choice of the points."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""

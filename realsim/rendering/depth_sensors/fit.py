@@ -60,7 +60,7 @@ class DepthFitConfig:
     distance_ratio: float = 1.3
     """Farthest over nearest plane, from which on the law of noise and distance is checked."""
     seed: int = 0
-    """Of the simulation that shows how often neighbours are equal without resampling."""
+    """Seed of the simulation that shows how often neighbours are equal without resampling."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -70,7 +70,7 @@ class LossFitConfig:
     rim_px: int = 10
     """Pixels from a depth edge that belong to it: less than the least object is wide."""
     seed: int = 0
-    """Of the simulations."""
+    """Seed of the simulations."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

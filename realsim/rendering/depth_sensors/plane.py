@@ -39,7 +39,7 @@ class PlaneConfig:
     closing_px: int = 15
     """Holes up to twice this width belong to the plane [px]."""
     seed: int = 0
-    """Of the triples."""
+    """Seed of the triples."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

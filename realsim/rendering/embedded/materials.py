@@ -29,9 +29,9 @@ PLAIN_COLORS = (
 WOOD_PERIOD_M = 0.5
 SPECKLE_PERIOD_M = 0.12
 OBJECT_ROUGHNESS = 0.42
-"""Of meshes without a material: satin plastic and printed cardboard."""
+"""Roughness of meshes without a material: satin plastic and printed cardboard."""
 TABLE_ROUGHNESS = 0.62
-"""Of background without a material: oiled wood, printed paper."""
+"""Roughness of background without a material: oiled wood, printed paper."""
 
 
 class MipTexture:

@@ -51,7 +51,7 @@ class PlaneTwin:
     area: Mask
     """(h, w) the plane with its holes."""
     intrinsics: CameraIntrinsics
-    """Of the window with what lies around it."""
+    """Intrinsics of the window with what lies around it."""
     corner: tuple[int, int]
     """Column and row of the window in that picture."""
     plane: PlacedMesh

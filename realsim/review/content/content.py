@@ -63,7 +63,7 @@ class SceneContent:
     thumbnails: Mapping[int, bytes]
     """The photographs of the shown views as small JPEGs, by number of the view."""
     grasp_sets: tuple[GraspSet, ...]
-    """Of the objects of the scene."""
+    """Grasp sets of the objects of the scene."""
 
     @staticmethod
     def load(

@@ -36,7 +36,7 @@ KEPT_CASTS = 128
 THIN_PX, BOLD_PX = 2, 4
 """Width of an outline and of the highlighted one [px]."""
 DASH_PX, GAP_PX = 6, 6
-"""Of the hidden part of an outline [px]."""
+"""Dash and gap of the hidden part of an outline [px]."""
 DIM = 0.85
 """By so much the hidden part is darker."""
 SEEN_M = 1e-4

@@ -30,11 +30,11 @@ class Moved(NamedTuple):
     """How far one pose is from another."""
 
     mm: float
-    """Of the object's middle [mm]."""
+    """Motion of the object's middle [mm]."""
     deg: float
     """Turn [deg]."""
     greatest_mm: float
-    """Of the vertex that moved furthest [mm]."""
+    """Motion of the vertex that moved furthest [mm]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -55,7 +55,7 @@ SAME_MM, SAME_DEG = 0.3, 0.2
 WORSE_SHARE = 0.005
 """The rendered gain may fall by this share without being worse: its own rounding."""
 STAGES = 5
-"""Of a snap, for its progress."""
+"""Number of stages of a snap, for its progress."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -44,7 +44,7 @@ class GraspMotion:
 
     instance: int
     row: int
-    """Of the instance's grasp set."""
+    """Row of the instance's grasp set."""
     time_s: Array
     """(S,) since the beginning [s], increasing."""
     Ts_world_hand: Array
@@ -125,9 +125,9 @@ class HandApproach:
     approach_m: float = 0.08
     """Length of the straight way [m]: the school's own."""
     speed_m_s: float = 0.10
-    """Of the hand [m/s]."""
+    """Speed of the hand [m/s]."""
     closing_m_s: float = 0.05
-    """Of each finger [m/s]: Franka's hand at its usual speed."""
+    """Speed of each finger [m/s]: Franka's hand at its usual speed."""
     hand: Hand = field(default_factory=find_hand)
     """What closes, from fully open."""
     rate_hz: float = 20.0

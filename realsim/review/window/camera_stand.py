@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from realsim.review.window.window import Window
 
 JPEG_QUALITY = 85
-"""Of the photograph in the browser [%]: no block is seen at this, at 150 kB for 1280x720."""
+"""Quality of the photograph in the browser [%]: no block is seen at this, at 150 kB for
+1280x720."""
 WIDTH_PX = (320, 1280)
 """Least and greatest width of the picture [px]: more than the cameras' own shows nothing new."""
 SAME_M, SAME_RAD = 1e-3, 3e-3

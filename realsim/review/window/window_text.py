@@ -21,7 +21,8 @@ from realsim.review.scene_list import ObjectRow
 ALARM = "#c92a2a"
 """The red of what is amiss."""
 LEAST_CONTRAST = 4.5
-"""Of letters to their ground: what WCAG 2.1 asks for at the size of the panel's text."""
+"""Least contrast of letters to their ground: what WCAG 2.1 asks for at the size of the panel's
+text."""
 ACTION_WORDS = {
     "accept": "accepted",
     "reject": "rejected",

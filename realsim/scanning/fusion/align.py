@@ -43,7 +43,7 @@ class Alignment:
     plane: SupportPlane
     """The refined table."""
     corrections: tuple[ViewCorrection, ...]
-    """Of all views, left-out ones included."""
+    """Corrections of all views, left-out ones included."""
     left_out: tuple[tuple[int, str], ...]
     """Views that were left out, and why."""
     coarse: Volume

@@ -186,7 +186,7 @@ class ScaleConfig:
     arm_sigma_deg: float | None = None
     """Likewise about each axis [deg]."""
     seed: int = 0
-    """Of everything that is drawn."""
+    """Seed of everything that is drawn."""
     table: TableConfig = field(default_factory=TableConfig)
     samples: SampleConfig = field(default_factory=SampleConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)

@@ -23,7 +23,7 @@ FORMAT = "realsim scale"
 FORMAT_VERSION = 1
 VERSIONS_OF = ("realsim", "numpy", "scipy", "open3d", "trimesh")
 SHAPES = {"T_world_obj": (4, 4), "covariance": (7, 7), "extent_mm": (3,)}
-"""Of a fit's arrays."""
+"""Shapes of a fit's arrays."""
 FIRST = ("verdict", "reasons", "scale", "sigma")
 """What a person looks for stands first."""
 TOLD = ("derived", "smallest_box_mm")
@@ -45,7 +45,7 @@ class ScaleRecord:
     poses: tuple[Json, ...] = ()
     """Per view, for machines: `index`, `T_world_cam`, `T_cam_obj` (of the scaled mesh) [m]."""
     versions: dict[str, str] = field(default_factory=dict[str, str])
-    """Of the libraries that made it."""
+    """Versions of the libraries that made it."""
 
 
 def installed_versions() -> dict[str, str]:

@@ -38,7 +38,8 @@ class HeightMapConfig:
     cells: int = 2500
     """Cells that the box of the footprint is divided into at most."""
     percentile: float = 85.0
-    """Of the heights in a cell: walls put lower points into it, flying pixels higher ones."""
+    """Percentile of a cell's heights that counts: walls put lower points into it, flying pixels higher
+    ones."""
     top_cells: int = 3
     """The height of the object is that of so many highest cells at least: one may be a fault."""
     least_island: float = 0.1
@@ -60,7 +61,7 @@ class HeightMap:
     top: float
     """Height of the object [m]."""
     area: float
-    """Of the footprint [m^2]."""
+    """Area of the footprint [m^2]."""
     center: Array
     """(2,) centroid of the footprint [m]."""
     spread: Array
@@ -78,9 +79,9 @@ class Template:
     points: Array
     """(K, 3) of the surface, in the mesh's axes, in random order: the first few stand for all."""
     area: float
-    """Of the footprint."""
+    """Area of the footprint."""
     height: float
-    """Of the mesh along the direction."""
+    """Height of the mesh along the direction."""
     center: Array
     """(2,) centroid of the footprint, after R."""
     spread: Array

@@ -24,7 +24,7 @@ from realsim.scanning.scale.shape import INNER_EXTENT, ScanShape
 from realsim.scanning.scale.state import OBJECT, PATCHES, RIM, SIZE, ScaleState, metre_per_px
 
 COLUMNS = 8
-"""Of a block of outlines: twist, size, the outlines' offset."""
+"""Columns of a block of outlines: twist, size, the outlines' offset."""
 WIDEST_GAP_PX = 5.0
 """An outline whose place is unknown over more than this says nothing."""
 RIM_PX = 0.35

@@ -18,7 +18,7 @@ class Similarity:
     T_world_obj: Array
     """(4, 4) of the scaled mesh in world [m]."""
     score: Real = float("nan")
-    """Of the step that made it; greater is better. Comparable within one list only."""
+    """Score of the step that made it; greater is better. Comparable within one list only."""
     source: str = ""
     """Where it comes from, for the report: 'given', 'stable pose 2, yaw 90 deg', ..."""
 

@@ -139,4 +139,4 @@ class SfmConfig:
     trust: TrustConfig = field(default_factory=TrustConfig)
     """Verdict."""
     seed: int = 0
-    """Of every random choice, COLMAP's included."""
+    """Seed of every random choice, COLMAP's included."""

@@ -12,7 +12,7 @@ INK, MUTED, GOOD, BAD = "#22303c", "#8a99a8", "#2a9d8f", "#c8553d"
 MOST_POINTS = 20_000
 """Points drawn; more only make the file larger."""
 SHOWN_PERCENTILES = (1.0, 99.0)
-"""Of the points that set the picture's frame: stray ones would shrink the rest."""
+"""Percentiles of the points that set the picture's frame: stray ones would shrink the rest."""
 AXIS_SHARE = 0.06
 """Length of a drawn optical axis over the width of the scene."""
 MOST_LABELS = 40

@@ -18,7 +18,7 @@ class Geometry:
     """Cameras, points and what was seen of them, in one world."""
 
     intrinsics: CameraIntrinsics
-    """Of all images."""
+    """Intrinsics of all images."""
     names: tuple[str, ...]
     """(V,) registered images."""
     Ts_world_cam: Array

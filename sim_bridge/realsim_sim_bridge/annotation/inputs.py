@@ -64,7 +64,7 @@ class FrameView:
     T_world_cam: Array
     """(4, 4) camera in world [m]."""
     digest: str
-    """Of everything its annotation depends on."""
+    """Digest of everything its annotation depends on."""
 
 
 def gathered(

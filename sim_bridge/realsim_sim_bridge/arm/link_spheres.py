@@ -25,7 +25,7 @@ BULGES_M = (0.02, 0.025, 0.03, 0.04, 0.055, 0.08)
 """How far the balls of a link may stand out of its bodies before they shrink [m]: a little more
 where links are large. On average they end up with half of it."""
 MOST_SPHERES = 8
-"""Of a link; a link may have more only with the last of the bulges."""
+"""Most spheres of a link; a link may have more only with the last of the bulges."""
 EDGE_M = 0.03
 """Longest edge of a triangle [m]."""
 CENTERS = 500

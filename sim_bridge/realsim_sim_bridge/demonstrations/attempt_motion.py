@@ -66,7 +66,7 @@ class Attempt:
     arm: GraspingArm
     trajectories: GraspTrajectories
     row: int
-    """Of the grasp set."""
+    """Row of the grasp set."""
     replay: SlipReplay
     body: SlipBody
     T_table_base: Array
@@ -76,7 +76,7 @@ class Attempt:
     others: Sequence[Array]
     """Corners (V, 3) of the other objects, table frame [m]."""
     closing_speed: float
-    """Of each finger [m/s]."""
+    """Speed of each finger [m/s]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -84,7 +84,7 @@ class _Clock:
     """When the stages begin, and when the attempt ends."""
 
     begins: tuple[float, ...]
-    """Of each stage that was executed [s]; NaN = the arm does not do it."""
+    """Beginning of each stage that was executed [s]; NaN = the arm does not do it."""
     touch_s: float
     """When the fingers reach the object [s]."""
     lost_s: float

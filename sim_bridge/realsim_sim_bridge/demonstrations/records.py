@@ -43,7 +43,7 @@ class GraspGoal:
     obj_id: int
     instance: int
     name: str
-    """Of the object."""
+    """Name of the object."""
     grasp: int
     """Row of the instance's grasp set."""
     T_base_grasp: Array

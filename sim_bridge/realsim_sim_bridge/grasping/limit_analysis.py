@@ -22,7 +22,7 @@ from realsim_sim_bridge.grasping.antipodal import RaySurface
 from realsim_sim_bridge.grasping.pad_contacts import pad_rays
 
 EDGES = 8
-"""Of a friction cone; the polygon has the circle's area."""
+"""Edges of a friction cone; the polygon has the circle's area."""
 CELLS, RAYS_PER_CELL = 3, 2
 """Cells per side of a pad, each one contact at most, and rays per side of a cell."""
 LENGTH_M = 0.05

@@ -49,9 +49,9 @@ class Calibration:
     trials: int
     objects: tuple[str, ...]
     held_share: float
-    """Of the trials that held; a grasp with more p_hold is told as one that holds."""
+    """Share of the trials that held; a grasp with more p_hold is told as one that holds."""
     engine: str
-    """Of the simulated attempt."""
+    """Engine of the simulated attempt."""
     reliability: tuple[Reliability, ...] = ()
 
     def p_hold(self, evidence: Array) -> Array:

@@ -57,7 +57,7 @@ class RealityConfig:
     hold: HoldConfig = field(default_factory=HoldConfig)
     convex: ConvexConfig = field(default_factory=ConvexConfig)
     seed: int = 0
-    """Of the intervals' bootstrap."""
+    """Seed of the intervals' bootstrap."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -70,7 +70,7 @@ class ObjectStand:
     sentence: str
     """What happened, with figures."""
     moved_m: float
-    """Of the centre of mass [m]."""
+    """Motion of the centre of mass [m]."""
     turned_deg: float
     jump_m_s: float
     """Largest upward and sideways speed in the first moments [m/s]."""
@@ -96,7 +96,7 @@ class StandReport:
     notes: tuple[str, ...]
     """Shapes that cannot be trusted: parts too large, meshes without volume."""
     settings: dict[str, float] = field(default_factory=dict[str, float])
-    """Of the engine, read back."""
+    """Settings of the engine, read back."""
 
     @property
     def stable(self) -> bool:

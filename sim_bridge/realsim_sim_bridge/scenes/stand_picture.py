@@ -22,7 +22,7 @@ COLORS: dict[Standing, str] = {
 VIEWS = (("from above", 0, 1, 2), ("from the side", 0, 2, 1))
 """Title, the axes drawn to the right and upwards, and the axis looked along."""
 MOST_FACES = 8_000
-"""Of a mesh that is drawn; a picture of 1600 pixels shows no more."""
+"""Most faces of a mesh that is drawn; a picture of 1600 pixels shows no more."""
 
 
 def stand_picture(scene: SchoolScene, report: StandReport) -> bytes:

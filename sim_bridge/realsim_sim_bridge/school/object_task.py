@@ -176,7 +176,7 @@ class Prepared:
     reasons: tuple[str, ...]
     """(N,) why not reachable."""
     trajectories: GraspTrajectories | None
-    """Of the candidates that the arm takes; None = there is none."""
+    """Trajectories of the candidates that the arm takes; None = there is none."""
     measures: dict[str, Array]
     """What geometry alone says of the candidates, (N,) each."""
     body: SlipBody | None

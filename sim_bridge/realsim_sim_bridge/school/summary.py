@@ -212,7 +212,7 @@ class SchoolSummary:
     penalized_by: dict[str, int]
     """Of the penalized: the stage that failed first; 'none' = none did."""
     score: Spread
-    """Of all candidates with a score."""
+    """Spread of the scores of all candidates that have one."""
     score_good: float
     score_bad: float
     """Mean scores; NaN of none."""

@@ -26,7 +26,7 @@ class SyntheticScene:
     """Everything that is seen in a synthetic view, besides the camera."""
 
     name: str
-    """Of the session that the views become."""
+    """Name of the session that the views become."""
     scene: Scene
     """Where the objects stand, and the table's plane; rejected objects are not shown."""
     models: Mapping[int, ObjectModel]

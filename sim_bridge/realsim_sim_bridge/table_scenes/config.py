@@ -116,7 +116,7 @@ class TableSceneConfig:
     walls: float = 0.5
     """Share of the scenes that stand in a room with walls; the others see the sky all around."""
     density: float = 1000.0
-    """Of every object [kg/m^3]; the paper's."""
+    """Density of every object [kg/m^3]; the paper's."""
     pool: PoolConfig = field(default_factory=PoolConfig)
     drop: DropConfig = field(default_factory=DropConfig)
 

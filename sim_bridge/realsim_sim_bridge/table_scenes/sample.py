@@ -51,7 +51,7 @@ class Layout:
     """A scene's table, and what came to rest on it."""
 
     number: int
-    """Of the scene."""
+    """Number of the scene."""
     seed: int
     table: str
     """Kind of the table; its sizes follow from seed and number."""

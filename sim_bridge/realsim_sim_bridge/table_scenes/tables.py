@@ -36,7 +36,7 @@ class TableModel:
     outline: Array
     """(N, 2) rim of the top surface, convex, counter-clockwise [m]."""
     height_m: float
-    """Of the top surface over the floor."""
+    """Height of the top surface over the floor."""
     parts: tuple[TablePart, ...]
     rims: tuple[Array, ...] = ()
     """Convex parts (V, 3) that rise above the top surface: an edge, the boards of a crate [m]."""

@@ -101,7 +101,7 @@ class LabelConfig:
     """Grasps on the edge, whose labels must not depend on the solver's settings."""
 
     seed: int = 7
-    """Of where the grasps are."""
+    """Seed of the grasps' places."""
     masses_kg: tuple[float, ...] = (0.01, 0.013, 0.1, 0.5, 2.0)
     """What the Robot School meets: from a paper cup to a full bottle."""
     shapes: tuple[str, ...] = ("box", "l_shape", "cylinder", "wedge")
@@ -154,7 +154,7 @@ class ReferenceConfig:
     """Shapes and their masses: about half of the lighter ones turn by more than 10 deg, and half of
     the heavier ones are dropped."""
     seed: int = 7
-    """Of where the grasps are."""
+    """Seed of the grasps' places."""
     grasps: int = 1
     """Of each shape and mass; they take the contact model about a second each."""
     lean_deg: float = 20.0

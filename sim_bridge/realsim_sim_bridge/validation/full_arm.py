@@ -62,11 +62,12 @@ def _along(q: Array, axis: int, distances: Array) -> Array:
 RATE_HZ = 1000.0
 """Steps per second: the arm carries true masses, for which the hand's steps are too long."""
 STIFFNESS, DAMPING = 1e5, 10.0
-"""Of the pads [N/m, N s/m]. In a hand that turns, Bullet's friction makes the velocities equal of
-two points that lie as far apart as pad and object overlap; at 10000 N/m and 70 N these are 1.2 of
-25 mm, and the object lags behind the hand by 5 % of its turn. A hand at rest knows no such lag."""
+"""Stiffness and damping of the pads [N/m, N s/m]. In a hand that turns, Bullet's friction makes the
+velocities equal of two points that lie as far apart as pad and object overlap; at 10000 N/m and 70
+N these are 1.2 of 25 mm, and the object lags behind the hand by 5 % of its turn. A hand at rest
+knows no such lag."""
 ITERATIONS = 100
-"""Of the solver, each step."""
+"""Iterations of the solver, each step."""
 GEAR_ERP, GEAR_FORCE_N = 0.3, 1000.0
 """What keeps the two fingers symmetric: share of the error taken back per step, and force [N]."""
 CLOSE_S = 0.5

@@ -52,7 +52,8 @@ class ReferenceSettings:
     load_s: float = 1e-3
     """Time for which a load stands [s]; a multiple of the step."""
     damping: float = 1.0
-    """Of each contact, in units of the critical damping of its share of the object's mass."""
+    """Damping of each contact, in units of the critical damping of its share of the object's
+    mass."""
     tangent_share: float = 1.0
     """Stiffness of the bristles, in units of a sphere's."""
     drive_kg: float = 0.4

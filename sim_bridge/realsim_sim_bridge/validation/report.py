@@ -22,7 +22,7 @@ class CheckResult:
     measured: float
     """NaN = it could not be measured, which is a failure."""
     unit: str
-    """Of figure and limit; '' = a share or a truth value."""
+    """Unit of figure and limit; '' = a share or a truth value."""
     limit: float
     at_least: bool = False
     """Whether the figure must be at least the limit; otherwise at most."""

@@ -18,7 +18,7 @@ from realsim_sim_bridge.slip.world import SlipBody
 SIDE_M = 0.05
 """Side of the cube."""
 OPENING_M = SIDE_M + 0.008
-"""Of the hand before it closes on the cube."""
+"""Opening of the hand before it closes on the cube."""
 DOWN = np.diag([1.0, -1.0, -1.0])
 """Rotation of a grasp from above."""
 READY = np.array([0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4])

@@ -43,7 +43,7 @@ class ScaleRequest:
     library: Path | None = None
     """Where the scaled model goes; None = nowhere."""
     name: str = ""
-    """Of the result; empty = that of the mesh."""
+    """Name of the result; empty = the mesh's."""
     up: "UpAxis | None" = None
     """Axis of the file that points up; None = as its format says."""
     start: Similarity | None = None
@@ -61,7 +61,7 @@ class ScaleRequest:
     obj_id: int | None = None
     """BOP id in the library; None = the next free one."""
     density: float | None = None
-    """Of the model in the library [kg/m^3]; None = the usual one."""
+    """Density of the model in the library [kg/m^3]; None = the usual one."""
     mass: float | None = None
     """As weighed [kg], instead of a density."""
     json: Path | None = None
@@ -79,7 +79,7 @@ class NamedMesh:
     where: str
     """For a person: the file, or the library and the name in it."""
     sha256: str
-    """Of vertices and faces."""
+    """SHA-256 of vertices and faces."""
     entry: str = ""
     """Its own name in the library; empty for a file."""
     library: Path | None = None

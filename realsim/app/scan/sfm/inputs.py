@@ -33,7 +33,7 @@ class SfmRequest:
     text: bool = False
     """Whether the COLMAP model is written as text, too."""
     seed: int = 0
-    """Of every random choice."""
+    """Seed of every random choice."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
