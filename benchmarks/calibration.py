@@ -42,7 +42,7 @@ from calibration_simulated import KINDS as ROBOTS
 from calibration_simulated import coverage_trial, efficiency_trial, solve_cpu_s
 from corner_accuracy import KINDS as TARGETS
 from corner_accuracy import measure, opencv
-from figures import Figure, Found, Goal, run
+from figures import DATA, Figure, Found, Goal, run
 
 A = TypeVar("A")
 B = TypeVar("B")
@@ -286,8 +286,7 @@ def measure_corners(a: argparse.Namespace) -> Found:
 
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
-    data = Path(os.environ.get("REALSIM_DATA", "../shared/data"))
-    parser.add_argument("--data", type=Path, default=data, help="folder of the real sets")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the real sets")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
 
 

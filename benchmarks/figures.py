@@ -29,6 +29,9 @@ import numpy as np
 
 from realsim.app.console import Console
 
+DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).resolve().parents[2] / "shared/data"))
+"""Folder of the real data."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Goal:
@@ -70,6 +73,13 @@ class Found:
     """Sentences for a person."""
     cases: dict[str, object] = field(default_factory=dict[str, object])
     """What is kept in the JSON besides: plain values."""
+
+    def real_data(self, part: str, under: str) -> Path | None:
+        """Return a folder of the real data, or None with a note that the part is not run."""
+        if (DATA / under).is_dir():
+            return DATA / under
+        self.notes.append(f"{part}: not run; set REALSIM_DATA to the folder that holds {under}")
+        return None
 
     def add(self, key: str, value: float, over: str = "") -> None:
         """Note a figure."""

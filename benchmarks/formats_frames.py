@@ -8,12 +8,12 @@ matters for an encoder is the noise, so real frames (REALSIM_DATA) are measured 
   apc_shelf_multiview   RealSense F200, 640x480
 """
 
-import os
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from figures import DATA
 from labels_scene import camera_720p, cameras, scene
 from numpy.typing import NDArray
 
@@ -22,8 +22,7 @@ from realsim.arrays import Array, Array32, Counts, Mask, Rgb
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.labels import LabelRenderer
 
-ROOT = Path(__file__).resolve().parents[1]
-DATA = Path(os.environ.get("REALSIM_DATA", ROOT.parent / "shared" / "data")) / "scenes"
+SCENES = DATA / "scenes"
 PIXELS_720P = 1280 * 720
 FULL_WELL = 9000.0
 """Electrons of a white pixel: of a small sensor at a small gain."""
@@ -106,14 +105,14 @@ def _grain(shape: tuple[int, ...], rng: np.random.Generator) -> Array32:
 def real() -> tuple[Picture, ...]:
     """Return the real frames; empty where there is no data."""
     found: list[Picture] = []
-    one = DATA / "graspnet_demo_frame"
+    one = SCENES / "graspnet_demo_frame"
     if (one / "color.png").is_file():
         found.append(_read("graspnet real", one / "color.png", one / "depth.png"))
-    for colour in sorted((DATA / "ycbv_mini/test").glob("*/rgb/*.png")):
+    for colour in sorted((SCENES / "ycbv_mini/test").glob("*/rgb/*.png")):
         folder = colour.parents[1]
         masks = sorted((folder / "mask_visib").glob(f"{colour.stem}_*.png"))
         found.append(_read("ycbv real", colour, folder / "depth" / colour.name, masks))
-    for colour in sorted((DATA / "apc_shelf_multiview").glob("scene-*/*.color.png"))[:5]:
+    for colour in sorted((SCENES / "apc_shelf_multiview").glob("scene-*/*.color.png"))[:5]:
         depth = colour.with_name(colour.name.replace("color", "depth"))
         found.append(_read("f200 real", colour, depth))
     return tuple(found)

@@ -14,13 +14,11 @@ What is fitted never is what is tested:
                         ones; no hole ratio
 """
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
-from figures import Found
+from figures import DATA, Found
 from registration_real import ycbv_frame
 
 from realsim.arrays import Array32, Mask
@@ -42,8 +40,6 @@ from realsim.rendering.depth_sensors.statistics import hole_share, local_noise
 from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.rays import BACKGROUND, PlacedMesh, RayScene
 
-ROOT = Path(__file__).resolve().parents[1]
-DATA = Path(os.environ.get("REALSIM_DATA", ROOT.parent / "shared" / "data"))
 XTION = profile("structured_light")
 F200 = replace(XTION, name="f200", baseline_m=0.047, min_z_m=0.2, max_z_m=1.5, depth_unit_m=1e-4)
 """Intel's F200: projector and camera 47 mm apart, as assumed for all ratios (it cancels)."""

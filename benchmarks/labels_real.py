@@ -8,8 +8,8 @@ shifted by three pixels, and of those at the network's own poses.
 """
 
 import numpy as np
-from figures import Found
-from registration_real import DATA, MATCHING, SHIFTED, registered, ycbv_frame
+from figures import DATA, Found
+from registration_real import MATCHING, SHIFTED, registered, ycbv_frame
 
 from realsim.arrays import Array, Mask, UInt8
 from realsim.rendering.labels import LabelRenderer, PlacedMesh

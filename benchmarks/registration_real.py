@@ -18,13 +18,13 @@ Imported by the registration benchmark. Figures:
                         median, after `refine_views` and before
 """
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from figures import DATA
 from registration_figures import Done
 
 from realsim.arrays import Array
@@ -42,8 +42,6 @@ from realsim.registration.refinement.views_only import refine_views
 from realsim.registration.register import Registration, register_scene
 from realsim.registration.views import SampleConfig, sample_views
 
-ROOT = Path(__file__).resolve().parents[1]
-DATA = Path(os.environ.get("REALSIM_DATA", ROOT.parent / "shared" / "data"))
 MATCHING, SHIFTED = (50, 51, 54), (52, 53)
 SYMMETRIC = (1, 4, 6, 13, 16, 18, 19, 20, 21)
 """Cans, the bowl, block, marker, clamps and brick: BOP names them symmetric, or a single view of

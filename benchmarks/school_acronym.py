@@ -5,7 +5,6 @@ simulation that agrees with it more is not a better one
 (docs/decisions/0018-what-the-labels-mean.md). The data is found through REALSIM_DATA.
 """
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,11 +52,8 @@ def held_by(half: _Half) -> Mask:
 def acronym(seed: int, keep: Path, quick: bool) -> Found:
     """Return the balanced accuracy of our held labels against ACRONYM's."""
     found = Found()
-    folder = Path(os.environ.get("REALSIM_DATA", "../shared/data")) / "school/acronym_mug"
-    if not folder.is_dir():
-        found.notes.append(
-            "acronym: not run; set REALSIM_DATA to the folder that holds school/acronym_mug"
-        )
+    folder = found.real_data("acronym", "school/acronym_mug")
+    if folder is None:
         return found
     given = read_acronym(next(folder.glob("Mug_*.h5")))
     rng = np.random.default_rng([seed, 4])

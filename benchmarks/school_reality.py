@@ -83,11 +83,8 @@ MOVED_M, TURNED_DEG, CHANGED = 0.001, 1.0, 0.2
 def trials(given: argparse.Namespace) -> Found:
     """Return how well p_hold tells what a real robot did."""
     found = Found()
-    folder = Path(os.environ.get("REALSIM_DATA", "../shared/data")) / "school/graspa_open"
-    if not folder.is_dir():
-        found.notes.append(
-            "trials: not run; set REALSIM_DATA to the folder that holds school/graspa_open"
-        )
+    folder = found.real_data("trials", "school/graspa_open")
+    if folder is None:
         return found
     engine = settings_of("mujoco" if given.quick else "pybullet")
     config = RealityConfig(convex=COARSE if given.quick else ConvexConfig())

@@ -21,12 +21,16 @@ FEW_DRAWS, LARGE_ERROR = 8, 0.1
 class Measure:
     """What one column of a grasp set's measures says."""
 
-    unit: str
     meaning: str
+    unit: str = "1"
     by_stage: bool = False
     """True: one value a stage (N, 4); False: one a grasp (N,)."""
     is_share: bool = False
     """Whether its values are within [0, 1]: probabilities and shares of something."""
+
+
+def _share(meaning: str) -> Measure:
+    return Measure(meaning=meaning, is_share=True)
 
 
 MEASURES = {
@@ -38,73 +42,45 @@ MEASURES = {
     "duration_s": Measure(
         unit="s", meaning="time until the stage ended or the object was lost", by_stage=True
     ),
-    "second_score": Measure(unit="1", meaning="the score by the second engine"),
-    "second_base_score": Measure(unit="1", meaning="the base score by the second engine"),
+    "second_score": Measure(meaning="the score by the second engine"),
+    "second_base_score": Measure(meaning="the base score by the second engine"),
     "second_slip_m": Measure(unit="m", meaning="slip by the second engine", by_stage=True),
     "second_slip_rad": Measure(unit="rad", meaning="turn by the second engine", by_stage=True),
-    "confidence": Measure(
-        unit="1",
-        meaning="agreement of the two engines, 0 to 1: 1 - |difference of the scores|",
-        is_share=True,
-    ),
+    "confidence": _share("agreement of the two engines, 0 to 1: 1 - |difference of the scores|"),
     "least_friction": Measure(
-        unit="1",
-        meaning="smallest friction at which all four stages are passed; inf = at none tried",
+        meaning="smallest friction at which all four stages are passed; inf = at none tried"
     ),
     "least_force_n": Measure(
         unit="N", meaning="smallest finger force at which all four stages are passed; inf likewise"
     ),
-    "margin": Measure(
-        unit="1",
-        meaning="share of the swept frictions and forces at which it is passed",
-        is_share=True,
-    ),
+    "margin": _share("share of the swept frictions and forces at which it is passed"),
     "stiffness_share": Measure(
-        unit="1", meaning="share of the swept stiffnesses of the pads at which it is passed"
+        meaning="share of the swept stiffnesses of the pads at which it is passed"
     ),
     "ferrari_canny": Measure(
-        unit="1", meaning="radius of the largest ball in the hull of the contact wrenches"
+        meaning="radius of the largest ball in the hull of the contact wrenches"
     ),
     "closure_friction": Measure(
-        unit="1", meaning="smallest friction of GraspNet's levels that closes; inf = none"
+        meaning="smallest friction of GraspNet's levels that closes; inf = none"
     ),
-    "dexnet_closure": Measure(unit="1", meaning="1 = force closure as Dex-Net tests it, 0 = none"),
-    "score_paper": Measure(
-        unit="1",
-        meaning="share of the stages passed in a row by the paper's limits, those of closing too",
-        is_share=True,
+    "dexnet_closure": Measure(meaning="1 = force closure as Dex-Net tests it, 0 = none"),
+    "score_paper": _share(
+        "share of the stages passed in a row by the paper's limits, those of closing too"
     ),
     "safety": Measure(
-        unit="1",
         meaning="load that the closed grasp bears over the stage's peak load; close: the weight",
         by_stage=True,
     ),
-    "p_hold": Measure(
-        unit="1", meaning="probability that a robot lifts the object and holds it", is_share=True
+    "p_hold": _share("probability that a robot lifts the object and holds it"),
+    "p_hold_error": _share("standard error of p_hold by its draws"),
+    "p_hold_draws": Measure(meaning="number of draws behind p_hold"),
+    "share_blocked": _share("share of draws whose fingers touch while open"),
+    "share_missed": _share("share of draws in which a pad meets nothing"),
+    "share_skewed": _share("share of draws whose pads meet the object outside the friction cone"),
+    "share_overloaded": _share(
+        "share of draws in which a stage's load is greater than the grasp bears"
     ),
-    "p_hold_error": Measure(
-        unit="1", meaning="standard error of p_hold by its draws", is_share=True
-    ),
-    "p_hold_draws": Measure(unit="1", meaning="number of draws behind p_hold"),
-    "share_blocked": Measure(
-        unit="1", meaning="share of draws whose fingers touch while open", is_share=True
-    ),
-    "share_missed": Measure(
-        unit="1", meaning="share of draws in which a pad meets nothing", is_share=True
-    ),
-    "share_skewed": Measure(
-        unit="1",
-        meaning="share of draws whose pads meet the object outside the friction cone",
-        is_share=True,
-    ),
-    "share_overloaded": Measure(
-        unit="1",
-        meaning="share of draws in which a stage's load is greater than the grasp bears",
-        is_share=True,
-    ),
-    "share_palm": Measure(
-        unit="1", meaning="share of draws whose palm touches; it fails none", is_share=True
-    ),
+    "share_palm": _share("share of draws whose palm touches; it fails none"),
 }
 """The columns that a grasp set may carry besides its score. NaN = not measured."""
 LABEL_MEASURES = ("p_hold", "p_hold_error", "p_hold_draws", "safety")

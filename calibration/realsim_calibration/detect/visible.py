@@ -3,19 +3,16 @@
 import numpy as np
 
 from realsim.arrays import Array, Int64, UInt8
-from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim_calibration.detect.chessboard import largest_chessboard
 from realsim_calibration.detect.ellipses import DotConfig, find_blobs
 from realsim_calibration.detect.images import gray_image
 from realsim_calibration.detect.lattice import grow_lattices, unimodular
 from realsim_calibration.detect.markers import (
-    FAMILY_DICTIONARY,
     decode_markers,
     dictionary_names,
     predefined_dictionary,
 )
 from realsim_calibration.detect.saddles import grid_arms, refine_saddles
-from realsim_calibration.views import TargetDetection
 
 SEARCH_PX = 1600
 """Larger pictures are halved until they fit: a diagnosis need not see the smallest marker."""
@@ -70,42 +67,6 @@ def what_is_visible(image: UInt8) -> str:
     if seen or dots:
         return seen or dots
     return f"nothing that looks like a target ({_exposure(gray)})"
-
-
-def explain_missing(image: UInt8, target: Target, detection: TargetDetection | None = None) -> str:
-    """Return why a target was not found: what was asked for, what is there, what to do.
-
-    Raises:
-        InputError: the image is not 8 bit.
-    """
-    text = f"The board file asks for {describe(target)}; the picture shows {what_is_visible(image)}"
-    if detection is not None and detection.rejected:
-        told = "; ".join(detection.rejected[:3])
-        more = len(detection.rejected) - 3
-        text += f". Not used: {told}" + (f" and {more} more" if more > 0 else "")
-    return f"{text}. Correct the board file, or take a picture of the right board."
-
-
-def describe(target: Target) -> str:
-    """Return a target in words."""
-    if isinstance(target, TagBoard):
-        ids = target.ids
-        return (
-            f"{target.rows * target.columns} tags of {FAMILY_DICTIONARY[target.family]}, ids "
-            f"{ids.min()} to {ids.max()}"
-        )
-    if isinstance(target, CharucoBoard):
-        old = " in the old pattern" if target.legacy else ""
-        return (
-            f"a ChArUco board of {target.columns}x{target.rows} squares with markers of "
-            f"{target.dictionary}{old}"
-        )
-    if isinstance(target, Chessboard):
-        return f"a chessboard with {target.columns}x{target.rows} inner corners"
-    assert isinstance(target, CircleGrid)
-    shape = "an asymmetric" if target.asymmetric else "a"
-    large = " with a large first dot" if target.large_origin else ""
-    return f"{shape} grid of {target.columns}x{target.rows} dots{large}"
 
 
 def _halved(gray: UInt8) -> UInt8:

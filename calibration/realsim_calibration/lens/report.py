@@ -102,16 +102,6 @@ class IntrinsicsReport:
         """
         return projection_sd(self.intrinsics, self.open_covariance, uv)
 
-    def projection_sd_grid(self, columns: int = 40, rows: int = 30) -> tuple[Array, Array]:
-        """Return pixels (rows, columns, 2) from border to border and their 1-sigma (rows, columns).
-
-        For a picture of the lens' uncertainty [px].
-        """
-        u = np.linspace(0, self.intrinsics.width - 1, columns)
-        v = np.linspace(0, self.intrinsics.height - 1, rows)
-        uv = np.stack(np.meshgrid(u, v), -1)
-        return uv, self.projection_sd_px(uv.reshape(-1, 2)).reshape(rows, columns)
-
     def table(self) -> tuple[tuple[str, float, float], ...]:
         """Return (term, value, 1-sigma) of the twelve terms."""
         i = self.intrinsics

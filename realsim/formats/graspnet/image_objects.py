@@ -14,8 +14,8 @@ from realsim.formats.graspnet.meta import META, Meta, read_meta
 from realsim.geometry import se3
 
 SAME_POSITION_M = 1.01e-4
-"""Greatest difference along one axis: half of the fourth decimal for each of the two files, and single
-precision."""
+"""Greatest difference along one axis: half of the fourth decimal for each of the two files, and
+single precision."""
 SAME_ROTATION_RAD = 4e-4
 """Half of the fourth decimal on four components is 2e-4 rad at most, for each of the two files."""
 

@@ -35,8 +35,8 @@ class GridConfig:
     border_share: float = 0.0005
     """Share of the points at either end of an axis that do not widen the grid: stray ones."""
     percentile: float = 85.0
-    """Percentile of a cell's heights that counts: walls put lower points into it, flying pixels higher
-    ones."""
+    """Percentile of a cell's heights that counts: walls put lower points into it, flying pixels
+    higher ones."""
     jump_m: float = 0.010
     """If the top point of a cell is so much above the next one it is left out as flying [m]."""
     layer_m: float = 0.004

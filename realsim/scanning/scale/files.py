@@ -1,7 +1,6 @@
 """A scale fit as one JSON file: everything that was found, from what, with which settings."""
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -14,7 +13,6 @@ from realsim.geometry import se3
 from realsim.scanning.scale.measured import Measurement
 from realsim.scanning.scale.measured_check import MeasuredCheck
 from realsim.scanning.scale.result import ScaleFit, Similarity
-from realsim.store import atomic
 from realsim.untrusted.own_json import from_json, read_object, to_json
 from realsim.untrusted.values import need
 
@@ -167,20 +165,6 @@ def record_from_json(data: Any, what: str = "scale.json") -> ScaleRecord:
         poses=tuple(d.get("poses", ())),
         versions=dict(d.get("versions", {})),
     )
-
-
-def record_bytes(record: ScaleRecord) -> bytes:
-    """Return the bytes of scale.json: lists of numbers on one line each."""
-    return json_lines(record_to_json(record)).encode("utf-8")
-
-
-def save_record(
-    path: Path | str, record: ScaleRecord, write: Callable[[Path, bytes], None] | None = None
-) -> None:
-    """Write scale.json whole or not at all."""
-    path = Path(path)
-    with atomic.storing(path.parent, path.name):
-        (write or atomic.write_bytes)(path, record_bytes(record))
 
 
 def load_record(path: Path | str) -> ScaleRecord:

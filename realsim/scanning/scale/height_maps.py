@@ -38,8 +38,8 @@ class HeightMapConfig:
     cells: int = 2500
     """Cells that the box of the footprint is divided into at most."""
     percentile: float = 85.0
-    """Percentile of a cell's heights that counts: walls put lower points into it, flying pixels higher
-    ones."""
+    """Percentile of a cell's heights that counts: walls put lower points into it, flying pixels
+    higher ones."""
     top_cells: int = 3
     """The height of the object is that of so many highest cells at least: one may be a fault."""
     least_island: float = 0.1

@@ -1,4 +1,4 @@
-"""Where synthetic cameras stand: spread over a hemisphere, or near cameras that are known."""
+"""Where synthetic cameras stand: spread over a hemisphere."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -61,31 +61,3 @@ def hemisphere_cameras(
     aims = middle + AIM_SHARE * distance[:, None] * rng.uniform(-0.5, 0.5, (count, 3))
     eyes = middle + distance[:, None] * away
     return np.stack([se3.look_at(e, a) for e, a in zip(eyes, aims, strict=True)])
-
-
-def cameras_near(
-    Ts_world_cam: ArrayLike,
-    rng: np.random.Generator,
-    count: int,
-    *,
-    sigma_m: float = 0.05,
-    sigma_deg: float = 5.0,
-) -> Array:
-    """Return new cameras (N, 4, 4), each a known one moved and turned a little.
-
-    Args:
-        Ts_world_cam: (V, 4, 4) the known cameras [m].
-        rng: source of all chance.
-        count: how many; the known ones are taken in turn.
-        sigma_m: 1-sigma of the move along each axis [m].
-        sigma_deg: 1-sigma of the turn about each axis [deg].
-
-    Raises:
-        InputError: no known cameras, or no new ones are wanted.
-    """
-    known = np.asarray(Ts_world_cam, dtype=np.float64).reshape(-1, 4, 4)
-    if len(known) == 0 or count < 1:
-        raise InputError(f"{count} cameras near {len(known)} known ones: 1 or more of each.")
-    turns = np.radians(sigma_deg) * rng.standard_normal((count, 3))
-    moves = sigma_m * rng.standard_normal((count, 3))
-    return known[np.arange(count) % len(known)] @ se3.exp(np.concatenate([turns, moves], -1))

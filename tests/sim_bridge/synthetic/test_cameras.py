@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from realsim import InputError
-from realsim.geometry import se3
-from realsim_sim_bridge.synthetic.cameras import cameras_near, hemisphere_cameras
+from realsim_sim_bridge.synthetic.cameras import hemisphere_cameras
 
 CENTER = np.array([0.4, -0.2, 0.1])
 
@@ -61,14 +60,3 @@ def test_what_cannot_be_is_refused():
     ):  # fmt: skip
         with pytest.raises(InputError, match="accepted"):
             hemisphere_cameras(CENTER, radius, count, np.random.default_rng(0), elevation)
-    with pytest.raises(InputError, match="known"):
-        cameras_near(np.zeros((0, 4, 4)), np.random.default_rng(0), 3)
-
-
-def test_near_cameras_stay_near_their_own():
-    known = spread(4)
-    near = cameras_near(known, np.random.default_rng(1), 400, sigma_m=0.02, sigma_deg=3.0)
-    move = se3.invert(known[np.arange(400) % 4]) @ near
-    assert np.std(move[:, :3, 3]) == pytest.approx(0.02, rel=0.1)
-    angle = np.degrees(se3.angle(move))
-    assert np.sqrt(np.mean(angle**2)) == pytest.approx(3.0 * np.sqrt(3), rel=0.1)
