@@ -29,7 +29,7 @@ from formats_mutations_scenes import Sample
 from realsim.errors import RealsimError
 
 HEADROOM_BYTES = 1 << 30
-CPU_S, WALL_S = 5, 20
+CPU_S, WALL_S = 5, 60
 BATCH = 25
 """Mutations that a worker gets at once."""
 NAN_ALLOWED = frozenset(

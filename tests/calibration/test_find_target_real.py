@@ -99,4 +99,4 @@ def test_a_wrong_board_file_is_answered_with_what_is_there():
     d = find_target(pictures[0], wrong)
     assert len(d) == 0
     message = what_is_visible(pictures[0])
-    assert "DICT_APRILTAG_36h11" in message
+    assert "17 markers of DICT_6X6_50" in message
