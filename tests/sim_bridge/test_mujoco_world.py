@@ -104,8 +104,8 @@ def test_states_carry_over_into_another_world():
         a, b, c = (w.play(loads, 20, 0.05) for w in (hands, other, third))
         assert same(b, c)
         assert np.allclose(a.Ts_world_body, b.Ts_world_body, rtol=0, atol=1e-4)
-        # What the solver starts from is not part of the state: 22 mN of 68 N.
-        assert np.allclose(a.finger_n, b.finger_n, rtol=0, atol=3e-2)
+        # What the solver starts from is not part of the state: 22 to 94 mN of 68 N, by processor.
+        assert np.allclose(a.finger_n, b.finger_n, rtol=3e-3, atol=0)
 
 
 def test_a_free_object_moves_as_its_twist_and_its_wrench_say():
