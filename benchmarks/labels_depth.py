@@ -19,6 +19,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from figures import DATA, Found
+from labels_losses import (
+    FittedLosses,
+    KnownView,
+    LossFitConfig,
+    fit_losses,
+)
 from registration_real import ycbv_frame
 
 from realsim.arrays import Array32, Mask
@@ -27,12 +33,6 @@ from realsim.geometry.camera import ray_table
 from realsim.images import read_image
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.depth_sensors.fit import FittedDepthModel, fit_depth_model
-from realsim.rendering.depth_sensors.loss_fit import (
-    FittedLosses,
-    KnownView,
-    LossFitConfig,
-    fit_losses,
-)
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.plane import PlaneView, find_plane
 from realsim.rendering.depth_sensors.profiles import DepthProfile, profile

@@ -106,3 +106,23 @@ def test_folders_that_hold_nothing_to_fit_are_named(walls: Path, tmp_path: Path)
     assert "is a folder" in refusal(walls, "--out", tmp_path)
     (tmp_path / "a.png").write_bytes(png_bytes(depth_counts(wall(0.3, 0.1), UNIT)))
     assert "--camera FILE" in refusal(tmp_path)
+    np.save(tmp_path / "a.npy", wall(0.3, 0.1))
+    assert "uint16" in refusal(tmp_path, "--quiet")
+    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY")
+    assert "cannot be read as an array" in refusal(tmp_path, "--quiet")
+
+
+def test_counts_in_arrays_are_taken_with_the_kinds_own_focal_length(tmp_path: Path) -> None:
+    v, u = np.mgrid[:480, :640]
+    exact = (0.4 / (1 + 0.1 * (u - 319.5) / 386.3 + 0.2 * (v - 239.5) / 386.3)).astype(np.float32)
+    camera = CameraIntrinsics(width=640, height=480, fx=386.3, fy=386.3, cx=319.5, cy=239.5)
+    model = DepthSensorModel.from_profile("d405", disparity_noise_px=0.06)
+    seen = model.measure(exact, camera, np.random.default_rng(0))
+    np.save(tmp_path / "depth.npy", depth_counts(seen, UNIT))
+    (tmp_path / "color.png").write_bytes(png_bytes(np.zeros((480, 640, 3), np.uint8)))
+    result = fit(tmp_path, "--out", tmp_path / "sensor.json", "--quiet")
+    assert result.exit_code == 0 and "386.3 px, is taken" in result.output, result.output
+    found = DepthSensorModel.load(tmp_path / "sensor.json")
+    assert found.disparity_noise_px == pytest.approx(0.06, rel=0.1)
+    assert found.whole_pixel_gain == pytest.approx(model.whole_pixel_gain, abs=0.1)
+    assert found.border_margin_px == pytest.approx(model.border_margin_px, abs=0.5)

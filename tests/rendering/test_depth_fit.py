@@ -10,6 +10,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
+from realsim.rendering.depth_sensors.edges import edges_of
 from realsim.rendering.depth_sensors.fit import FittedDepthModel, fit_depth_model
 from realsim.rendering.depth_sensors.fit_pictures import fit_picture
 from realsim.rendering.depth_sensors.model import DepthSensorModel
@@ -18,8 +19,9 @@ from realsim.rendering.depth_sensors.statistics import disparity_step, hole_shar
 
 CAMERA = CameraIntrinsics(width=400, height=300, fx=380, fy=380, cx=199.5, cy=149.5)
 SOFT = DepthSensorModel.from_profile(
-    "d405", disparity_noise_px=0.05, correlation_px=1.2, blobs_per_megapixel=80, blob_radius_px=4.0
-)
+    "d405", disparity_noise_px=0.05, correlation_px=1.2, correlation_aspect=1.0,
+    blobs_per_megapixel=80, blob_radius_px=4.0,
+)  # fmt: skip
 
 
 def wall(z: float, tilt_u: float = 0.3, tilt_v: float = 0.2) -> np.ndarray:
@@ -59,6 +61,23 @@ def test_holes_without_cause_are_counted() -> None:
         assert abs(estimate.value - getattr(SOFT, name)) <= 3 * estimate.uncertainty
 
 
+def test_what_things_before_a_wall_show_is_recovered() -> None:
+    model = DepthSensorModel.from_profile("d405", edge_dropout=0.6, border_margin_px=4.0)
+    frames = []
+    for k, exact in enumerate(WALLS):
+        scene = exact.copy()
+        for u in range(50, 400, 60):
+            scene[40:260, u : u + 14] *= 0.8
+        frames.append(model.measure(scene, CAMERA, np.random.default_rng(k)))
+    found = edges_of(frames, CAMERA, replace(model, edge_dropout=0.3, border_margin_px=0.0))
+    for name in ("edge_dropout", "border_margin_px"):
+        off = abs(found[name].value - getattr(model, name))
+        # Notches that edges tear make more edges: a sixth of the loss is not seen as such.
+        assert found[name].determined and off <= 0.2 * getattr(model, name), name
+    bare = edges_of([SOFT.measure(WALLS[0], CAMERA, np.random.default_rng(0))], CAMERA, SOFT)
+    assert not bare["edge_dropout"].determined and "depth edges" in bare["edge_dropout"].note
+
+
 @pytest.mark.slow
 def test_stripes_and_slow_noise_are_found() -> None:
     model = DepthSensorModel.from_profile(
@@ -73,7 +92,9 @@ def test_stripes_and_slow_noise_are_found() -> None:
 
 
 def test_noise_of_depth_grows_with_the_square_of_depth_over_focal_length_and_baseline() -> None:
-    model = DepthSensorModel.from_profile("d405", depth_unit_m=0.0, quantum_px=0.0)
+    model = DepthSensorModel.from_profile(
+        "d405", depth_unit_m=0.0, quantum_px=0.0, whole_pixel_gain=0.0
+    )
     sigma = []
     for z in (0.25, 0.5):
         plane = find_plane(
@@ -97,8 +118,9 @@ def test_bias_is_found_only_against_the_truth() -> None:
 @pytest.mark.slow
 def test_loss_by_obliquity_is_found_from_oblique_planes() -> None:
     model = DepthSensorModel.from_profile(
-        "d405", grazing_from_deg=60.0, grazing_to_deg=80.0, blobs_per_megapixel=0.0, max_z_m=10.0
-    )
+        "d405", grazing_from_deg=60.0, grazing_to_deg=80.0, blobs_per_megapixel=0.0, max_z_m=10.0,
+        correlation_px=2.0,
+    )  # fmt: skip
     tilts = (1.4, 2.0, 2.6, 3.2)
     frames = [
         model.measure(np.clip(wall(0.5, 0.0, t), 0.05, 9), CAMERA, np.random.default_rng(k))

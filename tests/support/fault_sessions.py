@@ -1,4 +1,4 @@
-"""The benchmark's sessions with faults, for tests: `faults.FAULTS`, `faults.draw_session`."""
+"""Benchmarks that are tested: `faults.FAULTS`, `faults.draw_session`, `losses.fit_losses`."""
 
 import importlib.util
 import sys
@@ -7,14 +7,12 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 
 
-def load_benchmark():
-    spec = importlib.util.spec_from_file_location(
-        "calibration_faults", ROOT / "benchmarks" / "calibration_faults.py"
-    )
+def load_benchmark(name):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
 
 
-faults = load_benchmark()
+faults, losses = load_benchmark("calibration_faults"), load_benchmark("labels_losses")

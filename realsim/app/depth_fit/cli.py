@@ -33,7 +33,12 @@ here."""
               help="The JSON; a picture is written beside it.  "
                    "[depth_sensor.json, stereo_sensor.json]")  # fmt: skip
 @click.option("--views", default="", help="Only these views, such as 1-8.  [all, at most 12]")
-@click.option("--camera", type=FOLDER, default=None, help="File with the intrinsics, for a FOLDER.")
+@click.option(
+    "--camera",
+    type=FOLDER,
+    default=None,
+    help="File with the intrinsics, for a FOLDER.  [beside it, or the kind's]",
+)
 @click.option("--unit", "unit_m", type=float, default=None,
               help="Metres per count of a FOLDER's depth images.  [the profile's]")  # fmt: skip
 @click.option("--baseline", "baseline_m", type=float, default=None,
@@ -44,7 +49,7 @@ def depth_fit(source: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     """Fit the depth camera's noise and holes to frames of a wall or a bare table.
 
     \b
-    SOURCE  a session with depth, or a folder of 16-bit depth PNGs of a plane
+    SOURCE  a session with depth, or a folder of 16-bit depth images (PNG, NPY)
 
     Three to twelve frames from different distances and angles say the most; the plane should fill
     most of each. What the frames do not determine is said and kept from the profile. The file can

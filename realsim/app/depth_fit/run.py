@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
@@ -11,8 +11,12 @@ from realsim.app.outputs import require_free_file
 from realsim.arrays import Array32
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
-from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
+from realsim.rendering.depth_sensors.profiles import NOMINAL_FOCAL_PX, DepthProfile, profile
 from realsim.store.opening import require_header
+
+if TYPE_CHECKING:
+    from realsim.rendering.depth_sensors.fit import FittedDepthModel
+    from realsim.rendering.stereo.fit import FittedStereo
 
 Item = TypeVar("Item")
 CAMERA_NAMES = ("camera.json", "intrinsics.json", "cam_K.txt", "camera.yaml", "intrinsics.yaml")
@@ -34,6 +38,8 @@ class DepthFrames:
     intrinsics: CameraIntrinsics
     unit_m: float
     """Metres per count of their files."""
+    is_nominal: bool = False
+    """Whether the camera is that of its kind, not the frames' own."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -55,6 +61,9 @@ def run_depth_fit(source: Path, request: DepthFitRequest, console: Any) -> None:
     Raises:
         InputError: the frames, the camera or an option cannot be used.
     """
+    from realsim.rendering.depth_sensors.fit import fit_depth_model
+    from realsim.rendering.depth_sensors.fit_pictures import fit_picture, stereo_fit_picture
+    from realsim.rendering.stereo.fit import FittedStereo, fit_stereo
     from realsim.store.atomic import write_bytes, write_json
 
     simulator = request.simulator
@@ -69,9 +78,25 @@ def run_depth_fit(source: Path, request: DepthFitRequest, console: Any) -> None:
             f"--unit {unit_m:g} m a count is refused; 1e-7 to 0.02 is accepted (0.001 where the "
             "counts are millimetres)."
         )
-    frames = read_frames(source, request.views, request.camera, unit_m)
-    fitted = _fitted_stereo if simulator == "stereo" else _fitted_disparity
-    document, picture = fitted(frames, kind, console)
+    frames = read_frames(source, request.views, request.camera, unit_m, kind.name)
+    if frames.is_nominal:
+        console.say(
+            f"no camera is given: the nominal focal length of a {kind.name}, "
+            f"{frames.intrinsics.fx:g} px, is taken; noise and step in pixels are as far off as it."
+        )
+    with console.stage(f"fitting {len(frames.names)} frames") as tick:
+        fit = (fit_stereo if simulator == "stereo" else fit_depth_model)(
+            frames.depths_m, frames.intrinsics, kind, unit_m=frames.unit_m, names=frames.names,
+            tick=tick,
+        )  # fmt: skip
+        picture = stereo_fit_picture(fit) if isinstance(fit, FittedStereo) else fit_picture(fit)
+    if isinstance(fit, FittedStereo):
+        _show_stereo(fit, kind, console)
+    else:
+        _show_disparity(fit, console)
+    for note in fit.notes:
+        console.say(note)
+    document = fit.document()
     write_json(out, document)
     write_bytes(out.with_suffix(".png"), picture)
     console.say(f"sensor    {out}")
@@ -79,19 +104,8 @@ def run_depth_fit(source: Path, request: DepthFitRequest, console: Any) -> None:
     console.result(document | {"file": out, "picture": out.with_suffix(".png")})
 
 
-def _fitted_disparity(
-    frames: DepthFrames, kind: DepthProfile, console: Any
-) -> tuple[dict[str, Any], bytes]:
-    """Fit the disparity-space model; return its JSON and its picture."""
-    from realsim.rendering.depth_sensors.fit import fit_depth_model
-    from realsim.rendering.depth_sensors.fit_pictures import fit_picture
-
-    with console.stage(f"fitting {len(frames.names)} frames") as tick:
-        fit = fit_depth_model(
-            frames.depths_m, frames.intrinsics, kind, unit_m=frames.unit_m, names=frames.names,
-            tick=tick,
-        )  # fmt: skip
-        picture = fit_picture(fit)
+def _show_disparity(fit: "FittedDepthModel", console: Any) -> None:
+    """Say what the fit of the disparity-space model found."""
     rows = [
         (name, f"{e.value:.4g}", f"{e.uncertainty:.2g}")
         if e.determined
@@ -99,24 +113,12 @@ def _fitted_disparity(
         for name, e in fit.estimates.items()
     ]
     console.table("the sensor", ("parameter", "value", "uncertainty"), rows)
-    for note in fit.notes:
-        console.say(note)
-    return fit.document(), picture
 
 
-def _fitted_stereo(
-    frames: DepthFrames, kind: DepthProfile, console: Any
-) -> tuple[dict[str, Any], bytes]:
-    """Fit the stereo simulator; return its JSON and its picture."""
-    from realsim.rendering.depth_sensors.fit_pictures import stereo_fit_picture
-    from realsim.rendering.stereo.fit import SEARCHED, fit_stereo
+def _show_stereo(fit: "FittedStereo", kind: DepthProfile, console: Any) -> None:
+    """Say what the fit of the stereo simulator found."""
+    from realsim.rendering.stereo.fit import SEARCHED
 
-    with console.stage(f"fitting {len(frames.names)} frames") as tick:
-        fit = fit_stereo(
-            frames.depths_m, frames.intrinsics, kind, unit_m=frames.unit_m, names=frames.names,
-            tick=tick,
-        )  # fmt: skip
-        picture = stereo_fit_picture(fit)
     rows = [(name, f"{getattr(fit.config, name):.4g}") for name in SEARCHED[kind.second_eye]]
     console.table("the simulator", ("setting", "value"), rows)
     rows = [
@@ -126,13 +128,12 @@ def _fitted_stereo(
     ]  # fmt: skip
     head = ("frame", "distance [m]", "noise [px]", "simulated", "holes [%]", "simulated")
     console.table("the frames and their twins", head, rows)
-    for note in fit.notes:
-        console.say(note)
-    return fit.document(), picture
 
 
-def read_frames(source: Path, views: str, camera: Path | None, unit_m: float) -> DepthFrames:
-    """Return the depth images of a session or of a folder.
+def read_frames(
+    source: Path, views: str, camera: Path | None, unit_m: float, kind: str
+) -> DepthFrames:
+    """Return the depth images of a session or of a folder, by a kind of camera.
 
     Raises:
         InputError: there are none, or the camera is not known.
@@ -143,9 +144,9 @@ def read_frames(source: Path, views: str, camera: Path | None, unit_m: float) ->
     if not source.is_dir():
         raise InputError(
             f"'{source}' is no folder; a session (it holds session.json) or a folder of 16-bit "
-            "depth PNGs is taken."
+            "depth images (PNG or NPY) is taken."
         )
-    return _of_folder(source, views, camera, unit_m)
+    return _of_folder(source, views, camera, unit_m, kind)
 
 
 def _of_session(source: Path, views: str) -> DepthFrames:
@@ -170,44 +171,72 @@ def _of_session(source: Path, views: str) -> DepthFrames:
         )
 
 
-def _of_folder(source: Path, views: str, camera: Path | None, unit_m: float) -> DepthFrames:
+def _of_folder(
+    source: Path, views: str, camera: Path | None, unit_m: float, kind: str
+) -> DepthFrames:
     from realsim.app.importing.folder import camera_of_file
     from realsim.app.option_values import numbers_of
-    from realsim.images import image_size, read_depth
 
     place = source / "depth" if (source / "depth").is_dir() else source
-    paths = sorted(place.glob("*.png"))
+    # Arrays are depth; beside them PNGs are the colour.
+    paths = sorted(place.glob("*.npy")) or sorted(place.glob("*.png"))
     if not paths:
-        raise InputError(f"{place} holds no PNG; 16-bit depth images of a plane are looked for.")
+        raise InputError(
+            f"{place} holds no PNG and no NPY; 16-bit depth images of a plane are looked for."
+        )
     wanted = numbers_of(views)
     if wanted:
         paths = [p for k, p in enumerate(paths) if k in wanted]
         if not paths:
             raise InputError(f"--views {views} names none of the images of {place} (from 0 on).")
     paths = _spread(paths, bool(wanted))
-    if camera is None:
-        beside = [f / n for f in (source, place) for n in CAMERA_NAMES if (f / n).is_file()]
-        if not beside:
+    depths = tuple(_depth_of(p, unit_m) for p in paths)
+    height, width = depths[0].shape
+    beside = [f / n for f in (source, place) for n in CAMERA_NAMES if (f / n).is_file()]
+    camera = camera or next(iter(beside), None)
+    nominal = NOMINAL_FOCAL_PX.get(kind, {}).get((width, height))
+    if camera is not None:
+        intrinsics = camera_of_file(camera, (width, height))
+    elif nominal is not None:
+        intrinsics = CameraIntrinsics(
+            width=width, height=height, fx=nominal, fy=nominal,
+            cx=(width - 1) / 2, cy=(height - 1) / 2,
+        )  # fmt: skip
+    else:
+        raise InputError(
+            f"the camera of {source} is not known: give --camera FILE, or put a camera.json "
+            "beside the images."
+        )
+    for path, depth in zip(paths, depths, strict=True):
+        if depth.shape != (intrinsics.height, intrinsics.width):
             raise InputError(
-                f"the camera of {source} is not known: give --camera FILE, or put a camera.json "
-                "beside the images."
-            )
-        camera = beside[0]
-    intrinsics = camera_of_file(camera, image_size(paths[0]))
-    for path in paths:
-        width, height = image_size(path)
-        if (width, height) != (intrinsics.width, intrinsics.height):
-            raise InputError(
-                f"{path.name} is {width}x{height}, and the camera of {camera.name} is "
+                f"{path.name} is {depth.shape[1]}x{depth.shape[0]}, and the camera "
+                f"of {camera.name if camera else paths[0].name} is "
                 f"{intrinsics.width}x{intrinsics.height}: the intrinsics of another resolution or "
                 "stream do not fit. Give those of the depth images."
             )
     return DepthFrames(
-        depths_m=tuple(read_depth(p, unit_m) for p in paths),
-        names=tuple(p.name for p in paths),
-        intrinsics=intrinsics,
-        unit_m=unit_m,
-    )
+        depths_m=depths, names=tuple(p.name for p in paths), intrinsics=intrinsics, unit_m=unit_m,
+        is_nominal=camera is None,
+    )  # fmt: skip
+
+
+def _depth_of(path: Path, unit_m: float) -> Array32:
+    """Return a depth image of counts, PNG or NPY [m]."""
+    from realsim.images import read_depth
+
+    if path.suffix != ".npy":
+        return read_depth(path, unit_m)
+    try:
+        counts = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"{path} cannot be read as an array ({error}). Copy it again.") from error
+    if counts.ndim != 2 or counts.dtype != np.uint16:
+        raise InputError(
+            f"{path} has the shape {counts.shape} and the type {counts.dtype}; depth counts of "
+            "(rows, columns) and the type uint16 are taken."
+        )
+    return (counts * np.float64(unit_m)).astype(np.float32)
 
 
 def _spread(items: Sequence[Item], chosen: bool) -> list[Item]:

@@ -201,7 +201,7 @@ def _fitted(
     return _scaled(one_fit, total), False
 
 
-LEAST_MISFIT = 5e-5
+LEAST_MISFIT = 1e-4
 """Mean squared misfit of the autocorrelation that needs an explanation."""
 
 

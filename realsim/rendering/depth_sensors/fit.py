@@ -24,10 +24,12 @@ from realsim.rendering.depth_sensors.autocovariance import (
     steady_sums,
     without_trend,
 )
+from realsim.rendering.depth_sensors.edges import edges_of
 from realsim.rendering.depth_sensors.fit_resimulated import (
     resampling_pitch,
     scaled,
-    typical_ratio,
+    typical_noise,
+    whole_pixel_gain,
 )
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.plane import PlaneConfig, PlaneView, find_plane
@@ -221,7 +223,11 @@ def _of_planes(
     holes = count_holes(planes)
     found |= blobs_of(planes) | grazing_of(holes)
     found |= bands | {"warp_px": warp_of(planes)}
+    found["whole_pixel_gain"] = whole_pixel_gain(
+        planes, intrinsics, kind.baseline_m, found["quantum_px"].value, rounding
+    )
     found["bias_px"] = _bias(planes, truths, fB)
+    found |= edges_of(depths, intrinsics, DepthSensorModel.from_profile(kind))
     model, more = _as_simulated(depths, planes, intrinsics, kind, unit, found, config.seed)
     notes += more
     notes += [f"{name}: {e.note}" for name, e in found.items() if e.note]
@@ -246,10 +252,11 @@ def _as_simulated(
     """
     notes: list[str] = []
     model = _model(kind, unit, found)
-    ratio = typical_ratio(depths, planes, intrinsics, model, seed)
+    ratio, wider = typical_noise(depths, planes, intrinsics, model, seed)
+    found["correlation_px"] = scaled(found["correlation_px"], wider)
+    found |= {n: scaled(found[n], ratio) for n in ("disparity_noise_px", "slow_noise_px")}
+    model = _model(kind, unit, found)
     if abs(np.log(ratio)) > np.log(HEAVY_TAILS):
-        found |= {n: scaled(found[n], ratio) for n in ("disparity_noise_px", "slow_noise_px")}
-        model = _model(kind, unit, found)
         notes.append(
             f"the noise has heavy tails (bumps, or patches that are worse than the rest): half of "
             f"the places have {ratio:.2f} x what the standard deviation says, and the model has "

@@ -14,12 +14,7 @@ REAL, FITTED, QUIET = "#2b6cb0", "#c05621", "#8a94a0"
 
 def fit_picture(fit: FittedDepthModel) -> bytes:
     """Return a PNG: residuals, autocorrelation, noise over distance, holes over obliquity."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure: Any = Figure(figsize=(13, 9), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(2, 2)
+    figure, axes = _figure()
     _residual(figure, axes[0, 0], fit)
     _correlation(axes[0, 1], fit)
     _distance(axes[1, 0], fit)
@@ -29,6 +24,21 @@ def fit_picture(fit: FittedDepthModel) -> bytes:
         f"{fit.profile}: noise {e.value:.3f} ± {e.uncertainty:.3f} px of disparity, "
         f"{len(fit.frames)} frames"
     )
+    return _png(figure)
+
+
+def _figure() -> tuple[Any, Any]:
+    """Return a figure and its four axes (2, 2)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure: Any = Figure(figsize=(13, 9), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(2, 2)
+
+
+def _png(figure: Any) -> bytes:
+    """Return a figure as PNG."""
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=90, metadata={"Software": None})
     return out.getvalue()
@@ -100,17 +110,9 @@ def _holes(axis: Any, fit: FittedDepthModel) -> None:
     axis.legend(frameon=False)
 
 
-REAL, SIMULATED = "#2b6cb0", "#c05621"
-
-
 def stereo_fit_picture(fit: FittedStereo) -> bytes:
     """Return a PNG: residuals of the middle frame and its twin, noise and holes over distance."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure: Any = Figure(figsize=(13, 9), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(2, 2)
+    figure, axes = _figure()
     k = len(fit.twins) // 2
     reach = 3 * max(float(np.nanstd(fit.twins[k].residual)), 1e-3)
     for axis, what, residual in (
@@ -127,9 +129,7 @@ def stereo_fit_picture(fit: FittedStereo) -> bytes:
     _pair(axes[1, 0], z, fit, ("sigma_px", 1.0, 0.05), "noise of disparity [px]")
     _pair(axes[1, 1], z, fit, ("hole_share", 100.0, 1.0), "pixels without depth [%]")
     figure.suptitle(f"stereo simulator of a {fit.profile}; planes compared: {len(fit.frames)}")
-    out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=90, metadata={"Software": None})
-    return out.getvalue()
+    return _png(figure)
 
 
 def _pair(
@@ -146,7 +146,7 @@ def _pair(
     """
     name, scale, least = what
     top = least
-    for side, mark, color in (("measured", "o", REAL), ("simulated", "x", SIMULATED)):
+    for side, mark, color in (("measured", "o", REAL), ("simulated", "x", FITTED)):
         values = [scale * getattr(getattr(f, side), name) for f in fit.frames]
         axis.plot(z, values, mark, color=color, ms=9, mew=2, label=side)
         top = max(top, 1.2 * float(np.nanmax([0.0, *values])))

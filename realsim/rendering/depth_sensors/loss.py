@@ -107,7 +107,7 @@ def material_loss(material: Material) -> float:
 
     Two causes, independent of each other: dark surfaces return too little light, and polished metal
     returns it in one direction. A rough guess, for materials that nobody has measured; a fit to
-    real frames of the object (`loss_fit`) is better.
+    real frames of the object (benchmarks/labels_losses.py) is better.
     """
     from scipy.special import ndtr
 

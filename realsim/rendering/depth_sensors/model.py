@@ -2,7 +2,8 @@
 
 A stereo camera measures d = f B / z in pixels, so everything that goes wrong goes wrong there:
 noise of constant size in d becomes sigma_z = z^2 sigma_d / (f B), surfaces that only one eye sees
-have no match, matches smear over depth edges. The defaults are those of a RealSense D405.
+have no match, matches smear over depth edges. The defaults are what was assumed of a RealSense D405
+before one was measured; `from_profile("d405")` is as measured.
 
 What the steps of `DepthSensorModel.measure` need stands beside this file: which surfaces only one
 eye sees (shadow), what is lost (loss), and noise (noise).
@@ -29,6 +30,7 @@ from realsim.rendering.depth_sensors.noise import (
     native_pixels,
     slow,
     uniform,
+    whole_pixel,
 )
 from realsim.rendering.depth_sensors.profiles import DepthProfile, SensorRecord, profile
 from realsim.rendering.depth_sensors.shadow import half_occluded, require_same_size, shadow_mask
@@ -43,6 +45,15 @@ ASSUMED_BY_PATTERN: dict[str, dict[str, float]] = {
     },
 }  # fmt: skip
 """What differs from the defaults with each pattern: assumptions, to be replaced by a fit."""
+MEASURED: dict[str, dict[str, float]] = {
+    "d405": {
+        "disparity_noise_px": 0.094, "correlation_px": 4.1, "correlation_aspect": 0.74,
+        "whole_pixel_gain": 0.52, "edge_width_px": 2, "edge_dropout": 0.5,
+        "border_margin_px": 6.6, "blobs_per_megapixel": 80.0, "blob_radius_px": 1.1,
+        "min_z_m": 0.05, "most_disparity_px": 126.0,
+    },
+}  # fmt: skip
+"""What `realsim depth-fit` found on frames of a camera of the kind (docs/decisions/0024)."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -108,6 +119,13 @@ class DepthSensorModel(SensorRecord):
     it, and things have shadows on both sides."""
     border: bool = True
     """Whether the band that the second eye's picture does not cover is lost, with occlusion."""
+    border_margin_px: float = 0.0
+    """By how much that band is wider than the disparity [px]: half of the matching window."""
+    most_disparity_px: float = 0.0
+    """Largest disparity that is searched [px]: what is nearer is lost. 0 = no limit."""
+    whole_pixel_gain: float = 0.0
+    """By what share the noise is greater at disparities of whole pixels than on average, and
+    smaller halfway between two: what matchers that fit a parabola to three costs do."""
     signal_range_m: float = 0.0
     """Depth at which half of a white surface seen frontally is lost for want of light [m]; loss
     grows with distance, obliquity and darkness from there (see loss). 0 = never."""
@@ -180,7 +198,7 @@ class DepthSensorModel(SensorRecord):
         values: dict[str, Any] = {
             "baseline_m": p.baseline_m, "min_z_m": p.min_z_m, "max_z_m": p.max_z_m,
             "quantum_px": p.quantum_px, "depth_unit_m": p.depth_unit_m,
-            **ASSUMED_BY_PATTERN[p.pattern],
+            **ASSUMED_BY_PATTERN[p.pattern], **MEASURED.get(p.name, {}),
         }  # fmt: skip
         return cls.from_fields(values | overrides, f"depth profile '{p.name}'")
 
@@ -201,6 +219,7 @@ class DepthSensorModel(SensorRecord):
         return shadow_mask(
             scene, depth_m, intrinsics, T_world_cam,
             baseline_m=self.baseline_m, eye_offset_m=self.eye_offset_m, border=self.border,
+            border_margin_px=self.border_margin_px,
         )  # fmt: skip
 
     def measure(
@@ -252,8 +271,9 @@ class DepthSensorModel(SensorRecord):
         if blocked is None and self.occlusion:
             first = self.eye_offset_m / self.baseline_m
             blocked = half_occluded(
-                exact, second_eye=1 + first, first_eye=first, border=self.border
-            )
+                exact, second_eye=1 + first, first_eye=first, border=self.border,
+                border_margin_px=self.border_margin_px,
+            )  # fmt: skip
         lost = self._material_loss(depth, exact, intrinsics, rng, loss, reflectance)
         if blocked is not None:
             lost = blocked if lost is None else lost | blocked
@@ -327,8 +347,7 @@ class DepthSensorModel(SensorRecord):
         """Return the disparity with pixels between two surfaces, and what (H, W) edges lose."""
         if self.edge_dropout == 0 and self.edge_flying == 0:
             return disparity, np.zeros(disparity.shape, dtype=bool)
-        far, near = _neighbourhood(disparity, valid, self.edge_width_px)
-        edge = valid & (near - far > self.edge_jump_px)
+        edge, far, near = depth_edges(disparity, valid, self.edge_width_px, self.edge_jump_px)
         flying = edge & (fate > 1 - self.edge_flying)
         smeared = np.where(flying, far + mix * (near - far), disparity)
         return smeared, edge & (fate < self.edge_dropout)
@@ -341,11 +360,14 @@ class DepthSensorModel(SensorRecord):
                 disparity.shape, warp_px=self.warp_px, column_band_px=self.column_band_px,
                 row_band_px=self.row_band_px, band_width_px=self.band_width_px, seed=self.specimen,
             )  # fmt: skip
-        disparity = disparity + np.float32(self.disparity_noise_px) * jitter
+        noise = np.float32(self.disparity_noise_px) * jitter
         if self.slow_noise_px > 0:
             field = slow(rng, disparity.shape, self.slow_correlation_px, self.correlation_aspect)
-            disparity = disparity + np.float32(self.slow_noise_px) * field
-        return disparity.astype(np.float32, copy=False)
+            noise = noise + np.float32(self.slow_noise_px) * field
+        if self.whole_pixel_gain > 0:
+            turn = np.float32(2 * np.pi / whole_pixel(self.quantum_px))
+            noise = noise * (1 + np.float32(self.whole_pixel_gain) * np.cos(turn * disparity))
+        return (disparity + noise).astype(np.float32, copy=False)
 
     def _depth_of(self, disparity: Array32, valid: Mask, fB: np.float32) -> Array32:
         """Return depth (H, W) of a measured disparity: rounded, and cut to the range."""
@@ -358,6 +380,8 @@ class DepthSensorModel(SensorRecord):
             q = np.float32(self.quantum_px)
             disparity = np.round(disparity / q) * q
         valid = valid & (disparity > 0)
+        if self.most_disparity_px > 0:
+            valid = valid & (disparity <= self.most_disparity_px)
         z = np.where(valid, fB / np.where(valid, disparity, 1), 0).astype(np.float32)
         if self.depth_unit_m > 0:
             z = np.round(z / np.float32(self.depth_unit_m)) * np.float32(self.depth_unit_m)
@@ -368,7 +392,16 @@ NOT_NEGATIVE = (
     "disparity_noise_px", "correlation_px", "quantum_px", "blobs_per_megapixel", "edge_dropout",
     "edge_flying", "slow_noise_px", "slow_correlation_px", "depth_unit_m", "fattening_px",
     "signal_range_m", "loss_patch_px", "warp_px", "column_band_px", "row_band_px", "specimen",
+    "border_margin_px", "most_disparity_px", "whole_pixel_gain",
 )  # fmt: skip
+
+
+def depth_edges(
+    disparity: Array32, valid: Mask, width_px: int, jump_px: float
+) -> tuple[Mask, Array32, Array32]:
+    """Return which pixels (H, W) lie at depth edges, and the least and greatest disparity there."""
+    far, near = _neighbourhood(disparity, valid, width_px)
+    return valid & (near - far > jump_px), far, near
 
 
 def _neighbourhood(disparity: Array32, valid: Mask, radius_px: int) -> tuple[Array32, Array32]:

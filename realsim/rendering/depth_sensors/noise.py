@@ -82,6 +82,15 @@ def slow(
     return np.asarray(cv2.remap(field, grid_u, grid_v, cv2.INTER_LINEAR), np.float32)
 
 
+def whole_pixel(quantum_px: float) -> float:
+    """Return what a whole pixel of the chip is worth, whose step is a unit fraction of it [px].
+
+    A focal length or baseline that is a little off makes all disparities a little too great or
+    small, the step and the chip's pixel with them.
+    """
+    return round(1 / quantum_px) * quantum_px if 0 < quantum_px <= 1 else 1.0
+
+
 def uniform(normal: Array32) -> Array32:
     """Return numbers uniform in (0, 1) of the same rank as standard normal ones."""
     from scipy.special import ndtr

@@ -41,8 +41,8 @@ def bands_of(planes: Sequence[PlaneView]) -> dict[str, Estimate]:
     The means of a column over the upper and over the lower half of the plane share the stripe, not
     the noise: their covariance over the columns is the stripes' variance.
     """
-    upright = [_halves(_without_bowl(p), 0) for p in planes]
-    lying = [_halves(_without_bowl(p), 1) for p in planes]
+    flat = [_without_bowl(p) for p in planes]
+    upright, lying = ([_halves(r, axis) for r in flat] for axis in (0, 1))
     return {
         "column_band_px": _shared(upright),
         "row_band_px": _shared(lying),

@@ -27,6 +27,7 @@ def shadow_mask(
     baseline_m: float,
     eye_offset_m: float = 0.0,
     border: bool = True,
+    border_margin_px: float = 0.0,
 ) -> Mask:
     """Return where (H, W) a surface is hidden from an eye, or outside the second eye's picture.
 
@@ -42,6 +43,7 @@ def shadow_mask(
         eye_offset_m: where the first eye stands [m]; 0 = the picture is its own.
         border: whether what lies outside the second eye's picture (its axes are parallel and it has
             the same lens) counts, too.
+        border_margin_px: how near to its left border a match is lost [px].
 
     Raises:
         InputError: sizes differ, or the pose is not rigid.
@@ -57,7 +59,7 @@ def shadow_mask(
         hidden |= _hidden_from(scene, points, np.array([x, 0.0, 0.0]), T)
     if border:
         u = np.nonzero(seen)[1] - intrinsics.fx * baseline_m / points[:, 2]
-        hidden |= u < -0.5
+        hidden |= u < border_margin_px - 0.5
     mask = np.zeros(depth.shape, dtype=bool)
     mask[seen] = hidden
     return mask
@@ -100,7 +102,12 @@ def _hidden_from(scene: RayScene, points: Array32, eye: Array, T_world_cam: Arra
 
 
 def half_occluded(
-    disparity: Array32, *, second_eye: float = 1.0, first_eye: float = 0.0, border: bool = True
+    disparity: Array32,
+    *,
+    second_eye: float = 1.0,
+    first_eye: float = 0.0,
+    border: bool = True,
+    border_margin_px: float = 0.0,
 ) -> Mask:
     """Return where (H, W) an eye cannot see what the picture shows, from the picture alone.
 
@@ -114,6 +121,7 @@ def half_occluded(
         second_eye: where the second eye stands [baselines].
         first_eye: where the first eye stands [baselines]; 0 = the picture is its own.
         border: whether what leaves the picture (u < d) counts.
+        border_margin_px: what comes so near to leaving it counts, too [px].
     """
     known = disparity > 0
     lost = np.zeros(disparity.shape, dtype=bool)
@@ -124,7 +132,7 @@ def half_occluded(
             lost |= _overtaken(disparity[:, ::-1] * np.float32(-s), known[:, ::-1])[:, ::-1]
     if border:
         u = np.arange(disparity.shape[1], dtype=np.float32)
-        lost |= u - disparity < -0.5
+        lost |= u - disparity < border_margin_px - 0.5
     return known & lost
 
 
