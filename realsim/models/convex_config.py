@@ -36,9 +36,9 @@ class ConvexConfig:
     max_parts: int = 128
     """Convex parts at most; a mug takes 60. The engines' time grows with them."""
     max_vertices: int = 64
-    """Vertices kept per part: those farthest out in so many evenly spread directions..."""
+    """Vertices kept per part: those farthest out in so many evenly spread directions."""
     most_vertices: int = 256
-    """...and up to so many where the parts would be smaller than the mesh by `vertex_loss`."""
+    """Vertices at most where the parts would be smaller than the mesh by `vertex_loss`."""
     vertex_loss: float = 0.03
     """Share of the volume that leaving vertices out may cost [-]: 0.5 mm of a 6 cm can's radius.
     64 vertices of a capsule lose 8 %."""

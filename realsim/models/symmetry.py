@@ -19,15 +19,18 @@ The group is that of the SHAPE. In BOP the symmetries of a textured model are th
 appearance: `texture_breaks` tells where the two differ, and who cares for appearance drops them.
 """
 
+import hashlib
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.mesh import diameter
 from realsim.models.model_records import Symmetries
 from realsim.models.symmetry_config import SymmetryConfig
 from realsim.models.symmetry_search import (
@@ -46,9 +49,18 @@ from realsim.models.symmetry_search import (
     turn,
 )
 from realsim.models.symmetry_surface import Surface, refinement, surface_of, texture_breaks
-from realsim.records import Mesh
+from realsim.records import Mesh, ObjectModel
+from realsim.store.arrays_on_disk import read_arrays, write_arrays
 
-__all__ = ["SymmetryConfig", "find_symmetries"]
+__all__ = ["SymmetryConfig", "find_symmetries", "with_found_symmetries"]
+
+EXACT_M, EXACT_SHARE = 0.0003, 0.005
+"""A model that declares no symmetry has those of its shape that miss by at most this [m], or by
+this share of its diameter if that is more: 0.65 mm of 13 cm, half of what `SymmetryConfig` allows
+a scan. No depth camera sees less."""
+REMEMBERED = 64
+"""Models whose symmetries are kept in memory."""
+_memory: dict[str, Symmetries] = {}
 
 FIT_ELEMENTS = 12
 """Elements of a group by which its axes are fitted; the others follow."""
@@ -61,6 +73,8 @@ FLIP_WORTH_A_TRY = 0.06
 STANDS_OUT = 0.5
 """An order of an axis that all orders nearly fit is one if it misses by less than this share of
 what they usually miss by: the teeth of a fine gear do, a distorted bottle's turns do not."""
+ALONG = 0.998
+"""Cosine from which on an axis is named x, y or z (3.6 deg)."""
 FEW = 4
 """Orders of a refused axis that are listed one by one."""
 SAME_MOTION = 0.08
@@ -131,6 +145,73 @@ def find_symmetries(mesh: Mesh, config: SymmetryConfig | None = None) -> Symmetr
         texture_breaks=texture_breaks(mesh, surface, chosen.elements(30.0)[1:], config),
         is_mirror_symmetric=passes([mirror]),
     )
+
+
+def with_found_symmetries(model: ObjectModel, folder: Path | None) -> tuple[ObjectModel, str]:
+    """Return a model with the symmetries of its shape, and words on them; "" = it has none.
+
+    What a model declares is left as it is. Where colours differ under a symmetry of the shape the
+    model gets none: a photograph tells these poses apart.
+
+    Args:
+        model: any.
+        folder: where what is found is kept between runs; None = in memory.
+    """
+    if len(model.symmetries) > 1 or model.symmetry_axes or not np.any(model.mesh.extent > 0):
+        return model, ""
+    found = _exact_symmetries(model.mesh, folder)
+    order = len(found.discrete)
+    kinds = [f"looks the same in {order} ways"] if order > 1 else []
+    kinds += ["is a body of revolution"] if found.axes else []
+    near = f"nearly symmetric: {found.near[0]}" if found.near else ""
+    if not kinds:
+        return model, near
+    words = f"it declares no symmetry, but its shape {' and '.join(kinds)} within "
+    words += f"{max(1e3 * found.worst_m, 0.01):.2f} mm: "
+    if found.texture_breaks:
+        words += "not taken for the same, since its colours differ and a photograph can tell"
+    else:
+        words += "poses that differ by them are taken for the same"
+        model = replace(model, symmetries=found.discrete, symmetry_axes=found.axes)
+    return model, f"{words}; {near}" if near else words
+
+
+def _exact_symmetries(mesh: Mesh, folder: Path | None) -> Symmetries:
+    """Return the symmetries of a shape within `EXACT_M`, from memory or `folder` if known."""
+    bound = max(EXACT_SHARE, EXACT_M / diameter(mesh))
+    bound = min(bound, SymmetryConfig().tolerance)
+    config = SymmetryConfig(tolerance=bound, greatest_tolerance=bound)
+    digest = hashlib.blake2b(repr(astuple(config)).encode(), digest_size=16)
+    for part in (mesh.vertices, mesh.faces, mesh.colors, mesh.uv, mesh.texture):
+        digest.update(b"-" if part is None else part.tobytes())
+    key = digest.hexdigest()
+    path = None if folder is None else folder / f"symmetries_{key}.npz"
+    known = _memory.get(key) or (None if path is None else _loaded(path))
+    if known is None:
+        known = find_symmetries(mesh, config)
+        if path is not None:
+            notes = {"worst_m": known.worst_m, "near": known.near, "breaks": known.texture_breaks}
+            axes = np.array(known.axes, dtype=np.float64).reshape(-1, 2, 3)
+            write_arrays(path, {"discrete": known.discrete, "axes": axes}, notes)
+    while len(_memory) >= REMEMBERED:
+        _memory.pop(next(iter(_memory)))
+    _memory[key] = known
+    return known
+
+
+def _loaded(path: Path) -> Symmetries | None:
+    """Return the symmetries of a file, or None if there is none or it is damaged."""
+    if not path.is_file():
+        return None
+    try:
+        arrays, notes = read_arrays(path)
+        axes = tuple((tuple(a), tuple(p)) for a, p in arrays["axes"].tolist())
+        return Symmetries(
+            discrete=arrays["discrete"], axes=axes, worst_m=notes["worst_m"],
+            near=tuple(notes["near"]), texture_breaks=notes["breaks"],
+        )  # fmt: skip
+    except (InputError, KeyError, TypeError, ValueError):
+        return None
 
 
 def _fitted(
@@ -256,9 +337,11 @@ def _near_text(
     d = axis.direction * np.sign(axis.direction[np.argmax(np.abs(axis.direction))])
     rest = [f"1/{k}" for k in orders if k != n]
     others = " and most others" if len(rest) > FEW else "".join(f", {r}" for r in rest)
+    axis_name = f"the axis ({d[0]:.3f}, {d[1]:.3f}, {d[2]:.3f})"
+    if d.max() > ALONG:
+        axis_name = "xyz"[int(np.argmax(d))]
     return fit.share, (
-        f"turn by 1/{n}{others} about the axis ({d[0]:.3f}, {d[1]:.3f}, {d[2]:.3f}): "
-        f"{100 * fit.share:.0f} % of the surface within {100 * config.near_distance:.1f} % of the "
-        f"diameter ({1e3 * config.near_distance * surface.diameter_m:.2g} mm), the worst off by "
-        f"{100 * fit.worst:.1f} % ({1e3 * fit.worst * surface.diameter_m:.2g} mm)"
+        f"a {'half turn' if n == 2 else f'turn by 1/{n}'}{others} about {axis_name} differs by "
+        f"{1e3 * fit.worst * surface.diameter_m:.2g} mm at most; {100 * fit.share:.0f} % of the "
+        f"surface by less than {1e3 * config.near_distance * surface.diameter_m:.2g} mm"
     )

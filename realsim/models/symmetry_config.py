@@ -44,9 +44,10 @@ class SymmetryConfig:
     judging_points: int = 1500
     """Surface points by which a symmetry is judged, by exact distances."""
     near_share: float = 0.7
-    """A refused motion is reported from this share of the surface on that it maps onto it..."""
+    """A refused motion is reported from this share of the surface on that it maps onto it."""
     near_distance: float = 0.015
-    """...within this distance [share of the diameter]: 2 mm of a 13 cm object."""
+    """The motion maps it onto itself within this distance [share of the diameter]: 2 mm of a 13 cm
+    object."""
     near_reported: int = 8
     """Axes of refused motions that are reported: a person reads them."""
     color_difference: float = 12.0

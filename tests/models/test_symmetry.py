@@ -12,8 +12,9 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import diameter, symmetry_transforms, transformed
 from realsim.geometry.parts import object_model, part
+from realsim.models import symmetry
 from realsim.models.reading import read_scan
-from realsim.models.symmetry import SymmetryConfig, find_symmetries
+from realsim.models.symmetry import SymmetryConfig, find_symmetries, with_found_symmetries
 from realsim.models.symmetry_search import closed, group, turn
 from realsim.records import Mesh, ObjectModel
 from realsim.scanning.simulated import distorted
@@ -236,7 +237,7 @@ def test_scanned_objects_have_the_symmetries_that_bop_lists(obj_id):
 def test_a_feature_that_breaks_a_symmetry_is_seen_and_the_near_symmetry_named():
     mug = find_symmetries(part("mug").mesh)
     assert len(mug.discrete) == 1 and mug.axes == () and mug.is_mirror_symmetric
-    assert any("about the axis (" in text and "% of the surface" in text for text in mug.near)
+    assert any("mm at most" in text and "% of the surface" in text for text in mug.near)
     # A can with a bump of 5 mm on one side: no turn is left, and all are nearly one.
     can = part("cylinder_can").mesh
     v = can.vertices.copy()
@@ -278,3 +279,25 @@ def test_a_shape_that_differs_from_its_mirror_image_is_told():
     duck = find_symmetries(object_model("duck").mesh)
     assert not duck.is_mirror_symmetric and len(duck.discrete) == 1
     assert find_symmetries(part("wedge").mesh).is_mirror_symmetric
+
+
+def test_an_undeclared_symmetry_is_taken_where_nothing_tells_it(tmp_path, monkeypatch):
+    bar = hull([*ring(6, -2.0), *ring(6, 2.0)], 0.02)
+    model = ObjectModel(obj_id=1, name="bar", mesh=bar)
+    found, words = with_found_symmetries(model, tmp_path)
+    assert len(found.symmetries) == 12 and found.symmetry_axes == () and "12 ways" in words
+    assert with_found_symmetries(found, tmp_path) == (found, "")
+
+    symmetry._memory.clear()
+    monkeypatch.setattr(symmetry, "find_symmetries", lambda *_: pytest.fail("it was kept"))
+    again, same_words = with_found_symmetries(model, tmp_path)
+    np.testing.assert_array_equal(again.symmetries, found.symmetries)
+    assert same_words == words
+    monkeypatch.undo()
+
+    # One end red: no flip, no symmetry for a photograph.
+    colors = np.where(bar.vertices[:, 2:] > 0, [255, 0, 0], [0, 0, 0]).astype(np.uint8)
+    painted, words = with_found_symmetries(
+        replace(model, mesh=replace(bar, colors=colors)), None
+    )  # fmt: skip
+    assert len(painted.symmetries) == 1 and "photograph" in words
