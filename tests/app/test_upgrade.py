@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,18 +11,38 @@ import pytest
 from click.testing import CliRunner, Result
 
 from realsim.app.upgrade.cli import upgrade_command
-from realsim.app.upgrade.config import UpgradeConfig
-from realsim.app.upgrade.dataset import scenes_of
-from realsim.app.upgrade.instances import told_apart, world_starts
+from realsim.app.upgrade.dataset import UpgradeConfig, scenes_of
+from realsim.app.upgrade.outcome import Outcome, decide
+from realsim.app.upgrade.source import told_apart, world_starts
 from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
 from realsim.geometry.parts import part
+from realsim.records import Mesh, ObjectPose, SupportPlane
+from realsim.registration.body import make_body
+from realsim.registration.judging.verdict import CONTRAST_DECIDED
+from realsim.registration.near_rivals import RivalConfig, print_duel
+from realsim.registration.photo import PhotoConfig, Picture, shifted
+from realsim.rendering.casting.pixel_caster import PixelCaster
+from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore
-from upgradable_datasets import bop_dataset, content_and_times, graspnet_dataset
+from upgradable_datasets import (
+    CAMERA,
+    NAMES,
+    bop_dataset,
+    cameras,
+    content_and_times,
+    graspnet_dataset,
+    grey_of,
+    looks,
+    slab,
+    standing,
+)
 
 OFF_M = 0.003
 """Annotations of the BOP scenes are off by this along the camera's x."""
 GRASPS = ("--grasps", "2")
+PAINTS = np.array([[200, 40, 40], [40, 60, 190], [120, 120, 110]], np.uint8)
+"""Of the box, the wedge and, at -1, what lies behind."""
 
 
 def upgrade(dataset: Path, out: Path, *more: str) -> Result:
@@ -146,3 +167,101 @@ def test_two_things_of_one_model_stay_two_in_every_order() -> None:
     assert notes == []
     starts = world_starts(seen, dict.fromkeys(rows, np.eye(4)))
     np.testing.assert_array_equal(starts[1].T_world_obj, T_b)
+
+
+# --- what becomes of an annotation ------------------------------------------------------------
+
+
+def judged(off_m: float, found_off_m: float, hidden: bool = False) -> list[Outcome]:
+    """Return what becomes of annotations and new poses that are off along the camera's x."""
+    placed, (T,) = standing(0.5), cameras(1)
+    things = [*placed]
+    if hidden:  # a board between the camera and the parts
+        board = se3.from_translation([0.0, -0.2, 0.2]) @ se3.exp([0.8, 0, 0, 0, 0, 0])
+        things.append(PlacedMesh(-1, slab(), board))
+    (labels,) = looks(things, 1)
+    depth_m = labels.depth_m.astype(np.float32)
+    picture = Picture(intrinsics=CAMERA, depth_m=depth_m, T_world_cam=T, rgb=grey_of(labels))
+
+    def at(off: float) -> list[ObjectPose]:
+        step = T @ se3.from_translation([off, 0, 0]) @ se3.invert(T)
+        return [
+            ObjectPose(obj_id=part(n).obj_id, instance=p.instance, verdict="accepted",
+                       T_world_obj=step @ p.T_world_obj)
+            for n, p in zip(NAMES, placed, strict=True)
+        ]  # fmt: skip
+
+    table = SupportPlane(T_world_table=np.eye(4))
+    return decide([picture], {part(n).obj_id: part(n) for n in NAMES}, at(off_m), at(found_off_m),
+                  table)  # fmt: skip
+
+
+@pytest.mark.parametrize("off_m", [-0.02, -0.004, 0.002, 0.008])
+def test_a_right_annotation_stays_whatever_is_proposed(off_m: float) -> None:
+    for outcome in judged(0.0, off_m):
+        assert outcome.kind != "improved" and not outcome.looks_wrong, outcome.words
+
+
+@pytest.mark.parametrize("off_m", [0.004, -0.008])
+def test_a_wrong_annotation_is_replaced_by_the_right_pose(off_m: float) -> None:
+    for outcome, right in zip(judged(off_m, 0.0), standing(0.5), strict=True):
+        assert outcome.kind == "improved", outcome.words
+        off = se3.transform(outcome.T_world_obj, right.mesh.vertices)
+        off -= se3.transform(right.T_world_obj, right.mesh.vertices)
+        assert np.linalg.norm(off, axis=1).max() < 0.001
+
+
+def test_a_hidden_thing_keeps_its_annotation_and_says_how_little_is_seen() -> None:
+    for outcome in judged(0.008, 0.0, hidden=True):
+        assert outcome.kind == "kept" and "in sight" in outcome.words
+
+
+def test_poses_follow_a_photograph_that_lies_beside_its_depth() -> None:
+    placed, (T,) = standing(0.5), cameras(1)
+    (labels,) = looks(placed, 1)
+    off_px = 3
+    picture = Picture(
+        intrinsics=CAMERA, depth_m=labels.depth_m.astype(np.float32), T_world_cam=T,
+        rgb=np.roll(PAINTS[labels.ids], off_px, axis=1),
+    )  # fmt: skip
+    poses = [p.T_world_obj for p in placed]
+    moved = shifted(picture, [p.mesh for p in placed], poses, PhotoConfig())
+    for before, after in zip(poses, moved, strict=True):
+        a, b = (se3.invert(T) @ X for X in (before, after))
+        px = CAMERA.fx * (b[:3, 3] - a[:3, 3]) / a[2, 3]
+        np.testing.assert_allclose(px, [off_px, 0, 0], atol=0.5)
+
+
+# --- by its print -----------------------------------------------------------------------------
+
+
+def test_the_print_tells_which_way_round_a_box_stands() -> None:
+    paints = np.array([[200, 40, 40], [40, 60, 190], [120, 120, 110], [230, 220, 60],
+                       [30, 30, 30], [240, 240, 240]], np.uint8)  # fmt: skip
+    bare = part("box").mesh
+    corners = bare.vertices[bare.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    along = np.argmax(np.abs(normals), axis=1)
+    side = 2 * along + (normals[np.arange(len(along)), along] > 0)
+    mesh = Mesh(
+        vertices=bare.vertices[bare.faces].reshape(-1, 3),
+        faces=np.arange(3 * len(side), dtype=np.int32).reshape(-1, 3),
+        colors=np.repeat(paints[side], 3, axis=0),
+    )
+    T, (T_cam,) = standing(0.5)[0].T_world_obj, cameras(1)
+    hits = PixelCaster([PlacedMesh(0, mesh, T)]).cast(CAMERA, T_cam)
+    rgb = np.where(hits.geometry[..., None] == 0, paints[side[hits.face]], 90).astype(np.uint8)
+    picture = Picture(intrinsics=CAMERA, depth_m=hits.depth_m, T_world_cam=T_cam, rgb=rgb)
+    half = T @ se3.exp([0, 0, np.pi, 0, 0, 0])
+    for paint, expected in ((mesh, True), (bare, False)):
+        model = replace(part("box"), mesh=paint)
+        body = make_body(ObjectPose(obj_id=1, instance=0, T_world_obj=T), model, 32, 100)
+        right = print_duel([body], [T], 0, [half], [picture], RivalConfig())
+        wrong = print_duel([body], [half], 0, [T], [picture], RivalConfig())
+        if not expected:
+            assert right is None and wrong is None
+            continue
+        assert right is not None and wrong is not None
+        assert (right.contrast or 0) > CONTRAST_DECIDED
+        assert (wrong.contrast or 0) < -CONTRAST_DECIDED
+        np.testing.assert_array_equal(wrong.T_rival, T)

@@ -140,6 +140,8 @@ def test_the_same_on_real_photographs(tmp_path: Path) -> None:
     few = ("--scenes", "50", "--views", "2", "--grasps", "5")
     run(UPGRADE, tmp_path, *few, "--quiet", DATASET=str(REAL))
     session = tmp_path / "upgraded/test/000050"
+    registered = (session / "registration/scene.json").read_bytes()
     scene = review(session)
     run(EXPORT, tmp_path, "--quiet", SESSION=str(session), FOLDER="labels")
     carries(tmp_path / "labels", session, scene)
+    assert (session / "registration/scene.json").read_bytes() == registered

@@ -30,14 +30,14 @@ class AgreementConfig:
     """One image against the others, of an object's place and of depth: labels and camera poses of
     public data sets are good to some millimetres, and so is depth averaged over objects [mm]."""
     stray_spreads: float = 5.0
-    """... and this many times what the others differ by (median distance from their median): where
-    all images differ, none stands off."""
+    """It must stand off by this many times what the others differ by, too (median distance from
+    their median): where all images differ, none stands off."""
     stray_iou: float = 0.05
-    """One image against the others, of an IoU: by which it may be less ..."""
+    """One image against the others, of an IoU: by which it may be less."""
     stray_times: float = 3.0
-    """... beside so many times what the others lack."""
+    """It must be less by so many times what the others lack, too."""
     stray_outline_px: float = 0.5
-    """... while the outline, too, is off by so much [px] more than so many times the others': half
+    """The outline, too, must be off by so much [px] more than so many times the others': half
     hidden things are all outline, so that a rounded pose costs a tenth of them."""
     fewest_images: int = 3
     """From which on one image of places or depth can be told to be the one that is off."""

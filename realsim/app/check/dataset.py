@@ -20,8 +20,7 @@ from realsim.app.check.tally import (
     agreement_of,
     stray_depth,
 )
-from realsim.app.upgrade.config import UpgradeConfig
-from realsim.app.upgrade.dataset import SceneRef, open_scene, scenes_of
+from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig, open_scene, scenes_of
 from realsim.arrays import Array32, Mask
 from realsim.errors import InputError, RealsimError
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene

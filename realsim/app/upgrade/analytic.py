@@ -15,8 +15,7 @@ import numpy as np
 from realsim import __version__
 from realsim.app.console import Console
 from realsim.app.stages import content_key, judged_scene, session_models
-from realsim.app.upgrade.config import UpgradeConfig
-from realsim.app.upgrade.dataset import SceneRef
+from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig
 from realsim.errors import InputError
 from realsim.records import GraspSet, ObjectModel
 from realsim.store import SessionStore, atomic

@@ -64,7 +64,7 @@ def upgrade_command(
     Exit codes: 0 done, 1 a scene was left out, 2 bad input.
     """
     from realsim.app.console import Console
-    from realsim.app.upgrade.config import UpgradeConfig
+    from realsim.app.upgrade.dataset import UpgradeConfig
     from realsim.app.upgrade.run import run_upgrade, show_upgrade
 
     config = UpgradeConfig(

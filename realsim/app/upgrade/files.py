@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from realsim import __version__
-from realsim.app.upgrade.config import UpgradeConfig
-from realsim.app.upgrade.dataset import SceneRef
+from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig
 from realsim.errors import InputError
 from realsim.store import SessionStore, atomic
 from realsim.untrusted.own_json import read_object
 
+RECORD = 2
+"""Number of the records' layout: those of another are made again."""
 IMPORTED = "imported"
 NOTE = "stages/upgrade.json"
 IMAGE_FOLDERS = ("mask", "mask_visib", "label", "rect", "meta")
@@ -38,7 +39,7 @@ def key_of(ref: SceneRef, config: UpgradeConfig) -> str:
 
     Contents are compared by every stage itself; this is to know in no time that nothing changed.
     """
-    digest = hashlib.sha256(json.dumps([__version__, config.result_key()]).encode())
+    digest = hashlib.sha256(json.dumps([__version__, RECORD, config.result_key()]).encode())
     files = [p for p in sorted(ref.folder.rglob("*")) if p.is_file()]
     files = [p for p in files if p.relative_to(ref.folder).parts[0] not in IMAGE_FOLDERS]
     if ref.models.is_dir():

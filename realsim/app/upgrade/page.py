@@ -64,13 +64,19 @@ def write_page(
         page.section(
             "Before and after",
             "Magenta and thin, on both sides of the handle: the pose as the data set has it. Right "
-            "of the handle also the refined one, in the colour of its verdict. Whole outlines, as "
+            "of the handle also the pose that is written, in the colour of its verdict: the same "
+            "where the annotation was kept or the new pose rejected. Whole outlines, as "
             f"if nothing stood in front. Worst first.{more}",
         )
         page.sliders(pairs)
     shown = ranked[:ROWS]
     worst = f"The worst {ROWS} of {len(ranked)}; upgrade.csv has all."
-    page.section("Objects", "Worst first." if len(ranked) <= ROWS else worst)
+    page.section(
+        "Objects",
+        f"{'Worst first.' if len(ranked) <= ROWS else worst} An annotation is improved only where "
+        "the new pose is better on depth and on the photograph; where it is not, it is kept, and "
+        "rejected says that the new pose was refused.",
+    )
     page.table(
         HEADER, [row_of(r, o) for r, o in shown],
         colors=[VERDICT_RGB.get(o["verdict"], (150, 150, 150)) for _, o in shown],
@@ -104,9 +110,9 @@ def _pair(out: Path, record: Record, o: Mapping[str, Any]) -> View:
     """Return the two pictures of an object, drawn when the page asks for them."""
     before, after = _pictures(out, str(record["place"]), o)
     return View(
-        f"{record['place']} image {o['shown']['image']}, {o['name']}: {o['verdict']}, "
-        f"moved by {o['moved_mm']:.1f} mm and {o['moved_deg']:.1f} deg"
-        + (f"; {'; '.join(o['reasons'])}" if o["reasons"] else ""),
+        f"{record['place']} image {o['shown']['image']}, {o['name']}: {o['outcome']}; "
+        f"{o['verdict']}, moved by {o['moved_mm']:.1f} mm and {o['moved_deg']:.1f} deg; {o['why']}"
+        + "".join(f"; {r}" for r in o["reasons"] if o["why"] not in r),
         {"as given": before, "refined": after},
     )
 

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from realsim.app.console import Console
 from realsim.app.upgrade.analytic import agreement_of, all_sets
-from realsim.app.upgrade.config import UpgradeConfig
-from realsim.app.upgrade.dataset import SceneRef, scenes_of
+from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig, scenes_of
 from realsim.app.upgrade.files import (
     all_records,
     finished_record,

@@ -2,7 +2,7 @@
 
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,25 +11,38 @@ import numpy as np
 from realsim import __version__, images
 from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console, Tick
-from realsim.app.register.run import register_session
+from realsim.app.register.config import RegisterRequest
+from realsim.app.register.results import Registered
+from realsim.app.register.run import run_register
 from realsim.app.school.run import school_session
 from realsim.app.school.tables import why_no_grasp
 from realsim.app.stages import save_starts
 from realsim.app.upgrade.analytic import AnalyticJob, agreement_of, try_analytic
-from realsim.app.upgrade.config import UpgradeConfig
-from realsim.app.upgrade.dataset import SceneRef, open_scene
+from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig, open_scene
 from realsim.app.upgrade.files import NOTE, keep_imported, key_of
-from realsim.app.upgrade.instances import moved_from_start, world_starts
-from realsim.app.upgrade.source import SceneSource, prepare
+from realsim.app.upgrade.outcome import Outcome, OutcomeConfig, decide
+from realsim.app.upgrade.source import SceneSource, moved_from_start, prepare, world_starts
 from realsim.formats.grasps.scene_grasps import executed
 from realsim.geometry import se3
 from realsim.records import CaptureSession, GraspSet, ObjectPose, Scene, View
+from realsim.registration.compare import spread_frames
+from realsim.registration.evidence import LazyFrame
+from realsim.registration.photo import Picture
+from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.store import SessionStore
 from realsim.store.lock import only_run_in
 from realsim.untrusted.own_json import read_values
 
 Record = dict[str, Any]
 """What came of a scene, as plain JSON values."""
+RIGHT_M = 0.003
+"""A pose's probability of being right, and so its verdict, speaks of this distance [m]."""
+UNDECIDED: Record = {
+    "outcome": "improved", "why": "no annotation in the images that took part", "depth_t": None,
+    "photo_t": None, "agree_annotation": None, "agree_new": None, "edge_px_annotation": None,
+    "edge_px_new": None, "visible": None, "proposed_mm": None,
+}  # fmt: skip
+"""Of an object whose annotation lies in no image that took part."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -110,7 +123,10 @@ def upgrade_scene(job: SceneJob, source: SceneSource, shown: Console | None) -> 
         save_models(store.folder / "models", source.models)
         starts = world_starts(source.seen, source.Ts_world_cam)
         save_starts(store, starts, f"{job.config.start} of {job.ref.place}")
-        scene = register_session(store, console)
+        result = run_register(
+            store, console, RegisterRequest(), lambda found: settled(store, source, found, console)
+        )
+        scene = result.scene
         grasps = school_session(
             store, console, grasps_per_object=job.config.grasps_per_object, seed=job.config.seed,
             workers=job.workers,
@@ -127,6 +143,82 @@ def upgrade_scene(job: SceneJob, source: SceneSource, shown: Console | None) -> 
         record["analytic"] = agreement_of(analytic)
         store.write_json(NOTE, {"key": key, "record": record})
     return record
+
+
+def settled(
+    store: SessionStore, source: SceneSource, result: Registered, console: Console
+) -> Registered:
+    """Return a registration with the annotations in their places that it does not better.
+
+    What became of each is in the report, by instance, under `upgrade`.
+
+    Args:
+        store: the session.
+        source: the scene, its annotations as its images have them.
+        result: what was registered.
+        console: progress.
+    """
+    config, objects = OutcomeConfig(), result.scene.objects
+    cameras = result.cameras.refined
+    # By the cameras as they are now: an annotation is a pose in its image.
+    annotations = world_starts({k: source.seen[k] for k in source.seen if k in cameras}, cameras)
+    if not annotations or not objects:
+        return result
+    middle = np.mean([a.T_world_obj[:3, 3] for a in annotations], axis=0)
+    frames = [LazyFrame(k, T, lambda k=k: store.depth_m(k)) for k, T in sorted(cameras.items())]
+    with console.stage("annotations against new poses", f"{len(annotations)} objects"):
+        pictures = [
+            Picture(
+                intrinsics=store.session.intrinsics, depth_m=f.depth_m, T_world_cam=f.T_world_cam,
+                rgb=store.rgb(f.index),
+            )
+            for f in spread_frames(frames, middle, config.views)
+        ]  # fmt: skip
+        outcomes = decide(pictures, source.models, annotations, objects, result.scene.plane, config)
+    scene = replace(result.scene, objects=_with_outcomes(objects, outcomes))
+    seen: dict[int, dict[int, SeenPose]] = {}
+    for view, rows in result.seen.items():
+        seen[view] = {}
+        for instance, old in rows.items():
+            o = scene.object(instance)
+            known = o.covariance is not None
+            seen[view][instance] = SeenPose(
+                T_cam_obj=se3.invert(cameras[view]) @ o.T_world_obj,
+                covariance=old.covariance if known else np.full((6, 6), np.nan),
+                sigma_px=old.sigma_px if known else float("nan"),
+            )
+    report = dict(result.report) | {"upgrade": {str(o.instance): o.as_json() for o in outcomes}}
+    return replace(result, scene=scene, seen=seen, report=report)
+
+
+def _with_outcomes(
+    scene_objects: Sequence[ObjectPose], outcomes: Sequence[Outcome]
+) -> tuple[ObjectPose, ...]:
+    """Return the registered objects with the annotations that were kept in their places.
+
+    A kept annotation within `RIGHT_M` of the new pose has that one's verdict; another one is
+    unchecked, or doubtful where it looks wrong.
+    """
+    by = {o.instance: o for o in outcomes}
+    out: list[ObjectPose] = []
+    for p in scene_objects:
+        o = by.get(p.instance)
+        if o is None:
+            out.append(p)
+            continue
+        near = o.evidence is not None and o.evidence.moved_m <= RIGHT_M
+        if o.kind == "improved" or (near and not o.looks_wrong and p.verdict != "rejected"):
+            out.append(replace(p, T_world_obj=o.T_world_obj))
+            continue
+        agree = {} if o.evidence is None else {"agree": o.evidence.agree[0]}
+        out.append(
+            replace(
+                p, T_world_obj=o.T_world_obj, covariance=None, checks=agree,
+                verdict="doubtful" if o.looks_wrong else "unchecked",
+                reasons=(f"annotation kept: {o.words}",),
+            )
+        )  # fmt: skip
+    return tuple(out)
 
 
 def _session_of(job: SceneJob, source: SceneSource) -> SessionStore:
@@ -165,6 +257,7 @@ def _record(
 ) -> Record:
     """Return what came of a scene."""
     sets = {s.instance: s for s in grasps}
+    became: Record = store.read_json("registration/report.json").get("upgrade", {})
     objects: list[Record] = []
     for o in scene.objects:
         moved_mm, moved_deg = moved_from_start(o, starts, source.models)
@@ -173,6 +266,7 @@ def _record(
             {
                 "instance": o.instance, "obj_id": o.obj_id, "name": source.models[o.obj_id].name,
                 "verdict": o.verdict, "reasons": list(o.reasons),
+                **UNDECIDED, **became.get(str(o.instance), {}),
                 "agree": _number(o.checks.get("agree")),
                 "probability": _number(o.checks.get("probability")),
                 "moved_mm": round(moved_mm, 3), "moved_deg": round(moved_deg, 3),

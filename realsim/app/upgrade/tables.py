@@ -21,11 +21,17 @@ JSON_FILE, CSV_FILE = "upgrade.json", "upgrade.csv"
 VERDICTS = ("rejected", "doubtful", "unchecked", "accepted")
 """Worst first."""
 COLUMNS = (
-    "scene", "instance", "obj_id", "name", "verdict", "agree", "probability", "moved_mm",
-    "moved_deg", "candidates", "tried", "good", "reasons",
+    "scene", "instance", "obj_id", "name", "outcome", "verdict", "agree", "probability",
+    "moved_mm", "moved_deg", "proposed_mm", "agree_annotation", "agree_new", "depth_t",
+    "edge_px_annotation", "edge_px_new", "photo_t", "visible", "candidates", "tried", "good",
+    "why", "reasons",
 )  # fmt: skip
 PAGE = "upgrade.html"
-HEADER = ["scene, object", "verdict", "agrees", "moved [mm]", "turned [deg]", "good grasps"]
+HEADER = [
+    "scene, object", "annotation", "verdict", "agrees", "moved [mm]", "turned [deg]",
+    "edges before, new [px]", "good grasps",
+]  # fmt: skip
+OUTCOMES = ("rejected", "kept", "improved")
 MOST_ROWS = 60
 """Objects in the console's table, worst first where there are more; upgrade.csv has all."""
 MOST_NOTES = 30
@@ -54,10 +60,14 @@ def row_of(record: Record, o: Mapping[str, Any]) -> list[str]:
     agree, grasps = o["agree"], o["grasps"]
     return [
         f"{record['place']} {o['name']}",
+        str(o["outcome"]),
         str(o["verdict"]),
         "-" if agree is None else f"{agree:.2f}",
         f"{o['moved_mm']:.1f}",
         f"{o['moved_deg']:.1f}",
+        "-"
+        if o["edge_px_new"] is None or o["edge_px_annotation"] is None
+        else f"{o['edge_px_annotation']:.1f}, {o['edge_px_new']:.1f}",
         f"{grasps['good']} of {grasps['tried']}",
     ]
 
@@ -65,6 +75,7 @@ def row_of(record: Record, o: Mapping[str, Any]) -> list[str]:
 def summary_of(records: Sequence[Record]) -> dict[str, Any]:
     """Return the counts and medians over all scenes."""
     objects = [o for _, o in objects_of(records)]
+    became = {k: sum(o["outcome"] == k for o in objects) for k in reversed(OUTCOMES)}
     verdicts = {v: sum(o["verdict"] == v for o in objects) for v in reversed(VERDICTS)}
 
     def middle(values: list[float]) -> float | None:
@@ -74,6 +85,7 @@ def summary_of(records: Sequence[Record]) -> dict[str, Any]:
         "scenes": len(records),
         "objects": len(objects),
         "frames": sum(int(r["frames"]) for r in records),
+        "annotations": {k: n for k, n in became.items() if n},
         "verdicts": {v: n for v, n in verdicts.items() if n},
         "median_moved_mm": middle([o["moved_mm"] for o in objects]),
         "median_moved_deg": middle([o["moved_deg"] for o in objects]),
@@ -86,13 +98,15 @@ def summary_of(records: Sequence[Record]) -> dict[str, Any]:
 def summary_line(summary: Mapping[str, Any]) -> str:
     """Return the summary as a sentence."""
     verdicts = ", ".join(f"{n} {v}" for v, n in summary["verdicts"].items()) or "no verdict"
+    became = ", ".join(f"{n} {k}" for k, n in summary["annotations"].items()) or "none"
     moved = summary["median_moved_mm"]
     far = "" if moved is None else (
         f"; moved by {moved:.1f} mm and {summary['median_moved_deg']:.1f} deg in the median"
     )  # fmt: skip
     return (
         f"{summary['scenes']} scenes, {summary['frames']} frames, {summary['objects']} objects: "
-        f"{verdicts}{far}; {summary['grasps_good']} of {summary['grasps_tried']} grasps are good"
+        f"annotations: {became}; {verdicts}{far}; {summary['grasps_good']} of "
+        f"{summary['grasps_tried']} grasps are good"
     )
 
 

@@ -1,0 +1,389 @@
+"""What becomes of an annotation: kept, improved, or its replacement rejected, and by what evidence.
+
+An annotation is replaced only where the new pose is better on the depth AND on the photograph, each
+by a paired t-test: over blocks of the pixels that either pose claims, and over sectors of the two
+outlines. The photograph is no part of the fit; where a pose was shifted onto it, that was done on
+other squares of it. All other things stand meanwhile where they are believed to be.
+
+A thing of which little is seen keeps its annotation. A pose that moved far is a proposal of a
+search, not a refinement: it must win clearly.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from realsim.arrays import Array, Array32, Mask
+from realsim.geometry import camera, se3
+from realsim.geometry.metrics import mssd_symmetric
+from realsim.records import ObjectModel, ObjectPose, SupportPlane
+from realsim.registration.compare import CompareConfig, Comparer, make_comparer
+from realsim.registration.evidence import DepthFrame, EvidenceConfig, measure_noise
+from realsim.registration.photo import (
+    Outline,
+    PhotoConfig,
+    Picture,
+    hidden_by_measured,
+    outline_of,
+    shifted,
+)
+
+Kind = Literal["kept", "improved", "rejected"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class OutcomeConfig:
+    """When an annotation is replaced."""
+
+    same_m: float = 0.0005
+    """Poses nearer than this are the same [m]."""
+    far_m: float = 0.015
+    """A pose that moved further is a proposal and must win clearly [m]."""
+    depth_t: float = 3.0
+    """Standard errors by which the new pose must be better on depth..."""
+    far_depth_t: float = 6.0
+    """...and a proposal."""
+    photo_t: float = 3.0
+    """The same on the photograph, of which half is looked at..."""
+    photo_ratio: float = 0.85
+    """...and the mean distance from its edges is less than this share of the annotation's; a
+    proposal's less than the square of this."""
+    least_visible: float = 0.3
+    """A thing of which less is seen, at either pose, keeps its annotation..."""
+    far_visible: float = 0.5
+    """...and where it is to move far."""
+    far_agree: float = 0.15
+    """Share of its pixels by which more must agree with the depth where it moves far."""
+    wrong_agree: float = 0.4
+    """An annotation with which less of the depth agrees looks wrong itself."""
+    block_px: int = 12
+    """Blocks of pixels whose depth counts as one piece: noise and holes are correlated."""
+    sectors: int = 36
+    """Sectors of an outline, each one piece."""
+    cap_px: float = 3.0
+    """An edge further away, or none, counts as this [px]."""
+    least_pieces: int = 8
+    """Fewer pieces decide nothing."""
+    views: int = 6
+    """Views that are looked at, at most."""
+    photo: PhotoConfig = PhotoConfig()  # noqa: RUF009 - frozen
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Evidence:
+    """What speaks for a new pose against the annotation."""
+
+    depth_t: float
+    """Standard errors by which the new pose is better on depth; NaN = cannot be told."""
+    photo_t: float
+    """The same on the photograph."""
+    photo_ratio: float
+    """Mean square distance of the photograph's edges, new by old."""
+    agree: tuple[float, float]
+    """Share of the pixels in sight that agree with the depth: annotation, new pose."""
+    edge_px: tuple[float, float]
+    """Median distance of the photograph's edges [px]: annotation, new pose."""
+    visible: float
+    """Share of the thing that is in sight, the lesser of the two poses'."""
+    moved_m: float
+    """Maximum symmetry-aware surface distance of the two [m]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Outcome:
+    """What became of one annotation."""
+
+    instance: int
+    kind: Kind
+    words: str
+    T_world_obj: Array
+    """(4, 4) the pose to go on with."""
+    evidence: Evidence | None
+    """Of the new pose; None = there is none."""
+    looks_wrong: bool = False
+    """Whether the annotation that was kept does not fit what was measured."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return plain values for tables."""
+        out: dict[str, Any] = {"outcome": self.kind, "why": self.words}
+        if (e := self.evidence) is not None:
+            out |= {
+                "depth_t": _plain(e.depth_t), "photo_t": _plain(e.photo_t),
+                "agree_annotation": _plain(e.agree[0]), "agree_new": _plain(e.agree[1]),
+                "edge_px_annotation": _plain(e.edge_px[0]), "edge_px_new": _plain(e.edge_px[1]),
+                "visible": _plain(e.visible), "proposed_mm": _plain(1e3 * e.moved_m),
+            }  # fmt: skip
+        return out
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Claim:
+    """One thing at one pose in one view, all others at theirs."""
+
+    own: Array32
+    scene: Array
+    """(H, W) depth of everything together [m]; inf = nothing is known to be there."""
+    sight: Mask
+    """(H, W) its pixels that nothing hides, rendered or measured."""
+    visible: float
+    outline: Outline
+
+
+class Referee:
+    """Compares poses of things in the views of a scene."""
+
+    def __init__(
+        self,
+        pictures: Sequence[Picture],
+        models: Mapping[int, ObjectModel],
+        plane: SupportPlane | None,
+        config: OutcomeConfig,
+    ) -> None:
+        """Measure the depth's noise; `models` are by instance."""
+        self.pictures, self.models, self.config = tuple(pictures), dict(models), config
+        frames = [
+            DepthFrame(index=k, depth_m=p.depth_m, T_world_cam=p.T_world_cam)
+            for k, p in enumerate(pictures)
+        ]
+        noise = measure_noise(frames, EvidenceConfig())
+        intrinsics = pictures[0].intrinsics
+        self._comparer: Comparer = make_comparer(intrinsics, frames, noise, plane, CompareConfig())
+        rows, columns = np.mgrid[: intrinsics.height, : intrinsics.width]
+        shape, flat = rows.shape, (rows.ravel(), columns.ravel())
+        self._tables = [self._comparer.table(f, *flat).reshape(shape) for f in frames]
+        self._depths: dict[tuple[int, int, bytes], Array32] = {}
+
+    def evidence(
+        self,
+        instance: int,
+        T_old: Array,
+        T_new: Array,
+        others: Mapping[int, Array],
+        held_out: bool,
+    ) -> Evidence:
+        """Return what speaks for a new pose, the other things standing at their poses.
+
+        `held_out`: of the photograph only the squares that no pose was shifted onto.
+        """
+        config = self.config
+        depth: list[Array] = []
+        photo: list[Array] = []
+        claims: list[tuple[_Claim, _Claim]] = []
+        for v in range(len(self.pictures)):
+            a, b = (self._claim(v, instance, T, others) for T in (T_old, T_new))
+            claims.append((a, b))
+            depth.append(self._depth_gains(v, a, b))
+            photo.append(self._photo_costs(v, instance, T_old, a, b, held_out))
+        costs = np.concatenate(photo)
+        means = costs.mean(0) if len(costs) else np.full(2, np.nan)
+        edges = [np.abs(np.concatenate([c[k].outline.offsets for c in claims])) for k in (0, 1)]
+        old, new = (float(np.nanmedian(e)) if np.isfinite(e).any() else np.nan for e in edges)
+        return Evidence(
+            depth_t=_t(np.concatenate(depth), config), photo_t=_t(costs @ [1.0, -1.0], config),
+            photo_ratio=float(means[1] / max(means[0], 1e-9)),
+            agree=(self._agree([a for a, _ in claims]), self._agree([b for _, b in claims])),
+            edge_px=(old, new),
+            visible=min(max(c[k].visible for c in claims) for k in (0, 1)),
+            moved_m=mssd_symmetric(T_old, T_new, self.models[instance]),
+        )  # fmt: skip
+
+    def _depth_of(self, v: int, instance: int, T: Array) -> Array32:
+        key = (v, instance, T.tobytes())
+        if key not in self._depths:
+            self._depths[key] = self.pictures[v].depth_of(self.models[instance].mesh, T)
+        return self._depths[key]
+
+    def _claim(self, v: int, instance: int, T: Array, others: Mapping[int, Array]) -> _Claim:
+        picture, own = self.pictures[v], self._depth_of(v, instance, T)
+        rest = [self._depth_of(v, i, X) for i, X in others.items() if i != instance]
+        behind = np.min([np.full_like(own, np.inf), *rest], axis=0)
+        scene = np.minimum(np.minimum(own, behind), self._tables[v])
+        hidden = hidden_by_measured(picture, own, self.config.photo)
+        sight = np.isfinite(own) & (own <= behind) & ~hidden
+        return _Claim(
+            own, scene, sight, float(sight.sum() / max(np.isfinite(own).sum(), 1)),
+            outline_of(picture, own, behind, self.config.photo),
+        )  # fmt: skip
+
+    def _likelihood(self, v: int, scene: Array, where: Mask) -> Array:
+        """Return how well the depth of pixels (N,) agrees, 1 to -1; 0 where nothing is known."""
+        z, measured = scene[where], self.pictures[v].depth_m[where].astype(np.float64)
+        agrees = self._comparer.likelihood(measured, np.minimum(z, 1e3))
+        return np.where(np.isfinite(z), agrees, 0.0)
+
+    def _gain(self, v: int, a: _Claim, b: _Claim, where: Mask) -> Array:
+        """Return by how much the new pose is more likely at pixels (N,).
+
+        Where one of the two has nothing known there, the other can only be contradicted.
+        """
+        old, new = (self._likelihood(v, c.scene, where) for c in (a, b))
+        known = np.isfinite(a.scene[where]) & np.isfinite(b.scene[where])
+        return np.where(known, new - old, np.minimum(new, 0.0) - np.minimum(old, 0.0))
+
+    def _usable(self, v: int) -> Mask:
+        return (self.pictures[v].depth_m > 0) & ~self._comparer.edges[v]
+
+    def _depth_gains(self, v: int, a: _Claim, b: _Claim) -> Array:
+        """Return (N,) by how much the new pose is more likely, block by block."""
+        where = (a.sight | b.sight) & self._usable(v)
+        gain = self._gain(v, a, b, where)
+        i, j = (x // self.config.block_px for x in np.nonzero(where))
+        _, of = np.unique(i * 100_000 + j, return_inverse=True)
+        return np.bincount(of.reshape(-1), weights=gain).astype(np.float64)
+
+    def _photo_costs(
+        self, v: int, instance: int, T: Array, a: _Claim, b: _Claim, held_out: bool
+    ) -> Array:
+        """Return (N, 2) mean distances of the edges, old and new, sector by sector."""
+        config, picture = self.config, self.pictures[v]
+        T_cam_obj = se3.invert(picture.T_world_cam) @ T
+        middle = se3.transform(T_cam_obj, self.models[instance].mesh.bounds.mean(0)[None])
+        center = camera.project(picture.intrinsics, middle)[0]
+        sums: list[Array] = []
+        counts: list[Array] = []
+        for claim in (a, b):
+            o = claim.outline
+            if held_out:
+                o = o.part(o.squares(config.photo.block_px, odd=True))
+            d = np.minimum(np.nan_to_num(np.abs(o.offsets), nan=config.cap_px), config.cap_px)
+            at, n = o.sectors(center, config.sectors), config.sectors
+            sums.append(np.bincount(at, weights=d, minlength=n).astype(np.float64))
+            counts.append(np.bincount(at, minlength=n).astype(np.float64))
+        both = (counts[0] > 0) & (counts[1] > 0)
+        return np.stack([s[both] / c[both] for s, c in zip(sums, counts, strict=True)], axis=1)
+
+    def _agree(self, claims: Sequence[_Claim]) -> float:
+        good, count = 0, 0
+        for v, claim in enumerate(claims):
+            likely = self._likelihood(v, claim.own.astype(float), claim.sight & self._usable(v))
+            good, count = good + int(np.sum(likely > 0)), count + len(likely)
+        return good / count if count else float("nan")
+
+
+def decide(
+    pictures: Sequence[Picture],
+    models: Mapping[int, ObjectModel],
+    annotations: Sequence[ObjectPose],
+    registered: Sequence[ObjectPose],
+    plane: SupportPlane | None,
+    config: OutcomeConfig | None = None,
+) -> list[Outcome]:
+    """Return what becomes of every annotation.
+
+    Args:
+        pictures: the views, with the cameras that `registered` is in.
+        models: object id -> model.
+        annotations: one per instance.
+        registered: the new poses; an instance that is missing was not placed.
+        plane: the table; None = not known.
+        config: see there.
+    """
+    config = config or OutcomeConfig()
+    of = {a.instance: models[a.obj_id] for a in annotations}
+    referee = Referee(pictures, of, plane, config)
+    new = {r.instance: r for r in registered if r.instance in of}
+    proposals = {i: [r.T_world_obj] for i, r in new.items()}
+    if len(pictures) == 1:
+        # Several views were brought together by their depth; one can be laid onto its photograph.
+        moved = shifted(
+            pictures[0], [of[i].mesh for i in new], [r.T_world_obj for r in new.values()],
+            config.photo,
+        )  # fmt: skip
+        proposals = {i: [T, *proposals[i]] for i, T in zip(new, moved, strict=True)}
+    now = {a.instance: a.T_world_obj for a in annotations}
+    outcomes: dict[int, Outcome] = {}
+    for _ in range(2):  # the second time with the others where they now are
+        for a in annotations:
+            outcomes[a.instance] = _decided(
+                a, new.get(a.instance), proposals.get(a.instance, ()), referee, now
+            )
+        now = {i: o.T_world_obj for i, o in outcomes.items()}
+    return [outcomes[a.instance] for a in annotations]
+
+
+def _decided(
+    given: ObjectPose,
+    found: ObjectPose | None,
+    proposals: Sequence[Array],
+    referee: Referee,
+    others: Mapping[int, Array],
+) -> Outcome:
+    """Return what becomes of one annotation."""
+    T = given.T_world_obj
+    if found is None:
+        words = "it was not found again: its annotation is kept unchecked"
+        return Outcome(instance=given.instance, kind="kept", words=words, T_world_obj=T,
+                       evidence=None)  # fmt: skip
+    first: tuple[Evidence, Kind, str] | None = None
+    for proposed in proposals:
+        e = referee.evidence(given.instance, T, proposed, others, proposed is not found.T_world_obj)
+        kind, words = _judged(e, found, referee.config)
+        if kind == "improved":
+            return Outcome(instance=given.instance, kind=kind, words=words, T_world_obj=proposed,
+                           evidence=e)  # fmt: skip
+        first = first or (e, kind, words)
+    assert first is not None
+    e, kind, words = first
+    wrong = e.visible >= referee.config.least_visible and e.agree[0] < referee.config.wrong_agree
+    if wrong:
+        words += (
+            f"; the annotation itself looks wrong: depth agrees at {100 * e.agree[0]:.0f} % of it"
+        )
+    return Outcome(instance=given.instance, kind=kind, words=words, T_world_obj=T, evidence=e,
+                   looks_wrong=wrong)  # fmt: skip
+
+
+def _judged(e: Evidence, found: ObjectPose, config: OutcomeConfig) -> tuple[Kind, str]:
+    """Return what becomes of an annotation by the evidence for a new pose, in words."""
+    said = (
+        f"depth agrees at {_share(e.agree[1])} instead of {_share(e.agree[0])} "
+        f"(t {e.depth_t:.1f}), the photograph's edges at {e.edge_px[1]:.1f} instead of "
+        f"{e.edge_px[0]:.1f} px (t {e.photo_t:.1f})"
+    )
+    far = e.moved_m > config.far_m
+    if (why := _why_kept(e, config)) is not None:
+        return "kept", why
+    if found.verdict == "rejected":
+        why = "; ".join(found.reasons) or "its checks failed"
+        return "rejected", f"the new pose was refused: {why}"
+    on_depth = e.depth_t > config.depth_t
+    ratio = config.photo_ratio
+    if far:
+        more = e.agree[1] - e.agree[0] >= config.far_agree
+        on_depth, ratio = e.depth_t > config.far_depth_t and more, ratio**2
+    if on_depth and e.photo_t > config.photo_t and e.photo_ratio < ratio:
+        return "improved", said
+    if far or e.depth_t < -config.depth_t or e.photo_t < -config.photo_t:
+        way = f"{1e3 * e.moved_m:.0f} mm away, does not win clearly" if far else "is worse"
+        return "rejected", f"the new pose, {way}: {said}" if far else f"the new pose {way}: {said}"
+    return "kept", f"the new pose is not better on both: {said}"
+
+
+def _why_kept(e: Evidence, config: OutcomeConfig) -> str | None:
+    """Return why a new pose is not even considered; None = it is."""
+    if e.moved_m < config.same_m:
+        return f"the new pose is the same within {1e3 * config.same_m:g} mm"
+    least = config.far_visible if e.moved_m > config.far_m else config.least_visible
+    if e.visible < least:
+        return f"only {100 * e.visible:.0f} % of it is in sight"
+    if np.isnan(e.depth_t) or np.isnan(e.photo_t):
+        which = "depth" if np.isnan(e.depth_t) else "photograph"
+        return f"the {which} shows too little of it to choose a pose by"
+    return None
+
+
+def _t(gains: Array, config: OutcomeConfig) -> float:
+    """Return by how many standard errors the mean of (N,) pieces is above 0; NaN = too few."""
+    if len(gains) < config.least_pieces:
+        return float("nan")
+    return float(gains.mean() / max(np.std(gains, ddof=1) / np.sqrt(len(gains)), 1e-9))
+
+
+def _share(value: float) -> str:
+    return "-" if np.isnan(value) else f"{100 * value:.0f} %"
+
+
+def _plain(value: float) -> float | None:
+    return round(float(value), 3) if np.isfinite(value) else None
