@@ -70,11 +70,17 @@ def wrong_pose(g: Given, k: int, kind: str, rng: np.random.Generator) -> Array:
     return T @ se3.from_rt(R, c - R @ c)
 
 
-def provoked(g: Given) -> Done:
-    """Return what came of the wrong claims."""
+def provoked(g: Given, rounds: int = ROUNDS, judged_rounds: int = JUDGED_ROUNDS) -> Done:
+    """Return what came of the wrong claims.
+
+    Args:
+        g: the scene.
+        rounds: registrations with wrong claims.
+        judged_rounds: judgements of wrong poses as if a search had found them.
+    """
     rng = stream(g.key.seed, "provoked")
     rows: list[Row] = []
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         kinds = _kinds(g, KINDS, rng)
         wanted: list[Wanted] = []
         for k, T in enumerate(_claims(g, kinds, rng)):
@@ -88,7 +94,7 @@ def provoked(g: Given) -> Done:
         found, _ = registered(g, wanted)
         every = rows_of("claimed", g.key.seed, g.scene, found.scene.objects)
         rows += [replace(row, part=kinds.get(k, "beside")) for k, row in enumerate(every)]
-    for _ in range(JUDGED_ROUNDS):
+    for _ in range(judged_rounds):
         kinds = _kinds(g, JUDGED_KINDS, rng)
         objects = _judged(g, _claims(g, kinds, rng))
         every = rows_of("judged", g.key.seed, g.scene, objects)
@@ -132,4 +138,4 @@ def _judged(g: Given, claims: Sequence[Array]) -> list[ObjectPose]:
         blind=[0] * len(bodies), contrasts=[None] * len(bodies), cameras=many.refined.cameras,
         plane=many.plane, known=(), with_starts=False,
     )  # fmt: skip
-    return judge_objects(intake, given, comparer, c).objects
+    return judge_objects(replace(intake, views=many.views), given, comparer, c).objects
