@@ -57,6 +57,7 @@ class Console:
         self._out = _rich(stderr=as_json)
         self._err = _rich(stderr=True)
         self._last_line = time.monotonic()
+        self._doing = ""
 
     @contextmanager
     def stage(self, name: str, note: str = "") -> Generator[Tick]:
@@ -69,6 +70,7 @@ class Console:
         """
         cpu, wall = cpu_seconds(), time.perf_counter()
         label = f"{name}: {note}" if note else name
+        self._doing = ""
         if self.quiet:
             yield _no_tick
         elif sys.stderr.isatty() and not self._err.is_dumb_terminal:
@@ -110,7 +112,8 @@ class Console:
             task = bar.add_task(label, total=None)
 
             def tick(done: int, total: int) -> None:
-                bar.update(task, completed=done, total=total)
+                words = f"{label}: {self._doing}" if self._doing else label
+                bar.update(task, completed=done, total=total, description=words)
 
             yield tick
             total = bar.tasks[0].total or 1
@@ -128,10 +131,16 @@ class Console:
             left = f", {duration((at - begun) * (total - done) / done)} left" if done > 0 else ""
             share = f"{100 * done // total} %"
             self._err.print(
-                f"{label}: {share} ({done} of {total}){left}", soft_wrap=True, markup=False
-            )
+                f"{label}: {share} ({done} of {total}){left}"
+                f"{f': {self._doing}' if self._doing else ''}",
+                soft_wrap=True, markup=False,
+            )  # fmt: skip
 
         return tick
+
+    def doing(self, words: str) -> None:
+        """Say what the stage does now: shown with its next step."""
+        self._doing = words
 
     def say(self, text: str) -> None:
         """Print one line of result."""

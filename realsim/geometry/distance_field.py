@@ -123,9 +123,11 @@ class DistanceField:
         key = _content_key(mesh, cells)
         known = _memory.get(key)
         if known is None:
-            known = _load(folder, key) or _compute(mesh, cells)
-            if folder is not None:
-                _save(folder, key, known)
+            known = _load(folder, key)
+            if known is None:
+                known = _compute(mesh, cells)
+                if folder is not None:
+                    _save(folder, key, known)
         _memory[key] = known
         _memory.move_to_end(key)
         while len(_memory) > REMEMBERED_FIELDS:

@@ -81,11 +81,17 @@ class Covariances:
     """(V, 6, 6)."""
 
 
-def covariances(system: System) -> Covariances:
-    """Return the covariance of all unknowns that are asked for."""
+def covariances(system: System, beyond: Array | float = 0.0) -> Covariances:
+    """Return the covariance of all unknowns that are asked for.
+
+    Args:
+        system: the equations, priors included.
+        beyond: (S, S) what the shared unknowns are unsure of beyond what the equations say; it is
+            carried to the views, which follow from the shared unknowns.
+    """
     own = np.linalg.inv(system.D)
     BD = system.B @ own
-    shared = inverse(without_views(system)[0])
+    shared = inverse(without_views(system)[0]) + beyond
     cross = -shared @ BD
     views = own - np.swapaxes(BD, 1, 2) @ cross
     return Covariances(shared=shared, cross=cross, views=views)

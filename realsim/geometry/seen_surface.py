@@ -26,9 +26,9 @@ EDGE_CELLS = 0.3
 DEEP_CELLS = 1.5
 """Cells inside of the surface at which the direction of the face is looked up."""
 EDGE_COS = 0.9
-"""Cosine between the directions outside and inside below which a point lies beyond an edge..."""
+"""Cosine between the directions outside and inside below which a point lies beyond an edge."""
 WALL_COS = 0.2
-"""...unless it is below this."""
+"""Below this cosine a point lies at a thin wall, not beyond an edge."""
 
 
 @njit(inline="always")

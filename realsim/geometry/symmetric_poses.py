@@ -25,7 +25,7 @@ SCREENED_ANGLES = 72
 """Angles about an axis at which the error is looked at first: between two of them it has a single
 minimum but for rare shapes, and then the neighbour's is as good."""
 SEARCHED_MINIMA = 3
-"""Of the minima among those angles so many are refined."""
+"""Minima among those angles that are refined."""
 ANGLE_RAD = 1e-8
 """To which the best angle is found [rad]: 1 nm at the rim of a 20 cm disc."""
 GOLDEN = (math.sqrt(5) - 1) / 2

@@ -66,7 +66,7 @@ def uncertainty(body: Body, fit: PoseFit, stride: int, config: CovarianceConfig)
     Along eigenvectors of H whose sensitivity sqrt(lambda / sum w) is too small, the prior replaces
     k s^2 / lambda. Mapped to the object's origin by the adjoint.
     """
-    values, vectors, scale = _principal_axes(body, fit)
+    values, vectors, scale = principal_axes(body, fit)
     sensitivity = _sensitivities(values, fit)
     blind = sensitivity < config.unobservable_sensitivity
     inflation = max(1.0, config.correlation_area_px / stride**2) * max(1.0, fit.variance)
@@ -81,7 +81,7 @@ def uncertainty(body: Body, fit: PoseFit, stride: int, config: CovarianceConfig)
     C = Ad @ C @ Ad.T
     return Uncertainty(
         covariance=0.5 * (C + C.T),
-        unobservable=tuple(_axis_name(vectors[:, i]) for i in np.flatnonzero(blind)),
+        unobservable=tuple(axis_name(vectors[:, i]) for i in np.flatnonzero(blind)),
         sensitivities=tuple(float(s) for s in sensitivity),
     )
 
@@ -91,11 +91,11 @@ def blind_motions(body: Body, fit: PoseFit, config: CovarianceConfig) -> Array:
 
     They are orthonormal, about the box centre, rotation first, turns times the body's radius [m].
     """
-    values, vectors, _ = _principal_axes(body, fit)
+    values, vectors, _ = principal_axes(body, fit)
     return vectors[:, _sensitivities(values, fit) < config.unobservable_sensitivity]
 
 
-def _principal_axes(body: Body, fit: PoseFit) -> tuple[Array, Array, Array]:
+def principal_axes(body: Body, fit: PoseFit) -> tuple[Array, Array, Array]:
     """Return eigenvalues (6,) and vectors (6, 6) of the scaled information, and the scale (6,)."""
     radius = body.radius_m
     scale = np.array([radius, radius, radius, 1.0, 1.0, 1.0])
@@ -108,7 +108,7 @@ def _sensitivities(values: Array, fit: PoseFit) -> Array:
     return np.sqrt(values / fit.weight) if fit.weight > 0 else np.zeros(6)
 
 
-def _axis_name(vector: Array) -> str:
+def axis_name(vector: Array) -> str:
     """Return the principal axis (6,) in words: what moves, along which axis of the object."""
     turn, shift = vector[:3], vector[3:]
     kind, part = ("turn about", turn) if turn @ turn > 0.5 else ("shift along", shift)
@@ -128,9 +128,9 @@ class BlindConfig:
     least_turn_share: float = 0.5
     """A blind motion whose turn (times the radius) is less than this share of it is a shift."""
     declared_deg: float = 5.0
-    """A declared continuous symmetry within this angle of a blind turn is the same axis..."""
+    """A declared continuous symmetry within this angle of a blind turn is the same axis."""
     declared_m: float = 0.005
-    """...if it also passes the fitted axis this near."""
+    """It must also pass the fitted axis this near [m]."""
     rounds: int = 3
     """Alternations of setting back and fitting the rest; the third moves nothing by 0.02 mm."""
     passes: int = 30
@@ -282,6 +282,8 @@ def _why_not(still: bool, before: float, after: float, config: BlindConfig) -> s
     """Return why the fit stands although it left the start along a blind direction."""
     if not still:
         return "with the start's value the points do determine this direction, and speak against it"
+    if before == 0.0:  # hidden as it lies: nothing of it is rendered in sight
+        return "where the fit has it nothing of it is in sight, and the start's value is no better"
     share = (before - after) / abs(before)
     return (
         f"the start's value would lose {100 * share:.1f} % of the rendered gain "

@@ -32,6 +32,8 @@ class Body:
     """(S, 3) outward normals of the samples."""
     ray_scene: Any
     """Open3D RaycastingScene of the mesh in its own frame."""
+    bounds_obj: Array = derived(init=False)
+    """(2, 3) least and greatest corner in the object's frame [m]."""
     center_obj: Array = derived(init=False)
     """(3,) centre of the bounding box in the object's frame [m]."""
     radius_m: float = derived(init=False)
@@ -39,7 +41,8 @@ class Body:
 
     def __post_init__(self) -> None:
         """Measure the box once: a fit asks for it thousands of times."""
-        low, high = self.model.mesh.bounds
+        low, high = bounds = self.model.mesh.bounds
+        object.__setattr__(self, "bounds_obj", bounds)
         object.__setattr__(self, "center_obj", 0.5 * (low + high))
         object.__setattr__(self, "radius_m", float(0.5 * np.linalg.norm(high - low)))
 
@@ -100,7 +103,7 @@ def pixel_box(
 
     The whole image if a corner of the body's box lies behind the camera; empty if it is outside.
     """
-    low, high = body.model.mesh.bounds
+    low, high = body.bounds_obj
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     corners_cam = se3.transform(T_cam_obj, low + corners * (high - low))
     if corners_cam[:, 2].max() <= 0:

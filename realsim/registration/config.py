@@ -18,6 +18,7 @@ from realsim.registration.near_rivals import RivalConfig
 from realsim.registration.near_start import JointConfig, SearchConfig
 from realsim.registration.odometry.cross_check import CheckConfig
 from realsim.registration.refinement.config import RefineConfig
+from realsim.registration.rivals_around import AroundConfig
 from realsim.registration.search.find import FindConfig
 from realsim.registration.single_view import SingleViewConfig
 from realsim.registration.solver import SolverConfig
@@ -104,6 +105,7 @@ class RegistrationConfig:
     verify: VerifyConfig = field(default_factory=VerifyConfig)
     swapped: SwappedConfig = field(default_factory=SwappedConfig)
     rivals: RivalConfig = field(default_factory=RivalConfig)
+    around: AroundConfig = field(default_factory=AroundConfig)
     judging: JudgingConfig = field(default_factory=JudgingConfig)
     offset: OffsetConfig = field(default_factory=OffsetConfig)
     sinking: SinkingConfig = field(default_factory=SinkingConfig)

@@ -6,6 +6,7 @@ colour image more often than moved by any other. Edges along rows and along colu
 apart: an outline must fall on an edge of its own direction.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -22,6 +23,10 @@ from realsim.registration.outlines import AlignmentConfig, edge_distance, outlin
 __all__ = ["AlignmentConfig", "AlignmentFinding", "check_alignment", "pooled_alignment"]
 
 Kind = Literal["aligned", "not_aligned", "unknown", "other_size"]
+WIDE_ASPECT = 4 / 3
+"""By this a picture of 4:3 is stretched that is resized to 16:9."""
+ASPECT_SLACK = 0.07
+"""Steps of the stretches, and that the lenses differ [log]."""
 LEAST_VOTES = 3
 """Two views may agree by chance."""
 
@@ -158,6 +163,7 @@ def _finding(
     moved = np.array([_peak(s[row], int(column)), _peak(s[:, column], int(row))]) - reach
     confidence = float((s[row, column] - np.median(s)) / spread)
     sure = confidence > config.confidence
+    few = len(votes) < LEAST_VOTES
     kind: Kind = "unknown"
     stretch = np.ones(2)
     off = float(np.hypot(moved[0], moved[1]))
@@ -172,9 +178,14 @@ def _finding(
         kind = "aligned"
     elif sure and off > config.wrong_px and s.max() > config.gain * unmoved:
         kind = "not_aligned"
+    elif (
+        few and off > config.wrong_px and s.max() > max(config.few_share, config.few_gain * unmoved)
+        and confidence > config.few_confidence
+    ):  # fmt: skip
+        kind = "not_aligned"
     at: tuple[Any, ...] = (slice(None), slice(None), int(row), int(column))
     if kind != "aligned" and scores.cube is not None:
-        best = _best_stretch(scores, config)
+        best = _best_stretch(scores, few, config)
         if best is not None:
             kind, stretch, moved, confidence, at = "not_aligned", *best
     shift = -moved * scores.px_factor
@@ -191,7 +202,7 @@ def _finding(
 
 
 def _best_stretch(
-    scores: _Scores, config: AlignmentConfig
+    scores: _Scores, few: bool, config: AlignmentConfig
 ) -> tuple[Array, Array, float, tuple[Any, ...]] | None:
     """Return stretch, shift, confidence and place of the best stretch, if it is believed."""
     cube = scores.cube
@@ -213,9 +224,23 @@ def _best_stretch(
     sure = (peak - usual) / (MAD_TO_SIGMA * float(np.median(np.abs(some - usual))) + 1e-9)
     better = peak > config.gain * float(cube[unit, unit, middle, middle])
     better &= peak > config.stretch_gain * float(cube[unit, unit].max())
-    if sure < config.stretch_confidence or off < config.wrong_px or not better:
+    if off < config.wrong_px or not better:
+        return None
+    if sure < config.stretch_confidence and not (
+        few
+        and sure > config.few_stretch_confidence
+        and peak > max(config.few_share, config.few_gain * float(cube[unit, unit, middle, middle]))
+        and peak > _least_gain(stretch, config) * float(cube[unit, unit].max())
+    ):
         return None
     return stretch, shift, float(sure), at
+
+
+def _least_gain(stretch: Array, config: AlignmentConfig) -> float:
+    """Return how many times better than a shift a stretch of one or two views must be."""
+    aspect = abs(math.log(stretch[1] / stretch[0]))
+    is_resized = abs(aspect - math.log(WIDE_ASPECT)) < ASPECT_SLACK
+    return config.few_resized_gain if is_resized else config.few_stretch_gain
 
 
 def _agrees(finding: AlignmentFinding, at: tuple[Any, ...], config: AlignmentConfig) -> bool:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.arrays import Array, Array32, Mask
+from realsim.arrays import Array, Array32, Mask, UInt8
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.clouds import voxel_mean
@@ -26,6 +26,8 @@ class DepthFrame:
     """(H, W) depth along z [m]; 0 = none."""
     T_world_cam: Array
     """(4, 4) camera in world [m]."""
+    read_rgb: Callable[[], UInt8] | None = None
+    """Reads the photograph (H, W, 3) that the depth lies on; None = there is none."""
 
 
 class LazyFrame(DepthFrame):
@@ -40,6 +42,7 @@ class LazyFrame(DepthFrame):
         read: Callable[[], Array32] | None = None,
         *,
         depth_m: Array32 | None = None,
+        read_rgb: Callable[[], UInt8] | None = None,
     ) -> None:
         """Keep how the image is read; nothing is read.
 
@@ -48,11 +51,13 @@ class LazyFrame(DepthFrame):
             T_world_cam: (4, 4) camera in world [m].
             read: returns the image; None = it is `depth_m`.
             depth_m: the image itself, as `dataclasses.replace` gives it.
+            read_rgb: returns the photograph; None = there is none.
         """
         if read is None and depth_m is None:
             raise InputError(f"view {index} has neither an image nor a way to read it; give one.")
         object.__setattr__(self, "index", index)
         object.__setattr__(self, "T_world_cam", T_world_cam)
+        object.__setattr__(self, "read_rgb", read_rgb)
         object.__setattr__(self, "_read", read or (lambda: depth_m))
 
     @property

@@ -29,6 +29,7 @@ from realsim.registration.evidence import (
 )
 from realsim.registration.intake import Intake
 from realsim.registration.near_start import BestStart, joint_fit, search
+from realsim.registration.rivals_around import Around, around
 from realsim.registration.solver import FreeSpace
 from realsim.registration.table_planes import find_support_plane
 
@@ -124,6 +125,37 @@ def register_few(
         kept=kept, clouds=clouds, found=found, history=history, plane=work.plane,
         no_plane=work.no_plane, stride=work.evidence.stride,
     )  # fmt: skip
+
+
+def few_around(
+    intake: Intake,
+    few: FewViews,
+    bodies: Sequence[Body],
+    claimed: Sequence[Array | None],
+    config: RegistrationConfig,
+) -> list[Around]:
+    """Return what the images say of every pose and those around it, all others where they are.
+
+    Args:
+        intake: the frames.
+        few: the fits.
+        bodies: the objects.
+        claimed: (4, 4) starts that somebody claimed; None = a search found them.
+        config: see there.
+    """
+    comparer = make_comparer(
+        intake.intrinsics, [read_frame(f) for f in intake.frames], intake.noise,
+        few.plane if few.plane is not None else intake.plane,
+        replace(config.compare, rays=config.around.rays),
+    )  # fmt: skip
+    at = [(b, k.fit.T_world_obj) for b, k in zip(bodies, few.kept, strict=True)]
+    return [
+        around(b, k.fit, cloud, comparer, [*at[:n], *at[n + 1 :]], start,
+               (config.around, config.solver))
+        for n, (b, k, cloud, start) in enumerate(
+            zip(bodies, few.kept, few.clouds, claimed, strict=True)
+        )
+    ]  # fmt: skip
 
 
 def _search_one(work: NearTask, body: Body, near: Cloud, tick: Callable[[], None]) -> BestStart:

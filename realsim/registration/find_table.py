@@ -142,6 +142,14 @@ def find_table(
         inliers=int(np.count_nonzero(on)),
     )
     tables = tuple(view_table(v, plane, noise, config) for v in views)
+    tilts = [t.tilt_deg for t in tables if t.own_share > 0]
+    if tilts and float(np.median(tilts)) > config.common_deg:
+        # Without a table, objects' faces make one up; every view sees another.
+        return TableFound(
+            plane=None,
+            reason=f"the views see planes that are tilted by {np.median(tilts):.1f} degrees "
+            f"against the best common one; {config.common_deg:g} is the most of a table",
+        )
     return TableFound(plane=plane, reason="", views=tables, share=best.count / len(points))
 
 

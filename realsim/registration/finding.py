@@ -1,6 +1,6 @@
 """From what is wanted to objects near their final poses, whatever was known of them before."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,6 +9,8 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
+from realsim.geometry.metrics import mssd_symmetric
+from realsim.models.symmetry import with_found_symmetries
 from realsim.records import ObjectModel, ObjectPose, names_of
 from realsim.registration.body import Body, make_body, moved_body
 from realsim.registration.config import RegistrationConfig
@@ -16,9 +18,17 @@ from realsim.registration.few_views import begin, search_near
 from realsim.registration.intake import Intake
 from realsim.registration.judging.scene_checks import SceneFinding, with_swaps
 from realsim.registration.judging.unit_checks import unit_errors
+from realsim.registration.many_views import ManyViews
 from realsim.registration.odometry.cross_check import KinematicsCheck
 from realsim.registration.reports import search_report
 from realsim.registration.search.find import find_objects
+from realsim.registration.search.flat_search import (
+    FlatPose,
+    cover,
+    is_free,
+    seek_flat,
+    table_map,
+)
 from realsim.registration.search.records import NotPlaced, Placed, Region, SearchResult, Wanted
 
 Progress = Callable[[int, int], None]
@@ -29,8 +39,18 @@ NO_INSTANCE = -1
 class Ticker:
     """Counts steps for the progress callback."""
 
-    def __init__(self, progress: Progress | None, total: int) -> None:
+    def __init__(
+        self, progress: Progress | None, total: int, told: Callable[[str], None] | None = None
+    ) -> None:
         self._progress, self._done, self._total = progress, 0, total
+        self._told = told
+
+    def say(self, words: str) -> None:
+        """Tell what is being done; no step is done by it."""
+        if self._told is not None:
+            self._told(words)
+        if self._progress is not None:
+            self._progress(min(self._done, self._total), self._total)
 
     def __call__(self) -> None:
         """One more step is done."""
@@ -54,6 +74,17 @@ class SceneTask:
     up: Array | None
     tick: Ticker
     kinematics: KinematicsCheck | None
+    symmetry_words: dict[int, str]
+    """Model -> what was found of symmetries that it does not declare."""
+
+    def symmetric(self, obj_ids: Iterable[int]) -> "SceneTask":
+        """Return the task with the symmetries of these models' shapes, where none are declared."""
+        models = dict(self.models)
+        for i in sorted(set(obj_ids) & set(models)):
+            if i not in self.symmetry_words:
+                models[i], words = with_found_symmetries(models[i], self.config.field_folder)
+                self.symmetry_words[i] = words
+        return replace(self, models=models)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -197,14 +228,80 @@ def seek_objects(task: SceneTask, asked: list[Wanted] | None) -> FoundObjects:
         return find_objects(
             intake.intrinsics, intake.frames, intake.views, plane, intake.noise, task.models,
             these, config.find, field_folder=config.field_folder, progress=task.tick.each,
+            told=task.tick.say,
         )  # fmt: skip
 
     result, findings = search(asked), []
+    if asked is None:  # only of what is there: it takes half a second each
+        task = task.symmetric(p.obj_id for p in result.placed)
     if asked is not None:
         result, findings = with_swaps(result, asked, dict(task.models), search, config.swapped)
     wrong = {i for f in findings for i in f.instances}
     claims = [w for w in asked or () if w.instance not in wrong]
     return replace(_found_objects(task, result, claims), findings=tuple(findings))
+
+
+def with_flat(
+    task: SceneTask, found: FoundObjects, many: ManyViews, asked: Sequence[Wanted]
+) -> FoundObjects | None:
+    """Return the objects with those flat ones that only refined views show; None = no more.
+
+    Objects of which nothing was claimed are sought: those that were not placed, and those that lie
+    elsewhere than a search of single images said.
+    """
+    config, plane = task.config.find.flat, many.plane
+    free = {w.instance: w.obj_id for w in asked if w.region is None and w.T_start is None}
+    placed = {b.start.instance: (b, T) for b, T in zip(found.bodies, many.poses, strict=True)}
+    sought = [
+        placed[i][0] if i in placed else _body(task, obj_id, i, np.eye(4))
+        for i, obj_id in free.items()
+        if min(task.models[obj_id].mesh.extent) < config.most_m
+    ]
+    if plane is None or not sought:
+        return None
+    middle = plane.T_world_table[:3, 3]
+    if placed:
+        middle = np.mean([body.center(T) for body, T in placed.values()], axis=0)
+    noise = task.config.refine.noise
+    area_px = noise.area_px * (task.intake.intrinsics.width / noise.area_width_px) ** 2
+    map_ = table_map(many.views, plane, task.intake.noise, middle, area_px, config)
+    flat = {b.start.instance for b in sought}
+    for instance, (body, T) in placed.items():
+        if instance not in flat:
+            map_ = cover(map_, body, T, config)
+    changed = False
+    poses = [(seek_flat(body, map_, config), body) for body in sought]
+    while left := [(p, b) for p, b in poses if p is not None]:
+        pose, body = max(left, key=lambda one: one[0].explained)
+        map_ = cover(map_, body, pose.T_world_obj, config)
+        # What the best one covers is no place for another.
+        poses = [
+            (p if is_free(map_, b, p.T_world_obj, config) else seek_flat(b, map_, config), b)
+            for p, b in left
+            if b is not body
+        ]
+        if body.start.instance in placed:
+            T = placed[body.start.instance][1]
+            if mssd_symmetric(T, pose.T_world_obj, body.model) < config.same_m:
+                continue
+        changed = True
+        found = _with_body(found, moved_body(body, pose.T_world_obj), pose)
+    return found if changed else None
+
+
+def _with_body(found: FoundObjects, body: Body, pose: FlatPose) -> FoundObjects:
+    """Return the objects with one more, or with one elsewhere."""
+    left = [n for n, b in enumerate(found.bodies) if b.start.instance != body.start.instance]
+    report = {"source": "mean heights", "explained": pose.explained, "contrast": pose.contrast}
+    return replace(
+        found,
+        bodies=[*(found.bodies[n] for n in left), body],
+        claimed=[*(found.claimed[n] for n in left), None],
+        contrasts=[*(found.contrasts[n] for n in left), pose.contrast],
+        rivals=[*(found.rivals[n] for n in left), None],
+        reports=[*(found.reports[n] for n in left), report],
+        not_placed=tuple(m for m in found.not_placed if m.instance != body.start.instance),
+    )
 
 
 def _found_objects(task: SceneTask, result: SearchResult, asked: Sequence[Wanted]) -> FoundObjects:

@@ -22,12 +22,15 @@ from realsim.registration.judging.surface_residuals import (
 )
 from realsim.registration.judging.verdict import probability_right, verdict_of
 from realsim.registration.table_planes import support_checks
+from realsim.registration.rivals_around import Around
 from realsim.registration.verify import Checked, verify_objects
 
 ONE_VIEW_CHECKS = ("residual_bound_mm",)
 """What the surface residuals of a single view are good for."""
 COMMON = ("common shift", "common sinking")
 """Findings on the scene's starts, depth or models that speak against no single pose."""
+FLAT_SIGMAS = 2.0
+"""A table may be off by so many of its sigmas under an object."""
 WORST = ("accepted", "doubtful", "rejected")
 """Verdicts, better first."""
 
@@ -65,6 +68,10 @@ class Poses:
     """What has been found wrong with the objects before."""
     with_starts: bool
     """Whether the bodies' starts were claimed by somebody."""
+    table_off_m: float = 0.0
+    """By how much the table is not flat, 1-sigma [m]."""
+    around: Sequence[Around] = ()
+    """Of few views: what the images say of each pose and those around it."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -107,7 +114,7 @@ def _features(
         given.plane, j.residuals,
     )  # fmt: skip
     level = error_level_m(residuals, j.residuals)
-    held = support_checks(given.bodies, given.poses, given.plane)
+    held = support_checks(given.bodies, given.poses, given.plane, FLAT_SIGMAS * given.table_off_m)
     halves: list[dict[str, float]] = [{} for _ in given.bodies]
     if len(intake.views) >= config.refine_from and given.bodies:
         owned = owned_points(
@@ -162,6 +169,8 @@ def _object(
         name: float(value) for name, value in features.items() if value is not None
     }
     checks |= {"probability": probability, "blind_axes": float(given.blind[k])}
+    if given.around:
+        checks["around"] = given.around[k].probability
     return ObjectPose(
         obj_id=body.start.obj_id, instance=body.start.instance, T_world_obj=given.poses[k],
         covariance=given.covariances[k], checks=_finite(checks), verdict=verdict, reasons=reasons,

@@ -24,7 +24,6 @@ from realsim.registration.evidence import (
 from realsim.registration.intake import Intake
 from realsim.registration.near_start import assign_points
 from realsim.registration.refinement.config import RefineConfig
-from realsim.registration.refinement.equations import State
 from realsim.registration.refinement.refine import Refined, refine
 from realsim.registration.refinement.uncertainty import SeenPose, object_covariance, seen_poses
 from realsim.registration.solver import PoseFit, solve_pose
@@ -35,7 +34,7 @@ CLOUD_POINTS = 400_000
 AGAIN_DEG = 3.0
 """An object that was turned back further than this about a fitted axis is refined again [deg]."""
 AGAIN_ROUNDS = 2
-"""...in so many rounds."""
+"""Rounds in which it is."""
 SHAPE_PIECES = 12.0
 """Independent pieces of a mesh's error."""
 LEAST_SIGMA_MM, LEAST_SIGMA_DEG = 0.05, 0.01
@@ -58,6 +57,8 @@ class ManyViews:
     """Per object, its pose in every view."""
     frames: tuple[DepthFrame, ...]
     """With the refined cameras and the depth's bias taken out; read when asked."""
+    views: tuple[ViewPoints, ...]
+    """Their points, likewise."""
     plane: SupportPlane | None
 
 
@@ -105,7 +106,7 @@ def register_many(
     """
     rough = [b.T_start for b in bodies]
     constants = refine_config(config)
-    refined, frames, clouds, kept = _refine_once(
+    refined, (frames, views), clouds, kept = _refine_once(
         intake, bodies, (rough, claimed), plane, constants, config, progress
     )
     turned = [_turn_deg(T, k.fit.T_world_obj) for T, k in zip(refined.poses, kept, strict=True)]
@@ -114,7 +115,7 @@ def register_many(
         # An axis that was fitted is a little off, and so is what is turned far about it.
         rough = [k.fit.T_world_obj for k in kept]
         constants = replace(constants, rounds=AGAIN_ROUNDS)
-        refined, frames, clouds, kept = _refine_once(
+        refined, (frames, views), clouds, kept = _refine_once(
             intake, bodies, (rough, claimed), plane, constants, config, None
         )
     back = [se3.invert(T) @ k.fit.T_world_obj for T, k in zip(refined.poses, kept, strict=True)]
@@ -141,7 +142,7 @@ def register_many(
     ]
     return ManyViews(
         refined=refined, poses=[k.fit.T_world_obj for k in kept], kept=kept, clouds=clouds,
-        covariances=covariances, seen=seen, frames=frames, plane=refined.plane,
+        covariances=covariances, seen=seen, frames=frames, views=views, plane=refined.plane,
     )  # fmt: skip
 
 
@@ -153,23 +154,30 @@ def _refine_once(
     constants: RefineConfig,
     config: RegistrationConfig,
     progress: Callable[[int, int], None] | None,
-) -> tuple[Refined, tuple[DepthFrame, ...], list[Cloud], list[Kept]]:
+) -> tuple[Refined, tuple[tuple[DepthFrame, ...], tuple[ViewPoints, ...]], list[Cloud], list[Kept]]:
     """Return one refinement from rough poses, corrected frames and clouds, and the final poses."""
     rough, claimed = poses
     refined = refine(
         intake.intrinsics, intake.views, bodies, rough, plane, intake.noise, constants, progress
     )
-    bias = DepthBias(scale=float(refined.state.bias[0]), offset_per_m=float(refined.state.bias[1]))
+    scale = float(refined.state.bias[0])
     frames = tuple(
-        correct_frame(f, T, bias) for f, T in zip(intake.frames, refined.cameras, strict=True)
+        correct_frame(f, T, DepthBias(scale=scale, offset_per_m=float(offset)))
+        for f, T, offset in zip(
+            intake.frames, refined.cameras, refined.state.offsets(), strict=True
+        )
     )
-    clouds = _clouds(intake, bodies, refined, config)
+    views = tuple(
+        replace(v, T_world_cam=T, points=refined.state.corrected(v.points, k).astype(np.float32))
+        for k, (v, T) in enumerate(zip(intake.views, refined.cameras, strict=True))
+    )
+    clouds = _clouds(intake, views, bodies, refined, config)
     comparer = comparer_on(intake, frames, refined.plane, bodies, refined.poses, config)
     kept = [
         _keep_blind(body, start, T, (cloud, comparer), config)
         for body, start, T, cloud in zip(bodies, claimed, refined.poses, clouds, strict=True)
     ]
-    return refined, frames, clouds, kept
+    return refined, (frames, views), clouds, kept
 
 
 def _keep_blind(
@@ -244,15 +252,16 @@ def _blind_covariance(body: Body, fit: PoseFit, config: RegistrationConfig) -> A
 
 
 def _clouds(
-    intake: Intake, bodies: Sequence[Body], refined: Refined, config: RegistrationConfig
+    intake: Intake,
+    views: Sequence[ViewPoints],
+    bodies: Sequence[Body],
+    refined: Refined,
+    config: RegistrationConfig,
 ) -> list[Cloud]:
     """Return each object's averaged points, cameras and depth as refined."""
-    total = sum(len(v.points) for v in intake.views)
+    total = sum(len(v.points) for v in views)
     every = max(1, -(-total // CLOUD_POINTS))
-    parts = [
-        _points_near(v, T, refined.state, (bodies, refined.poses), every, config)
-        for v, T in zip(intake.views, refined.cameras, strict=True)
-    ]
+    parts = [_points_near(v, (bodies, refined.poses), every, config) for v in views]
     near: list[Cloud] = []
     for k, (body, T) in enumerate(zip(bodies, refined.poses, strict=True)):
         cloud = _join_parts([p[k] for p in parts], intake)
@@ -263,21 +272,19 @@ def _clouds(
 
 def _points_near(
     view: ViewPoints,
-    T_world_cam: Array,
-    state: State,
     objects: tuple[Sequence[Body], Array],
     every: int,
     config: RegistrationConfig,
 ) -> list[tuple[Array, Array, Array]]:
     """Return of one view, per object, points near it in world, directions to the camera, depths."""
-    p = state.corrected(view.points[::every].astype(np.float64))
-    world = se3.transform(T_world_cam, p)
+    p = view.points[::every].astype(np.float64)
+    world = se3.transform(view.T_world_cam, p)
     reach = config.joint.assign_m
     out: list[tuple[Array, Array, Array]] = []
     for body, T in zip(*objects, strict=True):
         close = np.linalg.norm(world - body.center(T), axis=1) < body.radius_m + reach
         some = world[close]
-        towards = T_world_cam[:3, 3] - some
+        towards = view.T_world_cam[:3, 3] - some
         out.append((some, towards / np.linalg.norm(towards, axis=1, keepdims=True), p[close, 2]))
     return out
 

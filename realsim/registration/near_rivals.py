@@ -4,10 +4,14 @@ In the search, cameras are off by a millimetre, and a pipe whose ends differ by 
 stays undecided. Refined, the averaged points lie within a tenth of a millimetre of the surface; so
 the pose and its rival are fitted to the same points, and the squares of their residuals compared
 cell by cell over the surface (a paired t-test over cells of `cell_m`, each an independent piece).
+
+A box turned by half is the same to depth; its print is not. Where the mesh has colours, the frames
+photographs, and depth hardly decides, the print does.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,9 +19,16 @@ from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.metrics import mssd_symmetric
 from realsim.registration.body import Body
-from realsim.registration.evidence import Cloud
+from realsim.registration.compare import make_comparer
+from realsim.registration.evidence import Cloud, read_frame
 from realsim.registration.judging.verdict import CONTRAST_DECIDED
+from realsim.registration.photo import PhotoConfig, Picture, paint_of, print_errors
+from realsim.registration.search.near_symmetry import near_symmetries
 from realsim.registration.solver import SolverConfig, solve_pose
+
+if TYPE_CHECKING:
+    from realsim.registration.config import RegistrationConfig
+    from realsim.registration.intake import Intake
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -31,13 +42,29 @@ class RivalConfig:
     cap_m: float = 0.003
     """Larger residuals count as this [m]: points of a neighbour."""
     t: float = 4.0
-    """Standard errors by which the rival must be worse..."""
+    """Standard errors by which the rival must be worse."""
     ratio: float = 0.25
-    """...and share of the mean square by which it must be."""
+    """Share of the mean square by which it must be worse, too."""
     same_m: float = 0.001
     """Fitted poses nearer than this are one [m]."""
     least_cells: int = 12
     """Fewer cells decide nothing."""
+    print_spread: float = 12.0
+    """A mesh whose colours vary by less has no print [of 255]."""
+    print_gap: float = 0.1
+    """By so much the correlation with the photograph must differ."""
+    print_rivals: int = 12
+    """Near symmetries that the print is asked about, those that fit best."""
+    beside_share: float = 0.7
+    """Poses nearer than this are one to the print [share of half the box's diagonal]."""
+    least_print: float = 0.25
+    """A print that correlates by less at both poses is not the object's, or not seen."""
+    print_loss: float = 0.5
+    """A rival that loses more of the rendered gain, not fitted yet, is none to the print."""
+    photo: PhotoConfig = field(default_factory=PhotoConfig)
+    """How the photograph is read."""
+    print_from: float = 4.0 * CONTRAST_DECIDED
+    """Depth that decides by more than this contrast is not asked again by the print."""
     solver: SolverConfig = field(default_factory=SolverConfig)
     """The fits."""
 
@@ -102,6 +129,125 @@ def duels(
         None if R is None else duel(b, T, R, c, float(m), config)
         for b, T, R, c, m in zip(bodies, poses, rivals, clouds, misfits_m, strict=True)
     ]
+
+
+def duels_by_print(
+    bodies: Sequence[Body],
+    rivals: Sequence[Array | None],
+    contrasts: Sequence[float | None],
+    intake: "Intake",
+    config: "RegistrationConfig",
+) -> tuple[list[float | None], list[Duel | None]]:
+    """Return the contrasts, those among them settled by the print, and the duels that say so.
+
+    Args:
+        bodies: the objects where they were found.
+        rivals: of each, by depth; None = none.
+        contrasts: to these.
+        intake: the frames.
+        config: see there.
+    """
+    rules, poses = config.rivals, [b.T_start for b in bodies]
+    out, fought = list(contrasts), list[Duel | None]([None] * len(poses))
+    asked = [
+        n for n, (c, R) in enumerate(zip(contrasts, rivals, strict=True))
+        if R is not None and c is not None and c < rules.print_from
+        and paint_of(bodies[n].model.mesh) is not None
+    ]  # fmt: skip
+    pictures = [
+        Picture(intrinsics=intake.intrinsics, depth_m=f.depth_m, T_world_cam=f.T_world_cam,
+                rgb=f.read_rgb())
+        for f in (intake.frames if asked else ()) if f.read_rgb is not None
+    ]  # fmt: skip
+    if not pictures:
+        return out, fought
+    comparer = make_comparer(
+        intake.intrinsics, [read_frame(f) for f in intake.frames], intake.noise, intake.plane,
+        config.compare,
+    )  # fmt: skip
+    for n in asked:
+        near = near_symmetries(bodies[n].model, config.find.near, config.field_folder)
+        others = [poses[n] @ S for S in near[: rules.print_rivals]]
+        others += [R for R in (rivals[n],) if R is not None]
+        stride = comparer.stride_of(bodies[n], poses[n])
+        least = (1.0 - rules.print_loss) * comparer.gain(bodies[n], poses[n], stride)[0]
+        others = [R for R in others if comparer.gain(bodies[n], R, stride)[0] >= least]
+        said = print_duel(bodies, poses, n, others, pictures, rules) if others else None
+        if said is None or said.contrast is None:
+            continue
+        # A print that does not decide can raise a doubt, and settles none.
+        if abs(said.contrast) >= CONTRAST_DECIDED:
+            out[n], fought[n] = abs(said.contrast), said
+        elif said.contrast < 0:
+            out[n] = min(abs(said.contrast), abs(out[n] or 0.0))
+    return out, fought
+
+
+def print_duel(
+    bodies: Sequence[Body],
+    poses: Sequence[Array],
+    number: int,
+    rivals: Sequence[Array],
+    pictures: Sequence[Picture],
+    config: RivalConfig,
+) -> Duel | None:
+    """Return how clearly the print of an object in the photographs is that of its pose.
+
+    Args:
+        bodies: all objects.
+        poses: (4, 4) each.
+        number: which of them has rivals.
+        rivals: (4, 4) each.
+        pictures: the photographs.
+        config: see there.
+
+    Returns:
+        The duel with the best rival; contrast 0 = two rivals are alike. None = the object has no
+        print, or it is found at no pose.
+    """
+    paint = paint_of(bodies[number].model.mesh)
+    if paint is None or float(paint.colors.std(0).max()) < config.print_spread:
+        return None
+    sets: list[list[tuple[float, Array]]] = [[] for _ in range(1 + len(rivals))]
+    for picture in pictures:
+        rest = [
+            picture.depth_of(b.model.mesh, T)
+            for k, (b, T) in enumerate(zip(bodies, poses, strict=True)) if k != number
+        ]  # fmt: skip
+        for found, T in zip(sets, (poses[number], *rivals), strict=True):
+            own = picture.depth_of(bodies[number].model.mesh, T)
+            others = np.min([*rest, np.full_like(own, np.inf)], axis=0)
+            found.append(print_errors(picture, paint, T, own, others, config.photo))
+    values = np.nan_to_num([np.mean([r for r, _ in found]) for found in sets])
+    best = int(np.argmax(values))
+    if values[best] < config.least_print:
+        return None
+    Ts, body = [poses[number], *rivals], bodies[number]
+    # Those that lie beside the best are no other side of the object: fits bring them together.
+    beside = config.beside_share * body.radius_m
+    clear = min(
+        (
+            min(_print_gap(found, sets[best], config), float(values[best] - value))
+            for T, found, value in zip(Ts, sets, values, strict=True)
+            if mssd_symmetric(Ts[best], T, body.model) > beside
+        ),
+        default=config.print_gap,
+    )
+    if best == 0:
+        return Duel(contrast=CONTRAST_DECIDED * clear / config.print_gap, T_rival=rivals[0])
+    return Duel(contrast=-CONTRAST_DECIDED * clear / config.print_gap, T_rival=rivals[best - 1])
+
+
+def _print_gap(
+    worse: Sequence[tuple[float, Array]], better: Sequence[tuple[float, Array]], config: RivalConfig
+) -> float:
+    """Return how clearly one print fits better, block by block; `print_gap` = clearly."""
+    gaps = np.concatenate([(w - b).ravel() for (_, w), (_, b) in zip(worse, better, strict=True)])
+    gaps = gaps[np.isfinite(gaps)]
+    if len(gaps) < config.least_cells:
+        return 0.0
+    t = gaps.mean() / max(float(np.std(gaps, ddof=1)) / np.sqrt(len(gaps)), 1e-9)
+    return float(max(t, 0.0)) / config.t * config.print_gap
 
 
 def _squares(body: Body, T: Array, cloud: Cloud, misfit_m: float, config: RivalConfig) -> Array:

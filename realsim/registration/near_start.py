@@ -168,9 +168,9 @@ class JointConfig:
     sweeps: int = 3
     """Alternations of assigning points and fitting; the third moves nothing by 0.01 mm."""
     table_m: float = 0.003
-    """Points nearer to the table than this are the table's..."""
+    """Points nearer to the table than this are the table's."""
     table_share: float = 0.2
-    """...but at most this share of the object's height: a flat object keeps its points."""
+    """At most this share of the object's height is: a flat object keeps its points."""
     coarse_share: float = 1 / 25
     """Coarse voxel as a share of the bounding box's diagonal, within `coarse_m`."""
     coarse_m: tuple[float, float] = (0.002, 0.005)

@@ -8,7 +8,7 @@
 5. Covariance, checks, probability, verdict; the same for the paper's way, ICP in one view.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,7 +24,7 @@ from realsim.registration.body import Body, moved_body
 from realsim.registration.compare import Comparer
 from realsim.registration.config import METHODS, RegistrationConfig
 from realsim.registration.evidence import DepthFrame
-from realsim.registration.few_views import register_few
+from realsim.registration.few_views import few_around, register_few
 from realsim.registration.finding import (
     FoundObjects,
     Progress,
@@ -35,12 +35,13 @@ from realsim.registration.finding import (
     models_in_units,
     seek_objects,
     wanted_objects,
+    with_flat,
 )
 from realsim.registration.intake import Intake, check_odometry, take_in
 from realsim.registration.judge import Defect, Poses, judge_objects
 from realsim.registration.judging.verdict import CONTRAST_DECIDED
 from realsim.registration.many_views import ManyViews, comparer_on, register_many
-from realsim.registration.near_rivals import Duel, duels
+from realsim.registration.near_rivals import Duel, duels, duels_by_print
 from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.registration.reports import (
     camera_report,
@@ -48,10 +49,12 @@ from realsim.registration.reports import (
     object_report,
     plane_report,
 )
+from realsim.registration.rivals_around import integrated
 from realsim.registration.search.records import NotPlaced, Wanted
 from realsim.registration.single_view import fit_single_view, reference_frame
 from realsim.registration.verify import verify_objects
 from realsim.registration.view_checks import check_views
+from realsim.registration.views import ViewPoints
 
 __all__ = ["DepthFrame", "Registration", "RegistrationConfig", "register_scene"]
 
@@ -78,7 +81,7 @@ class Registration:
     """Plain JSON values: per object the search, the residuals, what was rejected; the cameras."""
 
 
-def register_scene(
+def register_scene(  # noqa: PLR0913 - the inputs, and two ways to follow them
     name: str,
     intrinsics: CameraIntrinsics,
     frames: Sequence[DepthFrame],
@@ -88,6 +91,7 @@ def register_scene(
     *,
     gravity_up_world: ArrayLike | None = None,
     progress: Progress | None = None,
+    told: Callable[[str], None] | None = None,
 ) -> Registration:
     """Return the pose of every object in world from all depth frames together.
 
@@ -101,6 +105,7 @@ def register_scene(
         config: see there.
         gravity_up_world: (3,) up; helps to tell the table from a wall.
         progress: called with (steps done, steps).
+        told: called with words for what is being done.
 
     Raises:
         InputError: an object names an unknown model, numbers repeat, images do not fit the camera,
@@ -110,7 +115,8 @@ def register_scene(
     if config.method not in METHODS:
         raise InputError(f"the method is '{config.method}'; {' or '.join(METHODS)} is accepted.")
     asked = wanted_objects(models, wanted, config)
-    tick = Ticker(progress, len(frames) + 2 * max(len(asked or ()), 1) + config.refine.rounds + 3)
+    sought = len(models if asked is None else asked)
+    tick = Ticker(progress, len(frames) + 2 * sought + config.refine.rounds + 3, told)
     up = None if gravity_up_world is None else np.asarray(gravity_up_world, dtype=np.float64)
     intake = take_in(intrinsics, frames, config, up, tick)
     asked, refused = in_units(models, asked, intake, config)
@@ -121,13 +127,19 @@ def register_scene(
         kinematics, why_not = check_odometry(intake, config)
         if why_not is not None:
             intake = replace(intake, findings=(*intake.findings, why_not))
-    task = SceneTask(name, intake, models, config, up, tick, kinematics)
+    task = SceneTask(name, intake, models, config, up, tick, kinematics, {})
+    if asked is not None:
+        task = task.symmetric(w.obj_id for w in asked)
     found = seek_objects(task, asked)
     missing = (*refused, *found.not_placed)
     if not found.bodies:
         return _nothing(task, found, missing)
     many = len(intake.frames) >= config.refine_from and config.refine_cameras
-    fit = _fit_many(task, found) if many else _fit_few(task, found)
+    if many:
+        found, fit = _fit_many(task, found, asked or ())
+        missing = (*refused, *found.not_placed)
+    else:
+        fit = _fit_few(task, found)
     return _registration(task, found, missing, fit)
 
 
@@ -138,6 +150,8 @@ class _Fit:
     poses: Poses
     frames: Sequence[DepthFrame]
     """With the cameras and the depth as they are now known."""
+    views: tuple[ViewPoints, ...]
+    """Their points, likewise."""
     kept: list[Kept]
     uncertain: list[Uncertainty]
     searches: list[dict[str, Any]]
@@ -150,12 +164,16 @@ class _Fit:
     """Report of what all objects have in common, as JSON values."""
 
 
-def _fit_many(task: SceneTask, found: FoundObjects) -> _Fit:
-    """Return everything refined together."""
+def _fit_many(
+    task: SceneTask, found: FoundObjects, asked: Sequence[Wanted]
+) -> tuple[FoundObjects, _Fit]:
+    """Return everything refined together, and the objects with the flat ones that it showed."""
     intake, config = task.intake, task.config
-    claimed = claimed_bodies(found)
-    starts = [b if T is not None else None for b, T in zip(claimed, found.claimed, strict=True)]
-    many = register_many(intake, found.bodies, starts, intake.plane, config, task.tick.each)
+    many = register_many(intake, found.bodies, _starts(found), intake.plane, config, task.tick.each)
+    if (more := with_flat(task, found, many, asked)) is not None:
+        found = more
+        many = register_many(intake, found.bodies, _starts(found), intake.plane, config)
+    claimed, starts = claimed_bodies(found), _starts(found)
     fought = _duels(found, many, config)
     if any(_is_lost(d) for d in fought):
         found = _with_rivals(found, fought)
@@ -171,11 +189,12 @@ def _fit_many(task: SceneTask, found: FoundObjects) -> _Fit:
             _contrast(c, d, k) for c, d, k in zip(found.contrasts, fought, many.kept, strict=True)
         ],
         cameras=many.refined.cameras, plane=many.plane,
+        table_off_m=float(many.refined.misfit_m[-1]),
         known=found.findings, with_starts=all(T is not None for T in found.claimed),
     )  # fmt: skip
     numbers = [f.index for f in intake.frames]
-    return _Fit(
-        poses=poses, frames=many.frames, kept=many.kept, uncertain=uncertain,
+    return found, _Fit(
+        poses=poses, frames=many.frames, views=many.views, kept=many.kept, uncertain=uncertain,
         searches=found.reports,
         seen={
             number: {
@@ -184,19 +203,22 @@ def _fit_many(task: SceneTask, found: FoundObjects) -> _Fit:
             for v, number in enumerate(numbers)
         },
         findings=_views_off(intake, many, claimed, config),
-        report={"refinement": camera_report(many, numbers)},
+        report={"refinement": camera_report(many, claimed, numbers)},
     )  # fmt: skip
+
+
+def _starts(found: FoundObjects) -> list[Body | None]:
+    """Return the bodies at the starts that somebody claimed; None = nobody did."""
+    claimed = zip(claimed_bodies(found), found.claimed, strict=True)
+    return [None if T is None else body for body, T in claimed]
 
 
 def _views_off(
     intake: Intake, many: ManyViews, bodies: Sequence[Body], config: RegistrationConfig
 ) -> list[Defect]:
     """Return the views that do not fit the registered objects, their cameras refined."""
-    views = [
-        replace(v, T_world_cam=T) for v, T in zip(intake.views, many.refined.cameras, strict=True)
-    ]
     found = check_views(
-        views, many.plane, intake.noise, config.judging.views, bodies=bodies,
+        many.views, many.plane, intake.noise, config.judging.views, bodies=bodies,
         Ts_world_obj=many.poses,
     )  # fmt: skip
     known = {f.index for f in intake.findings}
@@ -245,21 +267,29 @@ def _with_rivals(found: FoundObjects, fought: Sequence[Duel | None]) -> FoundObj
 def _fit_few(task: SceneTask, found: FoundObjects) -> _Fit:
     """Return the objects fitted with the cameras at their word."""
     intake, config = task.intake, task.config
+    contrasts, fought = duels_by_print(found.bodies, found.rivals, found.contrasts, intake, config)
+    found = replace(_with_rivals(found, fought), contrasts=contrasts)
     few = register_few(intake, found.bodies, config, task.up, task.tick)
     claimed = claimed_bodies(found)
+    tried = few_around(intake, few, claimed, found.claimed, config)
+    kept = [replace(k, fit=a.fit) for k, a in zip(few.kept, tried, strict=True)]
     uncertain = [
         uncertainty(b, k.fit, few.stride, config.covariance)
-        for b, k in zip(claimed, few.kept, strict=True)
+        for b, k in zip(claimed, kept, strict=True)
     ]
     poses = Poses(
-        bodies=claimed, poses=[k.fit.T_world_obj for k in few.kept], clouds=few.clouds,
-        covariances=[u.covariance for u in uncertain],
+        bodies=claimed, poses=[k.fit.T_world_obj for k in kept], clouds=few.clouds,
+        covariances=[
+            integrated(b, u.covariance, a)
+            for b, u, a in zip(claimed, uncertain, tried, strict=True)
+        ],
+        around=tried,
         blind=[len(u.unobservable) for u in uncertain], contrasts=found.contrasts,
         cameras=intake.cameras, plane=few.plane if few.plane is not None else intake.plane,
         known=found.findings, with_starts=all(T is not None for T in found.claimed),
     )  # fmt: skip
     return _Fit(
-        poses=poses, frames=intake.frames, kept=few.kept, uncertain=uncertain,
+        poses=poses, frames=intake.frames, views=intake.views, kept=kept, uncertain=uncertain,
         searches=[{**r, **f.report} for r, f in zip(found.reports, few.found, strict=True)],
         seen={}, findings=[], report={"joint": few.history},
     )  # fmt: skip
@@ -284,7 +314,7 @@ def _registration(
     """Return the objects judged, with the paper's way beside them."""
     given, intake, config = fit.poses, task.intake, task.config
     comparer = comparer_on(intake, fit.frames, given.plane, given.bodies, given.poses, config)
-    judgement = judge_objects(intake, given, comparer, config)
+    judgement = judge_objects(replace(intake, views=fit.views), given, comparer, config)
     task.tick()
     single, single_report = _single_view(task, given, comparer)
     task.tick()
@@ -316,7 +346,7 @@ def _registration(
         "kinematics": None if task.kinematics is None else task.kinematics.as_json(),
         **fit.report,
         "objects": [
-            object_report(*one)
+            {**object_report(*one), "symmetry": task.symmetry_words.get(one[1].obj_id, "")}
             for one in zip(
                 given.bodies, objects, fit.kept, fit.searches, fit.uncertain, strict=True
             )

@@ -13,6 +13,7 @@ from realsim.registration.config import RegistrationConfig
 from realsim.registration.judge import Poses
 from realsim.registration.many_views import ManyViews
 from realsim.registration.refinement.equations import BIAS, HAND_EYE
+from realsim.registration.refinement.uncertainty import common_covariance
 from realsim.registration.search.records import Placed
 from realsim.registration.verify import common_offset, common_sinking
 
@@ -73,24 +74,30 @@ def object_report(
     }
 
 
-def camera_report(many: ManyViews, numbers: Sequence[int]) -> dict[str, Any]:
+def camera_report(
+    many: ManyViews, bodies: Sequence[Body], numbers: Sequence[int]
+) -> dict[str, Any]:
     """Return what the refinement found of cameras, depth and table."""
     refined = many.refined
     C = refined.covariance.shared
     mm, deg = refined.hand_eye_mm_deg
     sigma = np.sqrt(np.diag(C))
     own = refined.state.views
+    common = np.sqrt(np.diag(common_covariance(refined, bodies)))
     return {
         "hand_eye_mm": mm,
         "hand_eye_deg": deg,
         "hand_eye_sigma_mm": 1e3 * float(np.linalg.norm(sigma[HAND_EYE][3:])),
         "hand_eye_sigma_deg": float(np.degrees(np.linalg.norm(sigma[HAND_EYE][:3]))),
+        "common_sigma_mm": 1e3 * float(np.linalg.norm(common[3:])),
+        "common_sigma_deg": float(np.degrees(np.linalg.norm(common[:3]))),
         "view_sigma_mm": refined.view_sigma[1],
         "view_sigma_deg": refined.view_sigma[0],
         "views": {
             str(i): {
-                "shift_mm": 1e3 * float(np.linalg.norm(x[3:])),
+                "shift_mm": 1e3 * float(np.linalg.norm(x[3:6])),
                 "turn_deg": float(np.degrees(np.linalg.norm(x[:3]))),
+                "depth_offset_per_m": float(x[6]),
             }
             for i, x in zip(numbers, own, strict=True)
         },

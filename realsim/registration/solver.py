@@ -223,6 +223,7 @@ def solve_pose(
     stages: tuple[Stage, ...],
     config: SolverConfig,
     free_space: FreeSpace | None = None,
+    held: Array | None = None,
 ) -> PoseFit:
     """Return the pose at which the measured points lie on the model's surface.
 
@@ -233,6 +234,8 @@ def solve_pose(
         stages: the annealing.
         config: see there.
         free_space: images that the model may not stand in front of; None = not checked.
+        held: (6, K) orthonormal motions that are left as they are, about the box's centre, rotation
+            first, turns times the radius; None = none.
     """
     T = np.array(T_world_obj, dtype=np.float64)
     sigmas = np.sqrt(np.square(cloud.sigmas) + config.sigma_floor_m**2)
@@ -241,6 +244,7 @@ def solve_pose(
     radius = body.radius_m
     scale = np.array([radius, radius, radius, 1.0, 1.0, 1.0])
     T_center = se3.from_translation(body.center_obj)
+    free = np.eye(6) if held is None else np.eye(6) - held @ held.T
     sums, taken = _Sums(np.zeros((6, 6)), 0.0, 0.0, 0.0, 0), 0
     history: list[float] = []
     for stage in stages:
@@ -261,8 +265,9 @@ def solve_pose(
                 )
             H = H + np.triu(H, 1).T
             # In scaled units every unknown moves the surface by about its own size.
-            A = H / np.outer(scale, scale) + config.damping**2 * sums.weight * np.eye(6)
-            xi = np.linalg.solve(A, b / scale) / scale
+            A = free @ (H / np.outer(scale, scale)) @ free
+            A += config.damping**2 * sums.weight * np.eye(6)
+            xi = np.linalg.solve(A, free @ (b / scale)) / scale
             T = T @ T_center @ se3.exp(xi) @ se3.invert(T_center)
             if np.linalg.norm(xi[:3]) * radius + np.linalg.norm(xi[3:]) < config.converged_m:
                 break

@@ -28,6 +28,9 @@ class TableSearchConfig:
     """Points of each view by which its own table is measured."""
     iterations: int = 300
     """Random triples; finds a plane of 25 % of the points with p = 0.99."""
+    common_deg: float = 3.0
+    """Where views see their planes tilted by more than this against the common one, in the median,
+    it is no table [deg]: a hand-eye is off by a degree at most."""
     searches: int = 2
     """Random searches per plane, each over other points."""
     triple_points: int = 4_000
@@ -331,9 +334,11 @@ def table_depth(plane: SupportPlane, T_world_cam: Array, rays: NDArray[np.floati
 
 
 def support_checks(
-    bodies: Sequence[Body], poses: Sequence[Array], plane: SupportPlane | None
+    bodies: Sequence[Body], poses: Sequence[Array], plane: SupportPlane | None, off_m: float = 0.0
 ) -> list[dict[str, float]]:
     """Return of every object how deep it is sunk into the table and how far it floats.
+
+    What a table that is not flat can be off by, `off_m`, counts for neither.
 
     In a pile an object may stand on another: it floats by the least of its heights over the table
     and its distances to the other objects.
@@ -346,7 +351,7 @@ def support_checks(
     results: list[dict[str, float]] = []
     for k, (body, T) in enumerate(zip(bodies, poses, strict=True)):
         gap = lowest_height(plane, body.model.mesh.vertices, T)
-        floating = max(0.0, gap)
+        floating = max(0.0, gap - off_m)
         for j, (other, T_other) in enumerate(zip(bodies, poses, strict=True)):
             apart = float(np.linalg.norm(body.center(T) - other.center(T_other)))
             if floating == 0.0 or j == k or apart > body.radius_m + other.radius_m + floating:
@@ -354,5 +359,5 @@ def support_checks(
             near = other.field.distance(body.samples, se3.invert(T_other) @ T)
             back = body.field.distance(other.samples, se3.invert(T) @ T_other)
             floating = max(0.0, min(floating, float(near.min()), float(back.min())))
-        results.append({"sunk_mm": 1e3 * max(0.0, -gap), "floating_mm": 1e3 * floating})
+        results.append({"sunk_mm": 1e3 * max(0.0, -gap - off_m), "floating_mm": 1e3 * floating})
     return results

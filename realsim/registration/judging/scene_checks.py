@@ -57,7 +57,7 @@ class SwapConfig:
     turns: int = 4
     """Quarter turns about the vertical that are tried, for each of the six sides up."""
     finalists: int = 4
-    """Of the fitted turns so many are rendered."""
+    """Fitted turns that are rendered."""
     points: int = 1500
     """Points that fit a turn."""
     solver: SolverConfig = field(default_factory=SolverConfig)

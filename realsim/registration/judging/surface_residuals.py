@@ -62,7 +62,8 @@ class ResidualConfig:
     level_per_m: float = 0.003
     """The level where it cannot be measured: this times z^2 [1/m], 0.3 mm at 30 cm, 3 mm at 1 m."""
     level_objects: int = 4
-    """Of fewer objects the level is not measured: one wrong pose would excuse itself."""
+    """Least objects for which the level is measured: with fewer one wrong pose would excuse
+    itself."""
     looks: int = 48
     """Views, evenly picked, in which patches are looked at for free space."""
     look_cos: float = 0.35

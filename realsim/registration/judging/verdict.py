@@ -95,7 +95,7 @@ NEEDED = ("agree", "gain", "cover", "free_space_violation")
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Coefficients:
-    """Of one set."""
+    """Weights of one set."""
 
     bias: float
     """b."""
@@ -315,7 +315,8 @@ def reasons_of(features: Mapping[str, float | None], config: VerdictConfig) -> t
     if contrast < c.contrast:
         reasons.append(
             f"a nearly symmetric pose explains the images as well (contrast {contrast:.2f}, "
-            f"{c.contrast:g} decides)"
+            f"{c.contrast:g} decides): declare the symmetry if both are the same to you, else look "
+            "at the photograph"
         )
     return tuple(reasons)
 

@@ -16,6 +16,8 @@ class PointConfig:
     foot_m: float = 0.004
     """Near the table a point could be either's: so low over it, points within `reach_m` of a model
     are left out [m]."""
+    foot_share: float = 0.2
+    """So low is never more than this share of the object's height: plates are nothing but foot."""
     table_margin_m: float = 0.06
     """The table is used up to this far from an object [m]: farther away it may bend."""
     points_per_object: int = 60_000
@@ -65,6 +67,9 @@ class CameraPrior:
     the hand-eye."""
     view_deg: float = 0.03
     """Likewise [deg]."""
+    view_offset_per_m: float = 0.002
+    """Standard deviation of a view's own offset of the inverse depth [1/m]: 0.02 px of a D405,
+    whose disparity wanders."""
     learn_views: bool = True
     """Whether the views' sigmas are found from the views (if there are `learn_from` or more)."""
     learn_from: int = 6
@@ -88,9 +93,13 @@ class RefineConfig:
     """In so many last rounds, thin-walled objects are compared with their triangles instead of the
     distance field, whose cells are as wide as their walls."""
     thin_cells: float = 3.0
-    """An object is thin-walled where its wall is thinner than so many cells of its field..."""
+    """An object is thin-walled where its wall is thinner than so many cells of its field."""
     thin_share: float = 0.2
-    """...on this share of its surface."""
+    """Share of its surface on which it must be so."""
+    flat_m: float = 0.008
+    """An object that rises less over the table is placed by the step at its outline [m]."""
+    blur_m: tuple[float, ...] = (0.004, 0.002, 0.001)
+    """Blur of the step, round by round [m]."""
     free_turn_deg: float = 30.0
     """1-sigma of how far an object may turn from its start [deg]: a body of revolution would turn
     as it likes."""

@@ -16,7 +16,8 @@ All other unknowns follow from the block by adjoints. With A the row of a block'
 table -A[0, 1, 5], camera A Ad(M), because M exp(xi) = exp(Ad(M) xi) M. Shared unknowns are 6 of the
 hand-eye, 2 of the depth's bias, 3 of the table (two tilts and the height), 6 of every object (right
 twist about its centre); then whatever the caller adds: the sizes of objects, offsets of patches of
-the surface, an offset of outlines. Every view has 6 more (see `geometry.normal_equations`).
+the surface, an offset of outlines. Every view has 6 more (see `geometry.normal_equations`), or 7:
+what a stereo camera's disparity is off by wanders, and is an offset of the view's inverse depth.
 
 To fit a size too (the body's frame at its centre, as large as the body now is):
     places, distances, normals = seen_distances(lattice, size, points, views, cameras, edges)
@@ -33,7 +34,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from realsim.arrays import Array, Int32, Int64
+from realsim.arrays import Array, Array32, Int32, Int64
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.normal_equations import System, add_row
@@ -50,6 +51,8 @@ TABLE_AT: Int64 = np.arange(TABLE.start, TABLE.stop)
 HAND_EYE_AT: Int64 = np.arange(HAND_EYE.start, HAND_EYE.stop)
 BLOCK = 8
 """Columns of a block: twist and bias. A ninth is the logarithm of the body's size."""
+OFFSET = 7
+"""The block's column of the inverse depth's offset, which a view may have of its own."""
 LEAST_ALONG = 0.15
 """Least cosine between ray and normal at which the ray is followed to the surface."""
 
@@ -202,12 +205,18 @@ class Blocks:
     """None = the surface is as the model says."""
 
 
-def assemble(bodies: Sequence[Blocks], unknowns: int) -> System:
-    """Return the normal equations of so many shared unknowns without any prior."""
+def assemble(bodies: Sequence[Blocks], unknowns: int, of_view: int = 6) -> System:
+    """Return the normal equations without any prior.
+
+    Args:
+        bodies: what the points of each say.
+        unknowns: how many are shared.
+        of_view: how many every view has: 6 of its twist, or 7 with an offset of its inverse depth.
+    """
     V, S = len(bodies[0].H), unknowns
     system = System(
-        A=np.zeros((S, S)), a=np.zeros(S), B=np.zeros((V, S, 6)), D=np.zeros((V, 6, 6)),
-        d=np.zeros((V, 6)),
+        A=np.zeros((S, S)), a=np.zeros(S), B=np.zeros((V, S, of_view)),
+        D=np.zeros((V, of_view, of_view)), d=np.zeros((V, of_view)),
     )  # fmt: skip
     for blocks in bodies:
         _add(system, blocks)
@@ -217,36 +226,38 @@ def assemble(bodies: Sequence[Blocks], unknowns: int) -> System:
 def _add(system: System, blocks: Blocks) -> None:
     """Add the blocks of one body."""
     own, rows, more, hand = blocks.own, np.array(blocks.rows), blocks.further, HAND_EYE_AT
-    Ad = se3.adjoint(blocks.Ms)
-    back = np.swapaxes(Ad, 1, 2)
-    H, b = blocks.H[:, :6, :6], blocks.b[:, :6]
-    Hc = H @ Ad
-    cc = back @ Hc
-    cb = back @ blocks.H[:, :6, 6:]
-    cd = np.einsum("vji,vj->vi", Ad, b)
+    H, b = blocks.H, blocks.b
+    # Columns of a block by unknowns of its view: the camera's twist, the inverse depth's offset.
+    G = np.zeros((*b.shape, system.d.shape[1]))
+    G[:, :6, :6] = se3.adjoint(blocks.Ms)
+    G[:, OFFSET, 6:] = 1.0
+    back = np.swapaxes(G, 1, 2)
+    HG = H @ G
+    cc = back @ HG
     A, B = system.A, system.B
-    A[np.ix_(own, own)] += H.sum(0)[np.ix_(rows, rows)]
-    A[np.ix_(more, more)] += blocks.H[:, 6:, 6:].sum(0)
-    A[np.ix_(hand, hand)] += cc.sum(0)
-    _couple(A, own, more, -blocks.H[:, :6, 6:].sum(0)[rows])
-    _couple(A, own, hand, -Hc.sum(0)[rows])
-    _couple(A, hand, more, cb.sum(0))
-    system.a[own] -= b.sum(0)[rows]
-    system.a[more] += blocks.b[:, 6:].sum(0)
-    system.a[hand] += cd.sum(0)
-    B[:, own] -= Hc[:, rows]
-    B[:, more] += np.swapaxes(cb, 1, 2)
-    B[:, hand] += cc
+    A[np.ix_(own, own)] += H[:, :6, :6].sum(0)[np.ix_(rows, rows)]
+    A[np.ix_(more, more)] += H[:, 6:, 6:].sum(0)
+    A[np.ix_(hand, hand)] += cc.sum(0)[:6, :6]
+    _couple(A, own, more, -H[:, :6, 6:].sum(0)[rows])
+    _couple(A, own, hand, -HG.sum(0)[rows, :6])
+    _couple(A, hand, more, HG.sum(0)[6:, :6].T)
+    cd = np.einsum("vji,vj->vi", G, b)
+    system.a[own] -= b[:, :6].sum(0)[rows]
+    system.a[more] += b[:, 6:].sum(0)
+    system.a[hand] += cd.sum(0)[:6]
+    B[:, own] -= HG[:, rows]
+    B[:, more] += HG[:, 6:]
+    B[:, hand] += cc[:, :6]
     system.D[:] += cc
     system.d[:] += cd
     if (offsets := blocks.offsets) is not None:
         at, total = offsets.at, offsets.coupling.sum(0)
-        ck = back @ offsets.coupling[:, :6]
+        ck = back @ offsets.coupling
         A[at, at] += offsets.information
         system.a[at] += offsets.right
         _couple(A, own, at, -total[rows])
         _couple(A, more, at, total[6:])
-        _couple(A, hand, at, ck.sum(0))
+        _couple(A, hand, at, ck.sum(0)[:6])
         B[:, at] += np.swapaxes(ck, 1, 2)
 
 
@@ -267,23 +278,44 @@ class State:
     hand_eye: Array
     """(6,) twist of every camera [rad, m]."""
     views: Array
-    """(V, 6) further twist of each."""
+    """(V, 7) further twist of each, and the offset of its inverse depth [rad, m, 1/m]; (V, 6) where
+    that is the same for all."""
     bias: Array
     """(2,) scale and offset [1/m] of the inverse depth."""
 
     def cameras(self, claimed: Array) -> Array:
         """Return the cameras (V, 4, 4) as they stand now, from what is said of them."""
-        return claimed @ se3.exp(self.hand_eye + self.views)
+        return claimed @ se3.exp(self.hand_eye + self.views[:, :6])
 
-    def corrected(self, points: Array) -> Array:
-        """Return points (N, 3) in camera axes without the depth's bias."""
-        scale, offset = self.bias
-        return points / (scale + offset * points[:, 2:])
+    def offsets(self) -> Array:
+        """Return the offset of the inverse depth of every view (V,) [1/m]."""
+        return self.bias[1] + self.views[:, 6:].sum(axis=1)
+
+    def corrected(self, points: Array | Array32, views: int | Int32) -> Array:
+        """Return points (N, 3) in the axes of their views' cameras without the depth's bias."""
+        offset = np.broadcast_to(self.offsets()[views], len(points))
+        return points / (self.bias[0] + offset[:, None] * points[:, 2:])
 
 
 def centre_pose(body: Body, T_world_obj: Array) -> Array:
     """Return the pose (4, 4) of the body's frame moved to the centre of its box."""
     return T_world_obj @ se3.from_translation(body.center_obj)
+
+
+def moves_of_all(bodies: Sequence[Body], state: State) -> Array:
+    """Return how the shared unknowns (S, 6) change if everything on the table moves as one.
+
+    The six are turns about the middle of the objects' centres and shifts, in world axes.
+    """
+    centres = np.array([centre_pose(b, T) for b, T in zip(bodies, state.poses, strict=True)])
+    if len(centres) == 0:
+        return np.zeros((OBJECTS, 6))
+    middle = se3.from_translation(centres[:, :3, 3].mean(axis=0))
+    moves = np.zeros((OBJECTS + 6 * len(centres), 6))
+    moves[OBJECTS:] = se3.adjoint(se3.invert(centres) @ middle).reshape(-1, 6)
+    if state.T_world_table is not None:
+        moves[TABLE] = se3.adjoint(se3.invert(state.T_world_table) @ middle)[list(TABLE_ROWS)]
+    return moves
 
 
 def step_state(state: State, bodies: list[Body], shared: Array, views: Array) -> State:
@@ -293,7 +325,7 @@ def step_state(state: State, bodies: list[Body], shared: Array, views: Array) ->
         state: before.
         bodies: the objects.
         shared: (11 + 6 K,) see `equations`.
-        views: (V, 6).
+        views: (V, 6 or 7).
     """
     poses = [
         centre_pose(b, T) @ se3.exp(shared[object_at(k)])

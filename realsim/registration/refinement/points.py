@@ -58,7 +58,7 @@ def _sorted_in(
     points: Array32,
     views: Int32,
     cameras: Array,
-    bias: tuple[float, float],
+    bias: tuple[float, Array],
     spheres: tuple[Array, Array, Array],
 ) -> tuple[Array32, Mask, Int32, Int64]:
     """Return points in world, which are around a body, and each body's candidates.
@@ -67,14 +67,14 @@ def _sorted_in(
         points: (N, 3) as measured, in camera axes.
         views: (N,).
         cameras: (V, 4, 4).
-        bias: scale and offset of the inverse depth.
+        bias: scale of the inverse depth, and its offset in every view (V,).
         spheres: centres (K, 3), square of the reach (K,), and square of the table's (K,).
 
     Returns:
         Corrected points (N, 3) in world, flags (N,), and the candidates' numbers body after body
         with where each body's begin (K + 1,).
     """
-    scale, offset = bias
+    scale, offsets = bias
     centers, reach, margin = spheres
     bodies = len(centers)
     out = np.empty((len(points), 3), np.float32)
@@ -82,7 +82,7 @@ def _sorted_in(
     begin = np.zeros(bodies + 1, np.int64)
     for i in range(len(points)):
         C = cameras[views[i]]
-        f = 1.0 / (scale + offset * points[i, 2])
+        f = 1.0 / (scale + offsets[views[i]] * points[i, 2])
         a, b, c = f * points[i, 0], f * points[i, 1], f * points[i, 2]
         for k in range(3):
             out[i, k] = C[k, 0] * a + C[k, 1] * b + C[k, 2] * c + C[k, 3]
@@ -158,8 +158,9 @@ def assign_views(
     cameras: Array,
     config: PointConfig,
     share: float = 1.0,
-) -> tuple[list[Owned], Owned]:
-    """Return the points of every body and those of the table.
+    flat: Sequence[int] = (),
+) -> tuple[list[Owned], Owned, list[Owned]]:
+    """Return the points of every body, those of the table, and all around the flat bodies.
 
     Args:
         points: of all views.
@@ -169,9 +170,10 @@ def assign_views(
         cameras: (V, 4, 4) as they stand now.
         config: see there.
         share: of the points that the configuration allows.
+        flat: numbers of the flat bodies.
     """
     poses, T_world_table = list(state.poses), state.T_world_table
-    bias = (float(state.bias[0]), float(state.bias[1]))
+    bias = (float(state.bias[0]), state.offsets())
     centers = np.array([b.center(T) for b, T in zip(bodies, poses, strict=True)]).reshape(-1, 3)
     radii = np.array([b.radius_m for b in bodies])
     spheres = (
@@ -183,6 +185,11 @@ def assign_views(
     for k, (body, T) in enumerate(zip(bodies, poses, strict=True)):
         f, mine = body.field, index[begin[k] : begin[k + 1]]
         _claim((f.grid, f.origin, f.cell), world, mine, se3.invert(T), k, (distance, owner))
+    most = int(share * config.points_per_object)
+    near: list[Owned] = []
+    for k in flat:
+        mine = index[begin[k] : begin[k + 1]]
+        near.append(_thinned(points, mine[(owner[mine] == k) | (owner[mine] == NOBODY)], most))
     table = np.zeros(len(world), dtype=bool)
     if T_world_table is not None:
         row = se3.invert(T_world_table)[2].astype(np.float32)
@@ -191,16 +198,27 @@ def assign_views(
         slack = 3.0 * noise.sigma(points.points[some, 2])
         free = owner[some] == NOBODY
         table[some[free & (height < config.table_reach_m + slack)]] = True
-        owner[some[height < config.foot_m]] = NOBODY
-    most = int(share * config.points_per_object)
-    own = [_thinned(points, owner == k, most) for k in range(len(bodies))]
+        feet = _feet(bodies, poses, row, config)[owner[some]]
+        owner[some[height < feet]] = NOBODY
+    own = [_thinned(points, np.flatnonzero(owner == k), most) for k in range(len(bodies))]
     most = int(share * config.table_points_per_view * len(cameras))
-    return own, _thinned(points, table, most)
+    return own, _thinned(points, np.flatnonzero(table), most), near
 
 
-def _thinned(points: AllPoints, mine: Mask, most: int) -> Owned:
-    """Return the points where `mine`, every so many of them."""
-    index = np.flatnonzero(mine)
+def _feet(bodies: Sequence[Body], poses: Sequence[Array], up: Array32, c: PointConfig) -> Array:
+    """Return how high over the table every body's points begin (K + 1,) [m]; nobody's last.
+
+    Were it the same for all, a plate of 3 mm would keep only the noise over it and be set too high.
+    """
+    tops = [
+        np.ptp(b.model.mesh.vertices @ (T[:3, :3].T @ up[:3]))
+        for b, T in zip(bodies, poses, strict=True)
+    ]
+    return np.append(np.minimum(c.foot_m, c.foot_share * np.array(tops)), 0.0)
+
+
+def _thinned(points: AllPoints, index: Int32 | Int64, most: int) -> Owned:
+    """Return the points of these numbers, every so many of them."""
     every = max(1, -(-len(index) // most))
     index = index[::every]
     views = points.views[index]

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from realsim.arrays import Array
+from realsim.arrays import Array, Int64
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.normal_equations import (
@@ -22,8 +22,10 @@ from realsim.geometry.normal_equations import (
     System,
     add_prior,
     covariances,
+    inverse,
     solve,
     symmetric,
+    without_views,
 )
 from realsim.geometry.robust import mad_sigma
 from realsim.geometry.seen_surface import seen_distances
@@ -43,9 +45,11 @@ from realsim.registration.refinement.equations import (
     State,
     add_blocks,
     assemble,
+    moves_of_all,
     object_at,
     step_state,
 )
+from realsim.registration.refinement.flat import is_flat, step_term
 from realsim.registration.refinement.points import (
     Owned,
     assign_views,
@@ -55,8 +59,16 @@ from realsim.registration.refinement.points import (
 )
 from realsim.registration.views import ViewPoints
 
-LEAST_SIGMA = (np.radians(1e-3), 1e-5)
-"""Least prior 1-sigma of a turn [rad] and a shift [m]: nothing is perfect."""
+OF_VIEW, KINDS = 7, (3, 3, 1)
+"""Unknowns of a view: a turn, a shift, an offset of its inverse depth."""
+LEAST_SIGMA = (np.radians(1e-3), 1e-5, 1e-5)
+"""Least prior 1-sigma of a turn [rad], a shift [m], an offset [1/m]: nothing is perfect."""
+SIDE_COS = 0.5
+"""Steeper surface of a flat object is its side: its few points are half the table's."""
+SMOOTH_WHOLE = 0.7
+"""Share of the variance of smooth errors that all views have in common: set in the second lab."""
+GROUPS = 8
+"""Groups of views that are left out in turn."""
 FIXED = 1e-9
 """1-sigma of an unknown that is held [its unit]."""
 
@@ -136,19 +148,20 @@ def refine(
     state = State(
         poses=np.stack(poses) if len(poses) else np.zeros((0, 4, 4)),
         T_world_table=None if plane is None else plane.T_world_table.copy(),
-        hand_eye=np.zeros(6), views=np.zeros((len(views), 6)),
+        hand_eye=np.zeros(6), views=np.zeros((len(views), OF_VIEW)),
         bias=np.array([config.bias.scale, config.bias.offset_per_m]),
     )  # fmt: skip
     everything = join_views(views)
     misfits = np.full(len(bodies) + 1, config.noise.widest_m)
-    sigmas = np.array([np.radians(config.prior.view_deg), config.prior.view_mm / 1e3])
+    sigmas = _said_sigmas(config)
     history: list[dict[str, float]] = []
-    system, used = None, np.zeros(len(bodies) + 1)
+    system, blocks, used = None, list[Blocks](), np.zeros(len(bodies) + 1)
     for round_ in range(config.rounds):
         last = round_ == config.rounds - 1
-        own, table = assign_views(
+        flat = _flat(task, state)
+        own, table, near = assign_views(
             everything, noise, bodies, state, state.cameras(task.claimed), config.points,
-            1.0 if last else config.early_share,
+            1.0 if last else config.early_share, flat,
         )  # fmt: skip
         if sum(len(o.points) for o in own) + len(table.points) < config.points.least_points:
             raise DegenerateError(
@@ -158,20 +171,25 @@ def refine(
             )
         exact = round_ >= config.rounds - config.exact_rounds
         for _ in range(config.steps):
-            system, misfits, used = _linearise(task, state, (own, table), misfits, exact)
+            blocks, misfits, used = _linearise(task, state, (own, table), misfits, exact)
+            system = assemble(blocks, OBJECTS + 6 * len(own), OF_VIEW)
             _add_priors(system, task, state, sigmas)
+            blur = config.blur_m[min(round_, len(config.blur_m) - 1)]
+            for k, points in zip(flat, near, strict=True):
+                _add_step(system, task, state, k, points, blur)
             state = step_state(state, task.bodies, *solve(system))
             sigmas = _learn_sigmas(system, state, config, sigmas)
         history.append(_row(state, misfits, sigmas))
         if progress is not None:
             progress(round_ + 1, config.rounds)
     assert system is not None, "there is at least one round"
+    beyond = _apart(system, blocks, task, state, sigmas)
     table_pose = state.T_world_table
     return Refined(
         poses=state.poses, cameras=state.cameras(task.claimed),
         plane=None if plane is None or table_pose is None
         else replace(plane, T_world_table=_rigid(table_pose)),
-        state=state, covariance=covariances(system), misfit_m=misfits, used=used,
+        state=state, covariance=covariances(system, beyond), misfit_m=misfits, used=used,
         view_sigma=(float(np.degrees(sigmas[0])), 1e3 * float(sigmas[1])), history=tuple(history),
     )  # fmt: skip
 
@@ -197,21 +215,25 @@ def _row(state: State, misfits: Array, sigmas: Array) -> dict[str, float]:
 
 def _linearise(
     task: _Task, state: State, points: tuple[list[Owned], Owned], misfits: Array, exact: bool
-) -> tuple[System, Array, Array]:
-    """Return the equations at a state without priors, the bodies' misfits, and points used."""
+) -> tuple[list[Blocks], Array, Array]:
+    """Return what the points say at a state, the bodies' misfits, and points used."""
     own, table = points
     cameras = state.cameras(task.claimed)
+    flat = _flat(task, state)
     blocks: list[Blocks] = []
     seen, used = misfits.copy(), np.zeros(len(own) + 1)
     for k, (body, mine) in enumerate(zip(task.bodies, own, strict=True)):
         T_obj_world = se3.invert(state.poses[k])
         Ms = T_obj_world @ cameras
         eyes = np.ascontiguousarray(Ms[:, :3, 3])
-        p = state.corrected(mine.points)
+        p = state.corrected(mine.points, mine.views)
         if exact and task.thin[k]:
             surface = exact_residuals(body, p, mine.views, Ms, eyes)
         else:
             surface = seen_distances(body.field.lattice, 1.0, p, mine.views, (Ms, eyes), False)
+        if k in flat and state.T_world_table is not None:
+            up = T_obj_world[:3, :3] @ state.T_world_table[:3, 2]
+            surface[1][np.abs(surface[2] @ up) < SIDE_COS] = np.nan
         center = body.center_obj
         Ms_centred = se3.from_translation(-center) @ Ms
         few = len(p) < task.config.points.least_points
@@ -222,7 +244,7 @@ def _linearise(
     if state.T_world_table is not None and len(table.points):
         Ms = se3.invert(state.T_world_table) @ cameras
         eyes = np.ascontiguousarray(Ms[:, :3, 3])
-        p = state.corrected(table.points)
+        p = state.corrected(table.points, table.views)
         M = Ms[table.views]
         places = np.einsum("nij,nj->ni", M[:, :3, :3], p) + M[:, :3, 3]
         up = np.tile(np.array([0.0, 0.0, 1.0]), (len(p), 1))
@@ -231,7 +253,36 @@ def _linearise(
             (float(misfits[-1]), task.config.noise.table_flat_m), False,
         )  # fmt: skip
         blocks.append(Blocks(H=H, b=b, Ms=Ms, own=TABLE_AT, rows=TABLE_ROWS))
-    return assemble(blocks, OBJECTS + 6 * len(own)), seen, used
+    return blocks, seen, used
+
+
+def _flat(task: _Task, state: State) -> list[int]:
+    """Return which bodies lie on the table and rise hardly over it."""
+    if state.T_world_table is None:
+        return []
+    T, most = se3.invert(state.T_world_table), task.config.flat_m
+    found = enumerate(zip(task.bodies, state.poses, strict=True))
+    return [k for k, (body, pose) in found if is_flat(body, T @ pose, most)]
+
+
+def _add_step(
+    system: System, task: _Task, state: State, k: int, near: Owned, blur_m: float
+) -> None:
+    """Add what the step at a flat body's outline says of its place on the table."""
+    if state.T_world_table is None or len(near.points) < task.config.points.least_points:
+        return
+    T = se3.invert(state.T_world_table)
+    Ms = T @ state.cameras(task.claimed)
+    p = state.corrected(near.points, near.views)
+    M = Ms[near.views]
+    noise = task.config.noise
+    crowding = np.maximum(1.0, task.area_px / near.area_px)
+    sigmas = np.maximum(task.noise.sigma(p[:, 2]), noise.floor_m) * np.sqrt(crowding)
+    places = np.einsum("nij,nj->ni", M[:, :3, :3], p) + M[:, :3, 3]
+    H, b = step_term(task.bodies[k], T @ state.poses[k], places, M[:, :3, 3], sigmas, blur_m)
+    at = object_at(k)
+    system.A[np.ix_(at, at)] += H
+    system.a[at] += b
 
 
 def _block_sums(
@@ -285,7 +336,7 @@ def _add_priors(system: System, task: _Task, state: State, view_sigmas: Array) -
     p = config.prior
     hand = np.repeat([np.radians(p.hand_eye_deg), p.hand_eye_mm / 1e3], 3)
     add_prior(system, HAND_EYE, state.hand_eye, np.diag(1.0 / np.square(hand)))
-    own = np.diag(1.0 / np.square(np.repeat(np.maximum(view_sigmas, LEAST_SIGMA), 3)))
+    own = _view_precision(view_sigmas)
     system.D[:] += own
     system.d[:] -= state.views @ own
     C = config.bias.covariance
@@ -303,6 +354,62 @@ def _add_priors(system: System, task: _Task, state: State, view_sigmas: Array) -
     system.A[TABLE_AT, TABLE_AT] += 1.0
 
 
+def _view_precision(sigmas: Array) -> Array:
+    """Return the prior's precision (7, 7) of a view's unknowns."""
+    return np.diag(1.0 / np.square(np.repeat(np.maximum(sigmas, LEAST_SIGMA), KINDS)))
+
+
+def _apart(
+    system: System, blocks: Sequence[Blocks], task: _Task, state: State, sigmas: Array
+) -> Array:
+    """Return by how much groups of views disagree on the shared unknowns, as a covariance (S, S).
+
+    Errors that neighbouring views share (a smooth error of the arm, a lens that does not fit) do
+    not average out as the equations take for granted. A jackknife over groups of neighbours sees:
+    J = (n - 1) / n sum_g d_g d_g^T with d_g the solution without group g less its mean (Efron,
+    1982), each solved from the same equations.
+    """
+    A, a = without_views(system)
+    W = _view_precision(sigmas)
+    largest = np.zeros_like(A)
+    for order in _orders(task.claimed):
+        found = []
+        for g in np.array_split(order, min(GROUPS, len(order))):
+            part = assemble(
+                [replace(b, H=b.H[g], b=b.b[g], Ms=b.Ms[g]) for b in blocks], len(a), OF_VIEW
+            )
+            part.D[:] += W
+            part.d[:] -= state.views[g] @ W
+            A_g, a_g = without_views(part)
+            found.append(inverse(A - A_g) @ (a - a_g))
+        off = np.array(found) - np.mean(found, axis=0)
+        J = (len(off) - 1) / len(off) * off.T @ off
+        if np.trace(J[OBJECTS:, OBJECTS:]) > np.trace(largest[OBJECTS:, OBJECTS:]):
+            largest = J
+    move = moves_of_all(task.bodies, state)
+    smooth = SMOOTH_WHOLE * _smooth_share(task, state, sigmas)
+    shared = smooth * np.repeat(np.square(sigmas[:2]), 3)
+    return largest + move @ np.diag(shared) @ move.T
+
+
+def _smooth_share(task: _Task, state: State, sigmas: Array) -> float:
+    """Return how alike the errors of the nearest cameras are, 0 to 1.
+
+    An arm's errors are mostly smooth. What all views have of them moves the scene as a whole, which
+    no view contradicts; how much that may be shows in neighbours, which are alike.
+    """
+    at = task.claimed[:, :3, 3]
+    gaps = np.linalg.norm(at[:, None] - at[None], axis=-1)
+    np.fill_diagonal(gaps, np.inf)
+    x = state.views[:, :6] / np.repeat(sigmas[:2], 3)
+    return float(np.clip(np.sum(x * x[gaps.argmin(axis=1)]) / max(np.sum(x * x), 1e-12), 0.0, 1.0))
+
+
+def _orders(cameras: Array) -> tuple[Int64, Int64]:
+    """Return the views (V,) by how high they look down, and by when they were taken."""
+    return np.argsort(-cameras[:, 2, 2]), np.arange(len(cameras))
+
+
 def _learn_sigmas(system: System, state: State, config: RefineConfig, sigmas: Array) -> Array:
     """Return the 1-sigma of the views' turns and shifts [rad, m]: one step of EM."""
     p = config.prior
@@ -310,6 +417,12 @@ def _learn_sigmas(system: System, state: State, config: RefineConfig, sigmas: Ar
         return sigmas
     C = covariances(system).views
     spread = np.square(state.views) + np.diagonal(C, axis1=1, axis2=2)
-    found = np.sqrt([spread[:, :3].mean(), spread[:, 3:].mean()])
-    said = np.array([np.radians(p.view_deg), p.view_mm / 1e3])
+    found = np.sqrt([part.mean() for part in np.split(spread, np.cumsum(KINDS)[:-1], axis=1)])
+    said = _said_sigmas(config)
     return np.clip(found, p.learn_factor[0] * said, p.learn_factor[1] * said)
+
+
+def _said_sigmas(config: RefineConfig) -> Array:
+    """Return the 1-sigma of a view's turn [rad], shift [m] and offset [1/m] before it is learnt."""
+    p = config.prior
+    return np.array([np.radians(p.view_deg), p.view_mm / 1e3, p.view_offset_per_m])

@@ -14,7 +14,13 @@ from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.registration.body import Body
-from realsim.registration.refinement.equations import HAND_EYE_AT, centre_pose, object_at
+from realsim.registration.refinement.equations import (
+    HAND_EYE_AT,
+    OBJECTS,
+    centre_pose,
+    moves_of_all,
+    object_at,
+)
 from realsim.registration.refinement.refine import Refined
 
 PIXEL_SAMPLES = 40
@@ -41,6 +47,17 @@ def object_covariance(refined: Refined, body: Body, k: int) -> Array:
     return _symmetric(Ad @ refined.covariance.shared[np.ix_(at, at)] @ Ad.T)
 
 
+def common_covariance(refined: Refined, bodies: Sequence[Body]) -> Array:
+    """Return the covariance (6, 6) of what all objects have in common [rad, m].
+
+    The move of everything on the table, about the middle of the objects and in world axes, that
+    comes nearest to the objects' moves; what is left of these is each object's own.
+    """
+    moves = moves_of_all(bodies, refined.state)[OBJECTS:]
+    nearest = np.linalg.pinv(moves)
+    return _symmetric(nearest @ refined.covariance.shared[OBJECTS:, OBJECTS:] @ nearest.T)
+
+
 def seen_poses(
     refined: Refined, bodies: Sequence[Body], intrinsics: CameraIntrinsics
 ) -> list[list[SeenPose]]:
@@ -59,9 +76,9 @@ def _seen(refined: Refined, body: Body, k: int, intrinsics: CameraIntrinsics) ->
     J = np.concatenate([np.tile(np.eye(6), (len(Ms), 1, 1)), -Ad, -Ad], axis=2)
     joint = np.empty((len(Ms), 18, 18))
     joint[:, :12, :12] = C.shared[np.ix_(picked, picked)]
-    joint[:, :12, 12:] = C.cross[:, picked]
-    joint[:, 12:, :12] = np.swapaxes(C.cross[:, picked], 1, 2)
-    joint[:, 12:, 12:] = C.views
+    joint[:, :12, 12:] = C.cross[:, picked, :6]
+    joint[:, 12:, :12] = np.swapaxes(C.cross[:, picked, :6], 1, 2)
+    joint[:, 12:, 12:] = C.views[:, :6, :6]
     centre = J @ joint @ np.swapaxes(J, 1, 2)
     back = se3.adjoint(se3.from_translation(body.center_obj))
     axes = [(np.asarray(a), np.asarray(p) - body.center_obj) for a, p in body.model.symmetry_axes]

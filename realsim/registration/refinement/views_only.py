@@ -38,9 +38,10 @@ class ViewsConfig:
     rounds: int = 14
     """Searches for partners, each followed by one step."""
     points_per_view: int = 3000
-    """At most so many points of a view are compared with the others..."""
+    """At most so many points of a view are compared with the others."""
     surface_points: int = 15_000
-    """...which are surfaces of at most so many: partners must be near, or curvature is an error."""
+    """Points at most of the surfaces that they are compared with: partners must be near, or
+    curvature is an error."""
     partners: int = 3
     """Views with which each is compared: those whose cameras are nearest and that look the same
     way. Depth errors depend on the place in the image (views of a real F200 disagree by 1.4 mm

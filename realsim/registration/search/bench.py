@@ -1,7 +1,7 @@
 """Everything that a search looks at, made once: points, heights, lattices, models."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from realsim.registration.search.candidates import (
     candidates,
     fuse,
 )
+from realsim.registration.search.flat_search import FlatConfig
 from realsim.registration.search.height_grid import GridConfig, HeightGrid, height_grid
 from realsim.registration.search.matching import MatchConfig, match_templates
 from realsim.registration.search.near_symmetry import NearSymmetryConfig, near_symmetries
@@ -48,9 +49,9 @@ class FindConfig:
     """Views whose points are fused, spread over the session: more change the poses by 0.1 mm."""
     far_sigma_m: float = 0.003
     """Depth with a larger 1-sigma is not looked at [m]: far parts of the table rise and sink with
-    it, and flat things are found in them..."""
+    it, and flat things are found in them."""
     far_ratio: float = 2.5
-    """...unless the typical depth of the views has a sigma so many times smaller only."""
+    """It is looked at where the typical depth's sigma is only so many times smaller."""
     table: TableSearchConfig = field(default_factory=TableSearchConfig)
     """Tells what the views look at: 0.6 of their distance around the point they aim at."""
     area: float = 1.4
@@ -61,15 +62,17 @@ class FindConfig:
     samples: int = 200
     """Surface samples of a model; the search itself needs none."""
     region_slack_m: float = 0.010
-    """A fitted pose may leave the region that was given by this [m]..."""
+    """A fitted pose may leave the region that was given by this [m]."""
     region_slack_deg: float = 10.0
-    """...and by this [deg]."""
+    """The same for its turn [deg]."""
     seed: int = 0
     """Seed of the random turns at clusters."""
     grid: GridConfig = field(default_factory=GridConfig)
     """Heights over the table."""
     templates: TemplateConfig = field(default_factory=TemplateConfig)
     """How models look from above."""
+    flat: FlatConfig = field(default_factory=FlatConfig)
+    """How plates and cards are found, which no single image shows."""
     match: MatchConfig = field(default_factory=MatchConfig)
     """Templates over heights."""
     near: NearSymmetryConfig = field(default_factory=NearSymmetryConfig)
@@ -121,11 +124,19 @@ class Bench:
     """Denser and with more frames, for near-symmetric poses."""
     sought: Mapping[int, Sought]
     templates: Mapping[int, ModelTemplates]
-    near: Mapping[int, Array]
-    """Near-symmetries (N, 4, 4) per model."""
+    field_folder: Path | None
+    """Where what is derived from meshes is kept between runs."""
     looked_at: Region
     """What the views look at: no object is sought beyond it."""
     watch: Stopwatch
+    _near: dict[int, Array] = field(default_factory=dict[int, Array])
+
+    def near(self, obj_id: int) -> Array:
+        """Return the near-symmetries (N, 4, 4) of a model: only what is found is asked for them."""
+        if obj_id not in self._near:
+            model = self.sought[obj_id].body.model
+            self._near[obj_id] = near_symmetries(model, self.config.near, self.field_folder)
+        return self._near[obj_id]
 
 
 def spread(Ts_world_cam: Array, center: Array, count: int) -> list[int]:
@@ -154,6 +165,7 @@ def make_bench(
     models: Mapping[int, ObjectModel],
     config: FindConfig,
     field_folder: Path | None,
+    told: Callable[[str], None] | None = None,
 ) -> Bench:
     """Return all that a search needs; models are prepared once and kept in the folder.
 
@@ -165,6 +177,7 @@ def make_bench(
         models: those that may be there.
         config: see there.
         field_folder: where what is derived from meshes is kept between runs; None = in memory.
+        told: called with words for what is being done.
 
     Raises:
         InputError: there are no frames or no views.
@@ -177,13 +190,13 @@ def make_bench(
     watch = Stopwatch()
     sought: dict[int, Sought] = {}
     templates: dict[int, ModelTemplates] = {}
-    near: dict[int, Array] = {}
-    for obj_id, model in sorted(models.items()):
+    for n, (obj_id, model) in enumerate(sorted(models.items())):
+        if told is not None:
+            told(f"preparing model {n + 1} of {len(models)}: {model.name}")
         start = ObjectPose(obj_id=obj_id, instance=0, T_world_obj=np.eye(4))
         body = make_body(start, model, config.field_cells, config.samples, field_folder)
         sought[obj_id] = Sought(body=body, sameness=make_sameness(model))
         templates[obj_id] = model_templates(model, config.templates, field_folder)
-        near[obj_id] = near_symmetries(model, config.near, field_folder)
     watch.lap("models")
     used = [views[int(n)] for n in np.linspace(0, len(views) - 1, min(config.views, len(views)))]
     far = _far(used, noise, config)
@@ -201,7 +214,7 @@ def make_bench(
     watch.lap("canvas")
     return Bench(
         config=config, plane=plane, fused=fused, grid=grid, canvas=canvas, close=close,
-        sought=sought, templates=templates, near=near, watch=watch,
+        sought=sought, templates=templates, field_folder=field_folder, watch=watch,
         looked_at=Region(center_world=middle, radius_m=config.area * radius),
     )  # fmt: skip
 

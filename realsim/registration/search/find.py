@@ -48,6 +48,7 @@ def find_objects(  # noqa: PLR0913 - the stage's inputs, all of them needed
     *,
     field_folder: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
+    told: Callable[[str], None] | None = None,
 ) -> SearchResult:
     """Return the poses of the wanted objects, or of whatever models are there.
 
@@ -63,6 +64,7 @@ def find_objects(  # noqa: PLR0913 - the stage's inputs, all of them needed
         config: see there.
         field_folder: where what is derived from meshes is kept between runs; None = in memory.
         progress: called with (groups of hypotheses made, groups).
+        told: called with words for what is being done.
 
     Raises:
         InputError: no frames, no views, no models, or two wanted objects of one instance number.
@@ -71,12 +73,13 @@ def find_objects(  # noqa: PLR0913 - the stage's inputs, all of them needed
     used = {w.obj_id for w in sensible} if sensible is not None else set(models)
     bench = make_bench(
         intrinsics, frames, views, (plane, noise), {i: models[i] for i in used}, config,
-        field_folder,
+        field_folder, told,
     )  # fmt: skip
-    search = Search(bench=bench, wanted=sensible)
+    search = Search(bench=bench, wanted=sensible, told=told)
     search.choices = [set() for _ in sensible or ()]
     groups = search.groups(range(len(sensible or ())))
     for n, (obj_id, region, places) in enumerate(groups):
+        search.say(f"searching model {n + 1} of {len(groups)}", obj_id)
         starts = [s for p in places if sensible for s in claimed_starts(bench, sensible[p])]
         starts += resting_starts(bench, obj_id, region)
         search.add(fitted_candidates(bench, obj_id, starts, region), places)
@@ -139,6 +142,7 @@ def _finish(
         bench.watch.lap("polish")
         return out
 
+    search.say(f"comparing {len(chosen)} poses with what looks nearly the same")
     chosen = polish()
     renders = [
         render(bench.close, s.body, c.T_world_obj) for s, c in zip(soughts, chosen, strict=True)
@@ -167,7 +171,7 @@ def _finish(
 def _near(search: Search, n: int, pose: Candidate) -> Array:
     """Return the near-symmetries (N, 4, 4) of a pose that lead to where its object may be."""
     bench = search.bench
-    near = bench.near[pose.obj_id]
+    near = bench.near(pose.obj_id)
     region = None if search.wanted is None else search.wanted[n].region
     if region is None:
         return near

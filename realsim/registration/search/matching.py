@@ -42,16 +42,16 @@ class MatchConfig:
     """Cost of a point that something else lies above."""
     table_low_m: float = 0.001
     """Agreement with a surface up to this height over the plane counts nothing [m]: it is the table
-    itself..."""
+    itself."""
     table_high_m: float = 0.004
-    """...and from this height on it counts fully [m]."""
+    """Height over the plane from which on agreement counts fully [m]."""
     standing_m: float = 0.006
     """Something stands where the surface is so high over the plane [m]: far and slanted views of
-    the table are noisy..."""
+    the table are noisy."""
     standing_share: float = 0.6
-    """...or so high as this share of the height of a lying object, if that is less..."""
+    """The same as a share of the height of a lying object, if that is less."""
     standing_low_m: float = 0.0015
-    """...but at least this [m]: the noise of a table that many views see."""
+    """Least of these heights [m]: the noise of a table that many views see."""
     inner_share: float = 0.45
     """Positions are skipped where the nearest thing is further off than this share of the
     template's points are: (1 - s) - s < `least_score`."""
@@ -85,10 +85,10 @@ class MatchConfig:
     """A turn must improve the score by so much, one point of 200: else the candidates of a disc
     with a few small holes gather at yaws that mean nothing."""
     same_m: float = 0.012
-    """Candidates nearer than this... [m]"""
+    """Candidates nearer than this [m]."""
     same_deg: float = 8.0
-    """...and turned by less, modulo symmetry, are one [deg]: half a step of the search. With 13 deg
-    a flange whose yaw only its bores tell had no candidate within 18 deg."""
+    """Candidates turned by less, modulo symmetry, are then one [deg]: half a step of the search.
+    With 13 deg a flange whose yaw only its bores tell had no candidate within 18 deg."""
     most_per_place: int = 10
     """Candidates with the same centre at most: else an object that looks nearly the same after
     many turns has no candidate elsewhere."""

@@ -39,20 +39,20 @@ class NearSymmetryConfig:
 
     near_m: float = 0.002
     """Most of the surface must come to lie within this of the surface [m]: what a fit takes for
-    noise and calibration errors..."""
+    noise and calibration errors."""
     near_share_of_size: float = 0.025
-    """...or within this share of the longest side, if that is more."""
+    """The same as a share of the longest side, if that is more."""
     least_share: float = 0.7
-    """Share of the surface for which that must hold..."""
+    """Share of the surface for which that must hold."""
     far_least_share: float = 0.6
-    """...or this share, if the motion is far from every symmetry: a knob turned by half a lobe. A
-    small tilt fits so much, too, but a fit to images turns it back..."""
+    """The same if the motion is far from every symmetry: a knob turned by half a lobe. A
+    small tilt fits so much, too, but a fit to images turns it back."""
     far_share: float = 0.25
-    """...far being so much of the longest side."""
+    """A motion is far by so much of the longest side."""
     true_m: float = 0.00125
-    """If all of the surface lies within this, it is a true symmetry [m]: no camera sees it..."""
+    """If all of the surface lies within this, it is a true symmetry [m]: no camera sees it."""
     true_share_of_size: float = 0.01
-    """...or within this share of the longest side, if that is less."""
+    """The same as a share of the longest side, if that is less."""
     outliers: float = 0.004
     """Share of the surface that may be further off all the same: edges of triangles, spikes."""
     orders: tuple[int, ...] = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20)

@@ -156,11 +156,11 @@ class ContrastConfig:
         Stage(kernel=8.0, cap_m=0.005, steps=6, gated=True),
         Stage(kernel=4.0, cap_m=0.003, steps=6, gated=True),
     )
-    """Of that fit: the pose is right but for the near-symmetry."""
+    """Stages of that fit: the pose is right but for the near-symmetry."""
     same_m: float = 0.003
-    """Poses nearer than this, modulo symmetry, are no rivals [m]..."""
+    """Poses nearer than this, modulo symmetry, are no rivals [m]."""
     same_share: float = 0.04
-    """...nor those nearer than this share of the object's size: fits of one and the same pose that
+    """The same as a share of the object's size: fits of one and the same pose that
     ended a little apart make a right pose look undecided."""
     differ_m: float = 0.0005
     """Rendered depths that differ by more than this belong to differing pixels [m]."""

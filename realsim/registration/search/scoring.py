@@ -213,7 +213,7 @@ def _known(canvas: Canvas) -> tuple[Array32, Array32, Array32, Array32]:
 
 def _boxes(canvas: Canvas, body: Body, Ts_obj_cam: Array) -> Int64:
     """Return the lattice boxes (F, 4) top, bottom, left, right (exclusive) that hold the body."""
-    low, high = body.model.mesh.bounds
+    low, high = body.bounds_obj
     unit = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     corners = se3.transform(se3.invert(Ts_obj_cam), low + unit * (high - low))  # (F, 8, 3)
     uv = project(canvas.intrinsics, corners) / canvas.stride

@@ -39,9 +39,9 @@ class SelectionConfig:
     """Share of its cells that must not be hidden: a wrong pose inside of something else agrees on
     the few cells that show."""
     clash_depth_m: float = 0.004
-    """Surface deeper than this inside of another object... [m]"""
+    """Surface deeper than this inside of another object [m]."""
     clash_share: float = 0.05
-    """...makes two poses impossible together if it is more than this share."""
+    """Two poses are impossible together if more than this share lies so deep."""
     better: float = 1.0
     """Cells by which another pose must gain more to replace a chosen one: ends the ascent."""
     pair_shortlist: int = 6

@@ -1,6 +1,6 @@
 """The state of a search: the poses found so far, and which wanted object may have which."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,10 +26,21 @@ class Search:
     pool: list[Candidate] = field(default_factory=list[Candidate])
     choices: list[set[int]] = field(default_factory=list[set[int]])
     """Per wanted object its poses in the pool."""
+    told: Callable[[str], None] | None = None
+    """Is told in words what is being done."""
+    _known: dict[int, list[int]] = field(default_factory=dict[int, list[int]])
+    """Per model its poses in the pool."""
+
+    def say(self, words: str, obj_id: int | None = None) -> None:
+        """Tell what is being done, and for which model."""
+        if self.told is not None:
+            name = "" if obj_id is None else f": {self.bench.sought[obj_id].body.model.name}"
+            self.told(f"{words}{name}")
 
     def choose(self, first: Sequence[int | None] | None = None) -> Selection:
         """Return the joint choice; `first` is what was chosen before."""
         canvas, config = self.bench.canvas, self.bench.config.selection
+        self.say(f"choosing among {len(self.pool)} poses")
         if self.wanted is None:
             before = [c for c in first or () if c is not None]
             chosen = select_any(canvas, self.pool, config, before, self._clash)
@@ -50,10 +61,14 @@ class Search:
         return share > config.clash_share
 
     def add(self, found: Sequence[Candidate], places: Sequence[int]) -> None:
-        """Put poses into the pool, for wanted objects at these places; known ones are left out."""
-        for c in found:
+        """Put poses into the pool, for wanted objects at these places; known ones are left out.
+
+        Where anything may be anywhere, poses that explain nothing are left out, too.
+        """
+        least = -np.inf if self.wanted is not None else 0.0
+        for c in (c for c in found if c.alone.gain > least):
             same = self.bench.sought[c.obj_id].sameness
-            known = [n for n, k in enumerate(self.pool) if k.obj_id == c.obj_id]
+            known = self._known.setdefault(c.obj_id, [])
             Ts = np.array([self.pool[n].T_world_obj for n in known]).reshape(-1, 4, 4)
             apart = same.distances(c.T_world_obj, Ts)
             if known and apart.min() < 0.5 * self.bench.config.refine.same_m:
@@ -63,6 +78,7 @@ class Search:
             else:
                 at = len(self.pool)
                 self.pool.append(c)
+                known.append(at)
             for n in places:
                 self.choices[n].add(at)
 
@@ -91,7 +107,9 @@ def seek_unsure(search: Search, selection: Selection) -> Selection:
             search, selection, unsure, None if round_ == 0 else rng
         ):
             break
-        selection = search.choose(selection.chosen)
+        before, selection = selection, search.choose(selection.chosen)
+        if search.wanted is None and round_ > 0 and selection.chosen == before.chosen:
+            break
     if search.wanted is None:
         return selection
     unsure = _suspects(search, selection)
@@ -124,12 +142,19 @@ def _sought(
     buffer = compose(bench.canvas.table, [c.rendered for _, c in sure])
     taken = peel.taken_cells(bench.grid, T_table_world, bench.fused.coarse, known)
     bench.watch.lap("peel")
-    for obj_id, region, places in search.groups(unsure):
+    sought = search.groups(unsure)
+    for n, (obj_id, region, places) in enumerate(sought):
+        search.say(f"searching what is left for model {n + 1} of {len(sought)}", obj_id)
         starts = (
             resting_starts(bench, obj_id, region, taken)
             if rng is None
             else peel.residual_starts(
-                bench.sought[obj_id], groups, bench.plane.T_world_table[:3, 2], rng, config
+                bench.sought[obj_id],
+                groups,
+                bench.plane.T_world_table[:3, 2],
+                rng,
+                config,
+                len(bench.sought),
             )
         )
         search.add(fitted_candidates(bench, obj_id, starts, region, (left, buffer)), places)

@@ -41,9 +41,9 @@ class TemplateConfig:
     """Points around the footprint per pose."""
     outside_low_m: float = 0.006
     """The points around lie at least so far outside of the footprint [m]: two cells, so that the
-    object's own edge is not taken for them..."""
+    object's own edge is not taken for them."""
     outside_high_m: float = 0.011
-    """...and at most so far [m]: further out stand the neighbours."""
+    """They lie at most so far outside [m]: further out stand the neighbours."""
     rays: int = 3000
     """Rays per pose over the box of its footprint; thin objects hit a tenth of their box."""
     symmetry_step_deg: float = 5.0
@@ -76,9 +76,9 @@ class ModelTemplates:
     outside: Array32
     """(D, L, 3) around the footprint; z = height of the nearest point of the top surface [m]."""
     yaw_counts: Int64
-    """(D,) how many yaws differ..."""
+    """(D,) how many yaws differ."""
     yaw_steps: Array
-    """(D,) ...and their step [rad]."""
+    """(D,) step of the yaws [rad]."""
     probabilities: Array
     """(D,) of the resting poses."""
     center_obj: Array

@@ -1,0 +1,238 @@
+"""How likely a pose of one to three views is right, its unobservable directions integrated.
+
+So few views leave directions open in which a fit may slide: a mug's turn while its handle is
+hidden, a plate's place on the table. There a Gaussian about the fit says too little, because the
+images stay as well explained over centimetres, or better elsewhere. So poses T_ij along the two
+least determined directions v, w are tried, the others fitted again:
+    T_ij = T exp(a_i v + b_j w),    w_ij ~ exp(-C_ij / temperature) prior(T_ij) da_i db_j,
+    C = 1/2 sum min((z_measured - z_rendered)^2 / sigma^2, cap^2) / pixels of one measurement,
+over the union of all footprints, neighbours and table rendered as well. The best pose T_best is
+taken, and
+    P(MSSD < bound) = sum w_ij Phi((bound - MSSD(T_ij, T_best)) / s),
+s being half a step: the probability is a continuous function of the pose. Declared symmetries do
+not count, because MSSD knows them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtr
+
+from realsim.arrays import Array
+from realsim.geometry import se3
+from realsim.geometry.metrics import aligned_pose, mssd_symmetric
+from realsim.registration.blind import axis_name, principal_axes
+from realsim.registration.body import Body, footprint
+from realsim.registration.compare import Comparer
+from realsim.registration.evidence import Cloud
+from realsim.registration.solver import PoseFit, SolverConfig, solve_pose
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class AroundConfig:
+    """How the poses around a fit of few views are weighed."""
+
+    bound_m: float = 0.003
+    """A pose is right within this MSSD [m]."""
+    offsets_m: tuple[float, ...] = (-0.014, -0.009, -0.005, -0.002, 0.0, 0.002, 0.005, 0.009, 0.014)
+    """Offsets along either direction, as motion of the surface [m]: as far as starts are off."""
+    rays: int = 1500
+    """Rays aimed at the object in each frame; sets the stride."""
+    cap: float = 4.0
+    """A pixel that is further off counts as so many sigmas: something else is there."""
+    floor_m: float = 0.0006
+    """Least 1-sigma of a pixel [m]: mesh and neighbours are off by as much."""
+    temperature: float = 3.0
+    """Costs are divided by this: residuals of neighbouring pixels share what is wrong with mesh,
+    lens and edges, and are not independent."""
+    unknown: float = 2.0
+    """A pixel of which nothing is predicted (no table behind it) counts as so many sigmas."""
+    area_px: float = 50.0
+    """Pixels of one independent measurement, in an image of `area_width_px`."""
+    area_width_px: int = 1280
+    """See `area_px`."""
+    declared_share: float = 0.3
+    """A direction that moves the surface, modulo symmetry, by less than this share of its length is
+    a declared symmetry."""
+    prior_m: float = 0.015
+    """1-sigma of how far the surface is from a claimed start [m]."""
+    better: float = 2.0
+    """Temperatures by which another pose must cost less to be taken instead of the fit."""
+    least_open: float = 0.002
+    """A direction whose 1-sigma is greater is named as one that is not seen [m]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Around:
+    """What the images say of a pose and those around it."""
+
+    fit: PoseFit
+    """At the best of the poses."""
+    probability: float
+    """That the best pose is right within the bound."""
+    spread: Array
+    """(6, 6) covariance of the weighted poses about the best one, right twist about the box's
+    centre, turns times the radius [m^2]."""
+    weak: Array
+    """(6, 2) the directions along which poses were tried, in the same units."""
+    unseen: tuple[str, ...]
+    """Directions that are wider than they should be, in words with their 1-sigma."""
+
+
+def around(
+    body: Body,
+    fit: PoseFit,
+    cloud: Cloud,
+    comparer: Comparer,
+    others: Sequence[tuple[Body, Array]],
+    claimed: Array | None,
+    configs: tuple[AroundConfig, SolverConfig],
+) -> Around:
+    """Return the best pose near a fit, and how likely it is right.
+
+    Args:
+        body: the object.
+        fit: of its points.
+        cloud: these points.
+        comparer: the frames, noise and table.
+        others: the other objects and their poses (4, 4).
+        claimed: (4, 4) the start, if somebody claimed it; None = a search found it.
+        configs: see `AroundConfig`; of the fits.
+    """
+    config, solver = configs
+    weak = _weak_directions(body, fit, config)
+    offsets, steps = np.array(config.offsets_m), np.gradient(config.offsets_m)
+    fits = [
+        solve_pose(
+            body, cloud, _moved(body, fit.T_world_obj, weak @ np.array([a, b])), solver.fine,
+            solver, held=weak,
+        )
+        for a in offsets for b in offsets
+    ]  # fmt: skip
+    volumes = np.outer(steps, steps).ravel()
+    middle = len(fits) // 2
+    fits[middle] = fit
+    Ts = np.stack([f.T_world_obj for f in fits])
+    costs = _costs(body, Ts, comparer, others, config)
+    if claimed is not None:
+        away = np.array([mssd_symmetric(claimed, T, body.model) for T in Ts])
+        costs = costs + 0.5 * config.temperature * np.square(away / config.prior_m)
+    best = int(np.argmin(costs))
+    if costs[best] > costs[middle] - config.better * config.temperature:
+        best = middle
+    weights = np.exp(-(costs - costs.min()) / config.temperature) * volumes
+    weights /= weights.sum()
+    T_best = Ts[best]
+    off = np.array([mssd_symmetric(T_best, T, body.model) for T in Ts])
+    # A pose of the grid stands for all that lie within half a step of it.
+    half = 0.5 * np.sqrt(volumes)
+    probability = float(weights @ ndtr((config.bound_m - off) / half))
+    xi = np.array([_twist(body, T_best, T) if w > 1e-5 else np.zeros(6)
+                   for T, w in zip(Ts, weights, strict=True)])  # fmt: skip
+    spread = np.asarray((xi * weights[:, None]).T @ xi)
+    return Around(
+        fit=fits[best], probability=probability, spread=spread, weak=weak,
+        unseen=_unseen(spread, config),
+    )  # fmt: skip
+
+
+def integrated(body: Body, covariance: Array, found: Around) -> Array:
+    """Return the covariance (6, 6) of a fit with the spread of what was tried in place of its own.
+
+    Along the directions that were tried the Gaussian about the fit is replaced.
+
+    Args:
+        body: the object.
+        covariance: (6, 6) of the right twist about the object's origin, rotation first [rad, m].
+        found: what was tried.
+    """
+    scale = np.repeat([body.radius_m, 1.0], 3)
+    to_centre = scale[:, None] * se3.adjoint(se3.from_translation(-body.center_obj))
+    Q = np.eye(6) - found.weak @ found.weak.T
+    C = Q @ to_centre @ covariance @ to_centre.T @ Q + found.spread
+    back = np.linalg.inv(to_centre)
+    C = back @ C @ back.T
+    return 0.5 * (C + C.T)
+
+
+def _weak_directions(body: Body, fit: PoseFit, config: AroundConfig) -> Array:
+    """Return the two least determined motions (6, 2) of the surface that are no declared symmetry.
+
+    Motions are orthonormal, about the centre of the box, rotation first, turns times the radius.
+    """
+    _, vectors, _ = principal_axes(body, fit)
+    chosen: list[Array] = []
+    length = config.offsets_m[-1]
+    for v in vectors.T:
+        T = _moved(body, np.eye(4), length * v)
+        low, high = body.bounds_obj
+        moved = float(np.linalg.norm(se3.transform(T, np.stack([low, high])) - [low, high],
+                                     axis=1).max())  # fmt: skip
+        if mssd_symmetric(np.eye(4), T, body.model) > config.declared_share * moved:
+            chosen.append(v)
+        if len(chosen) == 2:
+            break
+    return np.stack(chosen, axis=1)
+
+
+def _moved(body: Body, T_world_obj: Array, x: Array) -> Array:
+    """Return a pose moved by x (6,): about the box's centre, turns times the radius [m]."""
+    c = se3.from_translation(body.center_obj)
+    scale = np.repeat([1.0 / body.radius_m, 1.0], 3)
+    return T_world_obj @ c @ se3.exp(x * scale) @ se3.invert(c)
+
+
+def _twist(body: Body, T_best: Array, T: Array) -> Array:
+    """Return the motion (6,) from the best pose to another, turned by symmetry to be the least."""
+    c = se3.from_translation(body.center_obj)
+    step = se3.invert(T_best @ c) @ aligned_pose(T_best, T, body.model) @ c
+    return se3.log(step) * np.repeat([body.radius_m, 1.0], 3)
+
+
+def _costs(
+    body: Body,
+    Ts: Array,
+    comparer: Comparer,
+    others: Sequence[tuple[Body, Array]],
+    config: AroundConfig,
+) -> Array:
+    """Return what the images of all frames hold against each of the poses (N, 4, 4)."""
+    costs = np.zeros(len(Ts))
+    intrinsics = comparer.intrinsics
+    stride = comparer.stride_of(body, Ts[len(Ts) // 2])
+    area = config.area_px * (intrinsics.width / config.area_width_px) ** 2
+    share = min(1.0, stride**2 / area)
+    shape = (-(-intrinsics.height // stride), -(-intrinsics.width // stride))
+    for frame in comparer.frames:
+        T_cam_world = se3.invert(frame.T_world_cam)
+        prints = [footprint(body, intrinsics, T_cam_world @ T, stride) for T in Ts]
+        at = [p.rows // stride * shape[1] + p.columns // stride for p in prints]
+        cells = np.unique(np.concatenate(at))
+        rows, columns = cells // shape[1] * stride, cells % shape[1] * stride
+        measured = frame.depth_m[rows, columns].astype(np.float64)
+        behind = np.full(shape[0] * shape[1], np.inf)
+        for other, T in others:
+            p = footprint(other, intrinsics, T_cam_world @ T, stride)
+            k = p.rows // stride * shape[1] + p.columns // stride
+            behind[k] = np.minimum(behind[k], p.z)
+        known = np.minimum(behind[cells], comparer.table(frame, rows, columns))
+        seen = measured > 0
+        sigma = np.hypot(comparer.noise.sigma(measured), config.floor_m)
+        index = np.full(shape[0] * shape[1], -1)
+        index[cells] = np.arange(len(cells))
+        for n, (p, k) in enumerate(zip(prints, at, strict=True)):
+            z = known.copy()
+            z[index[k]] = np.minimum(z[index[k]], p.z)
+            r = np.where(np.isfinite(z), (measured - z) / sigma, config.unknown)
+            costs[n] += 0.5 * share * float(np.sum(np.minimum(r * r, config.cap**2)[seen]))
+    return costs
+
+
+def _unseen(spread: Array, config: AroundConfig) -> tuple[str, ...]:
+    """Return the directions of a spread (6, 6) that are wider than `least_open`, in words."""
+    values, vectors = np.linalg.eigh(spread)
+    return tuple(
+        f"{axis_name(vectors[:, i])} by {1e3 * np.sqrt(values[i]):.1f} mm"
+        for i in np.argsort(-values) if values[i] > config.least_open**2
+    )  # fmt: skip
