@@ -32,9 +32,9 @@ class CheckConfig:
     optimism: tuple[float, float] = (1.6, 3.0)
     """Unseen over seen error: beyond, the fit follows single views."""
     scale: tuple[float, float] = (0.003, 0.02)
-    """A board size that is off by this share is a misprint; by more, another board ..."""
+    """A board size that is off by this share is a misprint; by more, another board."""
     scale_sigmas: float = 3.0
-    """... if it is off by this many sigma as well."""
+    """It must be off by this many sigma as well."""
     unseen_px: tuple[float, float] = (1.5, 6.0)
     """Unseen views; good real sets reach 0.3 to 1.1 px."""
     focal: tuple[float, float] = (0.01, 0.03)

@@ -46,14 +46,18 @@ def seed(what: str = "Of everything random: the same seed, the same result.") ->
     return click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help=what)
 
 
-class ArmName(click.ParamType[str]):
+class Name(click.ParamType[str]):
+    """What is found by name; whether there is such a thing is seen when it is looked for."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the text."""
+        return str(value)
+
+
+class ArmName(Name):
     """An arm that is found by name, or the folder of one: see `realsim.robots`."""
 
     name = "arm"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the text; whether there is such an arm is seen when it is looked for."""
-        return str(value)
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
@@ -81,14 +85,10 @@ def arm(what: str, default: str | None = None) -> Decorator:
     return lambda command: new(old(command))
 
 
-class PlanName(click.ParamType[str]):
+class PlanName(Name):
     """A plan file, or one that comes with realsim: `shipped:NAME`."""
 
     name = "plan"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the text; whether there is such a plan is seen when it is opened."""
-        return str(value)
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str

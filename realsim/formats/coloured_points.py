@@ -1,6 +1,6 @@
 """Coloured points of a scene out of its depth images: what Gaussian splatting begins with."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from realsim import images
 from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
+from realsim.formats.export_folder import Content, ExportFolder
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
 from realsim.geometry import se3
 from realsim.geometry.clouds import voxel_mean
@@ -26,6 +27,12 @@ JUMP_SHARE = 0.02
 and back."""
 
 
+MOST_POINTS = 10_000_000
+"""Points that a data set may be asked to have: 500 MB as text."""
+POINTS_ROW = "points.json"
+"""Where an export notes their number."""
+
+
 class ColouredPoints(NamedTuple):
     """Points with colours, in the order of their voxels."""
 
@@ -33,6 +40,40 @@ class ColouredPoints(NamedTuple):
     """(N, 3) in world [m]."""
     colours: UInt8
     """(N, 3) RGB."""
+
+
+def require_points(points: int) -> None:
+    """Refuse a number of points that is not written.
+
+    Raises:
+        InputError: it is negative, or more than MOST_POINTS.
+    """
+    if not 0 <= points <= MOST_POINTS:
+        raise InputError(f"{points} points; 0 to {MOST_POINTS} can be written.")
+
+
+def write_points(
+    scene: LabelledScene,
+    folder: ExportFolder,
+    most: int,
+    piece: str,
+    files_of: Callable[["ColouredPoints"], Mapping[str, Content]],
+) -> int:
+    """Write a scene's points as a piece if it is not there yet; return their number.
+
+    Args:
+        scene: the scene.
+        folder: of the export.
+        most: number of points; 0 = none.
+        piece: its name.
+        files_of: returns the files that hold the points.
+    """
+    if folder.has(piece):
+        return int(dict(folder.rows(POINTS_ROW)).get(scene.name, 0))
+    cloud = coloured_points(scene, most)
+    count = len(cloud.points)
+    folder.write_piece(piece, files_of(cloud), {POINTS_ROW: (scene.name, count)})
+    return count
 
 
 def coloured_points(

@@ -18,7 +18,7 @@ from realsim.records import CameraIntrinsics
 
 DepthImage = Array32
 DepthOf = Callable[[int], tuple[DepthImage, CameraIntrinsics]]
-"""Of a view's place: its depth (H, W) [m], 0 = none, and its camera."""
+"""What returns, for a view's place, its depth (H, W) [m], 0 = none, and its camera."""
 SAMPLED_VIEWS = 24
 """Depth images read at most; they are kept in memory while they are compared."""
 POINTS = 1500

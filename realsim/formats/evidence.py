@@ -40,7 +40,8 @@ WORSE_BY = 3.0
 """A reading is wrong if its spread is this many times the best one's: noise of the views and of the
 labels is in both alike, and a wrong reading of a camera that moves is worse tens of times."""
 WORSE_MM = 5.0
-"""... and larger by this [mm]: public labels disagree between views by 3 to 6 mm at the truth."""
+"""It is larger by this, too [mm]: public labels disagree between views by 3 to 6 mm at the
+truth."""
 AGREES_MM = 50.0
 """A best spread beyond this [mm] is no agreement: the scene moves, or the unit is another."""
 MOST_VIEWS = 200
@@ -69,10 +70,11 @@ class Spread:
     """How far the views are from agreeing under one reading."""
 
     mm: float
-    """Of object positions in world, or of reprojected depth [mm]; NaN = nothing to compare."""
+    """Spread of object positions in world, or of reprojected depth [mm]; NaN = nothing to
+    compare."""
     deg: float | None = None
-    """Of object orientations in world [deg]; None for depth. Symmetric objects, labelled by any of
-    their equal poses, make it large, so it is told and not used."""
+    """Spread of object orientations in world [deg]; None for depth. Symmetric objects, labelled by
+    any of their equal poses, make it large, so it is told and not used."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -33,7 +33,7 @@ CHUNK = 1 << 20
 """[bytes] read at a time when a file is copied."""
 
 Content = bytes | Path
-"""Of a file: its bytes, or another file to copy."""
+"""What a file holds: its bytes, or another file to copy."""
 
 
 class ExportFolder:

@@ -150,7 +150,7 @@ class WrittenScene:
     frames: int
     """Frames of the scene."""
     frames_written: int
-    """Of them in this run; the others were there from an interrupted one."""
+    """Frames written in this run; the others were there from an interrupted one."""
     objects: int
     """Objects in all frames."""
     notes: tuple[str, ...] = ()

@@ -71,7 +71,7 @@ class SessionScene:
 
     @property
     def camera(self) -> str:
-        """Of the data set it was imported from; '' of a capture."""
+        """Return the camera's name in the data set it was imported from; '' of a capture."""
         return "" if self._imported is None else self._imported.camera
 
     @property

@@ -14,7 +14,7 @@ from realsim.records.checked_arrays import frozen
 STAGES = ("close", "lift", "oscillate", "pendulum")
 """The four stages of the slip test, in order."""
 FEW_DRAWS, LARGE_ERROR = 8, 0.1
-"""Of fewer draws, or of a larger standard error, a p_hold is marked where it is shown."""
+"""With fewer draws or a larger standard error a p_hold is marked where it is shown."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -85,9 +85,9 @@ class ArmFile(RobotFile, frozen=True, kw_only=True):
     joint_names: tuple[str, ...] = ()
     """What recordings and exports call the joints; else the URDF's names, or joint1, joint2 ..."""
     rods: tuple[Rod, ...] = ()
-    """The links' bodies in DH frames: round ones ..."""
+    """The links' bodies in DH frames: round ones."""
     blocks: tuple[Block, ...] = ()
-    """... and boxes."""
+    """The links' bodies that are boxes."""
     kept_apart: tuple[tuple[int, int], ...] = ()
     """Links, numbered from the base (0), that can never meet beside the neighbours."""
     mass_kg: float = 0.0

@@ -28,11 +28,11 @@ TRIED_VALUES = (0.31, -0.77, 1.13)
 TABLE = 16384
 """Random configurations inside the limits."""
 NEAREST = 24
-"""Of these start at each pose."""
+"""Configurations of the table that start at each pose."""
 TURN_M = 0.25
 """A rotation matrix's differences count as so many metres: half the length of a forearm."""
 STEPS, TABLE_DAMPING = 18, 0.02
-"""Of a seed from the table: its steps, and their damping."""
+"""Steps of a seed from the table, and their damping."""
 TRIED, BEYOND = 1000, 1.3
 """Configurations whose nearest in the table say how far a pose in reach can be from it, times."""
 SAME_RAD = 1e-4

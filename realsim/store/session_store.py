@@ -54,10 +54,10 @@ __all__ = ["ROBOT_FILE", "SESSION_FILE", "SessionStore", "depth_path", "rgb_path
 
 
 EAGER_VIEWS = 256
-"""Up to so many views scene_camera.json is written anew with each; beyond, ..."""
+"""Up to so many views scene_camera.json is written anew with each."""
 LAZY_GROWTH = 1.1
-"""... when it has grown by this factor, so that a view costs the same however many there are. The
-rest is written by the next file, by `close`, or by the next `open`."""
+"""Beyond, it is written when it has grown by this factor, so that a view costs the same however
+many there are. The rest is written by the next file, by `close`, or by the next `open`."""
 
 
 class SessionStore:

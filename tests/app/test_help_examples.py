@@ -108,17 +108,19 @@ def tried(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def run_in(folder: Path, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run an example in a folder of inputs, without what it is about to make."""
+def run_in(folder: Path, line: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Run an example in a folder of inputs; return what it said and the files it made."""
     assert any(line in lines for lines in EXAMPLES.values()), "the help shows another example"
     args = words_of(line)
     monkeypatch.chdir(folder)
     monkeypatch.setenv("REALSIM_CONFIG", "")
+    before = set(folder.rglob("*"))
     result = CliRunner().invoke(commands, args)
     allowed = {0, 1} if args[0] in MAY_FAIL_A_CHECK else {0}
     said = f"{result.output[-2000:]}\n{result.exception!r}"
     assert result.exception is None or isinstance(result.exception, SystemExit), said
     assert result.exit_code in allowed, said
+    return result.output + "".join(sorted(p.name for p in set(folder.rglob("*")) - before))
 
 
 @pytest.mark.parametrize("line", QUICK)
@@ -126,7 +128,7 @@ def test_quick_examples_run(
     line: str, plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copytree(plain, tmp_path, dirs_exist_ok=True)
-    run_in(tmp_path, line, monkeypatch)
+    assert run_in(tmp_path, line, monkeypatch).strip()
 
 
 @pytest.mark.slow
@@ -135,4 +137,4 @@ def test_the_longer_examples_run(
     line: str, tried: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copytree(tried, tmp_path, dirs_exist_ok=True)
-    run_in(tmp_path, line, monkeypatch)
+    assert run_in(tmp_path, line, monkeypatch).strip()

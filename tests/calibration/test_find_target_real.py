@@ -2,14 +2,17 @@
 
 import os
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from realsim.app.calibrate.folder import require_target
+from realsim.errors import InputError
 from realsim.records.targets import CharucoBoard, CircleGrid
 from realsim_calibration.detect.find import find_target
 from realsim_calibration.detect.homography import fit_homography, seen_from_front
-from realsim_calibration.detect.visible import what_is_visible
 
 ROOT = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
 DATA = ROOT / "handeye"
@@ -95,8 +98,10 @@ def test_all_views_are_found_and_fit_a_camera_better_than_with_opencv():
 
 def test_a_wrong_board_file_is_answered_with_what_is_there():
     pictures, _ = load("rtde_ur5e", every=30)
+    first = min((DATA / "rtde_ur5e/Hand-Eye-Data").glob("*.jpg"), key=lambda p: int(p.stem))
     wrong = CharucoBoard(rows=7, columns=5, square_m=0.033, marker_m=0.02)
     d = find_target(pictures[0], wrong)
     assert len(d) == 0
-    message = what_is_visible(pictures[0])
-    assert "17 markers of DICT_6X6_50" in message
+    folder: Any = SimpleNamespace(images=[first], labels=["0.jpg"])
+    with pytest.raises(InputError, match=r"dict=APRILTAG_36h11.*17 markers of DICT_6X6_50"):
+        require_target(folder, [d], wrong)

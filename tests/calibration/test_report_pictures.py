@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
@@ -110,7 +111,11 @@ def test_pictures_have_no_letters_that_the_font_lacks(report: HandEyeReport) -> 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with style.paper_style():  # a letter that the font lacks would be a warning, here an error
-            plot_views(dataclasses.replace(report, views=odd)).savefig(io.BytesIO(), format="png")
+            figure = plot_views(dataclasses.replace(report, views=odd))
+            figure.savefig(out := io.BytesIO(), format="png")
+    assert out.getvalue().startswith(b"\x89PNG")
+    shown = "".join(text.get_text() for text in figure.findobj(Text))
+    assert "view " in shown and "图" not in shown
 
 
 def test_sigma_is_given_along_the_axes_of_the_carrier(report: HandEyeReport) -> None:

@@ -82,9 +82,11 @@ def test_a_png_that_claims_more_than_its_bytes_can_hold_is_refused() -> None:
         require_decodable(claiming(9_000, 9_000), "x")
 
 
-def test_the_largest_cameras_images_are_not_refused() -> None:
+def test_the_largest_cameras_images_are_not_refused(tmp_path: Path) -> None:
     data = cv2.imencode(".png", np.zeros((8_000, 12_000), np.uint8))[1].tobytes()
     require_decodable(data, "x")
+    (path := tmp_path / "large.png").write_bytes(data)
+    assert images.image_size(path) == (12_000, 8_000)
 
 
 @pytest.mark.parametrize(

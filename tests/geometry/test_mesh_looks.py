@@ -91,4 +91,5 @@ def test_texture_coordinates_alone_make_no_texture(tmp_path: Path) -> None:
 def test_where_nobody_takes_notes_it_is_a_warning(tmp_path: Path) -> None:
     path = obj(tmp_path, UV + WITH_UV, RED + "map_Kd gone.png\n")
     with pytest.warns(UserWarning, match=r"'gone\.png', named in it, is not in its folder"):
-        load_mesh(path, "m")
+        mesh = load_mesh(path, "m")
+    assert mesh.texture is None and mesh.colors is not None

@@ -22,7 +22,7 @@ UNIT_TOLERANCE = 0.1
 LARGEST_RATIO = 1.2
 """Measured over predicted depth beyond which no camera's bias is the cause."""
 DOUBTFUL_RATIO = 1.03
-"""... and beyond which the board's size or the resolution of the intrinsics is doubted: depth
+"""Ratio beyond which the board's size or the resolution of the intrinsics is doubted: depth
 cameras are specified to 2 %."""
 RANGE_BOWL = 0.5
 """Curvature in units of a range image's from which depth is taken for a range."""

@@ -32,14 +32,14 @@ class DiagnosisConfig:
     accept_score: float = 5.0
     """A reading fits up to this score: real sets measure 1 to 2.5, wrong readings 10 to 20."""
     gain: float = 2.0
-    """Another reading must fit this many times better than the poses as given ..."""
+    """Another reading must fit this many times better than the poses as given."""
     gain_few: float = 3.0
-    """... or this many with few views, where chance helps."""
+    """The same with few views, where chance helps."""
     gross_error: float = 8.0
     """Single views are called mispaired from this error on: 4 deg or 8 % of the distance; planar
-    poses of good real sets reach 6 ..."""
+    poses of good real sets reach 6."""
     gain_gross: float = 1.15
-    """... and then the rest must fit only this many times better."""
+    """The rest must then fit only this many times better."""
     accept_degrees: float = 2.7
     """Degrees taken for radians are believed up to this score: each number may be any of 57."""
     doubtful_score: float = 1.5
@@ -52,7 +52,7 @@ class DiagnosisConfig:
     """A board this many times larger or smaller than said has another size; less is reported as a
     scale: printers and intrinsics are off by up to 5 %."""
     size_sigmas: float = 5.0
-    """... and the difference must be this many standard deviations."""
+    """The difference must be this many standard deviations."""
     same_pose_mm: float = 0.02
     """Poses nearer than this are one reading of the controller: arms at rest scatter more [mm]."""
     same_pose_deg: float = 0.002
@@ -60,7 +60,7 @@ class DiagnosisConfig:
     same_view: float = 0.5
     """Images of one pose are one view below this error, in units of `FitConfig` ..."""
     other_view: float = 2.0
-    """... and different ones beyond this."""
+    """They are different views beyond this."""
     least_turn_deg: float = 2.0
     """RMS turn about the second axis below which conventions cannot be tested [deg]."""
     small_turn_part: float = 0.2

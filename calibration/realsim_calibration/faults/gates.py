@@ -28,14 +28,15 @@ class GateConfig:
     px_ratio: float = 5.0
     """A view is dropped when its px through the closed form exceeds this many medians."""
     px_floor: float = 3.0
-    """... and this error [px]."""
+    """A dropped view's px exceeds this, too [px]."""
     twin_ratio: float = 2.0
     """The mirror twin of a planar pose may stand in when its px is at most this much worse."""
     frame_ratio: float = 5.0
-    """A view is dropped when its error through the fitted frames exceeds this many medians ..."""
+    """A view is dropped when its error through the fitted frames exceeds this many medians."""
     frame_floor: float = 4.0
-    """... and this, in units of `FitConfig`: 2 deg or 4 % of the distance to the board. Views of
-    good real sets reach 4.1 medians where the board is small and seen at a slant."""
+    """A dropped view's error exceeds this, too, in units of `FitConfig`: 2 deg or 4 % of the
+    distance to the board. Views of good real sets reach 4.1 medians where the board is small and
+    seen at a slant."""
     fit: FitConfig = field(default_factory=FitConfig)
 
 

@@ -32,7 +32,7 @@ class HalfTurnConfig:
     decisive_ratio: float = 5.0
     """The angles must fit this many times better after than before."""
     max_after_deg: float = 2.0
-    """... and to this [deg], median over the pairs: right data measure 0.1 to 0.6."""
+    """Median angle over the pairs to which they must fit [deg]: right data measure 0.1 to 0.6."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

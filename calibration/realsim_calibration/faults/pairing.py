@@ -38,10 +38,10 @@ class PairingConfig:
     max_shift: int = 4
     """Largest shift of the images against the poses that is tried."""
     ratio: float = 4.0
-    """Pose and image belong together when their error is below this many usual errors ..."""
+    """Pose and image belong together when their error is below this many usual errors."""
     floor: float = 6.0
-    """... or below this one in units of `FitConfig`: 3 deg or 6 % of the distance. Planar poses of
-    good real sets reach 5."""
+    """Pose and image belong together below this error, too, in units of `FitConfig`: 3 deg or 6 %
+    of the distance. Planar poses of good real sets reach 5."""
     swap_floor: float = 3.0
     """Two views that fit far better exchanged are swapped from this error on."""
     swap_gain: float = 4.0

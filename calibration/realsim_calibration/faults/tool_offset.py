@@ -26,9 +26,9 @@ class ToolOffsetConfig:
     least_deg: float = 1.5
     """The same for angles [deg]."""
     simpler: float = 2.0
-    """A frame fewer is believed while it fits at most this many times worse ..."""
+    """A frame fewer is believed while it fits at most this many times worse."""
     floor_mm: float = 4.0
-    """... or to this RMS [mm]."""
+    """It is believed, too, while it fits to this RMS [mm]."""
     min_group: int = 3
     """Fewest views that share a tool offset where it changes."""
     lever_m: float = 0.5

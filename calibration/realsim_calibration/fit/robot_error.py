@@ -34,12 +34,14 @@ class RobotErrorConfig:
     map_strengths: tuple[float, ...] = (0.1, 0.3, 1.0)
     """Ridges that are tried: half a millimetre at the edge of the poses, times these."""
     map_gain: float = 1.0
-    """A map must predict unseen views better than no map by so many standard errors ..."""
+    """A map must predict unseen views better than no map by so many standard errors."""
     worth: float = 0.05
-    """... and by this share: with hundreds of views a gain of one percent is beyond chance and not
-    worth 72 more numbers, which tripled the error where the robot's errors were white."""
+    """It must predict better by this share, too: with hundreds of views a gain of one percent is
+    beyond chance and not worth 72 more numbers, which tripled the error where the robot's errors
+    were white."""
     arm_gain: float = 2.0
-    """... and by so many better than the arm's own numbers, which cannot bend as freely."""
+    """It must be better than the arm's own numbers by so many standard errors, which cannot bend as
+    freely."""
     arm_angle_sd: float = 2e-4
     """Error of a joint zero or twist [rad]: 0.1-0.3 mm at the tool is left after a factory
     calibration; re-estimated from the views (`scales`)."""
@@ -52,7 +54,7 @@ class RobotErrorConfig:
     """An arm is the robot's when its nominal kinematics place the tool this well [m]: real arms
     differ from nominal by 1 to 3 mm."""
     arm_margin: float = 3.0
-    """... and this many times better than any other arm."""
+    """It must place it this many times better than any other arm."""
     scale_log_sd: float = 0.7
     """1-sigma of the logarithm of the re-estimated scales: a factor of 2 either way. Of an arm's
     24 or more errors a capture shows a dozen, too few to tell the size of the hidden ones alone."""

@@ -67,9 +67,9 @@ class LiveConfig:
     min_views_to_stop: int = 10
     """Fewest views with which the run may end: a sigma from fewer is itself unsure by a third."""
     stable_views: int = 3
-    """Views over which the held-out error must not change ..."""
+    """Views over which the held-out error must not change."""
     stable_share: float = 0.15
-    """... by more than this share."""
+    """Share by which it counts as changed."""
     least_gain: float = 0.02
     """The run ends when the best next view lowers the expected error by less than this share."""
     hidden_factor: float = 2.0
@@ -78,9 +78,10 @@ class LiveConfig:
     min_points: int = 4
     """Fewest points of a usable view."""
     same_deg: float = 2.0
-    """A hand turned by less than this [deg] ..."""
+    """A hand turned by less than this [deg]."""
     same_m: float = 0.01
-    """... and moved by less than this [m] has taken the same view again."""
+    """A hand that turned so little and moved by less than this [m] has taken the same view
+    again."""
     needs: NeedsConfig = field(default_factory=NeedsConfig)
     next_view: NextViewConfig = field(default_factory=NextViewConfig)
     limits: ViewLimits = field(default_factory=ViewLimits)

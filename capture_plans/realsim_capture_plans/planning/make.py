@@ -54,7 +54,7 @@ ELBOW_WORTH = 1.15
 """The other side of the elbow is used where the hole would be larger by this factor without it: the
 way there and back takes about 8 s."""
 SAMPLED_SHARE = 4
-"""Of an arm whose inverse is sampled, one in so many poses is tried."""
+"""One in so many poses is tried of an arm whose inverse is sampled."""
 MOST_MISSED = 0.25
 """Where more than this share of the directions is missed, the scene stands badly: no second try."""
 

@@ -27,7 +27,7 @@ MOST_NOTES = 12
 PAGE_PICTURES = 12
 """Frames on the page."""
 PICTURES = 8
-"""Of these, frames on the contact sheet."""
+"""Frames of the page that are on the contact sheet, too."""
 SHEET_GRASPS = 9
 """Grasps drawn in a frame of the sheet: few, so that the outlines can be judged."""
 SHEET_FILE = "reports/annotated.png"

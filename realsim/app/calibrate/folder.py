@@ -108,7 +108,7 @@ def calibrate_folder(request: FolderRequest, console: Console) -> tuple[Calibrat
     for name, reason in (*folder.unpaired_images, *folder.unpaired_poses):
         console.warn(f"{name} was left out: {reason}")
     detections = _detections(folder.images, target, request.out, console)
-    _require_target(folder, detections, target)
+    require_target(folder, detections, target)
     camera = _camera_of(request.camera)
     reading = reading or _stated_or_proven(folder, detections, target, camera, request, console)
     Ts, joints = folder.Ts_base_ee(reading), folder.joints
@@ -195,7 +195,7 @@ def _noted(path: Path) -> TargetDetection | None:
         return None
 
 
-def _require_target(
+def require_target(
     folder: "FolderInput", detections: Sequence[TargetDetection], target: Target
 ) -> None:
     """Raise if the target was found nowhere, saying what the pictures show instead."""
@@ -208,7 +208,7 @@ def _require_target(
     shown = what_is_visible(load_image(folder.images[0]))
     raise InputError(
         f"the target '{format_target(target)}' was found in none of the {len(detections)} images. "
-        f"{folder.labels[0]}: {shown} Give --board as it was printed."
+        f"{folder.labels[0]} shows {shown}. Give --board as it was printed."
     )
 
 

@@ -18,7 +18,7 @@ class ExportRequest:
     target: str
     """Format to write; see `realsim.app.export.targets.TARGETS`."""
     labels: Literal["auto", "annotated", "imported", "none"] = "auto"
-    """Of sessions: which labels are taken."""
+    """Which labels of sessions are taken."""
     scenes: tuple[int, ...] = ()
     """Numbers of scenes; none = all."""
     split: str = ""

@@ -28,9 +28,9 @@ COLUMNS_FIRST = "cam_R_w2c is written column by column"
 IN_METRES = "cam_t_w2c is in metres"
 TWICE = "cam_t_w2c was multiplied by 1000 once too often"
 TURNED_DEG = 5.0
-"""Static objects whose orientation differs more than this between views [deg] are suspicious..."""
+"""Static objects whose orientation differs more than this between views [deg] are suspicious."""
 TURNED_BY = 5.0
-"""... and columns are taken for rows if the other reading is this many times better."""
+"""Columns are taken for rows if the other reading is this many times better."""
 UNIT_FACTOR = 3.0
 """Measured depth within an object's visible part is at most this many times its distance, or less:
 what lies in front of an object's origin, or behind it where the label is rough, changes it by
@@ -40,7 +40,7 @@ LEAST_BOXES = 8
 BOX_VOTES = 0.8
 """Share of them that must fit better with columns first."""
 BOX_GAIN = 0.1
-"""... and their median gain of overlap (intersection over union)."""
+"""Least median gain of their overlap (intersection over union)."""
 LEAST_SEEN = 4
 """Objects that must be looked at before their places say anything."""
 SEEN_SHARE = 0.5

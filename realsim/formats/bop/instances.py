@@ -22,7 +22,7 @@ GATE_M = 0.02
 """Positions of one thing in several images agree within this [m]: labels and camera poses of public
 data sets are good to some millimetres."""
 GATE_SHARE = 0.4
-"""... and within this share of the least distance of two alike: less than half decides."""
+"""They agree within this share of the least distance of two alike, too: less than half decides."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

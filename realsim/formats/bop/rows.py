@@ -21,7 +21,7 @@ from realsim.untrusted.values import whole
 Json = dict[str, Any]
 GT_KEYS = ("obj_id", "cam_R_m2c", "cam_t_m2c")
 LARGEST_OBJECT_ID = 999_999
-"""Of obj_000001.ply."""
+"""Greatest number of an object, by the six digits of obj_000001.ply."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -48,7 +48,7 @@ class BopSceneRef:
 
     split: str
     scene_id: int
-    """Of onboarding_static/obj_000001_up it is the object's."""
+    """The scene's number; the object's for onboarding_static/obj_000001_up."""
     folder: Path
     camera: str = ""
     """Type of the camera, of scenes with several: that of scene_camera_CAMTYPE.json."""

@@ -91,39 +91,24 @@ def open_colmap(
     require_scale(metres_per_unit)
     model = read_model(folder)
     chosen, camera, notes = _of_one_camera(model, camera_id)
-    place = _images_place(root, folder, images_folder, chosen)
-    there = [(i, place / i.name) for i in chosen if (place / i.name).is_file()]
-    absent = [i.name for i in chosen if not (place / i.name).is_file()]
-    if absent:
-        notes.append(f"{len(absent)} images are not in {place} and were left out: {shown(absent)}.")
+    there = _images_there(_images_place(root, folder, images_folder, chosen), chosen, camera, notes)
     if model.unregistered:
         notes.append(
             f"{len(model.unregistered)} images have no pose in the model and were left out: "
             f"{shown(model.unregistered)}."
         )
-    size = require_one_size([image_header(p) for _, p in there], f"images of {place}")
-    if size != (camera.width, camera.height):
-        raise InputError(
-            f"the images in {place} are {size[0]}x{size[1]} px, the model's camera is of "
-            f"{camera.width}x{camera.height} px. Give the images that COLMAP was run on with "
-            "--images."
-        )
-    there.sort(key=lambda pair: natural_key(pair[0].name))
     depth: dict[str, Path] = {}
     unit_m: float | None = None
     if use_depth and (depth_folder is not None or depth_unit_m is not None):
         depth = find_depth(root, depth_folder, [i.name for i, _ in there], notes)
     posed = [
         PosedImage(
-            name=i.name,
-            colour=p,
-            depth=depth.get(i.name),
-            intrinsics=camera,
+            name=i.name, colour=p, depth=depth.get(i.name), intrinsics=camera,
             T_world_cam=i.T_world_cam,
         )
         for i, p in there
         if not depth or i.name in depth
-    ]
+    ]  # fmt: skip
     if depth:
         unit_m, _, said = checked_by_depth(
             posed, camera, depth_unit_m, str(folder), metres_per_unit, REMEDY
@@ -185,6 +170,28 @@ def _of_one_camera(
         notes += [f"{left} images of other cameras were left out."] if left else []
     chosen = [i for i in model.images if i.camera_id in groups[group]]
     return chosen, model.cameras[group], notes
+
+
+def _images_there(
+    place: Path, chosen: Sequence[ColmapImage], camera: CameraIntrinsics, notes: list[str]
+) -> list[tuple[ColmapImage, Path]]:
+    """Return the images whose files are there, in natural order; those absent go to the notes.
+
+    Raises:
+        InputError: they are of another size than the model's camera.
+    """
+    there = [(i, place / i.name) for i in chosen if (place / i.name).is_file()]
+    absent = [i.name for i in chosen if not (place / i.name).is_file()]
+    if absent:
+        notes.append(f"{len(absent)} images are not in {place} and were left out: {shown(absent)}.")
+    size = require_one_size([image_header(p) for _, p in there], f"images of {place}")
+    if size != (camera.width, camera.height):
+        raise InputError(
+            f"the images in {place} are {size[0]}x{size[1]} px, the model's camera is of "
+            f"{camera.width}x{camera.height} px. Give the images that COLMAP was run on with "
+            "--images."
+        )
+    return sorted(there, key=lambda pair: natural_key(pair[0].name))
 
 
 def _images_place(

@@ -22,7 +22,7 @@ import numpy as np
 
 from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
-from realsim.formats.coloured_points import coloured_points
+from realsim.formats.coloured_points import ColouredPoints, require_points, write_points
 from realsim.formats.export_folder import Content, ExportFolder
 from realsim.formats.folders.listing import shown
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene, WrittenScene
@@ -195,10 +195,6 @@ def _text(what: str, columns: str, lines: Sequence[str]) -> bytes:
 
 
 MODEL_FOLDER = "sparse/0"
-MODEL_PIECE, POINTS_ROW = "model", "points.json"
-"""The model as a piece of the export, and where the export notes its number of points."""
-MOST_POINTS = 10_000_000
-"""Points that a model may be asked to have: 500 MB as text."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -224,8 +220,7 @@ class ColmapWriteConfig:
             raise InputError(f"the encoding '{self.encoding}' is none of binary, text, both.")
         if self.images not in ("copied", "referenced"):
             raise InputError(f"images can be copied or referenced, not '{self.images}'.")
-        if not 0 <= self.points <= MOST_POINTS:
-            raise InputError(f"{self.points} points; 0 to {MOST_POINTS} can be written.")
+        require_points(self.points)
 
 
 def write_colmap(
@@ -283,7 +278,14 @@ def write_colmap(
             f"{scene.name}: none of the {len(scene.indices)} images has a camera pose, and a "
             "COLMAP model is made of them. Calibrate or register the session first."
         )
-    count = _write_model(scene, folder, config, list(cameras.values()), images)
+
+    def model_of(cloud: ColouredPoints) -> dict[str, bytes]:
+        parts = (list(cameras.values()), images, cloud.points, cloud.colours)
+        files = binary_files(*parts) if config.encoding != "text" else {}
+        files |= text_files(*parts) if config.encoding != "binary" else {}
+        return {f"{MODEL_FOLDER}/{name}": data for name, data in files.items()}
+
+    count = write_points(scene, folder, config.points, "model", model_of)
     return WrittenScene(
         name=scene.name, folder=folder.place, frames=len(images),
         frames_written=written if config.images == "copied" or config.depth else len(images),
@@ -313,27 +315,6 @@ def _files_of(
             files[f"depth/{frame.index:06d}.png"] = depth
             unit_m = frame.depth_unit_m
     return files, unit_m
-
-
-def _write_model(
-    scene: LabelledScene, folder: ExportFolder, config: ColmapWriteConfig,
-    cameras: list[CameraRow], images: list[ImageRow],
-) -> int:  # fmt: skip
-    """Write the files of the model if they are not there yet; return its number of points."""
-    if folder.has(MODEL_PIECE):
-        return int(dict(folder.rows(POINTS_ROW)).get(scene.name, 0))
-    cloud = coloured_points(scene, config.points)
-    files: dict[str, bytes] = {}
-    if config.encoding != "text":
-        files |= binary_files(cameras, images, cloud.points, cloud.colours)
-    if config.encoding != "binary":
-        files |= text_files(cameras, images, cloud.points, cloud.colours)
-    folder.write_piece(
-        MODEL_PIECE,
-        {f"{MODEL_FOLDER}/{name}": data for name, data in files.items()},
-        {POINTS_ROW: (scene.name, len(cloud.points))},
-    )
-    return len(cloud.points)
 
 
 def _common_place(scene: LabelledScene) -> Path:

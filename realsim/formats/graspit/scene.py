@@ -42,9 +42,9 @@ TABLE_TOLERANCE_M = 0.003
 """Objects whose lowest points differ by less stand on the same plane: physics left them there, with
 the engine's own tolerance."""
 CLEARER = 3.0
-"""The right order's evidence is at least so many times better than the wrong one's..."""
+"""The right order's evidence is at least so many times better than the wrong one's."""
 EVIDENCE_FLOOR_M = 0.001
-"""...after this is added to both: the grasps were snapped to samples a millimetre apart."""
+"""Distance that is added to both before: the grasps were snapped to samples a millimetre apart."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -18,7 +18,7 @@ import numpy as np
 
 from realsim import images
 from realsim.errors import InputError
-from realsim.formats.coloured_points import ColouredPoints, coloured_points
+from realsim.formats.coloured_points import ColouredPoints, require_points, write_points
 from realsim.formats.export_folder import Content, ExportFolder
 from realsim.formats.folders.depth_evidence import read_counts
 from realsim.formats.folders.listing import shown
@@ -33,9 +33,8 @@ from realsim.formats.nerfstudio.transforms import (
 from realsim.records import CameraIntrinsics
 
 POINTS_FILE = "sparse_pc.ply"
-ROWS, POINTS_ROW = "frames.json", "points.json"
-"""Where the export notes the frames that are done, and the number of points."""
-MOST_POINTS = 10_000_000
+ROWS = "frames.json"
+"""Where the export notes the frames that are done."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -57,8 +56,7 @@ class NerfstudioWriteConfig:
             raise InputError(
                 f"{self.depth_unit_m} m per count of depth; 1e-6 to 0.1 can be written."
             )
-        if not 0 <= self.points <= MOST_POINTS:
-            raise InputError(f"{self.points} points; 0 to {MOST_POINTS} can be written.")
+        require_points(self.points)
 
 
 def write_nerfstudio(
@@ -100,7 +98,10 @@ def write_nerfstudio(
             entry |= camera_entry(frame.intrinsics, f"image {index} of {scene.name}")
         folder.write_piece(piece, files, {ROWS: (str(index), entry)})
         written += 1
-    points = _write_points(scene, folder, config)
+    points = write_points(
+        scene, folder, config.points, "points",
+        lambda cloud: {POINTS_FILE: ply_of(cloud)} if len(cloud.points) else {},
+    )  # fmt: skip
     top = _top(scene, shared, unit_m, points)
     folder.write_document(FILE, _document(top, folder))
     return WrittenScene(
@@ -184,18 +185,6 @@ def _objects_mask(scene: LabelledScene, frame: LabelledFrame) -> Any:
         mask = scene.mask(frame.index, k, visible=True)
         union |= False if mask is None else mask
     return union
-
-
-def _write_points(scene: LabelledScene, folder: ExportFolder, config: NerfstudioWriteConfig) -> int:
-    """Write the point cloud if it is not there yet; return its number of points."""
-    piece = "points"
-    if folder.has(piece):
-        return int(dict(folder.rows(POINTS_ROW)).get(scene.name, 0))
-    cloud = coloured_points(scene, config.points)
-    count = len(cloud.points)
-    files: dict[str, Content] = {POINTS_FILE: ply_of(cloud)} if count else {}
-    folder.write_piece(piece, files, {POINTS_ROW: (scene.name, count)})
-    return count
 
 
 def ply_of(cloud: ColouredPoints) -> bytes:

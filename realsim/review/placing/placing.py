@@ -19,11 +19,11 @@ LEAST_ACROSS_M = 0.002
 """Clicked points must spread this far (RMS) across the line through them [m]: a click is good to
 2 mm, and with less than that the turn about the line is anybody's guess."""
 LEAST_ACROSS_SHARE = 0.08
-"""...and by this share of their spread along it, likewise."""
+"""The same as a share of their spread along it."""
 DISTANCE_SHARE = 0.25
-"""By how much of their distance two clicked pairs may disagree..."""
+"""By how much of their distance two clicked pairs may disagree."""
 DISTANCE_M = (0.004, 0.010)
-"""...but at least and at most by so much [m]: two clicks of 2 to 3 mm each differ by no more."""
+"""They may at least and at most by so much [m]: two clicks of 2 to 3 mm each differ by no more."""
 
 
 class Moved(NamedTuple):

@@ -24,9 +24,9 @@ SOUND_PX = 2
 """Poses rest on pixels whose neighbours so far away are trusted too [px]."""
 PATCH_M = 0.004
 """Edge of a patch of the object [m]: flat enough where the radius is above 10 mm, and some 50
-pixels, as many as the noise is correlated over..."""
+pixels, as many as the noise is correlated over."""
 PATCH_PX = 6.0
-"""...but at least this many pixels wide."""
+"""Pixels that a patch is wide at least."""
 TABLE_PATCH_M = 0.010
 """Edge of a patch of the table [m]."""
 CORRELATED_PX = 50.0

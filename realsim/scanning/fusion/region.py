@@ -16,13 +16,13 @@ from realsim.scanning.fusion.evidence import cloud_stride, sparse_cloud
 from realsim.scanning.fusion.result import FusionConfig, FusionFrame
 
 CELL_M = 0.004
-"""Cells in which things are told apart [m]..."""
+"""Cells in which things are told apart [m]."""
 CELL_PX = 2.0
-"""...or this many points of the strided images, if they are coarser."""
+"""The same in points of the strided images, if they are coarser."""
 LIFT_SIGMAS = 3.0
-"""A point counts as above the table from so many sigmas of its height..."""
+"""A point counts as above the table from so many sigmas of its height."""
 LIFT_M = 0.003
-"""...plus this: poses are off by as much at the border of the region [m]."""
+"""Height that is added to that: poses are off by as much at the border of the region [m]."""
 LEAST_VIEWS_OF_CELL = 3
 """A cell belongs to a thing if so many views have a point in it: flying pixels do not agree."""
 LEAST_PLANE_SHARE = 0.15
@@ -30,11 +30,11 @@ LEAST_PLANE_SHARE = 0.15
 CLEAR_RMS = 3.0
 """Points further from the plane than so many times its RMS are above or below it."""
 TOP_BELOW = 0.5
-"""With more of the points below, the plane is the top of something..."""
+"""With more of the points below, the plane is the top of something."""
 TOP_SOME_BELOW = 0.1
-"""...and with more than this below..."""
+"""The same if few of the points are above."""
 TOP_ABOVE = 0.05
-"""...if those above are fewer than this share of them."""
+"""Points above are few if they are fewer than this share of those below."""
 HOLES_SHARE = 0.05
 """From this share of pixels without depth the message on an empty table mentions transparency."""
 

@@ -102,7 +102,7 @@ class SearchConfig:
     """How many scales and poses are tried."""
 
     near_first: int = 3
-    """Of a given start: it and two other scales, before its turns are tried."""
+    """Starts at a given one, with two other scales, before its turns are tried."""
     half_turns: int = 3
     """Half turns about the box axes, the last of the starts near a given one."""
     turn_gain: float = 0.02
@@ -148,21 +148,22 @@ class VerdictConfig:
     least_iou: float = 0.86
     """Least overlap of the model's outline with the measured one."""
     part_agree: float = 0.8
-    """A mesh that agrees wherever it is seen..."""
+    """Overlap from which a mesh agrees wherever it is seen."""
     part_cover: float = 0.7
-    """... but covers less than this of what was measured is of a part of what stands there."""
+    """Such a mesh that covers less than this of what was measured is of a part of what stands
+    there."""
     rival_change: float = 0.04
     """A rival solution counts if its scale differs by more than this [share of the scale]."""
     rival_gain: float = 0.02
-    """... and its gain comes within this of the best one's."""
+    """Its gain must come within this of the best one's, too."""
     doubtful_sigma: float = 0.03
     """A 1-sigma above this share of the scale is no metric scale."""
     worst_shape: float = 0.04
     """A mesh whose surface is off by more than this share of its size is another object."""
     far_share: float = 0.06
-    """A measured point further than this share of the size from the mesh is not of it..."""
+    """A measured point further than this share of the size from the mesh is not of it."""
     most_far: float = 0.01
-    """...and more than this share of such points make the result doubtful: a handle elsewhere."""
+    """More than this share of such points makes the result doubtful: a handle elsewhere."""
     view_sigmas: float = 4.0
     """A view whose camera must be moved by so many sigma is left out."""
     view_share: float = 0.7

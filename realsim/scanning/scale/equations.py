@@ -111,7 +111,7 @@ def object_distances(shape: ScanShape, state: ScaleState, cameras: Array, points
     """Return how far points in camera axes lie from the object, and T_body_cam (V, 4, 4)."""
     Ms = se3.invert(state.poses[0]) @ cameras
     eyes = np.ascontiguousarray(Ms[:, :3, 3])
-    p = state.corrected(points)
+    p = state.corrected(points, views)
     return seen_distances(shape.field.lattice, state.s, p, views, (Ms, eyes), True), Ms
 
 
@@ -226,7 +226,8 @@ def table_blocks(
     variance = np.square(evidence.noise.sigma(points[:, 2])) + TABLE_SIGMA_M**2
     variance *= _crowding([v.table_area_px for v in evidence.views], config)[views]
     Ms = se3.invert(state.table) @ cameras
-    places = np.einsum("nij,nj->ni", Ms[views, :3, :3], state.corrected(points)) + Ms[views, :3, 3]
+    p = state.corrected(points, views)
+    places = np.einsum("nij,nj->ni", Ms[views, :3, :3], p) + Ms[views, :3, 3]
     up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     H, b = np.zeros((len(Ms), BLOCK, BLOCK)), np.zeros((len(Ms), BLOCK))
     add_blocks(

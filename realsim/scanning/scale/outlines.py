@@ -138,7 +138,18 @@ def _image(rim: Rim) -> tuple[Array32, Array32, float, float]:
 
 
 @njit
-def add_outline(  # noqa: PLR0915 - one pass over the points, in compiled code
+def _between_pixels(
+    image: Array32, row: int, column: int, du: float, dv: float
+) -> tuple[float, float, float]:
+    """Return an image's value beside a pixel, and its slopes along u and v, by four pixels."""
+    d00, d01 = image[row, column], image[row, column + 1]
+    d10, d11 = image[row + 1, column], image[row + 1, column + 1]
+    top, low = d00 + du * (d01 - d00), d10 + du * (d11 - d10)
+    return top + dv * (low - top), (d01 - d00) * (1 - dv) + (d11 - d10) * dv, low - top
+
+
+@njit
+def add_outline(
     points: Array,
     M: Array,
     camera: Array,
@@ -191,10 +202,7 @@ def add_outline(  # noqa: PLR0915 - one pass over the points, in compiled code
             continue
         gap = 1.0 if one_sided else gap
         du, dv = u - j, v - i0
-        d00, d01 = distance[i0, j], distance[i0, j + 1]
-        d10, d11 = distance[i0 + 1, j], distance[i0 + 1, j + 1]
-        top_row, low_row = d00 + du * (d01 - d00), d10 + du * (d11 - d10)
-        D = top_row + dv * (low_row - top_row)
+        D, along_u, along_v = _between_pixels(distance, i0, j, du, dv)
         if one_sided and D <= offset:
             continue
         metre = a2 / f
@@ -206,8 +214,7 @@ def add_outline(  # noqa: PLR0915 - one pass over the points, in compiled code
         if w == 0.0:
             continue
         # Gradient of r in camera axes, the lens taken for straight here.
-        h0 = ((d01 - d00) * (1 - dv) + (d11 - d10) * dv) * fx / f
-        h1 = (low_row - top_row) * fy / f
+        h0, h1 = along_u * fx / f, along_v * fy / f
         h2 = -(h0 * x + h1 * y)
         g0 = M[0, 0] * h0 + M[0, 1] * h1 + M[0, 2] * h2
         g1 = M[1, 0] * h0 + M[1, 1] * h1 + M[1, 2] * h2

@@ -28,7 +28,7 @@ RANGE_PERCENTILE = 98.0
 """The colours end where all but so many percent of the residuals lie: outliers must not pale the
 rest."""
 LEAST_RANGE_MM = 0.3
-"""... but not below the noise of a depth camera, which would look like a shape error [mm]."""
+"""They do not end below the noise of a depth camera, which would look like a shape error [mm]."""
 ROUND_MM = (0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 """Ends of the colour bar [mm]."""
 SAME_SCALE = 0.02

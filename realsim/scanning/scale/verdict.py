@@ -118,7 +118,7 @@ def _one_view(
     height = (T[:3, 3] - origin) @ up + np.where(model, hit, 0.0) * (directions @ up)
     z = np.minimum(hit, table)
     known = depth > 0
-    m = state.corrected(rays * depth[:, None])[:, 2]
+    m = state.corrected(rays * depth[:, None], 0)[:, 2]
     tau = tolerance(evidence, np.where(known, depth, 1.0))
     new = np.maximum(-1.0, 1.0 - 2.0 * np.square((m - z) / tau))
     old = np.maximum(-1.0, 1.0 - 2.0 * np.square((m - table) / tau))

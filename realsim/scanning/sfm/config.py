@@ -22,7 +22,7 @@ class FeatureConfig:
     max_angle_deg: float = 60.0
     """Pairs of known poses whose optical axes differ by more are not matched: SIFT is lost."""
     neighbours: int = 14
-    """Of each view so many nearest by angle are matched where poses are known."""
+    """Neighbours of a view, nearest by angle, that it is matched with where poses are known."""
     exhaustive_up_to: int = 40
     """Up to so many views all pairs within the angle are matched."""
     max_ratio: float = 0.8

@@ -28,11 +28,11 @@ class DepthAgreement:
     measured: float
     """Share of the visible pixels that have a measurement; NaN = no visible pixel."""
     agree: float
-    """Of these, the share within the tolerance; NaN = none is measured."""
+    """Share of the measured within the tolerance; NaN = none is measured."""
     nearer: float
-    """Of these, the share where something nearer was measured: an occluder nobody modelled."""
+    """Share of the measured where something nearer was measured: an occluder nobody modelled."""
     farther: float
-    """Of these, the share where the measurement looks through the object: the pose is off."""
+    """Share of the measured where the measurement looks through the object: the pose is off."""
     bias_m: float
     """Median of measured - rendered over the agreeing pixels [m]; NaN = none."""
 

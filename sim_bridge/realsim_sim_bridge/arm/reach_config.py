@@ -135,7 +135,7 @@ class ReachConfig:
 
 
 PANDA_SIZE_M, PANDA_SHOULDER_M = 0.887, 0.333
-"""Of a Panda: what `_size_m` says of it, and its shoulder's height over its base [m]."""
+"""Size of a Panda as `_size_m` says it, and its shoulder's height over its base [m]."""
 PANDA_HEIGHT_M, PANDA_BACK_M = 0.70, 0.60
 """Where a Panda hangs [m]."""
 WRIST_OVER_TABLE_M, OVER_HOME_M = 0.25, 0.35

@@ -45,7 +45,7 @@ RESAMPLES = 2000
 BINS = 10
 """Equal ones of p_hold, in the expected calibration error and the reliability diagram."""
 FEW_OBJECTS = 3
-"""Of fewer objects no interval is given, and no object can be left out."""
+"""Least objects for which an interval is given and one can be left out."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -18,7 +18,7 @@ from realsim_sim_bridge.slip.slip_test import SlipConfig, Slips, SlipTrial, run_
 from realsim_sim_bridge.slip.world import Engine
 
 Z_95 = 1.959964
-"""Of the normal distribution: 95 % lie within so many standard deviations."""
+"""Standard deviations within which 95 % of a normal distribution lie."""
 EXACT = 1e-9
 """Scores that differ by less are the same: sums of quarters and twelfths."""
 

@@ -19,7 +19,8 @@ QUALITIES = ("score", "p_hold", "margin", "ferrari_canny", "closure_friction")
 """What is ranked; closure_friction is better where it is smaller, so its correlations are negative
 where it agrees."""
 LEAST_GRASPS = 10
-"""Of fewer grasps no correlation is given: its interval would span nearly everything."""
+"""Least grasps for which a correlation is given: of fewer its interval would span nearly
+everything."""
 RESAMPLES = 1000
 """Bootstrap samples: the ends of a 95 % interval are good to about a twentieth of its width."""
 MOST_DRAWS = 50_000_000
@@ -37,7 +38,7 @@ class RankCorrelation:
     first: str
     second: str
     grasps: int
-    """Of which both are known."""
+    """Grasps of which both are known."""
     rho: float
     """NaN = too few grasps, or one of the two is the same for all."""
     low: float
@@ -56,7 +57,7 @@ class ClosureConfusion:
     open_good: int
     open_bad: int
     friction: float | None = None
-    """Of closure_friction: the greatest level at which a grasp closes; those that close at any
+    """Greatest level of closure_friction at which a grasp closes; those that close at any
     level count as closed, also above the friction that physics tried them with. None = of a measure
     that has one friction only, or no grasp closes."""
 

@@ -192,7 +192,7 @@ class HandResult:
     judged: int
     """Candidates with a score."""
     reached: int
-    """Of these, what the arm gets to."""
+    """Candidates of these that the arm gets to."""
     good: int
     score: float
     """Mean of the judged; NaN of none."""
@@ -210,7 +210,7 @@ class SchoolSummary:
     outcomes: dict[str, int]
     """Candidates by OUTCOMES; they sum to `candidates`."""
     penalized_by: dict[str, int]
-    """Of the penalized: the stage that failed first; 'none' = none did."""
+    """Penalized candidates by the stage that failed first; 'none' = none did."""
     score: Spread
     """Spread of the scores of all candidates that have one."""
     score_good: float

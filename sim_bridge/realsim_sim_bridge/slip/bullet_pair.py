@@ -108,7 +108,7 @@ class BulletPair:
         self.reach_m = body.reach()
         gravity = 0.0 if stand is None else stand.gravity
         self.weights_n = gravity * self._mass, gravity * body.mass_kg
-        """Of the object in the engine while it stands, and its own from then [N]."""
+        """Weight of the object in the engine while it stands, and its own from then [N]."""
 
     # --- what is in it ------------------------------------------------------------------------
 

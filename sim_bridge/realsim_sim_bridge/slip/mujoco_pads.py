@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from realsim_sim_bridge.slip.engines import MujocoSettings
 
 PAD_PRIORITY = 1
-"""Of the spheres' geoms: the higher one decides a contact's friction and stiffness alone."""
+"""Priority of the spheres' geoms: the higher one decides a contact's friction and stiffness
+alone."""
 SPHERE = 2
 """mjGEOM_SPHERE; no other geom is one."""
 PAD_STEPS = 2.0

@@ -33,8 +33,8 @@ class Stand:
     """
 
     height_m: float
-    """Of the table, where the object's lowest point is [m]: registration leaves objects some mm in
-    or above the true one, from which they would jump or onto which they would fall."""
+    """Height of the table, where the object's lowest point is [m]: registration leaves objects some
+    mm in or above the true one, from which they would jump or onto which they would fall."""
     friction: float
     """Coulomb coefficient between the object and all of it."""
     gravity: float

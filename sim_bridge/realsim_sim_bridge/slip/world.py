@@ -203,7 +203,7 @@ class Closing:
     """How the fingers close."""
 
     speed: float = 0.1
-    """Of each finger [m/s]: the Franka Hand's top speed."""
+    """Speed of each finger [m/s]: the Franka Hand's top speed."""
     table_friction: float | None = 0.4
     """Coulomb coefficient of the object with the table that it stands on and the neighbours beside
     it: wood on wood (0.25 to 0.5 in the Engineering ToolBox's table), plastics and metals on it

@@ -37,8 +37,8 @@ franka_description, after Gaz et al., Dynamic identification of the Franka Emika
 retrieval of feasible parameters using penalty-based optimization, 2019. Link i's frame lies on
 joint i's axis beside the next one; of link 7 it is the flange."""
 FLANGE = (0.001, (0.0, 0.0, 0.0), (1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6))
-"""Of the link `flange`: a mere frame, but PyBullet gives a link without mass a kilogram; the
-flange's own mass is in link 7."""
+"""Mass, centre and inertia of the link `flange`: a mere frame, but PyBullet gives a link without
+mass a kilogram; the flange's own mass is in link 7."""
 
 
 def arm_urdf(

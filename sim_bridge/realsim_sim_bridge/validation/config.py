@@ -56,9 +56,9 @@ class LimitConfig:
     hold_s: float = 0.5
     """And then stands [s]."""
     held_m: float = 1e-3
-    """A cube that moved less is held [m] ..."""
+    """A cube that moved less is held [m]."""
     held_deg: float = 2.0
-    """... if it turned less than this, too [deg]."""
+    """It must have turned less than this, too [deg]."""
     creep_share: float = 0.8
     """Load of the long hold, in units of the limit."""
     curved_share: float = 0.5
@@ -156,7 +156,7 @@ class ReferenceConfig:
     seed: int = 7
     """Seed of the grasps' places."""
     grasps: int = 1
-    """Of each shape and mass; they take the contact model about a second each."""
+    """Grasps of each shape and mass; they take the contact model about a second each."""
     lean_deg: float = 20.0
     """How far the surfaces under the fingers may lean over [deg]: friction holds 26 deg."""
     agreement: float = 0.78
