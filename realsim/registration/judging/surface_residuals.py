@@ -33,6 +33,10 @@ from realsim.registration.judging.patches import (
 from realsim.registration.views import ViewPoints
 
 
+LEVEL_HALVINGS = 40
+"""Halvings of the interval in which the level is sought: it ends at 1e-12 of it."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ResidualConfig:
     """How the surface is cut and when a patch is wrong."""
@@ -61,9 +65,11 @@ class ResidualConfig:
     """Least and greatest level [m]: beyond, poses are wrong, not meshes and cameras."""
     level_per_m: float = 0.003
     """The level where it cannot be measured: this times z^2 [1/m], 0.3 mm at 30 cm, 3 mm at 1 m."""
-    level_objects: int = 4
-    """Least objects for which the level is measured: with fewer one wrong pose would excuse
+    level_prior: float = 2.0
+    """That expectation counts as so many objects: with fewer, one wrong pose would excuse
     itself."""
+    level_patches: float = 10.0
+    """An object with so many measured patches counts half."""
     looks: int = 48
     """Views, evenly picked, in which patches are looked at for free space."""
     look_cos: float = 0.35
@@ -264,28 +270,36 @@ def _means_of(
 
 
 def error_level_m(residuals: Sequence[SurfaceResiduals], config: ResidualConfig) -> float:
-    """Return the level of error that the objects of a session share [m].
+    """Return the level of error L that the objects of a session share [m].
 
-    The median over objects of 1.48 * median |m| of their patches, freed of its standard error:
-    half of the objects, and of each half of its patches, may be wrong without raising it. Of too
-    few objects it is what depth of that distance must be expected to be off by.
+    It lies between what depth of that distance must be expected to be off by, L0, and the objects'
+    own levels l_i = 1.48 * median |m| of their patches, freed of their standard error:
+        w_0 (L0^2 - L^2) / (L0^2 + L^2) + sum_i w_i (l_i^2 - L^2) / (l_i^2 + L^2) = 0,
+    w_i = n_i / (n_i + `level_patches`) with n_i patches. No object pulls by more than 1, so that one
+    wrong pose does not excuse itself; and no pose, moved a little, makes the level jump, as a median
+    of a few objects does.
     """
     least, most = config.level_m
     own: list[float] = []
-    depths: list[float] = []
+    weights: list[float] = []
     for r in residuals:
         if np.any(r.measured):
             spread = mad_sigma(r.mean_m[r.measured])
             noise = float(np.median(r.sigma_m[r.measured]))
-            own.append(float(np.sqrt(max(0.0, spread**2 - noise**2))))
-            depths.append(r.depth_m)
-    if not own:
+            own.append(max(least**2, spread**2 - noise**2))
+            count = float(np.count_nonzero(r.measured))
+            weights.append(count / (count + config.level_patches))
+    depths = [r.depth_m for r in residuals if np.isfinite(r.depth_m)]
+    if not depths:
         return least
-    if len(own) < config.level_objects:
-        level = config.level_per_m * float(np.median(depths)) ** 2
-    else:
-        level = float(np.median(own))
-    return float(np.clip(level, least, most))
+    squares = np.append(own, max(least, config.level_per_m * float(np.median(depths)) ** 2) ** 2)
+    pulls = np.append(weights, config.level_prior)
+    low, high = np.log(squares.min()), np.log(squares.max())
+    for _ in range(LEVEL_HALVINGS):
+        middle = 0.5 * (low + high)
+        up = float(pulls @ ((squares - np.exp(middle)) / (squares + np.exp(middle)))) > 0
+        low, high = (middle, high) if up else (low, middle)
+    return float(np.clip(np.exp(0.25 * (low + high)), least, most))
 
 
 def wrong_bound_m(level_m: float, config: ResidualConfig) -> float:
