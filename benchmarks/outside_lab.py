@@ -8,7 +8,7 @@ those of an independent check of this project.
 """
 
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -69,6 +69,11 @@ class Lab:
     distance_m: tuple[float, float] = (0.30, 0.45)
     highest_deg: float = 75.0
     lowest_deg: float = 25.0
+    photos: bool = False
+    """Whether every frame has a photograph, too."""
+    grain: float = 2.0
+    """1-sigma of its noise [of 255]."""
+    blur_px: float = 0.7
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -248,6 +253,42 @@ def _measured(
     return (np.round(depth * 1e4) / 1e4).astype(np.float32)
 
 
+def _photo(world: Any, T: Array, albedo: Array, lab: Lab, rng: np.random.Generator) -> Any:
+    """Return a photograph (H, W, 3): four rays a pixel, a lamp above with its shadows, paint with smooth stains.
+
+    Args:
+        world: everything, for casting.
+        T: (4, 4) where the camera is.
+        albedo: (G + 1, 3) by geometry; the last of what is nowhere.
+        lab: severities.
+        rng: of the grain.
+    """
+    rays = _rays(lab)
+    image = np.zeros((lab.height, lab.width, 3))
+    lamp = np.array([0.35, -0.25, 0.9]) / np.linalg.norm([0.35, -0.25, 0.9])
+    step = np.array([[1.0 / lab.focal_px, 0, 0], [0, 1.0 / lab.focal_px, 0]])
+    for du, dv in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)):
+        directions = (rays + du * step[0] + dv * step[1]) @ T[:3, :3].T
+        origins = np.broadcast_to(T[:3, 3], directions.shape)
+        hit = world.cast_rays(o3d.core.Tensor(np.concatenate([origins, directions], -1)
+                                              .astype(np.float32)))  # fmt: skip
+        z, normals = hit["t_hit"].numpy().astype(np.float64), hit["primitive_normals"].numpy()
+        which = np.minimum(hit["geometry_ids"].numpy().astype(np.int64), len(albedo) - 1)
+        normals = normals * -np.sign((normals * directions).sum(-1, keepdims=True))
+        places = origins + np.where(np.isfinite(z), z, 0.0)[..., None] * directions
+        stains = 1.0 + 0.08 * np.sin(places @ [70.0, 41.0, 55.0] + which) * np.cos(
+            places @ [-33.0, 64.0, 20.0]
+        )
+        towards = np.concatenate(
+            [places + 5e-4 * normals, np.broadcast_to(lamp, places.shape)], -1
+        ).astype(np.float32)
+        lit = ~world.test_occlusions(o3d.core.Tensor(towards)).numpy()
+        light = 0.35 + 0.65 * lit * np.clip(normals @ lamp, 0.0, 1.0)
+        image += 0.25 * albedo[which] * (light * stains)[..., None]
+    image = gaussian_filter(image, (lab.blur_px, lab.blur_px, 0))
+    return np.clip(image + rng.normal(0, lab.grain, image.shape), 0, 255).astype(np.uint8)
+
+
 def make_scene(seed: int, lab: Lab | None = None, ids: list[int] | None = None,
                count: int = 10) -> LabScene:  # fmt: skip
     """Return a scene of the lab.
@@ -276,6 +317,10 @@ def make_scene(seed: int, lab: Lab | None = None, ids: list[int] | None = None,
     table = _table(lab)
     if table is not None:
         dark_of[world.add_triangles(mesh_of(table))] = False
+    paints = np.random.default_rng([seed, 5])
+    albedo = np.full((len(dark_of) + 1, 3), 20.0)
+    for number, black in dark_of.items():
+        albedo[number] = paints.uniform(15, 45, 3) if black else paints.uniform(60, 245, 3)
     alone = [_alone(known[i][1], T) for i, T in zip(ids, poses, strict=True)]
     rays = _rays(lab)
     keep = np.exp(-1.0 / lab.bias_views)
@@ -295,7 +340,13 @@ def make_scene(seed: int, lab: Lab | None = None, ids: list[int] | None = None,
         # Noise has a generator of its own: the scene stays when the sensor changes.
         noise = np.random.default_rng([seed, 7, k])
         depth = _measured(z, facing, dark, float(bias), lab, noise)
-        frames.append(DepthFrame(index=k, depth_m=depth, T_world_cam=claimed[k]))
+        rgb = None
+        if lab.photos:
+            rgb = _photo(world, T, albedo, lab, np.random.default_rng([seed, 9, k]))
+        frames.append(
+            DepthFrame(index=k, depth_m=depth, T_world_cam=claimed[k],
+                       read_rgb=None if rgb is None else partial(np.copy, rgb))
+        )  # fmt: skip
         bias = keep * bias + np.sqrt(1 - keep**2) * rng.normal(0, lab.bias_px)
         if k % 8 == 0:
             for number, instance in instance_of.items():

@@ -66,10 +66,11 @@ def starts(scene: LabScene, rng: np.random.Generator) -> list[ObjectPose]:
     return out
 
 
-def ones(seed: int, views: int, config: RegistrationConfig) -> list[One]:
+def ones(seed: int, views: int, photos: bool, config: RegistrationConfig) -> list[One]:
     """Return all objects of a scene in some of its frames, each frame alone."""
     # The camera is where it is said to be: one view's pose is known against its camera only.
-    scene = make_scene(seed, Lab(views=views, hand_eye_mm=0, hand_eye_deg=0, arm_mm=0, arm_deg=0))
+    lab = Lab(views=views, hand_eye_mm=0, hand_eye_deg=0, arm_mm=0, arm_deg=0, photos=photos)
+    scene = make_scene(seed, lab)
     rng = np.random.default_rng([seed, 1])
     rows: list[One] = []
     for frame in scene.frames:

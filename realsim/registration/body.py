@@ -61,6 +61,13 @@ def moved_body(body: Body, T_world_obj: Array) -> Body:
     return replace(body, start=replace(body.start, T_world_obj=T_world_obj))
 
 
+def moved_about_center(body: Body, T_world_obj: Array, motion: Array) -> Array:
+    """Return a pose moved by a motion (6,): about the box's centre, turns times the radius [m]."""
+    c = se3.from_translation(body.center_obj)
+    step = se3.exp(motion * np.repeat([1.0 / body.radius_m, 1.0], 3))
+    return T_world_obj @ c @ step @ se3.invert(c)
+
+
 def make_body(
     start: ObjectPose, model: ObjectModel, cells: int, samples: int, folder: Path | None = None
 ) -> Body:

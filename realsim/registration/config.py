@@ -17,6 +17,7 @@ from realsim.registration.judging.verdict import VerdictConfig
 from realsim.registration.near_rivals import RivalConfig
 from realsim.registration.near_start import JointConfig, SearchConfig
 from realsim.registration.odometry.cross_check import CheckConfig
+from realsim.registration.photo_fit import PhotoFitConfig
 from realsim.registration.refinement.config import RefineConfig
 from realsim.registration.rivals_around import AroundConfig
 from realsim.registration.search.find import FindConfig
@@ -105,6 +106,7 @@ class RegistrationConfig:
     verify: VerifyConfig = field(default_factory=VerifyConfig)
     swapped: SwappedConfig = field(default_factory=SwappedConfig)
     rivals: RivalConfig = field(default_factory=RivalConfig)
+    photo_fit: PhotoFitConfig = field(default_factory=PhotoFitConfig)
     around: AroundConfig = field(default_factory=AroundConfig)
     judging: JudgingConfig = field(default_factory=JudgingConfig)
     offset: OffsetConfig = field(default_factory=OffsetConfig)

@@ -70,8 +70,9 @@ class LazyFrame(DepthFrame):
 def correct_frame(frame: DepthFrame, T_world_cam: Array, bias: DepthBias) -> DepthFrame:
     """Return the frame with another camera pose and the depth's bias taken out; read when asked."""
     return LazyFrame(
-        frame.index, T_world_cam, lambda: bias.corrected(frame.depth_m).astype(np.float32)
-    )
+        frame.index, T_world_cam, lambda: bias.corrected(frame.depth_m).astype(np.float32),
+        read_rgb=frame.read_rgb,
+    )  # fmt: skip
 
 
 def read_frame(frame: DepthFrame) -> DepthFrame:

@@ -14,6 +14,7 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import SupportPlane
+from realsim.records.depth_bias import DepthBias
 from realsim.registration.blind import Kept, keep_start
 from realsim.registration.body import Body, moved_body
 from realsim.registration.compare import Comparer, make_comparer, spread_frames
@@ -23,12 +24,15 @@ from realsim.registration.evidence import (
     DepthFrame,
     Evidence,
     average_cloud,
+    correct_frame,
     gather,
     read_frame,
     without_table,
 )
 from realsim.registration.intake import Intake
 from realsim.registration.near_start import BestStart, joint_fit, search
+from realsim.registration.photo import Picture
+from realsim.registration.photo_fit import PhotoFit, photo_fit
 from realsim.registration.rivals_around import Around, around
 from realsim.registration.solver import FreeSpace
 from realsim.registration.table_planes import find_support_plane
@@ -127,11 +131,74 @@ def register_few(
     )  # fmt: skip
 
 
+def with_photograph(
+    intake: Intake, few: FewViews, bodies: Sequence[Body], config: RegistrationConfig
+) -> tuple[Intake, FewViews, PhotoFit | None]:
+    """Return everything of a single view brought together with its photograph; None = it has none.
+
+    Args:
+        intake: the frames.
+        few: the fits.
+        bodies: the objects.
+        config: see there.
+    """
+    (frame, *more) = intake.frames
+    if more or frame.read_rgb is None:
+        return intake, few, None
+    picture = Picture(
+        intrinsics=intake.intrinsics, depth_m=frame.depth_m, T_world_cam=frame.T_world_cam,
+        rgb=frame.read_rgb(),
+    )  # fmt: skip
+    fit = photo_fit(picture, bodies, [k.fit for k in few.kept], few.stride,
+                    intake.noise, config.photo_fit)  # fmt: skip
+    if not fit.taken:
+        return intake, few, fit
+    bias = DepthBias(scale=1.0, offset_per_m=fit.offset_per_m)
+    T = frame.T_world_cam
+
+    def moved(points_world: Array) -> Array:
+        points = se3.transform(se3.invert(T), points_world)
+        return se3.transform(T, points / (1.0 + fit.offset_per_m * points[:, 2:]))
+
+    (view,) = intake.views
+    scale = 1.0 + fit.offset_per_m * view.points[:, 2:]
+    plane = few.plane if few.plane is not None else intake.plane
+    if plane is not None:
+        plane = _moved_plane(plane, moved, np.mean([b.center(T) for b, T in zip(bodies, fit.poses,
+                                                                        strict=True)], axis=0))  # fmt: skip
+    corrected = replace(
+        intake, frames=(correct_frame(frame, T, bias),), plane=plane,
+        views=(replace(view, points=(view.points / scale).astype(np.float32)),),
+    )  # fmt: skip
+    kept = [replace(k, fit=k.fit.at(T)) for k, T in zip(few.kept, fit.poses, strict=True)]
+    clouds = [replace(c, points=moved(c.points)) for c in few.clouds]
+    return corrected, replace(few, kept=kept, clouds=clouds, plane=plane), fit
+
+
+def _moved_plane(
+    plane: SupportPlane, moved: Callable[[Array], Array], middle: Array
+) -> SupportPlane:
+    """Return a plane whose points near the middle (3,) were moved."""
+    T = plane.T_world_table
+    at = se3.transform(se3.invert(T), middle[None])[0] * [1.0, 1.0, 0.0]
+    corners = at + 0.1 * np.array([[1.0, 0, 0], [-0.5, 0.8, 0], [-0.5, -0.8, 0]])
+    a, b, c = moved(se3.transform(T, corners))
+    up = np.cross(b - a, c - a)
+    up /= np.linalg.norm(up)
+    back = T.copy()
+    # The turn is tiny: its sine is its angle.
+    back[:3, :3] = se3.exp_so3(np.cross(T[:3, 2], up)) @ T[:3, :3]
+    off = float((np.mean([a, b, c], axis=0) - T[:3, 3]) @ up)
+    back[:3, 3] = T[:3, 3] + off * up
+    return replace(plane, T_world_table=back)
+
+
 def few_around(
     intake: Intake,
     few: FewViews,
     bodies: Sequence[Body],
     claimed: Sequence[Array | None],
+    photo: PhotoFit | None,
     config: RegistrationConfig,
 ) -> list[Around]:
     """Return what the images say of every pose and those around it, all others where they are.
@@ -141,6 +208,7 @@ def few_around(
         few: the fits.
         bodies: the objects.
         claimed: (4, 4) starts that somebody claimed; None = a search found them.
+        photo: what the photograph says; None = there is none.
         config: see there.
     """
     comparer = make_comparer(
@@ -151,6 +219,10 @@ def few_around(
     at = [(b, k.fit.T_world_obj) for b, k in zip(bodies, few.kept, strict=True)]
     return [
         around(b, k.fit, cloud, comparer, [*at[:n], *at[n + 1 :]], start,
+               (None, config.around.offset_noises * intake.noise.per_m)
+               if photo is None or not photo.taken
+               else (photo.edges[n], photo.offset_sigma_per_m),
+               config.refine.noise.area_at(intake.intrinsics.width),
                (config.around, config.solver))
         for n, (b, k, cloud, start) in enumerate(
             zip(bodies, few.kept, few.clouds, claimed, strict=True)

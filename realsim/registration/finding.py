@@ -262,8 +262,7 @@ def with_flat(
     middle = plane.T_world_table[:3, 3]
     if placed:
         middle = np.mean([body.center(T) for body, T in placed.values()], axis=0)
-    noise = task.config.refine.noise
-    area_px = noise.area_px * (task.intake.intrinsics.width / noise.area_width_px) ** 2
+    area_px = task.config.refine.noise.area_at(task.intake.intrinsics.width)
     map_ = table_map(many.views, plane, task.intake.noise, middle, area_px, config)
     flat = {b.start.instance for b in sought}
     for instance, (body, T) in placed.items():

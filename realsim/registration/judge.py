@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from realsim.arrays import Array
+from realsim.geometry import se3
 from realsim.records import ObjectPose, SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.compare import Comparer
@@ -22,7 +23,9 @@ from realsim.registration.judging.surface_residuals import (
 )
 from realsim.registration.judging.verdict import probability_right, verdict_of
 from realsim.registration.table_planes import support_checks
+from realsim.registration.refinement.flat import is_flat
 from realsim.registration.rivals_around import Around
+from realsim.registration.search.flat_search import cover, explained_at, table_map
 from realsim.registration.verify import Checked, verify_objects
 
 ONE_VIEW_CHECKS = ("residual_bound_mm",)
@@ -89,6 +92,14 @@ def judge_objects(
     checked = verify_objects(given.bodies, given.poses, given.clouds, comparer, config.verify)
     features = _features(intake, given, checked, config)
     probabilities = [probability_right(f) for f in features]
+    if given.around:
+        # Of few views half of the right poses look improbable to checks that were set on many;
+        # they warn below `reject`, and what the views leave open decides.
+        least = config.judging.verdict.reject
+        probabilities = [
+            a.probability * min(1.0, p / least)
+            for a, p in zip(given.around, probabilities, strict=True)
+        ]
     # A single view leaves probabilities low; what the bounds do not reject still moved alike.
     one = len(intake.views) == 1
     usable = [c.verdict != "rejected" for c in checked] if one else None
@@ -124,19 +135,48 @@ def _features(
         fit = half_fit(given.bodies, given.poses, owned, j.held_out)
         found = held_out(given.bodies, owned, len(intake.views), fit, j.held_out)
         halves = [h.checks() for h in found]
+    flat = flat_checks(intake, given, config)
     surfaces = [residual_checks(r, level, j.residuals) for r in residuals]
     if len(intake.views) == 1:
         # One view shows too little of a surface for its patches to say anything.
         surfaces = [{name: s[name] for name in ONE_VIEW_CHECKS} for s in surfaces]
     return [
         {
-            **c.checks, **r, **s, **h,
+            **c.checks, **r, **s, **h, **f,
             "contrast": contrast, "views": float(len(intake.views)),
         }
-        for c, r, s, h, contrast in zip(
-            checked, surfaces, held, halves, given.contrasts, strict=True
+        for c, r, s, h, f, contrast in zip(
+            checked, surfaces, held, halves, flat, given.contrasts, strict=True
         )
     ]  # fmt: skip
+
+
+def flat_checks(intake: Intake, given: Poses, config: RegistrationConfig) -> list[dict[str, float]]:
+    """Return of every flat object what share of the heights around it its pose explains.
+
+    A card that is slid over the table agrees with all depth to its thickness; the mean heights of
+    all views tell where it lies. Nothing of other objects, and nothing of too few views.
+    """
+    rules, plane = config.find.flat, given.plane
+    checks: list[dict[str, float]] = [{} for _ in given.bodies]
+    if plane is None or len(intake.views) < config.refine_from:
+        return checks
+    T_table = se3.invert(plane.T_world_table)
+    both = list(zip(given.bodies, given.poses, strict=True))
+    flat = [k for k, (b, T) in enumerate(both) if is_flat(b, T_table @ T, rules.most_m)]
+    if not flat:
+        return checks
+    middle = np.mean([b.center(T) for b, T in both], axis=0)
+    area_px = config.refine.noise.area_at(intake.intrinsics.width)
+    map_ = table_map(intake.views, plane, intake.noise, middle, area_px, rules)
+    for k in flat:
+        rest = map_
+        for body, T in (*both[:k], *both[k + 1 :]):
+            rest = cover(rest, body, T, rules)
+        share = explained_at(rest, *both[k], given.table_off_m, rules)
+        if share is not None:
+            checks[k]["explained"] = share
+    return checks
 
 
 def _object(
@@ -151,13 +191,10 @@ def _object(
     """Return one object with its verdict: the worse of the bounds' and the probability's."""
     body = given.bodies[k]
     verdict, reasons = verdict_of(probability, features, config.judging.verdict)
-    contrast = features.get("contrast")
-    undecided = contrast is not None and contrast < config.judging.verdict.contrast
-    if features["views"] == 1.0 and verdict != "accepted" and not undecided:
-        # Of one view half of the right poses have a low probability; the bounds, which were set on
-        # real single frames, decide, and the probability only warns.
-        verdict = "doubtful" if probability < config.judging.verdict.reject else checked.verdict
-        reasons = reasons if verdict == "doubtful" else ()
+    if given.around and verdict != "accepted":
+        # Not knowing is no reason to reject: the bounds do that.
+        verdict = "doubtful"
+        reasons = (*reasons, *(f"not seen in so few views: {w}" for w in given.around[k].unseen))
     if WORST.index(checked.verdict) > WORST.index(verdict):
         verdict, reasons = checked.verdict, (*checked.reasons, *reasons)
     mine = [f for f in findings if body.start.instance in f.instances and f.kind not in COMMON]
@@ -169,8 +206,6 @@ def _object(
         name: float(value) for name, value in features.items() if value is not None
     }
     checks |= {"probability": probability, "blind_axes": float(given.blind[k])}
-    if given.around:
-        checks["around"] = given.around[k].probability
     return ObjectPose(
         obj_id=body.start.obj_id, instance=body.start.instance, T_world_obj=given.poses[k],
         covariance=given.covariances[k], checks=_finite(checks), verdict=verdict, reasons=reasons,

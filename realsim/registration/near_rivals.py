@@ -57,6 +57,8 @@ class RivalConfig:
     """Near symmetries that the print is asked about, those that fit best."""
     beside_share: float = 0.7
     """Poses nearer than this are one to the print [share of half the box's diagonal]."""
+    print_views: int = 4
+    """Photographs that are asked, of many, spread around the objects."""
     least_print: float = 0.25
     """A print that correlates by less at both poses is not the object's, or not seen."""
     print_loss: float = 0.5

@@ -26,6 +26,10 @@ from realsim.rendering.casting.pixel_caster import PixelCaster
 from realsim.rendering.rays import PlacedMesh
 
 
+WINDOW_PX = 16
+"""Around a model in a picture so much is looked at [px]: more than all filters reach."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PhotoConfig:
     """How outlines are held against a photograph."""
@@ -129,17 +133,17 @@ class Outline:
         return np.floor((np.arctan2(y, x) / (2 * np.pi) % 1.0) * count).astype(np.int64) % count
 
 
-def hidden_by_measured(picture: Picture, own: Array32, config: PhotoConfig) -> Mask:
+def hidden_by_measured(measured: Array32, own: Array32, config: PhotoConfig) -> Mask:
     """Return (H, W) where something was measured in front of a mesh or of its next pixel.
 
     Args:
-        picture: what was measured.
+        measured: (H, W) depth; 0 = none [m].
         own: (H, W) the mesh's depth, inf beside it [m].
         config: see there.
     """
     # Beside the mesh the nearest depth of its rim.
     rim = np.where(np.isfinite(own), own, cv2.erode(np.minimum(own, 99.0), np.ones((5, 5))))
-    front = (picture.depth_m > 0) & (rim < 99) & (picture.depth_m < rim - config.front_m)
+    front = (measured > 0) & (rim < 99) & (measured < rim - config.front_m)
     return cv2.dilate(front.astype(np.uint8), np.ones((5, 5))) > 0
 
 
@@ -152,10 +156,16 @@ def outline_of(picture: Picture, own: Array32, others: Array32, config: PhotoCon
         others: (H, W) that of all other things.
         config: see there.
     """
+    size = own.shape[::-1]
     inside = np.isfinite(own) & (own <= others)
     nothing = np.zeros((0, 2))
     if not inside.any():
         return Outline(pixels=nothing, normals=nothing, offsets=np.zeros(0))
+    spans = [np.flatnonzero(inside.any(axis=a)) for a in (1, 0)]
+    first = [max(0, int(s[0]) - WINDOW_PX) for s in spans]
+    window = tuple(slice(f, int(s[-1]) + WINDOW_PX) for f, s in zip(first, spans, strict=True))
+    own, others, inside = own[window], others[window], inside[window]
+    measured = picture.depth_m[window]
     smooth = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), config.outline_px)
     du, dv = (cv2.Sobel(smooth, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1)))
     slope = np.hypot(du, dv)
@@ -163,12 +173,12 @@ def outline_of(picture: Picture, own: Array32, others: Array32, config: PhotoCon
     # Beyond the border something must lie behind: where it lies in front, its own outline is seen.
     nearest = cv2.erode(np.where(inside, 99.0, np.minimum(others, 99.0)), np.ones((3, 3)))
     seen = border & (nearest > own + config.behind_m) & (slope > 0.02)
-    i, j = np.nonzero(seen & ~hidden_by_measured(picture, own, config))
+    i, j = np.nonzero(seen & ~hidden_by_measured(measured, own, config))
     normals = -np.stack([du[i, j], dv[i, j]], axis=1) / slope[i, j][:, None]
     # Across a straight outline the smoothed mask falls by `slope` per pixel where it is a half.
     away = np.clip((smooth[i, j] - 0.5) / slope[i, j], -1.0, 1.5)
-    pixels = np.stack([j, i], axis=1) + away[:, None] * normals
-    within = np.all((pixels > 2) & (pixels < np.array(inside.shape[::-1]) - 3), axis=1)
+    pixels = np.stack([j + first[1], i + first[0]], axis=1) + away[:, None] * normals
+    within = np.all((pixels > 2) & (pixels < np.array(size) - 3), axis=1)
     pixels, normals = pixels[within], normals[within].astype(np.float64)
     return Outline(pixels=pixels, normals=normals, offsets=_edges(picture, pixels, normals, config))
 
@@ -334,7 +344,7 @@ def print_errors(
     seen &= (at >= 0).all(1) & (at[:, 0] < width) & (at[:, 1] < height)
     j, i = at[seen].T
     free = (np.abs(own[i, j] - points[seen, 2]) < config.behind_m) & (own[i, j] <= others[i, j])
-    free &= ~hidden_by_measured(picture, own, config)[i, j]
+    free &= ~hidden_by_measured(picture.depth_m, own, config)[i, j]
     i, j, C = i[free], j[free], paint.colors[seen][free]
     if len(i) < 10 * config.least_points:
         return nothing

@@ -21,10 +21,10 @@ from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene
 from realsim.registration.blind import Kept, Uncertainty, uncertainty
 from realsim.registration.body import Body, moved_body
-from realsim.registration.compare import Comparer
+from realsim.registration.compare import Comparer, spread_frames
 from realsim.registration.config import METHODS, RegistrationConfig
 from realsim.registration.evidence import DepthFrame
-from realsim.registration.few_views import few_around, register_few
+from realsim.registration.few_views import few_around, register_few, with_photograph
 from realsim.registration.finding import (
     FoundObjects,
     Progress,
@@ -47,9 +47,10 @@ from realsim.registration.reports import (
     camera_report,
     common_report,
     object_report,
+    photo_report,
     plane_report,
 )
-from realsim.registration.rivals_around import integrated
+from realsim.registration.rivals_around import Around, integrated
 from realsim.registration.search.records import NotPlaced, Wanted
 from realsim.registration.single_view import fit_single_view, reference_frame
 from realsim.registration.verify import verify_objects
@@ -179,15 +180,17 @@ def _fit_many(
         found = _with_rivals(found, fought)
         many = register_many(intake, found.bodies, starts, intake.plane, config)
         fought = _duels(found, many, config)
+    contrasts, printed = _print_duels(task, found, many, fought)
+    if any(_is_lost(d) for d in printed):
+        found = _with_rivals(found, printed)
+        many = register_many(intake, found.bodies, starts, intake.plane, config)
     uncertain = [
         uncertainty(b, k.fit, 1, config.covariance) for b, k in zip(claimed, many.kept, strict=True)
     ]
     poses = Poses(
         bodies=claimed, poses=many.poses, clouds=many.clouds, covariances=list(many.covariances),
         blind=[len(u.unobservable) for u in uncertain],
-        contrasts=[
-            _contrast(c, d, k) for c, d, k in zip(found.contrasts, fought, many.kept, strict=True)
-        ],
+        contrasts=contrasts,
         cameras=many.refined.cameras, plane=many.plane,
         table_off_m=float(many.refined.misfit_m[-1]),
         known=found.findings, with_starts=all(T is not None for T in found.claimed),
@@ -254,6 +257,24 @@ def _duels(found: FoundObjects, many: ManyViews, config: RegistrationConfig) -> 
     return duels(found.bodies, poses, rivals, many.clouds, misfits, config.rivals)
 
 
+def _print_duels(
+    task: SceneTask, found: FoundObjects, many: ManyViews, fought: Sequence[Duel | None]
+) -> tuple[list[float | None], list[Duel | None]]:
+    """Return the contrasts, those that depth leaves open settled by the print, and its duels."""
+    contrasts = [
+        _contrast(c, d, k) for c, d, k in zip(found.contrasts, fought, many.kept, strict=True)
+    ]
+    bodies = [moved_body(b, T) for b, T in zip(found.bodies, many.poses, strict=True)]
+    rivals = [
+        None if R is None else T @ se3.invert(b.T_start) @ R
+        for b, T, R in zip(found.bodies, many.poses, found.rivals, strict=True)
+    ]
+    middle = np.mean([b.center(b.T_start) for b in bodies], axis=0)
+    some = tuple(spread_frames(many.frames, middle, task.config.rivals.print_views))
+    intake = replace(task.intake, frames=some, plane=many.plane)
+    return duels_by_print(bodies, rivals, contrasts, intake, task.config)
+
+
 def _with_rivals(found: FoundObjects, fought: Sequence[Duel | None]) -> FoundObjects:
     """Return the objects with poses and rivals exchanged where the rival is the better one."""
     bodies, rivals = list(found.bodies), list(found.rivals)
@@ -271,8 +292,11 @@ def _fit_few(task: SceneTask, found: FoundObjects) -> _Fit:
     found = replace(_with_rivals(found, fought), contrasts=contrasts)
     few = register_few(intake, found.bodies, config, task.up, task.tick)
     claimed = claimed_bodies(found)
-    tried = few_around(intake, few, claimed, found.claimed, config)
-    kept = [replace(k, fit=a.fit) for k, a in zip(few.kept, tried, strict=True)]
+    intake, few, photo = with_photograph(intake, few, claimed, config)
+    kept, tried = few.kept, list[Around]()
+    if len(intake.frames) < config.refine_from:
+        tried = few_around(intake, few, claimed, found.claimed, photo, config)
+        kept = [replace(k, fit=a.fit) for k, a in zip(kept, tried, strict=True)]
     uncertain = [
         uncertainty(b, k.fit, few.stride, config.covariance)
         for b, k in zip(claimed, kept, strict=True)
@@ -280,8 +304,8 @@ def _fit_few(task: SceneTask, found: FoundObjects) -> _Fit:
     poses = Poses(
         bodies=claimed, poses=[k.fit.T_world_obj for k in kept], clouds=few.clouds,
         covariances=[
-            integrated(b, u.covariance, a)
-            for b, u, a in zip(claimed, uncertain, tried, strict=True)
+            integrated(b, u.covariance, tried[k]) if tried else u.covariance
+            for k, (b, u) in enumerate(zip(claimed, uncertain, strict=True))
         ],
         around=tried,
         blind=[len(u.unobservable) for u in uncertain], contrasts=found.contrasts,
@@ -291,7 +315,7 @@ def _fit_few(task: SceneTask, found: FoundObjects) -> _Fit:
     return _Fit(
         poses=poses, frames=intake.frames, views=intake.views, kept=kept, uncertain=uncertain,
         searches=[{**r, **f.report} for r, f in zip(found.reports, few.found, strict=True)],
-        seen={}, findings=[], report={"joint": few.history},
+        seen={}, findings=[], report={"joint": few.history, **photo_report(photo)},
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from realsim.registration.body import Body
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.judge import Poses
 from realsim.registration.many_views import ManyViews
+from realsim.registration.photo_fit import PhotoFit
 from realsim.registration.refinement.equations import BIAS, HAND_EYE
 from realsim.registration.refinement.uncertainty import common_covariance
 from realsim.registration.search.records import Placed
@@ -72,6 +73,27 @@ def object_report(
         "sensitivities": list(u.sensitivities),
         "search": search,
     }
+
+
+def photo_report(photo: PhotoFit | None) -> dict[str, Any]:
+    """Return what the photograph of a single view said; nothing where there is none."""
+    if photo is None:
+        return {}
+    said = {
+        "taken": photo.taken,
+        "beside_depth_px": [float(p) for p in photo.beside_px],
+        "edge_px_before": photo.edge_px[0],
+        "edge_px_after": photo.edge_px[1],
+    }
+    if not photo.taken:
+        return {"photograph": said}
+    depth = {
+        "depth_scale": 1.0,
+        "depth_scale_sigma": 0.0,
+        "depth_offset_per_m": photo.offset_per_m,
+        "depth_offset_sigma_per_m": photo.offset_sigma_per_m,
+    }
+    return {"photograph": said, "refinement": depth}
 
 
 def camera_report(

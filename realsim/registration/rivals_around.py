@@ -8,9 +8,11 @@ least determined directions v, w are tried, the others fitted again:
     C = 1/2 sum min((z_measured - z_rendered)^2 / sigma^2, cap^2) / pixels of one measurement,
 over the union of all footprints, neighbours and table rendered as well. The best pose T_best is
 taken, and
-    P(MSSD < bound) = sum w_ij Phi((bound - MSSD(T_ij, T_best)) / s),
-s being half a step: the probability is a continuous function of the pose. Declared symmetries do
-not count, because MSSD knows them.
+    P(MSSD < bound) = sum w_ij E_t Phi((bound - hypot(MSSD(T_ij, T_best), t)) / s),
+s being half a step: the probability is a continuous function of the pose. t is what an offset of
+the views' depth moves everything by along the ray, which no point can tell; it has the sigma of the
+camera, or what a photograph leaves of it. The photograph's edges count in C as well. Declared
+symmetries do not count, because MSSD knows them.
 """
 
 from collections.abc import Sequence
@@ -22,11 +24,18 @@ from scipy.special import ndtr
 from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.metrics import aligned_pose, mssd_symmetric
+from realsim.records import SupportPlane
 from realsim.registration.blind import axis_name, principal_axes
-from realsim.registration.body import Body, footprint
+from realsim.registration.body import Body, footprint, moved_about_center
 from realsim.registration.compare import Comparer
 from realsim.registration.evidence import Cloud
+from realsim.registration.photo_fit import Edges
+from realsim.registration.refinement.flat import laid_down
 from realsim.registration.solver import PoseFit, SolverConfig, solve_pose
+
+
+NODES = 9
+"""Nodes of the quadrature over the offset of the depth."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -48,17 +57,21 @@ class AroundConfig:
     lens and edges, and are not independent."""
     unknown: float = 2.0
     """A pixel of which nothing is predicted (no table behind it) counts as so many sigmas."""
-    area_px: float = 50.0
-    """Pixels of one independent measurement, in an image of `area_width_px`."""
-    area_width_px: int = 1280
-    """See `area_px`."""
     declared_share: float = 0.3
     """A direction that moves the surface, modulo symmetry, by less than this share of its length is
     a declared symmetry."""
     prior_m: float = 0.015
     """1-sigma of how far the surface is from a claimed start [m]."""
-    better: float = 2.0
+    better: float = 4.0
     """Temperatures by which another pose must cost less to be taken instead of the fit."""
+    likely: float = 40.0
+    """Poses that depth holds more than this against, over the best, are not shown to the
+    photograph."""
+    offset_noises: float = 0.5
+    """1-sigma of the offset of a view's inverse depth that no photograph tells, in units of its
+    noise k: what a calibrated stereo camera wanders by, less than what it may be off by."""
+    flat_m: float = 0.008
+    """An object that rises less over the table lies on it, whatever its own points say [m]."""
     least_open: float = 0.002
     """A direction whose 1-sigma is greater is named as one that is not seen [m]."""
 
@@ -87,6 +100,8 @@ def around(
     comparer: Comparer,
     others: Sequence[tuple[Body, Array]],
     claimed: Array | None,
+    photo: tuple[Edges | None, float],
+    area_px: float,
     configs: tuple[AroundConfig, SolverConfig],
 ) -> Around:
     """Return the best pose near a fit, and how likely it is right.
@@ -98,6 +113,9 @@ def around(
         comparer: the frames, noise and table.
         others: the other objects and their poses (4, 4).
         claimed: (4, 4) the start, if somebody claimed it; None = a search found it.
+        photo: the edges that the photograph shows; and what is left of the offset of the inverse
+            depth, 1-sigma [1/m].
+        area_px: pixels of one independent measurement of depth.
         configs: see `AroundConfig`; of the fits.
     """
     config, solver = configs
@@ -105,7 +123,7 @@ def around(
     offsets, steps = np.array(config.offsets_m), np.gradient(config.offsets_m)
     fits = [
         solve_pose(
-            body, cloud, _moved(body, fit.T_world_obj, weak @ np.array([a, b])), solver.fine,
+            body, cloud, moved_about_center(body, fit.T_world_obj, weak @ np.array([a, b])), solver.fine,
             solver, held=weak,
         )
         for a in offsets for b in offsets
@@ -113,8 +131,20 @@ def around(
     volumes = np.outer(steps, steps).ravel()
     middle = len(fits) // 2
     fits[middle] = fit
-    Ts = np.stack([f.T_world_obj for f in fits])
-    costs = _costs(body, Ts, comparer, others, config)
+    Ts = _laid_down(body, np.stack([f.T_world_obj for f in fits]), comparer.plane, config)
+    costs = _costs(body, Ts, comparer, others, area_px, config)
+    edges, offset = photo
+    if edges is not None:
+        likely = np.flatnonzero(
+            (costs < costs.min() + config.likely) | (np.arange(len(Ts)) == middle)
+        )
+        amended = [edges.amended(Ts[n], weak) for n in likely]
+        Ts[likely] = _laid_down(
+            body, np.stack([T for T, _ in amended]), comparer.plane, config
+        )  # fmt: skip
+        seen = np.array([cost for _, cost in amended])
+        costs[:] = np.inf
+        costs[likely] = _costs(body, Ts[likely], comparer, others, area_px, config) + seen
     if claimed is not None:
         away = np.array([mssd_symmetric(claimed, T, body.model) for T in Ts])
         costs = costs + 0.5 * config.temperature * np.square(away / config.prior_m)
@@ -127,12 +157,18 @@ def around(
     off = np.array([mssd_symmetric(T_best, T, body.model) for T in Ts])
     # A pose of the grid stands for all that lie within half a step of it.
     half = 0.5 * np.sqrt(volumes)
-    probability = float(weights @ ndtr((config.bound_m - off) / half))
+    follows = np.mean([_follows(body, T_best, f.T_world_cam) for f in comparer.frames], axis=0)
+    follows = follows * offset / np.sqrt(len(comparer.frames))
+    nodes, shares = np.polynomial.hermite_e.hermegauss(NODES)
+    t = np.hypot(off[:, None], np.linalg.norm(follows) * nodes)
+    within = ndtr((config.bound_m - t) / half[:, None]) @ (shares / shares.sum())
+    probability = float(weights @ within)
     xi = np.array([_twist(body, T_best, T) if w > 1e-5 else np.zeros(6)
                    for T, w in zip(Ts, weights, strict=True)])  # fmt: skip
     spread = np.asarray((xi * weights[:, None]).T @ xi)
+    spread[3:, 3:] += np.outer(follows, follows)
     return Around(
-        fit=fits[best], probability=probability, spread=spread, weak=weak,
+        fit=fits[best].at(T_best), probability=probability, spread=spread, weak=weak,
         unseen=_unseen(spread, config),
     )  # fmt: skip
 
@@ -165,7 +201,7 @@ def _weak_directions(body: Body, fit: PoseFit, config: AroundConfig) -> Array:
     chosen: list[Array] = []
     length = config.offsets_m[-1]
     for v in vectors.T:
-        T = _moved(body, np.eye(4), length * v)
+        T = moved_about_center(body, np.eye(4), length * v)
         low, high = body.bounds_obj
         moved = float(np.linalg.norm(se3.transform(T, np.stack([low, high])) - [low, high],
                                      axis=1).max())  # fmt: skip
@@ -176,18 +212,30 @@ def _weak_directions(body: Body, fit: PoseFit, config: AroundConfig) -> Array:
     return np.stack(chosen, axis=1)
 
 
-def _moved(body: Body, T_world_obj: Array, x: Array) -> Array:
-    """Return a pose moved by x (6,): about the box's centre, turns times the radius [m]."""
+def _laid_down(body: Body, Ts: Array, plane: SupportPlane | None, config: AroundConfig) -> Array:
+    """Return poses T_world_obj (N, 4, 4), laid down on the table if the object is flat."""
+    if plane is None:
+        return Ts
+    T = plane.T_world_table
+    return T @ laid_down(body, se3.invert(T) @ Ts, config.flat_m)
+
+
+def _motion(body: Body, T_from: Array, T_to: Array) -> Array:
+    """Return the motion (6,) of the box's centre between two poses, turns times the radius [m]."""
     c = se3.from_translation(body.center_obj)
-    scale = np.repeat([1.0 / body.radius_m, 1.0], 3)
-    return T_world_obj @ c @ se3.exp(x * scale) @ se3.invert(c)
+    return se3.log(se3.invert(T_from @ c) @ T_to @ c) * np.repeat([body.radius_m, 1.0], 3)
+
+
+def _follows(body: Body, T_world_obj: Array, T_world_cam: Array) -> Array:
+    """Return how the object (3,) follows the offset of inverse depth, in its own axes [m^2]."""
+    T = se3.invert(T_world_cam) @ T_world_obj
+    center = body.center(T)
+    return T[:3, :3].T @ (-center[2] * center)
 
 
 def _twist(body: Body, T_best: Array, T: Array) -> Array:
     """Return the motion (6,) from the best pose to another, turned by symmetry to be the least."""
-    c = se3.from_translation(body.center_obj)
-    step = se3.invert(T_best @ c) @ aligned_pose(T_best, T, body.model) @ c
-    return se3.log(step) * np.repeat([body.radius_m, 1.0], 3)
+    return _motion(body, T_best, aligned_pose(T_best, T, body.model))
 
 
 def _costs(
@@ -195,14 +243,14 @@ def _costs(
     Ts: Array,
     comparer: Comparer,
     others: Sequence[tuple[Body, Array]],
+    area_px: float,
     config: AroundConfig,
 ) -> Array:
     """Return what the images of all frames hold against each of the poses (N, 4, 4)."""
     costs = np.zeros(len(Ts))
     intrinsics = comparer.intrinsics
     stride = comparer.stride_of(body, Ts[len(Ts) // 2])
-    area = config.area_px * (intrinsics.width / config.area_width_px) ** 2
-    share = min(1.0, stride**2 / area)
+    share = min(1.0, stride**2 / area_px)
     shape = (-(-intrinsics.height // stride), -(-intrinsics.width // stride))
     for frame in comparer.frames:
         T_cam_world = se3.invert(frame.T_world_cam)

@@ -21,7 +21,7 @@ from realsim.records.depth_bias import DepthBias
 from realsim.registration.search.records import Wanted
 from realsim.store import SessionStore
 from realsim.store.manifest import Manifest
-from realsim.store.session_store import depth_path
+from realsim.store.session_store import depth_path, rgb_path
 
 if TYPE_CHECKING:
     from realsim.app.console import Tick
@@ -101,7 +101,7 @@ def read_inputs(
         {str(k): model_hash(m) for k, m in available.items()},
         _said(store, request),
         {str(k): claimed[k].tolist() for k in sorted(claimed)}, list(views),
-        _depth_hashes(store, views), str(store.session.intrinsics),
+        _image_hashes(store, views), str(store.session.intrinsics),
         store.extra.get("gravity_up_world"),
     )  # fmt: skip
     return RegisterInputs(
@@ -292,8 +292,8 @@ def _views(
     return tuple(usable), tuple(left_out)
 
 
-def _depth_hashes(store: SessionStore, views: Sequence[int]) -> list[str]:
-    """Return the checksums of the depth images, as listed when they were captured."""
+def _image_hashes(store: SessionStore, views: Sequence[int]) -> list[str]:
+    """Return the checksums of depth images and photographs, as listed when they were captured."""
     entries = Manifest(store.folder).entries
-    paths = [depth_path(k) for k in views]
+    paths = [path(k) for k in views for path in (depth_path, rgb_path)]
     return [entries[p].sha256 if p in entries else p for p in paths]

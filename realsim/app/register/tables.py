@@ -125,7 +125,7 @@ def camera_line(result: Registered) -> str:
     """Return in one line what became of the cameras."""
     n = len(result.cameras.refined)
     found: dict[str, Any] = result.report.get("refinement", {})
-    if not found:
+    if "hand_eye_mm" not in found:
         few = "" if n == 0 else f" ({n} views)"
         return f"cameras were taken at their word{few}."
     each: list[dict[str, float]] = list(found.get("views", {}).values())
@@ -154,6 +154,21 @@ def odometry_line(result: Registered) -> str:
     if found["faults"]:
         return f"odometry from depth names {len(found['faults'])} faults (noise {noise})."
     return f"odometry from depth finds nothing gross against the robot's poses (noise {noise})."
+
+
+def photograph_line(result: Registered) -> str:
+    """Return in one line what the photograph of a single view said; empty where there is none."""
+    found: dict[str, Any] = result.report.get("photograph") or {}
+    if not found:
+        return ""
+    before, after = found["edge_px_before"], found["edge_px_after"]
+    if not found["taken"]:
+        return f"the photograph's edges settle nothing here ({before:.1f} px from the outlines)."
+    u, v = found["beside_depth_px"]
+    return (
+        f"outlines lie {after:.2f} px from the photograph's edges (mean; {before:.2f} px by depth "
+        f"alone); the photograph lies ({u:+.1f}, {v:+.1f}) px beside the depth."
+    )
 
 
 def depth_line(result: Registered) -> str:
@@ -212,7 +227,10 @@ def show_registered(
         console.table("Not placed", MISSING_HEADER, missing_rows(result, models))
     if result.remarks:
         console.table("Views and scene", VIEW_HEADER, view_rows(result))
-    lines = (table_line(result), camera_line(result), depth_line(result), odometry_line(result))
+    lines = (
+        table_line(result), camera_line(result), photograph_line(result), depth_line(result),
+        odometry_line(result),
+    )  # fmt: skip
     for line in (*symmetry_lines(result), *lines):
         if line:
             console.say(line)

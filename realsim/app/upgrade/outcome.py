@@ -200,7 +200,7 @@ class Referee:
         rest = [self._depth_of(v, i, X) for i, X in others.items() if i != instance]
         behind = np.min([np.full_like(own, np.inf), *rest], axis=0)
         scene = np.minimum(np.minimum(own, behind), self._tables[v])
-        hidden = hidden_by_measured(picture, own, self.config.photo)
+        hidden = hidden_by_measured(picture.depth_m, own, self.config.photo)
         sight = np.isfinite(own) & (own <= behind) & ~hidden
         return _Claim(
             own, scene, sight, float(sight.sum() / max(np.isfinite(own).sum(), 1)),

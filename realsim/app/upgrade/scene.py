@@ -12,6 +12,7 @@ from realsim import __version__, images
 from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console, Tick
 from realsim.app.register.config import RegisterRequest
+from realsim.app.register.pictures import bias_of
 from realsim.app.register.results import Registered
 from realsim.app.register.run import run_register
 from realsim.app.school.run import school_session
@@ -165,7 +166,11 @@ def settled(
     if not annotations or not objects:
         return result
     middle = np.mean([a.T_world_obj[:3, 3] for a in annotations], axis=0)
-    frames = [LazyFrame(k, T, lambda k=k: store.depth_m(k)) for k, T in sorted(cameras.items())]
+    bias = bias_of(result)
+    frames = [
+        LazyFrame(k, T, lambda k=k: bias.corrected(store.depth_m(k)).astype(np.float32))
+        for k, T in sorted(cameras.items())
+    ]
     with console.stage("annotations against new poses", f"{len(annotations)} objects"):
         pictures = [
             Picture(

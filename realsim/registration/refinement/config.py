@@ -39,6 +39,11 @@ class NoiseConfig:
     s = 2 px, the D405's matching window."""
     area_width_px: int = 1280
     """The image width at which `area_px` holds; it shrinks with the square of the width."""
+
+    def area_at(self, width_px: int) -> float:
+        """Return the pixels that share one window's noise in an image of this width [px^2]."""
+        return self.area_px * (width_px / self.area_width_px) ** 2
+
     oblique: float = 0.3
     """Least cosine by which a ray's noise is projected onto the surface's normal."""
     floor_m: float = 1e-4

@@ -14,6 +14,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.geometry import se3
+from realsim.models.resting import resting_orientations
 from realsim.registration.body import Body
 
 CELL_M = 5e-4
@@ -24,6 +25,8 @@ OUTLINE_M = 0.0004
 """1-sigma of where the sensor shows an outline [m]."""
 LOW, STEEP = 0.5, 0.9
 """Rays less steep are not used, steeper ones fully: low ones see far edges only, and too wide."""
+LEAN_DEG = 5.0
+"""A flat object that leans by more does not lie on the table [deg]."""
 CUT_SIGMAS = 4.0
 """Points whose height is further off than this and than the object is high are something else."""
 
@@ -32,6 +35,32 @@ def is_flat(body: Body, T_table_obj: Array, most_m: float) -> bool:
     """Return whether the object rises less than `most_m` over the table on which it lies."""
     z = body.model.mesh.vertices @ T_table_obj[2, :3] + T_table_obj[2, 3]
     return bool(np.ptp(z) < most_m and abs(float(z.min())) < most_m)
+
+
+def laid_down(body: Body, Ts_table_obj: Array, most_m: float) -> Array:
+    """Return poses (N, 4, 4) of a flat object laid down on the table where they nearly lie on it.
+
+    One view tells a plate's tilt worse than the table does. Poses that lean by more than `LEAN_DEG`,
+    or lie higher or lower than `most_m`, stay: something else carries them.
+    """
+    if min(body.model.mesh.extent) > most_m:
+        return Ts_table_obj
+    up = np.array([r.R[2] for r in resting_orientations(body.model.mesh) if r.height < most_m])
+    if len(up) == 0:
+        return Ts_table_obj
+    out = Ts_table_obj.copy()
+    for T in out:
+        best = up[int(np.argmax(up @ T[2, :3]))]
+        lean = np.cross(T[:3, :3] @ best, [0.0, 0.0, 1.0])
+        low = float((body.model.mesh.vertices @ T[2, :3]).min() + T[2, 3])
+        if best @ T[2, :3] < np.cos(np.radians(LEAN_DEG)) or abs(low) > most_m:
+            continue
+        c = T[:3, :3] @ body.center_obj + T[:3, 3]
+        turn = se3.exp_so3(lean)
+        T[:3, 3] = c + turn @ (T[:3, 3] - c)
+        T[:3, :3] = turn @ T[:3, :3]
+        T[2, 3] -= float((body.model.mesh.vertices @ T[2, :3]).min() + T[2, 3])
+    return out
 
 
 def step_term(

@@ -139,10 +139,9 @@ def refine(
         DegenerateError: no point lies on any object or on the table.
     """
     config = config or RefineConfig()
-    width = config.noise.area_width_px
     task = _Task(
         list(bodies), np.stack([v.T_world_cam for v in views]), tuple(views), noise,
-        config.noise.area_px * (intrinsics.width / width) ** 2, config,
+        config.noise.area_at(intrinsics.width), config,
         [thin_share(b, config.thin_cells) > config.thin_share for b in bodies],
     )  # fmt: skip
     state = State(

@@ -143,7 +143,7 @@ def refine_views(
         raise InputError(
             f"{len(views)} views were given; two that overlap are the least that can be aligned."
         )
-    area = config.noise.area_px * (intrinsics.width / config.noise.area_width_px) ** 2
+    area = config.noise.area_at(intrinsics.width)
     surfaces = [_surface(v, noise, area, config) for v in views]
     claimed = np.stack([v.T_world_cam for v in views])
     pairs = _pairs(claimed, config)

@@ -132,6 +132,35 @@ def cover(map_: TableMap, body: Body, T_world_obj: Array, config: FlatConfig) ->
     return TableMap(map_.T_world_table, map_.low, map_.heights, weights)
 
 
+def explained_at(
+    map_: TableMap, body: Body, T_world_obj: Array, table_off_m: float, config: FlatConfig
+) -> float | None:
+    """Return what share of the heights on and around a flat object its pose explains, noise aside.
+
+    With N cells of variance s^2: 1 - (sum (h - m)^2 / s^2 - N) / (sum h^2 / s^2), at most 1.
+    s is that of the mean of a cell and of what the table is off by, `table_off_m` [m]. None = too
+    little of the footprint and the ring around it is measured.
+    """
+    T = se3.invert(map_.T_world_table) @ T_world_obj
+    heights, low = height_map(body, T, config.cell_m / 4)
+    m = gaussian_filter(heights, 2.0)
+    steps = round(config.ring_m / config.cell_m * 4)
+    ring = binary_dilation(heights > 0, iterations=steps)
+    at = np.argwhere(map_.weights > 0)
+    places = map_.low + config.cell_m * at
+    cells = np.round((places - low) / (config.cell_m / 4)).astype(np.int64)
+    inside = np.all((cells >= 0) & (cells < m.shape), axis=1)
+    at, cells = at[inside], cells[inside]
+    near = ring[tuple(cells.T)]
+    at, cells = at[near], cells[near]
+    if len(at) * 16 < config.measured * ring.sum():
+        return None
+    h = map_.heights[tuple(at.T)]
+    w = 1.0 / (1.0 / map_.weights[tuple(at.T)] + max(config.floor_m, table_off_m) ** 2)
+    left = max(float(w @ np.square(h - m[tuple(cells.T)])) - len(w), 0.0)
+    return 1.0 - left / max(float(w @ np.square(h)), 1e-12)
+
+
 def is_free(map_: TableMap, body: Body, T_world_obj: Array, config: FlatConfig) -> bool:
     """Return whether enough of the map is left where an object would lie."""
     left = map_.weights[_footprint(map_, body, T_world_obj, config)] > 0

@@ -1,0 +1,327 @@
+"""One view's poses and its depth brought together with its photograph.
+
+Depth knows an object's distance but for an offset that all of the view share, 1/z + offset: 0.05 px
+of a D405's disparity are 1 mm at 40 cm. It knows outlines to some pixels, since stereo matching
+fattens them, and flat objects hardly have sides. A photograph shows outlines to fractions of a
+pixel: how large all objects appear tells the offset, where their outlines lie tells the rest. With
+x_k the twist of object k (camera axes, about its centre), H_k the information of its points, s_k
+how its pose follows the offset, n_i, J_i the normal and the Jacobian of outline point i, d_i the
+distance of the photograph's edge from it:
+    sum_k (x_k - s_k o)' H_k (x_k - s_k o) + sum_i w_i (d_i - n_i.(J_i x_k + c) - rim_k)^2
+      + (o / sigma_o)^2 + |c / sigma_c|^2 + sum_k (rim_k / sigma_rim)^2
+is least. c (the photograph lies beside the depth) and the rims (meshes too large) move nothing.
+Weights come from the residuals; an outline that fits no edge moves nothing either. What comes out
+is taken only if the outlines fit clearly better and the depth, its offset taken out, no worse.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from realsim.arrays import Array, Array32
+from realsim.geometry import se3
+from realsim.geometry.camera import ray_table
+from realsim.records import CameraIntrinsics
+from realsim.registration.body import Body, footprint, moved_about_center
+from realsim.registration.evidence import DepthNoise
+from realsim.registration.photo import Outline, PhotoConfig, Picture, outline_of
+from realsim.registration.solver import PoseFit
+
+
+AMENDED, REWEIGHTED = 2, 4
+"""Times an outline is drawn again while a pose is amended, and times its edges are weighed."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PhotoFitConfig:
+    """What depth and photograph may be off by."""
+
+    offset_noises: float = 1.0
+    """1-sigma of the offset of a view's inverse depth, in units of its noise k: what stereo is off
+    by is some hundredths of a pixel, as its noise is."""
+    beside_px: float = 1.5
+    """1-sigma of how far the photograph lies beside the depth [px]."""
+    rim_px: float = 0.3
+    """1-sigma of an object's rim [px]: a mesh that is 0.5 % too large."""
+    depth_m: float = 0.0006
+    """What the points of an object are off by in common, shift, 1-sigma [m]."""
+    depth_deg: float = 0.4
+    """Likewise, turn [deg]."""
+    blind_m: float = 0.01
+    """1-sigma of motions that points do not determine, of the surface [m]."""
+    most_m: float = 0.012
+    """A pose that the photograph would move further is not moved [m]."""
+    better: float = 0.9
+    """The mean distance of the edges must shrink to this share, else nothing is moved."""
+    cap_px: float = 3.0
+    """An edge further away, or none, counts as this in that mean [px]."""
+    cap_sigmas: float = 3.0
+    """An edge further off than so many sigmas, or none, counts as that."""
+    rounds: int = 3
+    """Times the outlines are drawn again."""
+    photo: PhotoConfig = field(default_factory=PhotoConfig)
+    """How outlines are held against the photograph."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Edges:
+    """What the photograph says of one object, all others and what is common as they were fitted."""
+
+    picture: Picture
+    body: Body
+    others: Array32
+    """(H, W) depth of all other objects; inf beside them [m]."""
+    beside_px: Array
+    """(2,) how far the photograph lies beside the depth [px]."""
+    rim_px: float
+    """Of the object [px]."""
+    sigma_px: float
+    """1-sigma of one edge [px]."""
+    count: int
+    """Points of its outline at the fit."""
+    information: Array
+    """(6, 6) of the object's points: twist about the box's centre in its axes, rotation first, turns
+    times the radius [1/m^2]."""
+    config: PhotoFitConfig
+
+    def amended(self, T_world_obj: Array, held: Array) -> tuple[Array, float]:
+        """Return a pose (4, 4) amended to lie on the edges, and what they hold against it.
+
+        Nothing is moved along the directions `held` (6, K), and else as far as the object's points
+        allow it. What is held against it is half the sum of squared residuals, each capped.
+        """
+        free = np.linalg.svd(held)[0][:, held.shape[1] :]
+        H, together = free.T @ self.information @ free, self.config.photo.together
+        y, T = np.zeros(free.shape[1]), T_world_obj
+        for _ in range(AMENDED):
+            A, d = self._rows(T)
+            A, seen = A @ free, np.isfinite(d)
+            r0 = d[seen] + A[seen] @ y
+            for _ in range(REWEIGHTED):
+                w = _weights(r0 - A[seen] @ y, self.sigma_px) / together
+                y = np.linalg.solve(H + (A[seen].T * w) @ A[seen], A[seen].T @ (w * r0))
+            T = moved_about_center(self.body, T_world_obj, free @ y)
+        _, d = self._rows(T)
+        cap = self.config.cap_sigmas
+        r = np.minimum(np.abs(np.nan_to_num(d / self.sigma_px, nan=cap)), cap)
+        mean = float(np.mean(np.square(r))) if len(r) else cap**2
+        return T, 0.5 * mean * self.count / together
+
+    def _rows(self, T_world_obj: Array) -> tuple[Array, Array]:
+        """Return (N, 6) how the outline's points move along their normals, and the edges (N,)."""
+        T = se3.invert(self.picture.T_world_cam) @ T_world_obj
+        seen = _outline(self.picture, self.body, T, self.others, self.config.photo)
+        B = np.kron(np.eye(2), T[:3, :3]) / np.repeat([self.body.radius_m, 1.0], 3)
+        o = seen.outline
+        return seen.J @ B, o.offsets - o.normals @ self.beside_px - self.rim_px
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class PhotoFit:
+    """What came of it."""
+
+    poses: list[Array]
+    """(4, 4) each."""
+    offset_per_m: float
+    """Of the view's inverse depth [1/m]: to be taken out."""
+    offset_sigma_per_m: float
+    """Its 1-sigma."""
+    beside_px: Array
+    """(2,) how far the photograph lies beside the depth [px]."""
+    edges: list[Edges]
+    """Per object; none where nothing was moved."""
+    edge_px: tuple[float, float]
+    """Mean distance of the edges from the outlines, before and after [px]."""
+    taken: bool
+    """Whether anything was moved."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Seen:
+    """The outline of one object, linearised."""
+
+    outline: Outline
+    J: Array
+    """(N, 6) of the distance along the normal, camera axes, about the centre [px/rad, px/m]."""
+
+
+def photo_fit(
+    picture: Picture, bodies: Sequence[Body], fits: Sequence[PoseFit], stride: int,
+    noise: DepthNoise, config: PhotoFitConfig,
+) -> PhotoFit:  # fmt: skip
+    """Return poses that fit depth and photograph.
+
+    Args:
+        picture: the view.
+        bodies: the objects.
+        fits: of their points.
+        stride: of the points [px].
+        noise: of the depth.
+        config: see there.
+    """
+    offset = config.offset_noises * noise.per_m
+    T_cam_world = se3.invert(picture.T_world_cam)
+    begin = [T_cam_world @ f.T_world_obj for f in fits]
+    H = [_information(b, f, T[:3, :3], stride, config)
+         for b, f, T in zip(bodies, fits, begin, strict=True)]  # fmt: skip
+    now, x = list(begin), np.zeros(3 + 7 * len(bodies))
+    seen = _outlines(picture, bodies, now, config.photo)
+    before = _mean_px(seen, np.zeros(2), config)
+    sigmas, C = np.ones(len(bodies)), np.eye(len(x))
+    for _ in range(config.rounds):
+        x, C, sigmas = _solved(seen, bodies, begin, H, x, offset, config)
+        now = [_stepped(b, T, x[3 + 7 * k : 9 + 7 * k])
+               for k, (b, T) in enumerate(zip(bodies, begin, strict=True))]  # fmt: skip
+        seen = _outlines(picture, bodies, now, config.photo)
+    after = _mean_px(seen, x[1:3], config)
+    taken = len(before) > 0 and after.mean() < config.better * before.mean()
+    far = [float(np.linalg.norm(x[6 + 7 * k : 9 + 7 * k])) for k in range(len(bodies))]
+    if not taken or max(far) > config.most_m:
+        return _untouched(fits, before, offset)
+    depths = [_depth_of(b, picture.intrinsics, T) for b, T in zip(bodies, now, strict=True)]
+    edges: list[Edges] = []
+    for k, (body, s) in enumerate(zip(bodies, seen, strict=True)):
+        B = np.kron(np.eye(2), now[k][:3, :3]) / np.repeat([body.radius_m, 1.0], 3)
+        others = np.min([*depths[:k], *depths[k + 1 :], np.full_like(depths[k], np.inf)], axis=0)
+        edges.append(
+            Edges(picture=picture, body=body, others=others, beside_px=x[1:3],
+                  rim_px=float(x[9 + 7 * k]), sigma_px=float(sigmas[k]),
+                  count=len(s.outline.offsets), information=B.T @ H[k] @ B, config=config)
+        )  # fmt: skip
+    return PhotoFit(
+        poses=[picture.T_world_cam @ T for T in now], offset_per_m=float(x[0]),
+        offset_sigma_per_m=float(np.sqrt(C[0, 0])), beside_px=x[1:3], edges=edges,
+        edge_px=(float(before.mean()), float(after.mean())), taken=True,
+    )  # fmt: skip
+
+
+def _untouched(fits: Sequence[PoseFit], before: Array, offset_sigma: float) -> PhotoFit:
+    """Return what is left where the photograph does not help."""
+    mean = float(before.mean()) if len(before) else float("nan")
+    return PhotoFit(
+        poses=[f.T_world_obj for f in fits], offset_per_m=0.0,
+        offset_sigma_per_m=offset_sigma, beside_px=np.zeros(2),
+        edges=[], edge_px=(mean, mean), taken=False,
+    )  # fmt: skip
+
+
+def _information(
+    body: Body, fit: PoseFit, R_cam_obj: Array, stride: int, config: PhotoFitConfig
+) -> Array:
+    """Return what an object's points say of its twist (6, 6), camera axes, about its centre."""
+    scale = np.repeat([body.radius_m, 1.0], 3)
+    inflation = max(1.0, 50.0 / stride**2) * max(1.0, fit.variance if fit.points else 1.0)
+    own = fit.information / np.outer(scale, scale) / inflation
+    own = own + np.eye(6) / config.blind_m**2
+    common = np.repeat([np.radians(config.depth_deg) * body.radius_m, config.depth_m], 3)
+    H = np.linalg.inv(np.linalg.inv(own) + np.diag(np.square(common))) * np.outer(scale, scale)
+    B = np.kron(np.eye(2), R_cam_obj)
+    return B @ H @ B.T
+
+
+def _outlines(
+    picture: Picture, bodies: Sequence[Body], Ts_cam_obj: Sequence[Array], config: PhotoConfig
+) -> list[_Seen]:
+    """Return the outlines of all objects, each hidden by the others."""
+    depths = [_depth_of(b, picture.intrinsics, T) for b, T in zip(bodies, Ts_cam_obj, strict=True)]
+    out: list[_Seen] = []
+    for k, (body, T) in enumerate(zip(bodies, Ts_cam_obj, strict=True)):
+        others = np.min([*depths[:k], *depths[k + 1 :], np.full_like(depths[k], np.inf)], axis=0)
+        out.append(_outline(picture, body, T, others, config))
+    return out
+
+
+def _outline(
+    picture: Picture, body: Body, T_cam_obj: Array, others: Array32, config: PhotoConfig
+) -> _Seen:
+    """Return the outline of one object."""
+    depth = _depth_of(body, picture.intrinsics, T_cam_obj)
+    o = outline_of(picture, depth, others, config)
+    at = np.round(o.pixels - o.normals).astype(np.int64)
+    z = depth[at[:, 1], at[:, 0]].astype(np.float64)
+    o, at, z = o.part(np.isfinite(z)), at[np.isfinite(z)], z[np.isfinite(z)]
+    p = ray_table(picture.intrinsics)[at[:, 1], at[:, 0]] * z[:, None]
+    J = _jacobian(o.normals, p, p - body.center(T_cam_obj), picture.intrinsics)
+    return _Seen(o, J)
+
+
+def _depth_of(body: Body, intrinsics: CameraIntrinsics, T_cam_obj: Array) -> Array32:
+    """Return the depth (H, W) of a body alone [m]; inf beside it."""
+    z = np.full((intrinsics.height, intrinsics.width), np.inf, np.float32)
+    p = footprint(body, intrinsics, T_cam_obj, 1)
+    z[p.rows, p.columns] = p.z
+    return z
+
+
+def _jacobian(n: Array, p: Array, q: Array, c: CameraIntrinsics) -> Array:
+    """Return how outline points p (N, 3), q from the centre, move along n as the body does."""
+    x, y, z = p.T
+    g = np.stack([n[:, 0] * c.fx / z, n[:, 1] * c.fy / z,
+                  -(n[:, 0] * c.fx * x + n[:, 1] * c.fy * y) / z**2], axis=1)  # fmt: skip
+    return np.concatenate([np.cross(q, g), g], axis=1)
+
+
+def _follows(center: Array) -> Array:
+    """Return how a pose (6,) follows the offset of the inverse depth: p -> p / (1 + o z)."""
+    return np.concatenate([np.zeros(3), -center[2] * center])
+
+
+def _solved(
+    seen: Sequence[_Seen], bodies: Sequence[Body], begin: Sequence[Array], H: Sequence[Array],
+    x: Array, offset: float, config: PhotoFitConfig,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Return unknowns, their covariance, and every outline's 1-sigma [px].
+
+    The unknowns: the offset, c (2), and of every object its twist (6) and rim.
+    """
+    size, before = len(x), x
+    prior = np.zeros(size)
+    prior[0], prior[1:3] = offset**-2, config.beside_px**-2
+    prior[9::7] = config.rim_px**-2
+    base = np.diag(prior)
+    rows: list[tuple[Array, Array]] = []
+    for k, (body, s) in enumerate(zip(bodies, seen, strict=True)):
+        at = np.arange(3 + 7 * k, 9 + 7 * k)
+        F = np.zeros((6, size))
+        F[:, at], F[:, 0] = np.eye(6), -_follows(body.center(begin[k]))
+        base += F.T @ H[k] @ F
+        found = np.isfinite(s.outline.offsets)
+        J = np.zeros((int(found.sum()), size))
+        J[:, at], J[:, 1:3], J[:, 9 + 7 * k] = s.J[found], s.outline.normals[found], 1.0
+        # Distances were measured from where the outline is now.
+        moved = np.zeros(size)
+        moved[at] = before[at]
+        rows.append((J, s.outline.offsets[found] + J @ moved))
+    sigmas = np.full(len(bodies), config.photo.least_px)
+    A = base
+    for _ in range(8):
+        A, b = base.copy(), np.zeros(size)
+        for k, (J, d) in enumerate(rows):
+            if len(d) < config.photo.least_points:
+                continue
+            r = d - J @ x
+            sigmas[k] = max(1.48 * float(np.median(np.abs(r))), config.photo.least_px)
+            w = _weights(r, float(sigmas[k])) / config.photo.together
+            A += J.T @ (w[:, None] * J)
+            b += J.T @ (w * d)
+        x = np.asarray(np.linalg.solve(A, b), dtype=np.float64)
+    return x, np.asarray(np.linalg.inv(A)), sigmas
+
+
+def _weights(residuals: Array, sigma_px: float) -> Array:
+    """Return robust weights of edges at these distances [1/px^2]: others' edges hardly count."""
+    return 1.0 / np.square(1.0 + np.square(residuals / (1.5 * sigma_px))) / sigma_px**2
+
+
+def _stepped(body: Body, T_cam_obj: Array, x: Array) -> Array:
+    """Return a pose moved by a twist (6,) about its centre in camera axes."""
+    c = se3.from_translation(body.center(T_cam_obj))
+    return c @ se3.exp(x) @ se3.invert(c) @ T_cam_obj
+
+
+def _mean_px(seen: Sequence[_Seen], beside_px: Array, config: PhotoFitConfig) -> Array:
+    """Return the distances (N,) of all edges, what lies beside taken out [px]."""
+    found = [np.abs(s.outline.offsets - s.outline.normals @ beside_px) for s in seen]
+    return np.minimum(np.nan_to_num(np.concatenate([*found, np.zeros(0)]), nan=config.cap_px),
+                      config.cap_px)  # fmt: skip
