@@ -254,7 +254,7 @@ def _measured(
 
 
 def _photo(world: Any, T: Array, albedo: Array, lab: Lab, rng: np.random.Generator) -> Any:
-    """Return a photograph (H, W, 3): four rays a pixel, a lamp above with its shadows, paint with smooth stains.
+    """Return a photograph (H, W, 3): four rays a pixel, a lamp and shadows, paint with stains.
 
     Args:
         world: everything, for casting.

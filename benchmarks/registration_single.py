@@ -84,8 +84,10 @@ def ones(seed: int, views: int, photos: bool, config: RegistrationConfig) -> lis
                 continue
             model = scene.models[o.obj_id]
             off = mssd_symmetric(by[o.instance].T_world_obj, o.T_world_obj, model)
-            rows.append(One(seed=seed, view=frame.index, name=model.name, off_m=off,
-                            verdict=o.verdict, checks=dict(o.checks), reasons=o.reasons))  # fmt: skip
+            rows.append(
+                One(seed=seed, view=frame.index, name=model.name, off_m=off, verdict=o.verdict,
+                    checks=dict(o.checks), reasons=o.reasons)
+            )  # fmt: skip
     return rows
 
 

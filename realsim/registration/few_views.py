@@ -33,7 +33,7 @@ from realsim.registration.intake import Intake
 from realsim.registration.near_start import BestStart, joint_fit, search
 from realsim.registration.photo import Picture
 from realsim.registration.photo_fit import PhotoFit, photo_fit
-from realsim.registration.rivals_around import Around, around
+from realsim.registration.rivals_around import Around, Images, around
 from realsim.registration.solver import FreeSpace
 from realsim.registration.table_planes import find_support_plane
 
@@ -164,13 +164,13 @@ def with_photograph(
     scale = 1.0 + fit.offset_per_m * view.points[:, 2:]
     plane = few.plane if few.plane is not None else intake.plane
     if plane is not None:
-        plane = _moved_plane(plane, moved, np.mean([b.center(T) for b, T in zip(bodies, fit.poses,
-                                                                        strict=True)], axis=0))  # fmt: skip
+        centers = [b.center(X) for b, X in zip(bodies, fit.poses, strict=True)]
+        plane = _moved_plane(plane, moved, np.mean(centers, axis=0))
     corrected = replace(
         intake, frames=(correct_frame(frame, T, bias),), plane=plane,
         views=(replace(view, points=(view.points / scale).astype(np.float32)),),
     )  # fmt: skip
-    kept = [replace(k, fit=k.fit.at(T)) for k, T in zip(few.kept, fit.poses, strict=True)]
+    kept = [replace(k, fit=k.fit.at(X)) for k, X in zip(few.kept, fit.poses, strict=True)]
     clouds = [replace(c, points=moved(c.points)) for c in few.clouds]
     return corrected, replace(few, kept=kept, clouds=clouds, plane=plane), fit
 
@@ -216,16 +216,18 @@ def few_around(
         few.plane if few.plane is not None else intake.plane,
         replace(config.compare, rays=config.around.rays),
     )  # fmt: skip
+    offset = config.around.offset_noises * intake.noise.per_m
+    images = Images(
+        comparer=comparer, area_px=config.refine.noise.area_at(intake.intrinsics.width),
+        offset_per_m=offset if photo is None or not photo.taken else photo.offset_sigma_per_m,
+    )  # fmt: skip
+    edges = [None] * len(bodies) if photo is None or not photo.taken else photo.edges
     at = [(b, k.fit.T_world_obj) for b, k in zip(bodies, few.kept, strict=True)]
     return [
-        around(b, k.fit, cloud, comparer, [*at[:n], *at[n + 1 :]], start,
-               (None, config.around.offset_noises * intake.noise.per_m)
-               if photo is None or not photo.taken
-               else (photo.edges[n], photo.offset_sigma_per_m),
-               config.refine.noise.area_at(intake.intrinsics.width),
+        around(b, k.fit, cloud, [*at[:n], *at[n + 1 :]], start, edge, images,
                (config.around, config.solver))
-        for n, (b, k, cloud, start) in enumerate(
-            zip(bodies, few.kept, few.clouds, claimed, strict=True)
+        for n, (b, k, cloud, start, edge) in enumerate(
+            zip(bodies, few.kept, few.clouds, claimed, edges, strict=True)
         )
     ]  # fmt: skip
 

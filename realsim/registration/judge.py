@@ -22,10 +22,10 @@ from realsim.registration.judging.surface_residuals import (
     surface_residuals,
 )
 from realsim.registration.judging.verdict import probability_right, verdict_of
-from realsim.registration.table_planes import support_checks
 from realsim.registration.refinement.flat import is_flat
 from realsim.registration.rivals_around import Around
 from realsim.registration.search.flat_search import cover, explained_at, table_map
+from realsim.registration.table_planes import support_checks
 from realsim.registration.verify import Checked, verify_objects
 
 ONE_VIEW_CHECKS = ("residual_bound_mm",)

@@ -25,7 +25,6 @@ from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.casting.pixel_caster import PixelCaster
 from realsim.rendering.rays import PlacedMesh
 
-
 WINDOW_PX = 16
 """Around a model in a picture so much is looked at [px]: more than all filters reach."""
 

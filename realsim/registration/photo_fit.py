@@ -28,7 +28,6 @@ from realsim.registration.evidence import DepthNoise
 from realsim.registration.photo import Outline, PhotoConfig, Picture, outline_of
 from realsim.registration.solver import PoseFit
 
-
 AMENDED, REWEIGHTED = 2, 4
 """Times an outline is drawn again while a pose is amended, and times its edges are weighed."""
 
@@ -81,8 +80,8 @@ class Edges:
     count: int
     """Points of its outline at the fit."""
     information: Array
-    """(6, 6) of the object's points: twist about the box's centre in its axes, rotation first, turns
-    times the radius [1/m^2]."""
+    """(6, 6) of the object's points: twist about the box's centre in its axes, rotation first,
+    turns times the radius [1/m^2]."""
     config: PhotoFitConfig
 
     def amended(self, T_world_obj: Array, held: Array) -> tuple[Array, float]:
@@ -100,7 +99,8 @@ class Edges:
             r0 = d[seen] + A[seen] @ y
             for _ in range(REWEIGHTED):
                 w = _weights(r0 - A[seen] @ y, self.sigma_px) / together
-                y = np.linalg.solve(H + (A[seen].T * w) @ A[seen], A[seen].T @ (w * r0))
+                left: Array = H + (A[seen].T * w) @ A[seen]
+                y = np.asarray(np.linalg.solve(left, A[seen].T @ (w * r0)), dtype=np.float64)
             T = moved_about_center(self.body, T_world_obj, free @ y)
         _, d = self._rows(T)
         cap = self.config.cap_sigmas
@@ -279,7 +279,7 @@ def _solved(
     prior = np.zeros(size)
     prior[0], prior[1:3] = offset**-2, config.beside_px**-2
     prior[9::7] = config.rim_px**-2
-    base = np.diag(prior)
+    base: Array = np.diag(prior)
     rows: list[tuple[Array, Array]] = []
     for k, (body, s) in enumerate(zip(bodies, seen, strict=True)):
         at = np.arange(3 + 7 * k, 9 + 7 * k)
@@ -293,8 +293,8 @@ def _solved(
         moved = np.zeros(size)
         moved[at] = before[at]
         rows.append((J, s.outline.offsets[found] + J @ moved))
-    sigmas = np.full(len(bodies), config.photo.least_px)
-    A = base
+    sigmas: Array = np.full(len(bodies), config.photo.least_px)
+    A: Array = base
     for _ in range(8):
         A, b = base.copy(), np.zeros(size)
         for k, (J, d) in enumerate(rows):
@@ -306,7 +306,7 @@ def _solved(
             A += J.T @ (w[:, None] * J)
             b += J.T @ (w * d)
         x = np.asarray(np.linalg.solve(A, b), dtype=np.float64)
-    return x, np.asarray(np.linalg.inv(A)), sigmas
+    return x, np.asarray(np.linalg.inv(A), dtype=np.float64), sigmas
 
 
 def _weights(residuals: Array, sigma_px: float) -> Array:

@@ -24,7 +24,6 @@ from scipy.special import ndtr
 from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.metrics import aligned_pose, mssd_symmetric
-from realsim.records import SupportPlane
 from realsim.registration.blind import axis_name, principal_axes
 from realsim.registration.body import Body, footprint, moved_about_center
 from realsim.registration.compare import Comparer
@@ -33,7 +32,8 @@ from realsim.registration.photo_fit import Edges
 from realsim.registration.refinement.flat import laid_down
 from realsim.registration.solver import PoseFit, SolverConfig, solve_pose
 
-
+UNLIKELY = 1e-5
+"""Poses of less weight are no part of the spread."""
 NODES = 9
 """Nodes of the quadrature over the offset of the depth."""
 
@@ -93,15 +93,26 @@ class Around:
     """Directions that are wider than they should be, in words with their 1-sigma."""
 
 
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Images:
+    """What poses are held against."""
+
+    comparer: Comparer
+    """The frames, their noise, and the table."""
+    area_px: float
+    """Pixels of one independent measurement of depth."""
+    offset_per_m: float
+    """1-sigma of the offset of the views' inverse depth [1/m]."""
+
+
 def around(
     body: Body,
     fit: PoseFit,
     cloud: Cloud,
-    comparer: Comparer,
     others: Sequence[tuple[Body, Array]],
     claimed: Array | None,
-    photo: tuple[Edges | None, float],
-    area_px: float,
+    edges: Edges | None,
+    images: Images,
     configs: tuple[AroundConfig, SolverConfig],
 ) -> Around:
     """Return the best pose near a fit, and how likely it is right.
@@ -110,67 +121,76 @@ def around(
         body: the object.
         fit: of its points.
         cloud: these points.
-        comparer: the frames, noise and table.
         others: the other objects and their poses (4, 4).
         claimed: (4, 4) the start, if somebody claimed it; None = a search found it.
-        photo: the edges that the photograph shows; and what is left of the offset of the inverse
-            depth, 1-sigma [1/m].
-        area_px: pixels of one independent measurement of depth.
+        edges: what the photograph shows of it; None = nothing.
+        images: see there.
         configs: see `AroundConfig`; of the fits.
     """
     config, solver = configs
     weak = _weak_directions(body, fit, config)
     offsets, steps = np.array(config.offsets_m), np.gradient(config.offsets_m)
-    fits = [
-        solve_pose(
-            body, cloud, moved_about_center(body, fit.T_world_obj, weak @ np.array([a, b])), solver.fine,
-            solver, held=weak,
-        )
-        for a in offsets for b in offsets
-    ]  # fmt: skip
-    volumes = np.outer(steps, steps).ravel()
+    moves = [weak @ np.array([a, b]) for a in offsets for b in offsets]
+    starts = [moved_about_center(body, fit.T_world_obj, x) for x in moves]
+    fits = [solve_pose(body, cloud, T, solver.fine, solver, held=weak) for T in starts]
     middle = len(fits) // 2
     fits[middle] = fit
-    Ts = _laid_down(body, np.stack([f.T_world_obj for f in fits]), comparer.plane, config)
-    costs = _costs(body, Ts, comparer, others, area_px, config)
-    edges, offset = photo
+    Ts = _laid_down(body, np.stack([f.T_world_obj for f in fits]), images, config)
+    costs = _costs(body, Ts, others, images, config)
     if edges is not None:
-        likely = np.flatnonzero(
-            (costs < costs.min() + config.likely) | (np.arange(len(Ts)) == middle)
-        )
-        amended = [edges.amended(Ts[n], weak) for n in likely]
-        Ts[likely] = _laid_down(
-            body, np.stack([T for T, _ in amended]), comparer.plane, config
-        )  # fmt: skip
+        is_likely = costs < costs.min() + config.likely
+        is_likely[middle] = True
+        amended = [edges.amended(T, weak) for T in Ts[is_likely]]
+        Ts[is_likely] = _laid_down(body, np.stack([T for T, _ in amended]), images, config)
         seen = np.array([cost for _, cost in amended])
-        costs[:] = np.inf
-        costs[likely] = _costs(body, Ts[likely], comparer, others, area_px, config) + seen
+        costs[is_likely] = _costs(body, Ts[is_likely], others, images, config) + seen
+        costs[~is_likely] = np.inf
     if claimed is not None:
         away = np.array([mssd_symmetric(claimed, T, body.model) for T in Ts])
         costs = costs + 0.5 * config.temperature * np.square(away / config.prior_m)
     best = int(np.argmin(costs))
     if costs[best] > costs[middle] - config.better * config.temperature:
         best = middle
+    volumes = np.outer(steps, steps).ravel()
     weights = np.exp(-(costs - costs.min()) / config.temperature) * volumes
     weights /= weights.sum()
-    T_best = Ts[best]
-    off = np.array([mssd_symmetric(T_best, T, body.model) for T in Ts])
     # A pose of the grid stands for all that lie within half a step of it.
-    half = 0.5 * np.sqrt(volumes)
-    follows = np.mean([_follows(body, T_best, f.T_world_cam) for f in comparer.frames], axis=0)
-    follows = follows * offset / np.sqrt(len(comparer.frames))
-    nodes, shares = np.polynomial.hermite_e.hermegauss(NODES)
-    t = np.hypot(off[:, None], np.linalg.norm(follows) * nodes)
-    within = ndtr((config.bound_m - t) / half[:, None]) @ (shares / shares.sum())
-    probability = float(weights @ within)
-    xi = np.array([_twist(body, T_best, T) if w > 1e-5 else np.zeros(6)
-                   for T, w in zip(Ts, weights, strict=True)])  # fmt: skip
+    probability, follows = _within(
+        body, (Ts, best), weights, 0.5 * np.sqrt(volumes), images, config
+    )
+    xi = np.array([
+        _twist(body, Ts[best], T) if w > UNLIKELY else np.zeros(6)
+        for T, w in zip(Ts, weights, strict=True)
+    ])  # fmt: skip
     spread = np.asarray((xi * weights[:, None]).T @ xi)
     spread[3:, 3:] += np.outer(follows, follows)
     return Around(
-        fit=fits[best].at(T_best), probability=probability, spread=spread, weak=weak,
+        fit=fits[best].at(Ts[best]), probability=probability, spread=spread, weak=weak,
         unseen=_unseen(spread, config),
     )  # fmt: skip
+
+
+def _within(
+    body: Body,
+    poses: tuple[Array, int],
+    weights: Array,
+    half: Array,
+    images: Images,
+    config: AroundConfig,
+) -> tuple[float, Array]:
+    """Return the probability that the best of weighted poses is right within the bound.
+
+    Also how an offset of the depth of 1 sigma moves it (3,), in its own axes [m].
+    """
+    Ts, best = poses
+    off = np.array([mssd_symmetric(Ts[best], T, body.model) for T in Ts])
+    frames = images.comparer.frames
+    follows = np.mean([_follows(body, Ts[best], f.T_world_cam) for f in frames], axis=0)
+    follows = follows * images.offset_per_m / np.sqrt(len(frames))
+    nodes, shares = np.polynomial.hermite_e.hermegauss(NODES)
+    t = np.hypot(off[:, None], np.linalg.norm(follows) * nodes)
+    within = ndtr((config.bound_m - t) / half[:, None]) @ (shares / shares.sum())
+    return float(weights @ within), follows
 
 
 def integrated(body: Body, covariance: Array, found: Around) -> Array:
@@ -212,8 +232,9 @@ def _weak_directions(body: Body, fit: PoseFit, config: AroundConfig) -> Array:
     return np.stack(chosen, axis=1)
 
 
-def _laid_down(body: Body, Ts: Array, plane: SupportPlane | None, config: AroundConfig) -> Array:
+def _laid_down(body: Body, Ts: Array, images: Images, config: AroundConfig) -> Array:
     """Return poses T_world_obj (N, 4, 4), laid down on the table if the object is flat."""
+    plane = images.comparer.plane
     if plane is None:
         return Ts
     T = plane.T_world_table
@@ -241,16 +262,16 @@ def _twist(body: Body, T_best: Array, T: Array) -> Array:
 def _costs(
     body: Body,
     Ts: Array,
-    comparer: Comparer,
     others: Sequence[tuple[Body, Array]],
-    area_px: float,
+    images: Images,
     config: AroundConfig,
 ) -> Array:
-    """Return what the images of all frames hold against each of the poses (N, 4, 4)."""
+    """Return what the depth of all frames holds against each of the poses (N, 4, 4)."""
+    comparer = images.comparer
     costs = np.zeros(len(Ts))
     intrinsics = comparer.intrinsics
     stride = comparer.stride_of(body, Ts[len(Ts) // 2])
-    share = min(1.0, stride**2 / area_px)
+    share = min(1.0, stride**2 / images.area_px)
     shape = (-(-intrinsics.height // stride), -(-intrinsics.width // stride))
     for frame in comparer.frames:
         T_cam_world = se3.invert(frame.T_world_cam)

@@ -32,7 +32,6 @@ from realsim.registration.judging.patches import (
 )
 from realsim.registration.views import ViewPoints
 
-
 LEVEL_HALVINGS = 40
 """Halvings of the interval in which the level is sought: it ends at 1e-12 of it."""
 
@@ -275,9 +274,9 @@ def error_level_m(residuals: Sequence[SurfaceResiduals], config: ResidualConfig)
     It lies between what depth of that distance must be expected to be off by, L0, and the objects'
     own levels l_i = 1.48 * median |m| of their patches, freed of their standard error:
         w_0 (L0^2 - L^2) / (L0^2 + L^2) + sum_i w_i (l_i^2 - L^2) / (l_i^2 + L^2) = 0,
-    w_i = n_i / (n_i + `level_patches`) with n_i patches. No object pulls by more than 1, so that one
-    wrong pose does not excuse itself; and no pose, moved a little, makes the level jump, as a median
-    of a few objects does.
+    w_i = n_i / (n_i + `level_patches`) with n_i patches. No object pulls by more than 1, so that
+    one wrong pose does not excuse itself; and no pose, moved a little, makes the level jump, as a
+    median of a few objects does.
     """
     least, most = config.level_m
     own: list[float] = []

@@ -40,8 +40,8 @@ def is_flat(body: Body, T_table_obj: Array, most_m: float) -> bool:
 def laid_down(body: Body, Ts_table_obj: Array, most_m: float) -> Array:
     """Return poses (N, 4, 4) of a flat object laid down on the table where they nearly lie on it.
 
-    One view tells a plate's tilt worse than the table does. Poses that lean by more than `LEAN_DEG`,
-    or lie higher or lower than `most_m`, stay: something else carries them.
+    One view tells a plate's tilt worse than the table does. Poses that lean by more than
+    `LEAN_DEG`, or lie higher or lower than `most_m`, stay: something else carries them.
     """
     if min(body.model.mesh.extent) > most_m:
         return Ts_table_obj

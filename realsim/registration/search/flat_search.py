@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
-from realsim.arrays import Array, Int64
+from realsim.arrays import Array, Int64, Mask
 from realsim.geometry import se3
 from realsim.geometry.metrics import mssd_symmetric
 from realsim.models.resting import resting_orientations
@@ -145,7 +145,7 @@ def explained_at(
     heights, low = height_map(body, T, config.cell_m / 4)
     m = gaussian_filter(heights, 2.0)
     steps = round(config.ring_m / config.cell_m * 4)
-    ring = binary_dilation(heights > 0, iterations=steps)
+    ring: Mask = np.asarray(binary_dilation(heights > 0, iterations=steps), dtype=np.bool_)
     at = np.argwhere(map_.weights > 0)
     places = map_.low + config.cell_m * at
     cells = np.round((places - low) / (config.cell_m / 4)).astype(np.int64)
