@@ -16,8 +16,8 @@ published figures; everything was tuned on seeds 1 to 20. Parts and their figure
                                       shift; the worst of the three
   provoked    outside_wrong_accepted_share
                                       of wrong poses, found or provoked (`registration_provoked.py`)
-  single      single_wrong_accepted_share, single_right_accepted_share, probability_jump: see
-              `registration_single.py`
+  single      single_wrong_accepted_share, single_right_accepted_share, probability_jump and more:
+              see `registration_single.py`
   table       no_table_false_findings findings on scenes with no table and with a wavy one that
                                       speak of sinking or floating objects
   upgrade     upgrade_worse_share, edge_px_ours, edge_px_annotation: see `registration_upgrade.py`
@@ -44,6 +44,8 @@ from figures import Figure, Found, Goal, run
 from outside_lab import Lab, LabScene, make_scene
 from registration_methods import Given, registered, wanted_of
 from registration_provoked import provoked
+from registration_single import FIGURES as SINGLE
+from registration_upgrade import FIGURES as UPGRADE
 from scipy.stats import chi2
 
 from realsim.app.console import Console
@@ -254,13 +256,9 @@ FIGURES = {
     "outside_false_alarm_share": Figure(unit="", goal=Goal(high=0.08)),
     "outside_wrong_accepted_share": Figure(unit="", goal=Goal(high=0.01)),
     "flat_bias_mm": Figure(unit="mm", goal=Goal(high=0.15)),
-    "single_wrong_accepted_share": Figure(unit="", goal=Goal(high=0.10)),
-    "single_right_accepted_share": Figure(unit="", goal=Goal(low=0.85)),
-    "probability_jump": Figure(unit="", goal=Goal(high=0.1)),
+    **SINGLE,
     "no_table_false_findings": Figure(unit="", goal=Goal(high=0)),
-    "upgrade_worse_share": Figure(unit="", goal=Goal(high=0.0)),
-    "edge_px_ours": Figure(unit="px"),
-    "edge_px_annotation": Figure(unit="px"),
+    **UPGRADE,
     "loop_coverage95": Figure(unit="", goal=Goal(low=0.90, high=0.98)),
     "d405_noise_ratio": Figure(unit="", goal=Goal(low=0.9, high=1.1)),
     "d405_holes_ratio": Figure(unit="", goal=Goal(low=0.85, high=1.15)),
