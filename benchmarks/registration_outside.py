@@ -59,7 +59,7 @@ PACKAGES = ("realsim", "numpy", "numba", "open3d-cpu", "trimesh")
 RIGHT_MM = 3.0
 SEEN_SHARE = 0.1
 """An object of which no view sees so much is not counted."""
-SCENES, QUICK_SCENES, LOOPS, JUDGED = 7, 1, 10, 6
+SCENES, QUICK_SCENES, LOOPS, JUDGED = 7, 1, 10, 8
 TABLES = ("none", "wavy")
 
 

@@ -37,7 +37,7 @@ from realsim.registration.register import register_scene
 START = (0.010, 10.0)
 """Starts are off by this [m, deg]."""
 RIGHT_M = 0.003
-SCENES, QUICK_SCENES = 12, 1
+SCENES, QUICK_SCENES = 8, 1
 VIEWS, QUICK_VIEWS = 8, 2
 """Frames of a scene, each alone."""
 SEEN_PX = 400

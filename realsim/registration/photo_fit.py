@@ -131,6 +131,8 @@ class PhotoFit:
     """(2,) how far the photograph lies beside the depth [px]."""
     edges: list[Edges]
     """Per object; none where nothing was moved."""
+    covariances: list[Array]
+    """(6, 6) per object, of the right twist about its origin, rotation first [rad, m]; likewise."""
     edge_px: tuple[float, float]
     """Mean distance of the edges from the outlines, before and after [px]."""
     taken: bool
@@ -181,6 +183,7 @@ def photo_fit(
         return _untouched(fits, before, offset)
     depths = [_depth_of(b, picture.intrinsics, T) for b, T in zip(bodies, now, strict=True)]
     edges: list[Edges] = []
+    covariances: list[Array] = []
     for k, (body, s) in enumerate(zip(bodies, seen, strict=True)):
         B = np.kron(np.eye(2), now[k][:3, :3]) / np.repeat([body.radius_m, 1.0], 3)
         others = np.min([*depths[:k], *depths[k + 1 :], np.full_like(depths[k], np.inf)], axis=0)
@@ -189,9 +192,15 @@ def photo_fit(
                   rim_px=float(x[9 + 7 * k]), sigma_px=float(sigmas[k]),
                   count=len(s.outline.offsets), information=B.T @ H[k] @ B, config=config)
         )  # fmt: skip
+        at = np.arange(3 + 7 * k, 9 + 7 * k)
+        to_obj = se3.adjoint(se3.from_translation(body.center_obj)) @ np.kron(
+            np.eye(2), now[k][:3, :3].T
+        )
+        covariances.append(to_obj @ C[np.ix_(at, at)] @ to_obj.T)
     return PhotoFit(
         poses=[picture.T_world_cam @ T for T in now], offset_per_m=float(x[0]),
         offset_sigma_per_m=float(np.sqrt(C[0, 0])), beside_px=x[1:3], edges=edges,
+        covariances=covariances,
         edge_px=(float(before.mean()), float(after.mean())), taken=True,
     )  # fmt: skip
 
@@ -202,7 +211,7 @@ def _untouched(fits: Sequence[PoseFit], before: Array, offset_sigma: float) -> P
     return PhotoFit(
         poses=[f.T_world_obj for f in fits], offset_per_m=0.0,
         offset_sigma_per_m=offset_sigma, beside_px=np.zeros(2),
-        edges=[], edge_px=(mean, mean), taken=False,
+        edges=[], covariances=[], edge_px=(mean, mean), taken=False,
     )  # fmt: skip
 
 

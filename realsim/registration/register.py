@@ -301,11 +301,14 @@ def _fit_few(task: SceneTask, found: FoundObjects) -> _Fit:
         uncertainty(b, k.fit, few.stride, config.covariance)
         for b, k in zip(claimed, kept, strict=True)
     ]
+    covariances = [u.covariance for u in uncertain]
+    if photo is not None and photo.taken:
+        covariances = photo.covariances
     poses = Poses(
         bodies=claimed, poses=[k.fit.T_world_obj for k in kept], clouds=few.clouds,
         covariances=[
-            integrated(b, u.covariance, tried[k]) if tried else u.covariance
-            for k, (b, u) in enumerate(zip(claimed, uncertain, strict=True))
+            integrated(b, C, tried[k]) if tried else C
+            for k, (b, C) in enumerate(zip(claimed, covariances, strict=True))
         ],
         around=tried,
         blind=[len(u.unobservable) for u in uncertain], contrasts=found.contrasts,

@@ -89,6 +89,8 @@ class Around:
     centre, turns times the radius [m^2]."""
     weak: Array
     """(6, 2) the directions along which poses were tried, in the same units."""
+    step_m: float
+    """Least step along them [m]."""
     unseen: tuple[str, ...]
     """Directions that are wider than they should be, in words with their 1-sigma."""
 
@@ -166,7 +168,7 @@ def around(
     spread[3:, 3:] += np.outer(follows, follows)
     return Around(
         fit=fits[best].at(Ts[best]), probability=probability, spread=spread, weak=weak,
-        unseen=_unseen(spread, config),
+        step_m=float(steps.min()), unseen=_unseen(spread, config),
     )  # fmt: skip
 
 
@@ -196,7 +198,8 @@ def _within(
 def integrated(body: Body, covariance: Array, found: Around) -> Array:
     """Return the covariance (6, 6) of a fit with the spread of what was tried in place of its own.
 
-    Along the directions that were tried the Gaussian about the fit is replaced.
+    Along the directions that were tried the Gaussian about the fit is replaced; of it is left what
+    is narrower than a step of the grid, whose poses are all alike.
 
     Args:
         body: the object.
@@ -206,7 +209,9 @@ def integrated(body: Body, covariance: Array, found: Around) -> Array:
     scale = np.repeat([body.radius_m, 1.0], 3)
     to_centre = scale[:, None] * se3.adjoint(se3.from_translation(-body.center_obj))
     Q = np.eye(6) - found.weak @ found.weak.T
-    C = Q @ to_centre @ covariance @ to_centre.T @ Q + found.spread
+    own = to_centre @ covariance @ to_centre.T
+    narrow = np.minimum(np.diag(found.weak.T @ own @ found.weak), found.step_m**2 / 12.0)
+    C = Q @ own @ Q + found.spread + (found.weak * narrow) @ found.weak.T
     back = np.linalg.inv(to_centre)
     C = back @ C @ back.T
     return 0.5 * (C + C.T)

@@ -51,12 +51,14 @@ def laid_down(body: Body, Ts_table_obj: Array, most_m: float) -> Array:
     out = Ts_table_obj.copy()
     for T in out:
         best = up[int(np.argmax(up @ T[2, :3]))]
-        lean = np.cross(T[:3, :3] @ best, [0.0, 0.0, 1.0])
+        away = T[:3, :3] @ best
+        across = np.array([away[1], -away[0], 0.0])  # away x up
+        sine = float(np.linalg.norm(across))
         low = float((body.model.mesh.vertices @ T[2, :3]).min() + T[2, 3])
         if best @ T[2, :3] < np.cos(np.radians(LEAN_DEG)) or abs(low) > most_m:
             continue
         c = T[:3, :3] @ body.center_obj + T[:3, 3]
-        turn = se3.exp_so3(lean)
+        turn = se3.exp_so3(across * (np.arctan2(sine, away[2]) / max(sine, 1e-12)))
         T[:3, 3] = c + turn @ (T[:3, 3] - c)
         T[:3, :3] = turn @ T[:3, :3]
         T[2, 3] -= float((body.model.mesh.vertices @ T[2, :3]).min() + T[2, 3])

@@ -1,0 +1,239 @@
+"""In a second lab that shares nothing with the first: one view, its photograph, plates, no table."""
+
+import ast
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from fault_sessions import ROOT, load_benchmark
+from realsim.geometry import se3
+from realsim.geometry.metrics import aligned_pose, mssd_symmetric
+from realsim.records import ObjectPose, SupportPlane
+from realsim.registration.body import make_body, moved_about_center
+from realsim.registration.config import RegistrationConfig
+from realsim.registration.evidence import Cloud
+from realsim.registration.intake import take_in
+from realsim.registration.judging.verdict import EXPLAINED
+from realsim.registration.refinement.flat import LEAN_DEG, laid_down
+from realsim.registration.register import register_scene
+from realsim.registration.search.flat_search import explained_at, table_map
+from realsim.registration.solver import SolverConfig, solve_pose
+
+shapes = load_benchmark("outside_shapes")
+lab = load_benchmark("outside_lab")
+CONFIG = RegistrationConfig(with_single_view=False)
+TRUE_CAMERAS = {"hand_eye_mm": 0.0, "hand_eye_deg": 0.0, "arm_mm": 0.0, "arm_deg": 0.0}
+IDS = {name: i for i, (name, *_) in enumerate(shapes.SHAPES.items(), start=1)}
+OFFSET_PX = 0.1
+"""By which the disparity of the one view is too large: 1.5 to 2.5 mm."""
+FLAT_M = CONFIG.around.flat_m
+
+
+def off_by(pose: ObjectPose, mm: float, deg: float, rng: np.random.Generator) -> ObjectPose:
+    axis, way = rng.normal(size=(2, 3))
+    xi = np.concatenate([
+        np.radians(deg) * axis / np.linalg.norm(axis), 1e-3 * mm * way / np.linalg.norm(way)
+    ])  # fmt: skip
+    return replace(pose, T_world_obj=pose.T_world_obj @ se3.exp(xi))  # origins are in the middle
+
+
+def body_of(name: str, T: np.ndarray):
+    model = shapes.objects()[IDS[name]][0]
+    start = ObjectPose(obj_id=model.obj_id, instance=0, T_world_obj=T)
+    return make_body(start, model, 64, 200)
+
+
+# --- laws -----------------------------------------------------------------------------------------
+
+
+def test_the_lab_knows_nothing_of_the_first_but_the_records():
+    allowed = {"realsim.geometry.mesh", "realsim.interop", "realsim.records"}
+    for name in ("outside_lab", "outside_shapes"):
+        tree = ast.parse((ROOT / "benchmarks" / f"{name}.py").read_text())
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("realsim"):
+                frame = [a.name for a in node.names] == ["DepthFrame"]
+                assert node.module in allowed or frame, node.module
+
+
+def test_held_directions_are_left_as_they_are():
+    rng = np.random.default_rng(0)
+    body = body_of("carton", np.eye(4))
+    towards = np.where(body.normals @ [0.3, 0.4, 0.87] > 0, 1.0, -1.0)[:, None] * body.normals
+    cloud = Cloud(points=body.samples, towards=towards, sigmas=np.full(len(towards), 5e-4))
+    for _ in range(4):
+        held = np.linalg.qr(rng.normal(size=(6, 2)))[0]
+        x = rng.normal(size=6) * 2e-3
+        start = moved_about_center(body, np.eye(4), x)
+        fit = solve_pose(body, cloud, start, SolverConfig().fine, SolverConfig(), held=held)
+        step = se3.log(se3.invert(start) @ fit.T_world_obj) * np.repeat([body.radius_m, 1.0], 3)
+        free = step - held @ (held.T @ step)
+        assert np.linalg.norm(held.T @ step) < 0.05 * np.linalg.norm(step)
+        assert np.linalg.norm(free) > 5e-4
+
+
+@pytest.mark.parametrize("lean", [-3.0, 1.0, 3.0])
+def test_a_plate_that_nearly_lies_on_the_table_is_laid_down(lean):
+    yaw = se3.exp([0, 0, 0.7, 0.02, -0.01, 0.004])
+    T = yaw @ se3.exp([np.radians(lean), 0, 0, 0, 0, 0])
+    body = body_of("plate_3", T)
+    (laid,) = laid_down(body, T[None], FLAT_M)
+    z = se3.transform(laid, body.model.mesh.vertices)[:, 2]
+    assert abs(z.min()) < 1e-9 and np.ptp(z) == pytest.approx(0.003, abs=1e-6)
+    np.testing.assert_allclose(body.center(laid)[:2], body.center(T)[:2], atol=1e-9)
+    np.testing.assert_allclose(laid_down(body, laid[None], FLAT_M)[0], laid, atol=1e-9)
+
+
+def test_what_leans_or_is_not_flat_is_left_alone():
+    leaning = se3.exp([np.radians(2 * LEAN_DEG), 0, 0, 0, 0, 0.01])
+    high = se3.exp([0, 0, 0.3, 0, 0, 0.02])
+    for name, T in (("plate_3", leaning), ("plate_3", high), ("carton", np.eye(4))):
+        np.testing.assert_array_equal(laid_down(body_of(name, T), T[None], FLAT_M)[0], T)
+
+
+def test_a_sensor_without_faults_measures_the_rays():
+    quiet = lab.Lab(
+        views=1, noise_px=0.0, step_px=1e-6, bias_px=0.0, fattening_px=0, flying_share=0.0,
+        holes_share=0.0, lens_px=0.0, **TRUE_CAMERAS,
+    )  # fmt: skip
+    scene = lab.make_scene(1, quiet, ids=[IDS["carton"]])
+    (frame,) = scene.frames
+    body = body_of("carton", scene.truth[0].T_world_obj)
+    v, u = np.argwhere(frame.depth_m > 0)[::997].T
+    z = frame.depth_m[v, u].astype(float)
+    rays = np.stack([(u - scene.intrinsics.cx) / 440, (v - scene.intrinsics.cy) / 440,
+                     np.ones_like(z)], axis=1)  # fmt: skip
+    world = se3.transform(frame.T_world_cam, rays * z[:, None])
+    surface = np.abs(body.field.distance(world, se3.invert(scene.truth[0].T_world_obj)))
+    assert np.quantile(np.minimum(np.abs(world[:, 2]), surface), 0.98) < 5e-4
+
+
+# --- one view ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def one_view():
+    ids = [IDS[n] for n in ("mug", "carton", "plate_3", "bottle", "wedge", "hex_bar")]
+    severe = lab.Lab(views=1, bias_px=0.0, highest_deg=50.0, photos=True, **TRUE_CAMERAS)
+    scene = lab.make_scene(5, severe, ids=ids)
+    (frame,) = scene.frames
+    off = OFFSET_PX / (severe.focal_px * severe.baseline_m)
+    z = np.where(frame.depth_m > 0, frame.depth_m / (1 + off * frame.depth_m), 0)
+    return replace(scene, frames=(replace(frame, depth_m=z.astype(np.float32)),))
+
+
+def registered(scene, frame):
+    rng = np.random.default_rng(0)
+    starts = [off_by(t, 8, 8, rng) for t in scene.truth]
+    return register_scene("x", scene.intrinsics, [frame], scene.models, starts, CONFIG)
+
+
+def errors(scene, found):
+    by = {t.instance: t.T_world_obj for t in scene.truth}
+    return {
+        scene.models[o.obj_id].name: 1e3
+        * mssd_symmetric(by[o.instance], o.T_world_obj, scene.models[o.obj_id])
+        for o in found.scene.objects
+    }
+
+
+@pytest.fixture(scope="module")
+def with_photo(one_view):
+    return registered(one_view, one_view.frames[0])
+
+
+def test_a_photograph_takes_the_offset_out_of_the_depth(one_view, with_photo):
+    frame = one_view.frames[0]
+    bare = registered(one_view, replace(frame, read_rgb=None))
+    assert "photograph" not in bare.report and with_photo.report["photograph"]["taken"]
+    assert with_photo.report["refinement"]["depth_offset_per_m"] != 0.0
+    left, had = (errors(one_view, r) for r in (with_photo, bare))
+    assert np.median(list(left.values())) < 0.8 * np.median(list(had.values()))
+    offset = with_photo.report["refinement"]["depth_offset_per_m"]
+    sigma = with_photo.report["refinement"]["depth_offset_sigma_per_m"]
+    true = -OFFSET_PX / (440 * 0.018)
+    assert abs(offset - true) < 3 * sigma and offset < 0
+
+
+def test_an_accepted_pose_is_right_and_its_covariance_holds_the_error(one_view, with_photo):
+    by = {t.instance: t.T_world_obj for t in one_view.truth}
+    accepted = [o for o in with_photo.scene.objects if o.verdict == "accepted"]
+    assert len(accepted) >= 3
+    squares = []
+    for o in accepted:
+        model = one_view.models[o.obj_id]
+        assert errors(one_view, with_photo)[model.name] < 3.0
+        T = aligned_pose(by[o.instance], o.T_world_obj, model)
+        xi = se3.log(se3.invert(T) @ by[o.instance])
+        squares.append(xi @ np.linalg.solve(o.covariance, xi))
+    assert 0.5 < np.median(squares) < 12.6  # 95 % of chi2 with six degrees of freedom
+
+
+def test_a_photograph_of_something_else_moves_nothing(one_view):
+    frame = one_view.frames[0]
+    noise = np.random.default_rng(0).integers(90, 110, (480, 640, 3)).astype(np.uint8)
+    found = registered(one_view, replace(frame, read_rgb=partial(np.copy, noise)))
+    bare = registered(one_view, replace(frame, read_rgb=None))
+    assert not found.report["photograph"]["taken"]
+    for a, b in zip(found.scene.objects, bare.scene.objects, strict=True):
+        np.testing.assert_allclose(a.T_world_obj, b.T_world_obj, atol=1e-9)
+
+
+@pytest.mark.parametrize("hidden", [True, False])
+def test_the_turn_of_a_mug_is_doubted_where_its_handle_is_hidden(hidden):
+    scene = lab.make_scene(
+        1, lab.Lab(views=1, bias_px=0.0, highest_deg=25.0, **TRUE_CAMERAS), ids=[IDS["mug"]]
+    )
+    (true,), (frame,) = scene.truth, scene.frames
+    # The mug stands; the camera is put before it, its handle behind it or at its side.
+    T = se3.from_translation([0.0, 0.0, true.T_world_obj[2, 3]])
+    T[2, 3] = -float(scene.models[true.obj_id].mesh.bounds[0, 2])
+    eye = [-0.36, 0.0, 0.16] if hidden else [0.0, -0.36, 0.16]
+    T_world_cam = se3.look_at(eye, [0.0, 0.0, 0.04])
+    world = lab.o3d.t.geometry.RaycastingScene()
+    body = shapes.objects()[IDS["mug"]][1].copy().apply_transform(T)
+    world.add_triangles(shapes.mesh_of(body))
+    table = lab._table(lab.Lab())
+    world.add_triangles(shapes.mesh_of(table))
+    directions = lab._rays(lab.Lab(lens_px=0.0)) @ T_world_cam[:3, :3].T
+    origins = np.broadcast_to(T_world_cam[:3, 3], directions.shape)
+    rays = np.concatenate([origins, directions], -1).astype(np.float32)
+    z = world.cast_rays(lab.o3d.core.Tensor(rays))["t_hit"].numpy().astype(np.float64)
+    z = np.where(z < 1.5, z * (1 + 0.002 * np.random.default_rng(0).normal(size=z.shape)), 0.0)
+    frame = replace(frame, depth_m=z.astype(np.float32), T_world_cam=T_world_cam)
+    start = replace(true, T_world_obj=T @ se3.exp([0, 0, np.radians(8), 0, 0, 0]))
+    found = register_scene("x", scene.intrinsics, [frame], scene.models, [start], CONFIG)
+    (mug,) = found.scene.objects
+    if hidden:
+        assert mug.verdict == "doubtful"
+        assert any("turn about" in r and "not seen" in r for r in mug.reasons), mug.reasons
+        # The covariance is as wide as what is not known: at 45 mm several degrees.
+        assert np.degrees(np.sqrt(mug.covariance[2, 2])) > 3.0
+    else:
+        assert mug.verdict == "accepted", mug.reasons
+        assert errors(replace(scene, truth=(replace(true, T_world_obj=T),)), found)["mug"] < 3.0
+
+
+# --- plates ---------------------------------------------------------------------------------------
+
+
+def test_a_slid_plate_does_not_explain_the_heights_around_it():
+    flat = lab.Lab(views=12, **TRUE_CAMERAS)
+    scene = lab.make_scene(3, flat, ids=[IDS["plate_2"], IDS["plate_5"]])
+    intake = take_in(scene.intrinsics, scene.frames, CONFIG)
+    plane = SupportPlane(T_world_table=np.eye(4))
+    assert intake.plane is not None
+    map_ = table_map(intake.views, intake.plane, intake.noise, np.zeros(3), 12.5, CONFIG.find.flat)
+    up = intake.plane.T_world_table @ se3.invert(plane.T_world_table)
+    for true in scene.truth:
+        name = scene.models[true.obj_id].name
+        body = body_of(name, true.T_world_obj)
+        there = laid_down(body, (se3.invert(up) @ true.T_world_obj)[None], FLAT_M)[0]
+        right = explained_at(map_, body, up @ there, 0.0, CONFIG.find.flat)
+        slid = explained_at(
+            map_, body, up @ se3.from_translation([0.012, 0.0, 0.0]) @ there, 0.0, CONFIG.find.flat
+        )
+        assert right is not None and slid is not None
+        assert right > EXPLAINED > slid, name
