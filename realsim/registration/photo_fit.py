@@ -39,8 +39,6 @@ class PhotoFitConfig:
     offset_noises: float = 1.0
     """1-sigma of the offset of a view's inverse depth, in units of its noise k: what stereo is off
     by is some hundredths of a pixel, as its noise is."""
-    beside_px: float = 1.5
-    """1-sigma of how far the photograph lies beside the depth [px]."""
     rim_px: float = 0.3
     """1-sigma of an object's rim [px]: a mesh that is 0.5 % too large."""
     depth_m: float = 0.0006
@@ -286,7 +284,7 @@ def _solved(
     """
     size, before = len(x), x
     prior = np.zeros(size)
-    prior[0], prior[1:3] = offset**-2, config.beside_px**-2
+    prior[0], prior[1:3] = offset**-2, config.photo.common_px**-2
     prior[9::7] = config.rim_px**-2
     base: Array = np.diag(prior)
     rows: list[tuple[Array, Array]] = []

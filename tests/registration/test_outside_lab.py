@@ -1,4 +1,4 @@
-"""In a second lab that shares nothing with the first: one view, its photograph, plates, no table."""
+"""In a second lab, which shares nothing with the first: one view, its photograph, plates."""
 
 import ast
 from dataclasses import replace
@@ -110,7 +110,7 @@ def test_a_sensor_without_faults_measures_the_rays():
     assert np.quantile(np.minimum(np.abs(world[:, 2]), surface), 0.98) < 5e-4
 
 
-# --- one view ---------------------------------------------------------------------------------------
+# --- one view ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
