@@ -14,6 +14,9 @@ from realsim.registration.compare import Comparer
 from realsim.registration.evidence import Cloud, DepthFrame
 from realsim.registration.table_planes import lowest_height, support_checks
 
+FAR_M = 1e3
+"""Depth of what is nowhere [m]."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class VerifyConfig:
@@ -68,6 +71,8 @@ class _Seen:
 
     measured: Array
     rendered: Array
+    behind: Array
+    """(N,) what is next behind it of the other models and the table [m]; inf = nothing known."""
     points_world: Array
 
 
@@ -151,6 +156,7 @@ def _seen_in(
     """Return per object its compared pixels in one frame, hidden ones left out."""
     height, width = frame.depth_m.shape
     nearest = np.full((-(-height // stride), -(-width // stride)), np.inf)
+    second = nearest.copy()
     T_cam_world = se3.invert(frame.T_world_cam)
     prints = [
         footprint(b, comparer.intrinsics, T_cam_world @ T, stride)
@@ -158,6 +164,7 @@ def _seen_in(
     ]
     for p in prints:
         v, u = p.rows // stride, p.columns // stride
+        second[v, u] = np.minimum(second[v, u], np.maximum(nearest[v, u], p.z))
         nearest[v, u] = np.minimum(nearest[v, u], p.z)
     seen: list[_Seen] = []
     for p in prints:
@@ -168,7 +175,11 @@ def _seen_in(
         front &= (measured > 0) & ~edges[p.rows, p.columns]
         rays = ray_table(comparer.intrinsics)[p.rows[front], p.columns[front]]
         points = se3.transform(frame.T_world_cam, rays * p.z[front, None])
-        seen.append(_Seen(measured=measured[front], rendered=p.z[front], points_world=points))
+        behind = np.minimum(table, second[p.rows // stride, p.columns // stride])
+        seen.append(
+            _Seen(measured=measured[front], rendered=p.z[front], behind=behind[front],
+                  points_world=points)
+        )  # fmt: skip
     return seen
 
 
@@ -178,6 +189,7 @@ def _image_checks(
     """Return the shares that come from comparing rendered with measured depth."""
     measured = np.concatenate([s.measured for s in seen])
     rendered = np.concatenate([s.rendered for s in seen])
+    behind = np.concatenate([s.behind for s in seen])
     points = np.concatenate([s.points_world for s in seen])
     tau = comparer.tau(measured)
     d = measured - rendered
@@ -185,11 +197,15 @@ def _image_checks(
     n = int(np.count_nonzero(~hidden))
     checks = {"n_pixels": float(n), "hidden": float(np.mean(hidden)) if len(d) else 1.0}
     if n == 0:
-        return checks | {"agree": 0.0, "gain": -1.0, "cover": 0.0, "free_space_violation": 0.0}
+        nothing = {"agree": 0.0, "gain": -1.0, "margin": 0.0, "cover": 0.0}
+        return checks | nothing | {"free_space_violation": 0.0}
     d, tau = d[~hidden], tau[~hidden]
     checks["agree"] = float(np.mean(np.abs(d) <= tau))
     likelihood = comparer.likelihood(measured[~hidden], rendered[~hidden])
     checks["gain"] = float(np.mean(likelihood))
+    # Where nothing is known behind it, nothing explains the depth instead.
+    instead = comparer.likelihood(measured[~hidden], np.minimum(behind[~hidden], FAR_M))
+    checks["margin"] = float(np.mean(likelihood - instead))
     checks["free_space_violation"] = float(np.mean(d > tau))
     checks["cover"] = _cover(points[~hidden], measured[~hidden], cloud, comparer, config)
     return checks
