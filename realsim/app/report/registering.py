@@ -36,19 +36,15 @@ AGREE = (
     "the share whose depth fits its pose within the sensor's noise. Registration uses it."
 )
 PROBABILITY = (
-    "That the object is right within 3 mm, from all its checks by a formula that was fitted to "
-    "thousands of poses of known error."
+    "That the object is right within 3 mm: from four views on by a formula of all its checks that "
+    "was fitted to thousands of poses of known error; from fewer, the share of all poses that the "
+    "views cannot tell apart."
 )
 SIGMA = (
     "Along, or about, the worst axis. Turns about an axis of revolution change nothing and are set "
     "aside."
 )
-SINGLE_NOTE = (
-    "1: registered in a single photograph. Half of the right poses of single photographs have a "
-    "low probability, so the bounds of the checks decide and the probability only warns: "
-    "'accepted' says that nothing measured speaks against the pose, not that it is proven."
-)
-PERSON_NOTE = "2: a person accepted it; the probability is the computed one."
+PERSON_NOTE = "b: a person accepted it; the probability is the computed one."
 PICTURES = (
     ("overlay.jpg", "Outlines in the colour of the verdict, through the refined cameras."),
     ("cameras.jpg", "The same edge before and after the cameras were refined."),
@@ -187,12 +183,6 @@ def _view_sigmas(result: Registered) -> dict[int, list[float]]:
     return {k: v for k, v in rows.items() if v}
 
 
-def _is_low(row: Mapping[str, Any]) -> bool:
-    """Return whether an object is accepted although its probability alone would not do."""
-    p = row["probability"]
-    return row["verdict"] == "accepted" and p is not None and p < VerdictConfig().accept
-
-
 def _findings(section: Section, result: Registered, store: SessionStore) -> None:
     """Say what speaks against using the objects."""
     for row in section.objects:
@@ -207,15 +197,6 @@ def _findings(section: Section, result: Registered, store: SessionStore) -> None
     for missing in result.not_placed:
         name = f"{missing.instance} (object {missing.obj_id})"
         section.say("warn", f"Object {name} is not placed: {missing.reason}")
-    low = [r for r in section.objects if _is_low(r) and not r["decided_by"]]
-    if low:
-        least = min(r["probability"] for r in low)
-        section.say(
-            "warn",
-            f"{len(low)} accepted objects have a probability below {VerdictConfig().accept:g} "
-            f"(least {least:.2f}): of a single photograph the bounds decide. `realsim review "
-            "SESSION` to look at them.",
-        )
     for remark in result.remarks:
         where = "Scene" if remark.view is None else f"View {remark.view}"
         section.say("warn", f"{where}: {remark.words}")
@@ -230,13 +211,9 @@ def _object_table(section: Section) -> None:
         Cell(text="1 sigma [mm]", hover=SIGMA), Cell(text="[deg]", hover=SIGMA),
         Cell(text="depth agrees [%]", hover=AGREE, note="a"), "in views [px]", "views", "why",
     ]  # fmt: skip
-    single = person = False
     rows: list[list[object]] = []
     for r in section.objects:
-        note = ""
-        if _is_low(r):
-            note = "2" if r["decided_by"] else "1"
-            single, person = single or note == "1", person or note == "2"
+        note = "b" if r["decided_by"] and r["verdict"] == "accepted" else ""
         verdict = r["verdict"] + (f" by {r['decided_by']}" if r["decided_by"] else "")
         rows.append(
             [
@@ -256,9 +233,7 @@ def _object_table(section: Section) -> None:
         f"a: {AGREE} The section on labels has a share of the same name of every frame by itself.",
         "foot",
     )
-    if single:
-        section.page.text(SINGLE_NOTE, "foot")
-    if person:
+    if any(r["decided_by"] and r["verdict"] == "accepted" for r in section.objects):
         section.page.text(PERSON_NOTE, "foot")
 
 

@@ -16,7 +16,7 @@ HIDDEN_FREE = 0.3
 MARGIN, MARGIN_STEP = 0.3, 0.15
 """By how much more likely an object's pixels are than without it, from which on it is needed there,
 and by how much less takes `CONTRAST_WEIGHT` from the log-odds: a card on top of a box agrees with
-the box. Second lab: right ones 0.4 (a plate of 2 mm) and more, those on another's place up to -0.15.
+the box. Second lab: right ones 0.4 (a plate of 2 mm) and more, those on another place up to -0.15.
 """
 EXPLAINED, EXPLAINED_STEP = 0.98, 0.015
 """Share of the heights around a flat object from which on its pose explains them, and by how much
