@@ -113,9 +113,11 @@ def is_inside(true: ObjectPose, T: Array, pose: ObjectPose, model: ObjectModel) 
 
 
 @cache
-def scenes(first: int, count: int) -> tuple[tuple[int, LabScene], ...]:
+def scenes(first: int, count: int, quick: bool) -> tuple[tuple[int, LabScene], ...]:
     """Return the scenes, made once."""
-    return tuple((seed, make_scene(seed)) for seed in range(first, first + count))
+    lab, objects = (Lab(views=16), 5) if quick else (Lab(), 10)
+    seeds = range(first, first + count)
+    return tuple((seed, make_scene(seed, lab, count=objects)) for seed in seeds)
 
 
 @cache
@@ -134,7 +136,7 @@ def given_of(seed: int, scene: LabScene) -> Given:
 
 
 def _scenes(given: argparse.Namespace) -> tuple[tuple[int, LabScene], ...]:
-    return scenes(given.seed, QUICK_SCENES if given.quick else given.scenes)
+    return scenes(given.seed, QUICK_SCENES if given.quick else given.scenes, given.quick)
 
 
 def many(given: argparse.Namespace) -> Found:
@@ -180,7 +182,7 @@ def provoked_poses(given: argparse.Namespace) -> Found:
     found = Found()
     verdicts: list[str] = []
     for seed, scene in _scenes(given):
-        rows = provoked(given_of(seed, scene), 1, 2 if given.quick else JUDGED).rows
+        rows = provoked(given_of(seed, scene), 1, 1 if given.quick else JUDGED).rows
         wrong = [r for r in rows if RIGHT_MM < r.mssd_mm and r.verdict != "not placed"]
         verdicts += [r.verdict for r in wrong]
         found.notes += [
@@ -197,7 +199,8 @@ def tables(given: argparse.Namespace) -> Found:
     """Count findings that are drawn from a table that is not there, or not flat."""
     found, count = Found(), 0
     for table in TABLES[: 1 if given.quick else 2]:
-        scene = make_scene(given.seed + 500, Lab(table=table, views=32), count=6)
+        views, count = (8, 4) if given.quick else (32, 6)
+        scene = make_scene(given.seed + 500, Lab(table=table, views=views), count=count)
         config = RegistrationConfig(field_folder=fields(), with_single_view=False)
         g = Given(key=cast(Any, argparse.Namespace(seed=0)), scene=cast(Any, scene),
                   models=scene.models, config=config)  # fmt: skip
@@ -232,7 +235,7 @@ def loop(given: argparse.Namespace) -> Found:
     found = Found()
     inside: list[bool] = []
     for seed in range(given.seed, given.seed + (1 if given.quick else LOOPS)):
-        config = DemoConfig(seed=seed, views=8 if given.quick else 32, objects=4 if given.quick
+        config = DemoConfig(seed=seed, views=6 if given.quick else 32, objects=2 if given.quick
                             else 8, grasps_per_object=1)  # fmt: skip
         with tempfile.TemporaryDirectory() as folder:
             result = run_demo(config, Path(folder) / "demo", Console(quiet=True))

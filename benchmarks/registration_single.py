@@ -38,7 +38,7 @@ START = (0.010, 10.0)
 """Starts are off by this [m, deg]."""
 RIGHT_M = 0.003
 SCENES, QUICK_SCENES = 8, 1
-VIEWS, QUICK_VIEWS = 8, 2
+VIEWS, QUICK_VIEWS = 8, 1
 """Frames of a scene, each alone."""
 SEEN_PX = 400
 """An object of which a frame shows fewer pixels is not asked for: nobody would."""
@@ -84,11 +84,13 @@ def starts(scene: LabScene, rng: np.random.Generator) -> list[ObjectPose]:
     return out
 
 
-def ones(seed: int, views: int, photos: bool, config: RegistrationConfig) -> list[One]:
+def ones(
+    seed: int, views: int, photos: bool, config: RegistrationConfig, count: int = 10
+) -> list[One]:
     """Return all objects of a scene in some of its frames, each frame alone."""
     # The camera is where it is said to be: one view's pose is known against its camera only.
     lab = Lab(views=views, hand_eye_mm=0, hand_eye_deg=0, arm_mm=0, arm_deg=0, photos=photos)
-    scene = make_scene(seed, lab)
+    scene = make_scene(seed, lab, count=count)
     rng = np.random.default_rng([seed, 1])
     rows: list[One] = []
     for frame in scene.frames:
@@ -181,15 +183,15 @@ def measure(given: argparse.Namespace) -> Found:
     """Measure all of it."""
     found = Found()
     config = RegistrationConfig(with_single_view=False)
-    views = QUICK_VIEWS if given.quick else VIEWS
+    views, count = (QUICK_VIEWS, 4) if given.quick else (VIEWS, 10)
     seeds = range(given.seed, given.seed + (QUICK_SCENES if given.quick else SCENES))
     for suffix in ("", "_depth"):
-        rows = [r for seed in seeds for r in ones(seed, views, suffix == "", config)]
+        rows = [r for seed in seeds for r in ones(seed, views, suffix == "", config, count)]
         figures_of(rows, found, suffix)
     rng = np.random.default_rng(given.seed)
-    jumps = [jump_of_one(make_scene(s, Lab(views=1, photos=True)), rng, config) for s in seeds[:3]]
-    lab = Lab(views=4 if given.quick else JUMP_VIEWS)
-    jumps += [jump_of_many(make_scene(s, lab), rng, config) for s in seeds[:2]]
+    few, many = Lab(views=1, photos=True), Lab(views=4 if given.quick else JUMP_VIEWS)
+    jumps = [jump_of_one(make_scene(s, few, count=count), rng, config) for s in seeds[:3]]
+    jumps += [jump_of_many(make_scene(s, many, count=count), rng, config) for s in seeds[:2]]
     found.add("probability_jump", max(jumps))
     return found
 

@@ -14,7 +14,7 @@ from realsim.registration.judge import Poses
 from realsim.registration.many_views import ManyViews
 from realsim.registration.photo_fit import PhotoFit
 from realsim.registration.refinement.equations import BIAS, HAND_EYE
-from realsim.registration.refinement.uncertainty import common_covariance
+from realsim.registration.refinement.uncertainty import common_and_own
 from realsim.registration.search.records import Placed
 from realsim.registration.verify import common_offset, common_sinking
 
@@ -105,7 +105,8 @@ def camera_report(
     mm, deg = refined.hand_eye_mm_deg
     sigma = np.sqrt(np.diag(C))
     own = refined.state.views
-    common = np.sqrt(np.diag(common_covariance(refined, bodies)))
+    shared, each = common_and_own(refined, bodies)
+    common = np.sqrt(np.diag(shared))
     return {
         "hand_eye_mm": mm,
         "hand_eye_deg": deg,
@@ -113,6 +114,10 @@ def camera_report(
         "hand_eye_sigma_deg": float(np.degrees(np.linalg.norm(sigma[HAND_EYE][:3]))),
         "common_sigma_mm": 1e3 * float(np.linalg.norm(common[3:])),
         "common_sigma_deg": float(np.degrees(np.linalg.norm(common[:3]))),
+        "own_sigma_mm": {
+            str(b.start.instance): 1e3 * float(np.sqrt(np.trace(own_C[3:, 3:])))
+            for b, own_C in zip(bodies, each, strict=True)
+        },
         "view_sigma_mm": refined.view_sigma[1],
         "view_sigma_deg": refined.view_sigma[0],
         "views": {

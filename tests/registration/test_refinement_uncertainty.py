@@ -1,5 +1,6 @@
 """How sure refined poses are: covariances that hold what they promise."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -11,10 +12,11 @@ from realsim.geometry.camera import project
 from realsim.registration.body import Body, make_body
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.intake import take_in
-from realsim.registration.refinement.equations import HAND_EYE, OBJECTS
+from realsim.registration.refinement.equations import HAND_EYE, OBJECTS, moves_of_all
 from realsim.registration.refinement.refine import Refined, refine
 from realsim.registration.refinement.uncertainty import (
     SeenPose,
+    common_and_own,
     object_covariance,
     seen_poses,
 )
@@ -92,6 +94,27 @@ def test_covariance_in_a_view_is_that_of_samples_of_everything():
     ])  # fmt: skip
     spread = np.sqrt(uv.var(0).sum(-1).mean())
     assert seen(0)[k][v].sigma_px == pytest.approx(spread, rel=0.05)
+
+
+def test_a_move_of_everything_is_common_and_what_is_left_is_own():
+    _, bodies, refined = refined_scene(0)
+    moves = moves_of_all(bodies, refined.state)
+    S = np.diag(np.square([1e-3, 2e-3, 1e-3, 1e-4, 2e-4, 3e-4]))
+
+    def told(C: Array) -> tuple[Array, Array]:
+        return common_and_own(
+            replace(refined, covariance=replace(refined.covariance, shared=C)), bodies
+        )
+
+    common, own = told(moves @ S @ moves.T)
+    np.testing.assert_allclose(common, S, atol=1e-12)
+    np.testing.assert_allclose(own, 0.0, atol=1e-12)
+    # One object's own error is hardly common to four, and mostly its own.
+    C = np.zeros_like(refined.covariance.shared)
+    C[-3:, -3:] = 1e-8 * np.eye(3)
+    common, own = told(C)
+    assert np.trace(own[-1][3:, 3:]) > 4 * np.trace(own[0][3:, 3:])
+    assert np.trace(own[-1][3:, 3:]) > 0.3 * 3e-8
 
 
 # --- statistics ----------------------------------------------------------------------------------

@@ -138,7 +138,8 @@ def camera_line(result: Registered) -> str:
     if "common_sigma_mm" in found:
         line += (
             f" All objects may be off together by {found['common_sigma_mm']:.2f} mm / "
-            f"{found['common_sigma_deg']:.2f} deg (1 sigma)."
+            f"{found['common_sigma_deg']:.2f} deg (1 sigma), each by itself by "
+            f"{np.median(list(found['own_sigma_mm'].values()) or [0.0]):.2f} mm (median)."
         )
     return line
 
@@ -266,6 +267,7 @@ def as_json(result: Registered, models: Mapping[int, ObjectModel]) -> dict[str, 
         "findings": [{"view": r.view, "kind": r.kind, "words": r.words} for r in result.remarks],
         "cameras": camera_line(result),
         "common_sigma_mm": result.report.get("refinement", {}).get("common_sigma_mm"),
+        "own_sigma_mm": result.report.get("refinement", {}).get("own_sigma_mm"),
         "common_sigma_deg": result.report.get("refinement", {}).get("common_sigma_deg"),
         "kinematics": plain(result.report.get("kinematics")),
         "views": sorted(result.cameras.refined),

@@ -47,15 +47,24 @@ def object_covariance(refined: Refined, body: Body, k: int) -> Array:
     return _symmetric(Ad @ refined.covariance.shared[np.ix_(at, at)] @ Ad.T)
 
 
-def common_covariance(refined: Refined, bodies: Sequence[Body]) -> Array:
-    """Return the covariance (6, 6) of what all objects have in common [rad, m].
+def common_and_own(refined: Refined, bodies: Sequence[Body]) -> tuple[Array, Array]:
+    """Return the covariance of what all objects have in common, and of what is each one's own.
 
-    The move of everything on the table, about the middle of the objects and in world axes, that
-    comes nearest to the objects' moves; what is left of these is each object's own.
+    Common is the move of everything on the table, about the middle of the objects and in world
+    axes, that comes nearest to the objects' moves; what is left of these is each object's own.
+
+    Returns:
+        (6, 6), and (K, 6, 6) about the objects' centres in their axes [rad, m].
     """
+    C = refined.covariance.shared[OBJECTS:, OBJECTS:]
     moves = moves_of_all(bodies, refined.state)[OBJECTS:]
     nearest = np.linalg.pinv(moves)
-    return _symmetric(nearest @ refined.covariance.shared[OBJECTS:, OBJECTS:] @ nearest.T)
+    left = np.eye(len(C)) - moves @ nearest
+    own = (left @ C @ left.T).reshape(len(bodies), 6, len(bodies), 6)
+    return (
+        _symmetric(nearest @ C @ nearest.T),
+        np.stack([_symmetric(own[k, :, k]) for k in range(len(bodies))]),
+    )
 
 
 def seen_poses(
