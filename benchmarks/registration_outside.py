@@ -199,8 +199,8 @@ def tables(given: argparse.Namespace) -> Found:
     """Count findings that are drawn from a table that is not there, or not flat."""
     found, count = Found(), 0
     for table in TABLES[: 1 if given.quick else 2]:
-        views, count = (8, 4) if given.quick else (32, 6)
-        scene = make_scene(given.seed + 500, Lab(table=table, views=views), count=count)
+        views, objects = (8, 4) if given.quick else (32, 6)
+        scene = make_scene(given.seed + 500, Lab(table=table, views=views), count=objects)
         config = RegistrationConfig(field_folder=fields(), with_single_view=False)
         g = Given(key=cast(Any, argparse.Namespace(seed=0)), scene=cast(Any, scene),
                   models=scene.models, config=config)  # fmt: skip

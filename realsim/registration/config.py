@@ -45,6 +45,30 @@ class JudgingConfig:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class SecondLookConfig:
+    """When a joint fit is made again."""
+
+    on_table_m: float = 0.003
+    """A point so near to the plane is on it [m]."""
+    beside_m: float = 0.012
+    """A point so far from all objects is beside them [m]."""
+    cell_m: float = 0.01
+    """Cells by which areas on the plane are measured [m]."""
+    least_beside: float = 0.5
+    """Least area of a table that is seen beside the objects, as a share of the area that these
+    cover: an invented one lies on the objects, or on one that was not placed."""
+    odd_m: float = 0.0015
+    """A view is odd whose camera was moved by so much, seen at the objects [m]."""
+    odd_factor: float = 5.0
+    """It was moved by so many times what the others were in the median, too."""
+    most_odd: float = 0.25
+    """Share of the views that may be odd: of more, the others are no measure."""
+    moved_m: float = 0.0015
+    """If all cameras were moved by so much in the median, that is told [m]: an arm is not so
+    coarse."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class RegistrationConfig:
     """All constants of a registration."""
 
@@ -106,6 +130,7 @@ class RegistrationConfig:
     verify: VerifyConfig = field(default_factory=VerifyConfig)
     swapped: SwappedConfig = field(default_factory=SwappedConfig)
     rivals: RivalConfig = field(default_factory=RivalConfig)
+    second_look: SecondLookConfig = field(default_factory=SecondLookConfig)
     photo_fit: PhotoFitConfig = field(default_factory=PhotoFitConfig)
     around: AroundConfig = field(default_factory=AroundConfig)
     judging: JudgingConfig = field(default_factory=JudgingConfig)

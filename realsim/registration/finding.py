@@ -1,6 +1,7 @@
 """From what is wanted to objects near their final poses, whatever was known of them before."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -288,17 +289,30 @@ def with_flat(
     return found if changed else None
 
 
-def _with_body(found: FoundObjects, body: Body, pose: FlatPose) -> FoundObjects:
-    """Return the objects with one more, or with one elsewhere."""
-    left = [n for n, b in enumerate(found.bodies) if b.start.instance != body.start.instance]
-    report = {"source": "mean heights", "explained": pose.explained, "contrast": pose.contrast}
+def without_objects(found: FoundObjects, instances: AbstractSet[int]) -> FoundObjects:
+    """Return the objects without some of them."""
+    left = [n for n, b in enumerate(found.bodies) if b.start.instance not in instances]
     return replace(
         found,
-        bodies=[*(found.bodies[n] for n in left), body],
-        claimed=[*(found.claimed[n] for n in left), None],
-        contrasts=[*(found.contrasts[n] for n in left), pose.contrast],
-        rivals=[*(found.rivals[n] for n in left), None],
-        reports=[*(found.reports[n] for n in left), report],
+        bodies=[found.bodies[n] for n in left],
+        claimed=[found.claimed[n] for n in left],
+        contrasts=[found.contrasts[n] for n in left],
+        rivals=[found.rivals[n] for n in left],
+        reports=[found.reports[n] for n in left],
+    )
+
+
+def _with_body(found: FoundObjects, body: Body, pose: FlatPose) -> FoundObjects:
+    """Return the objects with one more, or with one elsewhere."""
+    rest = without_objects(found, {body.start.instance})
+    report = {"source": "mean heights", "explained": pose.explained, "contrast": pose.contrast}
+    return replace(
+        rest,
+        bodies=[*rest.bodies, body],
+        claimed=[*rest.claimed, None],
+        contrasts=[*rest.contrasts, pose.contrast],
+        rivals=[*rest.rivals, None],
+        reports=[*rest.reports, report],
         not_placed=tuple(m for m in found.not_placed if m.instance != body.start.instance),
     )
 

@@ -19,6 +19,7 @@ from realsim.registration.judging.scene_checks import SceneFinding, scene_findin
 from realsim.registration.judging.surface_residuals import (
     error_level_m,
     residual_checks,
+    size_error,
     surface_residuals,
 )
 from realsim.registration.judging.verdict import probability_right, verdict_of
@@ -136,7 +137,11 @@ def _features(
         found = held_out(given.bodies, owned, len(intake.views), fit, j.held_out)
         halves = [h.checks() for h in found]
     flat = flat_checks(intake, given, config)
-    surfaces = [residual_checks(r, level, j.residuals) for r in residuals]
+    surfaces = [
+        residual_checks(r, level, j.residuals)
+        | {"size_error": size_error(r, b.center_obj, level) or 0.0}
+        for r, b in zip(residuals, given.bodies, strict=True)
+    ]
     if len(intake.views) == 1:
         # One view shows too little of a surface for its patches to say anything.
         surfaces = [{name: s[name] for name in ONE_VIEW_CHECKS} for s in surfaces]
@@ -197,6 +202,14 @@ def _object(
         reasons = (*reasons, *(f"not seen in so few views: {w}" for w in given.around[k].unseen))
     if WORST.index(checked.verdict) > WORST.index(verdict):
         verdict, reasons = checked.verdict, (*checked.reasons, *reasons)
+    size = features.get("size_error") or 0.0
+    if size != 0.0 and verdict != "accepted":
+        reasons = (
+            *reasons,
+            f"its surface looks {100 * abs(size):.0f} % {'larger' if size > 0 else 'smaller'} than "
+            "its model's, at least: the model may have the wrong size. Measure it, or scale it with "
+            f"`realsim scan scale {body.model.name} SESSION`",
+        )
     mine = [f for f in findings if body.start.instance in f.instances and f.kind not in COMMON]
     if mine:
         reasons = (*reasons, *(f.words for f in mine))

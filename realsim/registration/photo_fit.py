@@ -28,6 +28,8 @@ from realsim.registration.evidence import DepthNoise
 from realsim.registration.photo import Outline, PhotoConfig, Picture, outline_of
 from realsim.registration.solver import PoseFit
 
+LEAST_OFFSET_PER_M = 1e-4
+"""Least 1-sigma of the offset of inverse depth [1/m]: 0.1 mm at a metre; nothing is perfect."""
 AMENDED, REWEIGHTED = 2, 4
 """Times an outline is drawn again while a pose is amended, and times its edges are weighed."""
 
@@ -160,7 +162,7 @@ def photo_fit(
         noise: of the depth.
         config: see there.
     """
-    offset = config.offset_noises * noise.per_m
+    offset = max(config.offset_noises * noise.per_m, LEAST_OFFSET_PER_M)
     T_cam_world = se3.invert(picture.T_world_cam)
     begin = [T_cam_world @ f.T_world_obj for f in fits]
     H = [_information(b, f, T[:3, :3], stride, config)

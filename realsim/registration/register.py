@@ -9,6 +9,7 @@
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,12 +17,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from realsim.arrays import Array
-from realsim.errors import DegenerateError, InputError
+from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene
 from realsim.registration.blind import Kept, Uncertainty, uncertainty
 from realsim.registration.body import Body, moved_body
-from realsim.registration.compare import Comparer, spread_frames
+from realsim.registration.compare import spread_frames
 from realsim.registration.config import METHODS, RegistrationConfig
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.few_views import few_around, register_few, with_photograph
@@ -36,9 +37,10 @@ from realsim.registration.finding import (
     seek_objects,
     wanted_objects,
     with_flat,
+    without_objects,
 )
 from realsim.registration.intake import Intake, check_odometry, take_in
-from realsim.registration.judge import Defect, Poses, judge_objects
+from realsim.registration.judge import COMMON, Defect, Poses, judge_objects
 from realsim.registration.judging.verdict import CONTRAST_DECIDED
 from realsim.registration.many_views import ManyViews, comparer_on, register_many
 from realsim.registration.near_rivals import Duel, duels, duels_by_print
@@ -52,8 +54,15 @@ from realsim.registration.reports import (
 )
 from realsim.registration.rivals_around import Around, integrated
 from realsim.registration.search.records import NotPlaced, Wanted
-from realsim.registration.single_view import fit_single_view, reference_frame
-from realsim.registration.verify import verify_objects
+from realsim.registration.second_look import (
+    NO_TABLE,
+    camera_moves,
+    far_moved,
+    is_beside_objects,
+    odd_views,
+    without_views,
+)
+from realsim.registration.top_down import not_seen, top_down_poses
 from realsim.registration.view_checks import check_views
 from realsim.registration.views import ViewPoints
 
@@ -136,12 +145,21 @@ def register_scene(  # noqa: PLR0913 - the inputs, and two ways to follow them
     if not found.bodies:
         return _nothing(task, found, missing)
     many = len(intake.frames) >= config.refine_from and config.refine_cameras
-    if many:
-        found, fit = _fit_many(task, found, asked or ())
-        missing = (*refused, *found.not_placed)
-    else:
-        fit = _fit_few(task, found)
-    return _registration(task, found, missing, fit)
+    if not many:
+        return _registration(task, found, missing, _fit_few(task, found))
+    before = task.intake.plane
+    task, found, fit = _fit_many(task, found, asked or ())
+    if before is not None and task.intake.plane is None:
+        # What was sought on a table that is not there is sought again.
+        task, found, fit = _fit_many(task, seek_objects(task, asked), asked or ())
+    missing = (*refused, *found.not_placed)
+    result = _registration(task, found, missing, fit)
+    bad = {o.instance for o in result.scene.objects if o.verdict == "rejected"}
+    if not bad or len(bad) == len(found.bodies):
+        return result
+    # What is not there must not pull the cameras.
+    task, rest, fit = _fit_many(task, without_objects(found, bad), ())
+    return with_rejected(_registration(task, rest, missing, fit), result, bad)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -167,10 +185,23 @@ class _Fit:
 
 def _fit_many(
     task: SceneTask, found: FoundObjects, asked: Sequence[Wanted]
-) -> tuple[FoundObjects, _Fit]:
-    """Return everything refined together, and the objects with the flat ones that it showed."""
+) -> tuple[SceneTask, FoundObjects, _Fit]:
+    """Return everything refined together, without a table and views that the fit contradicts.
+
+    The objects are those given and the flat ones that only refined views show.
+    """
     intake, config = task.intake, task.config
     many = register_many(intake, found.bodies, _starts(found), intake.plane, config, task.tick.each)
+    rules = config.second_look
+    looked = intake
+    if many.plane is not None and not is_beside_objects(many, found.bodies, many.plane, rules):
+        looked = replace(looked, plane=None, no_plane=NO_TABLE)
+    moves = camera_moves(many, found.bodies)
+    if odd := odd_views(looked, moves, config.refine_from, rules):
+        looked = without_views(looked, odd)
+    if looked is not intake:
+        intake, task = looked, replace(task, intake=looked)
+        many = register_many(intake, found.bodies, _starts(found), intake.plane, config)
     if (more := with_flat(task, found, many, asked)) is not None:
         found = more
         many = register_many(intake, found.bodies, _starts(found), intake.plane, config)
@@ -196,7 +227,8 @@ def _fit_many(
         known=found.findings, with_starts=all(T is not None for T in found.claimed),
     )  # fmt: skip
     numbers = [f.index for f in intake.frames]
-    return found, _Fit(
+    moved = far_moved(camera_moves(many, claimed), rules)
+    return task, found, _Fit(
         poses=poses, frames=many.frames, views=many.views, kept=many.kept, uncertain=uncertain,
         searches=found.reports,
         seen={
@@ -205,7 +237,7 @@ def _fit_many(
             }
             for v, number in enumerate(numbers)
         },
-        findings=_views_off(intake, many, claimed, config),
+        findings=[*moved, *_views_off(intake, many, claimed, config)],
         report={"refinement": camera_report(many, claimed, numbers)},
     )  # fmt: skip
 
@@ -343,7 +375,7 @@ def _registration(
     comparer = comparer_on(intake, fit.frames, given.plane, given.bodies, given.poses, config)
     judgement = judge_objects(replace(intake, views=fit.views), given, comparer, config)
     task.tick()
-    single, single_report = _single_view(task, given, comparer)
+    single, single_report = top_down_poses(task, given, comparer)
     task.tick()
     objects = tuple(judgement.objects)
     scene = Scene(name=task.name, objects=objects, plane=given.plane)
@@ -354,7 +386,7 @@ def _registration(
         scene = replace(baseline, name=task.name)
         # The paper carries its poses to the other views by the cameras as they are claimed.
         cameras, seen = {f.index: f.T_world_cam for f in intake.frames}, {}
-        missing = (*missing, *_not_seen(given, single, single_report))
+        missing = (*missing, *not_seen(given, single, single_report))
     gross = () if task.kinematics is None else task.kinematics.faults
     findings = (*intake.findings, *gross, *fit.findings, *judgement.findings)
     report = {
@@ -385,47 +417,22 @@ def _registration(
     )  # fmt: skip
 
 
-def _not_seen(
-    given: Poses, single: Sequence[ObjectPose], report: Mapping[str, Any]
-) -> list[NotPlaced]:
-    """Return the objects that the single view could not be fitted to."""
-    fitted = {o.instance for o in single}
-    starts = [b.start for b in given.bodies if b.start.instance not in fitted]
-    return [
-        NotPlaced(obj_id=s.obj_id, instance=s.instance, reason=f"in view {report['frame']}: {why}")
-        for s, why in zip(starts, report["not_fitted"], strict=True)
+def with_rejected(result: Registration, first: Registration, bad: AbstractSet[int]) -> Registration:
+    """Return a registration with the objects that were rejected before it was made."""
+    words = "it took no part in the fit of the cameras"
+    out = [
+        replace(o, reasons=(*o.reasons, words)) for o in first.scene.objects if o.instance in bad
     ]
-
-
-def _single_view(
-    task: SceneTask, given: Poses, comparer: Comparer
-) -> tuple[list[ObjectPose], dict[str, Any]]:
-    """Return the baseline's poses and which frame it used; objects it cannot see are left out."""
-    config, intake = task.config, task.intake
-    if not (config.with_single_view or config.method == "top-down"):
-        return [], {"frame": None, "not_fitted": []}
-    center = np.mean([b.center(b.T_start) for b in given.bodies], axis=0)
-    frame = reference_frame(intake.frames, given.plane, center)
-    kept: list[int] = []
-    poses: list[Array] = []
-    missing: list[str] = []
-    for i, body in enumerate(given.bodies):
-        try:
-            T = fit_single_view(body, intake.intrinsics, frame, config.single_view)
-        except DegenerateError as error:
-            missing.append(f"instance {body.start.instance}: {error}")
-            continue
-        kept.append(i)
-        poses.append(T)
-    checked = verify_objects(
-        [given.bodies[i] for i in kept], poses, [given.clouds[i] for i in kept], comparer,
-        config.verify,
+    rows = [r for r in first.report["objects"] if r["instance"] in bad]
+    seen = {
+        view: poses | {i: p for i, p in first.seen.get(view, {}).items() if i in bad}
+        for view, poses in result.seen.items()
+    }
+    objects = sorted((*result.scene.objects, *out), key=lambda o: o.instance)
+    every = sorted((*result.report["objects"], *rows), key=lambda r: r["instance"])
+    known = {(f.kind, f.words) for f in result.findings}
+    lost = [f for f in first.findings if (f.kind, f.words) not in known and f.kind not in COMMON]
+    return replace(
+        result, scene=replace(result.scene, objects=tuple(objects)), seen=seen,
+        findings=(*result.findings, *lost), report={**result.report, "objects": every},
     )  # fmt: skip
-    objects = [
-        ObjectPose(
-            obj_id=given.bodies[i].start.obj_id, instance=given.bodies[i].start.instance,
-            T_world_obj=T, checks=c.checks, verdict=c.verdict, reasons=c.reasons,
-        )
-        for i, T, c in zip(kept, poses, checked, strict=True)
-    ]  # fmt: skip
-    return objects, {"frame": frame.index, "not_fitted": missing}

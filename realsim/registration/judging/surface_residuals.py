@@ -32,6 +32,9 @@ from realsim.registration.judging.patches import (
 )
 from realsim.registration.views import ViewPoints
 
+SIZE_LEAST, SIZE_ERRORS, SIZE_EXPLAINED, SIZE_PATCHES = 0.02, 5.0, 0.5, 30
+"""When a model is said to have the wrong size: least share, standard errors, share of the residuals
+that it explains, and patches that are measured."""
 LEVEL_HALVINGS = 40
 """Halvings of the interval in which the level is sought: it ends at 1e-12 of it."""
 
@@ -348,6 +351,30 @@ def residual_checks(
         "patch_rms": rms / bound,
         "wrong_patch_mm2": _largest_piece(r, wrong),
     }
+
+
+def size_error(residuals: SurfaceResiduals, center_obj: Array, level_m: float) -> float | None:
+    """Return by what share the real object is larger than its model; None = nothing says so.
+
+    With q the place of a patch from the centre and n its normal, a model of another size that was
+    fitted all the same leaves m = n.t + s n.q. It is believed if s is `SIZE_LEAST` at least, many
+    times its standard error, and explains most of what is left.
+    """
+    r = residuals
+    some = r.measured
+    if np.count_nonzero(some) < SIZE_PATCHES:
+        return None
+    n, q, m = r.patches.normals[some], r.patches.centers[some] - center_obj, r.mean_m[some]
+    A = np.column_stack([n, np.sum(n * q, axis=1)])
+    w = 1.0 / (np.square(r.sigma_m[some]) + level_m**2)
+    H = (A.T * w) @ A
+    x = np.linalg.lstsq(H, A.T @ (w * m), rcond=1e-9)[0]
+    left = w @ np.square(m - A @ x)
+    explained = 1.0 - float(left / max(float(w @ np.square(m)), 1e-12))
+    error = float(np.sqrt(np.linalg.pinv(H)[3, 3]))
+    s = float(x[3])
+    sure = abs(s) > max(SIZE_LEAST, SIZE_ERRORS * error) and explained > SIZE_EXPLAINED
+    return s if sure else None
 
 
 def _share(areas: Array, part: Mask, whole: Mask) -> float:

@@ -23,6 +23,8 @@ from realsim.registration.refinement.equations import (
 )
 from realsim.registration.refinement.refine import Refined
 
+TINY = 1e-16
+"""A variance far below any that counts [rad^2, m^2]."""
 PIXEL_SAMPLES = 40
 """Points of the surface over which the pixel uncertainty is averaged."""
 
@@ -50,15 +52,17 @@ def object_covariance(refined: Refined, body: Body, k: int) -> Array:
 def common_and_own(refined: Refined, bodies: Sequence[Body]) -> tuple[Array, Array]:
     """Return the covariance of what all objects have in common, and of what is each one's own.
 
-    Common is the move of everything on the table, about the middle of the objects and in world
-    axes, that comes nearest to the objects' moves; what is left of these is each object's own.
+    Common is the move M x of everything on the table, about the middle of the objects and in world
+    axes, that is most likely behind the objects' moves y of covariance C (generalised least
+    squares): x = (M' C^-1 M)^-1 M' C^-1 y. What is left of y is each object's own.
 
     Returns:
         (6, 6), and (K, 6, 6) about the objects' centres in their axes [rad, m].
     """
     C = refined.covariance.shared[OBJECTS:, OBJECTS:]
     moves = moves_of_all(bodies, refined.state)[OBJECTS:]
-    nearest = np.linalg.pinv(moves)
+    weighted = np.linalg.solve(C + TINY * np.eye(len(C)), moves)
+    nearest = np.linalg.solve(moves.T @ weighted, weighted.T)
     left = np.eye(len(C)) - moves @ nearest
     own = (left @ C @ left.T).reshape(len(bodies), 6, len(bodies), 6)
     return (

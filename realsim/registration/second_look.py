@@ -1,0 +1,101 @@
+"""What only a joint fit shows to be wrong with its inputs; then it is made again without them.
+
+A plane that lies on objects alone is no table. A view whose camera had to be moved much further
+than the others' has depth beside its image, or the pose of another moment. An object that is
+rejected pulls the cameras all the same.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from realsim.arrays import Array
+from realsim.geometry import se3
+from realsim.records import SupportPlane
+from realsim.registration.body import Body
+from realsim.registration.config import SecondLookConfig
+from realsim.registration.intake import Intake
+from realsim.registration.many_views import ManyViews
+from realsim.registration.view_agreement import ViewFinding
+
+NO_TABLE = "what looked like a table is seen on the objects only"
+"""Why there is no plane."""
+POINTS = 20_000
+"""Points of all views that are asked where the plane is seen."""
+
+
+def is_beside_objects(
+    many: ManyViews, bodies: Sequence[Body], plane: SupportPlane, config: SecondLookConfig
+) -> bool:
+    """Return whether the plane is seen beside the objects, as a table is."""
+    every = max(1, sum(len(v.points) for v in many.views) // POINTS)
+    points = np.concatenate([
+        se3.transform(v.T_world_cam, v.points[::every].astype(np.float64)) for v in many.views
+    ])  # fmt: skip
+    there = se3.transform(se3.invert(plane.T_world_table), points)
+    is_on = np.abs(there[:, 2]) < config.on_table_m
+    on = points[is_on]
+    beside = np.ones(len(on), dtype=np.bool_)
+    for body, T in zip(bodies, many.poses, strict=True):
+        near = np.linalg.norm(on - body.center(T), axis=1) < body.radius_m + config.beside_m
+        d = body.field.distance(on[near], se3.invert(T))
+        beside[near] &= d > config.beside_m
+    cells = np.unique(np.floor(there[is_on][beside][:, :2] / config.cell_m), axis=0)
+    covered = sum(float(np.prod(np.sort(b.model.mesh.extent)[1:])) for b in bodies)
+    return len(cells) * config.cell_m**2 >= config.least_beside * covered
+
+
+def camera_moves(many: ManyViews, bodies: Sequence[Body]) -> Array:
+    """Return by how much each camera alone was moved (V,), at the middle of the objects [m]."""
+    middle = np.mean([b.center(T) for b, T in zip(bodies, many.poses, strict=True)], axis=0)
+    x = many.refined.state.views[:, :6]
+    at = np.einsum(
+        "vij,vj->vi", np.swapaxes(many.refined.cameras[:, :3, :3], 1, 2),
+        middle - many.refined.cameras[:, :3, 3],
+    )  # fmt: skip
+    return np.linalg.norm(x[:, 3:] + np.cross(x[:, :3], at), axis=1)
+
+
+def odd_views(
+    intake: Intake, moves: Array, least_views: int, config: SecondLookConfig
+) -> list[ViewFinding]:
+    """Return the views whose cameras had to be moved much further than the others'."""
+    usual = float(np.median(moves))
+    odd = moves > max(config.odd_m, config.odd_factor * usual)
+    count = int(np.count_nonzero(odd))
+    if count > config.most_odd * len(moves) or len(moves) - count < least_views:
+        return []
+    return [
+        ViewFinding(
+            index=frame.index, kind="objects_off", exclude=True,
+            words=f"view {frame.index}: its camera would have to be {1e3 * move:.1f} mm from where "
+            f"it is said to be for its depth to fit ({1e3 * usual:.1f} mm in the median view): its "
+            "depth lies beside its photograph, or its pose is of another moment. It is left out.",
+        )
+        for frame, move, is_odd in zip(intake.frames, moves, odd, strict=True) if is_odd
+    ]  # fmt: skip
+
+
+def without_views(intake: Intake, odd: Sequence[ViewFinding]) -> Intake:
+    """Return the intake without the odd views, with what is said of them."""
+    gone = {f.index for f in odd}
+    kept = [k for k, f in enumerate(intake.frames) if f.index not in gone]
+    return replace(
+        intake, frames=tuple(intake.frames[k] for k in kept),
+        views=tuple(intake.views[k] for k in kept), findings=(*intake.findings, *odd),
+    )  # fmt: skip
+
+
+def far_moved(moves: Array, config: SecondLookConfig) -> list[ViewFinding]:
+    """Return that all cameras were moved far, if they were."""
+    usual = float(np.median(moves))
+    if usual < config.moved_m:
+        return []
+    words = (
+        f"each camera had to be moved by {1e3 * usual:.1f} mm on its own (median) for the depth of "
+        "all views to agree: the depth is scaled or does not lie on the colour image's pixels, the "
+        "camera's lens is another's, or the robot's poses are coarse. Poses fit the depth; look at "
+        "the outlines on the photographs before you use them."
+    )
+    return [ViewFinding(index=None, kind="cameras_moved", words=words, exclude=False)]
