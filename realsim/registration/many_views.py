@@ -60,6 +60,8 @@ class ManyViews:
     views: tuple[ViewPoints, ...]
     """Their points, likewise."""
     plane: SupportPlane | None
+    arm_constant_m: float
+    """1-sigma per axis of what the arm is off by everywhere: part of the covariances [m]."""
 
 
 def refine_config(config: RegistrationConfig) -> RefineConfig:
@@ -123,8 +125,10 @@ def register_many(
         _misfit_covariance(b, refined.misfit_m[k]) + _blind_covariance(b, kept[k].fit, config)
         for k, b in enumerate(bodies)
     ]
+    # In world: what the arm is off by everywhere. Against the cameras it does not count.
+    arm = np.diag(np.square([0.0, 0.0, 0.0, *[constants.prior.arm_constant_mm / 1e3] * 3]))
     covariances = [
-        _turn_covariance(object_covariance(refined, b, k), S) + more
+        _turn_covariance(object_covariance(refined, b, k), S) + more + arm
         for k, (b, S, more) in enumerate(zip(bodies, back, beyond, strict=True))
     ]
     seen = [
@@ -143,6 +147,7 @@ def register_many(
     return ManyViews(
         refined=refined, poses=[k.fit.T_world_obj for k in kept], kept=kept, clouds=clouds,
         covariances=covariances, seen=seen, frames=frames, views=views, plane=refined.plane,
+        arm_constant_m=constants.prior.arm_constant_mm / 1e3,
     )  # fmt: skip
 
 

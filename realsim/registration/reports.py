@@ -106,7 +106,8 @@ def camera_report(
     sigma = np.sqrt(np.diag(C))
     own = refined.state.views
     shared, each = common_and_own(refined, bodies)
-    common = np.sqrt(np.diag(shared))
+    arm = np.repeat([0.0, many.arm_constant_m**2], 3)
+    common = np.sqrt(np.diag(shared) + arm)
     return {
         "hand_eye_mm": mm,
         "hand_eye_deg": deg,

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import expit, ndtr
 
 from realsim.arrays import Array
 from realsim.geometry import se3
@@ -32,6 +32,8 @@ from realsim.registration.photo_fit import Edges
 from realsim.registration.refinement.flat import laid_down
 from realsim.registration.solver import PoseFit, SolverConfig, solve_pose
 
+CHOICE = 2.0
+"""How fast the probability goes over from the fit's to the rival's [1 / temperature]."""
 UNLIKELY = 1e-5
 """Poses of less weight are no part of the spread."""
 NODES = 9
@@ -157,9 +159,14 @@ def around(
     weights = np.exp(-(costs - costs.min()) / config.temperature) * volumes
     weights /= weights.sum()
     # A pose of the grid stands for all that lie within half a step of it.
-    probability, follows = _within(
-        body, (Ts, best), weights, 0.5 * np.sqrt(volumes), images, config
-    )
+    half = 0.5 * np.sqrt(volumes)
+    probability, follows = _within(body, (Ts, best), weights, half, images, config)
+    rival = int(np.argmin(costs))
+    if rival != middle:
+        # Where the choice changes, the probability does not jump: it is that of both.
+        gap = (costs[middle] - costs[rival]) / config.temperature - config.better
+        both = [_within(body, (Ts, n), weights, half, images, config)[0] for n in (middle, rival)]
+        probability = float(np.array(both) @ expit(CHOICE * gap * np.array([-1.0, 1.0])))
     xi = np.array([
         _twist(body, Ts[best], T) if w > UNLIKELY else np.zeros(6)
         for T, w in zip(Ts, weights, strict=True)
