@@ -235,8 +235,8 @@ def loop(given: argparse.Namespace) -> Found:
     found = Found()
     inside: list[bool] = []
     for seed in range(given.seed, given.seed + (1 if given.quick else LOOPS)):
-        config = DemoConfig(seed=seed, views=6 if given.quick else 32, objects=2 if given.quick
-                            else 8, grasps_per_object=1)  # fmt: skip
+        config = DemoConfig(seed=seed, views=6 if given.quick else 24, objects=2 if given.quick
+                            else 6, grasps_per_object=1)  # fmt: skip
         with tempfile.TemporaryDirectory() as folder:
             result = run_demo(config, Path(folder) / "demo", Console(quiet=True))
             truth = load_truth(result.folder / "truth")

@@ -60,7 +60,8 @@ def require_sound(store: SessionStore) -> list[str]:
         more = f" and {len(faults) - 3} more" if len(faults) > 3 else ""
         raise InputError(
             f"session '{store.folder}' is not as it was captured: {named}{more}. Restore the files "
-            "from a copy, or capture the views again; nothing was computed from what is left."
+            "from a copy, or capture the views again; nothing was computed from what is left. "
+            f"`realsim check {store.folder} --repair` takes damaged views out and keeps the rest."
         )
     return [f.path for f in found]
 

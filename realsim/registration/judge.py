@@ -179,8 +179,8 @@ def flat_checks(intake: Intake, given: Poses, config: RegistrationConfig) -> lis
         for body, T in (*both[:k], *both[k + 1 :]):
             rest = cover(rest, body, T, rules)
         share = explained_at(rest, *both[k], given.table_off_m, rules)
-        if share is not None:
-            checks[k]["explained"] = share
+        # What is hidden all around lies there as well as anywhere.
+        checks[k]["explained"] = 0.0 if share is None else share
     return checks
 
 
@@ -207,7 +207,7 @@ def _object(
         reasons = (
             *reasons,
             f"its surface looks {100 * abs(size):.0f} % {'larger' if size > 0 else 'smaller'} than "
-            "its model's, at least: the model may have the wrong size. Measure it, or scale it with "
+            "its model's, at least: the model may have the wrong size. Measure it, or run "
             f"`realsim scan scale {body.model.name} SESSION`",
         )
     mine = [f for f in findings if body.start.instance in f.instances and f.kind not in COMMON]

@@ -224,6 +224,11 @@ def _claimed(
     if not request.hand_held:
         if claimed:
             return claimed
+        if not store.session.views:
+            raise InputError(
+                f"session '{store.folder}' holds no views (what `realsim check --repair` took out "
+                "lies in its folder 'damaged'); capture them again."
+            )
         raise InputError(
             f"no view of session '{store.folder}' has a camera pose yet: run "
             f"`realsim calibrate {store.folder}` first. A capture without a robot, the camera led "

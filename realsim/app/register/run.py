@@ -40,6 +40,8 @@ from realsim.registration.register import Registration
 from realsim.store import SessionStore
 
 STAGE = "register"
+BESIDE = "the depth does not lie on the photographs, and labels would lie beside the object"
+"""Why no pose is accepted then."""
 Amend = Callable[[Registered], Registered]
 PIXEL_POINTS = 40
 """Vertices of a mesh over which the pixel uncertainty is averaged."""
@@ -156,7 +158,17 @@ def _registered(
         )  # fmt: skip
     result = as_registered(found, inputs, store.session.intrinsics, request)
     off = colour_remark(store, sorted(found.cameras))
-    return result if off is None else replace(result, remarks=(*result.remarks, off))
+    if off is None:
+        return result
+    # Poses fit the depth, but labels are drawn on photographs.
+    objects = tuple(
+        replace(o, verdict="doubtful", reasons=(*o.reasons, BESIDE))
+        if o.verdict == "accepted"
+        else o
+        for o in result.scene.objects
+    )
+    scene = replace(result.scene, objects=objects)
+    return replace(result, scene=scene, remarks=(*result.remarks, off))
 
 
 def as_registered(

@@ -358,7 +358,8 @@ def _judged(e: Evidence, found: ObjectPose, config: OutcomeConfig) -> tuple[Kind
     if far or e.depth_t < -config.depth_t or e.photo_t < -config.photo_t:
         way = f"{1e3 * e.moved_m:.0f} mm away, does not win clearly" if far else "is worse"
         return "rejected", f"the new pose, {way}: {said}" if far else f"the new pose {way}: {said}"
-    return "kept", f"the new pose is not better on both: {said}"
+    sure = f"{config.depth_t:g} and {config.photo_t:g}"
+    return "kept", f"the new pose is not surely better on both (t of {sure} would be): {said}"
 
 
 def _why_kept(e: Evidence, config: OutcomeConfig) -> str | None:

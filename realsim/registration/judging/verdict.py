@@ -18,7 +18,7 @@ MARGIN, MARGIN_STEP = 0.3, 0.15
 and by how much less takes `CONTRAST_WEIGHT` from the log-odds: a card on top of a box agrees with
 the box. Second lab: right ones 0.4 (a plate of 2 mm) and more, those on another place up to -0.15.
 """
-EXPLAINED, EXPLAINED_STEP = 0.98, 0.015
+EXPLAINED, EXPLAINED_STEP = 0.99, 0.008
 """Share of the heights around a flat object from which on its pose explains them, and by how much
 less takes `CONTRAST_WEIGHT` from the log-odds (second lab: right ones 1.0, those 3 mm off and more
 up to 0.966)."""

@@ -224,7 +224,9 @@ def _not_placed(search: Search, final: Sequence[Candidate | None], n: int) -> No
     reason = (
         f"nothing {where} looks like it"
         if not rest
-        else f"of {len(rest)} poses {where} none explains what the other objects leave over: the "
-        f"best gains {max(scores):.2f} per pixel, {least:.2f} is needed"
+        else f"nothing that was measured {where} looks like it, beside what the other objects and "
+        f"the table explain (best of {len(rest)} poses: {max(scores):.2f} likelier per pixel, "
+        f"{least:.2f} is needed): it is not there, or the depth does not show it, or its start is "
+        "of another scene"
     )
     return NotPlaced(obj_id=wanted.obj_id, instance=wanted.instance, reason=reason)
