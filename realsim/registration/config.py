@@ -54,9 +54,9 @@ class SecondLookConfig:
     """A point so far from all objects is beside them [m]."""
     cell_m: float = 0.01
     """Cells by which areas on the plane are measured [m]."""
-    least_beside: float = 0.5
-    """Least area of a table that is seen beside the objects, as a share of the area that these
-    cover: an invented one lies on the objects, or on one that was not placed."""
+    least_beside: float = 1.0
+    """Least area of a table that is seen beside the placed objects, as a share of what all wanted
+    ones cover: an invented one lies on the objects, or on some that were not placed."""
     odd_m: float = 0.0015
     """A view is odd whose camera was moved by so much, seen at the objects [m]."""
     odd_factor: float = 5.0

@@ -194,7 +194,10 @@ def _fit_many(
     many = register_many(intake, found.bodies, _starts(found), intake.plane, config, task.tick.each)
     rules = config.second_look
     looked = intake
-    if many.plane is not None and not is_beside_objects(many, found.bodies, many.plane, rules):
+    wanted = [task.models[w.obj_id] for w in asked] or [b.model for b in found.bodies]
+    if many.plane is not None and not is_beside_objects(
+        many, found.bodies, many.plane, wanted, rules
+    ):
         looked = replace(looked, plane=None, no_plane=NO_TABLE)
     moves = camera_moves(many, found.bodies)
     if odd := odd_views(looked, moves, config.refine_from, rules):

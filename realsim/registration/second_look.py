@@ -12,7 +12,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.geometry import se3
-from realsim.records import SupportPlane
+from realsim.records import ObjectModel, SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.config import SecondLookConfig
 from realsim.registration.intake import Intake
@@ -26,9 +26,21 @@ POINTS = 20_000
 
 
 def is_beside_objects(
-    many: ManyViews, bodies: Sequence[Body], plane: SupportPlane, config: SecondLookConfig
+    many: ManyViews,
+    bodies: Sequence[Body],
+    plane: SupportPlane,
+    wanted: Sequence[ObjectModel],
+    config: SecondLookConfig,
 ) -> bool:
-    """Return whether the plane is seen beside the objects, as a table is."""
+    """Return whether the plane is seen beside the objects, as a table is.
+
+    Args:
+        many: the joint fit.
+        bodies: the objects that were placed.
+        plane: what may be a table.
+        wanted: the models of all objects that should be there.
+        config: see there.
+    """
     every = max(1, sum(len(v.points) for v in many.views) // POINTS)
     points = np.concatenate([
         se3.transform(v.T_world_cam, v.points[::every].astype(np.float64)) for v in many.views
@@ -42,7 +54,7 @@ def is_beside_objects(
         d = body.field.distance(on[near], se3.invert(T))
         beside[near] &= d > config.beside_m
     cells = np.unique(np.floor(there[is_on][beside][:, :2] / config.cell_m), axis=0)
-    covered = sum(float(np.prod(np.sort(b.model.mesh.extent)[1:])) for b in bodies)
+    covered = sum(float(np.prod(np.sort(m.mesh.extent)[1:])) for m in wanted)
     return len(cells) * config.cell_m**2 >= config.least_beside * covered
 
 

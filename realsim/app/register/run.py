@@ -162,11 +162,10 @@ def _registered(
         return result
     # Poses fit the depth, but labels are drawn on photographs.
     objects = tuple(
-        replace(o, verdict="doubtful", reasons=(*o.reasons, BESIDE))
-        if o.verdict == "accepted"
-        else o
+        o if o.verdict != "accepted"
+        else replace(o, verdict="doubtful", reasons=(*o.reasons, BESIDE))
         for o in result.scene.objects
-    )
+    )  # fmt: skip
     scene = replace(result.scene, objects=objects)
     return replace(result, scene=scene, remarks=(*result.remarks, off))
 

@@ -32,7 +32,7 @@ from realsim.registration.judging.patches import (
 )
 from realsim.registration.views import ViewPoints
 
-SIZE_LEAST, SIZE_ERRORS, SIZE_EXPLAINED, SIZE_PATCHES = 0.02, 5.0, 0.5, 30
+SIZE_LEAST, SIZE_ERRORS, SIZE_EXPLAINED, SIZE_PATCHES = 0.02, 5.0, 0.35, 30
 """When a model is said to have the wrong size: least share, standard errors, share of the residuals
 that it explains, and patches that are measured."""
 LEVEL_HALVINGS = 40
