@@ -49,7 +49,9 @@ def upgraded(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def meshes(upgraded):
-    import open3d as o3d
+    from realsim.interop import import_open3d
+
+    o3d = import_open3d()
 
     scenes = {}
     for file in sorted((upgraded / "models").glob("obj_*.ply")):
@@ -62,7 +64,9 @@ def meshes(upgraded):
 
 def rendered_distance_mm(scene, row, K, size):
     """Return the distance image (3 H, 3 W) [mm] of a model on BOP's large canvas, 0 = nothing."""
-    import open3d as o3d
+    from realsim.interop import import_open3d
+
+    o3d = import_open3d()
 
     width, height = size
     u, v = np.meshgrid(np.arange(-width, 2 * width), np.arange(-height, 2 * height))
