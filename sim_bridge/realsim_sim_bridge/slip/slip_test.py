@@ -43,6 +43,10 @@ Rows = NDArray[np.int64]
 CLOSE, LIFT, OSCILLATE, PENDULUM = range(len(STAGES))
 
 
+NOT_SIMULATED = "not simulated"
+"""How the failure of a stage ends that limit analysis decided (`SlipConfig.sure`)."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SlipConfig:
     """Everything the slip test depends on besides the score's limits."""
@@ -384,7 +388,7 @@ class _SlipTest:
             if np.isinf(slip) and not self._played[row]:
                 why = (
                     f"the object's weight is {1.0 / self._safety[row, CLOSE]:.1f} times what the "
-                    "grasp bears; not simulated"
+                    f"grasp bears; {NOT_SIMULATED}"
                 )
             elif np.isinf(slip):
                 why = "the object was lost"
