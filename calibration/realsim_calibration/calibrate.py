@@ -55,7 +55,7 @@ RADIAL_POWERS = {"k1": 3, "k2": 5, "k3": 7}
 """Power of the radius with which a term moves a point."""
 
 
-def _determined(
+def determined_priors(
     sd: tuple[float, ...], lens: IntrinsicsReport, border_px: float
 ) -> tuple[float, ...]:
     """Return the priors of the distortion, tight for terms that the views do not determine.
@@ -111,7 +111,7 @@ def calibrate(
         joint = replace(
             hand_eye.joint,
             focal_sd=config.own_focal_sd,
-            distortion_sd=_determined(hand_eye.joint.distortion_sd, lens, config.border_px),
+            distortion_sd=determined_priors(hand_eye.joint.distortion_sd, lens, config.border_px),
         )
         hand_eye = replace(hand_eye, joint=joint)
     report = calibrate_hand_eye_report(views, target, camera, hand_eye, arm)

@@ -62,6 +62,7 @@ class LinearModel:
 
     def __init__(self, problem: JointProblem, state: JointState, roots: Array) -> None:
         self.problem, self.state = problem, state
+        self.shared = SHARED
         rows = problem.equations(state, roots)
         self.coordinates = 2 * len(roots)
         self.weight_sums = np.add.reduceat(roots**2, problem.starts[:-1])
@@ -103,11 +104,11 @@ class LinearModel:
         flat = rows.reshape(-1, rows.shape[-1])
         gram = flat.T @ flat
         n = len(gram) - 1
-        at = np.append(np.arange(SHARED), n)
+        at = np.append(np.arange(self.shared), n)
         gram[np.ix_(at, at)] += self.rest_gram
         prior = np.eye(n)
-        prior[:SHARED, :SHARED] = self.prior
-        return gram, prior, np.concatenate([self.offset, np.zeros(n - SHARED)])
+        prior[: self.shared, : self.shared] = self.prior
+        return gram, prior, np.concatenate([self.offset, np.zeros(n - self.shared)])
 
     def _solve(
         self, basis: ErrorBasis | None, ratio: Array, sigma: float, rounds: int
@@ -145,7 +146,7 @@ class LinearModel:
         robot = self._robot_rows(basis, ratio)
         U = np.zeros((len(robot), self.J.shape[1], robot.shape[-1]))
         U[:, :6] = robot
-        U[:, 6:, :SHARED], U[:, 6:, -1] = self.rest[..., :-1], self.rest[..., -1]
+        U[:, 6:, : self.shared], U[:, 6:, -1] = self.rest[..., :-1], self.rest[..., -1]
         U /= sigma
         U, residual = U[..., :-1], U[..., -1] + U[..., :-1] @ step
         try:
@@ -162,9 +163,9 @@ class LinearModel:
 
     def predicted(self, basis: ErrorBasis | None, steps: Array) -> Array:
         """Return the RMS (views,) [px] of every view through the robot's pose at its own step."""
-        r = self.r + (self.J @ steps[:, :SHARED, None])[..., 0]
+        r = self.r + (self.J @ steps[:, : self.shared, None])[..., 0]
         if basis is not None:
-            smooth = basis.columns @ steps[:, SHARED:, None]
+            smooth = basis.columns @ steps[:, self.shared :, None]
             r = r + (self.D @ smooth)[..., 0]
         return np.sqrt(np.sum(r**2, -1) / self.weight_sums)
 

@@ -82,7 +82,7 @@ class Solution:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class _Choice:
+class Choice:
     """A candidate with its fit."""
 
     basis: ErrorBasis | None
@@ -108,13 +108,13 @@ def solve(
     model = LinearModel(problem, state, roots)
     fixed = config.joint.robot_ratio
     white, most, ratio = _robot_share(problem, model, state, sigma, config)
-    none = _Choice(basis=None, ratio=ratio, fit=model.fit(None, ratio, sigma))
+    none = Choice(basis=None, ratio=ratio, fit=model.fit(None, ratio, sigma))
     choices = [none]
     Ts = np.stack([v.T_base_ee for v in setup.views])
     known: ErrorBasis | None = None
     if config.robot_map:
         bounded = ratio if fixed else np.minimum(ratio, config.noise.bound)
-        choices += _maps(model, Ts, sigma, bounded, config)
+        choices += map_choices(model, Ts, sigma, bounded, config)
     if arm is not None and joints is not None:
         # What is left of the robot's error beside the arm's own is noise: lambda needs no bound.
         noise = replace(config.noise, least=fixed, most=fixed) if fixed else config.noise
@@ -122,16 +122,16 @@ def solve(
         arm_ratio, known = estimate_arm(model, basis, sigma, noise, config.robot)
         fit = model.fit(known, arm_ratio, sigma)
         if config.robot_map:
-            choices.append(_Choice(basis=known, ratio=arm_ratio, fit=fit))
-    best = _chosen(choices, config.robot)
+            choices.append(Choice(basis=known, ratio=arm_ratio, fit=fit))
+    best = chosen_of(choices, config.robot)
     if best.basis is not None and best.basis.kind != "arm" and not fixed:
         ratio = estimate_ratio(model, best.basis, sigma, most, config.noise)
-        best = _Choice(basis=best.basis, ratio=ratio, fit=model.fit(best.basis, ratio, sigma))
+        best = Choice(basis=best.basis, ratio=ratio, fit=model.fit(best.basis, ratio, sigma))
     alone = state.moved(none.fit.step)
     state, sigma, roots = _final_fit(problem, state, best, roots)
     model = LinearModel(problem, state, roots)
     final = model.fit(best.basis, best.ratio, sigma)
-    columns = _hidden_errors(model, none, known, Ts, sigma, config.robot.hidden_factor)
+    columns = hidden_errors(model, none, known, Ts, sigma, config.robot.hidden_factor)
     independent = white.excess <= 0
     covariance = _covariance(model, final, best, columns, known, independent)
     return Solution(
@@ -186,7 +186,7 @@ def _robot_share(
 
 
 def _final_fit(
-    problem: JointProblem, state: JointState, best: _Choice, roots: Array
+    problem: JointProblem, state: JointState, best: Choice, roots: Array
 ) -> tuple[JointState, float, Array]:
     """Return the joint fit with the chosen robot error, from the linear solution."""
     weights = best.fit.step[29:]
@@ -196,20 +196,20 @@ def _final_fit(
     return state, sigma, roots
 
 
-def _maps(
+def map_choices(
     model: LinearModel, Ts: Array, sigma: float, ratio: Array, config: "HandEyeConfig"
-) -> list[_Choice]:
+) -> list[Choice]:
     """Return the fits with a map in tool or base axes, weakest first."""
-    choices: list[_Choice] = []
+    choices: list[Choice] = []
     for strength in config.robot.map_strengths:
         for kind in ("ee", "base"):
             basis = map_basis(Ts, kind, strength, config.robot.map_unit)
             fit = model.fit(basis, ratio, sigma)
-            choices.append(_Choice(basis=basis, ratio=ratio, fit=fit))
+            choices.append(Choice(basis=basis, ratio=ratio, fit=fit))
     return choices
 
 
-def _chosen(choices: list[_Choice], config: RobotErrorConfig) -> _Choice:
+def chosen_of(choices: list[Choice], config: RobotErrorConfig) -> Choice:
     """Return the candidate that predicts unseen views best; sounder ones win within the noise.
 
     A map must beat no map, and the arm's own numbers, by so many standard errors of the paired
@@ -229,14 +229,14 @@ def _chosen(choices: list[_Choice], config: RobotErrorConfig) -> _Choice:
     return best
 
 
-def _gain_in_errors(sound: _Choice, other: _Choice) -> float:
+def _gain_in_errors(sound: Choice, other: Choice) -> float:
     """Return by how many standard errors another candidate predicts unseen views better."""
     gain = np.log(sound.fit.unseen_px) - np.log(other.fit.unseen_px)
     return float(np.mean(gain)) / max(float(np.std(gain)) / np.sqrt(len(gain)), 1e-12)
 
 
-def _hidden_errors(
-    model: LinearModel, none: _Choice, known: ErrorBasis | None, Ts: Array, sigma: float,
+def hidden_errors(
+    model: LinearModel, none: Choice, known: ErrorBasis | None, Ts: Array, sigma: float,
     hidden: float,
 ) -> Array:  # fmt: skip
     """Return errors (views, 6, q) that the arm may have, per standard deviation."""
@@ -249,7 +249,7 @@ def _hidden_errors(
 
 
 def _covariance(
-    model: LinearModel, fit: LinearFit, choice: _Choice, columns: Array,
+    model: LinearModel, fit: LinearFit, choice: Choice, columns: Array,
     known: ErrorBasis | None, independent: bool,
 ) -> Array:  # fmt: skip
     """Return the covariance of all parameters of a fit."""
@@ -259,7 +259,7 @@ def _covariance(
     return with_arm(covariance, model.influence(fit, choice.ratio, columns))
 
 
-def _offsets(best: _Choice, state: JointState, covariance: Array) -> Array | None:
+def _offsets(best: Choice, state: JointState, covariance: Array) -> Array | None:
     """Return the joint zero offsets and their 1-sigma (n, 2) [rad] of an arm's fit."""
     if best.basis is None or best.basis.kind != "arm":
         return None
