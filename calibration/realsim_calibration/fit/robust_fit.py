@@ -91,6 +91,7 @@ class Choice:
 
     @property
     def name(self) -> str:
+        """Name of the basis, "none" without one."""
         return "none" if self.basis is None else self.basis.name
 
 
