@@ -14,6 +14,8 @@ from realsim_calibration.views import TargetDetection
 
 MIN_PART = (3, 3)
 """Least part of a chessboard that OpenCV looks for, in inner corners."""
+SLOW_SEARCH_PX = 1000
+"""Larger pictures are shrunk before the search that takes long on clutter."""
 LINE_SHARE = 0.6
 """Share of a line that must be corners for it to be part of a chessboard."""
 
@@ -127,11 +129,14 @@ def _partly(grid: Array | None, board: Chessboard) -> str:
     """Return what was found of a board that is not whole."""
     total = board.rows * board.columns
     if grid is None:
-        return f"no chessboard: 0 of {total} inner corners"
+        return (
+            f"no chessboard of {board.columns}x{board.rows} inner corners was recognised (0 of "
+            f"{total}): too small, too oblique, cut off, or covered?"
+        )
     r, c = grid.shape[:2]
     return (
-        f"{r * c} of {total} inner corners ({c}x{r} of {board.columns}x{board.rows}): a chessboard "
-        "must be seen whole, with its white margin, and free of glare"
+        f"{r * c} of {total} inner corners ({c}x{r} of {board.columns}x{board.rows}) were "
+        "recognised: a chessboard must be seen whole, with its white margin, free of glare"
     )
 
 
@@ -150,14 +155,25 @@ def largest_chessboard(gray: UInt8, search_px: int) -> Array | None:
 
 
 def _classic(gray: UInt8, board: Chessboard) -> Array | None:
-    """Return the corners (rows, columns, 2) as the older search of one exact size finds them."""
+    """Return the corners (rows, columns, 2) as the older search of one exact size finds them.
+
+    OpenCV's fast check counts squares at one threshold of the whole picture: a dark board in a
+    bright room does not pass it. So the search is made without it, too, in a picture that is small
+    enough, because clutter costs it seconds.
+    """
     import cv2
 
-    flags = cv2.CALIB_CB_ADAPTIVE_THRESH + cv2.CALIB_CB_NORMALIZE_IMAGE + cv2.CALIB_CB_FAST_CHECK
-    ok, corners = cv2.findChessboardCorners(gray, (board.columns, board.rows), flags=flags)
-    if not ok:
-        return None
-    return np.asarray(corners, dtype=np.float64).reshape(board.rows, board.columns, 2)
+    usual = cv2.CALIB_CB_ADAPTIVE_THRESH + cv2.CALIB_CB_NORMALIZE_IMAGE
+    small, scale = _sizes(gray, SLOW_SEARCH_PX)[0]
+    for image, pixel, flags in (
+        (gray, 1.0, usual + cv2.CALIB_CB_FAST_CHECK),
+        (small, scale, usual),
+    ):
+        ok, corners = cv2.findChessboardCorners(image, (board.columns, board.rows), flags=flags)
+        if ok:
+            grid = np.asarray(corners, dtype=np.float64).reshape(board.rows, board.columns, 2)
+            return (grid + 0.5) * pixel - 0.5
+    return None
 
 
 def _sizes(gray: UInt8, search_px: int) -> list[tuple[UInt8, float]]:

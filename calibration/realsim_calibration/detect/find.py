@@ -1,6 +1,6 @@
 """Find a target's points in an image, whatever kind of target it is."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -8,12 +8,16 @@ from realsim.arrays import UInt8
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
+from realsim_calibration.detect.blur import blur_reason
 from realsim_calibration.detect.charuco import CharucoConfig, find_charuco
 from realsim_calibration.detect.chessboard import ChessboardConfig, find_chessboard
 from realsim_calibration.detect.circles import CirclesConfig, find_circles
 from realsim_calibration.detect.images import gray_image, size_of
 from realsim_calibration.detect.tags import DetectionConfig, TagDetections, detect_tags
 from realsim_calibration.views import TargetDetection
+
+FEW_POINTS = 8
+"""With fewer points it is looked at whether the picture is blurred."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -61,6 +65,18 @@ def find_target(
             f"the image is {width}x{height} px, the intrinsics are for {intrinsics.width}x"
             f"{intrinsics.height}: give the intrinsics of this image size, or none."
         )
+    found = _points(gray, target, intrinsics, config)
+    if len(found) < FEW_POINTS:
+        blurred = blur_reason(gray)
+        if blurred:
+            return replace(found, rejected=(blurred, *found.rejected))
+    return found
+
+
+def _points(
+    gray: UInt8, target: Target, intrinsics: CameraIntrinsics | None, config: FindConfig
+) -> TargetDetection:
+    """Return the points by the search for the target's kind."""
     if isinstance(target, TagBoard):
         return tag_points(
             detect_tags(gray, target, config.tags, intrinsics=intrinsics), target, size_of(gray)

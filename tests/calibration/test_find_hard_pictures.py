@@ -1,0 +1,42 @@
+"""Pictures that are dark or blurred: found, or named for what they are."""
+
+import numpy as np
+import pytest
+
+from pictured_targets import TARGETS, page_of, picture, pose, truth
+from realsim_calibration.detect.blur import edge_blur_px
+from realsim_calibration.detect.find import find_target
+
+
+@pytest.mark.parametrize("tilt", [10.0, 45.0])
+def test_a_dark_chessboard_in_a_bright_room_is_found(tilt):
+    board, (page, origin) = TARGETS["chessboard"], page_of(TARGETS["chessboard"])
+    T, rng = pose(board, tilt), np.random.default_rng(1)
+    dark = np.where(page > 127, 50, 10).astype(np.uint8)
+    image = picture(board, T, noise=0.0, page=(dark, origin))
+    sheet = picture(board, T, blur=0.1, noise=0.0, page=(np.full_like(page, 255), origin)) > 200
+    image = np.where(sheet, image, 230) + rng.normal(scale=2.0, size=image.shape)
+    found = find_target(np.clip(np.rint(image), 0, 255).astype(np.uint8), board)
+    assert len(found) == len(board.points_board)
+    assert np.abs(found.uv - truth(board, T)[found.point_ids]).max() < 0.3
+
+
+@pytest.mark.parametrize("name", ["tags", "charuco", "chessboard", "circles"])
+def test_a_blurred_picture_is_named_as_blurred(name):
+    board = TARGETS[name]
+    T, rng = pose(board, 30.0), np.random.default_rng(0)
+    for blur in (0.8, 2.0, 4.0):
+        measured = edge_blur_px(picture(board, T, rng, blur=blur))
+        assert 0.7 * blur < measured < 1.5 * max(blur, 0.8), blur
+    found = find_target(picture(board, T, rng, blur=9.0), board)
+    assert len(found) == 0
+    assert found.rejected[0].startswith("the picture is blurred: its edges spread over")
+    assert "rest" in found.rejected[0]
+
+
+def test_a_sharp_picture_without_the_board_is_not_called_blurred():
+    found = find_target(
+        picture(TARGETS["circles"], pose(TARGETS["circles"], 20.0)), TARGETS["tags"]
+    )
+    assert len(found) == 0 and not any("blurred" in r for r in found.rejected)
+    assert np.isnan(edge_blur_px(np.full((100, 100), 90, np.uint8)))
