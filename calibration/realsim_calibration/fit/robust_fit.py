@@ -245,8 +245,10 @@ def hidden_errors(
         return known.columns
     scaled = estimate_scale(model, map_basis(Ts, "base", 1.0, 1e-4), none.ratio, sigma)
     fit = model.fit(scaled, none.ratio, sigma)
-    spread = np.asarray(np.linalg.inv(fit.information)[SHARED:, SHARED:], dtype=np.float64)
-    return unknown_arm_columns(scaled, fit.step[SHARED:], spread, hidden)
+    spread = np.asarray(
+        np.linalg.inv(fit.information)[model.shared :, model.shared :], dtype=np.float64
+    )
+    return unknown_arm_columns(scaled, fit.step[model.shared :], spread, hidden)
 
 
 def _covariance(
