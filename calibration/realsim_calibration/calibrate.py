@@ -18,7 +18,7 @@ from realsim_calibration.lens.fit import IntrinsicsConfig
 from realsim_calibration.lens.intrinsics import calibrate_intrinsics
 from realsim_calibration.lens.report import IntrinsicsReport
 from realsim_calibration.results import HandEyeReport
-from realsim_calibration.views import BoardView, detection_of
+from realsim_calibration.views import BoardView, detection_of, measured_poses
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -196,6 +196,7 @@ def calibrate_from_poses(
     grid = grid or VirtualGrid()
     A = np.asarray(Ts_base_ee, dtype=np.float64).reshape(-1, 4, 4)
     C = np.asarray(Ts_cam_board, dtype=np.float64).reshape(-1, 4, 4)
+    C = measured_poses(C, [f"T_cam_board of view {k}" for k in range(len(C))])
     if len(A) != len(C):
         raise InputError(
             f"hand-eye: {len(A)} hand poses and {len(C)} camera poses were given; every view needs "
@@ -220,4 +221,5 @@ def calibrate_from_poses(
         )  # fmt: skip
     config = replace(config or HandEyeConfig(), joint=held_lens_and_board(grid.robot_ratio))
     report = calibrate_hand_eye_report(views, target, camera, config, arm)
-    return replace(report, Z=report.Z @ grid.T_grid_board)
+    to_board = grid.T_grid_board
+    return replace(report, Z=report.Z @ to_board, Z_alone=report.Z_alone @ to_board)

@@ -1,5 +1,6 @@
 """What a calibration is made of: the target's points found in an image, and the robot's pose."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,8 +8,8 @@ from numpy.typing import ArrayLike
 
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
-from realsim.geometry import se3
 from realsim.records import Target
+from realsim_calibration.inputs.readings import PoseReading
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -81,9 +82,7 @@ class BoardView:
 
     def __post_init__(self) -> None:
         """Check that the pose is rigid and freeze it."""
-        T = se3.check_rigid(self.T_base_ee, f"T_base_ee of view {self.label}")
-        if T.shape != (4, 4):
-            raise InputError(f"T_base_ee of view {self.label} has shape {T.shape}, not (4, 4).")
+        T = measured_poses(self.T_base_ee, [f"T_base_ee of view {self.label}"])[0]
         T.setflags(write=False)
         object.__setattr__(self, "T_base_ee", T)
 
@@ -91,6 +90,25 @@ class BoardView:
     def label(self) -> str:
         """The name, or the index where there is none."""
         return self.name or str(self.index)
+
+
+def measured_poses(Ts: ArrayLike, names: Sequence[str]) -> Array:
+    """Return poses (n, 4, 4) as controllers and detectors print them, made exactly rigid.
+
+    Rotations may be rounded to three decimals, as in pose files; the nearest rotation is taken.
+
+    Args:
+        Ts: (n, 4, 4) poses, or one (4, 4) [m].
+        names: what each is called in the error.
+
+    Raises:
+        InputError: another shape, or numbers that are not finite.
+        NotRigidError: mirrored, scaled, or no rotation at all.
+    """
+    T = np.asarray(Ts, dtype=np.float64)
+    if T.shape not in ((4, 4), (len(names), 4, 4)):
+        raise InputError(f"{names[0] if names else 'the poses'}: shape {T.shape}, not (4, 4) each.")
+    return PoseReading(rotation="matrix").apply(T.reshape(-1, 16), rows=names, reach_m=np.inf)
 
 
 def detection_of(

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
+from realsim.errors import InputError, NotRigidError
 from realsim.geometry import se3
 from realsim.geometry.camera import project, undistort
 from realsim.records import Chessboard
@@ -71,6 +71,7 @@ def test_perfect_poses_alone_give_the_truth():
     r = calibrate_from_poses(A, C)
     assert np.abs(se3.log(se3.invert(X) @ r.X)).max() < 1e-6
     assert np.abs(se3.log(se3.invert(Z) @ r.Z)).max() < 1e-6
+    assert np.abs(se3.log(se3.invert(Z) @ r.Z_alone)).max() < 1e-6
     with pytest.raises(InputError, match="12 hand poses and 11 camera poses"):
         calibrate_from_poses(A, C[1:])
     with pytest.raises(InputError, match="behind the camera"):
@@ -155,3 +156,22 @@ def test_joints_of_another_arm_are_named(simulate):
         calibrate_hand_eye_report(
             views, sim.board, sim.intrinsics0, arm=find_arm("panda").chain.bare()
         )
+
+
+def test_matrices_that_a_controller_rounded_are_taken(simulate):
+    sim = simulate(4, views=12)
+    rng = np.random.default_rng(6)
+    C = np.array([se3.invert(v.T_base_ee @ sim.T_ee_cam) @ sim.T_base_board for v in sim.views])
+    A = np.array([v.T_base_ee for v in sim.views])
+    rounded = np.round(A, 4)  # R^T R is off by up to 1e-4
+    assert (
+        np.abs(np.swapaxes(rounded, 1, 2)[:, :3, :3] @ rounded[:, :3, :3] - np.eye(3)).max() > 2e-5
+    )
+    exact, close = calibrate_from_poses(A, C), calibrate_from_poses(rounded, np.round(C, 4))
+    assert np.abs(se3.log(se3.invert(exact.X) @ close.X)).max() < 2e-4
+    view = replace(sim.views[0], T_base_ee=rounded[0])
+    assert np.abs(view.T_base_ee[:3, :3] @ view.T_base_ee[:3, :3].T - np.eye(3)).max() < 1e-14
+    A[3, :3, :3] *= 1.0 + rng.uniform(0.02, 0.03)
+    with pytest.raises(NotRigidError, match=r"view 3.*not a rotation") as error:
+        calibrate_from_poses(A, C)
+    assert "mesh" not in str(error.value)
