@@ -12,6 +12,7 @@ from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Check, Chessboard, Target
+from realsim_calibration.checks import own_lens_check
 from realsim_calibration.fit.joint_solve import JointConfig
 from realsim_calibration.hand_eye import HandEyeConfig, calibrate_hand_eye_report
 from realsim_calibration.lens.fit import IntrinsicsConfig
@@ -115,6 +116,11 @@ def calibrate(
         )
         hand_eye = replace(hand_eye, joint=joint)
     report = calibrate_hand_eye_report(views, target, camera, hand_eye, arm)
+    if lens is not None:  # no camera was given, so nothing is said of one
+        alone, fitted = (float(np.sqrt(c.fx * c.fy)) for c in (camera, report.intrinsics))
+        own = own_lens_check(alone, fitted, hand_eye.checks)
+        checks = tuple(own if c.name == "given camera" else c for c in report.checks)
+        report = replace(report, checks=checks)
     return Calibration(hand_eye=report, lens=lens)
 
 

@@ -202,17 +202,37 @@ def _flatness(r: HandEyeReport, c: CheckConfig) -> Check:
 
 def given_camera_check(f_given: float, f_fitted: float, config: CheckConfig) -> Check:
     """Return the check of a camera that was given against the one that the views show."""
-    off = f_fitted / f_given - 1
+    return _focal_check(
+        f_given, f_fitted, config, "given camera",
+        "the views show a focal length of {:.1f} px, the given camera has {:.1f} px ({:+.1f} %).",
+        "Is it the camera, the resolution and the focus of these images? Leave the camera out to "
+        "have the lens calibrated from these views.",
+    )  # fmt: skip
+
+
+def own_lens_check(f_alone: float, f_fitted: float, config: CheckConfig) -> Check:
+    """Return the check of a lens from the views alone against the one that the poses agree with."""
+    return _focal_check(
+        f_alone, f_fitted, config, "focal length with poses",
+        "with the robot's poses the views show a focal length of {:.1f} px, without them {:.1f} px "
+        "({:+.1f} %).",
+        "Add views at other distances and tilts: these hardly tell focal length from distance. Was "
+        "the focus changed between them?",
+    )  # fmt: skip
+
+
+def _focal_check(
+    f_before: float, f_fitted: float, config: CheckConfig, name: str, sentence: str, advice: str
+) -> Check:
+    off = f_fitted / f_before - 1
     verdict = _verdict(abs(off), config.focal)
     return Check(
-        name="given camera",
+        name=name,
         verdict=verdict,
-        sentence=f"the views show a focal length of {f_fitted:.1f} px, the given camera has "
-        f"{f_given:.1f} px ({100 * off:+.1f} %).",
-        advice=_advice(verdict, "Is it the camera, the resolution and the focus of these images? "
-                       "Leave the camera out to have the lens calibrated from these views."),
+        sentence=sentence.format(f_fitted, f_before, 100 * off),
+        advice=_advice(verdict, advice),
         value=off,
-    )  # fmt: skip
+    )
 
 
 def _robot(r: HandEyeReport, c: CheckConfig) -> Check:

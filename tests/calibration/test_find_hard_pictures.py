@@ -40,3 +40,10 @@ def test_a_sharp_picture_without_the_board_is_not_called_blurred():
     )
     assert len(found) == 0 and not any("blurred" in r for r in found.rejected)
     assert np.isnan(edge_blur_px(np.full((100, 100), 90, np.uint8)))
+
+
+def test_a_board_that_is_cut_off_is_not_counted_from_a_line_that_is_not_there():
+    board, rng = TARGETS["chessboard"], np.random.default_rng(0)
+    T = pose(board, rng.uniform(8, 40), 0.0, rng.uniform(-80, 80), rng.uniform(0.3, 0.4))
+    found = find_target(picture(board, T, rng, noise=2.0), board)
+    assert len(found) == 0 and "of the first row could be measured" in found.rejected[0]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from realsim.app.calibrate.folder import require_target
+from realsim.app.calibrate.images import require_target
 from realsim.errors import InputError
 from realsim.records.targets import CharucoBoard, CircleGrid
 from realsim_calibration.detect.find import find_target

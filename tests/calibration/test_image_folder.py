@@ -163,6 +163,14 @@ def test_poses_and_depth_beside_the_images(tmp_path):
     assert np.abs(found.Ts_base_ee() - READING.apply(raw)).max() < 1e-14
 
 
+def test_a_camera_beside_one_pose_file_is_no_pose_file(tmp_path):
+    make_images(tmp_path, [f"{k}.png" for k in range(4)])
+    write_rows(tmp_path / "p.txt", rows(4))
+    (tmp_path / "lens.json").write_text(json.dumps({"fx": 600, "fy": 600, "cx": 320, "cy": 240}))
+    found = read_image_folder(tmp_path, tmp_path, reading=READING)
+    assert len(found) == 4 and any("lens.json" in n for n in found.poses.notes)
+
+
 def test_a_list_of_pairs_decides_and_is_checked(tmp_path):
     images = make_images(tmp_path / "i", [f"{k}.png" for k in range(6)])
     (tmp_path / "p").mkdir()

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from realsim.arrays import Array, UInt8
+from realsim.arrays import Array, Mask, UInt8
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import Chessboard
 from realsim_calibration.detect.edges import bilinear
@@ -67,6 +67,9 @@ def find_chessboard(
         intrinsics,
     )
     faults = tuple(f"corner {k}: {f}" for k, f in enumerate(found.faults) if f)
+    lost = _lost_line(found.good.reshape(grid.shape[:2]))
+    if lost:
+        return _nothing(gray, lost, *faults[:3])
     if found.good.mean() < config.min_share:
         share = f"{int(found.good.sum())} of {len(r)} corners could be measured"
         return _nothing(gray, share, *faults[:3])
@@ -77,6 +80,19 @@ def find_chessboard(
         image_size=size_of(gray),
         rejected=faults,
     )
+
+
+def _lost_line(good: Mask) -> str:
+    """Return what to say of an outer line without any corner; empty where there is none.
+
+    A board that is cut off fits its own size when a line of corners is made up on the other side,
+    and then every corner has a wrong number.
+    """
+    for name, line in (("first row", good[0]), ("last row", good[-1]),
+                       ("first column", good[:, 0]), ("last column", good[:, -1])):  # fmt: skip
+        if not line.any():
+            return f"no corner of the {name} could be measured: is the board cut off or covered?"
+    return ""
 
 
 def _nothing(gray: UInt8, *reasons: str) -> TargetDetection:

@@ -160,16 +160,20 @@ def inverted(p: Poses, config: DiagnosisConfig) -> Hypothesis:
         places = (
             f"the camera stands {_mm(x, h)} from the base and the board {_mm(z, h)} from the tool"
         )
+    mode = "eye_to_hand" if p.eye_in_hand else "eye_in_hand"
+    flag = "give --eye-to-hand" if p.eye_in_hand else "leave --eye-to-hand out"
+    remedy = "add ',inverted' to --reading, as in --reading rotvec,m,inverted (Python: T_base_ee)"
+    other_remedy = f"{flag} (Python: mode='{mode}')"
     # What is in the hand is nearer to it than what stands in the base.
     if (x > z) == p.eye_in_hand:
         likely, other_way = other_way, likely
+        remedy, other_remedy = other_remedy, remedy
     return Hypothesis(
         fault="robot_inverted", name=h.name, fit=h.fit, score=h.score, T=h.T, C=h.C, rows=h.rows,
         sentence="The hand poses are inverted: hand and camera agree when every hand pose is "
         f"inverted. Either {likely}, or {other_way}: poses alone cannot tell the two apart. "
         f"With them inverted {places}, which speaks for the first.",
-        advice="Say which it is: give T_base_ee, which maps points of the tool into the base, or "
-        "choose the other place of the camera (eye in hand or eye to hand).",
+        advice=f"Say which it is. For the first: {remedy}. For the second: {other_remedy}.",
         note="the hand poses were inverted.",
     )  # fmt: skip
 

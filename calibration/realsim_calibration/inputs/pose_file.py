@@ -28,6 +28,10 @@ MAX_LISTING_BYTES = 2**20
 MAX_FOLDER_FILES = 20_000
 """Files of one pose each in a folder."""
 _TREES = (".json", ".yaml", ".yml")
+_CAMERA = re.compile(
+    rb"\b(fx|camera_?matrix|intrinsics?|dist(ortion)?_?coeff\w*|distortion_model)\b", re.IGNORECASE
+)
+"""Keys of a file of intrinsics."""
 
 
 def read_pose_file(path: Path | str, *, key: str | None = None) -> RawPoses:
@@ -200,6 +204,8 @@ def _pose_files(folder: Path) -> tuple[list[Path], str]:
     ]
     if len(files) > MAX_FOLDER_FILES:
         raise InputError(f"{folder} holds {len(files)} files; at most {MAX_FOLDER_FILES} are read.")
+    cameras = [p for p in files if _is_camera(p)]
+    files = [p for p in files if p not in cameras] or files
     kinds: dict[tuple[str, str], list[Path]] = {}
     for p in files:
         kinds.setdefault((re.sub(r"\d+", "#", p.stem), p.suffix.lower()), []).append(p)
@@ -213,7 +219,17 @@ def _pose_files(folder: Path) -> tuple[list[Path], str]:
     chosen = series[0] if series else files
     left = sorted(p.name for p in files if p not in chosen)
     note = f"Not read, as their names are unlike the others: {', '.join(left[:8])}." if left else ""
-    return sorted(chosen, key=lambda p: natural_key(p.name)), note
+    if cameras and cameras != files:
+        note += f" Not read, as a camera: {', '.join(p.name for p in cameras[:8])}."
+    return sorted(chosen, key=lambda p: natural_key(p.name)), note.strip()
+
+
+def _is_camera(path: Path) -> bool:
+    """Return whether a file holds a camera's intrinsics, by its keys: no pose has a focal length."""
+    if path.suffix.lower() not in _TREES or path.stat().st_size > MAX_LISTING_BYTES:
+        return False
+    data = path.read_bytes()
+    return b"pose" not in data.lower() and _CAMERA.search(data) is not None
 
 
 def _combined(path: Path, files: Sequence[Path], names: Sequence[str], key: str | None) -> RawPoses:

@@ -4,23 +4,23 @@ Nothing is guessed in silence: how images and poses were paired, and how the pos
 said; where the file leaves several readings open, the images decide, or nothing is calibrated.
 """
 
-import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from realsim.app.calibrate.board_views import arm_of
+from realsim.app.calibrate.images import find_in_images, require_one_size, require_target
 from realsim.app.console import Console
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Target
 from realsim.robots.arm import find_arm
-from realsim.store.atomic import write_json, write_text
+from realsim.store.atomic import write_text
 from realsim_calibration import (
     BoardView,
     Calibration,
@@ -31,7 +31,6 @@ from realsim_calibration import (
     calibrate_intrinsics,
     diagnose,
     estimate_board_pose,
-    find_target,
     prove_reading,
 )
 
@@ -83,6 +82,20 @@ def made_of(images: Path) -> str:
     return json.dumps({"images": str(images.resolve())})
 
 
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FolderViews:
+    """What a folder holds, read and proven."""
+
+    images: tuple[Path, ...]
+    views: list[BoardView]
+    """One for each image."""
+    target: Target
+    camera: CameraIntrinsics | None
+    """The camera that was given."""
+    arm: DhArm | None
+    """The arm that was named, or that joints and poses prove."""
+
+
 def calibrate_folder(request: FolderRequest, console: Console) -> tuple[Calibration, list[Path]]:
     """Return the calibration of a folder and the files that were written.
 
@@ -95,6 +108,20 @@ def calibrate_folder(request: FolderRequest, console: Console) -> tuple[Calibrat
     config = replace(config, hand_eye=replace(config.hand_eye, mode=request.mode))
     if request.board_poses is not None:
         return _from_pose_files(request, config, console)
+    found = read_views(request, console)
+    with console.stage("calibrate", f"{len(found.views)} views"):
+        result = calibrate(
+            found.views, found.target, intrinsics0=found.camera, arm=found.arm, config=config
+        )
+    return result, write_calibration(result, request, found.images, console)
+
+
+def read_views(request: FolderRequest, console: Console) -> FolderViews:
+    """Return the views of a folder of images: paired, found, their poses read.
+
+    Raises:
+        InputError: something cannot be read, paired or proven; says what to give.
+    """
     from realsim_calibration.inputs import read_image_folder, reading_from_text
 
     target = target_of(request.board)
@@ -107,9 +134,10 @@ def calibrate_folder(request: FolderRequest, console: Console) -> tuple[Calibrat
         console.warn(note)
     for name, reason in (*folder.unpaired_images, *folder.unpaired_poses):
         console.warn(f"{name} was left out: {reason}")
-    detections = _detections(folder.images, target, request.out, console)
+    detections = find_in_images(folder.images, target, request.out, console)
     require_target(folder, detections, target)
     camera = _camera_of(request.camera)
+    require_one_size(folder.labels, detections, camera, request.camera)
     reading = reading or _stated_or_proven(folder, detections, target, camera, request, console)
     Ts, joints = folder.Ts_base_ee(reading), folder.joints
     views = [
@@ -119,10 +147,10 @@ def calibrate_folder(request: FolderRequest, console: Console) -> tuple[Calibrat
         )
         for k, found in enumerate(detections)
     ]  # fmt: skip
-    arm = _arm(request.arm, views, console)
-    with console.stage("calibrate", f"{len(views)} views"):
-        result = calibrate(views, target, intrinsics0=camera, arm=arm, config=config)
-    return result, write_calibration(result, request, folder.images, console)
+    return FolderViews(
+        images=folder.images, views=views, target=target, camera=camera,
+        arm=_arm(request.arm, views, console),
+    )  # fmt: skip
 
 
 def target_of(text: str) -> Target:
@@ -147,69 +175,6 @@ def _camera_of(path: Path | None) -> CameraIntrinsics | None:
     from realsim_calibration.lens.camera_files import read_camera
 
     return None if path is None else read_camera(path)
-
-
-def _detections(
-    images: Sequence[Path], target: Target, out: Path, console: Console
-) -> list[TargetDetection]:
-    """Return the points found in every image; what was found before is not looked for again."""
-    from realsim_calibration.inputs import load_image
-    from realsim_calibration.targets.target_text import format_target
-
-    found: list[TargetDetection] = []
-    with console.stage("find the target", f"{len(images)} images") as tick:
-        for k, path in enumerate(images):
-            key = hashlib.sha256(path.read_bytes() + format_target(target).encode()).hexdigest()
-            note = out / "detections" / f"{key[:24]}.json"
-            seen = _noted(note)
-            if seen is None:
-                seen = find_target(load_image(path), target)
-                write_json(note, _detection_json(seen))
-            found.append(seen)
-            tick(k + 1, len(images))
-    return found
-
-
-def _detection_json(found: TargetDetection) -> dict[str, Any]:
-    return {
-        "point_ids": found.point_ids.tolist(),
-        "uv": found.uv.tolist(),
-        "image_size": list(found.image_size),
-        "sd_px": None if found.sd_px is None else found.sd_px.tolist(),
-        "rejected": list(found.rejected),
-    }
-
-
-def _noted(path: Path) -> TargetDetection | None:
-    """Return a detection noted earlier; a damaged note is no note."""
-    try:
-        d = json.loads(path.read_text())
-        return TargetDetection(
-            point_ids=np.array(d["point_ids"], dtype=np.int64),
-            uv=np.array(d["uv"], dtype=np.float64),
-            image_size=(int(d["image_size"][0]), int(d["image_size"][1])),
-            sd_px=None if d["sd_px"] is None else np.array(d["sd_px"], dtype=np.float64),
-            rejected=tuple(d["rejected"]),
-        )
-    except (OSError, ValueError, KeyError, TypeError, InputError):
-        return None
-
-
-def require_target(
-    folder: "FolderInput", detections: Sequence[TargetDetection], target: Target
-) -> None:
-    """Raise if the target was found nowhere, saying what the pictures show instead."""
-    if any(len(d) for d in detections):
-        return
-    from realsim_calibration.detect.visible import what_is_visible
-    from realsim_calibration.inputs import load_image
-    from realsim_calibration.targets.target_text import format_target
-
-    shown = what_is_visible(load_image(folder.images[0]))
-    raise InputError(
-        f"the target '{format_target(target)}' was found in none of the {len(detections)} images. "
-        f"{folder.labels[0]} shows {shown}. Give --board as it was printed."
-    )
 
 
 def _stated_or_proven(

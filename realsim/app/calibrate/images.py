@@ -1,0 +1,121 @@
+"""The target in the images of a folder: found once and noted, and refused where it is nowhere."""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from realsim.app.console import Console
+from realsim.errors import InputError
+from realsim.records import CameraIntrinsics, Target
+from realsim.store.atomic import write_json
+from realsim_calibration import TargetDetection, find_target
+
+if TYPE_CHECKING:
+    from realsim_calibration.inputs import FolderInput
+
+
+def find_in_images(
+    images: Sequence[Path], target: Target, out: Path, console: Console
+) -> list[TargetDetection]:
+    """Return the points found in every image; what was found before is not looked for again."""
+    from realsim_calibration.inputs import load_image
+    from realsim_calibration.targets.target_text import format_target
+
+    found: list[TargetDetection] = []
+    with console.stage("find the target", f"{len(images)} images") as tick:
+        for k, path in enumerate(images):
+            key = hashlib.sha256(path.read_bytes() + format_target(target).encode()).hexdigest()
+            note = out / "detections" / f"{key[:24]}.json"
+            seen = _noted(note)
+            if seen is None:
+                seen = find_target(load_image(path), target)
+                write_json(note, _detection_json(seen))
+            found.append(seen)
+            tick(k + 1, len(images))
+    return found
+
+
+def _detection_json(found: TargetDetection) -> dict[str, Any]:
+    return {
+        "point_ids": found.point_ids.tolist(),
+        "uv": found.uv.tolist(),
+        "image_size": list(found.image_size),
+        "sd_px": None if found.sd_px is None else found.sd_px.tolist(),
+        "rejected": list(found.rejected),
+    }
+
+
+def _noted(path: Path) -> TargetDetection | None:
+    """Return a detection noted earlier; a damaged note is no note."""
+    try:
+        d = json.loads(path.read_text())
+        return TargetDetection(
+            point_ids=np.array(d["point_ids"], dtype=np.int64),
+            uv=np.array(d["uv"], dtype=np.float64),
+            image_size=(int(d["image_size"][0]), int(d["image_size"][1])),
+            sd_px=None if d["sd_px"] is None else np.array(d["sd_px"], dtype=np.float64),
+            rejected=tuple(d["rejected"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError, InputError):
+        return None
+
+
+def require_target(
+    folder: "FolderInput", detections: Sequence[TargetDetection], target: Target
+) -> None:
+    """Raise if the target was found nowhere, saying what the pictures show instead."""
+    if any(len(d) for d in detections):
+        return
+    from realsim_calibration.detect.visible import what_is_visible
+    from realsim_calibration.inputs import load_image
+    from realsim_calibration.targets.target_text import format_target
+
+    shown = what_is_visible(load_image(folder.images[0]))
+    raise InputError(
+        f"the target '{format_target(target)}' was found in none of the {len(detections)} images. "
+        f"{folder.labels[0]} shows {shown}. Give --board as it was printed."
+    )
+
+
+def require_one_size(
+    labels: Sequence[str],
+    detections: Sequence[TargetDetection],
+    camera: CameraIntrinsics | None,
+    file: Path | None,
+) -> None:
+    """Raise unless all images have one size, and the given camera the same.
+
+    It is asked before the poses are looked at: a lens of another size spoils every board pose, and
+    the poses would be blamed.
+
+    Raises:
+        InputError: several sizes; says which, and by how much the intrinsics are to be scaled.
+    """
+    sizes = Counter(d.image_size for d in detections)
+    (w, h), _ = sizes.most_common(1)[0]
+    if len(sizes) > 1:
+        odd = [n for n, d in zip(labels, detections, strict=True) if d.image_size != (w, h)]
+        shown = ", ".join(f"{n} of {a}x{b} px" for (a, b), n in sizes.most_common())
+        raise InputError(
+            f"the images have several sizes: {shown}. One lens belongs to one size: take these "
+            f"out: {', '.join(odd[:8])}{' ...' if len(odd) > 8 else ''}."
+        )
+    if camera is None or (camera.width, camera.height) == (w, h):
+        return
+    same_shape = camera.width * h == camera.height * w
+    scale = (
+        f"if the images were only resized: fx and fy times s = {w / camera.width:.4g}, cx and cy "
+        "as (c + 0.5) * s - 0.5"
+        if same_shape
+        else "their shapes differ: a crop or another mode of the sensor"
+    )
+    raise InputError(
+        f"--camera {file} is for images of {camera.width}x{camera.height} px, and these are "
+        f"{w}x{h}. Give the intrinsics of this size ({scale}), or leave --camera out: the lens is "
+        "then calibrated from these images."
+    )

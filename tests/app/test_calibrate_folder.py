@@ -1,0 +1,92 @@
+"""`realsim calibrate` on plain folders: what is found is named, with the exact thing to do."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from pictured_folders import X, pictures, save_pictures
+from realsim.app.calibrate.folder import FolderRequest, read_views
+from realsim.app.console import Console
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim_calibration import calibrate
+
+BOARD = "chessboard:7x6,square=20mm"
+
+
+@pytest.fixture(scope="module")
+def found_before(tmp_path_factory):
+    """Return a folder of results in which the ten pictures have been searched."""
+    folder = tmp_path_factory.mktemp("searched")
+    images = folder / "i"
+    shots, hands = pictures()
+    save_pictures(images, shots)
+    write_matrices(images / "poses.json", hands)
+    read_views(request(images, folder / "out"), Console(quiet=True))
+    return folder / "out"
+
+
+def request(images, out, **more):
+    return FolderRequest(images=images, out=out, **{"board": BOARD} | more)
+
+
+def write_matrices(path, Ts):
+    path.write_text(json.dumps({"poses": np.asarray(Ts).tolist()}))
+
+
+@pytest.fixture
+def lab(tmp_path, found_before):
+    """Return a folder with ten pictures and their poses; its pictures are searched already."""
+    shots, hands = pictures()
+    save_pictures(tmp_path / "lab", shots)
+    write_matrices(tmp_path / "lab" / "poses.json", hands)
+    shutil.copytree(found_before, tmp_path / "out")
+    return tmp_path / "lab"
+
+
+def read(lab, **more):
+    return read_views(request(lab, lab.parent / "out", **more), Console(quiet=True))
+
+
+def test_a_camera_of_another_size_is_named_before_the_poses(lab):
+    camera = {"fx": 300, "fy": 300, "cx": 160, "cy": 120, "width": 320, "height": 240}
+    (lab / "camera.json").write_text(json.dumps({**camera, "distortion": []}))
+    # rotation vectors would have to be proven by the images, with the wrong lens
+    (lab / "poses.json").unlink()
+    _, hands = pictures()
+    rows = np.hstack([hands[:, :3, 3], se3.log_so3(hands[:, :3, :3])])
+    np.savetxt(lab / "poses.txt", rows)
+    with pytest.raises(InputError, match=r"for images of 320x240 px, and these are 640x480") as e:
+        read(lab, camera=lab / "camera.json")
+    assert "s = 2," in str(e.value) and "leave --camera out" in str(e.value)
+    assert len(read(lab).views) == 10
+
+
+def test_images_of_several_sizes_are_named(lab):
+    shots, _ = pictures()
+    save_pictures(lab, [shots[3][:400]], "03.png")
+    with pytest.raises(InputError, match="640x480 px, 1|of 640x480 px") as e:
+        read(lab)
+    assert "take these out: 03.png" in str(e.value).replace("\n", " ")
+
+
+def test_nothing_is_said_of_a_given_camera_where_none_was_given(lab):
+    found = read(lab)
+    result = calibrate(found.views, found.target)
+    assert np.abs(se3.log(se3.invert(X) @ result.hand_eye.X)[3:]).max() < 2e-3
+    names = [c.name for c in result.checks]
+    assert "given camera" not in names and "focal length with poses" in names
+    assert not any("given camera" in c.sentence for c in result.checks)
+    given = calibrate(found.views, found.target, intrinsics0=result.hand_eye.intrinsics)
+    assert "given camera" in [c.name for c in given.checks]
+
+
+def test_a_fixed_camera_is_told_by_its_flag(lab):
+    _, hands = pictures()
+    write_matrices(lab / "poses.json", se3.invert(hands))
+    found = read(lab)
+    with pytest.raises(InputError, match=r"inverted") as e:
+        calibrate(found.views, found.target)
+    assert "--eye-to-hand" in str(e.value) and "--reading" in str(e.value)
