@@ -51,6 +51,9 @@ class FitConfig:
     good, and 120 miss all of them once in 10^7 times."""
     group: int = 5
     """Views that start the translations: 15 equations for 7 unknowns."""
+    width_share: float = 0.5
+    """The width of the refinement's weights follows the error of this share of the views: the
+    median, unless as many as half of the views may be wrong."""
     steps: int = 12
     """Gauss-Newton steps: the start is near, six are usual."""
     seed: int = 0
@@ -288,7 +291,7 @@ def _weighted(
     J, r = linearise(A, Rc, q, *frames)
     unit = np.array([np.radians(config.unit_deg)] * 3 + [s * distance * config.unit_part] * 3)
     errors = np.linalg.norm(r / unit, axis=-1)
-    width = config.agree * max(float(np.median(errors)), 1.0)
+    width = config.agree * max(float(np.quantile(errors, config.width_share)), 1.0)
     root = (1.0 / (1.0 + (errors / width) ** 2))[:, None]
     column = np.array([1.0] * 6 + [s * distance] * 6 + [s])
     J = (J / unit[:, None] * root[..., None]).reshape(-1, 13) * column
