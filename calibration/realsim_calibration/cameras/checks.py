@@ -1,0 +1,96 @@
+"""What a person should know of several cameras calibrated together."""
+
+import numpy as np
+
+from realsim.records import Check
+from realsim_calibration.cameras.results import CamerasReport
+
+TOGETHER_MM = (2.0, 6.0)
+"""Board's middle seen by two cameras at once: as the held-out limits of one camera."""
+FEW_VIEWS = (4, 1)
+"""Views of a camera: its place then rests on few of them."""
+NAMED = 4
+
+
+def rig_checks(report: CamerasReport) -> tuple[Check, ...]:
+    """Return the checks of the cameras together."""
+    return (*_few_views(report), *_pairs(report), *_arm(report), *_odd(report), *_base(report))
+
+
+def _few_views(r: CamerasReport) -> list[Check]:
+    found: list[Check] = []
+    for camera, own in zip(r.rig.cameras, r.cameras, strict=True):
+        used = sum(v.used for v in r.views if v.camera == camera.name)
+        if used < FEW_VIEWS[0]:
+            found.append(
+                Check(
+                    name="few views", verdict="warn", value=used,
+                    sentence=f"camera '{camera.name}' is placed by {used} "
+                    f"view{'s' * (used != 1)} only (1 sigma {own.sigma_mm:.2f} mm).",
+                    advice="Let it see the board at more instants.",
+                )
+            )  # fmt: skip
+    return found
+
+
+def _pairs(r: CamerasReport) -> list[Check]:
+    found: list[Check] = []
+    for pair in r.pairs:
+        if not np.isfinite(pair.apart_mm) or pair.apart_mm <= TOGETHER_MM[0]:
+            continue
+        bad = pair.apart_mm > TOGETHER_MM[1]
+        found.append(
+            Check(
+                name="pair", verdict="bad" if bad else "warn", value=pair.apart_mm, unit="mm",
+                sentence=f"cameras '{pair.names[0]}' and '{pair.names[1]}' see the board "
+                f"{pair.apart_mm:.2f} mm apart (RMS of {pair.together} instants; worst: "
+                f"{pair.worst}).",
+                advice="Are their images of the same moment? Look at the instant named.",
+            )
+        )  # fmt: skip
+    return found
+
+
+def _arm(r: CamerasReport) -> list[Check]:
+    if not r.bad_arm:
+        return []
+    names = ", ".join(r.bad_arm[:NAMED])
+    more = f" and {len(r.bad_arm) - NAMED} more" if len(r.bad_arm) > NAMED else ""
+    return [
+        Check(
+            name="arm poses", verdict="warn", value=len(r.bad_arm),
+            sentence=f"all cameras contradict the arm's pose at {names}{more}; there the cameras "
+            "alone were used.",
+            advice="Was the arm still moving, or is it another instant's pose?",
+        )
+    ]  # fmt: skip
+
+
+def _odd(r: CamerasReport) -> list[Check]:
+    odd = r.disagreeing()
+    if not odd:
+        return []
+    names = ", ".join(f"{v.name} ({v.unseen_px:.2f} px)" for v in odd[:NAMED])
+    more = f" and {len(odd) - NAMED} more" if len(odd) > NAMED else ""
+    return [
+        Check(
+            name="views that disagree", verdict="warn", value=len(odd),
+            sentence=f"three times worse predicted than their cameras' others: {names}{more}.",
+            advice="Look at these images: a blurred one, a board that moved, an arm not at rest.",
+            views=tuple(v.instant for v in odd),
+        )
+    ]  # fmt: skip
+
+
+def _base(r: CamerasReport) -> list[Check]:
+    if r.reference == "robot base":
+        return []
+    return [
+        Check(
+            name="reference", verdict="warn",
+            sentence=f"no arm ties the cameras to a robot: all places are in camera "
+            f"'{r.reference}'.",
+            advice="Let the arm carry a board before them (--held-board), or add a camera in the "
+            "hand, if the robot's base is wanted.",
+        )
+    ]  # fmt: skip

@@ -1,0 +1,350 @@
+"""From a start to the calibration of a rig: the steps of `fit.robust_fit` for several cameras.
+
+1. joint fit without robot errors, then with them at lambda = 0.3; every camera's own sigma and
+   corner weights
+2. candidates for the robot's smooth error, judged by predicting every instant without it
+3. joint fit with the chosen one, lambda re-estimated; covariance of all cameras from noise and from
+   what the arm may still hide, which moves all of them at once
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from realsim.arrays import Array
+from realsim.geometry import se3
+from realsim.geometry.dh import DhArm
+from realsim.records import ArmErrorMap, RobotErrorMap
+from realsim_calibration.cameras.problem import RigModel, RigProblem, RigState
+from realsim_calibration.fit.board_pose import refine_board_pose
+from realsim_calibration.fit.joint_solve import (
+    JointProblem,
+    JointState,
+    Setup,
+    ViewCorners,
+    smooth_errors,
+)
+from realsim_calibration.fit.linear_model import LinearFit
+from realsim_calibration.fit.noise_scale import (
+    NoiseConfig,
+    Whiteness,
+    estimate_arm,
+    estimate_ratio,
+    largest_ratio,
+    whiteness,
+)
+from realsim_calibration.fit.robot_error import ErrorBasis, arm_basis, map_record
+from realsim_calibration.fit.robust_fit import (
+    Choice,
+    chosen_of,
+    hidden_errors,
+    map_choices,
+    with_arm,
+)
+from realsim_calibration.fit.view_system import camera_record
+from realsim_calibration.screening import HandEyeConfig
+
+LEAST_SHARE = 0.25
+"""A Gauss-Newton step that is still no gain when cut to this share is none: the fit has ended."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class RigSolution:
+    """The calibration of a rig."""
+
+    problem: RigProblem
+    state: RigState
+    sigmas: Array
+    """(C,) 1-sigma of a corner's coordinate of every camera [px]."""
+    ratio: Array
+    fit: LinearFit
+    model: RigModel
+    covariance: Array
+    """(S, S) of all shared unknowns."""
+    information: Array
+    """(S, S), the robot's map held."""
+    alone: RigState
+    """The fit without a map of the robot's error."""
+    alone_covariance: Array
+    basis: ErrorBasis | None
+    robot_map: RobotErrorMap | ArmErrorMap | None
+    scores: tuple[tuple[str, float], ...]
+    joint_offsets: Array | None
+    independent: bool
+
+
+def solve_rig(
+    problem: RigProblem, start: RigState, config: HandEyeConfig, arm: DhArm | None,
+    joints: Array | None,
+) -> RigSolution:  # fmt: skip
+    """Return the calibration from a start.
+
+    Args:
+        problem: the rig.
+        start: where the fit begins.
+        config: priors, noise, maps.
+        arm: the arm's kinematics.
+        joints: (I, n) joint angles [rad] of all instants; None where some have none.
+
+    Raises:
+        DegenerateError: the views do not determine the parameters.
+    """
+    noise, bound = config.noise, np.full(2, config.noise.bound)
+    sigmas = np.full(len(problem.rig.cameras), config.joint.start_sigma_px)
+    state = optimize(problem, start, None, np.zeros(2), sigmas, problem.ones(), config)
+    sigmas, roots = spread(problem, state, sigmas, config)
+    for _ in range(config.joint.rounds):
+        state = optimize(problem, state, None, bound, sigmas, roots, config)
+        sigmas, roots = spread(problem, state, sigmas, config)
+    model = RigModel(problem, state, sigmas, roots)
+    whites = _whiteness(problem, state, noise)
+    most = min(largest_ratio(w, noise) for w in whites)
+    ratio = estimate_ratio(model, None, 1.0, most, noise)
+    none = Choice(basis=None, ratio=ratio, fit=model.fit(None, ratio, 1.0))
+    choices, known = [none], None
+    Ts = state.A
+    if config.robot_map and problem.arm_used:
+        choices += map_choices(model, Ts, 1.0, np.minimum(ratio, noise.bound), config)
+        if arm is not None and joints is not None:
+            basis = arm_basis(arm, joints, Ts, config.robot)
+            arm_ratio, known = estimate_arm(model, basis, 1.0, noise, config.robot)
+            fit = model.fit(known, arm_ratio, 1.0)
+            choices.append(Choice(basis=known, ratio=arm_ratio, fit=fit))
+    best = chosen_of(choices, config.robot)
+    ratio = best.ratio
+    if best.basis is not None and best.basis.kind != "arm":
+        ratio = estimate_ratio(model, best.basis, 1.0, most, noise)
+    alone = model.moved(none.fit.step, None, none.ratio)
+    state = model.moved(best.fit.step, best.basis, ratio)
+    state = optimize(problem, state, best.basis, ratio, sigmas, roots, config)
+    sigmas, roots = spread(problem, state, sigmas, config)
+    model = RigModel(problem, state, sigmas, roots)
+    # sigma was estimated camera by camera: 1 is what remains.
+    final = model.fit(best.basis, ratio, 1.0, rounds=0)
+    none_fit = model.fit(None, none.ratio, none.fit.sigma_px, rounds=0)
+    independent = all(w.excess <= 0 for w in whites)
+    columns = None
+    if problem.arm_used:
+        columns = _hidden(model, none, known, Ts, config)
+    covariance = _covariance(problem, model, final, best, ratio, columns, known, independent)
+    alone_covariance = _covariance(
+        problem, model, none_fit, none, none.ratio, columns, known, independent
+    )
+    S = problem.size
+    return RigSolution(
+        problem=problem, state=state, sigmas=sigmas, ratio=ratio, fit=final, model=model,
+        covariance=covariance[:S, :S], information=final.information[:S, :S], alone=alone,
+        alone_covariance=alone_covariance[:S, :S], basis=best.basis,
+        robot_map=None if best.basis is None else map_record(best.basis, state.weights, Ts, arm),
+        scores=tuple((c.name, c.fit.score) for c in choices),
+        joint_offsets=_offsets(best.basis, state, covariance, S), independent=independent,
+    )  # fmt: skip
+
+
+def optimize(
+    problem: RigProblem, state: RigState, basis: ErrorBasis | None, ratio: Array, sigmas: Array,
+    roots: Sequence[Array], config: HandEyeConfig,
+) -> RigState:  # fmt: skip
+    """Return the least-squares state for fixed sigmas, lambda (2,) and corner weights.
+
+    Raises:
+        DegenerateError: the views do not determine the parameters.
+    """
+    model = RigModel(problem, state, sigmas, roots)
+    cost, share = model.cost(basis, ratio), 1.0
+    for _ in range(config.joint.max_iterations):
+        trial = model.step(basis, ratio, share)
+        moved = RigModel(problem, trial, sigmas, roots)
+        new = moved.cost(basis, ratio)
+        if not new < cost:
+            share /= 2
+            if share < LEAST_SHARE:
+                break
+            continue
+        gain = (cost - new) / max(cost, 1e-12)
+        model, cost, share = moved, new, 1.0
+        if gain < config.joint.step_tolerance:
+            break
+    return model.rig_state
+
+
+def spread(
+    problem: RigProblem, state: RigState, sigmas: Array, config: HandEyeConfig
+) -> tuple[Array, list[Array]]:
+    """Return every camera's sigma (C,) [px] and the roots of the Huber weights of all views.
+
+    An instant's own poses are fitted to its views alone: they take their share of the coordinates.
+    """
+    total, count = np.zeros(len(sigmas)), np.zeros(len(sigmas))
+    roots: list[Array] = []
+    shared = [len(c) for c in problem.camera_columns]
+    count -= shared
+    for k, r in enumerate(problem.residuals(state)):
+        view = problem.views[k]
+        c = view.camera
+        away = np.linalg.norm(r, axis=-1)
+        limit = config.joint.huber_sigmas * sigmas[c]
+        w = np.minimum(1.0, limit / np.maximum(away, 1e-12))
+        own = 6 * len(problem.loose_of(view.instant)) + 6 * (view.moved and state.errors.any())
+        total[c] += float(np.sum(w * away**2))
+        count[c] += 2 * len(r) - own / len(problem.at[view.instant])
+        roots.append(np.sqrt(w))
+    return np.sqrt(np.maximum(total, 1e-12) / np.maximum(count, 1.0)), roots
+
+
+def _whiteness(problem: RigProblem, state: RigState, config: NoiseConfig) -> list[Whiteness]:
+    """Return whether corners are independent inside the views of every camera and board.
+
+    A free pose a view is fitted, so that only lens and board matter: its pose stands for the arm's.
+    """
+    Ts = problem.poses(state)
+    groups: dict[tuple[int, int], list[int]] = {}
+    for k, view in enumerate(problem.views):
+        groups.setdefault((view.camera, view.board), []).append(k)
+    found: list[Whiteness] = []
+    for (c, b), ks in sorted(groups.items()):
+        size = ks[0]
+        image = problem.rig.sightings[size].detection.image_size
+        corners = tuple(
+            ViewCorners(index=k, T_base_ee=np.ascontiguousarray(Ts[k]),
+                        xy=problem.views[k].xy, uv=problem.views[k].uv)
+            for k in ks
+        )  # fmt: skip
+        one = JointProblem(
+            Setup(views=corners, to_hand=True, middle=problem.middles[b],
+                  half_extent=problem.halves[b],
+                  intrinsics0=camera_record(state.lens[c], image)),
+            problem.joints[c],
+        )  # fmt: skip
+        at = JointState(
+            X=np.eye(4), Z=np.eye(4), camera=state.lens[c], board=state.shape[b],
+            weights=np.zeros(0), errors=np.zeros((len(ks), 6)),
+        )  # fmt: skip
+        white = whiteness(one, at, config)
+        if np.isfinite(white.ratio):
+            found.append(white)
+    return found or [Whiteness(ratio=float("nan"), sd=float("nan"))]
+
+
+def _hidden(
+    model: RigModel, none: Choice, known: ErrorBasis | None, Ts: Array, config: HandEyeConfig
+) -> Array:
+    """Return errors (I, 6, q) that the arm may have, per standard deviation.
+
+    Beside those of one camera, where no joints are known: an error that is the same in all poses
+    in the axes of the base (about the middle of the hand's places), as large as the one in the
+    axes of the tool. It looks like other places of all fixed cameras, and of the table, at once.
+    """
+    columns = hidden_errors(model, none, known, Ts, 1.0, config.robot.hidden_factor)
+    if known is not None:
+        return columns
+    middle = se3.from_translation(Ts[:, :3, 3].mean(0))
+    base = np.stack([se3.adjoint(se3.invert(T) @ middle) for T in Ts]) @ columns[0, :, :6]
+    return np.concatenate([columns, base], -1)
+
+
+def _covariance(
+    problem: RigProblem, model: RigModel, fit: LinearFit, choice: Choice, ratio: Array,
+    columns: Array | None, known: ErrorBasis | None, independent: bool,
+) -> Array:  # fmt: skip
+    """Return the covariance of all parameters of a fit, as `fit.robust_fit` puts it together."""
+    marginal = np.asarray(np.linalg.inv(fit.information), dtype=np.float64)
+    covariance = marginal
+    if not independent:
+        n = len(fit.away)
+        data = np.einsum("nrc,nrd->cd", fit.view_rows, fit.view_rows, optimize=True)
+        prior = fit.information - data
+        jackknife = (n - 1) / n * fit.away.T @ fit.away + marginal @ prior @ marginal
+        places = np.concatenate([c[:6] for c in problem.camera_columns if problem.free[c[0]]])
+        at = np.ix_(places, places)
+        kappa = float(np.trace(np.linalg.solve(marginal[at], jackknife[at])) / len(places))
+        covariance = (jackknife + max(kappa, 1.0) * marginal) / 2
+        covariance = (covariance + covariance.T) / 2
+    modelled = known is not None and choice.basis is known
+    if columns is None or modelled:
+        return covariance
+    return with_arm(covariance, model.influence(fit, ratio, columns))
+
+
+def _offsets(
+    basis: ErrorBasis | None, state: RigState, covariance: Array, shared: int
+) -> Array | None:
+    """Return the joint zero offsets and their 1-sigma (n, 2) [rad] of an arm's fit."""
+    if basis is None or basis.kind != "arm":
+        return None
+    n = len(basis.unit) // 4
+    sd = np.sqrt(np.diag(covariance)[shared : shared + n])
+    return np.stack([state.weights[:n] * basis.unit[:n], sd * basis.unit[:n]], -1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class UnseenView:
+    """One view's part; the fields are those of `results.SightingReport`."""
+
+    residuals: Array
+    seen_px: float
+    unseen_px: float
+    unseen_mm: float
+    unseen_deg: float
+    T_cam_board: Array
+
+
+def unseen_views(solution: RigSolution) -> list[UnseenView]:
+    """Return every view's part, seen and as predicted by the fit without its instant.
+
+    Both go through the robot's pose and its map; a board moved by hand is placed by the instant's
+    own views, all of them.
+    """
+    problem, state, basis = solution.problem, solution.state, solution.basis
+    smooth = smooth_errors(basis, state.weights, len(problem.at))
+    seen = problem.residuals(_settled(problem, state, smooth, solution.sigmas))
+    found: dict[int, UnseenView] = {}
+    S = problem.size
+    for i, views in enumerate(problem.at):
+        away = solution.fit.away[i]
+        errors = smooth if basis is None else smooth + basis.columns @ away[S:]
+        moved = _settled(problem, problem.stepped(state, away), errors, solution.sigmas, only=i)
+        unseen = problem.residuals(moved, views)
+        for k, r, expected in zip(views, unseen, problem.poses(moved, views), strict=True):
+            view = problem.views[k]
+            points = problem.shaped_points(moved.shape[view.board], view.board, view.xy)
+            alone, _ = refine_board_pose(expected, points, view.uv, moved.lens[view.camera])
+            middle = problem.middles[view.board][None]
+            apart = se3.transform(alone, middle) - se3.transform(expected, middle)
+            found[k] = UnseenView(
+                residuals=seen[k],
+                seen_px=_rms(seen[k]),
+                unseen_px=_rms(r),
+                unseen_mm=1e3 * float(np.linalg.norm(apart)),
+                unseen_deg=float(np.degrees(se3.angle(se3.invert(expected) @ alone))),
+                T_cam_board=alone,
+            )
+    return [found[k] for k in range(len(problem.views))]
+
+
+def _rms(r: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(r**2, -1))))
+
+
+def _settled(
+    problem: RigProblem, state: RigState, errors: Array, sigmas: Array, only: int | None = None
+) -> RigState:
+    """Return the state with these robot errors, what instants have for themselves fitted anew."""
+    state = replace(state, errors=errors)
+    wanted = [i for i in range(len(problem.at)) if problem.loose_of(i) and only in {None, i}]
+    if not wanted:
+        return state
+    A, loose = state.A.copy(), dict(state.loose)
+    for i in wanted:
+        for _ in range(2):
+            state = replace(state, A=A, loose=loose)
+            blocks = problem.view_blocks(state, sigmas, problem.ones(), problem.at[i])
+            F, M = problem.instant_rows(i, blocks)
+            moves = -np.linalg.lstsq(F, M[:, -1], rcond=None)[0]
+            for (b, _), xi in zip(problem.loose_of(i), moves.reshape(-1, 6), strict=True):
+                if b < 0:
+                    A[i] = A[i] @ se3.exp(xi)
+                else:
+                    loose[b, i] = loose[b, i] @ se3.exp(xi)
+    return replace(state, A=A, loose=loose)
