@@ -67,7 +67,7 @@ def test_a_camera_of_another_size_is_named_before_the_poses(lab):
 def test_images_of_several_sizes_are_named(lab):
     shots, _ = pictures()
     save_pictures(lab, [shots[3][:400]], "03.png")
-    with pytest.raises(InputError, match="640x480 px, 1|of 640x480 px") as e:
+    with pytest.raises(InputError, match="of 640x480 px") as e:
         read(lab)
     assert "take these out: 03.png" in str(e.value).replace("\n", " ")
 

@@ -42,8 +42,13 @@ def test_a_sharp_picture_without_the_board_is_not_called_blurred():
     assert np.isnan(edge_blur_px(np.full((100, 100), 90, np.uint8)))
 
 
-def test_a_board_that_is_cut_off_is_not_counted_from_a_line_that_is_not_there():
-    board, rng = TARGETS["chessboard"], np.random.default_rng(0)
-    T = pose(board, rng.uniform(8, 40), 0.0, rng.uniform(-80, 80), rng.uniform(0.3, 0.4))
-    found = find_target(picture(board, T, rng, noise=2.0), board)
-    assert len(found) == 0 and "of the first row could be measured" in found.rejected[0]
+@pytest.mark.parametrize(("seed", "view"), [(0, 0), (0, 3), (1, 2)])
+def test_a_line_made_up_in_the_margin_does_not_shift_the_numbers(seed, view):
+    # OpenCV's newer search misses a line of these boards, or makes one up.
+    board, rng = TARGETS["chessboard"], np.random.default_rng(seed)
+    for k in range(view + 1):
+        T = pose(board, rng.uniform(8, 40), 36.0 * k, rng.uniform(-80, 80), rng.uniform(0.3, 0.4))
+        image = picture(board, T, rng, noise=2.0)
+    found = find_target(image, board)
+    assert len(found) == len(board.points_board)
+    assert np.abs(found.uv - truth(board, T)[found.point_ids]).max() < 0.3

@@ -9,7 +9,12 @@ from realsim.records import CameraIntrinsics
 from realsim.records.targets import Chessboard
 from realsim_calibration.detect.edges import bilinear
 from realsim_calibration.detect.images import gray_image, size_of
-from realsim_calibration.detect.saddles import SaddleConfig, grid_arms, refine_saddles
+from realsim_calibration.detect.saddles import (
+    SaddleConfig,
+    Saddles,
+    grid_arms,
+    refine_saddles,
+)
 from realsim_calibration.views import TargetDetection
 
 MIN_PART = (3, 3)
@@ -55,23 +60,17 @@ def find_chessboard(
     grid, fault = _whole(gray, board, config)
     if grid is None:
         return _nothing(gray, fault)
-    grid, dark = number_corners(gray, grid)
-    r, c = np.divmod(np.arange(grid.shape[0] * grid.shape[1]), grid.shape[1])
-    found = refine_saddles(
-        gray,
-        grid.reshape(-1, 2),
-        grid_arms(grid).reshape(-1, 4, 2),
-        ((r + c) % 2 == 0) == dark,
-        1.0,
-        config.saddles,
-        intrinsics,
-    )
-    faults = tuple(f"corner {k}: {f}" for k, f in enumerate(found.faults) if f)
+    found = _measured(gray, grid, config, intrinsics)
     lost = _lost_line(found.good.reshape(grid.shape[:2]))
+    exact = _classic(gray, board) if lost else None
+    if exact is not None:
+        found = _measured(gray, exact, config, intrinsics)
+        lost = _lost_line(found.good.reshape(exact.shape[:2]))
+    faults = tuple(f"corner {k}: {f}" for k, f in enumerate(found.faults) if f)
     if lost:
         return _nothing(gray, lost, *faults[:3])
     if found.good.mean() < config.min_share:
-        share = f"{int(found.good.sum())} of {len(r)} corners could be measured"
+        share = f"{int(found.good.sum())} of {len(found.good)} corners could be measured"
         return _nothing(gray, share, *faults[:3])
     return TargetDetection(
         point_ids=np.flatnonzero(found.good),
@@ -82,11 +81,28 @@ def find_chessboard(
     )
 
 
+def _measured(
+    gray: UInt8, grid: Array, config: ChessboardConfig, intrinsics: CameraIntrinsics | None
+) -> Saddles:
+    """Return the corners of a grid, numbered and measured."""
+    grid, dark = number_corners(gray, grid)
+    r, c = np.divmod(np.arange(grid.shape[0] * grid.shape[1]), grid.shape[1])
+    return refine_saddles(
+        gray,
+        grid.reshape(-1, 2),
+        grid_arms(grid).reshape(-1, 4, 2),
+        ((r + c) % 2 == 0) == dark,
+        1.0,
+        config.saddles,
+        intrinsics,
+    )
+
+
 def _lost_line(good: Mask) -> str:
     """Return what to say of an outer line without any corner; empty where there is none.
 
-    A board that is cut off fits its own size when a line of corners is made up on the other side,
-    and then every corner has a wrong number.
+    OpenCV's newer search may miss a line and make one up on the other side, in the margin: then
+    every corner has a wrong number.
     """
     for name, line in (("first row", good[0]), ("last row", good[-1]),
                        ("first column", good[:, 0]), ("last column", good[:, -1])):  # fmt: skip
@@ -108,6 +124,8 @@ def _whole(gray: UInt8, board: Chessboard, config: ChessboardConfig) -> tuple[Ar
     """Return the corners (rows, columns, 2) in an order of the right shape, or what is wrong."""
     shapes = {(board.rows, board.columns), (board.columns, board.rows)}
     grid = largest_chessboard(gray, config.search_px)
+    if grid is not None and grid.shape[:2] not in shapes and not _fits_in(grid, board):
+        grid = _without_clutter(gray, grid)
     if grid is None or (grid.shape[:2] not in shapes and _fits_in(grid, board)):
         # A plain search of the exact size finds a few that the other does not.
         exact = _classic(gray, board)
@@ -119,8 +137,6 @@ def _whole(gray: UInt8, board: Chessboard, config: ChessboardConfig) -> tuple[Ar
                 "corners: correct rows and columns"
             )
         grid = exact
-    if grid.shape[:2] not in shapes:
-        grid = _without_clutter(gray, grid)
     if grid.shape[:2] not in shapes:
         return None, (
             f"the picture shows a chessboard of {max(grid.shape[:2])}x{min(grid.shape[:2])} inner "

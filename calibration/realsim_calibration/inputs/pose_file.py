@@ -169,7 +169,7 @@ def _from_folder(folder: Path, key: str | None) -> RawPoses:
         )
     if len(files) == 1:
         raw = read_pose_file(files[0], key=key)
-        note = f"{files[0].name} is the only pose file of the folder."
+        note = f"{files[0].name} is the only pose file of the folder. {note}".strip()
     else:
         raw = _combined(folder, files, [f.name for f in files], key)
     return replace(raw, notes=((note,) if note else ()) + raw.notes)
@@ -225,7 +225,7 @@ def _pose_files(folder: Path) -> tuple[list[Path], str]:
 
 
 def _is_camera(path: Path) -> bool:
-    """Return whether a file holds a camera's intrinsics, by its keys: no pose has a focal length."""
+    """Return whether a file holds a camera's intrinsics, by its keys."""
     if path.suffix.lower() not in _TREES or path.stat().st_size > MAX_LISTING_BYTES:
         return False
     data = path.read_bytes()
