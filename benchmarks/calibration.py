@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from calibration_faults import faults_named_share
+from calibration_faults import faults_named_share, layouts_that_are_read
 from calibration_real import (
     FOLDS,
     SOURCES,
@@ -69,6 +69,7 @@ FIGURES = {
     **{f"coverage95_{kind}_alone": Figure(unit="") for kind in ROBOTS},
     **{f"x_mm_{kind}": Figure(unit="mm") for kind in ROBOTS},
     "faults_named_share": Figure(unit="", goal=ALL),
+    "layouts_read": Figure(unit="", goal=Goal(low=16)),
     "corner_rms_px": Figure(unit="px", goal=Goal(high=0.10)),
     "corner_rms_strong_px": Figure(unit="px", goal=Goal(high=0.22)),
     "corner_found_share": Figure(unit=""),
@@ -253,6 +254,9 @@ def measure_faults(a: argparse.Namespace) -> Found:
     trials = each(a, _faults, range(a.seed, a.seed + (1 if a.quick else 10)))
     share = float(np.mean([share for share, _ in trials]))
     found.add("faults_named_share", share, f"{len(trials)} x {len(trials[0][1])} sessions")
+    layouts = layouts_that_are_read()
+    read = sum(not problem for problem in layouts.values())
+    found.add("layouts_read", read, f"of {len(layouts)}: " + ", ".join(layouts))
     found.cases["faults missed"] = [
         {"seed": seed, "fault": row[0], "said": row[3]}
         for seed, (_, table) in enumerate(trials)

@@ -9,9 +9,12 @@ and where rotations were misread when the repaired rotations are the true ones. 
 hold few views, small motions and a bad robot too: anything but "none" is a false alarm.
 """
 
+import sys
+import tempfile
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -347,6 +350,15 @@ def named(s: Session, d: Diagnosis) -> bool:
         return False
     off = se3.angle(np.swapaxes(d.repaired_base_ee[:, :3, :3], -1, -2) @ s.true_R)
     return bool(off.max() < 1e-3)
+
+
+def layouts_that_are_read() -> dict[str, str]:
+    """Return every layout of images and poses that was written; "" where it was read back right."""
+    sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
+    from pose_layouts import layouts_read
+
+    with tempfile.TemporaryDirectory() as place:
+        return layouts_read(Path(place))
 
 
 def ask(s: Session) -> Diagnosis:

@@ -7,8 +7,10 @@ from pathlib import Path
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim_calibration.inputs.image_files import content_of, list_images
+from realsim_calibration.inputs.layouts import image_folder, pose_folders, poses_of
 from realsim_calibration.inputs.pairing import Pairing, pair
 from realsim_calibration.inputs.pose_file import read_pose_file
+from realsim_calibration.inputs.pose_pairs import read_pose_pairs
 from realsim_calibration.inputs.raw_poses import RawPoses, listed_readings
 from realsim_calibration.inputs.readings import PoseReading
 
@@ -84,7 +86,7 @@ def read_image_folder(
     reading: PoseReading | None = None,
     key: str | None = None,
 ) -> FolderInput:
-    """Return the images of a folder, each with its pose.
+    """Return the images of a folder, each with its pose; `layouts` says where they may lie.
 
     Pairs by the image names beside the poses, else by the names or numbers of the pose files, else
     by the lines' numbers or order if the counts agree.
@@ -99,13 +101,22 @@ def read_image_folder(
         InputError: unreadable, nothing to pair, counts that differ without names, or a reading
             that does not fit.
     """
-    listing = list_images(Path(images))
-    raw = read_pose_file(poses, key=key)
-    names = [p.name for p in listing.images]
-    try:
-        found = pair(names, raw.labels, raw.stems, raw.where)
-    except InputError as error:
-        raise InputError(f"{images} and {raw.path}: {error}") from error
+    folder = Path(images)
+    single = pose_folders(folder, key) if Path(poses) == folder else None
+    if single is not None:
+        listing, raw, names = single.listing, single.raw, list(single.names)
+        sentence = f"One folder a pose: {names[0]} with {raw.where[0]}, and so on."
+        found = Pairing(pairs=tuple((k, k) for k in range(len(raw))), sentence=sentence)
+    else:
+        listing = list_images(image_folder(folder))
+        raw = read_pose_file(
+            poses_of(folder, image_folder(folder)) if Path(poses) == folder else poses, key=key
+        )
+        names = [p.name for p in listing.images]
+        try:
+            found = pair(names, raw.labels, raw.stems, raw.where)
+        except InputError as error:
+            raise InputError(f"{images} and {raw.path}: {error}") from error
     measured = raw.measured
     kept = [(i, r) for i, r in found.pairs if measured[r]]
     lost = [(i, r) for i, r in found.pairs if not measured[r]]
@@ -115,11 +126,12 @@ def read_image_folder(
     if reading is not None:
         rows.poses(reading)
     chosen = [listing.images[i] for i, _ in kept]
-    same_images = _equal_groups([p.name for p in chosen], [content_of(p) for p in chosen])
+    labels = tuple(names[i] for i, _ in kept)
+    same_images = _equal_groups(labels, [content_of(p) for p in chosen])
     same_poses = _equal_groups(rows.where, [v.tobytes() for v in rows.values + 0.0])
     return FolderInput(
         images=tuple(chosen),
-        labels=tuple(p.name for p in chosen),
+        labels=labels,
         depths=tuple(listing.depths[i] for i, _ in kept),
         poses=rows,
         reading=reading,
@@ -140,7 +152,7 @@ def read_image_folder(
 
 
 def read_board_poses(
-    robot: Path | str,
+    robot: Path | str | None,
     board: Path | str,
     *,
     robot_key: str | None = None,
@@ -149,15 +161,19 @@ def read_board_poses(
     """Return robot poses and board poses that were measured elsewhere, row by row.
 
     Args:
-        robot: file or folder of T_base_ee.
-        board: file or folder of T_cam_board; the same formats are read.
+        robot: file or folder of T_base_ee; None where the board's file holds pairs of both.
+        board: file or folder of T_cam_board, the same formats are read; or a file of pairs.
         robot_key: which key of the robot's file holds the poses.
         board_key: which key of the board's file holds them.
 
     Raises:
         InputError: unreadable, or counts that differ without names.
     """
-    a, b = read_pose_file(robot, key=robot_key), read_pose_file(board, key=board_key)
+    if robot is None:
+        a, b = read_pose_pairs(board)
+    else:
+        a = read_pose_file(robot, key=robot_key)
+        b = read_pose_file(board, key=board_key, board=True)
     names = [label or stem for label, stem in zip(b.labels, b.stems, strict=True)]
     try:
         if all(names):

@@ -28,13 +28,15 @@ MAX_LISTING_BYTES = 2**20
 MAX_FOLDER_FILES = 20_000
 """Files of one pose each in a folder."""
 _TREES = (".json", ".yaml", ".yml")
+_BOARD_SERIES = re.compile(r"c[PM]o|board|target|marker|object")
+"""In the name of a file: it holds the board's pose in the camera (ViSP: cPo, cMo)."""
 _CAMERA = re.compile(
     rb"\b(fx|camera_?matrix|intrinsics?|dist(ortion)?_?coeff\w*|distortion_model)\b", re.IGNORECASE
 )
 """Keys of a file of intrinsics."""
 
 
-def read_pose_file(path: Path | str, *, key: str | None = None) -> RawPoses:
+def read_pose_file(path: Path | str, *, key: str | None = None, board: bool = False) -> RawPoses:
     """Return the poses of a file, of a folder with a file for each, or of a list of such files.
 
     Accepted: lines of numbers (txt, csv, tsv; header optional), JSON and YAML (lists, dicts from
@@ -44,16 +46,18 @@ def read_pose_file(path: Path | str, *, key: str | None = None) -> RawPoses:
     Args:
         path: the file or folder.
         key: which key or array holds the poses, where there are several.
+        board: whether a folder's poses of the board are wanted, where it has the robot's, too
+            (ViSP's pose_cPo_1.yaml beside pose_fPe_1.yaml).
 
     Raises:
         InputError: missing, damaged, too large, or no poses; names the line, entry or file.
     """
     path = Path(path)
     if path.is_dir():
-        return _from_folder(path, key)
+        return _from_folder(path, key, board=board)
     if not path.is_file():
         raise InputError(f"{path} does not exist; a file or a folder of poses was expected there.")
-    tree = _tree(path) if path.suffix.lower() in _TREES else None
+    tree = file_tree(path) if path.suffix.lower() in _TREES else None
     if tree is not None:
         listed = _listing(tree)
         if listed:
@@ -61,7 +65,7 @@ def read_pose_file(path: Path | str, *, key: str | None = None) -> RawPoses:
     return raw_from_table(_table(path, key, tree))
 
 
-def _text(path: Path) -> str:
+def file_text(path: Path) -> str:
     """Return a text file's content."""
     limit = MAX_YAML_BYTES if path.suffix.lower() in (".yaml", ".yml") else MAX_TEXT_BYTES
     size = path.stat().st_size
@@ -78,9 +82,9 @@ def _text(path: Path) -> str:
         raise InputError(f"{path} cannot be read ({error}).") from error
 
 
-def _tree(path: Path) -> Any:
+def file_tree(path: Path) -> Any:
     """Return the tree of a JSON or YAML file."""
-    text = _text(path)
+    text = file_text(path)
     return (loaded_json if path.suffix.lower() == ".json" else loaded_yaml)(text, str(path))
 
 
@@ -94,8 +98,8 @@ def _table(path: Path, key: str | None, tree: Any = None) -> PoseTable:
     if ending == ".npz":
         return table_from_npz(path, key)
     if ending in _TREES:
-        return table_from_tree(path, _tree(path) if tree is None else tree, key)
-    text = _text(path)
+        return table_from_tree(path, file_tree(path) if tree is None else tree, key)
+    text = file_text(path)
     if re.match(r"\s*(\{|\[\s*[\[{])", text):
         try:
             return table_from_tree(path, loaded_json(text, str(path)), key)
@@ -140,12 +144,12 @@ def _from_listing(path: Path, pairs: Sequence[tuple[str, str]], key: str | None)
     twice = sorted({p for p, _ in pairs if [q for q, _ in pairs].count(p) > 1}, key=natural_key)
     if twice:
         raise InputError(f"{path} names pose files more than once: {', '.join(twice[:8])}.")
-    raw = _combined(path, files, [p for p, _ in pairs], key)
+    raw = read_single_files(path, files, [p for p, _ in pairs], key)
     note = f"{path.name} says which pose belongs to which image."
     return replace(raw, labels=tuple(i for _, i in pairs), notes=(note, *raw.notes))
 
 
-def _from_folder(folder: Path, key: str | None) -> RawPoses:
+def _from_folder(folder: Path, key: str | None, *, board: bool) -> RawPoses:
     """Return the poses of a folder: by a list in or beside it, else one file a pose."""
     for place in (folder, folder.parent):
         lists = _listings_in(place, folder)
@@ -161,7 +165,7 @@ def _from_folder(folder: Path, key: str | None) -> RawPoses:
                 note = f"Not on the list and not read: {', '.join(f.name for f in others[:8])}."
                 raw = replace(raw, notes=(*raw.notes, note))
             return raw
-    files, note = _pose_files(folder)
+    files, note = _pose_files(folder, board=board)
     if not files:
         raise InputError(
             f"{folder} holds no pose files ({', '.join(ENDINGS)}). Give the file or the folder "
@@ -171,7 +175,7 @@ def _from_folder(folder: Path, key: str | None) -> RawPoses:
         raw = read_pose_file(files[0], key=key)
         note = f"{files[0].name} is the only pose file of the folder. {note}".strip()
     else:
-        raw = _combined(folder, files, [f.name for f in files], key)
+        raw = read_single_files(folder, files, [f.name for f in files], key)
     return replace(raw, notes=((note,) if note else ()) + raw.notes)
 
 
@@ -185,7 +189,7 @@ def _listings_in(place: Path, folder: Path) -> list[tuple[Path, list[tuple[str, 
         if b"pose" not in data or not any(w.encode() in data for w in LABEL_NAMES):
             continue
         try:
-            pairs = _listing(_tree(path))
+            pairs = _listing(file_tree(path))
         except InputError:
             if place == folder:
                 continue  # it is read as a pose file, which says what is wrong
@@ -195,7 +199,7 @@ def _listings_in(place: Path, folder: Path) -> list[tuple[Path, list[tuple[str, 
     return found
 
 
-def _pose_files(folder: Path) -> tuple[list[Path], str]:
+def _pose_files(folder: Path, *, board: bool = False) -> tuple[list[Path], str]:
     """Return a folder's pose files in natural order, and what was left out."""
     files = [
         p
@@ -211,6 +215,10 @@ def _pose_files(folder: Path) -> tuple[list[Path], str]:
         kinds.setdefault((re.sub(r"\d+", "#", p.stem), p.suffix.lower()), []).append(p)
     series = sorted((v for v in kinds.values() if len(v) > 1), key=len, reverse=True)
     if len(series) > 1:
+        of_board = [bool(_BOARD_SERIES.search(s[0].stem)) for s in series]
+        wanted = [s for s, b in zip(series, of_board, strict=True) if b == board]
+        series = wanted if len(wanted) == 1 and any(of_board) else series
+    if len(series) > 1:
         shown = "; ".join(f"{len(s)} like {min(s).name}" for s in series)
         raise InputError(
             f"{folder} holds several series of files ({shown}). Give the poses a folder of their "
@@ -224,6 +232,13 @@ def _pose_files(folder: Path) -> tuple[list[Path], str]:
     return sorted(chosen, key=lambda p: natural_key(p.name)), note.strip()
 
 
+def pose_files_in(folder: Path) -> list[Path]:
+    """Return the files of a folder that may hold poses, in natural order; cameras do not."""
+    files = [p for p in folder.iterdir() if p.suffix.lower() in ENDINGS and p.is_file()]
+    files = [p for p in files if not p.name.startswith(".") and not _is_camera(p)]
+    return sorted(files, key=lambda p: natural_key(p.name))
+
+
 def _is_camera(path: Path) -> bool:
     """Return whether a file holds a camera's intrinsics, by its keys."""
     if path.suffix.lower() not in _TREES or path.stat().st_size > MAX_LISTING_BYTES:
@@ -232,7 +247,9 @@ def _is_camera(path: Path) -> bool:
     return b"pose" not in data.lower() and _CAMERA.search(data) is not None
 
 
-def _combined(path: Path, files: Sequence[Path], names: Sequence[str], key: str | None) -> RawPoses:
+def read_single_files(
+    path: Path, files: Sequence[Path], names: Sequence[str], key: str | None
+) -> RawPoses:
     """Return the poses of files that hold one each."""
     tables: list[PoseTable] = []
     for file, name in zip(files, names, strict=True):
@@ -243,7 +260,7 @@ def _combined(path: Path, files: Sequence[Path], names: Sequence[str], key: str 
                 "each must hold one."
             )
         first = tables[0] if tables else table
-        if table.names != first.names:
+        if table.names != first.names and not _reordered(table, first.names):
             raise InputError(
                 f"{file} holds {_columns(table)}, {files[0].name} {_columns(first)}: all files "
                 "must be written alike."
@@ -262,6 +279,18 @@ def _combined(path: Path, files: Sequence[Path], names: Sequence[str], key: str 
             notes=list(tables[0].notes),
         )
     )
+
+
+def _reordered(table: PoseTable, names: tuple[str, ...]) -> bool:
+    """Put a table's columns in the order of these names; return whether they are the same ones.
+
+    Programs write keys in the order of a hash, another in every file.
+    """
+    if "" in names or len(set(names)) != len(names) or sorted(names) != sorted(table.names):
+        return False
+    table.values = table.values[:, [table.names.index(n) for n in names]]
+    table.names = names
+    return True
 
 
 def _columns(table: PoseTable) -> str:

@@ -71,7 +71,8 @@ def _plain(node: Any, where: str) -> Any:
     try:
         channels = int(re.sub(r"\D", "", str(node.get("dt", ""))) or 1)
         shape = (int(node["rows"]), int(node["cols"]) * channels)
-        data = [number_of(str(v)) for v in node["data"]]
+        rows = [v if isinstance(v, list) else [v] for v in node["data"]]
+        data = [number_of(str(v)) for row in rows for v in row]
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where}: rows, cols, dt or data of a matrix are no numbers.") from error
     if len(data) != shape[0] * shape[1] or None in data:
@@ -79,4 +80,6 @@ def _plain(node: Any, where: str) -> Any:
             f"{where}: a matrix of {shape[0]} rows and {shape[1]} columns holds {len(data)} "
             f"values{', not all of them numbers' if None in data else ''}. Is the file cut off?"
         )
+    if shape == (6, 1) and "dt" not in node:  # ViSP's vpPoseVector: tx ty tz [m], theta u [rad]
+        return {"translation_m": data[:3], "rotation_vector_rad": data[3:]}
     return [data[r * shape[1] : (r + 1) * shape[1]] for r in range(shape[0])]

@@ -294,8 +294,7 @@ def _from_pose_files(
     """Return the calibration of robot poses and board poses without images."""
     from realsim_calibration.inputs import read_board_poses, reading_from_text
 
-    if request.poses is None or request.board_poses is None:
-        raise InputError("--board-poses needs --poses as well: the robot's pose file.")
+    assert request.board_poses is not None
     given = read_board_poses(request.poses, request.board_poses, robot_key=request.key or None)
     console.say(f"{len(given.robot)} pose pairs: {given.pairing}")
     board_reading = given.board.stated
