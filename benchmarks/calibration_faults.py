@@ -193,13 +193,23 @@ def board_in_mm(s: Session, rng: Rng) -> Session:
 
 def board_size(s: Session, rng: Rng) -> Session:
     """A square of another size."""
-    factor = float(rng.choice([35 / 19, 19 / 35, 30 / 25, 20 / 24]))
+    factor = float(rng.choice([35 / 19, 19 / 35, 30 / 25, 20 / 24, 1.1, 1 / 1.1]))
     target = replace(BOARD, square_m=BOARD.square_m * factor)
     return replace(s, C=_scaled(s.C, factor), target=target, expected=("board_size",))
 
 
 def _scaled(T: Array, factor: float) -> Array:
     return se3.from_rt(T[:, :3, :3], factor * T[:, :3, 3])
+
+
+def mirrored(s: Session, rng: Rng) -> Session:
+    """An axis counted the other way: of the positions, of the rotations, or of both."""
+    S = np.eye(3)
+    k, what = (int(v) for v in rng.integers(3, size=2))
+    S[k, k] = -1.0
+    R, t = s.T[:, :3, :3], s.T[:, :3, 3]
+    T = se3.from_rt(S @ R @ S if what != 0 else R, t @ S if what != 1 else t)
+    return replace(s, T=T, nominal=None, expected=("mirrored_axis",))
 
 
 def _far_pair(s: Session, rng: Rng) -> tuple[int, int]:
@@ -326,7 +336,7 @@ FAULTS: dict[str, Callable[[Session, Rng], Session]] = {
     for f in (
         euler_order, rotvec_as_euler, euler_as_rotvec, quaternion_order, degrees_as_radians,
         radians_as_degrees, robot_inverted, camera_inverted, wrong_mode, robot_in_mm, board_in_mm,
-        board_size, swapped, mispaired, shifted, shifted_later, flipped, tool_left_active,
+        board_size, mirrored, swapped, mispaired, shifted, shifted_later, flipped, tool_left_active,
         tool_changed, base_turned, duplicated, frozen, board_moved,
     )
 }  # fmt: skip
@@ -355,7 +365,7 @@ def named(s: Session, d: Diagnosis) -> bool:
 def layouts_that_are_read() -> dict[str, str]:
     """Return every layout of images and poses that was written; "" where it was read back right."""
     sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
-    from pose_layouts import layouts_read
+    from pose_layouts import layouts_read  # pyright: ignore[reportMissingImports]
 
     with tempfile.TemporaryDirectory() as place:
         return layouts_read(Path(place))

@@ -8,6 +8,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.records import ArmErrorMap, Check
+from realsim_calibration.faults.hypotheses import option_of, size_name
 from realsim_calibration.results import HandEyeReport
 
 Verdict = Literal["good", "warn", "bad", "unknown"]
@@ -182,8 +183,9 @@ def _scale(r: HandEyeReport, c: CheckConfig) -> Check:
         verdict=verdict,
         sentence=f"by the robot's metres the board is {b.scale:.4f} +-{sd:.4f} times the size "
         f"given; its height against its width is {1 + b.aspect:.4f}.",
-        advice=_advice(verdict, "Measure the print over several squares with a calliper: printers "
-                       "scale by a percent, and a wrong square size spoils every length."),
+        advice=_advice(verdict, "Measure the print over several squares with a calliper: by the "
+                       f"robot {size_name(r.target, b.scale)}. If the calliper agrees, give "
+                       f"{option_of(r.target, b.scale)} in --board."),
         value=b.scale,
     )  # fmt: skip
 

@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -156,6 +157,30 @@ def test_a_small_print_error_is_a_scale_and_not_a_fault():
     C[:, :3, 3] *= 1.02
     d = faults.ask(replace(s, C=C, nominal=None))
     assert d.fault == "none" and d.length_ratio == pytest.approx(1 / 1.02, rel=0.01)
+
+
+def test_a_square_ten_percent_too_large_is_refused_with_the_size_to_give():
+    s = session(7)
+    large = replace(faults.BOARD, square_m=1.1 * faults.BOARD.square_m)
+    C = s.C.copy()
+    C[:, :3, 3] *= 1.1
+    d = faults.ask(replace(s, C=C, target=large, nominal=None))
+    assert d.fault == "board_size", d.sentence
+    size = float(re.search(r"square is ([\d.]+) mm, not 22 mm", d.sentence)[1])
+    assert size == pytest.approx(20.0, rel=0.01)
+    assert f"square={size:.4g}mm" in d.advice
+
+
+@pytest.mark.parametrize("what", ["positions", "rotations", "frames"])
+def test_a_mirrored_axis_is_named(what):
+    s, S = session(2, views=(14, 14)), np.diag([1.0, 1.0, -1.0])
+    R, t = s.T[:, :3, :3], s.T[:, :3, 3]
+    R = R if what == "positions" else S @ R @ S
+    t = t if what == "rotations" else t @ S
+    d = faults.ask(replace(s, T=se3.from_rt(R, t), nominal=None))
+    assert d.fault == "mirrored_axis", d.sentence
+    said = {"frames": "x, y or z"}.get(what, f"the z axis of the {what} is mirrored")
+    assert said in d.sentence and d.advice
 
 
 def test_a_hand_that_does_not_turn_cannot_be_tested():

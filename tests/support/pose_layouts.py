@@ -233,7 +233,7 @@ LAYOUTS: dict[str, Callable[[Path, Array, list[UInt8]], Written]] = {
 }  # fmt: skip
 
 
-# --- pose pairs without images: (folder, robot, board) -> (file of the robot or None, of the board) ---
+# --- pose pairs without images: (folder, robot, board) -> (robot file or None, board file) ---
 
 
 def pairs_json(d: Path, Ts: Array, Cs: Array) -> tuple[Path | None, Path]:

@@ -33,6 +33,7 @@ from realsim_calibration.faults.hypotheses import (
     flipped_boards,
     inverted,
     moved,
+    option_of,
     paired_otherwise,
     raw_readings,
     reread_as_degrees,
@@ -40,6 +41,7 @@ from realsim_calibration.faults.hypotheses import (
     simple,
     size_name,
 )
+from realsim_calibration.faults.mirrored import mirrored
 from realsim_calibration.faults.tool_offset import tool_offset
 from realsim_calibration.fit.closed_forms import motions, principal_turns
 from realsim_calibration.results import Mode
@@ -194,7 +196,7 @@ def _search(
         return replace(given, fault="untestable", sentence=reason[0], advice=reason[1]), [given]
     if given.score <= config.sure_score and given.fit.errors.max() <= config.pairing.floor:
         return _sound(p, given, nominal, config), [given]
-    tried = [*raw_readings(p, raw, config), inverted(p, config)]
+    tried = [*raw_readings(p, raw, config), inverted(p, config), *mirrored(p, config)]
     tried += [h for h in (flipped_boards(p, config), paired_otherwise(p, config), moved(p, config))
               if h is not None]  # fmt: skip
     tried += reread_rotations(p, config, thorough=False)
@@ -301,8 +303,9 @@ def _sound(
             sentence=f"The board has another size: {size_name(p.target, ratio)} (the hand moves "
             f"{ratio:.4f} +- {ratio * sd:.4f} times as far as the camera, which is right for it "
             "at 1).",
-            advice="Measure the board over several squares and give its true size. If that is "
-            "right, the unit of the hand poses is wrong.",
+            advice="Measure the board over several squares and give its true size (--board ..., "
+            f"{option_of(p.target, ratio)}). If the size given is right, the unit of the hand "
+            "poses is wrong.",
             note="the board poses were scaled.",
         )
     scale = (

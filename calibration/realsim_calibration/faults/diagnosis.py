@@ -19,7 +19,7 @@ Fault = Literal[
     "board_flips", "board_size", "board_unit", "board_moved",
     "robot_inverted", "camera_inverted", "rotation_reading",
     "degrees_as_radians", "radians_as_degrees", "robot_unit",
-    "tool_offset", "tool_change", "camera_moved", "base_turned",
+    "tool_offset", "tool_change", "camera_moved", "base_turned", "mirrored_axis",
 ]  # fmt: skip
 
 
@@ -48,7 +48,7 @@ class DiagnosisConfig:
     """Fewer views than this are few."""
     tie: float = 1.25
     """Readings whose scores are within this factor fit equally well: the simpler one is named."""
-    max_size_ratio: float = 1.1
+    max_size_ratio: float = 1.07
     """A board this many times larger or smaller than said has another size; less is reported as a
     scale: printers and intrinsics are off by up to 5 %."""
     size_sigmas: float = 5.0

@@ -412,12 +412,24 @@ def moved(p: Poses, config: DiagnosisConfig) -> Hypothesis | None:
 
 def size_name(target: Target | None, ratio: float) -> str:
     """Return "the square is 19.06 mm, not 35 mm" for a target that is `ratio` times as large."""
-    if isinstance(target, TagBoard):
-        what, length = "tag's edge", target.tag_size_m
-    elif isinstance(target, (Chessboard, CharucoBoard)):
-        what, length = "square", target.square_m
-    elif isinstance(target, CircleGrid):
-        what, length = "grid's pitch", target.pitch_m
-    else:
+    what, length, _ = _length_of(target)
+    if not what:
         return f"the board is {ratio:.4g} times as large as said"
     return f"the {what} is {1e3 * length * ratio:.4g} mm, not {1e3 * length:.4g} mm"
+
+
+def option_of(target: Target | None, ratio: float) -> str:
+    """Return what --board says of a target that is `ratio` times as large: "square=19.06mm"."""
+    _, length, word = _length_of(target)
+    return f"{word}={1e3 * length * ratio:.4g}mm" if word else "its size"
+
+
+def _length_of(target: Target | None) -> tuple[str, float, str]:
+    """Return what a target's size is called, the size [m], and its word in --board."""
+    if isinstance(target, TagBoard):
+        return "tag's edge", target.tag_size_m, "tag"
+    if isinstance(target, (Chessboard, CharucoBoard)):
+        return "square", target.square_m, "square"
+    if isinstance(target, CircleGrid):
+        return "grid's pitch", target.pitch_m, "pitch"
+    return "", 0.0, ""

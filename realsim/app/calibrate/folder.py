@@ -48,7 +48,7 @@ MIN_DIAGNOSED = 6
 USUAL_READINGS = 2
 """Readings under which faults are looked for where none fits; the commonest come first."""
 NAMED_FAULTS = ("shifted_pairing", "robot_unit", "board_size", "board_unit", "tool_change",
-                "board_moved", "camera_moved")  # fmt: skip
+                "board_moved", "camera_moved", "mirrored_axis")  # fmt: skip
 """Faults of a whole set that explain why no reading fits."""
 PROOF_VIEWS = 40
 """Views that decide on a reading: more do not change the verdict."""
