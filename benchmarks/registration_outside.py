@@ -20,6 +20,8 @@ published figures; everything was tuned on seeds 1 to 20. Parts and their figure
               see `registration_single.py`
   table       no_table_false_findings findings on scenes with no table and with a wavy one that
                                       speak of sinking or floating objects
+  find_all    find_all_cpu_s, find_all_right_share, find_all_wrong_accepted
+                                      one cluttered frame of 12 objects, 30 models, no names given
   upgrade     upgrade_worse_share, edge_px_ours, edge_px_annotation: see `registration_upgrade.py`
   loop        loop_coverage95         the same coverage at the end of the project's own whole loop,
                                       calibration included; ten seeds
@@ -33,8 +35,9 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import argparse
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, cast
@@ -42,6 +45,7 @@ from typing import Any, cast
 import numpy as np
 from figures import Figure, Found, Goal, run
 from outside_lab import Lab, LabScene, make_scene
+from outside_shapes import objects as all_objects
 from registration_methods import Given, registered, wanted_of
 from registration_provoked import provoked
 from registration_single import FIGURES as SINGLE
@@ -54,6 +58,7 @@ from realsim.geometry import se3
 from realsim.geometry.metrics import aligned_pose, mssd_symmetric
 from realsim.records import ObjectModel, ObjectPose
 from realsim.registration.config import RegistrationConfig
+from realsim.registration.register import register_scene
 
 PACKAGES = ("realsim", "numpy", "numba", "open3d-cpu", "trimesh")
 RIGHT_MM = 3.0
@@ -226,9 +231,42 @@ def tables(given: argparse.Namespace) -> Found:
     return found
 
 
+def find_all(given: argparse.Namespace) -> Found:
+    """Measure one frame of clutter for which a whole library of models is tried."""
+    objects, small = (4, 2) if given.quick else (12, 12)
+    lab = Lab(views=1, photos=True, hand_eye_mm=0, hand_eye_deg=0, arm_mm=0, arm_deg=0)
+    scene = make_scene(given.seed + 700, lab, count=objects)
+    models = dict(scene.models)
+    if not given.quick:
+        models |= {k: o[0] for k, o in all_objects().items()}
+    for k, m in list(models.items())[:small]:
+        # Things that look alike but are smaller: none of them is there.
+        mesh = replace(m.mesh, vertices=0.7 * m.mesh.vertices)
+        models[100 + k] = replace(m, obj_id=100 + k, name=f"small {m.name}", mesh=mesh)
+    config = RegistrationConfig(field_folder=fields(), with_single_view=False)
+    begin = time.process_time()
+    result = register_scene("clutter", scene.intrinsics, scene.frames, models, None, config)
+    found = Found()
+    found.add("find_all_cpu_s", time.process_time() - begin, f"{len(models)} models")
+    true = {t.obj_id: t for t in scene.truth}
+    errors = {
+        o.obj_id: 1e3 * mssd_symmetric(true[o.obj_id].T_world_obj, o.T_world_obj, models[o.obj_id])
+        if o.obj_id in true else np.inf
+        for o in result.scene.objects
+    }  # fmt: skip
+    right = sum(off <= RIGHT_MM for off in errors.values())
+    found.add("find_all_right_share", right / len(true), f"{len(true)} objects, one view")
+    accepted = [o for o in result.scene.objects
+                if o.verdict == "accepted" and errors[o.obj_id] > RIGHT_MM]  # fmt: skip
+    found.add("find_all_wrong_accepted", len(accepted), f"{len(errors)} placed")
+    found.notes += [f"find-all, {models[o.obj_id].name}: {errors[o.obj_id]:.1f} mm off and accepted"
+                    for o in accepted]  # fmt: skip
+    return found
+
+
 def loop(given: argparse.Namespace) -> Found:
     """Measure whether the whole loop's poses lie within what they say of themselves."""
-    from realsim.app.demo.run import DemoConfig, run_demo
+    from realsim.app.demo.run import DemoConfig, capture_and_register
     from realsim.app.stages import session_models
     from realsim.app.truth import load_truth
 
@@ -238,11 +276,11 @@ def loop(given: argparse.Namespace) -> Found:
         config = DemoConfig(seed=seed, views=6 if given.quick else 24, objects=2 if given.quick
                             else 6, grasps_per_object=1)  # fmt: skip
         with tempfile.TemporaryDirectory() as folder:
-            result = run_demo(config, Path(folder) / "demo", Console(quiet=True))
-            truth = load_truth(result.folder / "truth")
-            models = session_models(result.store)
+            store, _, result = capture_and_register(config, Path(folder), Console(quiet=True))
+            truth = load_truth(Path(folder) / "truth")
+            models = session_models(store)
             scene = argparse.Namespace(truth=truth.objects, models=models)
-            rows = list(poses_of(seed, scene, result.scene.objects))
+            rows = list(poses_of(seed, scene, result.objects))
         inside += [r.inside for r in rows if r.mssd_mm <= RIGHT_MM]
         shifts = ", ".join(f"{r.mssd_mm:.2f}" for r in rows)
         found.notes.append(f"loop, seed {seed}: {shifts} mm")
@@ -261,6 +299,9 @@ FIGURES = {
     "flat_bias_mm": Figure(unit="mm", goal=Goal(high=0.15)),
     **SINGLE,
     "no_table_false_findings": Figure(unit="", goal=Goal(high=0)),
+    "find_all_cpu_s": Figure(unit="CPU s", goal=Goal(high=60)),
+    "find_all_right_share": Figure(unit=""),
+    "find_all_wrong_accepted": Figure(unit=""),
     **UPGRADE,
     "loop_coverage95": Figure(unit="", goal=Goal(low=0.90, high=0.98)),
     "d405_noise_ratio": Figure(unit="", goal=Goal(low=0.9, high=1.1)),
@@ -271,6 +312,7 @@ PARTS = {
     "provoked": provoked_poses,
     "single": "registration_single:measure",
     "table": tables,
+    "find_all": find_all,
     "upgrade": "registration_upgrade:measure",
     "loop": loop,
     "d405": "depth_d405:depth_d405",

@@ -37,6 +37,9 @@ from realsim.registration.rivals_around import Around, Images, around
 from realsim.registration.solver import FreeSpace
 from realsim.registration.table_planes import find_support_plane
 
+ALIKE = 0.9
+"""Depth and photograph that agree less on an object are told of."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class NearTask:
@@ -149,7 +152,8 @@ def with_photograph(
         intrinsics=intake.intrinsics, depth_m=frame.depth_m, T_world_cam=frame.T_world_cam,
         rgb=frame.read_rgb(),
     )  # fmt: skip
-    fit = photo_fit(picture, bodies, [k.fit for k in few.kept], few.stride,
+    together = max(1.0, config.covariance.correlation_area_px / few.stride**2)
+    fit = photo_fit(picture, bodies, [k.fit for k in few.kept], together,
                     intake.noise, config.photo_fit)  # fmt: skip
     if not fit.taken:
         return intake, few, fit
@@ -211,6 +215,7 @@ def few_around(
         photo: what the photograph says; None = there is none.
         config: see there.
     """
+    taken = photo if photo is not None and photo.taken else None
     comparer = make_comparer(
         intake.intrinsics, [read_frame(f) for f in intake.frames], intake.noise,
         few.plane if few.plane is not None else intake.plane,
@@ -219,17 +224,22 @@ def few_around(
     offset = config.around.offset_noises * intake.noise.per_m
     images = Images(
         comparer=comparer, area_px=config.refine.noise.area_at(intake.intrinsics.width),
-        offset_per_m=offset if photo is None or not photo.taken else photo.offset_sigma_per_m,
+        offset_per_m=offset if taken is None else taken.offset_sigma_per_m,
     )  # fmt: skip
-    edges = [None] * len(bodies) if photo is None or not photo.taken else photo.edges
+    edges = [None] * len(bodies) if taken is None else taken.edges
+    agreements = [(1.0, "")] * len(bodies) if taken is None else taken.agreements
     at = [(b, k.fit.T_world_obj) for b, k in zip(bodies, few.kept, strict=True)]
-    return [
+    tried = [
         around(b, k.fit, cloud, [*at[:n], *at[n + 1 :]], start, edge, images,
                (config.around, config.solver))
         for n, (b, k, cloud, start, edge) in enumerate(
             zip(bodies, few.kept, few.clouds, claimed, edges, strict=True)
         )
     ]  # fmt: skip
+    return [
+        replace(a, probability=a.probability * left, unlike=words if left < ALIKE else "")
+        for a, (left, words) in zip(tried, agreements, strict=True)
+    ]
 
 
 def _search_one(work: NearTask, body: Body, near: Cloud, tick: Callable[[], None]) -> BestStart:

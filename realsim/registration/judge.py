@@ -199,7 +199,9 @@ def _object(
     if given.around and verdict != "accepted":
         # Not knowing is no reason to reject: the bounds do that.
         verdict = "doubtful"
-        reasons = (*reasons, *(f"not seen in so few views: {w}" for w in given.around[k].unseen))
+        unlike = [given.around[k].unlike] if given.around[k].unlike else []
+        unseen = [f"not seen in so few views: {w}" for w in given.around[k].unseen]
+        reasons = (*reasons, *unlike, *unseen)
     if WORST.index(checked.verdict) > WORST.index(verdict):
         verdict, reasons = checked.verdict, (*checked.reasons, *reasons)
     size = features.get("size_error") or 0.0

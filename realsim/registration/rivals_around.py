@@ -95,6 +95,8 @@ class Around:
     """Least step along them [m]."""
     unseen: tuple[str, ...]
     """Directions that are wider than they should be, in words with their 1-sigma."""
+    unlike: str = ""
+    """In words, why depth and photograph tell of different things."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -138,8 +140,10 @@ def around(
     starts = [moved_about_center(body, fit.T_world_obj, x) for x in moves]
     fits = [solve_pose(body, cloud, T, solver.fine, solver, held=weak) for T in starts]
     middle = len(fits) // 2
+    # What else decided the fit (neighbours, the photograph) moves all poses as it moved the fit.
+    Ts = np.stack([_moved_alike(body, fits[middle], fit, f.T_world_obj) for f in fits])
     fits[middle] = fit
-    Ts = _laid_down(body, np.stack([f.T_world_obj for f in fits]), images, config)
+    Ts = _laid_down(body, Ts, images, config)
     costs = _costs(body, Ts, others, images, config)
     if edges is not None:
         is_likely = costs < costs.min() + config.likely
@@ -242,6 +246,14 @@ def _weak_directions(body: Body, fit: PoseFit, config: AroundConfig) -> Array:
         if len(chosen) == 2:
             break
     return np.stack(chosen, axis=1)
+
+
+def _moved_alike(body: Body, before: PoseFit, after: PoseFit, T_world_obj: Array) -> Array:
+    """Return a pose (4, 4) moved in world as a fit was, turned about the centre of its box."""
+    R = after.T_world_obj[:3, :3] @ before.T_world_obj[:3, :3].T
+    shift = body.center(after.T_world_obj) - body.center(before.T_world_obj)
+    center = body.center(T_world_obj)
+    return se3.from_rt(R, center + shift - R @ center) @ T_world_obj
 
 
 def _laid_down(body: Body, Ts: Array, images: Images, config: AroundConfig) -> Array:

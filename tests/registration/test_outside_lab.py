@@ -14,10 +14,12 @@ from realsim.records import ObjectPose, SupportPlane
 from realsim.registration.body import make_body, moved_about_center
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import Cloud
+from realsim.registration.few_views import ALIKE, register_few, with_photograph
 from realsim.registration.intake import take_in
 from realsim.registration.judging.verdict import EXPLAINED
 from realsim.registration.refinement.flat import LEAN_DEG, laid_down
 from realsim.registration.register import register_scene
+from realsim.registration.rivals_around import _moved_alike
 from realsim.registration.search.flat_search import explained_at, table_map
 from realsim.registration.solver import SolverConfig, solve_pose
 
@@ -43,6 +45,13 @@ def body_of(name: str, T: np.ndarray):
     model = shapes.objects()[IDS[name]][0]
     start = ObjectPose(obj_id=model.obj_id, instance=0, T_world_obj=T)
     return make_body(start, model, 64, 200)
+
+
+def dummy_fit(body, T: np.ndarray):
+    """Return a fit at T of no points but one on the body."""
+    point = se3.transform(T, body.center_obj[None])
+    cloud = Cloud(points=point, towards=np.array([[0.0, 0, 1]]), sigmas=np.ones(1))
+    return solve_pose(body, cloud, T, SolverConfig().fine, SolverConfig()).at(T)
 
 
 # --- laws -----------------------------------------------------------------------------------------
@@ -72,6 +81,20 @@ def test_held_directions_are_left_as_they_are():
         free = step - held @ (held.T @ step)
         assert np.linalg.norm(held.T @ step) < 0.05 * np.linalg.norm(step)
         assert np.linalg.norm(free) > 5e-4
+
+
+def test_poses_around_a_fit_are_moved_in_world_as_the_fit_was():
+    body = body_of("mug", np.eye(4))
+    rng = np.random.default_rng(0)
+    before, after, other = (se3.exp(0.2 * rng.normal(size=6)) for _ in range(3))
+    fits = [dummy_fit(body, T) for T in (before, after)]
+    np.testing.assert_allclose(_moved_alike(body, *fits, before), after, atol=1e-12)
+    moved = _moved_alike(body, *fits, other)
+    np.testing.assert_allclose(
+        body.center(moved) - body.center(other), body.center(after) - body.center(before)
+    )
+    turn = after[:3, :3] @ before[:3, :3].T
+    np.testing.assert_allclose(moved[:3, :3], turn @ other[:3, :3], atol=1e-12)
 
 
 @pytest.mark.parametrize("lean", [-3.0, 1.0, 3.0])
@@ -179,6 +202,24 @@ def test_a_photograph_of_something_else_moves_nothing(one_view):
     assert not found.report["photograph"]["taken"]
     for a, b in zip(found.scene.objects, bare.scene.objects, strict=True):
         np.testing.assert_allclose(a.T_world_obj, b.T_world_obj, atol=1e-9)
+
+
+def test_an_object_that_depth_and_photograph_place_apart_is_told_of(one_view):
+    (frame,) = one_view.frames
+    intake = take_in(one_view.intrinsics, [frame], CONFIG)
+    bodies = [make_body(t, one_view.models[t.obj_id], 64, 200) for t in one_view.truth]
+    few = register_few(intake, bodies, CONFIG, None, lambda: None)
+    names = [b.model.name for b in bodies]
+    n = names.index("plate_3")  # of which depth does not know where on the table it lies
+    aside = se3.from_translation(0.009 * frame.T_world_cam[:3, 0])
+    kept = list(few.kept)
+    kept[n] = replace(kept[n], fit=kept[n].fit.at(aside @ one_view.truth[n].T_world_obj))
+    before = with_photograph(intake, few, bodies, CONFIG)[2].agreements
+    after = with_photograph(intake, replace(few, kept=kept), bodies, CONFIG)[2].agreements
+    assert after[n][0] < 0.5 and "photograph" in after[n][1]
+    others = [k for k in range(len(names)) if k != n]
+    assert np.median([before[k][0] for k in others]) > ALIKE
+    assert np.median([after[k][0] for k in others]) > ALIKE
 
 
 @pytest.mark.parametrize("hidden", [True, False])

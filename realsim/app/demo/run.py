@@ -82,17 +82,11 @@ def run_demo(config: DemoConfig, out: Path, console: Console) -> DemoResult:
 
     from realsim.app.report.session import write_report
     from realsim.app.truth import loop_errors
-    from realsim_capture_plans.lab import LabConfig, SimulatedLab
 
     _claim(out, config)
     # One BLAS thread: on small matrices the spinning of more costs more than the work.
     with only_run_in(out), threadpool_limits(limits=1):
-        lab = SimulatedLab(LabConfig(seed=config.seed, arm=config.arm, n_objects=config.objects))
-        store = _capture_all(lab, config, out, console)
-        joints = {v.index: v.joints for v in store.session.views if v.joints is not None}
-        lab.write_truth(out / "truth", joints)
-        hand_eye = calibrate_session(store, console, config.arm)
-        scene = register_session(store, console)
+        store, hand_eye, scene = capture_and_register(config, out, console)
         grasps = school_session(
             store, console, grasps_per_object=config.grasps_per_object, seed=config.seed,
             workers=config.workers,
@@ -105,6 +99,25 @@ def run_demo(config: DemoConfig, out: Path, console: Console) -> DemoResult:
         folder=out, store=store, hand_eye=hand_eye, scene=scene, grasps=grasps, errors=errors,
         report=report, times=console.times,
     )  # fmt: skip
+
+
+def capture_and_register(
+    config: DemoConfig, out: Path, console: Console
+) -> tuple[SessionStore, HandEye, Scene]:
+    """Run the first half of the loop in `out`: plan, capture, calibrate, register.
+
+    Returns:
+        The session, the hand-eye calibration and the registered scene; the truth lies in
+        `out/truth`.
+    """
+    from realsim_capture_plans.lab import LabConfig, SimulatedLab
+
+    lab = SimulatedLab(LabConfig(seed=config.seed, arm=config.arm, n_objects=config.objects))
+    store = _capture_all(lab, config, out, console)
+    joints = {v.index: v.joints for v in store.session.views if v.joints is not None}
+    lab.write_truth(out / "truth", joints)
+    hand_eye = calibrate_session(store, console, config.arm)
+    return store, hand_eye, register_session(store, console)
 
 
 def _claim(out: Path, config: DemoConfig) -> None:
