@@ -6,6 +6,7 @@ from realsim_calibration.calibrate import (
     calibrate,
     calibrate_from_poses,
 )
+from realsim_calibration.clock.offset import ClockOffset, estimate_clock_offset
 from realsim_calibration.depth.bias import estimate_depth_bias
 from realsim_calibration.depth.board import DepthBoardView
 from realsim_calibration.detect.find import FindConfig, find_target
@@ -28,6 +29,7 @@ from realsim_calibration.hand_eye import (
 )
 from realsim_calibration.lens.fit import IntrinsicsConfig
 from realsim_calibration.lens.intrinsics import calibrate_intrinsics
+from realsim_calibration.pairs.solve import PosePairs, solve_pose_pairs
 from realsim_calibration.planning.live_calibration import LiveCalibration
 from realsim_calibration.planning.next_view import choose_next_views, rank_next_views
 from realsim_calibration.results import HandEyeReport
@@ -39,6 +41,7 @@ __all__ = [
     "BoardView",
     "Calibration",
     "CalibrationConfig",
+    "ClockOffset",
     "DepthBoardView",
     "FindConfig",
     "GateConfig",
@@ -48,6 +51,7 @@ __all__ = [
     "JointConfig",
     "LiveCalibration",
     "MotionConfig",
+    "PosePairs",
     "TargetDetection",
     "calibrate",
     "calibrate_from_poses",
@@ -60,10 +64,12 @@ __all__ = [
     "detection_of",
     "diagnose",
     "estimate_board_pose",
+    "estimate_clock_offset",
     "estimate_depth_bias",
     "find_target",
     "park",
     "prove_reading",
     "rank_next_views",
     "shah",
+    "solve_pose_pairs",
 ]

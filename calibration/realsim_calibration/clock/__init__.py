@@ -1,0 +1,1 @@
+"""Arm and camera by two clocks: the offset between them, from motion alone."""

@@ -1,0 +1,155 @@
+"""The offset between the clocks of arm and camera: laws, known answers, sigma, named errors."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+
+from realsim.arrays import Array
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim_calibration import ClockOffset, estimate_clock_offset
+from realsim_calibration.clock.offset import autocorrelation_factor
+from realsim_calibration.clock.streams import interpolated
+
+X_TRUE = se3.exp([0.1, -0.2, 0.7, 0.03, -0.05, 0.08])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Streams:
+    """Stamped poses of an arm and of the board in its camera."""
+
+    tr: Array
+    A: Array
+    tc: Array
+    C: Array
+
+    def offset(self, later: float = 0.0) -> ClockOffset:
+        """Return the estimate with the camera's stamps so much later."""
+        return estimate_clock_offset(self.tr, self.A, self.tc + later, self.C)
+
+
+def hand(seed: int, t: Array) -> Array:
+    """Return T_base_ee (n, 4, 4) of a smooth motion that does not repeat."""
+    rng = np.random.default_rng(seed)
+    f, phase = rng.uniform(0.1, 0.6, (3, 6)), rng.uniform(0, 2 * np.pi, (3, 6))
+    size = np.array([0.25, 0.25, 0.4, 0.06, 0.06, 0.06]) / np.sqrt(3)
+    x = (np.sin(2 * np.pi * f * t[:, None, None] + phase)).sum(1) * size
+    return se3.from_rt(se3.exp_so3(x[:, :3]) @ np.diag([1.0, -1, -1]), x[:, 3:] + [0.4, 0, 0.5])
+
+
+def streams(
+    seed: int = 0, d: float = 0.0, jitter: float = 0.0, noise: float = 1.0, seconds: float = 10.0
+) -> Streams:
+    """Return ten seconds at 125 and 15 Hz; the camera stamps a frame of time t as t + d."""
+    rng = np.random.default_rng(1000 + seed)
+    tr, t = np.arange(0, seconds, 0.008), np.arange(0.01, seconds, 1 / 15)
+    Z = se3.from_rt(np.diag([1.0, -1, -1]), [0.4, 0.05, 0.0])
+    A = hand(seed, tr) @ se3.exp(rng.normal(scale=2e-4 * noise, size=(len(tr), 6)))
+    C = se3.invert(hand(seed, t) @ X_TRUE) @ Z
+    C = C @ se3.exp(np.pad(rng.normal(scale=2e-3 * noise, size=(len(t), 3)), ((0, 0), (0, 3))))
+    C[:, :3, 3] += rng.normal(scale=1e-3 * noise, size=(len(t), 3))
+    return Streams(tr=tr, A=A, tc=t + d + rng.normal(scale=jitter, size=len(t)), C=C)
+
+
+@cache
+def base() -> ClockOffset:
+    """Return the estimate of the first streams, whose clocks agree."""
+    return streams().offset()
+
+
+def test_exact_streams_give_the_offset() -> None:
+    """Without noise 37 ms come back to a tenth of a millisecond, and X to a tenth of a mm."""
+    found = streams(d=0.037, noise=0.01).offset()
+    assert found.offset_s == pytest.approx(0.037, abs=1e-4)
+    assert np.linalg.norm((se3.invert(found.X) @ X_TRUE)[:3, 3]) < 1e-4
+
+
+@pytest.mark.parametrize("d", [0.25, -0.6])
+def test_a_shift_of_the_stamps_shifts_the_offset(d: float) -> None:
+    """Law: stamps later by d give an offset larger by d."""
+    assert streams().offset(d).offset_s - base().offset_s == pytest.approx(d, abs=5e-5)
+
+
+def test_one_constant_on_both_clocks_changes_nothing() -> None:
+    """Law: seconds since 1970 and seconds since the start are the same to the microsecond."""
+    s = streams()
+    later = estimate_clock_offset(s.tr + 1.7e9, s.A, s.tc + 1.7e9, s.C)
+    assert later.offset_s == pytest.approx(base().offset_s, abs=2e-6)
+
+
+def test_sigma_is_that_of_the_errors() -> None:
+    """Over twelve motions with jitter of 4 ms the offset is off by one sigma on the average."""
+    found = [streams(seed, d=0.05, jitter=0.004).offset() for seed in range(12)]
+    z = np.array([(f.offset_s - 0.05) / f.sigma_s for f in found])
+    assert 0.45 < np.sqrt(np.mean(z**2)) < 1.6
+    assert np.median([f.jitter_s for f in found]) == pytest.approx(0.004, rel=0.3)
+    assert np.median([abs(f.offset_s - 0.05) for f in found]) < 1e-3
+
+
+def test_whether_it_matters() -> None:
+    """A tenth of a second does, half a millisecond does not; the words say so."""
+    assert not streams(d=0.0005).offset().matters
+    far = streams(d=0.1).offset()
+    assert far.matters and "it matters" in far.sentence
+    assert far.moved_mm > 5.0
+
+
+def test_frames_without_a_board_and_wrong_ones_do_no_harm() -> None:
+    """NaN frames are left out, invented poses are gated."""
+    s = streams(d=0.02)
+    rng = np.random.default_rng(3)
+    C = s.C.copy()
+    C[::7] = np.nan
+    C[3::11] = se3.random_transform(rng, len(C[3::11]), 0.3)
+    found = estimate_clock_offset(s.tr, s.A, s.tc, C)
+    assert abs(found.offset_s - 0.02) < 1e-3
+    assert np.linalg.norm((se3.invert(found.X) @ X_TRUE)[:3, 3]) < 3e-3
+
+
+def test_no_motion_is_named() -> None:
+    """A still arm tells no time."""
+    s = streams()
+    with pytest.raises(InputError, match=r"robot's stream shows no motion.*--clock-offset"):
+        estimate_clock_offset(s.tr, np.repeat(s.A[:1], len(s.A), 0), s.tc, s.C)
+
+
+def test_streams_of_different_recordings_are_named() -> None:
+    """Motions that have nothing in common agree at no offset."""
+    s, other = streams(0), streams(1)
+    with pytest.raises(InputError, match="at no offset do"):
+        estimate_clock_offset(s.tr, s.A, other.tc, other.C)
+
+
+def test_an_offset_larger_than_the_recording_is_named() -> None:
+    """Of a motion the robot saw the beginning and the camera the end."""
+    s = streams(seconds=20.0)
+    early, late = s.tr < 8, s.tc > 11
+    with pytest.raises(InputError, match="larger than the recording"):
+        estimate_clock_offset(s.tr[early], s.A[early], s.tc[late], s.C[late])
+
+
+def test_too_few_stamped_poses_are_named() -> None:
+    """Two poses are no stream; stamps and poses must be as many."""
+    s = streams()
+    with pytest.raises(InputError, match="camera's stream has 2 poses"):
+        estimate_clock_offset(s.tr, s.A, s.tc[:2], s.C[:2])
+    with pytest.raises(InputError, match="clock: the robot's stream has"):
+        estimate_clock_offset(s.tr[:-1], s.A, s.tc, s.C)
+
+
+def test_neighbours_that_share_errors_widen_sigma() -> None:
+    """White scores have factor 1, a moving average of five has several times as much."""
+    white = np.random.default_rng(0).normal(size=2000)
+    assert autocorrelation_factor(white) == pytest.approx(1.0, abs=0.25)
+    assert autocorrelation_factor(np.convolve(white, np.ones(5))) > 3.0
+
+
+def test_interpolation_between_two_poses() -> None:
+    """Half way between two poses lies half the turn and half the way; outside is said."""
+    Ts = np.stack([np.eye(4), se3.from_rt(se3.exp_so3([0, 0, 1.0]), [0.2, 0, 0])])
+    found, inside = interpolated(np.array([0.0, 2.0]), Ts, np.array([1.0, 3.0]))
+    np.testing.assert_allclose(found[0, :3, :3], se3.exp_so3([0, 0, 0.5]), atol=1e-12)
+    np.testing.assert_allclose(found[0, :3, 3], [0.1, 0, 0], atol=1e-12)
+    assert inside.tolist() == [True, False]
