@@ -11,7 +11,8 @@ from realsim_calibration.checks import given_camera_check, hand_eye_checks
 from realsim_calibration.fit.joint_solve import Setup, ViewCorners
 from realsim_calibration.fit.robust_fit import Solution, solve
 from realsim_calibration.fit.view_system import SHARED, camera_record
-from realsim_calibration.results import BoardShape, HandEyeReport, ViewReport
+from realsim_calibration.plain import choose_plain
+from realsim_calibration.results import BoardShape, HandEyeReport, Stretch, ViewReport
 from realsim_calibration.screening import (
     Candidate,
     HandEyeConfig,
@@ -106,6 +107,7 @@ def _report(
     lens = solution.covariance[12:24, 12:24].copy()
     held = ~problem.free[:12]
     lens[held], lens[:, held] = 0.0, 0.0
+    plain = choose_plain(solution, screened, intrinsics0)
     used, size = solution.views, (intrinsics0.width, intrinsics0.height)
     report = HandEyeReport(
         mode=config.mode,
@@ -113,10 +115,16 @@ def _report(
         X=state.X,
         X_covariance=solution.covariance[:6, :6],
         Z=state.Z,
-        X_alone=solution.alone.X,
-        X_alone_covariance=solution.alone_covariance[:6, :6],
-        Z_alone=solution.alone.Z,
-        intrinsics_alone=camera_record(solution.alone.camera, size),
+        X_here=solution.here,
+        X_here_covariance=solution.here_covariance,
+        X_alone=plain.X,
+        X_alone_covariance=plain.covariance,
+        X_alone_here_covariance=plain.here_covariance,
+        Z_alone=plain.Z,
+        intrinsics_alone=plain.intrinsics,
+        plain_name=plain.name,
+        plain_scores=plain.scores,
+        stretch=_stretch(screened, solution),
         intrinsics=camera_record(state.camera, size),
         intrinsics_covariance=lens,
         board=shape,
@@ -143,6 +151,15 @@ def _report(
         given, fitted = (float(np.sqrt(c.fx * c.fy)) for c in (intrinsics0, report.intrinsics))
         checks = (*checks, given_camera_check(given, fitted, config.checks))
     return replace(report, checks=checks)
+
+
+def _stretch(screened: Screened, solution: Solution) -> Stretch | None:
+    """Return how the map does beyond its poses, views by index."""
+    s = solution.stretch
+    if s is None:
+        return None
+    views = tuple(screened.candidates[k].view.index for k in s.views)
+    return Stretch(views=views, map_px=s.map_px, plain_px=s.plain_px)
 
 
 def _rms(values: Sequence[float]) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check, HandEye, RobotErrorMap, Target
+from realsim.records.calibration import worst_sigmas
 from realsim.records.checked_arrays import frozen
 from realsim.untrusted.own_json import Real
 
@@ -93,6 +94,18 @@ class ViewReport:
                 robot_error=(6,))  # fmt: skip
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Stretch:
+    """How a robot map does beyond the poses it was fitted on: the outermost views held out."""
+
+    views: tuple[int, ...]
+    """Which views, by index."""
+    map_px: Real
+    """RMS with the map, fitted on the others [px]."""
+    plain_px: Real
+    """RMS without a map [px]."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class HandEyeReport:
     """A hand-eye calibration with its diagnosis.
@@ -110,13 +123,27 @@ class HandEyeReport:
     Z: Array
     """(4, 4) target in base or hand [m]."""
     X_alone: Array
-    """(4, 4) the camera's place fitted WITHOUT a map: for tools that know none [m]."""
+    """(4, 4) the camera's place WITHOUT a map, for tools that know none [m]: of `plain_scores` the
+    one that predicts unseen views best."""
     X_alone_covariance: Array
     """(6, 6) of the right perturbation of X_alone [rad, m]."""
     Z_alone: Array
     """(4, 4) the target's place that belongs to X_alone [m]."""
     intrinsics_alone: CameraIntrinsics
     """The camera that belongs to X_alone."""
+    X_here: Array | None = None
+    """(4, 4) X for this arm as it moves here [m]: what the robot gets wrong everywhere, and what
+    its map says on average, is in it. None: not estimated, X stands for it."""
+    X_here_covariance: Array | None = None
+    """(6, 6) of its right perturbation; X_covariance is absolute: for another arm, a drawing."""
+    X_alone_here_covariance: Array | None = None
+    """(6, 6) of X_alone, for this arm as it moves here."""
+    plain_name: str = "joint"
+    """Where X_alone comes from: the chosen one of `plain_scores`."""
+    plain_scores: tuple[tuple[str, Real], ...] = ()
+    """(candidate for X_alone, RMS of the unseen views without a map [px])."""
+    stretch: Stretch | None = None
+    """The map beyond its poses; None without a map, or where too few views would be left."""
     intrinsics: CameraIntrinsics
     intrinsics_covariance: Array
     """(12, 12) of fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6; zero rows = held."""
@@ -162,6 +189,7 @@ class HandEyeReport:
         """Check the arrays' shapes and freeze them."""
         _freeze(self, X=(4, 4), Z=(4, 4), X_alone=(4, 4), Z_alone=(4, 4), X_covariance=(6, 6),
                 X_alone_covariance=(6, 6), intrinsics_covariance=(12, 12), joint_offsets=(None, 2),
+                X_here=(4, 4), X_here_covariance=(6, 6), X_alone_here_covariance=(6, 6),
                 information=(None, None))  # fmt: skip
 
     @property
@@ -188,13 +216,28 @@ class HandEyeReport:
 
     @property
     def sigma_mm(self) -> float:
-        """Largest 1-sigma of X's translation along any axis [mm]."""
-        return float(1e3 * np.sqrt(np.linalg.eigvalsh(self.X_covariance[3:, 3:])[-1]))
+        """Largest 1-sigma of X's translation along any axis, absolute [mm]."""
+        return worst_sigmas(self.X_covariance)[0]
 
     @property
     def sigma_deg(self) -> float:
-        """Largest 1-sigma of X's rotation about any axis [deg]."""
-        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.X_covariance[:3, :3])[-1])))
+        """Largest 1-sigma of X's rotation about any axis, absolute [deg]."""
+        return worst_sigmas(self.X_covariance)[1]
+
+    @property
+    def here_mm(self) -> float:
+        """Largest 1-sigma of the camera's place for this arm as it moves here [mm]."""
+        return worst_sigmas(self.place_covariance)[0]
+
+    @property
+    def here_deg(self) -> float:
+        """Largest 1-sigma of the camera's rotation for this arm as it moves here [deg]."""
+        return worst_sigmas(self.place_covariance)[1]
+
+    @property
+    def place_covariance(self) -> Array:
+        """(6, 6) of the camera's place for this arm as it moves here; absolute where unknown."""
+        return self.X_covariance if self.X_here_covariance is None else self.X_here_covariance
 
     @property
     def hand_eye(self) -> HandEye:
@@ -208,6 +251,7 @@ class HandEyeReport:
         return HandEye(
             T_ee_cam=self.X,
             covariance=self.X_covariance,
+            here_covariance=self.X_here_covariance,
             T_base_board=self.Z,
             intrinsics=self.intrinsics,
             intrinsics_sd=np.sqrt(np.diag(self.intrinsics_covariance)),

@@ -105,7 +105,7 @@ def screen(
     _require_joints_of(arm, views)
     candidates, rejected = _candidates(views, target, intrinsics0, config)
     candidates, turned = _counted_from_one_end(candidates, target, intrinsics0)
-    A, C = _stacks(candidates)
+    A, C = stacks(candidates)
     check_observable(A, config.motion)
     labels = [c.view.label for c in candidates]
     diagnosis = examine(
@@ -125,10 +125,10 @@ def screen(
     rejected |= {candidates[k].view.index: reason for k, reason in dropped.items()}
     keep = [k for k in range(len(candidates)) if k not in dropped]
     candidates, C = [candidates[k] for k in keep], C[keep]
-    A = _stacks(candidates)[0]
+    A = stacks(candidates)[0]
     mismatch, ratio = rotation_mismatch_deg(A, C), screw_ratio(A, C, config.gates)
     candidates, start, starts, more = _start(candidates, C, intrinsics0, config)
-    used = _stacks(candidates)[1]
+    used = stacks(candidates)[1]
     motion = motion_check_of(_given(candidates), used, middle, eye_in_hand=in_hand)
     return Screened(
         candidates=candidates,
@@ -167,7 +167,7 @@ def _counted_from_one_end(
     candidates: list[Candidate], target: Target, intrinsics: CameraIntrinsics
 ) -> tuple[list[Candidate], Check | None]:
     """Return the candidates with boards that were counted from the wrong end counted anew."""
-    A, C = _stacks(candidates)
+    A, C = stacks(candidates)
     turns = half_turned(A, C, target)
     if turns is None:
         return candidates, None
@@ -242,7 +242,7 @@ def _candidates(
     return candidates, rejected
 
 
-def _stacks(candidates: list[Candidate]) -> tuple[Array, Array]:
+def stacks(candidates: list[Candidate]) -> tuple[Array, Array]:
     """Return (N, 4, 4) hand poses and board poses."""
     A = np.array([c.A for c in candidates]).reshape(-1, 4, 4)
     return A, np.array([c.pose.T_cam_board for c in candidates]).reshape(-1, 4, 4)
@@ -277,12 +277,12 @@ def _closed_forms(
     candidates: list[Candidate], C: Array, intrinsics: CameraIntrinsics, config: HandEyeConfig
 ) -> dict[str, tuple[Array, Array, Array]]:
     """Return (X, Z, px per view) of every closed form."""
-    A, _ = _stacks(candidates)
+    A, _ = stacks(candidates)
     check_observable(A, config.motion)
     tried: dict[str, tuple[Array, Array, Array]] = {}
     for name, solve_closed in CLOSED_FORMS.items():
         X, Z = solve_closed(A, C)
-        tried[name] = (X, Z, _view_px(candidates, X, Z, intrinsics))
+        tried[name] = (X, Z, view_px(candidates, X, Z, intrinsics))
     return tried
 
 
@@ -291,9 +291,9 @@ def _best(tried: dict[str, tuple[Array, Array, Array]]) -> tuple[Array, Array, A
     return min(tried.values(), key=lambda entry: float(np.median(entry[2])))
 
 
-def _view_px(candidates: list[Candidate], X: Array, Z: Array, camera: CameraIntrinsics) -> Array:
+def view_px(candidates: list[Candidate], X: Array, Z: Array, camera: CameraIntrinsics) -> Array:
     """Return each view's RMS through the robot pose [px], infinite behind the camera."""
-    Ts = se3.invert(_stacks(candidates)[0] @ X) @ Z
+    Ts = se3.invert(stacks(candidates)[0] @ X) @ Z
     seen = [se3.transform(T, c.points) for T, c in zip(Ts, candidates, strict=True)]
     error = project(camera, np.concatenate(seen)) - np.concatenate([c.uv for c in candidates])
     counts = np.array([len(c.uv) for c in candidates])

@@ -18,6 +18,12 @@ MAP_FEATURES = 12
 """Features of a pose in an error map: position (3) and rotation matrix (9)."""
 
 
+def worst_sigmas(covariance: Array) -> tuple[float, float]:
+    """Return the largest 1-sigma of translation [mm] and rotation [deg] of a covariance (6, 6)."""
+    mm = float(1e3 * np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
+    return mm, float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])))
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Check:
     """One thing that was looked at, what was found, and what to do about it."""
@@ -146,7 +152,8 @@ class HandEye:
     T_ee_cam: Array
     """(4, 4) camera in the controller's tool frame [m]."""
     covariance: Array
-    """(6, 6) of the right perturbation of T_ee_cam, rotation first [rad, m]."""
+    """(6, 6) of the right perturbation of T_ee_cam, rotation first [rad, m]: absolute, with what
+    the arm may be off by everywhere."""
     T_base_board: Array
     """(4, 4) board in base [m]."""
     intrinsics: CameraIntrinsics
@@ -169,6 +176,9 @@ class HandEye:
     they are."""
     checks: tuple[Check, ...] = ()
     """Everything that was checked, with verdict and advice."""
+    here_covariance: Array | None = None
+    """(6, 6) of the camera's place for this arm as it moves at the calibrated poses: what the arm
+    is off by everywhere cancels. None = not estimated."""
 
     def __post_init__(self) -> None:
         """Check that the poses are rigid and freeze the arrays."""
@@ -181,16 +191,25 @@ class HandEye:
         ):
             value = frozen(getattr(self, name), np.float64, shape, name)
             object.__setattr__(self, name, value)
+        if self.here_covariance is not None:
+            value = frozen(self.here_covariance, np.float64, (6, 6), "here_covariance")
+            object.__setattr__(self, "here_covariance", value)
 
     @property
     def sigma_deg(self) -> float:
-        """Largest 1-sigma of the rotation about any axis [deg]."""
-        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1])))
+        """Largest 1-sigma of the rotation about any axis, absolute [deg]."""
+        return worst_sigmas(self.covariance)[1]
 
     @property
     def sigma_mm(self) -> float:
-        """Largest 1-sigma of the translation along any axis [mm]."""
-        return float(1e3 * np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))
+        """Largest 1-sigma of the translation along any axis, absolute [mm]."""
+        return worst_sigmas(self.covariance)[0]
+
+    @property
+    def here_sigmas(self) -> tuple[float, float]:
+        """Largest 1-sigma [mm], [deg] for this arm as it moves here; absolute where unknown."""
+        known = self.here_covariance
+        return worst_sigmas(self.covariance if known is None else known)
 
     def camera_poses(self, Ts_base_ee: ArrayLike, joints: ArrayLike | None = None) -> Array:
         """Return T_base_cam (..., 4, 4) [m] at the controller's poses (..., 4, 4).

@@ -15,11 +15,11 @@ from realsim.records.checked_arrays import rigid
 from realsim.store import atomic
 from realsim.untrusted.own_json import OwnFile, Real, from_json, read_object, to_json
 from realsim_calibration.exports.frames import FrameNames, parent_frame, quaternion_xyzw
-from realsim_calibration.results import BoardShape, HandEyeReport, Mode, ViewReport
+from realsim_calibration.results import BoardShape, HandEyeReport, Mode, Stretch, ViewReport
 
 Record = TypeVar("Record")
 SCHEMA = "realsim.calibration"
-VERSION = 2
+VERSION = 3
 ROW_LENGTH = 10
 """Numbers up to which a list of rows is written one row a line."""
 SAME_ROTATION = 1e-6
@@ -32,9 +32,14 @@ MAP_NOTES = {
     ", and G = T_flange_tool, see ArmErrorMap; needs the joints q. Use X together with this map. "
     "X_alone needs no map.",
 }
+HERE = (
+    "where this arm's camera is at the calibrated poses; covariance: the arm's constant error out"
+)
 CONVENTIONS = {
     "transforms": "T_a_b maps points of b into a; matrices row by row; metres",
-    "covariance": "of the right perturbation T Exp(xi), xi = rotation first [rad, m]",
+    "covariance": "of the right perturbation T Exp(xi), xi = rotation first [rad, m]; absolute "
+    "(for another arm, a new mount, a drawing); X_here's, and here_covariance: for this arm as it "
+    "moves here",
     "camera": "optical frame: x right, y down, z forward; integer pixels are pixel centres",
     "board": "x along the columns, y down the page, z into the paper, origin at the first point",
     "distortion": "OpenCV: k1 k2 p1 p2 k3 k4 k5 k6",
@@ -102,9 +107,14 @@ def _document(report: HandEyeReport, frames: FrameNames) -> dict[str, Any]:
             "target": frames.target,
         },
         "X": _transform(report.X, parent, cam, with_map, report.X_covariance),
-        "X_alone": _transform(
-            report.X_alone, parent, cam, "without a map", report.X_alone_covariance
-        ),
+        "X_here": None
+        if report.X_here is None
+        else _transform(report.X_here, parent, cam, HERE, report.X_here_covariance),
+        "X_alone": {
+            **_transform(report.X_alone, parent, cam, "without a map", report.X_alone_covariance),
+            "origin": report.plain_name,
+            "here_covariance": report.X_alone_here_covariance,
+        },
         "Z": _transform(report.Z, other, frames.target, "together with X", None),
         "Z_alone": _transform(report.Z_alone, other, frames.target, "together with X_alone", None),
         "accuracy": {
@@ -136,6 +146,8 @@ def _document(report: HandEyeReport, frames: FrameNames) -> dict[str, Any]:
         "map_scores": [list(pair) for pair in report.map_scores],
         "joint_offsets": report.joint_offsets,
         "starts": [list(pair) for pair in report.starts],
+        "plain_scores": [list(pair) for pair in report.plain_scores],
+        "stretch": None if report.stretch is None else to_json(report.stretch),
         "views": [to_json(v) for v in report.views],
         "information": report.information,
     }
@@ -200,6 +212,13 @@ class _Calibrated(_Transform, frozen=True, kw_only=True):
     covariance: Array
 
 
+class _Alone(_Calibrated, frozen=True, kw_only=True):
+    """X_alone: also where it comes from, and its covariance for this arm."""
+
+    origin: str
+    here_covariance: Array | None
+
+
 class _File(OwnFile, frozen=True, kw_only=True):
     """The file; records with notes beside their fields are still plain."""
 
@@ -211,7 +230,8 @@ class _File(OwnFile, frozen=True, kw_only=True):
     warnings: list[str]
     frames: dict[str, str]
     X: _Calibrated
-    X_alone: _Calibrated
+    X_here: _Calibrated | None
+    X_alone: _Alone
     Z: _Transform
     Z_alone: _Transform
     accuracy: dict[str, Real]
@@ -225,6 +245,8 @@ class _File(OwnFile, frozen=True, kw_only=True):
     map_scores: tuple[tuple[str, Real], ...]
     joint_offsets: Array | None
     starts: tuple[tuple[str, Real], ...]
+    plain_scores: tuple[tuple[str, Real], ...]
+    stretch: Stretch | None
     views: tuple[ViewReport, ...]
     information: Array
 
@@ -278,8 +300,14 @@ def _report(d: _File, path: str) -> HandEyeReport:
         X=_matrix(d.X, f"{path}: X"),
         X_covariance=d.X.covariance,
         Z=_matrix(d.Z, f"{path}: Z"),
+        X_here=None if d.X_here is None else _matrix(d.X_here, f"{path}: X_here"),
+        X_here_covariance=None if d.X_here is None else d.X_here.covariance,
         X_alone=_matrix(d.X_alone, f"{path}: X_alone"),
         X_alone_covariance=d.X_alone.covariance,
+        X_alone_here_covariance=d.X_alone.here_covariance,
+        plain_name=d.X_alone.origin,
+        plain_scores=d.plain_scores,
+        stretch=d.stretch,
         Z_alone=_matrix(d.Z_alone, f"{path}: Z_alone"),
         intrinsics_alone=alone,
         intrinsics=camera,

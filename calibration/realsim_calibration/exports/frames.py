@@ -1,9 +1,9 @@
 """What an exported calibration says of itself: frames, the transform, accuracy, warnings.
 
-Other programs know no robot error map, so what they get is `X_alone`, the camera's place fitted
-without one, with `Z_alone` and `intrinsics_alone` of the same fit: numbers of two fits do not fit
-one another. The camera frame is always the OPTICAL one (x right, y down, z forward), unless a
-`camera_link` is asked for.
+Other programs know no robot error map, so what they get is `X_alone`, the place of the camera that
+predicts unseen views best without one, with `Z_alone` and `intrinsics_alone` of the same fit:
+numbers of two fits do not fit one another. The camera frame is always the OPTICAL one (x right, y
+down, z forward), unless a `camera_link` is asked for.
 """
 
 import re
@@ -15,14 +15,13 @@ from realsim import __version__
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import metrics, se3
+from realsim.records.calibration import worst_sigmas
 from realsim.records.checked_arrays import rigid
 from realsim_calibration.results import HandEyeReport
 
 FRAME_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.\-]*(/[A-Za-z0-9_.\-]+)*")
 """What tf2 takes for a frame: no spaces, no leading slash."""
 FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*")
-NO_MAP = "none"
-"""Name of the fit without a map in `map_scores`."""
 LOCK_COSINE = 1e-12
 """Cosine of the pitch below which roll and yaw turn about the same axis."""
 
@@ -123,13 +122,24 @@ def _accuracy_line(report: HandEyeReport) -> str:
         f"Views that the fit had not seen: {report.held_out_px:.2f} px, {report.held_out_mm:.2f} "
         f"mm, {report.held_out_deg:.3f} deg RMS, through the robot's own pose{through}."
     )
-    scores = dict(report.map_scores)
-    bare, best = scores.get(NO_MAP, np.nan), scores.get(report.map_name, np.nan)
-    if report.robot_map is None or not np.isfinite(bare) or not np.isfinite(best):
+    plain = dict(report.plain_scores).get(report.plain_name, np.nan)
+    if report.robot_map is None or not np.isfinite(plain):
         return line
+    return f"{line} Without the map, as exported here: {plain:.2f} px."
+
+
+def _sigma_line(report: HandEyeReport) -> str:
+    """Return both sigmas of what is exported: for this arm, and absolute."""
+    mm, deg = worst_sigmas(report.X_alone_covariance)
+    if report.X_alone_here_covariance is None:
+        return (
+            f"1 sigma along the worst axis: {mm:.3f} mm, {deg:.4f} deg. Numbers read back exactly."
+        )
+    here_mm, here_deg = worst_sigmas(report.X_alone_here_covariance)
     return (
-        f"{line} Without the map, as exported here: {bare:.2f} px where the map has {best:.2f} px "
-        "(geometric mean over the views)."
+        f"1 sigma along the worst axis for this arm as it moves here: {here_mm:.3f} mm, "
+        f"{here_deg:.4f} deg; for another arm, a new mount or a drawing: {mm:.3f} mm, {deg:.4f} "
+        "deg. Numbers read back exactly."
     )
 
 
@@ -138,8 +148,9 @@ def fit_line(report: HandEyeReport) -> str:
     if report.robot_map is None:
         return "Camera matrix, distortion, and the target's place belong to this hand-eye: one fit."
     return (
-        "Camera matrix, distortion, and the target's place belong to the hand-eye fitted WITHOUT "
-        "the robot's error map: do not mix them with those of calibration.json that need the map."
+        "Camera matrix, distortion, and the target's place belong to this hand-eye, used "
+        "WITHOUT the robot's error map: do not mix them with those of calibration.json that need "
+        "the map."
     )
 
 
@@ -155,9 +166,6 @@ def note_lines(
     """
     parent = parent_frame(report, frames)
     child = child or frames.camera_optical
-    covariance = report.X_alone_covariance
-    mm = 1e3 * np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
-    deg = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
     axes = (
         "the camera's OPTICAL frame: x right, y down, z forward"
         if child == frames.camera_optical
@@ -172,16 +180,22 @@ def note_lines(
         f"Hand-eye calibration by realsim {__version__}, {report.mode.replace('_', ' ')}.",
         f"Maps points of {child} ({axes}) into {parent}. Metres, radians.",
         reported,
-        f"1 sigma along the worst axis: {mm:.3f} mm, {deg:.4f} deg. Numbers read back exactly.",
+        _sigma_line(report),
         _accuracy_line(report),
     ]
     if report.robot_map is not None:
         moved = float(metrics.translation_error_mm(report.X, report.X_alone))
         turned = float(metrics.rotation_error_deg(report.X, report.X_alone))
         lines.append(
-            "This is the camera's place fitted WITHOUT the robot's error map, for programs that "
-            f"know none: {moved:.2f} mm and {turned:.3f} deg from the one in calibration.json, "
-            "which is valid with the map only."
+            "This is X_alone, the camera's place WITHOUT the robot's error map, for programs that "
+            f"know none: {moved:.2f} mm and {turned:.3f} deg from X in calibration.json, which is "
+            "valid with the map only."
+        )
+    if report.plain_scores:
+        held = ", ".join(f"{name} {px:.2f}" for name, px in report.plain_scores)
+        lines.append(
+            f"It is that of '{report.plain_name}', which predicts unseen views best without a map "
+            f"[px]: {held}."
         )
     if not report.checks:
         lines.append("WARNING: nothing was checked.")

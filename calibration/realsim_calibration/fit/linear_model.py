@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from realsim.arrays import Array
+from realsim.arrays import Array, Rows
 from realsim.errors import DegenerateError
 from realsim_calibration.fit.joint_solve import JointProblem, JointState
 from realsim_calibration.fit.robot_error import ErrorBasis
@@ -28,6 +28,10 @@ from realsim_calibration.fit.view_system import SHARED
 ROBOT = slice(SHARED, SHARED + 6)
 SIGMA_ROUNDS = 3
 """Rounds of sigma inside one evaluation of the likelihood; the fourth changes it by 1e-4."""
+
+LEAST_LEFT = 0.1
+"""1 - leverage is taken for no less: of 7 views one that alone holds a direction says nothing of
+its noise, and its jackknife step has no bound."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -43,6 +47,10 @@ class LinearFit:
     """(views, 24, 29 + p) U_i, whitened: H = sum U_i^T U_i + prior."""
     away: Array
     """(views, 29 + p) step from the solution to the fit without view i."""
+    swings: Array
+    """(views, 29 + p) `away`, backwards and bounded: no view counts more than ten times over."""
+    pulls: Array
+    """(views, 29 + p) U_i^T rho_i: how hard each view pulls at the solution."""
     seen_px: Array
     """(views,) RMS through the robot's pose and its map [px]."""
     unseen_px: Array
@@ -52,6 +60,18 @@ class LinearFit:
     def score(self) -> float:
         """Geometric mean of the unseen views' RMS [px]."""
         return float(np.exp(np.mean(np.log(np.maximum(self.unseen_px, 1e-9)))))
+
+    def without(self, views: Rows) -> Array:
+        """Return the step (29 + p,) from the solution to the fit without some views.
+
+        Raises:
+            DegenerateError: without them the rest is not determined.
+        """
+        rows = self.view_rows[views].reshape(-1, len(self.step))
+        rest = self.information - rows.T @ rows
+        if np.linalg.eigvalsh(rest)[0] <= 0:
+            raise DegenerateError("hand-eye: without these views the rest is not determined.")
+        return np.asarray(np.linalg.solve(rest, self.pulls[views].sum(0)), dtype=np.float64)
 
 
 class LinearModel:
@@ -157,6 +177,7 @@ class LinearModel:
             ) from error
         return LinearFit(
             step=step, sigma_px=sigma, information=H, view_rows=U, away=away,
+            pulls=np.einsum("nrc,nr->nc", U, residual), swings=_swings(H, U, residual),
             seen_px=self.predicted(basis, np.broadcast_to(step, away.shape)),
             unseen_px=self.predicted(basis, step + away),
         )  # fmt: skip
@@ -187,3 +208,12 @@ def _left_out(H: Array, U: Array, residual: Array) -> Array:
     V = V.reshape(len(H), len(U), -1).transpose(1, 0, 2)  # H^-1 U_i^T (views, dim, 24)
     inner = np.eye(U.shape[1]) - U @ V
     return (V @ np.linalg.solve(inner, residual[..., None]))[..., 0]
+
+
+def _swings(H: Array, U: Array, residual: Array) -> Array:
+    """Return `_left_out` (views, dim) with the views' leverage bounded."""
+    V = np.linalg.solve(H, np.swapaxes(U, 1, 2).transpose(1, 0, 2).reshape(len(H), -1))
+    V = V.reshape(len(H), len(U), -1).transpose(1, 0, 2)
+    left, axes = np.linalg.eigh(np.eye(U.shape[1]) - U @ V)
+    along = np.swapaxes(axes, 1, 2) @ residual[..., None]
+    return (V @ axes @ (along / np.maximum(left, LEAST_LEFT)[..., None]))[..., 0]

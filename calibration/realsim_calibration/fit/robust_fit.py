@@ -18,6 +18,13 @@ from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim.records import ArmErrorMap, RobotErrorMap
 from realsim_calibration.fit.board_pose import refine_board_pose
+from realsim_calibration.fit.effective import (
+    PlainFit,
+    Stretch,
+    plain_fits,
+    projection,
+    stretch,
+)
 from realsim_calibration.fit.joint_solve import JointProblem, JointState, Setup, smooth_errors
 from realsim_calibration.fit.linear_model import LinearFit, LinearModel
 from realsim_calibration.fit.noise_scale import (
@@ -35,6 +42,7 @@ from realsim_calibration.fit.robot_error import (
     arm_basis,
     map_basis,
     map_record,
+    pose_features,
 )
 from realsim_calibration.fit.view_system import SHARED
 
@@ -70,10 +78,20 @@ class Solution:
     """(29, 29) of the shared parameters."""
     information: Array
     """(29, 29), the map held."""
+    here: Array
+    """(4, 4) X for this arm as it moves here: see `effective`."""
+    here_covariance: Array
+    """(6, 6) of its right perturbation; what the arm gets wrong everywhere cancels."""
     alone: JointState
-    """The fit without a map."""
+    """The joint fit without a map."""
     alone_covariance: Array
     """(29, 29)."""
+    alone_here_covariance: Array
+    """(6, 6) of its X, for this arm."""
+    plain: tuple[PlainFit, ...]
+    """Joint fits for programs that know no map, `alone` first."""
+    stretch: Stretch | None
+    """How the map does beyond its poses; None without a map of the poses."""
     robot_map: RobotErrorMap | ArmErrorMap | None
     map_name: str
     scores: tuple[tuple[str, float], ...]
@@ -125,16 +143,26 @@ def solve(
         if config.robot_map:
             choices.append(Choice(basis=known, ratio=arm_ratio, fit=fit))
     best = chosen_of(choices, config.robot)
-    if best.basis is not None and best.basis.kind != "arm" and not fixed:
-        ratio = estimate_ratio(model, best.basis, sigma, most, config.noise)
-        best = Choice(basis=best.basis, ratio=ratio, fit=model.fit(best.basis, ratio, sigma))
+    if best.basis is not None and best.basis.kind != "arm":
+        basis = _mean_strength(best.basis, choices)
+        if not fixed:
+            ratio = estimate_ratio(model, basis, sigma, most, config.noise)
+        used = ratio if not fixed else best.ratio
+        best = Choice(basis=basis, ratio=used, fit=model.fit(basis, used, sigma))
     alone = state.moved(none.fit.step)
+    plain = plain_fits(model, none.fit, sigma, best.fit, best.basis)
+    beyond = None
+    if best.basis is not None and best.basis.kind != "arm":
+        beyond = stretch(model, best.fit, best.basis, none.fit, pose_features(Ts)[0])
+    alone_here = here_covariance(model, none, independent=white.excess <= 0)
     state, sigma, roots = _final_fit(problem, state, best, roots)
     model = LinearModel(problem, state, roots)
     final = model.fit(best.basis, best.ratio, sigma)
     columns = hidden_errors(model, none, known, Ts, sigma, config.robot.hidden_factor)
     independent = white.excess <= 0
     covariance = _covariance(model, final, best, columns, known, independent)
+    best = replace(best, fit=final)
+    moved = projection(model, best.basis)[:6, SHARED:] @ state.weights
     return Solution(
         problem=problem,
         state=state,
@@ -143,7 +171,12 @@ def solve(
         white=white,
         covariance=shared(covariance),
         information=final.information[:SHARED, :SHARED],
+        here=state.X @ se3.exp(moved),
+        here_covariance=here_covariance(model, best, independent=independent),
         alone=alone,
+        alone_here_covariance=alone_here,
+        plain=tuple(plain),
+        stretch=beyond,
         alone_covariance=shared(_covariance(model, none.fit, none, columns, known, independent)),
         robot_map=None if best.basis is None else map_record(best.basis, state.weights, Ts, arm),
         map_name=best.name,
@@ -228,6 +261,21 @@ def chosen_of(choices: list[Choice], config: RobotErrorConfig) -> Choice:
         if _gain_in_errors(arm, best) < config.arm_gain:
             best = arm
     return best
+
+
+def _mean_strength(best: ErrorBasis, choices: list[Choice]) -> ErrorBasis:
+    """Return the chosen kind of map at the mean strength of its candidates.
+
+    Views tell a map's strength roughly, so the likeliest one is a matter of luck: each strength
+    counts by its predictive density, score^-views (pseudo-Bayesian model averaging, Yao et al.
+    2018).
+    """
+    fits = [(c.basis, c.fit) for c in choices if c.basis is not None and c.basis.kind == best.kind]
+    scores = np.array([fit.score for _, fit in fits])
+    weights = (scores / scores.min()) ** -float(len(best.columns))
+    logs = np.log([basis.unit[0] / best.unit[0] for basis, _ in fits])
+    factor = float(np.exp(weights @ logs / weights.sum()))
+    return best.scaled(np.full(len(best.unit), factor))
 
 
 def _gain_in_errors(sound: Choice, other: Choice) -> float:
@@ -328,15 +376,28 @@ def _views(
 
 def noise_covariance(fit: LinearFit, *, independent: bool) -> Array:
     """Return the covariance (29 + p, ...) from noise, jackknifed unless corners are independent."""
-    marginal: Array = np.asarray(np.linalg.inv(fit.information), dtype=np.float64)
-    if independent:
-        return marginal
     n = len(fit.away)
+    share = (n - 1) / n
+    return _noise(fit, share * fit.away.T @ fit.away, np.eye(len(fit.step)), independent)
+
+
+def here_covariance(model: LinearModel, choice: Choice, *, independent: bool) -> Array:
+    """Return the covariance (6, 6) of X for this arm as it moves here (`effective`)."""
+    fit, P = choice.fit, projection(model, choice.basis)[X]
+    return _noise(fit, fit.swings.T @ fit.swings, P, independent)
+
+
+def _noise(fit: LinearFit, jackknife: Array, P: Array, independent: bool) -> Array:
+    """Return the covariance (q, q) of P theta from noise; X or its like comes first."""
+    marginal: Array = np.asarray(np.linalg.inv(fit.information), dtype=np.float64)
+    plain = P @ marginal @ P.T
+    if independent:
+        return plain
     data = np.einsum("nrc,nrd->cd", fit.view_rows, fit.view_rows)
     prior = fit.information - data
-    jackknife = (n - 1) / n * fit.away.T @ fit.away + marginal @ prior @ marginal
-    kappa = float(np.trace(np.linalg.solve(marginal[X, X], jackknife[X, X])) / 6)
-    covariance = (jackknife + max(kappa, 1.0) * marginal) / 2
+    full = P @ (jackknife + marginal @ prior @ marginal) @ P.T
+    kappa = float(np.trace(np.linalg.solve(plain[X, X], full[X, X])) / 6)
+    covariance = (full + max(kappa, 1.0) * plain) / 2
     return (covariance + covariance.T) / 2
 
 

@@ -233,8 +233,8 @@ class LiveCalibration:
             dropped = dict(report.rejected).get(last, "")
             note = f"view {usable[-1].label} was not used: {dropped}" if dropped else ""
         figures = (
-            f"{len(report.used)} views: camera known to {report.sigma_mm:.2f} mm, "
-            f"{report.sigma_deg:.3f} deg (wanted {self.config.sigma_mm:g} mm, "
+            f"{len(report.used)} views: camera known to {report.here_mm:.2f} mm, "
+            f"{report.here_deg:.3f} deg (wanted {self.config.sigma_mm:g} mm, "
             f"{self.config.sigma_deg:g} deg)"
         )
         bad = [c for c in report.checks if c.verdict == "bad"]
@@ -261,7 +261,7 @@ class LiveCalibration:
         """Return what must be done before the run may end, '' where nothing must."""
         c = self.config
         told = next((n.sentence for n in needs if n.hidden), "")
-        worst = max(report.sigma_mm / c.sigma_mm, report.sigma_deg / c.sigma_deg)
+        worst = max(report.here_mm / c.sigma_mm, report.here_deg / c.sigma_deg)
         return told if worst * c.hidden_factor > 1 else ""
 
     def _end(self, report: HandEyeReport, best: NextView | None) -> str:
@@ -269,7 +269,7 @@ class LiveCalibration:
         c = self.config
         if len(report.used) < c.min_views_to_stop:
             return ""
-        reached = report.sigma_mm <= c.sigma_mm and report.sigma_deg <= c.sigma_deg
+        reached = report.here_mm <= c.sigma_mm and report.here_deg <= c.sigma_deg
         recent = np.array(self._held_out[-c.stable_views :])
         stable = len(recent) == c.stable_views and bool(
             np.ptp(recent) <= c.stable_share * recent.mean()

@@ -238,7 +238,7 @@ class _Knowledge:
         try:
             L = np.linalg.cholesky(self._inverse(self._H[None])[0])
             to_unit = np.linalg.inv(L)
-            w, V = np.linalg.eigh(to_unit @ report.X_covariance @ to_unit.T)
+            w, V = np.linalg.eigh(to_unit @ report.place_covariance @ to_unit.T)
         except np.linalg.LinAlgError as error:
             raise DegenerateError(
                 "next view: the views so far do not determine X (its information is singular). "

@@ -30,7 +30,7 @@ def plot_uncertainty(report: HandEyeReport) -> Any:
     """Plot the 1 and 2 sigma ellipses of X along the camera's axes: translation and rotation."""
     figure = style.new_figure(5.4)
     axes = figure.subplots(2, 3)
-    C = report.X_covariance
+    C = report.place_covariance
     rows = (
         ("translation", "mm", 1e6 * C[3:, 3:], style.BLUE),
         ("rotation about", "deg", np.degrees(np.degrees(C[:3, :3])), style.GOOD),

@@ -109,8 +109,9 @@ def _verdict_section(page: _Page, report: HandEyeReport) -> None:
         (amount(report.held_out_px, 2, "px"), "error of unseen views"),
         (amount(report.held_out_mm, 2, "mm"), "the same, as a distance"),
         (amount(report.held_out_deg, 3, "deg"), "the same, as an angle"),
-        (f"± {amount(report.sigma_mm, 2, 'mm')}", "camera's place, 1 sigma"),
-        (f"± {amount(report.sigma_deg, 3, 'deg')}", "camera's rotation, 1 sigma"),
+        (f"± {amount(report.here_mm, 2, 'mm')}", "camera's place for this arm, 1 sigma"),
+        (f"± {amount(report.here_deg, 3, 'deg')}", "its rotation for this arm, 1 sigma"),
+        (f"± {amount(report.sigma_mm, 2, 'mm')}", "its place for another arm or a drawing"),
         (f"{len(report.used)} / {len(report.views)}", "views used / given"),
     ])  # fmt: skip
     page.section("Checks", "" if report.checks else "Nothing was checked.")

@@ -102,7 +102,7 @@ def pose_rows(report: HandEyeReport) -> list[list[str]]:
     """Return the rows that say where the camera is, with 1 sigma along the axes of the carrier."""
     X, what = report.X, carrier(report)
     # The covariance is that of a right perturbation: along the camera's axes.
-    in_carrier = X[:3, :3] @ report.X_covariance[3:, 3:] @ X[:3, :3].T
+    in_carrier = X[:3, :3] @ report.place_covariance[3:, 3:] @ X[:3, :3].T
     sd = 1e3 * np.sqrt(np.diag(in_carrier))
     place = [
         f"{a} {1e3 * v:.3f} ± {amount(s, 3)}" for a, v, s in zip("xyz", X[:3, 3], sd, strict=True)
@@ -111,10 +111,17 @@ def pose_rows(report: HandEyeReport) -> list[list[str]]:
     rpy = ", ".join(f"{np.degrees(v):.3f}" for v in roll_pitch_yaw(X[:3, :3]))
     rows = [
         [f"camera in the {what} [mm], ± 1 sigma", ", ".join(place)],
-        ["roll, pitch, yaw about fixed axes [deg]", f"{rpy} (± {report.sigma_deg:.4f})"],
+        ["roll, pitch, yaw about fixed axes [deg]", f"{rpy} (± {report.here_deg:.4f})"],
         ["quaternion x, y, z, w", q],
         ["looks along", looks_along(report)],
-        ["1 sigma, worst axis", f"{report.sigma_mm:.3f} mm, {report.sigma_deg:.4f} deg"],
+        [
+            "1 sigma, worst axis, for this arm as it moves here",
+            f"{report.here_mm:.3f} mm, {report.here_deg:.4f} deg",
+        ],
+        [
+            "the same for another arm, a new mount, a drawing",
+            f"{report.sigma_mm:.3f} mm, {report.sigma_deg:.4f} deg",
+        ],
     ]
     moved = float(metrics.translation_error_mm(report.X, report.X_alone))
     turned = float(metrics.rotation_error_deg(report.X, report.X_alone))
@@ -128,6 +135,17 @@ def pose_rows(report: HandEyeReport) -> list[list[str]]:
                 f"and {turned:.3f} deg elsewhere",
             ]
         )
+    if report.stretch is not None:
+        s = report.stretch
+        rows.append(
+            [
+                f"the {len(s.views)} outermost views, held out together",
+                f"{amount(s.map_px, 3, 'px')} with the map, {amount(s.plain_px, 3, 'px')} without",
+            ]
+        )
+    if report.plain_scores:
+        held = ", ".join(f"{name} {amount(px, 2)}" for name, px in report.plain_scores)
+        rows.append([f"X alone is '{report.plain_name}'; unseen views without a map [px]", held])
     return rows
 
 

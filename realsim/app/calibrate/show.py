@@ -13,6 +13,8 @@ from realsim_calibration import HandEyeReport
 
 NEXT_VIEWS = 3
 """Further views that are proposed."""
+GAIN = 0.95
+"""The proposed views are told of if together they bring a sigma below this part of what it is."""
 ORDER = ("bad", "warn", "unknown", "good")
 
 
@@ -28,9 +30,14 @@ def report_document(
         "mode": report.mode,
         "T_ee_cam" if in_hand else "T_base_cam": report.X,
         "T_base_board" if in_hand else "T_ee_board": report.Z,
+        "here_sigma_mm": report.here_mm,
+        "here_sigma_deg": report.here_deg,
+        "here_covariance": report.X_here_covariance,
         "sigma_mm": report.sigma_mm,
         "sigma_deg": report.sigma_deg,
         "covariance": report.X_covariance,
+        "T_alone": report.X_alone,
+        "alone_from": report.plain_name,
         "held_out_px": report.held_out_px,
         "held_out_mm": report.held_out_mm,
         "held_out_deg": report.held_out_deg,
@@ -45,10 +52,15 @@ def report_document(
 def show_hand_eye(hand_eye: HandEye, console: Console) -> None:
     """Print the hand-eye of a session and what speaks for it."""
     t, w = hand_eye.T_ee_cam[:3, 3] * 1e3, np.degrees(se3.log_so3(hand_eye.T_ee_cam[:3, :3]))
+    mm, deg = hand_eye.here_sigmas
     rows = [
         ["camera in tool, translation [mm]", " ".join(f"{v:.2f}" for v in t)],
         ["camera in tool, rotation vector [deg]", " ".join(f"{v:.3f}" for v in w)],
-        ["1 sigma (worst axis)", f"{hand_eye.sigma_mm:.3f} mm / {hand_eye.sigma_deg:.4f} deg"],
+        ["1 sigma (worst axis) for this arm as it moves here", f"{mm:.3f} mm / {deg:.4f} deg"],
+        [
+            "the same for another arm, a new mount, a drawing",
+            f"{hand_eye.sigma_mm:.3f} mm / {hand_eye.sigma_deg:.4f} deg",
+        ],
         ["reprojection of held-out views", f"{hand_eye.held_out_px:.3f} px"],
         ["views used / rejected", f"{len(hand_eye.view_indices)} / {len(hand_eye.rejected)}"],
     ]
@@ -78,6 +90,17 @@ def show_next_views(report: HandEyeReport, console: Console) -> None:
         views = choose_next_views(report, propose_views(report), NEXT_VIEWS)
     except RealsimError:
         return  # a calibration that is this poor has said so in its checks
+    if not views:
+        return
+    last = views[-1]
+    if last.sigma_mm > GAIN * report.sigma_mm and last.sigma_deg > GAIN * report.sigma_deg:
+        joints = any(v.joints is None for v in report.used)
+        console.say(
+            f"further views like these gain nothing: sigma stays at {report.sigma_mm:.2f} mm and "
+            f"{report.sigma_deg:.3f} deg. The arm's own errors are left"
+            + ("; joint angles with the poses let them be modelled." if joints else ".")
+        )
+        return
     rows = [
         [
             f"{k + 1}", f"{100 * v.distance_m:.0f} cm", f"{v.tilt_deg:.0f} deg",
