@@ -6,7 +6,8 @@ import shutil
 import numpy as np
 import pytest
 
-from pictured_folders import X, pictures, save_pictures
+from pictured_folders import X, Z, pictures, save_pictures
+from pictured_targets import CAMERA, TARGETS, truth
 from realsim.app.calibrate.folder import FolderRequest, read_views
 from realsim.app.console import Console
 from realsim.errors import InputError
@@ -90,3 +91,69 @@ def test_a_fixed_camera_is_told_by_its_flag(lab):
     with pytest.raises(InputError, match=r"inverted") as e:
         calibrate(found.views, found.target)
     assert "--eye-to-hand" in str(e.value) and "--reading" in str(e.value)
+
+
+def replace_pictures(lab, changed):
+    for k, picture in changed.items():
+        save_pictures(lab, [picture], f"{k:02d}.png")
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_too_few_views_are_named_with_how_many_are_needed(lab, views):
+    _, hands = pictures()
+    for path in sorted(lab.glob("*.png"))[views:]:
+        path.unlink()
+    write_matrices(lab / "poses.json", hands[:views])
+    with pytest.raises(InputError, match=f"{views} of {views} images.*3 views at least, and 24"):
+        read(lab)
+
+
+def test_fewer_poses_than_images_are_named_with_what_to_do(lab):
+    write_matrices(lab / "poses.json", pictures()[1][:7])
+    with pytest.raises(InputError, match=r"10 images and 7 poses.*image's name beside each"):
+        read(lab)
+
+
+@pytest.mark.parametrize("what", ["corners", "axes"])
+def test_drawings_on_the_target_are_named(lab, what, capsys):
+    import cv2
+
+    shots, hands = pictures()
+    target, drawn = TARGETS["chessboard"], {}
+    for k in (2, 5):
+        T = se3.invert(se3.invert(Z) @ hands[k] @ X)
+        image = cv2.cvtColor(shots[k], cv2.COLOR_GRAY2BGR)
+        if what == "corners":
+            uv = truth(target, T).astype(np.float32)
+            cv2.drawChessboardCorners(image, (7, 6), uv[:, None], True)
+        else:
+            rotation = cv2.Rodrigues(T[:3, :3])[0]
+            cv2.drawFrameAxes(image, CAMERA.K, np.zeros(5), rotation, T[:3, 3], 0.05, 2)
+        drawn[k] = image
+    read(lab)
+    assert "drawn" not in capsys.readouterr().err
+    replace_pictures(lab, drawn)
+    read(lab)
+    said = " ".join(capsys.readouterr().err.split())
+    assert "02.png, 05.png: coloured lines or dots are drawn over the target" in said
+    assert "leave these images out" in said
+
+
+def test_two_boards_among_the_images_are_named(lab, capsys):
+    other, _ = pictures("circles")
+    replace_pictures(lab, {k: other[k] for k in range(2)})
+    read(lab)
+    said = " ".join(capsys.readouterr().err.split())
+    assert "00.png shows a grid of 7x5 dots, not the target" in said
+    assert "it is one of 2 images without it (00.png, 01.png)" in said and "folder of their" in said
+
+
+def test_a_blurred_picture_is_dropped_with_its_reason(lab):
+    import cv2
+
+    shots, _ = pictures()
+    replace_pictures(lab, {4: cv2.GaussianBlur(shots[4], (0, 0), 15.0)})
+    found = read(lab)
+    report = calibrate(found.views, found.target).hand_eye
+    (dropped,) = (v for v in report.views if not v.used)
+    assert dropped.label == "04.png" and "the picture is blurred" in dropped.reason

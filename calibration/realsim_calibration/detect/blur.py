@@ -21,6 +21,9 @@ MIN_EDGES = 30
 BLURRED_PX = 1.5
 """From here on the edges are too soft: markers are lost from about 2 px on."""
 
+BLURRED = "the picture is blurred"
+"""How a reason begins that says so."""
+
 
 def edge_blur_px(gray: UInt8) -> float:
     """Return the median blur of a picture's edges as one sigma [px]; NaN where it has none.
@@ -67,6 +70,6 @@ def blur_reason(gray: UInt8) -> str:
     if not blur > BLURRED_PX:
         return ""
     return (
-        f"the picture is blurred: its edges spread over {blur:.1f} px (1 sigma, at most "
+        f"{BLURRED}: its edges spread over {blur:.1f} px (1 sigma, at most "
         f"{BLURRED_PX:g}). Let the arm rest before the picture is taken, focus, expose shorter"
     )

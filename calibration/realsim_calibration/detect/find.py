@@ -12,6 +12,7 @@ from realsim_calibration.detect.blur import blur_reason
 from realsim_calibration.detect.charuco import CharucoConfig, find_charuco
 from realsim_calibration.detect.chessboard import ChessboardConfig, find_chessboard
 from realsim_calibration.detect.circles import CirclesConfig, find_circles
+from realsim_calibration.detect.drawings import drawing_reason
 from realsim_calibration.detect.images import gray_image, size_of
 from realsim_calibration.detect.tags import DetectionConfig, TagDetections, detect_tags
 from realsim_calibration.views import TargetDetection
@@ -70,7 +71,8 @@ def find_target(
         blurred = blur_reason(gray)
         if blurred:
             return replace(found, rejected=(blurred, *found.rejected))
-    return found
+    drawn = drawing_reason(image, found.uv)
+    return replace(found, rejected=(drawn, *found.rejected)) if drawn else found
 
 
 def _points(

@@ -48,12 +48,12 @@ def examine(
 
 
 def told(found: Diagnosis) -> str:
-    """Return a diagnosis as a paragraph: what, the figures, what to do."""
+    """Return a diagnosis as a paragraph: what, what to do, the figures."""
     rows = "; ".join(
         f"{e.hypothesis}: {e.view_deg:.2f} deg, {e.view_mm:.1f} mm" for e in found.evidence[:SHOWN]
     )
-    tried = f" Misfit of the views: {rows}." if rows else ""
-    return f"{found.sentence}{tried} {found.advice}".strip()
+    tried = f"Misfit of the views: {rows}." if rows else ""
+    return " ".join(part for part in (found.sentence, found.advice, tried) if part)
 
 
 def check_of(found: Diagnosis | None, indices: Sequence[int]) -> Check:

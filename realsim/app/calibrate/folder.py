@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from realsim.app.calibrate.board_views import arm_of
-from realsim.app.calibrate.images import find_in_images, require_one_size, require_target
+from realsim.app.calibrate.images import (
+    find_in_images,
+    require_one_size,
+    require_target,
+    require_views,
+    warn_of_pictures,
+)
 from realsim.app.console import Console
 from realsim.arrays import Array
 from realsim.errors import InputError
@@ -136,6 +142,8 @@ def read_views(request: FolderRequest, console: Console) -> FolderViews:
         console.warn(f"{name} was left out: {reason}")
     detections = find_in_images(folder.images, target, request.out, console)
     require_target(folder, detections, target)
+    require_views(folder, detections, CalibrationConfig().hand_eye.motion.min_views)
+    warn_of_pictures(folder, detections, target, console)
     camera = _camera_of(request.camera)
     require_one_size(folder.labels, detections, camera, request.camera)
     reading = reading or _stated_or_proven(folder, detections, target, camera, request, console)

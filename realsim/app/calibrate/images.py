@@ -12,11 +12,17 @@ import numpy as np
 from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, Target
+from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid
 from realsim.store.atomic import write_json
 from realsim_calibration import TargetDetection, find_target
 
 if TYPE_CHECKING:
     from realsim_calibration.inputs import FolderInput
+
+SEARCH = "2"
+"""Goes up when a target may be found that was not before: notes of an earlier search are void."""
+LOOKED_AT = 2
+"""Images without the target in which it is looked what they show, which takes a second each."""
 
 
 def find_in_images(
@@ -29,7 +35,8 @@ def find_in_images(
     found: list[TargetDetection] = []
     with console.stage("find the target", f"{len(images)} images") as tick:
         for k, path in enumerate(images):
-            key = hashlib.sha256(path.read_bytes() + format_target(target).encode()).hexdigest()
+            what = f"{format_target(target)} {SEARCH}".encode()
+            key = hashlib.sha256(path.read_bytes() + what).hexdigest()
             note = out / "detections" / f"{key[:24]}.json"
             seen = _noted(note)
             if seen is None:
@@ -38,6 +45,71 @@ def find_in_images(
             found.append(seen)
             tick(k + 1, len(images))
     return found
+
+
+def warn_of_pictures(
+    folder: "FolderInput", detections: Sequence[TargetDetection], target: Target, console: Console
+) -> None:
+    """Say which images have drawings on the target, and which show another target."""
+    from realsim_calibration.detect.blur import BLURRED
+    from realsim_calibration.detect.drawings import DRAWN
+    from realsim_calibration.detect.visible import what_is_visible
+    from realsim_calibration.inputs import load_image
+
+    drawn = [k for k, d in enumerate(detections) if any(r.startswith(DRAWN) for r in d.rejected)]
+    if drawn:
+        why = detections[drawn[0]].rejected[0]
+        console.warn(f"{_named(folder, drawn)}: {why}, or leave these images out.")
+    lost = [k for k, d in enumerate(detections) if not len(d)]
+    sharp = [k for k in lost if not any(r.startswith(BLURRED) for r in detections[k].rejected)]
+    for k in sharp[:LOOKED_AT]:
+        shown = what_is_visible(load_image(folder.images[k]))
+        if _is_other(shown, target):
+            console.warn(
+                f"{folder.labels[k]} shows {shown}, not the target; it is one of {len(lost)} "
+                f"images without it ({_named(folder, lost)}). Are two boards mixed? Keep one a "
+                "calibration: move the images of the other into a folder of their own."
+            )
+            return
+
+
+def _named(folder: "FolderInput", rows: Sequence[int]) -> str:
+    more = f" and {len(rows) - 8} more" if len(rows) > 8 else ""
+    return ", ".join(folder.labels[k] for k in rows[:8]) + more
+
+
+def _is_other(shown: str, target: Target) -> bool:
+    """Return whether what a picture shows is another kind of target than this one."""
+    markers, dots = "markers of" in shown, "dots" in shown
+    if not (markers or dots or "chessboard" in shown):
+        return False
+    if isinstance(target, CircleGrid):
+        return not dots
+    if isinstance(target, Chessboard):
+        return markers or dots
+    family = target.dictionary if isinstance(target, CharucoBoard) else "APRILTAG"
+    return not markers or family.split("_")[1 if family.startswith("DICT_") else 0] not in shown
+
+
+def require_views(folder: "FolderInput", detections: Sequence[TargetDetection], least: int) -> None:
+    """Raise unless the target was found in enough images, with the reasons of the others.
+
+    Raises:
+        InputError: too few; says how many are needed.
+    """
+    found = sum(len(d) > 0 for d in detections)
+    if found >= least:
+        return
+    why = "; ".join(
+        f"{n}: {d.rejected[0] if d.rejected else 'the target was not found'}"
+        for n, d in zip(folder.labels, detections, strict=True)
+        if not len(d)
+    )
+    raise InputError(
+        f"{found} of {len(detections)} images show the target. A hand-eye needs {least} views at "
+        "least, and 24 are advised: tilted about two axes, rolled about the camera's axis, from "
+        f"several distances.{' Not found in ' + why + '.' if why else ''}"
+    )
 
 
 def _detection_json(found: TargetDetection) -> dict[str, Any]:
