@@ -14,6 +14,7 @@ from realsim_calibration.calibrate import CalibrationConfig, determined_priors
 from realsim_calibration.cameras.checks import rig_checks
 from realsim_calibration.cameras.faults import (
     FEW_VIEWS,
+    require_distinct,
     require_lenses,
     require_motion,
     require_sightings,
@@ -50,6 +51,7 @@ def calibrate_cameras(
         DegenerateError: the views do not determine a lens or a place; says what to add.
     """
     config = config or CalibrationConfig()
+    require_distinct(rig.boards)
     require_sightings(rig)
     require_sizes(rig)
     lenses, joints, own = _lenses(rig, config)

@@ -16,8 +16,8 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.records import CameraIntrinsics
-from realsim_calibration.cameras.rig import MOUNTS, PLACES, Mount, Place, Rig, Sighting
+from realsim.records import CameraIntrinsics, CharucoBoard, Chessboard, TagBoard
+from realsim_calibration.cameras.rig import MOUNTS, PLACES, Mount, Place, Rig, RigBoard, Sighting
 from realsim_calibration.fit.closed_forms import relative
 
 OPTIONS = {"table": "--board", "hand": "--held-board", "free": "--moved-board"}
@@ -30,6 +30,30 @@ LEAST_VIEWS = 4
 """Fewer views of a pair do not tell who moves."""
 FEW_VIEWS = 3
 """A lens is not calibrated from fewer."""
+
+
+def require_distinct(boards: Sequence[RigBoard]) -> None:
+    """Raise if two boards cannot be told apart in an image.
+
+    Raises:
+        InputError: they carry the same markers, or none and the same pattern.
+    """
+    for a, b in combinations(boards, 2):
+        one, other = a.target, b.target
+        alike = type(one) is type(other)
+        if isinstance(one, TagBoard) and isinstance(other, TagBoard):
+            same_ids = bool(set(one.ids.tolist()) & set(other.ids.tolist()))
+            alike = one.family == other.family and same_ids
+        elif isinstance(one, CharucoBoard) and isinstance(other, CharucoBoard):
+            alike = one.dictionary == other.dictionary
+        elif isinstance(one, Chessboard) and isinstance(other, Chessboard):
+            alike = (one.rows, one.columns) == (other.rows, other.columns)
+        if alike:
+            raise InputError(
+                f"boards '{a.name}' and '{b.name}' carry the same markers or pattern, so an image "
+                "does not tell which of them it shows. Print one of them with other markers: "
+                "another first id, another dictionary, another number of rows."
+            )
 
 
 def require_sightings(rig: Rig) -> None:

@@ -45,6 +45,9 @@ from realsim_calibration.fit.robust_fit import (
 from realsim_calibration.fit.view_system import camera_record
 from realsim_calibration.screening import HandEyeConfig
 
+SAG_RAD = 5e-4
+"""How far the most loaded joint gives way under the arm's own weight, 1-sigma [rad]: 10 to 20 N m
+over some 2e4 N m/rad, the stiffness of gears of this size."""
 LEAST_SHARE = 0.25
 """A Gauss-Newton step that is still no gain when cut to this share is none: the fit has ended."""
 
@@ -126,7 +129,7 @@ def solve_rig(
     independent = all(w.excess <= 0 for w in whites)
     columns = None
     if problem.arm_used:
-        columns = _hidden(model, none, known, Ts, config)
+        columns = _hidden(model, none, known, Ts, config, arm, joints)
     covariance = _covariance(problem, model, final, best, ratio, columns, known, independent)
     alone_covariance = _covariance(
         problem, model, none_fit, none, none.ratio, columns, known, independent
@@ -228,20 +231,41 @@ def _whiteness(problem: RigProblem, state: RigState, config: NoiseConfig) -> lis
 
 
 def _hidden(
-    model: RigModel, none: Choice, known: ErrorBasis | None, Ts: Array, config: HandEyeConfig
-) -> Array:
+    model: RigModel, none: Choice, known: ErrorBasis | None, Ts: Array, config: HandEyeConfig,
+    arm: DhArm | None, joints: Array | None,
+) -> Array:  # fmt: skip
     """Return errors (I, 6, q) that the arm may have, per standard deviation.
 
     Beside those of one camera, where no joints are known: an error that is the same in all poses
     in the axes of the base (about the middle of the hand's places), as large as the one in the
     axes of the tool. It looks like other places of all fixed cameras, and of the table, at once.
     """
+    if known is not None and arm is not None and joints is not None:
+        return np.concatenate([known.columns, sag_columns(arm, joints, known)], -1)
     columns = hidden_errors(model, none, known, Ts, 1.0, config.robot.hidden_factor)
-    if known is not None:
-        return columns
     middle = se3.from_translation(Ts[:, :3, 3].mean(0))
     base = np.stack([se3.adjoint(se3.invert(T) @ middle) for T in Ts]) @ columns[0, :, :6]
     return np.concatenate([columns, base], -1)
+
+
+def sag_columns(arm: DhArm, joints: Array, basis: ErrorBasis) -> Array:
+    """Return errors (I, 6, n) of joints that give way under the arm's weight, per 1-sigma.
+
+    A joint turns in proportion to the torque about it, by `SAG_RAD` where the torque is as large
+    as that of the joint that bears most (RMS); links weigh alike, each at its frame. No error of
+    the Denavit-Hartenberg numbers looks like it, so it is considered, not estimated.
+    """
+    frames = arm.link_frames(joints)
+    axes, at = frames[:, :-1, :3, 2], frames[:, :-1, :3, 3]
+    down = np.array([0.0, 0.0, -1.0])
+    torque = np.zeros(axes.shape[:2])
+    for j in range(arm.joints):
+        lever = (frames[:, j + 1 :, :3, 3] - at[:, j, None]).sum(1)
+        torque[:, j] = np.sum(axes[:, j] * np.cross(lever, down), -1)
+    most = float(np.sqrt(np.mean(torque**2, 0)).max())
+    G = np.eye(4) if basis.T_flange_tool is None else basis.T_flange_tool
+    turned = se3.adjoint(se3.invert(G)) @ arm.jacobian(joints)
+    return turned * (SAG_RAD * torque / max(most, 1e-9))[:, None, :]
 
 
 def _covariance(
@@ -261,9 +285,10 @@ def _covariance(
         kappa = float(np.trace(np.linalg.solve(marginal[at], jackknife[at])) / len(places))
         covariance = (jackknife + max(kappa, 1.0) * marginal) / 2
         covariance = (covariance + covariance.T) / 2
-    modelled = known is not None and choice.basis is known
-    if columns is None or modelled:
+    if columns is None:
         return covariance
+    if known is not None and choice.basis is known:
+        columns = columns[..., known.columns.shape[-1] :]  # the others are parameters of the fit
     return with_arm(covariance, model.influence(fit, ratio, columns))
 
 

@@ -16,6 +16,7 @@ from realsim.app.outputs import GOES_ON
     examples=(
         "realsim calibrate demo/session",
         "realsim calibrate photos --board aprilgrid:7x5,tag=30mm,gap=10mm --poses poses.csv",
+        "realsim calibrate lab --cameras wrist=hand,left=fixed --board table.json --poses arm.csv",
     ),
 )
 @click.argument("source", type=FOLDER)
@@ -25,6 +26,9 @@ from realsim.app.outputs import GOES_ON
 @click.option("--key", default="", help="Entry of the pose file, where there are several.")
 @click.option("--board-poses", type=FOLDER, default=None, help="Camera poses instead of images.")
 @click.option("--camera", type=FOLDER, default=None, help="File with known intrinsics.")
+@click.option("--cameras", default="", help="Several: wrist=hand,left=fixed; a folder each.")
+@click.option("--held-board", default="", help="With --cameras: target that the arm carries.")
+@click.option("--moved-board", default="", help="With --cameras: target that a person moves.")
 @click.option("--eye-to-hand", is_flag=True, help="The camera stands still, the target moves.")
 @arm("Name or folder; found out where joints are given.")
 @click.option(

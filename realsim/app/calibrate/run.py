@@ -33,6 +33,13 @@ def _run(source: Path, console: Console, *, live: bool, **options: Any) -> bool:
     from realsim.app.calibrate.session import has_board_views_only
     from realsim.store.opening import require_header
 
+    if options.get("cameras"):
+        from realsim.app.calibrate.cameras import run_cameras
+
+        return run_cameras(source, console, options)
+    alone = [f"--{o.replace('_', '-')}" for o in ("held_board", "moved_board") if options.get(o)]
+    if alone:
+        raise InputError(f"{alone[0]} is for several cameras: name them with --cameras.")
     require_header(source)
     if (source / "session.json").is_file() or has_board_views_only(source):
         _refuse_folder_options(options)

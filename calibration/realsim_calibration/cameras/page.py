@@ -1,0 +1,95 @@
+"""The page of several cameras: each camera, each pair, the views that disagree."""
+
+import numpy as np
+
+from realsim.pages import Cell, Page
+from realsim.records import Check
+from realsim_calibration.cameras.results import CamerasReport
+from realsim_calibration.cameras.rig import MOUNTS
+
+ORDER = ("bad", "warn", "unknown", "good")
+KIND = {"unknown": "off"}
+PAGE = "cameras_report.html"
+
+
+def camera_rows(report: CamerasReport) -> list[list[str]]:
+    """Return a row of every camera: where, how sure, views, unseen error."""
+    rows: list[list[str]] = []
+    for camera, r in zip(report.rig.cameras, report.cameras, strict=True):
+        own = [v for v in report.views if v.camera == camera.name]
+        place = " ".join(f"{v:.2f}" for v in 1e3 * r.X[:3, 3])
+        rows.append([
+            camera.name, MOUNTS[camera.mount], place,
+            f"{r.sigma_mm:.2f} mm / {r.sigma_deg:.3f} deg",
+            f"{sum(v.used for v in own)} / {len(own)}",
+            f"{r.held_out_px:.2f} px / {r.held_out_mm:.2f} mm",
+        ])  # fmt: skip
+    return rows
+
+
+CAMERA_HEADER = ["camera", "mount", "place [mm]", "1 sigma", "views used / found", "unseen views"]
+PAIR_HEADER = ["cameras", "sees the board together", "1 sigma", "apart (RMS)", "worst"]
+
+
+def pair_rows(report: CamerasReport) -> list[list[str]]:
+    """Return a row of every pair of cameras."""
+    return [
+        [
+            " - ".join(p.names), f"{p.together} instants",
+            f"{p.sigma_mm:.2f} mm / {p.sigma_deg:.3f} deg",
+            f"{p.apart_mm:.2f} mm" if np.isfinite(p.apart_mm) else "never together", p.worst,
+        ]
+        for p in report.pairs
+    ]  # fmt: skip
+
+
+def odd_rows(report: CamerasReport) -> list[list[str]]:
+    """Return a row of every view that was left out, then of those that disagree."""
+    return [
+        *([v.camera, v.name, "left out", v.reason] for v in report.rejected if len(v.detection)),
+        *(
+            [v.camera, v.name, f"{v.unseen_px:.2f} px", "three times its camera's usual error"]
+            for v in report.disagreeing()
+        ),
+    ]
+
+
+def cameras_page(report: CamerasReport) -> Page:
+    """Return the page."""
+    checks = sorted(report.all_checks, key=lambda c: ORDER.index(c.verdict))
+    worst = checks[0].verdict if checks else "good"
+    page = Page(
+        title="Cameras calibrated together",
+        about=f"{len(report.cameras)} cameras, {len(report.rig.instants)} instants; places in "
+        f"{report.reference}",
+    )
+    said = {"bad": "A check is bad.", "warn": "Usable; look at the warnings."}
+    page.verdict(KIND.get(worst, worst), said.get(worst, "No check found anything wrong."), "",
+                 [[c.sentence] for c in checks if c.verdict in {"bad", "warn"}])  # fmt: skip
+    page.cards([
+        (f"{r.held_out_mm:.2f} mm", f"unseen views of {c.name}")
+        for c, r in zip(report.rig.cameras, report.cameras, strict=True)
+    ])  # fmt: skip
+    page.section("Cameras", f"Robot error map: {report.map_name}.", key="cameras")
+    page.table(CAMERA_HEADER, camera_rows(report))
+    if report.pairs:
+        page.section("Pairs", "The board's middle, as either camera alone sees it.", key="pairs")
+        page.table(PAIR_HEADER, pair_rows(report))
+    odd = odd_rows(report)
+    if odd or report.bad_arm:
+        page.section("Views that disagree", key="views")
+        if report.bad_arm:
+            page.text(f"The arm's pose is not believed at {', '.join(report.bad_arm)}.", "note")
+        if odd:
+            page.table(["camera", "view", "", "why"], odd)
+    page.section("Checks", key="checks")
+    page.table(["check", "verdict", "what was found"], [_row(c) for c in checks])
+    return page
+
+
+def _row(check: Check) -> list[object]:
+    return [
+        check.name,
+        Cell(check.verdict, kind=KIND.get(check.verdict, check.verdict)),
+        f"{check.sentence} {check.advice}".strip(),
+    ]

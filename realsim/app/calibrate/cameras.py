@@ -1,0 +1,308 @@
+"""`realsim calibrate --cameras`: several cameras at once, from a folder of each or a session.
+
+Images of the same instant have the same name, or the same number in it, in every camera's folder;
+one file of poses says where the arm was. In a session the camera in the hand has `rgb/`, every
+other one `rgb_NAME/`, with the numbers of the views.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from realsim.app.calibrate.board_views import BOARD_FILE, arm_of
+from realsim.app.calibrate.camera_frames import (
+    Frames,
+    boards_of,
+    cameras_of,
+    frames_of,
+    pose_file_of,
+    with_intrinsics,
+)
+from realsim.app.calibrate.folder import MADE_OF, made_of
+from realsim.app.calibrate.images import find_in_images
+from realsim.app.calibrate.show import show_checks
+from realsim.app.console import Console
+from realsim.app.outputs import require_free_folder
+from realsim.app.stages import BOARD_VIEWS
+from realsim.errors import InputError, RealsimError
+from realsim.geometry.dh import DhArm
+from realsim.robots.arm import find_arm
+from realsim.store import SessionStore
+from realsim.store.atomic import write_bytes, write_text
+from realsim_calibration import BoardView, calibrate_intrinsics, estimate_board_pose, prove_reading
+from realsim_calibration.cameras.calibrate import calibrate_cameras
+from realsim_calibration.cameras.files import document, write_cameras
+from realsim_calibration.cameras.page import (
+    CAMERA_HEADER,
+    PAGE,
+    PAIR_HEADER,
+    camera_rows,
+    cameras_page,
+    odd_rows,
+    pair_rows,
+)
+from realsim_calibration.cameras.results import CamerasReport
+from realsim_calibration.cameras.rig import Instant, Rig, RigBoard, RigCamera, Sighting
+from realsim_calibration.inputs import (
+    RawPoses,
+    list_images,
+    load_image,
+    read_pose_file,
+    reading_from_text,
+)
+
+CAMERAS_FILE = "cameras.json"
+PROOF_VIEWS = 40
+"""Views that decide on a reading: more do not change the verdict."""
+
+
+def run_cameras(source: Path, console: Console, options: dict[str, Any]) -> bool:
+    """Calibrate several cameras; return whether no check is bad.
+
+    Raises:
+        InputError: source or options cannot be used; says what is accepted.
+        DegenerateError: the views do not determine the cameras.
+    """
+    cameras = cameras_of(options["cameras"])
+    for name in ("board_poses", "eye_to_hand"):
+        if options.get(name):
+            raise InputError(
+                f"--{name.replace('_', '-')} is of one camera alone; with --cameras say NAME=hand "
+                "or NAME=fixed, and give images."
+            )
+    if (source / BOARD_VIEWS / "session.json").is_file():
+        return _run_session(source, cameras, console, options)
+    if not source.is_dir():
+        raise InputError(f"'{source}' is not a folder; one with a folder per camera is expected.")
+    out: Path = options["out"]
+    require_free_folder(out, "--out", (CAMERAS_FILE, PAGE), (MADE_OF, (made_of(source),)))
+    boards = boards_of(options)
+    poses = pose_file_of(source, options["poses"], [c.name for c in cameras])
+    raw = None if poses is None else read_pose_file(poses, key=options["key"] or None)
+    frames = frames_of(source, cameras, raw)
+    cameras = with_intrinsics(cameras, options["camera"])
+    sightings = _sightings(frames, cameras, boards, out, console)
+    rig = Rig(
+        cameras=cameras, boards=boards, sightings=sightings,
+        instants=tuple(Instant(name=name) for name in frames.instants),
+    )  # fmt: skip
+    _require_seen(rig, frames)
+    rig = _with_poses(rig, frames, raw, options["reading"], console)
+    report = _calibrated(rig, options["arm"], console)
+    write_text(out / MADE_OF, made_of(source))
+    return _told(report, write_files(report, out), console)
+
+
+def _run_session(
+    source: Path, cameras: tuple[RigCamera, ...], console: Console, options: dict[str, Any]
+) -> bool:
+    """Calibrate the cameras of a session's board views, and note the one in the hand there."""
+    from realsim.untrusted.own_json import read_values
+    from realsim_calibration.targets.target_file import target_from_json
+
+    store = SessionStore.open(source / BOARD_VIEWS)
+    folder = source / "calibration"
+    boards = boards_of(options, needed=False)
+    if not any(b.place == "table" for b in boards) and (source / BOARD_FILE).is_file():
+        target = target_from_json(read_values(source / BOARD_FILE))
+        boards = (RigBoard(name="table", target=target, place="table"), *boards)
+    if not boards:
+        raise InputError(f"'{source}' has no {BOARD_FILE}: give --board or --held-board.")
+    views = store.session.views
+    images: dict[str, dict[int, Path]] = {}
+    for camera in cameras:
+        name = "rgb" if camera.mount == "hand" else f"rgb_{camera.name}"
+        found = {p.stem: p for p in list_images(store.folder / name).images}
+        images[camera.name] = {
+            i: found[f"{v.index:06d}"] for i, v in enumerate(views) if f"{v.index:06d}" in found
+        }
+    frames = Frames(instants=tuple(f"{v.index:06d}" for v in views), images=images, rows={})
+    known = tuple(
+        replace(c, intrinsics0=store.session.intrinsics) if c.mount == "hand" else c
+        for c in cameras
+    )
+    known = with_intrinsics(known, options["camera"])
+    rig = Rig(
+        cameras=known, boards=boards,
+        sightings=_sightings(frames, known, boards, folder, console),
+        instants=tuple(
+            Instant(name=f"{v.index:06d}", T_base_ee=v.T_base_ee, joints=v.joints) for v in views
+        ),
+    )  # fmt: skip
+    _require_seen(rig, frames)
+    report = _calibrated(rig, options["arm"], console)
+    return _told(report, write_files(report, folder / "cameras"), console)
+
+
+# --- what is seen ---------------------------------------------------------------------------------
+
+
+def _sightings(
+    frames: Frames, cameras: Sequence[RigCamera], boards: Sequence[RigBoard], out: Path,
+    console: Console,
+) -> tuple[Sighting, ...]:  # fmt: skip
+    """Return what every camera sees of every board, images without a board among them."""
+    found: list[Sighting] = []
+    for c, camera in enumerate(cameras):
+        own = sorted(frames.images[camera.name].items())
+        for b, board in enumerate(boards):
+            seen = find_in_images([p for _, p in own], board.target, out, console)
+            found += [
+                Sighting(camera=c, board=b, instant=i, detection=d, name=f"{camera.name}/{p.name}")
+                for (i, p), d in zip(own, seen, strict=True)
+                if len(d) or len(boards) == 1
+            ]
+    return tuple(found)
+
+
+def _require_seen(rig: Rig, frames: Frames) -> None:
+    """Raise if a camera never sees a board, saying what its images show instead."""
+    from realsim_calibration.detect.visible import what_is_visible
+
+    for c, camera in enumerate(rig.cameras):
+        own = [frames.images[camera.name][i] for i in sorted(frames.images[camera.name])]
+        if not own:
+            raise InputError(
+                f"camera '{camera.name}' has no image that belongs to a pose. Are its images named "
+                "as the other cameras'?"
+            )
+        if not any(len(s.detection) for s in rig.of_camera(c)):
+            raise InputError(
+                f"camera '{camera.name}' never sees a board: none was found in its {len(own)} "
+                f"images; {own[0].name} shows {what_is_visible(load_image(own[0]))}. Point it at "
+                "the board, give the target as it was printed, or leave the camera out of "
+                "--cameras."
+            )
+
+
+def _with_poses(
+    rig: Rig, frames: Frames, raw: RawPoses | None, reading: str, console: Console
+) -> Rig:
+    """Return the rig with the arm's poses, read as is said, stated or proven by the images."""
+    moving = any(rig.moves(s.camera, s.board) for s in rig.sightings if len(s.detection))
+    if raw is None:
+        if moving or any(c.mount == "hand" for c in rig.cameras):
+            raise InputError(
+                "a camera or a board is in the hand, and there are no poses of the arm: put one "
+                "file of poses beside the cameras' folders, or give --poses."
+            )
+        return rig
+    rows = [frames.rows[i] for i in range(len(frames.instants))]
+    poses = raw.subset(rows)
+    chosen = reading_from_text(reading) if reading else poses.stated
+    if chosen is None:
+        chosen = _proven(rig, poses)
+        console.say(f"poses read as the images prove: {chosen}.")
+    Ts, joints = poses.poses(chosen), poses.joints
+    instants = tuple(
+        replace(t, T_base_ee=Ts[i], joints=None if joints is None else joints[i])
+        for i, t in enumerate(rig.instants)
+    )
+    return replace(rig, instants=instants)
+
+
+def _proven(rig: Rig, poses: RawPoses) -> Any:
+    """Return the reading that the images of a camera prove.
+
+    Raises:
+        InputError: no camera moves against a board, or the images do not decide.
+    """
+    said = "no camera moves against a board"
+    for c, camera in enumerate(rig.cameras):
+        for b, board in enumerate(rig.boards):
+            own = [s for s in rig.of_camera(c) if s.board == b and len(s.detection)]
+            if board.place == "free" or not rig.moves(c, b) or len(own) < 3:
+                continue
+            try:
+                lens = (
+                    camera.intrinsics0
+                    or calibrate_intrinsics(
+                        [s.detection for s in own], board.target, names=[s.name for s in own]
+                    ).intrinsics
+                )
+            except RealsimError:
+                continue
+            pairs = [
+                (s.instant, pose.T_cam_board)
+                for s in own[:PROOF_VIEWS]
+                if (pose := estimate_board_pose(
+                    s.detection.points(board.target), s.detection.uv, lens)) is not None
+            ]  # fmt: skip
+            rows = poses.subset([i for i, _ in pairs])
+            candidates = [(str(r), rows.poses(r)) for r in rows.possible]
+            proof = prove_reading(candidates, np.array([T for _, T in pairs]), target=board.target)
+            mode = "eye_in_hand" if camera.mount == "hand" else "eye_to_hand"
+            if proof.decisive and proof.best_mode == mode:
+                return reading_from_text(proof.best)
+            said = proof.sentence
+    raise InputError(
+        f"how the poses are to be read is not clear from the file, and the images do not decide: "
+        f"{said} Give --reading, such as --reading rotvec,m."
+    )
+
+
+# --- the calibration ------------------------------------------------------------------------------
+
+
+def _calibrated(rig: Rig, arm: str, console: Console) -> CamerasReport:
+    known = _arm(rig, arm)
+    if known is not None:
+        console.say(f"joints and poses are those of a {known.name}: its own errors are modelled.")
+    with console.stage("calibrate", f"{len(rig.cameras)} cameras, {len(rig.instants)} instants"):
+        return calibrate_cameras(rig, arm=known)
+
+
+def _arm(rig: Rig, name: str) -> DhArm | None:
+    """Return the arm that was named, or that joints and poses prove."""
+    given = [t for t in rig.instants if t.T_base_ee is not None]
+    joints = bool(given) and all(t.joints is not None for t in rig.instants)
+    if name:
+        if not joints:
+            raise InputError(f"--arm {name} needs joint angles with every pose; there are none.")
+        return find_arm(name).chain.bare()
+    if not joints:
+        return None
+    views = [
+        BoardView(index=k, T_base_ee=t.T_base_ee, joints=t.joints,
+                  detection=rig.sightings[0].detection)
+        for k, t in enumerate(given) if t.T_base_ee is not None
+    ]  # fmt: skip
+    return arm_of(views)
+
+
+def write_files(report: CamerasReport, out: Path) -> list[Path]:
+    """Write page, `cameras.json` and every camera's own exports; return the paths, page first."""
+    from realsim_calibration.exports import FrameNames, write_exports
+
+    files = [out / PAGE, write_cameras(report, out / CAMERAS_FILE)]
+    write_bytes(out / PAGE, cameras_page(report).encode())
+    for camera, own in zip(report.rig.cameras, report.cameras, strict=True):
+        moved = any(
+            rig_board.target is own.target and rig_board.place == "hand"
+            for rig_board in report.rig.boards
+        )
+        names = FrameNames(name=camera.name, camera_optical=f"{camera.name}_optical_frame")
+        if camera.mount == "fixed" and not moved:
+            # The board does not hang on the hand: what the files call the hand is the base.
+            names = replace(names, hand=names.robot_base)
+        files += write_exports(own, out / camera.name / "exports", frames=names)
+    return files
+
+
+def _told(report: CamerasReport, files: list[Path], console: Console) -> bool:
+    """Print a calibration; return whether no check is bad."""
+    console.table("Cameras", CAMERA_HEADER, camera_rows(report))
+    if report.pairs:
+        console.table("Pairs", PAIR_HEADER, pair_rows(report))
+    odd = odd_rows(report)
+    if odd:
+        console.table("Views that disagree", ["camera", "view", "", "why"], odd)
+    show_checks(report.all_checks, console)
+    console.say(f"report: {files[0]}")
+    console.say(f"{len(files) - 1} files for programs beside it, a folder for each camera")
+    passed = not any(c.verdict == "bad" for c in report.all_checks)
+    console.result({"passed": passed, **document(report), "files": files})
+    return passed

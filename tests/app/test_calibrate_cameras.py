@@ -1,0 +1,254 @@
+"""`realsim calibrate --cameras`: pictures of a lab with a camera in the hand and two fixed ones."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from realsim.app.cli import commands
+from realsim.arrays import Array, UInt8
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics, CaptureSession, TagBoard, View
+from realsim.store import SessionStore
+from realsim.store.atomic import write_json
+from realsim_calibration.cameras.files import read_cameras
+from realsim_calibration.exports.calibration_file import read_calibration
+from realsim_calibration.inputs import load_image
+from realsim_calibration.targets.target_file import target_to_json
+
+CAMERA = CameraIntrinsics(width=640, height=480, fx=520.0, fy=520.0, cx=319.5, cy=239.5)
+TABLE = TagBoard(rows=3, columns=4, tag_size_m=0.04, gap_m=0.01)
+HELD = TagBoard(rows=3, columns=4, tag_size_m=0.04, gap_m=0.01, first_id=100)
+X_WRIST = se3.from_rt(se3.exp_so3([0.02, -0.03, 0.9]), [0.01, -0.065, 0.035])
+Z_TABLE = se3.from_rt(np.diag([1.0, -1.0, -1.0]), [0.32, 0.08, 0.0])
+Z_HELD = se3.from_rt(np.eye(3), [0.05, 0.04, 0.0])
+FIXED = {
+    "left": se3.look_at([0.75, 0.5, 0.85], [0.42, 0.05, 0.35], 0.0),
+    "right": se3.look_at([0.75, -0.45, 0.85], [0.42, 0.05, 0.35], 0.0),
+}
+VIEWS, MODULES, TEXTURE, SUPER = 10, 8, 8, 2
+
+
+def sheet_of(board: TagBoard) -> tuple[UInt8, float, int]:
+    """Return a board's sheet, its pixels per metre, and its margin [pixels]."""
+    from cv2 import aruco
+
+    tag = MODULES * TEXTURE
+    per_m, margin = tag / board.tag_size_m, tag // 2
+    pitch = round((board.tag_size_m + board.gap_m) * per_m)
+    width, height = (round(v * per_m) + 2 * margin for v in board.size_m)
+    sheet = np.full((height, width), 215, np.uint8)
+    dictionary = aruco.getPredefinedDictionary(aruco.DICT_APRILTAG_36h11)
+    for k, number in enumerate(board.ids):
+        row, column = divmod(k, board.columns)
+        y, x = margin + row * pitch, margin + column * pitch
+        large = np.kron(aruco.generateImageMarker(dictionary, int(number), MODULES),
+                        np.ones((TEXTURE, TEXTURE), np.uint8))  # fmt: skip
+        sheet[y : y + tag, x : x + tag] = np.where(large > 0, 215, 30)
+    return sheet, per_m, margin
+
+
+def photograph(boards: list[tuple[TagBoard, Array]], rng: np.random.Generator) -> UInt8:
+    """Return a picture (H, W, 3) of boards at T_cam_board, the later ones in front."""
+    import cv2
+
+    half = (SUPER - 1) / 2
+    finer = np.array([[SUPER, 0, half], [0, SUPER, half], [0, 0, 1.0]])
+    size = (CAMERA.width * SUPER, CAMERA.height * SUPER)
+    picture = np.full(size[::-1], 120, np.uint8)
+    for board, T in boards:
+        if T[2, 2] < 0.3 or T[2, 3] < 0.1:
+            continue
+        sheet, per_m, margin = sheet_of(board)
+        to_sheet = np.array([[per_m, 0, margin - 0.5], [0, per_m, margin - 0.5], [0, 0, 1.0]])
+        H = finer @ CAMERA.K @ T[:3, [0, 1, 3]] @ np.linalg.inv(to_sheet)
+        drawn = cv2.warpPerspective(sheet, H, size, flags=cv2.INTER_LINEAR)
+        picture = np.where(drawn > 0, drawn, picture).astype(np.uint8)
+    grey = cv2.resize(picture, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA)
+    noisy = np.clip(grey + rng.normal(scale=1.5, size=grey.shape), 0, 255)
+    return np.repeat(noisy.astype(np.uint8)[..., None], 3, -1)
+
+
+def hands(rng: np.random.Generator) -> Array:
+    """Return poses of the hand (VIEWS, 4, 4) above the table, tilted and rolled."""
+    found: list[Array] = []
+    for k in range(VIEWS):
+        turn = se3.exp_so3([np.pi, 0, 0]) @ se3.exp_so3(
+            [*rng.uniform(-0.35, 0.35, 2), -0.9 + 0.5 * np.sin(k)]
+        )
+        at = np.array([0.40, 0.0, 0.42]) + rng.uniform(-0.04, 0.04, 3)
+        found.append(se3.from_rt(turn, at))
+    return np.array(found)
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder of every camera, a file of poses, and both targets."""
+    folder = tmp_path_factory.mktemp("lab")
+    rng = np.random.default_rng(3)
+    rows = ["name,x,y,z,qx,qy,qz,qw"]
+    import cv2
+
+    for name in ("wrist", *FIXED):
+        (folder / name).mkdir()
+    for k, hand in enumerate(hands(rng)):
+        q = se3.quaternion_wxyz(hand[:3, :3])
+        numbers = [*hand[:3, 3], q[1], q[2], q[3], q[0]]
+        rows.append(f"{k:03d}.png," + ",".join(f"{v:.9f}" for v in numbers))
+        for name, eye in {"wrist": hand @ X_WRIST, **FIXED}.items():
+            to_cam = se3.invert(eye)
+            seen = [(TABLE, to_cam @ Z_TABLE)]
+            if name != "wrist":
+                seen.append((HELD, to_cam @ hand @ Z_HELD))
+            cv2.imwrite(str(folder / name / f"{k:03d}.png"), photograph(seen, rng))
+    (folder / "arm.csv").write_text("\n".join(rows) + "\n")
+    for name, board in (("table", TABLE), ("held", HELD)):
+        write_json(folder.parent / f"{name}.json", target_to_json(board))
+    return folder
+
+
+def run(source: Path, out: Path, *more: str, cameras: str = "wrist=hand,left=fixed,right=fixed"
+        ) -> Result:  # fmt: skip
+    boards = ["--board", str(source.parent / "table.json")]
+    if not any(m.startswith("--held") for m in more):
+        boards += ["--held-board", str(source.parent / "held.json")]
+    return CliRunner().invoke(
+        commands,
+        ["calibrate", str(source), "--cameras", cameras, *boards, "--out", str(out), *more],
+    )
+
+
+def refusal(result: Result) -> str:
+    """Return the words of a refusal."""
+    assert isinstance(result.exception, InputError), result.output
+    return str(result.exception)
+
+
+@pytest.fixture(scope="module")
+def calibrated(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
+    out = tmp_path_factory.mktemp("out") / "calibration"
+    return run(photos, out, "--json"), out
+
+
+def test_pictures_give_every_camera(calibrated: tuple[Result, Path]) -> None:
+    result, out = calibrated
+    assert result.exit_code in {0, 1}, result.output
+    found = read_cameras(out / "cameras.json")
+    for name, truth in {"wrist": X_WRIST, **FIXED}.items():
+        off = se3.invert(truth) @ found.camera(name).T
+        assert np.linalg.norm(off[:3, 3]) < 4e-3, name
+        assert se3.angle(off) < np.radians(0.4), name
+    assert (out / "cameras_report.html").stat().st_size > 5_000
+    assert {p.names for p in found.pairs} == {("wrist", "left"), ("wrist", "right"),
+                                              ("left", "right")}  # fmt: skip
+
+
+def test_every_camera_has_the_files_of_a_camera_alone(calibrated: tuple[Result, Path]) -> None:
+    _, out = calibrated
+    cameras = read_cameras(out / "cameras.json")
+    for name, mode in (("wrist", "eye_in_hand"), ("left", "eye_to_hand")):
+        one = read_calibration(out / name / "exports/calibration.json")
+        assert one.mode == mode
+        assert np.array_equal(one.X, cameras.camera(name).T)
+    assert "left_optical_frame" in (out / "left/exports/camera.urdf").read_text()
+
+
+def test_json_says_what_the_file_says(calibrated: tuple[Result, Path]) -> None:
+    result, out = calibrated
+    said, file = json.loads(result.stdout), json.loads((out / "cameras.json").read_text())
+    assert said["cameras"] == file["cameras"]
+    assert said["passed"] == (result.exit_code == 0)
+
+
+@pytest.mark.parametrize(
+    ("gone", "copied", "cameras", "words"),
+    [
+        ("", "", "wrist=hand,left", "NAME=hand or NAME=fixed"),
+        ("", "", "wrist=hand,top=fixed", "no folder"),
+        ("", "", "wrist=hand,wrist=fixed", "twice"),
+        ("arm.csv", "", "wrist=hand,left=fixed", "no poses of the arm"),
+        ("", "again.csv", "wrist=hand,left=fixed", "Give --poses"),
+    ],
+)
+def test_what_is_missing_is_named(
+    photos: Path, tmp_path: Path, gone: str, copied: str, cameras: str, words: str
+) -> None:
+    folder = shutil.copytree(photos, tmp_path / "lab")
+    for name in ("table", "held"):
+        shutil.copy(photos.parent / f"{name}.json", tmp_path)
+    for name in ("wrist", *FIXED):
+        for path in sorted((folder / name).glob("*.png"))[3:]:
+            path.unlink()
+    if copied:
+        shutil.copy(folder / "arm.csv", folder / copied)
+    if gone:
+        (folder / gone).unlink()
+    result = run(folder, tmp_path / "out", cameras=cameras)
+    assert words in refusal(result)
+
+
+def test_a_camera_that_sees_no_board_is_named_with_what_it_shows(
+    photos: Path, tmp_path: Path
+) -> None:
+    import cv2
+
+    folder = shutil.copytree(photos, tmp_path / "lab")
+    for name in ("table", "held"):
+        shutil.copy(photos.parent / f"{name}.json", tmp_path)
+    for path in (folder / "right").glob("*.png"):
+        cv2.imwrite(str(path), np.full((480, 640, 3), 90, np.uint8))
+    for name in ("wrist", "left"):
+        for path in sorted((folder / name).glob("*.png"))[2:]:
+            path.unlink()
+    result = run(folder, tmp_path / "out")
+    said = refusal(result)
+    assert "camera 'right' never sees a board" in said
+    assert "leave the camera out" in said
+
+
+def test_images_without_partners_are_left_out(photos: Path, tmp_path: Path) -> None:
+    from realsim.app.calibrate.camera_frames import cameras_of, frames_of
+    from realsim_calibration.inputs import read_pose_file
+
+    folder = shutil.copytree(photos, tmp_path / "lab")
+    (folder / "left/004.png").unlink()
+    shutil.copy(folder / "right/000.png", folder / "right/099.png")
+    cameras = cameras_of("wrist=hand,left=fixed,right=fixed")
+    frames = frames_of(folder, cameras, read_pose_file(folder / "arm.csv"))
+    assert [len(frames.images[c.name]) for c in cameras] == [VIEWS, VIEWS - 1, VIEWS]
+    names = {c.name: {i: p.name for i, p in frames.images[c.name].items()} for c in cameras}
+    assert all(names["right"][i] == name for i, name in names["wrist"].items())
+    assert all(names["wrist"][i] == name for i, name in names["left"].items())
+
+
+def test_board_views_of_a_session(photos: Path, tmp_path: Path) -> None:
+    """The camera in the hand has rgb/, the others rgb_NAME/ beside it."""
+    rng = np.random.default_rng(3)
+    views = tuple(View(index=k, T_base_ee=T) for k, T in enumerate(hands(rng)))
+    capture = tmp_path / "session/calibration/capture"
+    session = CaptureSession(name="board", intrinsics=CAMERA, views=(), depth_unit_m=0.001)
+    store = SessionStore.create(capture, session)
+    depth = np.zeros((CAMERA.height, CAMERA.width), np.uint16)
+    for view in views:
+        rgb = load_image(photos / f"wrist/{view.index:03d}.png")
+        store.add_view(view, rgb, depth)
+    store.close()
+    for name in FIXED:
+        (capture / f"rgb_{name}").mkdir()
+        for k in range(VIEWS):
+            shutil.copy(photos / name / f"{k:03d}.png", capture / f"rgb_{name}" / f"{k:06d}.png")
+    write_json(tmp_path / "session/calibration/board.json", target_to_json(TABLE))
+    held = str(photos.parent / "held.json")
+    result = CliRunner().invoke(
+        commands,
+        ["calibrate", str(tmp_path / "session"), "--cameras",
+         "wrist=hand,left=fixed,right=fixed", "--held-board", held],
+    )  # fmt: skip
+    assert result.exit_code in {0, 1}, result.output
+    found = read_cameras(tmp_path / "session/calibration/cameras/cameras.json")
+    off = se3.invert(FIXED["left"]) @ found.camera("left").T
+    assert np.linalg.norm(off[:3, 3]) < 4e-3
