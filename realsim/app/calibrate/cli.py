@@ -39,21 +39,33 @@ from realsim.app.outputs import GOES_ON
     help="Folder.",
 )
 @click.option("--live", is_flag=True, help="Watch SOURCE for new views and say when to stop.")
+@click.option("--check", is_flag=True, help="Does it still hold? Of a registered session.")
+@click.option("--tolerance", default=1.0, show_default=True, help="With --check: mm at objects.")
 @JSON
 @QUIET
 def calibrate_command(
-    source: Path, live: bool, as_json: bool, quiet: bool, **options: object
-) -> None:
+    source: Path, live: bool, check: bool, tolerance: float, as_json: bool, quiet: bool,
+    **options: object,
+) -> None:  # fmt: skip
     """Calibrate lens and hand-eye: SOURCE is a session, or a folder of images with poses.
 
     A session may have board views only: calibrate before the board is taken away, and once more
     when the objects are captured, which places the cameras of their views.
 
-    Exit codes: 0 done, 1 a check of the result is bad, 2 bad input.
+    With --check nothing is calibrated: a registered session says whether the camera still sits in
+    the hand as it was calibrated.
+
+    Exit codes: 0 done, 1 a check of the result is bad (or the camera moved), 2 bad input.
     """
     from realsim.app.calibrate.run import run_calibrate
     from realsim.app.console import Console
 
     console = Console(quiet=quiet, as_json=as_json)
+    if check:
+        from realsim.app.calibrate.check import run_check
+
+        if not run_check(source, console, tolerance):
+            sys.exit(1)
+        return
     if not run_calibrate(source, console, live=live, **options):
         sys.exit(1)

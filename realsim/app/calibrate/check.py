@@ -1,0 +1,102 @@
+"""`realsim calibrate SESSION --check`: does the calibration still hold, without a board?"""
+
+from pathlib import Path
+
+import numpy as np
+
+from realsim.app.console import Console
+from realsim.errors import InputError
+from realsim_calibration.pairs.drift import Drift, DriftConfig, estimate_drift
+
+CHECK_FILE = "calibration/check.json"
+"""What the last check found."""
+
+
+def run_check(source: Path, console: Console, tolerance_mm: float = 1.0) -> bool:
+    """Say whether the hand-eye of a registered session still holds; return whether it does.
+
+    Raises:
+        InputError: no session, no registration in it, or too few views that it refined.
+    """
+    from realsim.app.register.results import load_registered
+    from realsim.app.stages import open_session
+
+    if not (source / "session.json").is_file():
+        raise InputError(
+            f"'{source}' is not a session (it holds no session.json): --check needs a session of "
+            "objects that `realsim register` has placed."
+        )
+    store = open_session(source)
+    if not store.has("registration/report.json"):
+        raise InputError(
+            f"session '{source}' is not registered yet: run `realsim register {source}` first; "
+            "--check then compares where the objects say that the cameras were."
+        )
+    registered = load_registered(store)
+    cameras = registered.cameras
+    trusted = {o.instance for o in registered.scene.objects if o.verdict != "rejected"}
+    if not trusted:
+        raise InputError(
+            f"session '{source}': no object is placed, so nothing tells where the cameras were. "
+            "Register a scene with objects that are found."
+        )
+    views = sorted(set(cameras.claimed) & set(cameras.refined))
+    away = [
+        float(pose.T_cam_obj[2, 3])
+        for k in views
+        for instance, pose in registered.seen.get(k, {}).items()
+        if instance in trusted
+    ]
+    drift = estimate_drift(
+        np.array([cameras.claimed[k] for k in views]).reshape(-1, 4, 4),
+        np.array([cameras.refined[k] for k in views]).reshape(-1, 4, 4),
+        float(np.median(away)) if away else 0.5,
+        DriftConfig(tolerance_mm=tolerance_mm),
+    )
+    document = document_of(drift, tolerance_mm)
+    store.write_json(CHECK_FILE, document)
+    console.say(sentence(drift, tolerance_mm))
+    console.result(document)
+    return not drift.moved
+
+
+def sentence(drift: Drift, tolerance_mm: float) -> str:
+    """Return the verdict in words."""
+    sigma_deg, sigma_mm = drift.sigmas
+    size = (
+        f"the camera in the hand seems moved by {drift.mm:.2f} +-{sigma_mm:.2f} mm and "
+        f"{drift.deg:.3f} +-{sigma_deg:.3f} deg ({drift.views} views), which shifts the objects by "
+        f"{drift.shift_mm:.2f} +-{drift.sigma_mm:.2f} mm"
+    )
+    if drift.moved:
+        return (
+            f"the calibration does NOT hold: {size}; {tolerance_mm:g} mm are allowed. Tighten the "
+            "camera and calibrate anew with the board (`realsim calibrate`)."
+        )
+    unseen = 3 * drift.sigma_mm
+    doubt = (
+        f" A move of less than {unseen:.1f} mm would go unseen here: register a scene with more "
+        "views that roll and tilt the camera."
+        if unseen > tolerance_mm
+        else ""
+    )
+    return f"the calibration holds: {size}; {tolerance_mm:g} mm are allowed.{doubt}"
+
+
+def document_of(drift: Drift, tolerance_mm: float) -> dict[str, object]:
+    """Return plain JSON values."""
+    sigma_deg, sigma_mm = drift.sigmas
+    return {
+        "holds": not drift.moved,
+        "tolerance_mm": tolerance_mm,
+        "shift_mm": drift.shift_mm,
+        "shift_sigma_mm": drift.sigma_mm,
+        "moved_mm": drift.mm,
+        "moved_sigma_mm": sigma_mm,
+        "moved_deg": drift.deg,
+        "moved_sigma_deg": sigma_deg,
+        "chance": drift.chance,
+        "twist": drift.twist.tolist(),
+        "covariance": drift.covariance.tolist(),
+        "views": drift.views,
+    }

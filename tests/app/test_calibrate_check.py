@@ -1,0 +1,73 @@
+"""`realsim calibrate SESSION --check`: exit 0 where the camera sits as calibrated, 1 where not."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from realsim.app.cli import commands
+from realsim.app.register.files import write_result
+from realsim.arrays import Array
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.store import SessionStore
+from registered_sessions import models_of, registered_by_hand, table_session
+from shared_sessions import copy_of
+
+SLIP = np.array([0.004, -0.006, 0.002, 0.003, -0.001, 0.002])
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session of ten views whose cameras are off by the arm's noise."""
+    folder = tmp_path_factory.mktemp("check") / "s"
+    return table_session(folder, views=10, sigma=(5e-4, 2e-4)).folder
+
+
+def check(folder: Path, *options: str) -> Result:
+    return CliRunner().invoke(commands, ["calibrate", str(folder), "--check", *options])
+
+
+def registered(pristine: Path, folder: Path, slip: Array) -> Path:
+    """Return a copy that is registered, its calibration wrong by a slip."""
+    store = SessionStore.open(copy_of(pristine, folder))
+    result = registered_by_hand(store)
+    claimed = {k: T @ se3.exp(-slip) for k, T in result.cameras.claimed.items()}
+    write_result(store, replace(result, cameras=replace(result.cameras, claimed=claimed)),
+                 models_of(), {})  # fmt: skip
+    return folder
+
+
+def test_a_camera_that_sits_as_calibrated_holds(pristine: Path, tmp_path: Path) -> None:
+    done = check(registered(pristine, tmp_path / "s", np.zeros(6)), "--json")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["holds"] is True
+
+
+def test_a_camera_that_slipped_is_told_with_size_and_sigma(pristine: Path, tmp_path: Path) -> None:
+    """A slip of 3.7 mm: exit code 1, its size within three sigma, and kept in the session."""
+    folder = registered(pristine, tmp_path / "s", SLIP)
+    done = check(folder)
+    assert done.exit_code == 1
+    assert "does NOT hold" in done.output
+    kept = json.loads((folder / "calibration/check.json").read_text())
+    off = np.array(kept["twist"]) - SLIP
+    assert off @ np.linalg.solve(np.array(kept["covariance"]), off) < 25.0
+
+
+def test_a_large_tolerance_lets_it_pass(pristine: Path, tmp_path: Path) -> None:
+    folder = registered(pristine, tmp_path / "s", SLIP)
+    assert check(folder, "--tolerance", "30").exit_code == 0
+
+
+def test_what_cannot_be_checked_is_bad_input(pristine: Path, tmp_path: Path) -> None:
+    """A folder that is no session, and one that is not registered, are refused with what to do."""
+    for folder, words in (
+        (tmp_path, "not a session"),
+        (copy_of(pristine, tmp_path / "s"), "run `realsim register"),
+    ):
+        done = check(folder)
+        assert isinstance(done.exception, InputError) and words in str(done.exception)
