@@ -38,6 +38,9 @@ class ChessboardConfig:
     """Least share of the corners that must be measurable; fewer mean glare or a wrong grid."""
     look_for_twins: bool = True
     """Search once more beside the board found: of two equal boards neither can be trusted."""
+    twin_square_px: float = 28.0
+    """For that search the picture is halved until squares like those found are narrower; OpenCV
+    finds squares of 8 px, so a twin may stand 1.7 times as far away at least."""
 
 
 def find_chessboard(
@@ -143,7 +146,7 @@ def _whole(gray: UInt8, board: Chessboard, config: ChessboardConfig) -> tuple[Ar
             f"corners, not of {board.columns}x{board.rows}: correct rows and columns"
         )
     if config.look_for_twins:
-        other = largest_chessboard(_covered(gray, grid), config.search_px)
+        other = largest_chessboard(*_for_twins(_covered(gray, grid), grid, config))
         if other is not None and other.shape[:2] in shapes:
             return None, "two equal chessboards are in view: cover one"
     if grid.shape[:2] != (board.rows, board.columns):
@@ -208,7 +211,7 @@ def _classic(gray: UInt8, board: Chessboard) -> Array | None:
     return None
 
 
-def _sizes(gray: UInt8, search_px: int) -> list[tuple[UInt8, float]]:
+def _sizes(gray: UInt8, search_px: float) -> list[tuple[UInt8, float]]:
     """Return the image shrunk to `search_px` if it is larger, then as it is; with pixel sizes."""
     import cv2
 
@@ -220,6 +223,16 @@ def _sizes(gray: UInt8, search_px: int) -> list[tuple[UInt8, float]]:
     cut = gray[: size[1] * scale, : size[0] * scale]
     small = np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     return [(small, float(scale)), (gray, 1.0)]
+
+
+def _for_twins(gray: UInt8, grid: Array, config: ChessboardConfig) -> tuple[UInt8, int]:
+    """Return the picture, shrunk as far as squares like the grid's stay large, and its search size.
+
+    Most pictures have no second board, and a search for none costs as much as one for the first.
+    """
+    square = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=-1)))
+    small, _ = _sizes(gray, max(gray.shape) * config.twin_square_px / max(square, 1.0))[0]
+    return small, min(config.search_px, max(small.shape))
 
 
 def _covered(gray: UInt8, grid: Array) -> UInt8:

@@ -2,8 +2,10 @@
 
 import hashlib
 import json
+import os
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,23 +30,43 @@ LOOKED_AT = 2
 def find_in_images(
     images: Sequence[Path], target: Target, out: Path, console: Console
 ) -> list[TargetDetection]:
-    """Return the points found in every image; what was found before is not looked for again."""
-    from realsim_calibration.inputs import load_image
+    """Return the points found in every image; what was found before is not looked for again.
+
+    Images are searched side by side, as many as there are cores: OpenCV and numpy let go of the
+    interpreter while they work.
+    """
     from realsim_calibration.targets.target_text import format_target
 
-    found: list[TargetDetection] = []
+    what = f"{format_target(target)} {SEARCH}".encode()
     with console.stage("find the target", f"{len(images)} images") as tick:
-        for k, path in enumerate(images):
-            what = f"{format_target(target)} {SEARCH}".encode()
-            key = hashlib.sha256(path.read_bytes() + what).hexdigest()
-            note = out / "detections" / f"{key[:24]}.json"
-            seen = _noted(note)
-            if seen is None:
-                seen = find_target(load_image(path), target)
-                write_json(note, _detection_json(seen))
-            found.append(seen)
-            tick(k + 1, len(images))
+        found: list[TargetDetection] = []
+        with ThreadPoolExecutor(cores()) as pool:
+            search = [pool.submit(_found_once, path, target, what, out) for path in images]
+            try:
+                for k, one in enumerate(search):
+                    found.append(one.result())
+                    tick(k + 1, len(images))
+            except BaseException:
+                pool.shutdown(cancel_futures=True)  # one bad image: the others are not waited for
+                raise
     return found
+
+
+def _found_once(path: Path, target: Target, what: bytes, out: Path) -> TargetDetection:
+    """Return the points in one image, from its note or by a search that is noted."""
+    from realsim_calibration.inputs import load_image
+
+    note = out / "detections" / f"{hashlib.sha256(path.read_bytes() + what).hexdigest()[:24]}.json"
+    seen = _noted(note)
+    if seen is None:
+        seen = find_target(load_image(path), target)
+        write_json(note, _detection_json(seen))
+    return seen
+
+
+def cores() -> int:
+    """Return how many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def warn_of_pictures(
