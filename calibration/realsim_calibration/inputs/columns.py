@@ -142,10 +142,26 @@ def raw_from_table(table: PoseTable) -> RawPoses:
         stems=tuple(stems),
         where=tuple(table.where),
         joints=joints,
+        times=_times(table, names),
         said=said,
         possible=possible,
         notes=tuple(dict.fromkeys(notes)),
     )
+
+
+def _times(table: PoseTable, names: Sequence[str]) -> Array | None:
+    """Return the time stamps [s], None where no column is named as one or two are.
+
+    Their unit follows from the name (..._ns) or the size: seconds since 1970 are 1.7e9.
+    """
+    at = [k for k, name in enumerate(names) if name == "time"]
+    if len(at) != 1:
+        return None
+    times = table.values[:, at[0]]
+    size = float(np.nanmax(np.abs(times))) if np.isfinite(times).any() else 0.0
+    named = table.names[at[0]].lower().endswith(("_ns", "nsecs"))
+    unit = 1e-9 if named or size > 1e16 else 1e-6 if size > 1e14 else 1e-3 if size > 1e11 else 1.0
+    return times * unit
 
 
 def _index_stem(table: PoseTable, names: Sequence[str], row: int) -> str:

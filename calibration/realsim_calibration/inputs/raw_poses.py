@@ -78,6 +78,8 @@ class RawPoses:
     """(n,) where each pose stands, for messages: "line 12", "entry 3", "poses/3.yaml"."""
     joints: Array | None
     """(n, j) joint angles [rad]; None where the file has none."""
+    times: Array | None = None
+    """(n,) time stamps [s]; None where the file has none."""
     said: Said
     possible: tuple[PoseReading, ...]
     """Every reading that the names and the numbers admit, the commonest first."""
@@ -91,6 +93,9 @@ class RawPoses:
             if array is not None:
                 shape = (len(self.where), None)
                 object.__setattr__(self, name, frozen(array, np.float64, shape, name))
+        if self.times is not None:
+            times = frozen(self.times, np.float64, (len(self.where),), "times")
+            object.__setattr__(self, "times", times)
 
     def __len__(self) -> int:
         """Return the number of poses."""
@@ -121,6 +126,7 @@ class RawPoses:
             stems=tuple(self.stems[k] for k in pick),
             where=tuple(self.where[k] for k in pick),
             joints=None if self.joints is None else self.joints[pick],
+            times=None if self.times is None else self.times[pick],
         )
 
     def poses(self, reading: PoseReading, *, ranges: ReadingRanges | None = None) -> Array:

@@ -38,6 +38,7 @@ from realsim.app.outputs import GOES_ON
     show_default=True,
     help="Folder.",
 )
+@click.option("--clock-offset", default="auto", help="Of the camera: auto, off, seconds.")
 @click.option("--live", is_flag=True, help="Watch SOURCE for new views and say when to stop.")
 @click.option("--check", is_flag=True, help="Does it still hold? Of a registered session.")
 @click.option("--tolerance", default=1.0, show_default=True, help="With --check: mm at objects.")

@@ -81,6 +81,8 @@ class FolderRequest:
     mode: Literal["eye_in_hand", "eye_to_hand"] = "eye_in_hand"
     arm: str = ""
     """Name or folder of the arm; empty = the one that joints and poses prove, if any."""
+    clock: str = "auto"
+    """Offset of the camera's clock: auto, off, or seconds."""
 
 
 def made_of(images: Path) -> str:
@@ -303,6 +305,9 @@ def _from_pose_files(
     from realsim_calibration.inputs import read_board_poses, reading_from_text
 
     assert request.board_poses is not None
+    stamped = _from_logs(request, console)
+    if stamped is not None:
+        return _of_pairs(request, config, console, stamped)
     given = read_board_poses(request.poses, request.board_poses, robot_key=request.key or None)
     console.say(f"{len(given.robot)} pose pairs: {given.pairing}")
     board_reading = given.board.stated
@@ -317,6 +322,34 @@ def _from_pose_files(
         reading = _proven(given.robot, boards, None, request, console)
     Ts, joints = given.robot.poses(reading), given.robot.joints
     labels = [where or str(k) for k, where in enumerate(given.robot.where)]
+    console.say(f"robot poses read as {reading}, board poses as {board_reading}")
+    return _of_pairs(request, config, console, (Ts, boards, joints, labels))
+
+
+def _from_logs(
+    request: FolderRequest, console: Console
+) -> tuple[Array, Array, Array | None, list[str]] | None:
+    """Return the pairs of two logs with time stamps, None where they are paired otherwise."""
+    from realsim.app.calibrate.clock import pair_pose_logs, read_logs
+    from realsim_calibration.inputs import reading_from_text
+
+    assert request.board_poses is not None
+    if request.clock == "off" or request.poses is None:
+        return None
+    robot, board = read_logs(request.poses, request.board_poses, request.key)
+    reading = reading_from_text(request.reading) if request.reading else robot.stated
+    if reading is None or board.stated is None:
+        return None
+    readings = (reading, board.stated)
+    return pair_pose_logs(robot, board, readings, request.mode, request.clock, console)
+
+
+def _of_pairs(
+    request: FolderRequest, config: CalibrationConfig, console: Console,
+    pairs: tuple[Array, Array, Array | None, list[str]],
+) -> tuple[Calibration, list[Path]]:  # fmt: skip
+    """Return the calibration of (hand poses, board poses, joints, labels)."""
+    Ts, boards, joints, labels = pairs
     arm = find_arm(request.arm).chain.bare() if request.arm else None
     with console.stage("calibrate", f"{len(Ts)} pose pairs"):
         report = calibrate_from_poses(
@@ -326,7 +359,6 @@ def _from_pose_files(
         "there are no images: figures in px are those of a nominal camera (f = 900 px) that looks "
         "at the measured poses, and no lens is exported."
     )
-    console.say(f"robot poses read as {reading}, board poses as {board_reading}")
     result = Calibration(hand_eye=report, lens=None)
     return result, write_calibration(result, request, (), console)
 

@@ -43,7 +43,7 @@ def _run(source: Path, console: Console, *, live: bool, **options: Any) -> bool:
     require_header(source)
     if (source / "session.json").is_file() or has_board_views_only(source):
         _refuse_folder_options(options)
-        return _run_session(source, console, options["arm"] or "")
+        return _run_session(source, console, options["arm"] or "", options["clock_offset"])
     if not source.is_dir():
         raise InputError(
             f"'{source}' is not a folder; a session (it holds session.json) or a folder of images "
@@ -73,7 +73,7 @@ def _run(source: Path, console: Console, *, live: bool, **options: Any) -> bool:
     return not any(c.verdict == "bad" for c in result.checks)
 
 
-def _run_session(source: Path, console: Console, arm: str) -> bool:
+def _run_session(source: Path, console: Console, arm: str, clock: str) -> bool:
     """Calibrate a session, also one that has board views only; return whether no check is bad."""
     from realsim.app.calibrate.session import (
         calibrate_board_only,
@@ -85,9 +85,9 @@ def _run_session(source: Path, console: Console, arm: str) -> bool:
 
     board_only = has_board_views_only(source)
     if board_only:
-        hand_eye = calibrate_board_only(source, console, arm)
+        hand_eye = calibrate_board_only(source, console, arm, clock)
     else:
-        hand_eye = calibrate_session(open_session(source), console, arm)
+        hand_eye = calibrate_session(open_session(source), console, arm, clock)
     show_hand_eye(hand_eye, console)
     console.say(f"report and pictures: {source / 'calibration' / 'report'}")
     if board_only:
@@ -138,4 +138,5 @@ def _request(source: Path, options: dict[str, Any]) -> Any:
         camera=inside(options["camera"]),
         mode="eye_to_hand" if options["eye_to_hand"] else "eye_in_hand",
         arm=options["arm"] or "",
+        clock=options["clock_offset"],
     )

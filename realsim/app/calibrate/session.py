@@ -4,7 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from realsim.app.calibrate.board_views import read_board_views, write_results
+from realsim.app.calibrate.clock import mend_views
 from realsim.app.console import Console
 from realsim.app.stages import BOARD_VIEWS, content_key, is_current, mark_current, require_sound
 from realsim.errors import InputError
@@ -16,13 +19,16 @@ from realsim.store.session_check import is_session
 from realsim.untrusted.own_json import read_values
 
 
-def calibrate_session(store: SessionStore, console: Console, arm: str = "") -> HandEye:
+def calibrate_session(
+    store: SessionStore, console: Console, arm: str = "", clock: str = "auto"
+) -> HandEye:
     """Calibrate the hand-eye from the board views and place every camera of the session.
 
     Args:
         store: the session.
         console: told how far the work is.
         arm: name or folder of the arm; empty = the one that the session names or the poses prove.
+        clock: offset of the camera's clock: auto, off, or seconds.
 
     Raises:
         InputError: there are no board views, or no calibration/board.json.
@@ -40,7 +46,7 @@ def calibrate_session(store: SessionStore, console: Console, arm: str = "") -> H
     views_store = SessionStore.open(folder)
     require_sound(views_store)
     views = views_store.session.views
-    key = arm + content_key(
+    key = arm + ("" if clock == "auto" else clock) + content_key(
         folder / "robot.jsonl", store.folder / "calibration/board.json", folder / "session.json"
     )
     with console.stage("calibrate", f"{len(views)} board views") as tick:
@@ -49,6 +55,8 @@ def calibrate_session(store: SessionStore, console: Console, arm: str = "") -> H
         else:
             seen, target, known = read_board_views(store, views_store, arm, tick)
             camera = views_store.session.intrinsics
+            times = np.array([v.time_s for v in views])
+            seen = mend_views(seen, times, target, camera, clock, console)
             report = calibrate_hand_eye_report(seen, target, camera, arm=known)
             hand_eye = report.hand_eye
             write_results(report, seen, store, views_store)
@@ -102,7 +110,9 @@ def has_board_views_only(folder: Path) -> bool:
     return not is_session(folder) and (folder / BOARD_VIEWS / "session.json").is_file()
 
 
-def calibrate_board_only(folder: Path, console: Console, arm: str = "") -> HandEye:
+def calibrate_board_only(
+    folder: Path, console: Console, arm: str = "", clock: str = "auto"
+) -> HandEye:
     """Calibrate the hand-eye from the board views; no camera of a session is placed yet.
 
     Nothing is noted as done: once there is a session, `realsim calibrate` does it anew, lists the
@@ -119,6 +129,9 @@ def calibrate_board_only(folder: Path, console: Console, arm: str = "") -> HandE
     require_sound(views_store)
     with console.stage("calibrate", f"{len(views_store.session.views)} board views") as tick:
         seen, target, known = read_board_views(files, views_store, arm, tick)
+        times = np.array([v.time_s for v in views_store.session.views])
+        camera = views_store.session.intrinsics
+        seen = mend_views(seen, times, target, camera, clock, console)
         report = calibrate_hand_eye_report(seen, target, views_store.session.intrinsics, arm=known)
         write_results(report, seen, files, views_store)
         files.write_json(HAND_EYE_FILE, hand_eye_to_json(report.hand_eye))

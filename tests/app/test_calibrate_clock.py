@@ -1,0 +1,133 @@
+"""Pose logs and recordings by two clocks through `realsim calibrate`."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from realsim.app.calibrate.clock import (
+    arm_at,
+    clock_option,
+    is_stream,
+    mend_views,
+    pair_pose_logs,
+    read_logs,
+)
+from realsim.app.cli import commands
+from realsim.app.console import Console
+from realsim.arrays import Array
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.geometry.camera import project
+from realsim.records import CameraIntrinsics, Chessboard
+from realsim_calibration import BoardView, detection_of, solve_pose_pairs
+
+X_TRUE = se3.exp([0.1, -0.2, 0.7, 0.03, -0.05, 0.08])
+Z_TRUE = se3.from_rt(np.diag([1.0, -1, -1]), [0.4, 0.05, 0.0])
+CAMERA = CameraIntrinsics(width=640, height=480, fx=420.0, fy=420.0, cx=319.5, cy=239.5)
+BOARD = Chessboard(rows=5, columns=7, square_m=0.03)
+
+
+def hand(t: Array) -> Array:
+    """Return T_base_ee (n, 4, 4) of a motion above the board that does not repeat."""
+    rng = np.random.default_rng(0)
+    f, phase = rng.uniform(0.1, 0.5, (3, 6)), rng.uniform(0, 2 * np.pi, (3, 6))
+    size = np.array([0.2, 0.2, 0.4, 0.05, 0.05, 0.05]) / np.sqrt(3)
+    x = np.sin(2 * np.pi * f * t[:, None, None] + phase).sum(1) * size
+    return se3.from_rt(se3.exp_so3(x[:, :3]) @ np.diag([1.0, -1, -1]), x[:, 3:] + [0.4, 0, 0.5])
+
+
+def log(path: Path, t: Array, Ts: Array) -> Path:
+    """Write a pose log with time stamps."""
+    q = np.array([se3.quaternion_wxyz(T[:3, :3]) for T in Ts])
+    rows = np.column_stack([t, Ts[:, :3, 3], q[:, [1, 2, 3, 0]]])
+    np.savetxt(path, rows, "%.9f", ",", header="t,x,y,z,qx,qy,qz,qw", comments="")
+    return path
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Logs at 50 and 10 Hz; the camera's clock is 80 ms ahead."""
+    folder, rng = tmp_path_factory.mktemp("logs"), np.random.default_rng(1)
+    tr, t = np.arange(0, 8, 0.02), np.arange(0.5, 7.5, 0.1)
+    C = se3.invert(hand(t) @ X_TRUE) @ Z_TRUE @ se3.exp(rng.normal(scale=5e-4, size=(len(t), 6)))
+    log(folder / "robot.csv", tr, hand(tr) @ se3.exp(rng.normal(scale=1e-4, size=(len(tr), 6))))
+    log(folder / "board.csv", t + 0.08, C)
+    return folder
+
+
+def calibrate(folder: Path, out: Path, *more: str) -> Result:
+    given = ["calibrate", str(folder), "--poses", "robot.csv", "--board-poses", "board.csv"]
+    return CliRunner().invoke(commands, [*given, "--out", str(out), *more])
+
+
+def test_two_logs_are_joined_by_their_offset(logs: Path) -> None:
+    """400 robot poses and 70 board poses give 70 pairs that fit one place of the camera."""
+    robot, board = read_logs(logs / "robot.csv", logs / "board.csv", "")
+    assert robot.stated is not None and board.stated is not None
+    readings = robot.stated, board.stated
+    quiet = Console(quiet=True)
+    pairs = pair_pose_logs(robot, board, readings, "eye_in_hand", "auto", quiet)
+    assert pairs is not None and len(pairs[0]) == len(pairs[1]) == len(pairs[3]) == 70
+    found = solve_pose_pairs(pairs[0], pairs[1])
+    assert np.linalg.norm(found.X[:3, 3] - X_TRUE[:3, 3]) < 1e-3
+    told = pair_pose_logs(robot, board, readings, "eye_in_hand", "0.08", quiet)
+    assert told is not None
+    np.testing.assert_allclose(told[0], pairs[0], atol=5e-4)
+
+
+def test_a_given_offset_is_taken_and_off_pairs_rows(logs: Path, tmp_path: Path) -> None:
+    """A wrong given offset is taken at its word; without one 400 and 70 rows do not pair."""
+    far = calibrate(logs, tmp_path / "c", "--clock-offset", "100")
+    assert isinstance(far.exception, InputError) and "no time in common" in str(far.exception)
+    off = calibrate(logs, tmp_path / "c", "--clock-offset", "off")
+    assert isinstance(off.exception, InputError) and "belong together" in str(off.exception)
+
+
+def recorded(d: float) -> tuple[list[BoardView], Array]:
+    """Return board views of a moving camera whose stamps are d late, and the stamps."""
+    t = np.arange(0, 8, 1 / 15)
+    rng = np.random.default_rng(2)
+    views: list[BoardView] = []
+    Ts, points = hand(t), BOARD.points_board
+    centred = Z_TRUE @ se3.from_translation(-points.mean(0))
+    for k, T in enumerate(hand(t - d)):
+        uv = project(CAMERA, se3.transform(se3.invert(T @ X_TRUE) @ centred, points))
+        uv = uv + rng.normal(scale=0.1, size=uv.shape)
+        found = detection_of(BOARD, uv, (CAMERA.width, CAMERA.height))
+        views.append(BoardView(index=k, T_base_ee=Ts[k], detection=found))
+    return views, t
+
+
+def test_a_recording_follows_its_clock() -> None:
+    """Views 60 ms late get the arm's pose of 60 ms before; views by one clock stay as they are."""
+    views, t = recorded(0.06)
+    mended = mend_views(views, t, BOARD, CAMERA, "auto", Console(quiet=True))
+    truth = hand(t - 0.06)
+    error = [np.linalg.norm(v.T_base_ee[:3, 3] - truth[v.index, :3, 3]) for v in mended]
+    before = [np.linalg.norm(v.T_base_ee[:3, 3] - truth[v.index, :3, 3]) for v in views]
+    assert np.median(error) < 0.05 * np.median(before)
+    same, t = recorded(0.0)
+    kept = mend_views(same, t, BOARD, CAMERA, "auto", Console(quiet=True))
+    assert all(a is b for a, b in zip(kept, same, strict=True))
+
+
+def test_joints_follow_across_a_full_turn() -> None:
+    """Joint angles are interpolated the short way."""
+    t = np.array([0.0, 1.0, 2.0])
+    joints = np.array([[3.1], [-3.1], [-3.0]])
+    at = arm_at(t, np.tile(np.eye(4), (3, 1, 1)), joints, np.array([1.5]), 1.0).joints
+    assert at is not None
+    assert np.cos(at[0, 0]) == pytest.approx(-1.0, abs=1e-6)
+
+
+def test_views_at_stops_are_no_stream() -> None:
+    assert not is_stream(np.arange(0.0, 320.0, 8.0))
+    assert not is_stream(None)
+    assert is_stream(np.arange(0.0, 4.0, 0.1))
+
+
+def test_what_is_no_offset_is_named() -> None:
+    with pytest.raises(InputError, match="auto, off, or seconds"):
+        clock_option("soon")
