@@ -29,8 +29,8 @@ from realsim.app.outputs import GOES_ON
 )
 @click.option("--kind", default="auto", show_default=True,
               type=click.Choice(["auto", "bop", "graspnet"]), help="What DATASET is.")  # fmt: skip
-@click.option("--camera", default="", help="kinect or realsense, of GraspNet.  [both]",
-              type=click.Choice(["", "kinect", "realsense"]))  # fmt: skip
+@click.option("--camera", default="", metavar="NAME",
+              help="kinect or realsense, of GraspNet; a camera of BOP.  [all]")  # fmt: skip
 @click.option(
     "--start",
     default="gt",

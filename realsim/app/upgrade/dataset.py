@@ -125,6 +125,15 @@ def _require_places(refs: Sequence[SceneRef]) -> None:
 
 def _bop(dataset: Path, config: UpgradeConfig) -> list[SceneRef]:
     refs = find_scenes(dataset)
+    if config.camera:
+        there = sorted({r.camera for r in refs if r.camera})
+        refs = [r for r in refs if r.camera == config.camera]
+        if not refs:
+            raise InputError(
+                f"'{dataset}' holds no BOP scene of the camera '{config.camera}'"
+                + (f"; it has {', '.join(there)}." if there else ": its scenes name no camera. ")
+                + ("" if there else "Leave --camera out.")
+            )
     return [
         SceneRef(
             kind="bop", root=_root(r), folder=r.folder, number=r.scene_id,
