@@ -3,8 +3,9 @@
     uv run python benchmarks/calibration.py [--quick] [--json FILE] [--data DIR] [--part PART ...]
 
 Parts: time, real (5-fold held-out reprojection on three open sets, against OpenCV's seven closed
-forms, and the same with two poses swapped; a pose-only set, left out one by one), crb and coverage
-(simulation with truth), faults, corners. --quick takes few trials.
+forms with the best of five lenses, and the same with two poses swapped; a pose-only set, left out
+one by one), halves (sigma against disjoint halves of the four sets; the command on the whole sets),
+crb and coverage (simulation with truth), faults, corners. --quick takes few trials.
 """
 
 import os
@@ -18,10 +19,11 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from calibration_faults import faults_named_share, layouts_that_are_read
+from calibration_halves import Halves, exit_code, halves_apart
 from calibration_real import (
     FOLDS,
     SOURCES,
@@ -51,8 +53,15 @@ COVERAGE_VIEWS, DENSE_VIEWS = 40, 256
 COVERED = Goal(low=0.93, high=0.97)
 ALL = Goal(low=1.0, high=1.0)
 FIGURES = {
-    "heldout_ratio_geomean": Figure(unit="", goal=Goal(low=5.5)),
-    "heldout_ratio_min": Figure(unit="", goal=Goal(low=1.0)),
+    "heldout_ratio_geomean": Figure(unit="", goal=Goal(low=5.0)),
+    "heldout_ratio_min": Figure(unit="", goal=Goal(low=3.0)),
+    "x_alone_ratio_min": Figure(unit="", goal=Goal(low=1.0)),
+    **{f"x_alone_ratio_{name}": Figure(unit="") for name in (*SOURCES, "koch")},
+    "sigma_ratio_min": Figure(unit="", goal=Goal(low=0.7)),
+    "sigma_ratio_max": Figure(unit="", goal=Goal(high=2.0)),
+    **{f"this_arm_ratio_{name}": Figure(unit="") for name in (*SOURCES, "koch")},
+    **{f"this_arm_ratio_deg_{name}": Figure(unit="") for name in (*SOURCES, "koch")},
+    "good_sets_exit_zero": Figure(unit="", goal=Goal(low=4.0, high=4.0)),
     "rtde_px": Figure(unit="px", goal=Goal(high=0.40)),
     "rosi_px": Figure(unit="px", goal=Goal(high=1.25)),
     "muligheder_px": Figure(unit="px", goal=Goal(high=1.25)),
@@ -109,27 +118,37 @@ def measure_time(a: argparse.Namespace) -> Found:
     return found
 
 
+@cache
+def real_sets(data: Path, workers: int, quick: bool) -> tuple[tuple[ImageSet, ...], PoseSet] | None:
+    """Return the open sets with their corners, None where they are not there."""
+    if not (data / "handeye").is_dir():
+        return None
+    tasks = {name: image_tasks(data, name) for name in SOURCES}
+    steps = {name: max(1, len(part) // 12) if quick else 1 for name, part in tasks.items()}
+    tasks = {name: part[:: steps[name]] for name, part in tasks.items()}
+    seen = list(pool(workers).map(detect, [t for part in tasks.values() for t in part]))
+    sets: list[ImageSet] = []
+    for name, part in tasks.items():
+        sets.append(image_set(data, name, seen[: len(part)], steps[name]))
+        seen = seen[len(part) :]
+    return tuple(sets), read_koch(data)
+
+
 def measure_real(a: argparse.Namespace) -> Found:
     """Measure the held-out errors of the open sets, with a referee's closed forms beside them."""
     found, seeds = Found(), range(1 if a.quick else 4)
-    if not (a.data / "handeye").is_dir():
+    given = real_sets(a.data, a.workers, a.quick)
+    if given is None:
         found.notes.append(f"{a.data} has no folder handeye: real sets are not run. Give --data.")
         return found
+    sets, poses = given
     number = 1 if a.quick else FOLDS
-    tasks = {name: image_tasks(a.data, name) for name in SOURCES}
-    steps = {name: max(1, len(part) // 12) if a.quick else 1 for name, part in tasks.items()}
-    tasks = {name: part[:: steps[name]] for name, part in tasks.items()}
-    seen = each(a, detect, [t for part in tasks.values() for t in part])
-    sets: list[ImageSet] = []
-    for name, part in tasks.items():
-        sets.append(image_set(a.data, name, seen[: len(part)], steps[name]))
-        seen = seen[len(part) :]
-    poses = read_koch(a.data)
     referee = Referee.start(sets, poses, seeds)
     clean = folds(a, found, sets, seeds, "clean", number)
     for s in sets:
         px = px_by_seed(clean, s.name)
         found.cases[f"{s.name}_px by seed"] = px
+        found.cases[f"{s.name}_alone_px by seed"] = px_by_seed(clean, s.name, alone=True)
         found.add(f"{s.name}_px", float(np.mean(px)), f"{len(px)} seeds x {len(s.Ts)} views")
     joints = folds(a, found, sets, seeds, "with joints", number, joints=True)
     for key in {r.set_name for r in joints}:
@@ -187,8 +206,11 @@ def put_koch(a: argparse.Namespace, found: Found, poses: PoseSet) -> None:
     tasks = [(poses, k, True) for k in views] + [(poses, k, False) for k in plain]
     mm = each(a, left_out_mm, tasks)
     for name, part in (("koch", mm[: len(views)]), ("koch_no_joints", mm[len(views) :])):
-        found.add(f"{name}_mm", rms(part), f"{len(part)} views")
-        found.add(f"{name}_median_mm", float(np.median(part)), f"{len(part)} views")
+        found.add(f"{name}_mm", rms([p[0] for p in part]), f"{len(part)} views")
+        found.add(f"{name}_median_mm", float(np.median([p[0] for p in part])), f"{len(part)} views")
+    found.cases["koch_alone_mm"] = {
+        "views": list(plain), "mm": [p[1] for p in mm[len(views) :]]
+    }  # fmt: skip
 
 
 def put_referee(found: Found, referee: Referee) -> None:
@@ -202,7 +224,10 @@ def put_referee(found: Found, referee: Referee) -> None:
     for name, methods in theirs["px"].items():
         best = np.min(list(methods.values()), axis=0)
         ratios += (best / np.array(found.cases[f"{name}_px by seed"])).tolist()
-        found.add(f"{name}_closed_px", float(np.mean(best)), f"best of 7, {theirs['opencv']}")
+        alone = float(np.min(best / np.array(found.cases[f"{name}_alone_px by seed"])))
+        found.add(f"x_alone_ratio_{name}", alone, "worst seed; without the robot's map")
+        over = f"best of 7 with the best of 5 lenses, {theirs['opencv']}"
+        found.add(f"{name}_closed_px", float(np.mean(best)), over)
     if ratios:
         geometric_mean = float(np.exp(np.mean(np.log(ratios))))
         found.add("heldout_ratio_geomean", geometric_mean, f"{len(ratios)} sets x seeds")
@@ -210,6 +235,44 @@ def put_referee(found: Found, referee: Referee) -> None:
     if theirs["poses_mm"]:
         best_mm = min(rms(mm) for mm in theirs["poses_mm"].values())
         found.add("koch_closed_mm", best_mm, "best of 7")
+        ours: Any = found.cases["koch_alone_mm"]
+        same = min(rms([mm[k] for k in ours["views"]]) for mm in theirs["poses_mm"].values())
+        found.add("x_alone_ratio_koch", same / rms(ours["mm"]), f"{len(ours['mm'])} views")
+    alone_ratios = [v for k, v in found.figures.items() if k.startswith("x_alone_ratio_")]
+    if alone_ratios:
+        found.add("x_alone_ratio_min", min(alone_ratios), f"{len(alone_ratios)} sets, worst seed")
+
+
+def measure_halves(a: argparse.Namespace) -> Found:
+    """Measure sigma against disjoint halves of the open sets, and run the command on all four."""
+    found = Found()
+    given = real_sets(a.data, a.workers, a.quick)
+    if given is None:
+        found.notes.append(f"{a.data} has no folder handeye: real sets are not run. Give --data.")
+        return found
+    sets = (*given[0], given[1])
+    cuts = range(a.seed, a.seed + (1 if a.quick else 12))
+    results = each(a, halves_apart, [Halves(data=s, seed=k) for s in sets for k in cuts])
+    ratios: list[float] = []
+    for name in (*SOURCES, "koch"):
+        part = [r for r in results if r.name == name and not r.said]
+        over = f"{len(part)} of {len(cuts)} cuts"
+        if not part:
+            continue
+        ratios.append(rms([r.stated_mm for r in part]) / rms([r.mm for r in part]))
+        turn = rms([r.stated_deg for r in part]) / rms([r.deg for r in part])
+        found.add(f"this_arm_ratio_{name}", ratios[-1], over)
+        found.add(f"this_arm_ratio_deg_{name}", turn, over)
+    found.cases["halves"] = [
+        {"set": r.name, "mm": r.mm, "stated": r.stated_mm, "said": r.said} for r in results
+    ]
+    if ratios:
+        found.add("sigma_ratio_min", min(ratios), "stated sigma over spread, least set")
+        found.add("sigma_ratio_max", max(ratios), "stated sigma over spread, largest set")
+    codes = each(a, exit_code, [(a.data, name) for name in (*SOURCES, "koch")])
+    found.cases["exit codes"] = dict(zip((*SOURCES, "koch"), codes, strict=True))
+    found.add("good_sets_exit_zero", float(codes.count(0)), "realsim calibrate on whole sets")
+    return found
 
 
 def measure_crb(a: argparse.Namespace) -> Found:
@@ -296,7 +359,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 if __name__ == "__main__":
     parts = {
-        "time": measure_time, "real": measure_real, "crb": measure_crb,
+        "time": measure_time, "real": measure_real, "halves": measure_halves, "crb": measure_crb,
         "coverage": measure_coverage, "faults": measure_faults, "corners": measure_corners,
     }  # fmt: skip
     run("calibration", __doc__ or "", PACKAGES, FIGURES, parts, options=options)

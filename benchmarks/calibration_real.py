@@ -19,7 +19,7 @@ from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.dh import DhArm
-from realsim.records import ArmErrorMap, Target
+from realsim.records import ArmErrorMap, CameraIntrinsics, Target
 from realsim.robots.arm import UR5 as UR5_ARM
 from realsim.robots.arm import UR5E as UR5E_ARM
 from realsim_calibration import (
@@ -123,6 +123,9 @@ class FoldResult:
     number: int
     px: tuple[float, ...]
     """Per test view; infinite where nothing was calibrated."""
+    alone_px: tuple[float, ...] = ()
+    """The same by what is exported for programs that know no map: X_alone, Z_alone, its lens, and
+    the board as drawn."""
     rejected: tuple[int, ...] = ()
     swapped: tuple[int, int] | None = None
     map_name: str = ""
@@ -197,27 +200,40 @@ def run_fold(fold: Fold) -> FoldResult:
     try:
         report = calibrate(views, data.target, arm=data.arm if fold.joints else None).hand_eye
     except RealsimError as error:
-        return FoldResult(px=(float("inf"),) * len(test), said=str(error), **where)
-    points, px = board_points(report), []
+        bad = (float("inf"),) * len(test)
+        return FoldResult(px=bad, alone_px=bad, said=str(error), **where)
+    points, px, alone = board_points(report), list[float](), list[float]()
     for k in test:
-        T = corrected(report, data.Ts[k], None if q is None else q[k])
-        seen = data.detections[k]
-        T_cam_board = se3.invert(T @ report.X) @ report.Z
-        uv = project(report.intrinsics, se3.transform(T_cam_board, points[seen.point_ids]))
-        error = float(np.sqrt(np.mean(np.sum((uv - seen.uv) ** 2, -1))))
-        px.append(error if np.isfinite(error) else float("inf"))
+        T, seen = data.Ts[k], data.detections[k]
+        moved = corrected(report, T, None if q is None else q[k])
+        T_cam_board = se3.invert(moved @ report.X) @ report.Z
+        px.append(view_px(seen, report.intrinsics, T_cam_board, points))
+        T_cam_board = se3.invert(T @ report.X_alone) @ report.Z_alone
+        drawn = data.target.points_board
+        alone.append(view_px(seen, report.intrinsics_alone, T_cam_board, drawn))
     return FoldResult(
-        px=tuple(px), map_name=report.map_name, rejected=tuple(i for i, _ in report.rejected),
-        **where,
+        px=tuple(px), alone_px=tuple(alone), map_name=report.map_name,
+        rejected=tuple(i for i, _ in report.rejected), **where,
     )  # fmt: skip
 
 
-def px_by_seed(results: Sequence[FoldResult], name: str) -> list[float]:
-    """Return a set's held-out RMS [px], one per seed."""
+def view_px(
+    seen: TargetDetection, camera: CameraIntrinsics, T_cam_board: Array, points: Array
+) -> float:
+    """Return the RMS [px] of a view's points, infinite where they are behind the camera."""
+    uv = project(camera, se3.transform(T_cam_board, points[seen.point_ids]))
+    error = float(np.sqrt(np.mean(np.sum((uv - seen.uv) ** 2, -1))))
+    return error if np.isfinite(error) else float("inf")
+
+
+def px_by_seed(
+    results: Sequence[FoldResult], name: str, *, alone: bool = False
+) -> list[float]:  # fmt: skip
+    """Return a set's held-out RMS [px], one per seed; `alone`: without the robot's map."""
     found: dict[int, list[float]] = {}
     for r in results:
         if r.set_name == name:
-            found.setdefault(r.seed, []).extend(r.px)
+            found.setdefault(r.seed, []).extend(r.alone_px if alone else r.px)
     return [float(np.sqrt(np.mean(np.square(found[seed])))) for seed in sorted(found)]
 
 
@@ -239,8 +255,11 @@ def read_koch(data: Path) -> PoseSet:
     return PoseSet(A=given.robot.poses(reading), C=given.board.poses(reading), joints=joints)
 
 
-def left_out_mm(task: tuple[PoseSet, int, bool]) -> float:
-    """Return how far the board is, seen in view k, from where a calibration without k has it."""
+def left_out_mm(task: tuple[PoseSet, int, bool]) -> tuple[float, ...]:
+    """Return how far the board, seen in view k, is from where a calibration without k has it [mm].
+
+    Once with the robot's map, once by X_alone.
+    """
     poses, k, with_joints = task
     rest = np.arange(len(poses.A)) != k
     report = calibrate_from_poses(
@@ -248,7 +267,10 @@ def left_out_mm(task: tuple[PoseSet, int, bool]) -> float:
         arm=UR5_ARM if with_joints else None,
     )  # fmt: skip
     T = corrected(report, poses.A[k], poses.joints[k])
-    return 1e3 * float(np.linalg.norm((T @ report.X @ poses.C[k])[:3, 3] - report.Z[:3, 3]))
+    return tuple(
+        1e3 * float(np.linalg.norm((at @ X @ poses.C[k])[:3, 3] - Z[:3, 3]))
+        for at, X, Z in ((T, report.X, report.Z), (poses.A[k], report.X_alone, report.Z_alone))
+    )
 
 
 @dataclass(eq=False, kw_only=True, slots=True)

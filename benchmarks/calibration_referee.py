@@ -5,11 +5,12 @@
 
 OpenCV 5 has no calibrateHandEye, hence an environment of its own; nothing of realsim is used. Per
 fold: lens by calibrateCamera on the training views, board poses by solvePnP, X (and Z, by
-averaging where the method gives none), then every test view's points through its robot pose. The
-pose-only set is left out one by one. Input, per set S: S_A (n, 4, 4), S_points (m, 3), S_ids and
-S_uv of all views one after the other, S_start (n + 1,), S_size (2,), S_folds (seeds, n); and
-poses_A, poses_C (n, 4, 4). Output: {"px": {S: {method: [px per seed]}}, "poses_mm": {method: [mm
-per view]}}.
+averaging where the method gives none), then every test view's points through its robot pose; all
+with each of the usual lenses, so that whoever asks may choose the best afterwards. The pose-only
+set is left out one by one. Input, per set S: S_A (n, 4, 4), S_points (m, 3), S_ids and S_uv of all
+views one after the other, S_start (n + 1,), S_size (2,), S_folds (seeds, n); and poses_A, poses_C
+(n, 4, 4). Output: {"px": {S: {"method, lens": [px per seed]}}, "poses_mm": {method: [mm per
+view]}}.
 """
 
 import json
@@ -19,12 +20,20 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from realsim.arrays import Array
-
+Array = NDArray[np.float64]
 cv: Any = cv2
 HAND_EYE = ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS")
 ROBOT_WORLD = ("SHAH", "LI")
+LENSES = {
+    "none": cv.CALIB_ZERO_TANGENT_DIST | cv.CALIB_FIX_K1 | cv.CALIB_FIX_K2 | cv.CALIB_FIX_K3,
+    "k1": cv.CALIB_ZERO_TANGENT_DIST | cv.CALIB_FIX_K2 | cv.CALIB_FIX_K3,
+    "k1 k2": cv.CALIB_ZERO_TANGENT_DIST | cv.CALIB_FIX_K3,
+    "k1 k2 p1 p2": cv.CALIB_FIX_K3,
+    "k1 k2 p1 p2 k3": 0,
+}
+"""Distortion terms, and the flags of calibrateCamera that leave the others out."""
 MIN_POINTS = 8
 """Fewest points of a training view, as in the package."""
 
@@ -89,11 +98,20 @@ class ImageSet:
         self.folds = data[f"{name}_folds"]
 
     def fold_px(self, train: Any, test: Any) -> dict[str, list[float]]:
-        """Return every method's RMS [px] of every test view."""
+        """Return the RMS [px] of every test view for every method with every lens."""
+        out: dict[str, list[float]] = {}
+        for name, flags in LENSES.items():
+            for method, px in self._lens_px(train, test, flags).items():
+                out[f"{method}, {name}"] = px
+        return out
+
+    def _lens_px(self, train: Any, test: Any, flags: int) -> dict[str, list[float]]:
+        """Return every method's RMS [px] of every test view with one lens."""
         train = [k for k in train if len(self.uv[k]) >= MIN_POINTS]
         _, K, lens, _, _ = cv.calibrateCamera(
-            [self.points[k] for k in train], [self.uv[k] for k in train], self.size, None, None
-        )
+            [self.points[k] for k in train], [self.uv[k] for k in train], self.size, None, None,
+            flags=flags,
+        )  # fmt: skip
         poses = [cv.solvePnP(self.points[k], self.uv[k], K, lens)[1:] for k in train]
         C = np.array([rigid(np.ravel(r), t) for r, t in poses])
         out: dict[str, list[float]] = {}

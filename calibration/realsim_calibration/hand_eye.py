@@ -57,13 +57,13 @@ def calibrate_hand_eye_report(
     """Return the hand-eye calibration with its diagnosis; see `calibrate_hand_eye`."""
     config = config or HandEyeConfig()
     screened = screen(views, target, intrinsics0, config, arm)
-    setup = _setup(screened.candidates, target, intrinsics0, config)
+    setup = setup_of(screened.candidates, target, intrinsics0, config)
     joints = joints_of(screened.candidates) if arm is not None else None
     solution = solve(setup, screened.start, config, arm if joints is not None else None, joints)
     return _report(views, target, intrinsics0, config, screened, solution)
 
 
-def _setup(
+def setup_of(
     candidates: list[Candidate],
     target: Target,
     intrinsics0: CameraIntrinsics,

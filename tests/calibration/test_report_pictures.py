@@ -122,7 +122,7 @@ def test_sigma_is_given_along_the_axes_of_the_carrier(report: HandEyeReport) -> 
     """A camera turned by 90 deg about z: its x is the tool's y, so is its uncertainty."""
     X = se3.from_rt(se3.exp_so3([0, 0, np.pi / 2]), [0.01, 0.02, 0.03])
     C = np.diag([1e-8, 1e-8, 1e-8, 9e-6, 1e-6, 4e-6])
-    row = pose_rows(dataclasses.replace(report, X=X, X_here_covariance=C))[0]
+    row = pose_rows(dataclasses.replace(report, X_here=X, X_here_covariance=C))[0]
     assert row[1] == "x 10.000 ± 1.000, y 20.000 ± 3.000, z 30.000 ± 2.000"
 
 

@@ -316,7 +316,9 @@ def _appendix(page: _Page, report: HandEyeReport) -> None:
     page.section("The numbers, to copy")
     what, other = ("ee", "base") if report.mode == "eye_in_hand" else ("base", "ee")
     suffix = ", only together with the robot's error map" if report.robot_map is not None else ""
+    here = [] if report.X_here is None else [report.X_here]
     for name, T in (
+        *((f"T_{what}_cam for this arm as it moves here [m]", T) for T in here),
         (f"T_{what}_cam{suffix} [m]", report.X),
         (f"T_{what}_cam without a map, for other programs [m]", report.X_alone),
         (f"T_{other}_board [m]", report.Z),

@@ -99,8 +99,11 @@ def carrier(report: HandEyeReport) -> str:
 
 
 def pose_rows(report: HandEyeReport) -> list[list[str]]:
-    """Return the rows that say where the camera is, with 1 sigma along the axes of the carrier."""
-    X, what = report.X, carrier(report)
+    """Return the rows that say where the camera is for this arm, 1 sigma along the carrier's axes.
+
+    With a robot map the X that is used with it is elsewhere: the map's mean is in X for this arm.
+    """
+    X, what = report.X if report.X_here is None else report.X_here, carrier(report)
     # The covariance is that of a right perturbation: along the camera's axes.
     in_carrier = X[:3, :3] @ report.place_covariance[3:, 3:] @ X[:3, :3].T
     sd = 1e3 * np.sqrt(np.diag(in_carrier))
@@ -131,8 +134,8 @@ def pose_rows(report: HandEyeReport) -> list[list[str]]:
         rows.append(
             [
                 "robot error map",
-                f"in use; without it (X alone, for other programs) the camera is {moved:.2f} mm "
-                f"and {turned:.3f} deg elsewhere",
+                "in use, with an X of its own (calibration.json); without it (X alone, for other "
+                f"programs) the camera is {moved:.2f} mm and {turned:.3f} deg elsewhere",
             ]
         )
     if report.stretch is not None:

@@ -4,7 +4,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from realsim.app.calibrate.show import report_document, show_hand_eye, show_next_views, show_report
+from realsim.app.calibrate.show import (
+    report_document,
+    show_hand_eye,
+    show_next_views,
+    show_report,
+    warn_of_far_views,
+)
 from realsim.app.console import Console
 from realsim.errors import InputError
 
@@ -87,7 +93,9 @@ def _run_session(source: Path, console: Console, arm: str, clock: str) -> bool:
     if board_only:
         hand_eye = calibrate_board_only(source, console, arm, clock)
     else:
-        hand_eye = calibrate_session(open_session(source), console, arm, clock)
+        store = open_session(source)
+        hand_eye = calibrate_session(store, console, arm, clock)
+        warn_of_far_views(hand_eye, store.session.views, console)
     show_hand_eye(hand_eye, console)
     console.say(f"report and pictures: {source / 'calibration' / 'report'}")
     if board_only:

@@ -8,13 +8,17 @@ import numpy as np
 from realsim.app.console import Console
 from realsim.errors import RealsimError
 from realsim.geometry import se3
-from realsim.records import Check, HandEye
+from realsim.records import Check, HandEye, RobotErrorMap, View
 from realsim_calibration import HandEyeReport
 
 NEXT_VIEWS = 3
 """Further views that are proposed."""
 GAIN = 0.95
 """The proposed views are told of if together they bring a sigma below this part of what it is."""
+MAP_REACH = 2.0
+"""Gaps between the calibrated poses up to which a robot map holds (`RobotErrorMap.beyond`)."""
+FAR_NAMED = 6
+"""Views outside that are named."""
 ORDER = ("bad", "warn", "unknown", "good")
 
 
@@ -68,6 +72,23 @@ def show_hand_eye(hand_eye: HandEye, console: Console) -> None:
     for index, reason in hand_eye.rejected:
         console.warn(f"board view {index} was not used: {reason}")
     show_checks([c for c in hand_eye.checks if c.verdict != "good"], console)
+
+
+def warn_of_far_views(hand_eye: HandEye, views: Sequence[View], console: Console) -> None:
+    """Warn of views whose robot pose is outside of the poses that the robot's map was fitted on."""
+    known = hand_eye.robot_map
+    posed = [v for v in views if v.T_base_ee is not None]
+    if not isinstance(known, RobotErrorMap) or not posed:
+        return
+    beyond = known.beyond(np.array([v.T_base_ee for v in posed]))
+    far = [f"{v.index} ({b:.1f})" for v, b in zip(posed, beyond, strict=True) if b > MAP_REACH]
+    if far:
+        console.warn(
+            f"{len(far)} of {len(posed)} views are outside of the calibrated poses, where the "
+            f"robot's error map is a guess: {', '.join(far[:FAR_NAMED])}"
+            f"{', ...' if len(far) > FAR_NAMED else ''} (in gaps between calibrated poses, "
+            f"up to {MAP_REACH:g} is inside). Calibrate with board views where these were taken."
+        )
 
 
 def show_report(report: HandEyeReport, checks: Sequence[Check], console: Console) -> None:
