@@ -23,7 +23,14 @@ from realsim_calibration.cameras.faults import (
 from realsim_calibration.cameras.problem import RigProblem, first_state
 from realsim_calibration.cameras.results import CamerasReport, SightingReport, pair_reports
 from realsim_calibration.cameras.rig import Rig, Sighting
-from realsim_calibration.cameras.solve import RigSolution, UnseenView, solve_rig, unseen_views
+from realsim_calibration.cameras.solve import (
+    RigSolution,
+    UnseenView,
+    doubted_instants,
+    solve_rig,
+    unseen_views,
+    without_arm,
+)
 from realsim_calibration.cameras.start import Start, board_poses, find_start
 from realsim_calibration.checks import given_camera_check, hand_eye_checks, roll_range_deg
 from realsim_calibration.fit.joint_solve import JointConfig
@@ -65,7 +72,16 @@ def calibrate_cameras(
     state = first_state(start.X, start.Z, lenses, start.A[rows], loose)
     angles = [t.joints for t in used.instants]
     known = None if any(q is None for q in angles) else np.array(angles, dtype=np.float64)
-    solution = solve_rig(problem, state, config.hand_eye, arm if known is not None else None, known)
+    arm = arm if known is not None else None
+    solution = solve_rig(problem, state, config.hand_eye, arm, known)
+    doubted = doubted_instants(solution)
+    if doubted:
+        start.bad_arm += [rows[i] for i in doubted]
+        believed = problem.known.copy()
+        believed[doubted] = False
+        problem = RigProblem(used, lenses, joints, believed)
+        solution = solve_rig(problem, without_arm(solution.state, doubted), config.hand_eye, arm,
+                             known)  # fmt: skip
     return _report(rig, start, rows, solution, config, own)
 
 

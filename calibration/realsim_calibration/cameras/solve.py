@@ -48,6 +48,12 @@ from realsim_calibration.screening import HandEyeConfig
 SAG_RAD = 5e-4
 """How far the most loaded joint gives way under the arm's own weight, 1-sigma [rad]: 10 to 20 N m
 over some 2e4 N m/rad, the stiffness of gears of this size."""
+DOUBT_RATIO = 8.0
+"""An arm pose that is so many times further off than the median one is wrong: of noise in six
+coordinates the largest of a million is 3.1 times the median."""
+BASE_FACTOR = 2.0
+"""Constant error in the axes of the base over the one in the tool's: an arm near one posture sags,
+and is off by its first joints' zeros, alike in all poses. Chosen on simulated labs."""
 LEAST_SHARE = 0.25
 """A Gauss-Newton step that is still no gain when cut to this share is none: the fit has ended."""
 
@@ -237,7 +243,7 @@ def _hidden(
     """Return errors (I, 6, q) that the arm may have, per standard deviation.
 
     Beside those of one camera, where no joints are known: an error that is the same in all poses
-    in the axes of the base (about the middle of the hand's places), as large as the one in the
+    in the axes of the base (about the middle of the hand's places), larger than the one in the
     axes of the tool. It looks like other places of all fixed cameras, and of the table, at once.
     """
     if known is not None and arm is not None and joints is not None:
@@ -245,6 +251,7 @@ def _hidden(
     columns = hidden_errors(model, none, known, Ts, 1.0, config.robot.hidden_factor)
     middle = se3.from_translation(Ts[:, :3, 3].mean(0))
     base = np.stack([se3.adjoint(se3.invert(T) @ middle) for T in Ts]) @ columns[0, :, :6]
+    base = base * BASE_FACTOR
     return np.concatenate([columns, base], -1)
 
 
@@ -301,6 +308,36 @@ def _offsets(
     n = len(basis.unit) // 4
     sd = np.sqrt(np.diag(covariance)[shared : shared + n])
     return np.stack([state.weights[:n] * basis.unit[:n], sd * basis.unit[:n]], -1)
+
+
+def doubted_instants(solution: RigSolution) -> list[int]:
+    """Return the instants whose arm pose is further off than it is elsewhere, beyond any noise.
+
+    Several cameras, or one and the board's shape, place the hand there; the pose is not needed.
+    """
+    problem, state = solution.problem, solution.state
+    smooth = smooth_errors(solution.basis, state.weights, len(problem.at))
+    sd = np.repeat(solution.ratio, 3) * solution.model.unit_sd
+    off = np.linalg.norm((state.errors - smooth) / np.where(sd > 0, sd, np.inf), axis=-1)
+    arm = [
+        i for i, views in enumerate(problem.at)
+        if problem.known[i] and any(problem.views[k].moved for k in views)
+        and not any(problem.views[k].moved and problem.rig.boards[problem.views[k].board].place
+                    == "free" for k in views)
+    ]  # fmt: skip
+    if not arm or not off.any():
+        return []
+    limit = DOUBT_RATIO * float(np.median(off[arm]))
+    return [i for i in arm if off[i] > limit]
+
+
+def without_arm(state: RigState, instants: Sequence[int]) -> RigState:
+    """Return the start of a fit in which the arm's poses at some instants are not believed."""
+    A = state.A.copy()
+    A[instants] = A[instants] @ se3.exp(state.errors[instants])
+    errors = state.errors.copy()
+    errors[instants] = 0.0
+    return replace(state, A=A, errors=errors, weights=np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

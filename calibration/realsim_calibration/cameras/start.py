@@ -4,9 +4,9 @@
 2. closed-form hand-eyes of every camera and board that the arm moves against each other, with all
    their gates (`screening`); the one of most views is the anchor
 3. every other camera and board follows from those that are known, over the views that show both
-4. views that do not fit their camera's others are left out. Where all views of an instant that the
-   arm moves are off alike, it is the arm's pose that is wrong: it is estimated, and the cameras
-   that see boards then still tie each other.
+4. views that do not fit their camera's others are left out. Where most views of an instant that
+   the arm moves are off, and agree about another pose of the arm, it is the arm's that is wrong:
+   it is estimated, and the cameras that see boards then still tie each other.
 """
 
 from collections.abc import Sequence
@@ -274,8 +274,11 @@ class _Finder:
         for i in sorted({self.sightings[k].instant for k in bad}):
             here = [k for k in self.C if self.sightings[k].instant == i]
             moved = [k for k in here if self._moved(k)]
-            if len(moved) > 1 and i in self.A and all(k in bad for k in moved):
-                bad -= self._without_arm(i, moved, limits)
+            odd = sum(k in bad for k in moved)
+            if odd > 1 and 2 * odd > len(moved) and i in self.A:
+                agree = self._without_arm(i, moved, limits)
+                if agree:
+                    bad = (bad | set(moved)) - agree
         for k in sorted(bad):
             limit = limits[k]
             said = self.screened.get(k) or (
