@@ -26,6 +26,7 @@ from realsim_calibration.faults.diagnosis import (
     ReadingProof,
 )
 from realsim_calibration.faults.frame_fit import MIN_VIEWS, fit_frames, hand_side, mismatch
+from realsim_calibration.faults.gates import rotation_mismatch_deg
 from realsim_calibration.faults.hypotheses import (
     Hypothesis,
     Poses,
@@ -375,20 +376,24 @@ def prove_reading(
     middle = np.zeros(3) if target is None else target.points_board.mean(0)
     modes: tuple[Mode, Mode] = ("eye_in_hand", "eye_to_hand")
     entries: list[tuple[ReadingFit, Array, bool]] = []
-    for name, given in candidates:
-        T = se3.check_rigid(given, name).reshape(-1, 4, 4)
-        for mode in modes:
-            A = hand_side(T, mode == "eye_in_hand")
-            fit = fit_frames(A, C, middle, config.fit)
-            h = Hypothesis(fault="none", name=f"{name} ({mode})", fit=fit, score=fit.score, T=A,
-                           C=C, rows=np.zeros((0, 2), dtype=np.int64))  # fmt: skip
-            x, z = np.linalg.norm(fit.X[:3, 3]), np.linalg.norm(fit.Z[:3, 3])
-            # What sits in the hand is nearer to it than what stands in the base.
-            natural = bool(x < z if mode == "eye_in_hand" else z < x)
-            penalised = fit.score * (1 + abs(float(np.log(fit.length_ratio))) / np.log(1.5))
-            row = ReadingFit(name=name, mode=mode, evidence=evidence_of(h, True, config),
-                             penalised=penalised)  # fmt: skip
-            entries.append((row, A, natural))
+    read = [(name, se3.check_rigid(T, name).reshape(-1, 4, 4)) for name, T in candidates]
+    tried = [
+        (name, mode, hand_side(T, mode == "eye_in_hand")) for name, T in read for mode in modes
+    ]
+    # Turns of hand and camera agree without any frames: of many readings the worst need no fit.
+    turns = [rotation_mismatch_deg(A, C) for _, _, A in tried]
+    kept = np.argsort(turns, kind="stable")[: config.fitted_readings]
+    for name, mode, A in (tried[k] for k in sorted(kept.tolist())):
+        fit = fit_frames(A, C, middle, config.fit)
+        h = Hypothesis(fault="none", name=f"{name} ({mode})", fit=fit, score=fit.score, T=A,
+                       C=C, rows=np.zeros((0, 2), dtype=np.int64))  # fmt: skip
+        x, z = np.linalg.norm(fit.X[:3, 3]), np.linalg.norm(fit.Z[:3, 3])
+        # What sits in the hand is nearer to it than what stands in the base.
+        natural = bool(x < z if mode == "eye_in_hand" else z < x)
+        penalised = fit.score * (1 + abs(float(np.log(fit.length_ratio))) / np.log(1.5))
+        row = ReadingFit(name=name, mode=mode, evidence=evidence_of(h, True, config),
+                         penalised=penalised)  # fmt: skip
+        entries.append((row, A, natural))
     entries.sort(key=lambda e: e[0].penalised * (1.0 if e[2] else 1.01))
     return _proof(entries, config)
 
