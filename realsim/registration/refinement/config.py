@@ -67,10 +67,10 @@ class CameraPrior:
     better."""
     hand_eye_deg: float = 0.25
     """Likewise [deg]."""
-    arm_constant_mm: float = 0.12
+    arm_constant_mm: float = 0.08
     """Standard deviation per axis of what the arm is off by everywhere alike [mm]: it moves cameras
-    and objects together, so that no view shows it. Set on the whole loop, seeds 2000 to 2009: a
-    UR5 with calibrated kinematics."""
+    and objects together, so that no view shows it. Set on the whole loop, seeds 2000 to 2009 and
+    3000 to 3007: a UR5 with calibrated kinematics."""
     view_mm: float = 0.2
     """Standard deviation of each view on its own [mm]: the repeatable part of an arm's error is in
     the hand-eye."""
