@@ -44,7 +44,7 @@ except ImportError:
     )
 
 TIER, JUDGED_SEED, VERSION = "full", 7000, "1.1.0"
-SEQUENCES = {"robot_error": (60, 10), "pnp": (60, 10), "outliers": (40, 8), "temporal": (24, 5)}
+SEQUENCES = {"robot_error": (60, 8), "pnp": (60, 8), "outliers": (40, 6), "temporal": (24, 4)}
 """Sequences of each track, and of each with --quick."""
 RETRIES = 5
 COVERED = Goal(low=0.93, high=0.97)
