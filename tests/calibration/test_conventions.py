@@ -8,7 +8,6 @@ from fault_sessions import faults
 from realsim.errors import InputError, NotRigidError
 from realsim.geometry import se3
 from realsim_calibration.faults.diagnose import diagnose, prove_reading
-from realsim_calibration.faults.diagnosis import DiagnosisConfig
 from realsim_calibration.faults.frame_fit import fit_frames, hand_side, mismatch
 from realsim_calibration.faults.gates import GateConfig, frame_gate
 from realsim_calibration.faults.half_turns import half_turn, synchronise_half_turns
@@ -225,15 +224,7 @@ def test_the_reading_of_a_pose_file_is_proven():
     proof = prove_reading(readings(s), s.C, target=faults.BOARD)
     assert proof.best == "rotation vector" and proof.decisive and proof.ratio > 3
     assert proof.best_mode == ("eye_in_hand" if s.eye_in_hand else "eye_to_hand")
-    assert "fits" in proof.sentence and len(proof.fits) == 32
-    # Those that are not fitted would not have changed the verdict.
-    every = prove_reading(
-        readings(s), s.C, replace(DiagnosisConfig(), fitted_readings=99), target=faults.BOARD
-    )
-    assert len(every.fits) == 2 * len(readings(s))
-    assert (every.best, every.best_mode, every.runner_up, every.ratio) == (
-        proof.best, proof.best_mode, proof.runner_up, proof.ratio,
-    )  # fmt: skip
+    assert "fits" in proof.sentence and len(proof.fits) == 2 * len(readings(s))
 
 
 def test_inverted_poses_of_the_other_place_are_one_reading():

@@ -8,6 +8,7 @@ reading that fits, far better than the data as given, is the fault; where none d
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,8 +26,13 @@ from realsim_calibration.faults.diagnosis import (
     ReadingFit,
     ReadingProof,
 )
-from realsim_calibration.faults.frame_fit import MIN_VIEWS, fit_frames, hand_side, mismatch
-from realsim_calibration.faults.gates import rotation_mismatch_deg
+from realsim_calibration.faults.frame_fit import (
+    MIN_VIEWS,
+    FrameFit,
+    fit_frames,
+    hand_side,
+    mismatch,
+)
 from realsim_calibration.faults.hypotheses import (
     Hypothesis,
     Poses,
@@ -377,14 +383,13 @@ def prove_reading(
     modes: tuple[Mode, Mode] = ("eye_in_hand", "eye_to_hand")
     entries: list[tuple[ReadingFit, Array, bool]] = []
     read = [(name, se3.check_rigid(T, name).reshape(-1, 4, 4)) for name, T in candidates]
-    tried = [
-        (name, mode, hand_side(T, mode == "eye_in_hand")) for name, T in read for mode in modes
-    ]
-    # Turns of hand and camera agree without any frames: of many readings the worst need no fit.
-    turns = [rotation_mismatch_deg(A, C) for _, _, A in tried]
-    kept = np.argsort(turns, kind="stable")[: config.fitted_readings]
-    for name, mode, A in (tried[k] for k in sorted(kept.tolist())):
-        fit = fit_frames(A, C, middle, config.fit)
+    # The inverse read for the other place of the camera is the same equation: it is fitted once.
+    fits: dict[bytes, FrameFit] = {}
+    for (name, T), mode in product(read, modes):
+        A = hand_side(T, mode == "eye_in_hand")
+        key = (np.round(A, 9) + 0.0).tobytes()
+        fit = fits.get(key) or fit_frames(A, C, middle, config.fit)
+        fits[key] = fit
         h = Hypothesis(fault="none", name=f"{name} ({mode})", fit=fit, score=fit.score, T=A,
                        C=C, rows=np.zeros((0, 2), dtype=np.int64))  # fmt: skip
         x, z = np.linalg.norm(fit.X[:3, 3]), np.linalg.norm(fit.Z[:3, 3])

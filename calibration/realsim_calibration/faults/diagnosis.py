@@ -70,10 +70,6 @@ class DiagnosisConfig:
     optical axis than inverted."""
     decisive: float = 3.0
     """A reading of a pose file is proven when the next one fits this many times worse."""
-    fitted_readings: int = 32
-    """Of the readings of a pose file so many are fitted, those whose turns agree best: a wrong
-    rotation is off by tens of degrees, and the four readings of one rotation (units, directions)
-    come in one run."""
     fit: FitConfig = field(default_factory=FitConfig)
     pairing: PairingConfig = field(default_factory=PairingConfig)
     half_turns: HalfTurnConfig = field(default_factory=HalfTurnConfig)
@@ -158,7 +154,7 @@ class ReadingProof:
     """Which reading of a pose file fits the images."""
 
     fits: tuple[ReadingFit, ...]
-    """The candidates that were fitted, for both places of the camera, the best first."""
+    """Every candidate for both places of the camera, the best first."""
     best: str
     best_mode: Mode
     equivalent: tuple[str, ...]
