@@ -260,6 +260,7 @@ def _camera(
         target=board.target,
         X=state.X[c],
         X_covariance=solution.covariance[np.ix_(at[:6], at[:6])],
+        X_here_covariance=solution.here[np.ix_(at[:6], at[:6])],
         Z=place,
         X_alone=solution.alone.X[c],
         X_alone_covariance=solution.alone_covariance[np.ix_(at[:6], at[:6])],

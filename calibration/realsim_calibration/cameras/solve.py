@@ -73,6 +73,8 @@ class RigSolution:
     """(S, S) of all shared unknowns."""
     information: Array
     """(S, S), the robot's map held."""
+    here: Array
+    """(S, S) covariance without what the arm hides: for this arm as it moves here."""
     alone: RigState
     """The fit without a map of the robot's error."""
     alone_covariance: Array
@@ -80,7 +82,6 @@ class RigSolution:
     robot_map: RobotErrorMap | ArmErrorMap | None
     scores: tuple[tuple[str, float], ...]
     joint_offsets: Array | None
-    independent: bool
 
 
 def solve_rig(
@@ -132,22 +133,20 @@ def solve_rig(
     # sigma was estimated camera by camera: 1 is what remains.
     final = model.fit(best.basis, ratio, 1.0, rounds=0)
     none_fit = model.fit(None, none.ratio, none.fit.sigma_px, rounds=0)
-    independent = all(w.excess <= 0 for w in whites)
     columns = None
     if problem.arm_used:
         columns = _hidden(model, none, known, Ts, config, arm, joints)
-    covariance = _covariance(problem, model, final, best, ratio, columns, known, independent)
-    alone_covariance = _covariance(
-        problem, model, none_fit, none, none.ratio, columns, known, independent
-    )
+    covariance = _covariance(problem, model, final, best, ratio, columns, known)
+    alone_covariance = _covariance(problem, model, none_fit, none, none.ratio, columns, known)
     S = problem.size
     return RigSolution(
         problem=problem, state=state, sigmas=sigmas, ratio=ratio, fit=final, model=model,
-        covariance=covariance[:S, :S], information=final.information[:S, :S], alone=alone,
+        covariance=covariance[:S, :S], here=_noise_covariance(problem, final)[:S, :S],
+        information=final.information[:S, :S], alone=alone,
         alone_covariance=alone_covariance[:S, :S], basis=best.basis,
         robot_map=None if best.basis is None else map_record(best.basis, state.weights, Ts, arm),
         scores=tuple((c.name, c.fit.score) for c in choices),
-        joint_offsets=_offsets(best.basis, state, covariance, S), independent=independent,
+        joint_offsets=_offsets(best.basis, state, covariance, S),
     )  # fmt: skip
 
 
@@ -275,23 +274,30 @@ def sag_columns(arm: DhArm, joints: Array, basis: ErrorBasis) -> Array:
     return turned * (SAG_RAD * torque / max(most, 1e-9))[:, None, :]
 
 
+def _noise_covariance(problem: RigProblem, fit: LinearFit) -> Array:
+    """Return the covariance of all parameters from what the instants say apart from each other.
+
+    The mean of the jackknife over instants and of H^-1 scaled to its size, as in `fit.robust_fit`;
+    here also where corners are independent, for what an arm does beyond its basis is not.
+    """
+    marginal = np.asarray(np.linalg.inv(fit.information), dtype=np.float64)
+    n = len(fit.away)
+    data = np.einsum("nrc,nrd->cd", fit.view_rows, fit.view_rows, optimize=True)
+    prior = fit.information - data
+    jackknife = (n - 1) / n * fit.away.T @ fit.away + marginal @ prior @ marginal
+    places = np.concatenate([c[:6] for c in problem.camera_columns if problem.free[c[0]]])
+    at = np.ix_(places, places)
+    kappa = float(np.trace(np.linalg.solve(marginal[at], jackknife[at])) / len(places))
+    covariance = (jackknife + max(kappa, 1.0) * marginal) / 2
+    return np.asarray((covariance + covariance.T) / 2, dtype=np.float64)
+
+
 def _covariance(
     problem: RigProblem, model: RigModel, fit: LinearFit, choice: Choice, ratio: Array,
-    columns: Array | None, known: ErrorBasis | None, independent: bool,
+    columns: Array | None, known: ErrorBasis | None,
 ) -> Array:  # fmt: skip
     """Return the covariance of all parameters of a fit, as `fit.robust_fit` puts it together."""
-    marginal = np.asarray(np.linalg.inv(fit.information), dtype=np.float64)
-    covariance = marginal
-    if not independent:
-        n = len(fit.away)
-        data = np.einsum("nrc,nrd->cd", fit.view_rows, fit.view_rows, optimize=True)
-        prior = fit.information - data
-        jackknife = (n - 1) / n * fit.away.T @ fit.away + marginal @ prior @ marginal
-        places = np.concatenate([c[:6] for c in problem.camera_columns if problem.free[c[0]]])
-        at = np.ix_(places, places)
-        kappa = float(np.trace(np.linalg.solve(marginal[at], jackknife[at])) / len(places))
-        covariance = (jackknife + max(kappa, 1.0) * marginal) / 2
-        covariance = (covariance + covariance.T) / 2
+    covariance = _noise_covariance(problem, fit)
     if columns is None:
         return covariance
     if known is not None and choice.basis is known:
