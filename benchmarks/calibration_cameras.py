@@ -52,7 +52,7 @@ from realsim_calibration.results import BoardShape
 PACKAGES = ("realsim", "numpy", "scipy", "numba", "opencv-python-headless")
 VIEWS, HELD_OUT = 25, 15
 LIMIT = float(chi2.ppf(0.95, 6))
-LABS, QUICK_LABS = 40, 4
+LABS, QUICK_LABS = 40, 2
 WORTH = 0.01
 """A change of the wrist's error by this share is none."""
 ONE = Goal(low=1.0, high=1.0)
