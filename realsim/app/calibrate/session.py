@@ -46,8 +46,12 @@ def calibrate_session(
     views_store = SessionStore.open(folder)
     require_sound(views_store)
     views = views_store.session.views
-    key = arm + ("" if clock == "auto" else clock) + content_key(
-        folder / "robot.jsonl", store.folder / "calibration/board.json", folder / "session.json"
+    key = (
+        arm
+        + ("" if clock == "auto" else clock)
+        + content_key(
+            folder / "robot.jsonl", store.folder / "calibration/board.json", folder / "session.json"
+        )
     )
     with console.stage("calibrate", f"{len(views)} board views") as tick:
         if is_current(store, "calibrate", key):
