@@ -142,6 +142,7 @@ def test_other_images_are_not_mixed_into_an_upgrade(upgraded, tmp_path) -> None:
     assert "upgrade of other images" in failed_with(copy, again, "--scenes", "1")
 
 
+@pytest.mark.slow
 def test_a_camera_that_no_scene_of_a_bop_data_set_names_is_refused(upgraded) -> None:
     with pytest.raises(
         InputError, match=r"no BOP scene of the camera 'kinect'.*Leave --camera out"

@@ -69,6 +69,7 @@ def test_an_object_that_is_not_there_does_not_pull_the_cameras(scene, plain):
             assert o.verdict == "rejected" and "no part in the fit" in o.reasons[-1]
 
 
+@pytest.mark.slow
 def test_a_model_of_the_wrong_size_is_told_so(scene):
     big = scene.truth[1].obj_id
     models = dict(scene.models)
@@ -82,6 +83,7 @@ def test_a_model_of_the_wrong_size_is_told_so(scene):
     assert any("smaller than its model's" in r for r in of[big].reasons), of[big].reasons
 
 
+@pytest.mark.slow
 def test_a_plane_on_objects_alone_is_no_table():
     ids = {name: i for i, (name, *_) in enumerate(shapes.SHAPES.items(), start=1)}
     picked = [ids[n] for n in ("plate_5", "lid", "can", "stairs")]

@@ -44,7 +44,10 @@ def find_in_images(
             search = [pool.submit(_found_once, path, target, what, out) for path in images]
             try:
                 for k, one in enumerate(search):
-                    found.append(one.result())
+                    note, seen, is_new = one.result()
+                    if is_new:  # by one thread: equal images have one note
+                        write_json(note, _detection_json(seen))
+                    found.append(seen)
                     tick(k + 1, len(images))
             except BaseException:
                 pool.shutdown(cancel_futures=True)  # one bad image: the others are not waited for
@@ -52,16 +55,17 @@ def find_in_images(
     return found
 
 
-def _found_once(path: Path, target: Target, what: bytes, out: Path) -> TargetDetection:
-    """Return the points in one image, from its note or by a search that is noted."""
+def _found_once(
+    path: Path, target: Target, what: bytes, out: Path
+) -> tuple[Path, TargetDetection, bool]:
+    """Return the points in one image, from its note or by a search; the note, whether it is new."""
     from realsim_calibration.inputs import load_image
 
     note = out / "detections" / f"{hashlib.sha256(path.read_bytes() + what).hexdigest()[:24]}.json"
     seen = _noted(note)
-    if seen is None:
-        seen = find_target(load_image(path), target)
-        write_json(note, _detection_json(seen))
-    return seen
+    if seen is not None:
+        return note, seen, False
+    return note, find_target(load_image(path), target), True
 
 
 def cores() -> int:
