@@ -13,7 +13,7 @@ from realsim.app.register.files import write_result
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.store import SessionStore
+from realsim.store import SessionStore, load_hand_eye, save_hand_eye
 from registered_sessions import models_of, registered_by_hand, table_session
 from shared_sessions import copy_of
 
@@ -71,3 +71,33 @@ def test_what_cannot_be_checked_is_bad_input(pristine: Path, tmp_path: Path) -> 
     ):
         done = check(folder)
         assert isinstance(done.exception, InputError) and words in str(done.exception)
+
+
+def test_the_calibration_that_lies_there_now_is_checked(demo_session: Path, tmp_path: Path) -> None:
+    """A hand-eye that was changed after the registration is the one that does not hold."""
+    store = SessionStore.open(copy_of(demo_session, tmp_path / "s"))
+    assert check(store.folder, "--tolerance", "2").exit_code == 0
+    hand_eye = load_hand_eye(store)
+    aside = hand_eye.T_ee_cam @ se3.from_translation([0.005, 0.0, 0.0])
+    save_hand_eye(store, replace(hand_eye, T_ee_cam=aside))
+    done = check(store.folder, "--tolerance", "2")
+    assert done.exit_code == 1 and "another calibration" in done.output
+    found = json.loads((store.folder / "calibration/check.json").read_text())
+    assert abs(found["moved_mm"] - 5.0) < 1.5
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--check", "--tolerance", "nan"], "above 0"),
+        (["--check", "--tolerance", "-1"], "above 0"),
+        (["--check", "--live"], "no meaning with --check"),
+        (["--tolerance", "2"], "belongs to --check"),
+        (["--cameras", "a=hand", "--clock-offset", "0.1"], "one camera alone"),
+    ],
+)
+def test_options_that_would_not_be_looked_at_are_refused(
+    pristine: Path, tmp_path: Path, options: list[str], words: str
+) -> None:
+    done = CliRunner().invoke(commands, ["calibrate", str(pristine), *options])
+    assert isinstance(done.exception, InputError) and words in str(done.exception)

@@ -1,23 +1,35 @@
 """`realsim calibrate SESSION --check`: does the calibration still hold, without a board?"""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from realsim.app.console import Console
+from realsim.arrays import Array
 from realsim.errors import InputError
+from realsim.store import SessionStore, load_hand_eye
+from realsim.store.results import HAND_EYE_FILE
 from realsim_calibration.pairs.drift import Drift, DriftConfig, estimate_drift
 
 CHECK_FILE = "calibration/check.json"
 """What the last check found."""
+OTHER_M = 1e-4
+"""Cameras further from where a registration was told that they are stem from another
+calibration [m]."""
 
 
 def run_check(source: Path, console: Console, tolerance_mm: float = 1.0) -> bool:
     """Say whether the hand-eye of a registered session still holds; return whether it does.
 
+    What is held against the registered cameras is the calibration as it lies in the session now,
+    also where the scene was registered with another one.
+
     Raises:
         InputError: no session, no registration in it, or too few views that it refined.
     """
+    if not tolerance_mm > 0 or not np.isfinite(tolerance_mm):
+        raise InputError(f"--tolerance {tolerance_mm:g}: a length above 0 in mm is expected.")
     from realsim.app.register.results import load_registered
     from realsim.app.stages import open_session
 
@@ -47,8 +59,14 @@ def run_check(source: Path, console: Console, tolerance_mm: float = 1.0) -> bool
         for instance, pose in registered.seen.get(k, {}).items()
         if instance in trusted
     ]
+    if not views:
+        raise InputError(
+            f"session '{source}': registration/cameras.json holds no refined camera. Register it "
+            "with more views, and not with --no-cameras."
+        )
+    claimed = _placed_now(store, cameras.claimed, console)
     drift = estimate_drift(
-        np.array([cameras.claimed[k] for k in views]).reshape(-1, 4, 4),
+        np.array([claimed[k] for k in views]).reshape(-1, 4, 4),
         np.array([cameras.refined[k] for k in views]).reshape(-1, 4, 4),
         float(np.median(away)) if away else 0.5,
         DriftConfig(tolerance_mm=tolerance_mm),
@@ -58,6 +76,27 @@ def run_check(source: Path, console: Console, tolerance_mm: float = 1.0) -> bool
     console.say(sentence(drift, tolerance_mm))
     console.result(document)
     return not drift.moved
+
+
+def _placed_now(
+    store: SessionStore, claimed: Mapping[int, Array], console: Console
+) -> dict[int, Array]:
+    """Return the cameras as the calibration on disk places them; as claimed where there is none."""
+    if not store.has(HAND_EYE_FILE):
+        return dict(claimed)
+    hand_eye = load_hand_eye(store)
+    now = dict(claimed) | {
+        v.index: hand_eye.camera_poses(v.T_base_ee, v.joints)
+        for v in store.session.views
+        if v.T_base_ee is not None and v.index in claimed
+    }
+    off = max(float(np.linalg.norm(now[k][:3, 3] - T[:3, 3])) for k, T in claimed.items())
+    if off > OTHER_M:
+        console.warn(
+            f"{HAND_EYE_FILE} places cameras up to {1e3 * off:.1f} mm from where the registration "
+            "was told that they are: it is another calibration, and the one that is checked."
+        )
+    return now
 
 
 def sentence(drift: Drift, tolerance_mm: float) -> str:

@@ -58,10 +58,11 @@ def calibrate_command(
 
     Exit codes: 0 done, 1 a check of the result is bad (or the camera moved), 2 bad input.
     """
-    from realsim.app.calibrate.run import run_calibrate
+    from realsim.app.calibrate.run import require_used, run_calibrate
     from realsim.app.console import Console
 
     console = Console(quiet=quiet, as_json=as_json)
+    require_used(check, live, tolerance, options)
     if check:
         from realsim.app.calibrate.check import run_check
 

@@ -18,6 +18,31 @@ OUT = Path("calibration")
 """Where the calibration of a plain folder goes, if nobody says."""
 
 
+TOLERANCE_MM = 1.0
+"""What `--check` allows, if nobody says [mm at the objects]."""
+
+
+def require_used(check: bool, live: bool, tolerance: float, options: dict[str, Any]) -> None:
+    """Raise if an option was given that this way of calibrating does not look at.
+
+    Raises:
+        InputError: names the option and what it belongs to.
+    """
+    clock = options["clock_offset"] != "auto"
+    given = [f"--{name.replace('_', '-')}" for name, value in options.items()
+             if value and name not in ("out", "clock_offset")]  # fmt: skip
+    given += ["--clock-offset"] * clock + ["--live"] * live
+    if check and given:
+        raise InputError(f"{given[0]} has no meaning with --check, which calibrates nothing.")
+    if not check and tolerance != TOLERANCE_MM:
+        raise InputError("--tolerance belongs to --check: give both, or leave it out.")
+    if options["cameras"] and (clock or live):
+        name = "--live" if live else "--clock-offset"
+        raise InputError(
+            f"{name} is for one camera alone: calibrate it without --cameras, or leave {name} out."
+        )
+
+
 def run_calibrate(source: Path, console: Console, *, live: bool, **options: Any) -> bool:
     """Calibrate what `source` holds; return whether no check is bad.
 
