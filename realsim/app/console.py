@@ -251,11 +251,16 @@ def _rich(*, stderr: bool) -> "RichConsole":
     """
     from rich.console import Console as RichConsole
 
+    class Piped(RichConsole):
+        def on_broken_pipe(self) -> None:
+            # Rich would end with exit code 1, which says that a check failed.
+            raise BrokenPipeError
+
     stream = sys.stderr if stderr else sys.stdout
     plain = bool(os.environ.get("NO_COLOR"))
     forced = False if plain and not stream.isatty() else None
     width = None if sys.stdout.isatty() or stderr else PIPED_WIDTH
-    return RichConsole(stderr=stderr, highlight=False, width=width, force_terminal=forced)
+    return Piped(stderr=stderr, highlight=False, width=width, force_terminal=forced)
 
 
 def _is_text(k: int, cells: list[list[str]]) -> bool:

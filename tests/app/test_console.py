@@ -138,3 +138,17 @@ def test_json_has_records_arrays_paths_and_no_nan() -> None:
 )  # fmt: skip
 def test_a_time_is_said_as_people_say_it(seconds: float, text: str) -> None:
     assert duration(seconds) == text
+
+
+def test_a_reader_that_has_gone_is_not_a_check_that_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A table into a closed pipe is told as what it is: exit code 141, not 1."""
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as gone:
+        monkeypatch.setattr(sys, "stdout", gone)
+        console = Console()
+        with pytest.raises(BrokenPipeError):
+            console.say("words")
+            gone.flush()
+        monkeypatch.undo()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), gone.fileno())
