@@ -157,3 +157,28 @@ def test_a_blurred_picture_is_dropped_with_its_reason(lab):
     report = calibrate(found.views, found.target).hand_eye
     (dropped,) = (v for v in report.views if not v.used)
     assert dropped.label == "04.png" and "the picture is blurred" in dropped.reason
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (
+            lambda cv2, p: cv2.GaussianBlur(p, (0, 0), 12.0),
+            ["picture is blurred", "1 sigma", "rest"],
+        ),
+        (lambda cv2, p: (p * 0.04).astype(np.uint8), ["too dark, under-exposed", "Expose longer"]),
+    ],
+    ids=["blurred", "dark"],
+)
+def test_pictures_that_show_nothing_are_named_for_their_fault(lab, spoil, said):
+    import cv2
+
+    shots, _ = pictures()
+    replace_pictures(lab, {k: spoil(cv2, shot) for k, shot in enumerate(shots)})
+    with pytest.raises(InputError, match="found in none of the 10 images") as e:
+        read(lab)
+    text = " ".join(str(e.value).split())
+    assert all(words in text for words in said)
+    assert "Give --board as it was printed" not in text
+    if "blurred" in text:
+        assert 9.0 < float(text.split("spread over ")[1].split()[0]) < 16.0

@@ -5,6 +5,7 @@ import pytest
 
 from pictured_targets import TARGETS, page_of, picture, pose, truth
 from realsim_calibration.detect.blur import edge_blur_px
+from realsim_calibration.detect.drawings import DRAWN, drawing_reason
 from realsim_calibration.detect.find import find_target
 
 
@@ -52,3 +53,35 @@ def test_a_line_made_up_in_the_margin_does_not_shift_the_numbers(seed, view):
     found = find_target(image, board)
     assert len(found) == len(board.points_board)
     assert np.abs(found.uv - truth(board, T)[found.point_ids]).max() < 0.3
+
+
+def test_blue_fringes_and_a_tint_are_no_drawings():
+    # A camera whose blue spreads from the light into the dots, and which tints the dark.
+    import cv2
+
+    board, rng = TARGETS["circles"], np.random.default_rng(3)
+    gray = picture(board, pose(board, 25.0), rng, blur=1.0, noise=0.0).astype(float)
+    blue = cv2.dilate(gray, np.ones((3, 3)))
+    image = np.stack([1.2 * gray - 30, 1.2 * gray - 20, 1.2 * blue + 10], axis=-1)
+    image = np.clip(image + rng.normal(scale=3.0, size=image.shape), 0, 255).astype(np.uint8)
+    found = find_target(image, board)
+    assert len(found) == len(board.points_board)
+    assert drawing_reason(image, found.uv) == ""
+    cv2.drawChessboardCorners(
+        image, (board.columns, board.rows), found.uv.astype(np.float32)[:, None], True
+    )
+    assert drawing_reason(image, found.uv).startswith(DRAWN)
+
+
+@pytest.mark.parametrize("quality", [90, 100])
+def test_drawn_corners_are_told_after_jpeg(quality):
+    import cv2
+
+    board = TARGETS["chessboard"]
+    T = pose(board, 25.0)
+    image = cv2.cvtColor(picture(board, T, noise=2.0), cv2.COLOR_GRAY2BGR)
+    uv = truth(board, T).astype(np.float32)
+    cv2.drawChessboardCorners(image, (board.columns, board.rows), uv[:, None], True)
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    rgb = cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    assert drawing_reason(rgb, uv).startswith(DRAWN)

@@ -11,6 +11,7 @@ import pytest
 from realsim.app.calibrate.images import require_target
 from realsim.errors import InputError
 from realsim.records.targets import CharucoBoard, CircleGrid
+from realsim_calibration.detect.drawings import DRAWN
 from realsim_calibration.detect.find import find_target
 from realsim_calibration.detect.homography import fit_homography, seen_from_front
 
@@ -94,6 +95,13 @@ def test_all_views_are_found_and_fit_a_camera_better_than_with_opencv():
     a, b = camera_rms(ours, target, size), camera_rms(theirs, target, size)
     print(f"{name}: {len(pictures)} views, {a:.4f} px, with OpenCV's points {b:.4f} px")
     assert a < b
+
+
+def test_untouched_photographs_are_not_said_to_be_drawn_on():
+    pictures, target = load("rosi_circles", every=2)
+    for image in pictures:
+        found = find_target(image, target)
+        assert len(found) > 90 and not any(r.startswith(DRAWN) for r in found.rejected)
 
 
 def test_a_wrong_board_file_is_answered_with_what_is_there():

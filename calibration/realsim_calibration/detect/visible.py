@@ -42,6 +42,25 @@ MIN_DOTS = 16
 SIZE_SPREAD = 0.35
 """Median departure of dots' radii from their median: a target's dots are of one size."""
 
+DARK = 40
+"""A picture is too dark where 99 % of it is below this level of 255: a tenth of its range and
+less is left to tell black from white."""
+
+
+def dark_reason(image: UInt8) -> str:
+    """Return what to say of a picture that is too dark; empty where it is bright enough.
+
+    Raises:
+        InputError: the image is not 8 bit.
+    """
+    gray = gray_image(image)
+    if np.percentile(gray, 99) >= DARK:
+        return ""
+    return (
+        f"the picture is too dark, under-exposed ({_exposure(gray)}). Expose longer, raise the "
+        "gain, or light the target until its white parts are at 150 to 230"
+    )
+
 
 def what_is_visible(image: UInt8) -> str:
     """Return what an image shows of any kind of target, as a clause: "17 markers of DICT_6X6_100".

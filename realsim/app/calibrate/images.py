@@ -21,8 +21,8 @@ from realsim_calibration import TargetDetection, find_target
 if TYPE_CHECKING:
     from realsim_calibration.inputs import FolderInput
 
-SEARCH = "2"
-"""Goes up when a target may be found that was not before: notes of an earlier search are void."""
+SEARCH = "3"
+"""Goes up when a search finds or says something else: notes of an earlier search are void."""
 LOOKED_AT = 2
 """Images without the target in which it is looked what they show, which takes a second each."""
 
@@ -166,18 +166,34 @@ def _noted(path: Path) -> TargetDetection | None:
 def require_target(
     folder: "FolderInput", detections: Sequence[TargetDetection], target: Target
 ) -> None:
-    """Raise if the target was found nowhere, saying what the pictures show instead."""
+    """Raise if the target was found nowhere, saying what is wrong with the pictures.
+
+    Raises:
+        InputError: found nowhere; says whether the first picture is too dark or blurred, or what it
+            shows instead.
+    """
     if any(len(d) for d in detections):
         return
-    from realsim_calibration.detect.visible import what_is_visible
+    from realsim_calibration.detect.blur import blur_reason
+    from realsim_calibration.detect.images import gray_image
+    from realsim_calibration.detect.visible import dark_reason, what_is_visible
     from realsim_calibration.inputs import load_image
     from realsim_calibration.targets.target_text import format_target
 
-    shown = what_is_visible(load_image(folder.images[0]))
-    raise InputError(
-        f"the target '{format_target(target)}' was found in none of the {len(detections)} images. "
-        f"{folder.labels[0]} shows {shown}. Give --board as it was printed."
+    image, name = load_image(folder.images[0]), folder.labels[0]
+    says = (
+        f"the target '{format_target(target)}' was found in none of the {len(detections)} images."
     )
+    dark = dark_reason(image)
+    if dark:
+        raise InputError(f"{says} {name}: {dark}.")
+    shown, blurred = what_is_visible(image), blur_reason(gray_image(image))
+    if blurred:
+        raise InputError(
+            f"{says} {name}: {blurred}. Then take the pictures again. As blurred as it is, it "
+            f"seems to show {shown}: only if the target is another than given, change --board."
+        )
+    raise InputError(f"{says} {name} shows {shown}. Give --board as it was printed.")
 
 
 def require_one_size(
