@@ -149,7 +149,7 @@ def test_visible_masks_are_bops_but_for_edges_and_small_things(upgraded, meshes)
         shares.append((iou(visible & is_measured, bop & is_measured), name))
     shares.sort()
     assert shares[0][0] > 0.92, shares[:3]
-    assert np.median([s for s, _ in shares]) > 0.98, shares
+    assert np.median([s for s, _ in shares]) > 0.975, shares
 
 
 def test_the_tools_own_check_agrees(upgraded):

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from realsim.app.console import Tick
+from realsim.arrays import Array
 from realsim.errors import InputError, RealsimError
 from realsim.geometry.dh import DhArm
 from realsim.records import Target
@@ -112,10 +113,14 @@ def arm_of(views: Sequence[BoardView], name: str = "") -> DhArm | None:
     joints = [v.joints for v in views if v.joints is not None]
     if len(joints) < len(views) or len({len(q) for q in joints}) != 1:
         return None
-    Ts = np.array([v.T_base_ee for v in views])
-    known = known_chains(len(joints[0]))
+    return arm_of_poses(np.array([v.T_base_ee for v in views]), np.array(joints), name)
+
+
+def arm_of_poses(Ts_base_ee: Array, joints: Array, name: str = "") -> DhArm | None:
+    """Return the arm that poses (N, 4, 4) and joints (N, J) [rad] prove, None where they do not."""
+    known = known_chains(joints.shape[1])
     arms = [known[key].bare() for key in sorted(known, key=lambda k: not same_name(k, name))]
-    return matching_arm(np.array(joints), Ts, arms, RobotErrorConfig())
+    return matching_arm(joints, Ts_base_ee, arms, RobotErrorConfig())
 
 
 def write_results(

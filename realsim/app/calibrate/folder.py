@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from realsim.app.calibrate.board_views import arm_of
+from realsim.app.calibrate.board_views import arm_of, arm_of_poses
 from realsim.app.calibrate.images import (
     find_in_images,
     require_one_size,
@@ -293,9 +293,20 @@ def _arm(name: str, views: Sequence[BoardView], console: Console) -> DhArm | Non
             raise InputError(f"--arm {name} needs joint angles with every pose; there are none.")
         return arm
     arm = arm_of(views) if has_joints else None
+    if has_joints:
+        _tell_arm(arm, console)
+    return arm
+
+
+def _tell_arm(arm: DhArm | None, console: Console) -> None:
+    """Say which arm joints and poses prove, or that the joints are of no use."""
     if arm is not None:
         console.say(f"joints and poses are those of a {arm.name}: its own errors are modelled.")
-    return arm
+    else:
+        console.warn(
+            "the joints beside the poses are those of no arm that is known: they are not used. "
+            "Name the arm: --arm ur5e, or its folder."
+        )
 
 
 def _from_pose_files(
@@ -351,6 +362,9 @@ def _of_pairs(
     """Return the calibration of (hand poses, board poses, joints, labels)."""
     Ts, boards, joints, labels = pairs
     arm = find_arm(request.arm).chain.bare() if request.arm else None
+    if joints is not None and arm is None and request.mode == "eye_in_hand":
+        arm = arm_of_poses(Ts, joints)
+        _tell_arm(arm, console)
     with console.stage("calibrate", f"{len(Ts)} pose pairs"):
         report = calibrate_from_poses(
             Ts, boards, labels=labels, joints=joints, config=config.hand_eye, arm=arm
