@@ -213,7 +213,8 @@ def photo_fit(
     return PhotoFit(
         poses=[picture.T_world_cam @ T for T in now], offset_per_m=float(x[0]),
         offset_sigma_per_m=float(np.sqrt(C[0, 0])), beside_px=x[1:3], edges=edges,
-        covariances=covariances, agreements=_agreements(seen, x, config),
+        covariances=covariances,
+        agreements=_agreements(seen, _own_moves(bodies, begin, x), x, config),
         edge_px=(float(before.mean()), float(after.mean())), taken=True,
     )  # fmt: skip
 
@@ -223,18 +224,32 @@ def _places(x: Array) -> Array:
     return x[3:].reshape(-1, 7)[:, 3:6]
 
 
-def _agreements(seen: Sequence[_Seen], x: Array, config: PhotoFitConfig) -> list[tuple[float, str]]:
+def _own_moves(bodies: Sequence[Body], begin: Sequence[Array], x: Array) -> Array:
+    """Return how far each object was moved (K,) [m], without what the depth's offset moves it."""
+    common = [x[0] * _follows(b.center(T))[3:] for b, T in zip(bodies, begin, strict=True)]
+    return np.linalg.norm(_places(x) - common, axis=1)
+
+
+def _agreements(
+    seen: Sequence[_Seen], moved_m: Array, x: Array, config: PhotoFitConfig
+) -> list[tuple[float, str]]:
     """Return how well depth and photograph agree on every object, and in words why they do not."""
     found: list[tuple[float, str]] = []
+    rims, aways = x[9::7], np.zeros(len(seen))
     for k, s in enumerate(seen):
-        d = np.abs(s.outline.offsets - s.outline.normals @ x[1:3] - x[9 + 7 * k])
-        away = float(np.nanmedian(d)) if np.isfinite(d).any() else 0.0
-        told = (float(np.linalg.norm(_places(x)[k])), away, abs(float(x[9 + 7 * k])))
-        shares = np.array(told) / config.unlike
+        d = np.abs(s.outline.offsets - s.outline.normals @ x[1:3] - rims[k])
+        aways[k] = float(np.nanmedian(d)) if np.isfinite(d).any() else 0.0
+    most_m, most_px, most_rim_px = config.unlike
+    # Real pictures are worse than made ones, for all objects alike: what stands out is odd.
+    limits = (most_m, max(most_px, 2.0 * float(np.median(aways))), most_rim_px)
+    beside = np.abs(rims - np.median(rims))
+    for k in range(len(seen)):
+        told = (float(moved_m[k]), float(aways[k]), float(beside[k]))
+        shares = np.array(told) / limits
         words = (
             f"the photograph moves it by {1e3 * told[0]:.1f} mm from where its depth lies",
             f"the photograph's edges lie {told[1]:.1f} px from its outline",
-            f"the photograph shows its rim {told[2]:.1f} px from where the model has it",
+            f"the photograph shows its rim {told[2]:.1f} px from where the others' are",
         )
         left = float(np.prod(1.0 / (1.0 + shares**config.sharp)))
         found.append((left, words[int(np.argmax(shares))]))
