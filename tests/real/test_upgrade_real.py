@@ -106,6 +106,13 @@ def labels(out):
                 yield int(scene.name), row, about, masks, depth_mm, K
 
 
+def corrected_mm(out, number, depth_mm):
+    """Return the depth without the offset that the photograph of a scene showed it to have."""
+    report = json.loads((out / f"test/{number:06d}/registration/report.json").read_text())
+    offset = report.get("refinement", {}).get("depth_offset_per_m", 0.0)
+    return depth_mm / (1.0 + offset * depth_mm / 1e3)
+
+
 def iou(a, b):
     return np.count_nonzero(a & b) / max(np.count_nonzero(a | b), 1)
 
@@ -135,7 +142,9 @@ def test_counts_and_boxes_are_those_of_bops_documentation(upgraded, meshes):
 
 def test_visible_masks_are_bops_but_for_edges_and_small_things(upgraded, meshes):
     shares = []
-    for number, row, _, (_, visible), depth_mm, K in labels(upgraded):
+    for number, row, _, (_, visible), raw_mm, K in labels(upgraded):
+        # Masks are of the depth as it is corrected: BOP's rule is held against the same.
+        depth_mm = corrected_mm(upgraded, number, raw_mm)
         height, width = depth_mm.shape
         u, v = np.meshgrid(np.arange(width), np.arange(height))
         rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
@@ -149,7 +158,7 @@ def test_visible_masks_are_bops_but_for_edges_and_small_things(upgraded, meshes)
         shares.append((iou(visible & is_measured, bop & is_measured), name))
     shares.sort()
     assert shares[0][0] > 0.92, shares[:3]
-    assert np.median([s for s, _ in shares]) > 0.975, shares
+    assert np.median([s for s, _ in shares]) > 0.98, shares
 
 
 def test_the_tools_own_check_agrees(upgraded):
