@@ -24,10 +24,10 @@ class CheckConfig:
     """Share of views that were dropped."""
     roll_deg: tuple[float, float] = (60.0, 20.0)
     """Range of camera roll: without roll the error was 2 to 6 times larger in simulation."""
-    sigma_mm: tuple[float, float] = (1.0, 10.0)
-    """1-sigma of the camera's place for this arm: beyond 10 mm a ruler does better."""
-    sigma_deg: tuple[float, float] = (0.1, 1.0)
-    """1-sigma of the camera's direction: 0.1 deg is 0.7 mm at 0.4 m; a drawing knows 1 deg."""
+    sigma_mm: tuple[float, float] = (1.0, 3.0)
+    """1-sigma of the camera's place, for this arm as it moves here."""
+    sigma_deg: tuple[float, float] = (0.1, 0.4)
+    """1-sigma of the camera's direction: 0.1 deg is 0.7 mm at 0.4 m."""
     unseen_mm: tuple[float, float] = (2.0, 6.0)
     """Board's place predicted without the view: a UR5e's own errors leave 1 to 2 mm."""
     optimism: tuple[float, float] = (1.6, 3.0)
