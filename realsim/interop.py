@@ -51,6 +51,11 @@ def _preload_libusb() -> None:
         ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
 
 
+def cores() -> int:
+    """Return how many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 @contextmanager
 def quiet_output() -> Generator[None]:
     """Send what C code prints nowhere: PyBullet greets at import and at each connect.

@@ -319,7 +319,7 @@ class RigModel(LinearModel):
             for i, views in enumerate(problem.at)
         ]
         self.solved_rows: list[tuple[Array, Array]] = []
-        """Of every instant R (f, f) of F, and the turned rows (f, S + 7) that determine F."""
+        """Per instant R (f, f) of F and the turned rows (f, S + 7) that determine F."""
         left: list[Array] = []
         for F, M in parts:
             f = F.shape[1]

@@ -91,7 +91,7 @@ class CamerasReport:
     bad_arm: tuple[str, ...]
     """Instants whose arm pose contradicts all cameras; the cameras alone were used there."""
     checks: tuple[Check, ...]
-    """Of the cameras together; those of each are in its report."""
+    """Checks of the cameras together; those of each are in its report."""
 
     def camera(self, name: str) -> HandEyeReport:
         """Return one camera's report.

@@ -92,7 +92,7 @@ class ClockOffset:
     sigma_s: float
     """Its 1-sigma [s]."""
     correlation: float
-    """Of the turning speeds at the start."""
+    """Correlation of the turning speeds at the start."""
     jitter_s: float
     """Size of the stamps' jitter [s]."""
     moved_mm: float

@@ -13,8 +13,8 @@ AROUND_PX = 7
 BEYOND = 50
 """Levels by which a drawn pixel's channel lies outside of the shades around it. The soft edges of
 a lens with colour fringes lie between dark and bright in every channel, however blue they are.
-NEUTRAL and BEYOND were chosen on two real sets and ten rendered pictures, untouched and with
-corners and axes drawn, before and after JPEG."""
+NEUTRAL and BEYOND were chosen on two real sets and three rendered boards, untouched and
+with corners and axes drawn, before and after JPEG."""
 GREEN = 60
 """Levels by which green exceeds red and blue where it was drawn: a lens bends green less than blue
 and more than red, so that it never stands out alone."""

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from realsim.app.console import Tick
+from realsim.app.console import Console, Tick
 from realsim.arrays import Array
 from realsim.errors import InputError, RealsimError
 from realsim.geometry.dh import DhArm
@@ -114,6 +114,34 @@ def arm_of(views: Sequence[BoardView], name: str = "") -> DhArm | None:
     if len(joints) < len(views) or len({len(q) for q in joints}) != 1:
         return None
     return arm_of_poses(np.array([v.T_base_ee for v in views]), np.array(joints), name)
+
+
+def known_arm(
+    name: str, Ts_base_ee: Sequence[Array], joints: Sequence[Array | None], console: Console
+) -> DhArm | None:
+    """Return the arm that was named, or that poses (4, 4) and joints [rad] prove, and tell it.
+
+    Raises:
+        InputError: an arm that is not known, or one without joints.
+    """
+    given = [q for q in joints if q is not None]
+    complete = bool(given) and len(given) == len(Ts_base_ee) and len({len(q) for q in given}) == 1
+    if name:
+        arm = find_arm(name).chain.bare()
+        if not complete:
+            raise InputError(f"--arm {name} needs joint angles with every pose; there are none.")
+        return arm
+    if not complete:
+        return None
+    arm = arm_of_poses(np.array(Ts_base_ee), np.array(given))
+    if arm is not None:
+        console.say(f"joints and poses are those of a {arm.name}: its own errors are modelled.")
+    else:
+        console.warn(
+            "the joints beside the poses are those of no arm that is known: they are not used. "
+            "Name the arm: --arm ur5e, or its folder."
+        )
+    return arm
 
 
 def arm_of_poses(Ts_base_ee: Array, joints: Array, name: str = "") -> DhArm | None:

@@ -28,7 +28,7 @@ class Frames:
     instants: tuple[str, ...]
     """Names of the instants."""
     images: dict[str, dict[int, Path]]
-    """Of every camera the image at an instant."""
+    """Camera's name -> instant -> image."""
     rows: dict[int, int]
     """Row of the poses at an instant; empty where there are none."""
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from realsim.app.calibrate.board_views import BOARD_FILE, arm_of
+from realsim.app.calibrate.board_views import BOARD_FILE, known_arm
 from realsim.app.calibrate.camera_frames import (
     Frames,
     boards_of,
@@ -28,11 +28,9 @@ from realsim.app.console import Console
 from realsim.app.outputs import require_free_folder
 from realsim.app.stages import BOARD_VIEWS
 from realsim.errors import InputError, RealsimError
-from realsim.geometry.dh import DhArm
-from realsim.robots.arm import find_arm
 from realsim.store import SessionStore
 from realsim.store.atomic import write_bytes, write_text
-from realsim_calibration import BoardView, calibrate_intrinsics, estimate_board_pose, prove_reading
+from realsim_calibration import calibrate_intrinsics, estimate_board_pose, prove_reading
 from realsim_calibration.cameras.calibrate import calibrate_cameras
 from realsim_calibration.cameras.files import document, write_cameras
 from realsim_calibration.cameras.page import (
@@ -248,29 +246,11 @@ def _proven(rig: Rig, poses: RawPoses) -> Any:
 
 
 def _calibrated(rig: Rig, arm: str, console: Console) -> CamerasReport:
-    known = _arm(rig, arm)
-    if known is not None:
-        console.say(f"joints and poses are those of a {known.name}: its own errors are modelled.")
+    given = [t for t in rig.instants if t.T_base_ee is not None]
+    Ts = [t.T_base_ee for t in given if t.T_base_ee is not None]
+    known = known_arm(arm, Ts, [t.joints for t in given], console)
     with console.stage("calibrate", f"{len(rig.cameras)} cameras, {len(rig.instants)} instants"):
         return calibrate_cameras(rig, arm=known)
-
-
-def _arm(rig: Rig, name: str) -> DhArm | None:
-    """Return the arm that was named, or that joints and poses prove."""
-    given = [t for t in rig.instants if t.T_base_ee is not None]
-    joints = bool(given) and all(t.joints is not None for t in rig.instants)
-    if name:
-        if not joints:
-            raise InputError(f"--arm {name} needs joint angles with every pose; there are none.")
-        return find_arm(name).chain.bare()
-    if not joints:
-        return None
-    views = [
-        BoardView(index=k, T_base_ee=t.T_base_ee, joints=t.joints,
-                  detection=rig.sightings[0].detection)
-        for k, t in enumerate(given) if t.T_base_ee is not None
-    ]  # fmt: skip
-    return arm_of(views)
 
 
 def write_files(report: CamerasReport, out: Path) -> list[Path]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from realsim.app.calibrate.board_views import arm_of, arm_of_poses
+from realsim.app.calibrate.board_views import known_arm
 from realsim.app.calibrate.images import (
     find_in_images,
     require_one_size,
@@ -25,7 +25,6 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Target
-from realsim.robots.arm import find_arm
 from realsim.store.atomic import write_text
 from realsim_calibration import (
     BoardView,
@@ -159,7 +158,9 @@ def read_views(request: FolderRequest, console: Console) -> FolderViews:
     ]  # fmt: skip
     return FolderViews(
         images=folder.images, views=views, target=target, camera=camera,
-        arm=_arm(request.arm, views, console),
+        arm=known_arm(
+            request.arm, [v.T_base_ee for v in views], [v.joints for v in views], console
+        ),
     )  # fmt: skip
 
 
@@ -280,35 +281,6 @@ def _place(mode: str) -> str:
     return "in the hand" if mode == "eye_in_hand" else "standing still"
 
 
-def _arm(name: str, views: Sequence[BoardView], console: Console) -> DhArm | None:
-    """Return the arm that was named, or the one that joints and poses prove.
-
-    Raises:
-        InputError: an arm that is not known, or one without joints.
-    """
-    has_joints = bool(views) and all(v.joints is not None for v in views)
-    if name:
-        arm = find_arm(name).chain.bare()
-        if not has_joints:
-            raise InputError(f"--arm {name} needs joint angles with every pose; there are none.")
-        return arm
-    arm = arm_of(views) if has_joints else None
-    if has_joints:
-        _tell_arm(arm, console)
-    return arm
-
-
-def _tell_arm(arm: DhArm | None, console: Console) -> None:
-    """Say which arm joints and poses prove, or that the joints are of no use."""
-    if arm is not None:
-        console.say(f"joints and poses are those of a {arm.name}: its own errors are modelled.")
-    else:
-        console.warn(
-            "the joints beside the poses are those of no arm that is known: they are not used. "
-            "Name the arm: --arm ur5e, or its folder."
-        )
-
-
 def _from_pose_files(
     request: FolderRequest, config: CalibrationConfig, console: Console
 ) -> tuple[Calibration, list[Path]]:
@@ -361,10 +333,7 @@ def _of_pairs(
 ) -> tuple[Calibration, list[Path]]:  # fmt: skip
     """Return the calibration of (hand poses, board poses, joints, labels)."""
     Ts, boards, joints, labels = pairs
-    arm = find_arm(request.arm).chain.bare() if request.arm else None
-    if joints is not None and arm is None and request.mode == "eye_in_hand":
-        arm = arm_of_poses(Ts, joints)
-        _tell_arm(arm, console)
+    arm = known_arm(request.arm, list(Ts), [] if joints is None else list(joints), console)
     with console.stage("calibrate", f"{len(Ts)} pose pairs"):
         report = calibrate_from_poses(
             Ts, boards, labels=labels, joints=joints, config=config.hand_eye, arm=arm

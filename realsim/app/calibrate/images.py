@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -13,6 +12,7 @@ import numpy as np
 
 from realsim.app.console import Console
 from realsim.errors import InputError
+from realsim.interop import cores
 from realsim.records import CameraIntrinsics, Target
 from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid
 from realsim.store.atomic import write_json
@@ -66,11 +66,6 @@ def _found_once(
     if seen is not None:
         return note, seen, False
     return note, find_target(load_image(path), target), True
-
-
-def cores() -> int:
-    """Return how many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def warn_of_pictures(

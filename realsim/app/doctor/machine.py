@@ -10,6 +10,7 @@ from pathlib import Path
 
 from realsim.app.doctor.finding import Finding, Kind
 from realsim.app.doctor.isolation import Outcome
+from realsim.interop import cores
 
 GROUP = "Machine"
 GB = 1e9
@@ -50,12 +51,11 @@ def _processor() -> Finding:
     except OSError:
         text = ""
     flags = next((set(x.split()) for x in text.splitlines() if x.startswith("flags")), set[str]())
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     missing = [f for f in INSTRUCTIONS if f not in flags] if flags else []
     there = [f for f in INSTRUCTIONS if f in flags]
     return Finding(
         group=GROUP, name="processor", kind="note" if missing else "ok",
-        found=f"{cores} cores{''.join(f', {f}' for f in there)}",
+        found=f"{cores()} cores{''.join(f', {f}' for f in there)}",
         todo=f"no {' and '.join(missing)}: some packages are slow or do not start"
         if missing else "",
     )  # fmt: skip

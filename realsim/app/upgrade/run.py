@@ -112,7 +112,7 @@ def _many(
     Raises:
         InputError: another run is working in the folder.
     """
-    from realsim_sim_bridge.school.workers import cores
+    from realsim.interop import cores
 
     out.mkdir(parents=True, exist_ok=True)
     lock.enter_context(only_run_in(out))

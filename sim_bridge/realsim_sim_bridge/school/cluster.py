@@ -34,7 +34,8 @@ from pathlib import Path
 from typing import Any
 
 from realsim.errors import InputError
-from realsim_sim_bridge.school.workers import WorkerDiedError, Workers, cores
+from realsim.interop import cores
+from realsim_sim_bridge.school.workers import WorkerDiedError, Workers
 
 TOKEN_SOURCES = ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 TOKEN_FILE = Path(".ray/auth_token")

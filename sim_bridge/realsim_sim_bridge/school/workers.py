@@ -19,6 +19,7 @@ from typing import Any, Protocol
 from threadpoolctl import threadpool_limits
 
 from realsim.errors import RealsimError
+from realsim.interop import cores
 
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """The processes share the cores; threads of their libraries would fight over them, and sums split
@@ -59,11 +60,6 @@ def local_workers(count: int | None = None) -> Generator[Workers]:
         processes.end(at_once=True)
         raise
     processes.end(at_once=False)
-
-
-def cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0))
 
 
 class _ThisProcess:
