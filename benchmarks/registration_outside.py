@@ -120,7 +120,7 @@ def is_inside(true: ObjectPose, T: Array, pose: ObjectPose, model: ObjectModel) 
 @cache
 def scenes(first: int, count: int, quick: bool) -> tuple[tuple[int, LabScene], ...]:
     """Return the scenes, made once."""
-    lab, objects = (Lab(views=16), 5) if quick else (Lab(), 10)
+    lab, objects = (Lab(views=8), 4) if quick else (Lab(), 10)
     seeds = range(first, first + count)
     return tuple((seed, make_scene(seed, lab, count=objects)) for seed in seeds)
 
@@ -233,7 +233,7 @@ def tables(given: argparse.Namespace) -> Found:
 
 def find_all(given: argparse.Namespace) -> Found:
     """Measure one frame of clutter for which a whole library of models is tried."""
-    objects, small = (4, 2) if given.quick else (12, 12)
+    objects, small = (3, 1) if given.quick else (12, 12)
     lab = Lab(views=1, photos=True, hand_eye_mm=0, hand_eye_deg=0, arm_mm=0, arm_deg=0)
     scene = make_scene(given.seed + 700, lab, count=objects)
     models = dict(scene.models)
