@@ -25,7 +25,10 @@ def test_jobs_run_in_as_many_other_processes_as_asked_for(two):
     sleeps = [two.submit(time.sleep, 0.05) for _ in range(2)]
     wait(sleeps)
     pids = set()
-    for _ in range(4):
+    # Where others use the cores one of the two may take many of such short jobs.
+    for _ in range(100):
+        if len(pids) == 2:
+            break
         pids |= {f.result() for f in [two.submit(os.getpid), two.submit(os.getpid)]}
     assert len(pids) == 2 and os.getpid() not in pids
 
