@@ -2,10 +2,11 @@
 
     uv run python benchmarks/calibration.py [--quick] [--json FILE] [--data DIR] [--part PART ...]
 
-Parts: time, real (5-fold held-out reprojection on three open sets, against OpenCV's seven closed
-forms with the best of five lenses, and the same with two poses swapped; a pose-only set, left out
-one by one), halves (sigma against disjoint halves of the four sets; the command on the whole sets),
-crb and coverage (simulation with truth), faults, corners. --quick takes few trials.
+Parts: time (the solve; the whole command on 20 images and on 20 pose pairs), real (5-fold held-out
+reprojection on three open sets, against OpenCV's seven closed forms with the best of five lenses,
+and the same with two poses swapped; a pose-only set, left out one by one), halves (sigma against
+disjoint halves of the four sets; the command on the whole sets), crb and coverage (simulation with
+truth), faults, corners. --quick takes few trials.
 """
 
 import os
@@ -23,7 +24,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from calibration_faults import faults_named_share, layouts_that_are_read
-from calibration_halves import Halves, exit_code, halves_apart
+from calibration_halves import Command, Halves, halves_apart, run_command
 from calibration_real import (
     FOLDS,
     SOURCES,
@@ -49,7 +50,7 @@ from figures import DATA, Figure, Found, Goal, run
 A = TypeVar("A")
 B = TypeVar("B")
 PACKAGES = ("realsim", "numpy", "scipy", "gtsam", "numba", "opencv-python-headless")
-COVERAGE_VIEWS, DENSE_VIEWS = 40, 256
+COVERAGE_VIEWS, DENSE_VIEWS, COMMAND_VIEWS = 40, 256, 20
 COVERED = Goal(low=0.93, high=0.97)
 ALL = Goal(low=1.0, high=1.0)
 FIGURES = {
@@ -71,6 +72,8 @@ FIGURES = {
     "koch_median_mm": Figure(unit="mm", goal=Goal(high=1.1)),
     "solve_cpu_s": Figure(unit="s", goal=Goal(high=1.2)),
     "joint_solve_cpu_s": Figure(unit="s"),
+    "command_cpu_s_20_views": Figure(unit="s", goal=Goal(high=9.0)),
+    "command_cpu_s_20_pairs": Figure(unit="s"),
     "crb_ratio": Figure(unit="", goal=Goal(high=1.2)),
     "crb_ratio_median": Figure(unit=""),
     "coverage95": Figure(unit="", goal=COVERED),
@@ -110,11 +113,22 @@ def rms(values: Sequence[float]) -> float:
 
 
 def measure_time(a: argparse.Namespace) -> Found:
-    """Measure CPU seconds of a calibration of many views, in this process."""
+    """Measure CPU seconds of a calibration of many views, and of the whole command on 20."""
     found = Found()
     whole, alone, corners = solve_cpu_s(DENSE_VIEWS, 1 if a.quick else 3)
     found.add("solve_cpu_s", whole, f"{DENSE_VIEWS} views, {corners} corners")
     found.add("joint_solve_cpu_s", alone, "joint fit, maps, covariance")
+    if not (a.data / "handeye").is_dir():
+        found.notes.append(
+            f"{a.data} has no folder handeye: the command is not timed. Give --data."
+        )
+        return found
+    for key, name, over in (
+        ("command_cpu_s_20_views", "rtde", "realsim calibrate: 20 images of 1920x1080, a page"),
+        ("command_cpu_s_20_pairs", "koch", "realsim calibrate: 20 pose pairs, a page"),
+    ):
+        code, cpu_s = run_command(Command(data=a.data, name=name, views=COMMAND_VIEWS))
+        found.add(key, cpu_s if code == 0 else float("nan"), over)
     return found
 
 
@@ -269,7 +283,8 @@ def measure_halves(a: argparse.Namespace) -> Found:
     if ratios:
         found.add("sigma_ratio_min", min(ratios), "stated sigma over spread, least set")
         found.add("sigma_ratio_max", max(ratios), "stated sigma over spread, largest set")
-    codes = each(a, exit_code, [(a.data, name) for name in (*SOURCES, "koch")])
+    commands = [Command(data=a.data, name=name) for name in (*SOURCES, "koch")]
+    codes = [code for code, _ in each(a, run_command, commands)]
     found.cases["exit codes"] = dict(zip((*SOURCES, "koch"), codes, strict=True))
     found.add("good_sets_exit_zero", float(codes.count(0)), "realsim calibrate on whole sets")
     return found

@@ -5,6 +5,7 @@ if it were a session of its own. How far their X for this arm are apart, over wh
 promise for that, is 1 where sigma is right. The command itself is run on the whole sets, too.
 """
 
+import resource
 import subprocess
 import tempfile
 from dataclasses import dataclass
@@ -86,18 +87,43 @@ def halves_apart(task: Halves) -> Apart:
     )
 
 
-def exit_code(task: tuple[Path, str]) -> int:
-    """Return what `realsim calibrate` ends with on a whole set."""
-    data, name = task
-    folder = data / "handeye"
-    if name == "koch":
-        koch = folder / "koch_ur5"
-        words = [str(koch), "--poses", "robot_poses.yaml", "--board-poses",
-                 str(koch / "cam_poses.yaml"), "--reading", "matrix,mm"]  # fmt: skip
-    else:
-        source = SOURCES[name]
-        words = [str(folder / source.images), "--poses", str(folder / source.poses), "--board",
-                 source.target, "--reading", source.reading]  # fmt: skip
-    with tempfile.TemporaryDirectory() as out:
-        command = ["realsim", "calibrate", *words, "--out", str(Path(out) / "calibration")]
-        return subprocess.run(command, check=False, capture_output=True).returncode
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Command:
+    """`realsim calibrate` on a set."""
+
+    data: Path
+    name: str
+    views: int = 0
+    """How many of the set's images are given; 0 = all."""
+
+
+def run_command(task: Command) -> tuple[int, float]:
+    """Return the exit code of `realsim calibrate` on a set, and its CPU time [s]."""
+    folder = task.data / "handeye"
+    with tempfile.TemporaryDirectory() as place:
+        if task.name == "koch":
+            koch = folder / "koch_ur5"
+            words = [str(koch), "--poses", "robot_poses.yaml", "--board-poses",
+                     str(koch / "cam_poses.yaml"), "--reading", "matrix,mm"]  # fmt: skip
+        else:
+            source = SOURCES[task.name]
+            images = folder / source.images
+            if task.views:
+                images = _some(images, task.views, Path(place) / "images")
+            poses = images if source.poses == source.images else folder / source.poses
+            words = [str(images), "--poses", str(poses), "--board", source.target,
+                     "--reading", source.reading]  # fmt: skip
+        command = ["realsim", "calibrate", *words, "--out", str(Path(place) / "calibration")]
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        code = subprocess.run(command, check=False, capture_output=True).returncode
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return code, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def _some(images: Path, views: int, to: Path) -> Path:
+    """Return a folder with the first images of a set and their poses beside them."""
+    to.mkdir()
+    for image in sorted(images.glob("*.jpg"))[:views]:
+        for beside in images.glob(f"{image.stem}.*"):
+            (to / beside.name).symlink_to(beside)
+    return to
