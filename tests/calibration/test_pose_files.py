@@ -233,6 +233,21 @@ def test_time_and_index_columns_are_told_from_the_pose():
     assert counted.stems == tuple("345678")
 
 
+@pytest.mark.parametrize("start", [1305031102.17, 1700.0, 86400.0], ids="1970 28min day".split())
+@pytest.mark.parametrize("stops", [False, True], ids=["stream", "stops"])
+@pytest.mark.parametrize("unit", [1e9, 1e6])
+def test_time_stamps_from_1970_and_from_the_machines_start(start, stops, unit):
+    """28 minutes in ns have the size of ms since 1970: the steps tell them apart."""
+    rng = np.random.default_rng(4)
+    times = start + np.cumsum(rng.uniform(4, 20, 40) if stops else np.full(40, 0.033))
+    rows = [f"{int(t * unit)},0.{k:02d},0.1,0.2,0,0,0,1" for k, t in enumerate(times, 10)]
+    with folder() as place:
+        text = "\n".join(["timestamp,x,y,z,qx,qy,qz,qw", *rows])
+        (place / "a.csv").write_text(text)
+        found = read_pose_file(place / "a.csv")
+    assert np.allclose(found.times, times, atol=2e-6)
+
+
 def test_text_of_spreadsheets_and_windows():
     raw = reading_from_text("rotvec,m").numbers(random_poses(12, 4))
     text = "\r\n".join(" ".join(map(number, r)) for r in raw)

@@ -36,6 +36,13 @@ LABEL_NAMES = frozenset(
 """Names of a column or key that holds the image's name."""
 _INDEX = frozenset("index idx id i n no nr num number frame view pose image_id view_id".split())
 _TIME = frozenset("time timestamp t stamp secs sec nsecs time_s timestamp_s timestamp_ns".split())
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+DATES_S = (9.4e8, 4.2e9)
+"""Seconds since 1970 of the years 2000 and 2100."""
+LONGEST_STEP_S, LONGEST_EVEN_STEP_S = 600.0, 0.5
+"""Between two stops, and between two poses of a stream [s]."""
+EVEN_STEPS = 0.2
+"""Steps of a stream differ from their median by less than this part, in the median."""
 _PREFIX = r"^(?:(?:pose|tcp|robot|ee|eef|flange|tool|gripper|transform)_)*"
 _ROLES: tuple[tuple[str, str], ...] = (
     (_PREFIX + r"(?:position|pos|translation|trans|t|p)?_?([xyz])(?:_pos)?$", r"\1"),
@@ -150,18 +157,39 @@ def raw_from_table(table: PoseTable) -> RawPoses:
 
 
 def _times(table: PoseTable, names: Sequence[str]) -> Array | None:
-    """Return the time stamps [s], None where no column is named as one or two are.
-
-    Their unit follows from the name (..._ns) or the size: seconds since 1970 are 1.7e9.
-    """
+    """Return the time stamps [s], None where no column is named as one or two are."""
     at = [k for k, name in enumerate(names) if name == "time"]
     if len(at) != 1:
         return None
     times = table.values[:, at[0]]
-    size = float(np.nanmax(np.abs(times))) if np.isfinite(times).any() else 0.0
-    named = table.names[at[0]].lower().endswith(("_ns", "nsecs"))
-    unit = 1e-9 if named or size > 1e16 else 1e-6 if size > 1e14 else 1e-3 if size > 1e11 else 1.0
-    return times * unit
+    if table.names[at[0]].lower().endswith(("_ns", "nsecs")):
+        return times * 1e-9
+    unit = _time_unit(np.unique(times[np.isfinite(times)]))
+    if unit != "s":
+        table.notes.append(f"The time stamps are taken for {unit}: so they are dates or steps.")
+    return times * TIME_UNITS[unit]
+
+
+def _time_unit(times: Array) -> str:
+    """Return the unit of ascending time stamps (n,), all different.
+
+    Dates tell it by their size: seconds since 1970 are 1.7e9. Stamps that count from the start of a
+    machine tell it by their steps, and are seconds unless these were too long: even steps are a
+    stream's, uneven ones those between stops.
+    """
+    if len(times) < 2:
+        return "s"
+    steps = np.diff(times)
+    step = float(np.median(steps))
+    for unit, size in TIME_UNITS.items():
+        dated = DATES_S[0] < times[0] * size and times[-1] * size < DATES_S[1]
+        if dated and step * size <= LONGEST_STEP_S:
+            return unit
+    even = float(np.median(np.abs(steps - step))) < EVEN_STEPS * step
+    if step <= LONGEST_STEP_S:
+        return "s"
+    longest = LONGEST_EVEN_STEP_S if even else LONGEST_STEP_S
+    return next((u for u, size in TIME_UNITS.items() if step * size <= longest), "ns")
 
 
 def _index_stem(table: PoseTable, names: Sequence[str], row: int) -> str:
