@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from realsim.formats.bop.opening import open_labelled_bop
 from realsim.formats.bop.root_files import write_bop_models, write_bop_root
 from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
 from realsim.formats.export_folder import ExportFolder
+from realsim.geometry.metrics import mask_iou
 from realsim.store import SessionStore
 
 
@@ -147,26 +149,77 @@ def test_what_cannot_be_is_refused_and_leaves_nothing(bop, tmp_path):
     assert not out.exists()
 
 
-def test_a_lens_is_told_or_undone_but_not_forgotten(tmp_path):
-    lens = np.array([-0.08, 0.02, 0.001, -0.001, 0.0])
-    from dataclasses import replace
+LENS = np.array([-0.08, 0.02, 0.001, -0.001, 0.0])
 
+
+@pytest.fixture(scope="module")
+def bent(tmp_path_factory):
+    """A BOP data set seen through a lens; a hand hides a corner of the first object."""
+    folder = tmp_path_factory.mktemp("bent")
     scene = labelled_scene(
-        tmp_path / "images", [0, 1], intrinsics=replace(INTRINSICS, distortion=lens)
+        folder / "images", [0, 1, 2], intrinsics=replace(INTRINSICS, distortion=LENS)
     )
-    bop = written_bop(tmp_path / "bop", scene)
-    args = ("export", bop, "--to", "graspnet", "--table-is-world", "--quiet", "--out")
-    said = refused(*args, tmp_path / "g")
-    assert "--undistort" in said and "px" in said
-    done(*args, tmp_path / "g", "--undistort")
+    rows, columns = np.nonzero(scene.masks[1, 0, True])
+    hand = scene.masks[1, 0, True].copy()
+    hand[: int(np.median(rows)) + 1, : int(np.median(columns)) + 1] = False
+    assert 0.1 < np.mean(~hand[scene.masks[1, 0, True]]) < 0.6
+    scene.masks[1, 0, True] = hand
+    return written_bop(folder / "bop", scene)
+
+
+def masks_of(root, index, k, kind="mask_visib"):
+    return images.read_grey(next(root.glob(f"*/*/{kind}/{index:06d}_{k:06d}.png"))) > 0
+
+
+def test_bop_is_what_a_pinhole_reader_renders_of_its_poses(bent, tmp_path):
+    done("export", bent, "--to", "bop", "--out", tmp_path / "plain", "--quiet")
+    row = json.loads(next(tmp_path.glob("plain/*/*/scene_camera.json")).read_text())["0"]
+    assert "cam_distortion" not in row and row["cam_K"] == INTRINSICS.K.ravel().tolist()
+    ideal = labelled_scene(tmp_path / "ideal", [0, 1, 2])  # cast by the ideal camera
+    pairs = [(i, k) for i in range(3) for k in range(3)]
+    for kind, visible in (("mask", False), ("mask_visib", True)):
+        ious = [
+            mask_iou(masks_of(tmp_path / "plain", i, k, kind), ideal.masks[i, k, visible])
+            for i, k in pairs if visible is False or (i, k) != (1, 0)
+        ]  # fmt: skip
+        assert np.median(ious) >= 0.9999 and min(ious) >= 0.99
+    # What the hand hides in the raw picture stays hidden, and nothing else.
+    lost = ideal.masks[1, 0, True] & ~masks_of(tmp_path / "plain", 1, 0)
+    before = labelled_scene(tmp_path / "raw", [0, 1, 2], intrinsics=replace(
+        INTRINSICS, distortion=LENS)).masks[1, 0, True] & ~masks_of(bent, 1, 0)  # fmt: skip
+    assert abs(lost.sum() - before.sum()) < 0.05 * before.sum()
+    info = json.loads(next(tmp_path.glob("plain/*/*/scene_gt_info.json")).read_text())["1"][0]
+    assert info["px_count_visib"] == masks_of(tmp_path / "plain", 1, 0).sum()
+    assert info["px_count_all"] >= masks_of(tmp_path / "plain", 1, 0, "mask").sum()
+
+
+def test_a_lens_that_is_kept_says_what_it_costs(bent, tmp_path):
+    card = "README.md"
+    done("export", bent, "--to", "bop", "--out", tmp_path / "raw", "--keep-distortion", "--quiet")
+    assert_same_scene(bent, tmp_path / "raw")
+    said = (tmp_path / "raw" / card).read_text()
+    assert "the lens is kept" in said and "visible masks compared have an IoU below 0.99" in said
+    args = ("export", bent, "--to", "graspnet", "--table-is-world", "--quiet", "--out")
+    done(*args, tmp_path / "g")
+    assert "the lens is kept" not in (tmp_path / "g" / card).read_text()
     # The straight edge of a box is straight again: its mask is that of an ideal camera.
-    ideal = labelled_scene(tmp_path / "ideal", [0, 1])
+    ideal = labelled_scene(tmp_path / "ideal", [0, 1, 2])
     label = images.read_image(next(Path(tmp_path / "g").glob("scenes/*/*/label/0000.png")))
     for k, obj_id in enumerate(MODELS):
-        found, true = label == obj_id, ideal.mask(0, k, visible=True)
-        seen = label.shape[0] * label.shape[1]
-        assert np.count_nonzero(found ^ true) < 0.002 * seen
-    assert "contradict" in refused(*args, tmp_path / "x", "--undistort", "--ignore-distortion")
+        assert mask_iou(label == obj_id, ideal.mask(0, k, visible=True)) >= 0.9999
+    assert "contradict" in refused(*args, tmp_path / "x", "--undistort", "--keep-distortion")
+
+
+def test_masks_of_objects_without_a_mesh_are_resampled_and_said_to_be(bent, tmp_path):
+    import shutil
+
+    bare = shutil.copytree(bent, tmp_path / "bare")
+    for name in ("models", "models_eval"):
+        shutil.rmtree(bare / name)
+    done("export", bare, "--to", "bop", "--out", tmp_path / "out", "--quiet")
+    assert "[1, 7, 30] have resampled masks" in (tmp_path / "out/README.md").read_text()
+    ideal = labelled_scene(tmp_path / "ideal", [0, 1, 2])
+    assert mask_iou(masks_of(tmp_path / "out", 0, 1), ideal.masks[0, 1, True]) > 0.95
 
 
 def test_cameras_go_out_and_come_back(bop, tmp_path):

@@ -47,8 +47,10 @@ FORMATS = (
 @click.option("--no-masks", is_flag=True, help="Leave the masks out.")
 @click.option("--points", default=100_000, show_default=True, type=click.IntRange(0),
               help="Coloured points of a COLMAP model.")  # fmt: skip
-@click.option("--undistort", is_flag=True, help="Images as an ideal camera would see them.")
-@click.option("--ignore-distortion", is_flag=True, help="Raw images where no lens can be told.")
+@click.option(
+    "--undistort", is_flag=True, help="As an ideal camera sees it; BOP, GraspNet: always."
+)
+@click.option("--keep-distortion", is_flag=True, help="BOP, GraspNet: the raw images.")
 @click.option("--table-is-world", is_flag=True, help="Where no table is known: it is z = 0.")
 @click.option("--least-score", default=0.0, show_default=True, type=click.FloatRange(0, 1),
               help="Leave out grasps of less p_hold, else score (isaac).")  # fmt: skip

@@ -43,7 +43,7 @@ def _graspnet(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> Writ
     request = job.request
     camera = scene.camera if scene.camera in CAMERAS else request.camera or CAMERAS[0]
     config = GraspnetWriteConfig(
-        camera=camera, number=job.place.number, ignore_distortion=request.ignore_distortion,
+        camera=camera, number=job.place.number, ignore_distortion=request.keep_distortion,
         table_is_world=request.table_is_world, without_labels=not request.masks,
     )  # fmt: skip
     return write_graspnet_scene(scene, folder, config, progress=job.tick)
@@ -83,8 +83,9 @@ DATA_SETS: dict[str, Target] = {
             ("cam_R_w2c, cam_t_w2c", "world -> camera, row-major; left out where not known"),
             ("visib_fract", "visible pixels / all of the silhouette, beyond the border too"),
             (
-                "cam_distortion",
-                "not BOP's own key: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6",
+                "lens",
+                "undistorted; under --keep-distortion cam_distortion, a key that BOP does not "
+                "have, holds OpenCV's k1 k2 p1 p2 k3 k4 k5 k6",
             ),
         ),
         loading=(
@@ -94,6 +95,7 @@ DATA_SETS: dict[str, Target] = {
         ),
         write_scene=_bop,
         write_root=_bop_root,
+        is_pinhole=True,
         no_place=(TABLE, TRIED),
         options=(
             "labels",
@@ -104,6 +106,7 @@ DATA_SETS: dict[str, Target] = {
             "jpeg_quality",
             "masks",
             "undistort",
+            "keep_distortion",
         ),
     ),
     "graspnet": Target(
@@ -124,6 +127,7 @@ DATA_SETS: dict[str, Target] = {
         ),
         write_scene=_graspnet,
         write_root=_graspnet_root,
+        is_pinhole=True,
         no_place=(TRIED,),
         options=(
             "labels",
@@ -131,7 +135,7 @@ DATA_SETS: dict[str, Target] = {
             "models",
             "masks",
             "undistort",
-            "ignore_distortion",
+            "keep_distortion",
             "table_is_world",
         ),
     ),

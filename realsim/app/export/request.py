@@ -34,9 +34,9 @@ class ExportRequest:
     masks: bool = True
     """Whether masks are written."""
     undistort: bool = False
-    """Write images as an ideal camera would have seen them."""
-    ignore_distortion: bool = False
-    """Write images of a distorted lens into a format that knows no distortion."""
+    """Write images as an ideal camera would have seen them; BOP and GraspNet are always so."""
+    keep_distortion: bool = False
+    """Write images of a distorted lens into a format whose readers know no distortion."""
     table_is_world: bool = False
     """Where no table is known: z = 0 of the world is the table."""
     points: int = 100_000
@@ -65,8 +65,8 @@ class ExportRequest:
             seen.add(source.resolve())
         if not 1 <= self.jpeg_quality <= 100:
             raise InputError(f"--jpeg-quality {self.jpeg_quality} cannot be; 1 to 100 is accepted.")
-        if self.undistort and self.ignore_distortion:
-            raise InputError("--undistort and --ignore-distortion contradict each other.")
+        if self.undistort and self.keep_distortion:
+            raise InputError("--undistort and --keep-distortion contradict each other.")
         if self.points < 0:
             raise InputError(f"--points {self.points} cannot be; 0 or more is accepted.")
 

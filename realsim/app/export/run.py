@@ -26,7 +26,6 @@ from realsim.formats.export_folder import CONTENT, STATE, ExportFolder
 from realsim.formats.grasps.scene_grasps import executed
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene
 from realsim.formats.session_scene import SessionScene
-from realsim.formats.undistorted import UndistortedScene
 from realsim.records import ObjectModel
 from realsim.store.lock import only_run_in
 
@@ -83,8 +82,7 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
                 _add_models(models, opened, source)
                 if isinstance(opened, BopLabelledScene):
                     infos |= opened.models_info()
-                kept = out / STATE / "undistorted"
-                given = UndistortedScene(opened, kept) if request.undistort else opened
+                given = _as_asked(opened, target, request, out)
                 written = _write(given, place, target, folder, request, console)
                 facts.append(_facts(source, opened, written, target))
         except InputError:
@@ -162,6 +160,18 @@ def _require_outside(request: ExportRequest, out: Path) -> None:
             )
 
 
+def _as_asked(
+    scene: LabelledScene, target: Target, request: ExportRequest, out: Path
+) -> LabelledScene:
+    """Return the scene undistorted, where that was asked for or the format knows no lens."""
+    from realsim_sim_bridge.annotation.undistorted import UndistortedScene
+
+    if request.undistort or (target.is_pinhole and not request.keep_distortion):
+        counted = request.target == "bop"
+        return UndistortedScene(scene, out / STATE / "undistorted", counted=counted)
+    return scene
+
+
 def _write(
     scene: LabelledScene,
     place: ScenePlace,
@@ -186,7 +196,11 @@ def _write(
     has = {TABLE: scene.T_world_table is not None, TRIED: scene.grasps() is not None}
     lost = [what for what in target.no_place if has[what]]
     told = [f"{target.name} has no place for {' and '.join(lost)}: left out."] if lost else []
-    notes = tuple(dict.fromkeys((*scene.notes, *written.notes, *told)))
+    if target.is_pinhole and request.keep_distortion:
+        from realsim_sim_bridge.annotation.undistorted import cost_of_the_lens
+
+        told.append(cost_of_the_lens(scene))
+    notes = tuple(n for n in dict.fromkeys((*scene.notes, *written.notes, *told)) if n)
     if target.kind == "dataset":
         return replace(written, notes=notes)
     # It has a folder of its own, and no place for objects and their poses.

@@ -64,6 +64,8 @@ class Target:
     """Python that opens it; {scene} is the folder of the first scene."""
     write_scene: WriteScene
     write_root: WriteRoot | None = None
+    is_pinhole: bool = False
+    """Whether its readers know no lens: images are undistorted unless they are to be kept."""
     no_place: tuple[str, ...] = ()
     """What the format has no place for, of THINGS: it is told where a scene has it."""
     holds_grasps: bool = False

@@ -150,7 +150,7 @@ def _lens(survey: _Survey, scene: LabelledScene, config: GraspnetWriteConfig) ->
         raise InputError(
             f"the lens of {scene.name} has distortion, which moves pixels by up to {off:.1f} px; "
             "GraspNet's format has no place for it. Undistort them (--undistort), or "
-            "accept the error (--ignore-distortion)."
+            "accept the error (--keep-distortion)."
         )
     return [
         f"lens distortion is not written, the format has no place for it: readers take pixels up "

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from realsim.arrays import Array, Array32, Mask
 from realsim.formats.bop.labels import NO_BBOX, Bbox, bbox_of, gt_info_entry, rle_of
@@ -173,6 +173,33 @@ def unknown_occluder(
     )
 
 
+def object_info(
+    masks: ObjectMasks,
+    px_count_all: int,
+    depth: NDArray[Any],
+    pose: tuple[CameraIntrinsics, Mesh, ArrayLike],
+) -> dict[str, Any]:
+    """Return BOP's entry of scene_gt_info of one object, its silhouette also beyond the border.
+
+    Args:
+        masks: its masks in this frame.
+        px_count_all: pixels of its silhouette, also beyond the border.
+        depth: (H, W) measured depth in any unit, 0 = none.
+        pose: the camera, its mesh and T_cam_obj (4, 4) [m].
+    """
+    intrinsics, mesh, T_cam_obj = pose
+    inside = int(np.count_nonzero(masks.amodal))
+    box = silhouette_box(
+        masks.moved(bbox_of(masks.amodal)), inside, px_count_all, intrinsics, mesh.vertices,
+        T_cam_obj,
+    )  # fmt: skip
+    info = gt_info_entry(
+        masks.amodal, masks.visible, depth[masks.window], px_count_all=px_count_all, bbox_obj=box
+    )
+    info["bbox_visib"] = list(masks.moved(bbox_of(masks.visible)))
+    return info
+
+
 def label_object(
     placed: ObjectPose,
     mesh: tuple[Mesh, ArrayLike],
@@ -196,15 +223,9 @@ def label_object(
     (intrinsics, T_world_cam), (agreement, unknown) = camera_pose, evidence
     shape, bounds = mesh
     T_cam_obj = se3.invert(T_world_cam) @ placed.T_world_obj
-    count_all = labels.px_count_all[placed.instance]
-    inside = int(np.count_nonzero(masks.amodal))
-    box = silhouette_box(
-        masks.moved(bbox_of(masks.amodal)), inside, count_all, intrinsics, shape.vertices, T_cam_obj
+    info = object_info(
+        masks, labels.px_count_all[placed.instance], depth_m, (intrinsics, shape, T_cam_obj)
     )
-    info = gt_info_entry(
-        masks.amodal, masks.visible, depth_m[masks.window], px_count_all=count_all, bbox_obj=box
-    )
-    info["bbox_visib"] = list(masks.moved(bbox_of(masks.visible)))
     return FrameLabel(
         obj_id=placed.obj_id,
         instance=placed.instance,
