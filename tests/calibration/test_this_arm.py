@@ -23,7 +23,7 @@ from realsim_calibration.fit.closed_forms import CLOSED_FORMS
 from realsim_calibration.fit.effective import places_of
 from realsim_calibration.fit.linear_model import LinearModel
 from realsim_calibration.fit.robot_error import pose_features
-from realsim_calibration.fit.robust_fit import Solution, solve
+from realsim_calibration.fit.robust_fit import Solution, at_least, solve
 from realsim_calibration.hand_eye import setup_of
 from realsim_calibration.plain import choose_plain
 from realsim_calibration.screening import Screened, screen, stacks
@@ -84,6 +84,21 @@ def test_sigma_for_this_arm_is_what_halves_show_and_the_absolute_one_is_larger()
     assert 0.4 < np.sqrt(np.trace(C[3:, 3:])) / np.linalg.norm(off[3:]) < 4
     whole = calibrated()
     assert whole.here_mm < 0.5 * whole.sigma_mm and whole.here_deg < whole.sigma_deg
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0, 3.0])
+def test_the_absolute_sigma_is_nowhere_the_smaller_one(share: float) -> None:
+    """A covariance lifted to another's is no smaller than either, and lifted no further."""
+    rng = np.random.default_rng(6)
+    A, H = (M @ M.T for M in rng.normal(size=(2, 6, 6)))
+    whole = np.eye(9)
+    whole[:6, :6] = A
+    lifted = at_least(whole, share * A)
+    assert np.allclose(lifted[:6, :6], max(share, 1.0) * A) and np.array_equal(
+        lifted[6:], whole[6:]
+    )
+    lifted = at_least(whole, H)[:6, :6]
+    assert min(np.linalg.eigvalsh(lifted - A)[0], np.linalg.eigvalsh(lifted - H)[0]) > -1e-9
 
 
 def test_verdict_follows_this_arm_and_the_other_sigma_is_told() -> None:

@@ -160,8 +160,10 @@ def solve(
     final = model.fit(best.basis, best.ratio, sigma)
     columns = hidden_errors(model, none, known, Ts, sigma, config.robot.hidden_factor)
     independent = white.excess <= 0
-    covariance = _covariance(model, final, best, columns, known, independent)
     best = replace(best, fit=final)
+    here = here_covariance(model, best, independent=independent)
+    covariance = at_least(_covariance(model, final, best, columns, known, independent), here)
+    alone_covariance = _covariance(model, none.fit, none, columns, known, independent)
     moved = projection(model, best.basis)[:6, SHARED:] @ state.weights
     return Solution(
         problem=problem,
@@ -172,12 +174,12 @@ def solve(
         covariance=shared(covariance),
         information=final.information[:SHARED, :SHARED],
         here=state.X @ se3.exp(moved),
-        here_covariance=here_covariance(model, best, independent=independent),
+        here_covariance=here,
         alone=alone,
         alone_here_covariance=alone_here,
         plain=tuple(plain),
         stretch=beyond,
-        alone_covariance=shared(_covariance(model, none.fit, none, columns, known, independent)),
+        alone_covariance=shared(at_least(alone_covariance, alone_here)),
         robot_map=None if best.basis is None else map_record(best.basis, state.weights, Ts, arm),
         map_name=best.name,
         scores=tuple((c.name, c.fit.score) for c in choices),
@@ -365,9 +367,11 @@ def _views(
 # also holds the ridge of the robot's map. (2) Corner errors that are common to a view: then views,
 # not corners, are the independent observations, and the fits without one view each (jackknife, CR3)
 #
-#     J = (n - 1) / n sum (theta_-i - theta)(theta_-i - theta)^T + H^-1 Lambda H^-1
+#     J = sum (theta_-i - theta)(theta_-i - theta)^T + H^-1 Lambda H^-1
 #
 # say more than H^-1; from few views J itself is noisy and is averaged with H^-1 scaled to its size.
+# So noisy are they that the place for this arm could come out less sure than the absolute one, of
+# which it is a part: the absolute covariance is at least the other.
 # (3) Smooth errors of the arm that the fit does not model: an error that is the same in all tool
 # poses looks exactly like another place of the camera. They are considered (Schmidt): errors
 # e_i = B_i w, w ~ N(0, I), move the estimate by M w, M = d theta / d w, and add M M^T. B is the
@@ -376,18 +380,28 @@ def _views(
 
 def noise_covariance(fit: LinearFit, *, independent: bool) -> Array:
     """Return the covariance (29 + p, ...) from noise, jackknifed unless corners are independent."""
-    n = len(fit.away)
-    share = (n - 1) / n
-    return _noise(fit, share * fit.away.T @ fit.away, np.eye(len(fit.step)), independent)
+    return _noise(fit, np.eye(len(fit.step)), independent)
 
 
 def here_covariance(model: LinearModel, choice: Choice, *, independent: bool) -> Array:
     """Return the covariance (6, 6) of X for this arm as it moves here (`effective`)."""
-    fit, P = choice.fit, projection(model, choice.basis)[X]
-    return _noise(fit, fit.swings.T @ fit.swings, P, independent)
+    return _noise(choice.fit, projection(model, choice.basis)[X], independent)
 
 
-def _noise(fit: LinearFit, jackknife: Array, P: Array, independent: bool) -> Array:
+def at_least(covariance: Array, least: Array) -> Array:
+    """Return a covariance (n, n) whose first six rows are nowhere surer than another (6, 6).
+
+    What is missing is added along the directions in which the other is larger.
+    """
+    root = np.linalg.cholesky(covariance[X, X])
+    ratio, axes = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, least).T))
+    missing = root @ axes * np.sqrt(np.maximum(ratio - 1.0, 0.0))
+    lifted = covariance.copy()
+    lifted[X, X] += missing @ missing.T
+    return lifted
+
+
+def _noise(fit: LinearFit, P: Array, independent: bool) -> Array:
     """Return the covariance (q, q) of P theta from noise; X or its like comes first."""
     marginal: Array = np.asarray(np.linalg.inv(fit.information), dtype=np.float64)
     plain = P @ marginal @ P.T
@@ -395,6 +409,7 @@ def _noise(fit: LinearFit, jackknife: Array, P: Array, independent: bool) -> Arr
         return plain
     data = np.einsum("nrc,nrd->cd", fit.view_rows, fit.view_rows)
     prior = fit.information - data
+    jackknife = fit.swings.T @ fit.swings
     full = P @ (jackknife + marginal @ prior @ marginal) @ P.T
     kappa = float(np.trace(np.linalg.solve(plain[X, X], full[X, X])) / 6)
     covariance = (full + max(kappa, 1.0) * plain) / 2
