@@ -54,7 +54,8 @@ def storing(folder: Path, what: str) -> Generator[None]:
         ) from error
 
 
-def _temporary(path: Path) -> Path:
+def temporary(path: Path) -> Path:
+    """Return the name under which this process writes a file before it is whole."""
     # The process number tells a leftover from a file that another process is writing right now.
     return path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
 
@@ -95,10 +96,10 @@ def write_bytes(
     """
     path = Path(path)
     _make_folder(path.parent)
-    temporary = _temporary(path)
+    unnamed = temporary(path)
     announced = False
     try:
-        with temporary.open("wb") as file:
+        with unnamed.open("wb") as file:
             file.write(data)
             file.flush()
             if flush:
@@ -106,12 +107,12 @@ def write_bytes(
         if announce is not None:
             announce()
             announced = True
-        os.replace(temporary, path)
+        os.replace(unnamed, path)
         if flush:
             _sync_folder(path.parent)
     except BaseException:
         if not announced:
-            temporary.unlink(missing_ok=True)
+            unnamed.unlink(missing_ok=True)
         raise
 
 
