@@ -32,6 +32,7 @@ COMMANDS = {
     "report": "realsim.app.report.cli:report_command",
     "render": "realsim.app.render.cli:render_command",
     "generate": "realsim.app.generate.cli:generate_command",
+    "pipeline": "realsim.app.pipeline.cli:pipeline_command",
     "depth-fit": "realsim.app.depth_fit.cli:depth_fit",
     "upgrade": "realsim.app.upgrade.cli:upgrade_command",
     "demonstrations": "realsim.app.demonstrations.cli:demonstrations_command",

@@ -38,7 +38,7 @@ class Cell:
     note: str = ""
     """Mark of a footnote, such as 1."""
     href: str = ""
-    """Anchor on the same page."""
+    """Anchor on the same page, or with a slash a page beside it."""
     color: tuple[int, int, int] | None = None
     """RGB of a chip before the text: the object's colour in the pictures."""
 

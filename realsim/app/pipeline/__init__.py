@@ -1,0 +1,1 @@
+"""`realsim pipeline`: a whole campaign over many scenes, from one file."""

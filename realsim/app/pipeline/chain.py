@@ -1,0 +1,138 @@
+"""The commands of one scene, each in a process of its own: what it takes or breaks ends with it."""
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import BinaryIO
+
+PROGRAM = (sys.executable, "-c", "from realsim.app.pipeline.chain import child; child()")
+PR_SET_PDEATHSIG = 1
+"""Of Linux' prctl: the signal that a process gets when its parent ends."""
+DONE, LOOK = 0, 1
+"""Exit codes of a command that did its work; 1: one of its checks failed."""
+WORDS, TAIL_BYTES = 600, 20_000
+"""Characters of a command's last words that are kept, and where they are looked for."""
+SCENE = "SCENE"
+"""Word of a command that stands for the scene's folder, wherever that is."""
+ENVIRONMENT = {"REALSIM_CONFIG": "", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+"""The campaign's file alone says how commands run; scenes share the cores."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Command:
+    """A command of a stage."""
+
+    stage: str
+    words: tuple[str, ...]
+    """As they are typed behind `realsim`."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Ended:
+    """How a command ended."""
+
+    stage: str
+    words: tuple[str, ...]
+    """The command."""
+    code: int
+    """Exit code; negative: the signal that ended it."""
+    wall_s: float
+    cpu_s: float
+    """User and system time of the command with its processes [s]."""
+    peak_mb: float
+    """Largest memory of one process [MB]."""
+    told: str
+    """Why it failed, in its own words."""
+
+    @property
+    def is_done(self) -> bool:
+        """Return whether it did its work."""
+        return self.code in (DONE, LOOK)
+
+
+def run_chain(
+    commands: Sequence[Command], scene: Path, folder: Path, log: Path
+) -> tuple[Ended, ...]:
+    """Run commands on a scene, one after the other until one fails; return how they ended.
+
+    A command that was killed is begun once more: it goes on where it stopped.
+
+    Args:
+        commands: in their order.
+        scene: stands for `SCENE` in them.
+        folder: in which they run; on another machine, where it is not, the scene's.
+        log: file that their output is added to, if its folder is there.
+    """
+    ends: list[Ended] = []
+    for command in commands:
+        end = run_command(command, scene, folder, log)
+        if end.code < 0:
+            end = run_command(command, scene, folder, log)
+        ends.append(end)
+        if not end.is_done:
+            break
+    return tuple(ends)
+
+
+def run_command(command: Command, scene: Path, folder: Path, log: Path) -> Ended:
+    """Run one command and return how it ended; arguments as of `run_chain`."""
+    words = [str(scene) if word == SCENE else word for word in command.words]
+    with ExitStack() as opened:
+        out = opened.enter_context(log.open("ab") if log.parent.is_dir() else TemporaryFile())
+        out.write(f"$ realsim {' '.join(words)}\n".encode())
+        out.flush()
+        start, begun = out.tell(), time.monotonic()
+        process = subprocess.Popen(
+            [*PROGRAM, *words], cwd=folder if folder.is_dir() else scene.parent,
+            stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=os.environ | ENVIRONMENT,
+        )  # fmt: skip
+        try:
+            _, status, used = os.wait4(process.pid, 0)
+        except BaseException:
+            process.terminate()
+            process.wait()
+            raise
+        process.returncode = code = os.waitstatus_to_exitcode(status)
+        with Path(f"/proc/self/fd/{out.fileno()}").open("rb") as written:
+            told = "" if code in (DONE, LOOK) else _last_words(written, start, code)
+    return Ended(
+        stage=command.stage,
+        words=command.words,
+        code=code,
+        wall_s=time.monotonic() - begun,
+        cpu_s=used.ru_utime + used.ru_stime,
+        peak_mb=used.ru_maxrss / 1024,
+        told=told,
+    )
+
+
+def child() -> None:
+    """Run a command as a child that ends with its parent: two runs never meet in a folder."""
+    from realsim.app.cli import main
+
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a pool's process ignores it
+    main()
+
+
+def _last_words(written: BinaryIO, start: int, code: int) -> str:
+    """Return why a command failed, in its own words."""
+    written.seek(max(start, written.seek(0, os.SEEK_END) - TAIL_BYTES))
+    lines = written.read().decode("utf-8", "replace").strip().splitlines()
+    told = next((line for line in reversed(lines) if line.startswith("error: ")), "")
+    if told:
+        told = told.removeprefix("error: ")
+    elif lines:
+        told = lines[-1]
+    if code < 0:
+        told = f"ended by signal {-code}, as when memory runs out{f'; {told}' if told else ''}"
+    return told[:WORDS] or f"exit code {code}"

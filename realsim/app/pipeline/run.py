@@ -1,0 +1,319 @@
+"""A campaign as it runs: first its scenes, then each one's stages, then what is made of all."""
+
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from realsim.app.console import Console
+from realsim.app.pipeline.campaign import Campaign, Step
+from realsim.app.pipeline.chain import SCENE, Command, Ended, run_chain, run_command
+from realsim.errors import InputError, RealsimError
+from realsim.many import Outcome, PoolConfig, Task, Worked, open_pool, run_many
+from realsim.store.atomic import storing, write_bytes, write_json
+from realsim.store.lock import only_run_in
+from realsim.untrusted.own_json import read_own, to_json
+
+SCENES, RECORDS, LOGS = "scenes", "records", "logs"
+DOCUMENT, PAGE = "campaign.json", "campaign.html"
+LEAST_FREE_MB = 200
+"""With less room on the disk [MB] no further command is begun."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SceneState:
+    """A scene of a campaign."""
+
+    name: str
+    folder: Path
+    ends: tuple[Ended, ...] = ()
+    """Of its commands, as far as they ran."""
+
+    @property
+    def failure(self) -> Ended | None:
+        """Return the command that failed, if one did."""
+        return next((end for end in self.ends if not end.is_done), None)
+
+
+@dataclass(eq=False, kw_only=True, slots=True)
+class PipelineResult:
+    """What became of a campaign."""
+
+    scenes: list[SceneState]
+    of_all: list[Ended] = field(default_factory=list[Ended])
+    """Commands that made the scenes, and those over all of them."""
+    kept: int = 0
+    """Scenes that an earlier run had finished."""
+    stages: tuple[str, ...] = ()
+
+    def is_done(self, scene: SceneState) -> bool:
+        """Return whether a scene went through all its stages."""
+        return scene.failure is None and len(scene.ends) == len(self.stages)
+
+    @property
+    def failed(self) -> dict[str, str]:
+        """Return scene or stage -> why it failed."""
+        failures = {s.name: s.failure for s in self.scenes}
+        found = {name: f"{end.stage}: {end.told}" for name, end in failures.items() if end}
+        return found | {e.stage: e.told for e in self.of_all if not e.is_done}
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """Return the document of the campaign."""
+        return {
+            "scenes": len(self.scenes),
+            "done": sum(self.is_done(s) for s in self.scenes),
+            "kept": self.kept,
+            "failed": self.failed,
+            "stages": list(self.stages),
+            "commands": {s.name: to_json(s.ends) for s in self.scenes if s.ends},
+            "of_all": to_json(self.of_all),
+        }  # fmt: skip
+
+
+def run_pipeline(campaign: Campaign, where: PoolConfig, console: Console) -> PipelineResult:
+    """Run what a campaign has not done yet.
+
+    A scene that fails is listed, and the others go on; stages over all scenes take those that went
+    through.
+
+    Raises:
+        InputError: OUT is a file, or of another campaign, or another run works there.
+        RealsimError: the disk has no room.
+    """
+    out = _own_folder(campaign)
+    with only_run_in(out), storing(out, "the campaign's records"):
+        (out / LOGS).mkdir(exist_ok=True)
+        result = PipelineResult(scenes=[], stages=tuple(s.stage for s in campaign.of_a_scene))
+        if not _make_scenes(campaign, where, console, result):
+            _write(campaign, result)
+            return result
+        result.scenes = [_known(campaign, name, place) for name, place in scenes_of(campaign)]
+        result.kept = sum(result.is_done(s) for s in result.scenes)
+        _run_scenes(campaign, where, console, result)
+        done = [s for s in result.scenes if result.is_done(s)]
+        for step in campaign.of_all if done else ():
+            _require_room(out)
+            with console.stage(step.stage, f"{len(done)} scenes"):
+                result.of_all.append(
+                    _run(campaign, step, _words_of_all(campaign, step, done), where.processes)
+                )
+        _write(campaign, result)
+    return result
+
+
+def scenes_of(campaign: Campaign) -> list[tuple[str, Path]]:
+    """Return names and folders of a campaign's scenes.
+
+    Raises:
+        InputError: two sources would be imported as the same scene.
+    """
+    if campaign.source == "generate":
+        folder = campaign.out / SCENES
+        return [
+            (p.name, p) for p in sorted(folder.glob("scene_*")) if (p / "session.json").is_file()
+        ]
+    names = [p.stem if campaign.source == "sources" else p.name for p in campaign.places]
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            first = campaign.places[names.index(name)]
+            raise InputError(
+                f"{campaign.file}: {first} and {campaign.places[k]} would both be the scene "
+                f"'{name}'; rename one."
+            )
+    at = [campaign.out / SCENES / n for n in names]
+    return list(zip(names, campaign.places if campaign.source == "sessions" else at, strict=True))
+
+
+def show_plan(campaign: Campaign, console: Console) -> None:
+    """Print what would run."""
+    rows = [] if campaign.first is None else [[campaign.first.stage, _line(campaign.first, "")]]
+    rows += [[s.stage, _line(s, "SCENE")] for s in campaign.of_a_scene]
+    rows += [[s.stage, _line(s, "SCENE...")] for s in campaign.of_all]
+    console.table(f"Campaign {campaign.file.name} in {campaign.out}", ["stage", "command"], rows)
+    console.result({"out": campaign.out, "commands": {name: line for name, line in rows}})
+
+
+def show_pipeline(campaign: Campaign, result: PipelineResult, console: Console) -> None:
+    """Print what became of a campaign."""
+    from realsim.app.pipeline.page import STAGE_HEADER, stage_rows
+
+    ends = [e for s in result.scenes for e in s.ends] + result.of_all
+    rows = stage_rows(result.stages, ends)
+    console.table(f"Campaign {campaign.file.name}", STAGE_HEADER, rows)
+    for name, why in result.failed.items():
+        console.warn(f"{name}: {why}")
+    done = sum(result.is_done(s) for s in result.scenes)
+    console.say(f"{done} of {len(result.scenes)} scenes done, {result.kept} of them before")
+    console.say(f"page      {campaign.out / PAGE}")
+    if result.failed:
+        console.say(f"next      realsim pipeline {campaign.file}   (what failed is tried again)")
+
+
+def _own_folder(campaign: Campaign) -> Path:
+    """Return OUT, made if it is not there.
+
+    Raises:
+        InputError: it is a file, or holds something else.
+    """
+    out = campaign.out
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{campaign.file}: out = '{out}' is a file; give a folder.")
+    if out.is_dir() and any(out.iterdir()) and not (out / DOCUMENT).is_file():
+        raise InputError(
+            f"{campaign.file}: out = '{out}' holds something else (no {DOCUMENT}); give a new "
+            "folder, or one of an earlier run."
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    if not (out / DOCUMENT).is_file():
+        write_json(out / DOCUMENT, {"scenes": 0})
+    return out
+
+
+def _make_scenes(
+    campaign: Campaign, where: PoolConfig, console: Console, result: PipelineResult
+) -> bool:
+    """Generate or import the scenes; return whether there can be any."""
+    step, out = campaign.first, campaign.out.resolve()
+    if step is None:
+        return True
+    _require_room(out)
+    if campaign.source == "generate":
+        with console.stage("generate", "scenes"):
+            result.of_all.append(_run(campaign, step, [str(out / SCENES)], where.processes))
+        return result.of_all[-1].is_done
+    missing = [
+        (name, source, place)
+        for (name, place), source in zip(scenes_of(campaign), campaign.places, strict=True)
+        if not (place / "session.json").is_file()
+    ]
+    with console.stage("import", f"{len(missing)} recordings") as tick:
+        for k, (name, source, place) in enumerate(missing):
+            tick(k, len(missing))
+            end = _run(campaign, step, [str(source.resolve()), str(place)], where.processes)
+            result.of_all.append(replace(end, stage=f"import {name}"))
+    return True
+
+
+def _run_scenes(
+    campaign: Campaign, where: PoolConfig, console: Console, result: PipelineResult
+) -> None:
+    """Take scenes through their stages, as many at a time as there are workers."""
+    place = {s.name: k for k, s in enumerate(result.scenes)}
+    due = [s for s in result.scenes if not result.is_done(s)]
+    total, ended = len(due), 0
+    share = max(1, where.processes // max(1, total))
+    commands = [_command(step, [SCENE], share) for step in campaign.of_a_scene]
+
+    def tasks() -> Iterator[Task]:
+        for s in due:
+            _require_room(campaign.out)
+            log = _log(campaign, s.name)
+            args = (commands, Worked(s.folder.resolve()), _folder(campaign), log)
+            yield Task(name=s.name, fn=run_chain, args=args)
+
+    def keep(outcome: Outcome) -> None:
+        nonlocal ended
+        ended += 1
+        k = place[outcome.task.name]
+        ends: tuple[Ended, ...] = outcome.value or (_lost(outcome),)
+        write_json(campaign.out / RECORDS / f"{outcome.task.name}.json", to_json(ends))
+        result.scenes[k] = replace(result.scenes[k], ends=ends)
+        _write(campaign, result)
+
+    with console.stage("scenes", " ".join(result.stages)) as tick, open_pool(where) as pool:
+
+        def tell(names: Sequence[str]) -> None:
+            console.doing(", ".join(names))
+            tick(ended, total)
+
+        if due and campaign.of_a_scene:
+            run_many(tasks(), pool, keep, tick=tell)
+
+
+def _lost(outcome: Outcome) -> Ended:
+    """Return the end of a scene that its worker did not live to tell."""
+    return Ended(
+        stage="worker", words=(), code=-1, wall_s=0.0, cpu_s=0.0, peak_mb=0.0, told=outcome.why
+    )
+
+
+def _command(step: Step, words: Sequence[str], workers: int) -> Command:
+    share = ["--workers", str(workers)] if step.has_workers else []
+    return Command(
+        stage=step.stage,
+        words=(*step.command, *words, *step.options, *share, "--quiet", "--json"),
+    )
+
+
+def _words_of_all(campaign: Campaign, step: Step, done: Sequence[SceneState]) -> list[str]:
+    """Return what a stage over all scenes takes and fills."""
+    kinds = [s for s in campaign.of_all if s.stage == step.stage]
+    number = f"_{kinds.index(step) + 1}" if len(kinds) > 1 else ""
+    out = campaign.out.resolve() / f"{step.stage}{number}"
+    return [*(str(s.folder.resolve()) for s in done), "--out", str(out)]
+
+
+def _run(campaign: Campaign, step: Step, words: Sequence[str], workers: int) -> Ended:
+    command = _command(step, words, workers)
+    folder = _folder(campaign)
+    return run_command(command, folder, folder, _log(campaign, step.stage))
+
+
+def _known(campaign: Campaign, name: str, place: Path) -> SceneState:
+    """Return a scene as an earlier run left it, with those commands that are still asked for."""
+    scene = SceneState(name=name, folder=place)
+    record = campaign.out / RECORDS / f"{name}.json"
+    if not (record.is_file() and place.is_dir()):
+        return scene
+    try:
+        ends = read_own(record, list[Ended])
+    except InputError:
+        return scene  # a damaged record is no record: the commands find out what is done
+    commands = [_command(step, [SCENE], 1) for step in campaign.of_a_scene]
+    asked = [_without_workers(c.words) for c in commands]
+    same = [_without_workers(e.words) == a for e, a in zip(ends, asked, strict=False)]
+    kept = ends[: same.index(False)] if False in same else ends[: len(asked)]
+    return replace(scene, ends=tuple(kept))
+
+
+def _without_workers(words: Sequence[str]) -> list[str]:
+    """Return a command without its number of processes, on which no result depends."""
+    at = words.index("--workers") if "--workers" in words else len(words)
+    return [*words[:at], *words[at + 2 :]]
+
+
+def _write(campaign: Campaign, result: PipelineResult) -> None:
+    """Write the campaign's document and page."""
+    from realsim.app.pipeline.page import page_of
+
+    write_json(campaign.out / DOCUMENT, result.told)
+    write_bytes(campaign.out / PAGE, page_of(campaign, result).encode())
+
+
+def _require_room(out: Path) -> None:
+    """Raise where the disk is nearly full: all further commands would break in the middle.
+
+    Raises:
+        RealsimError: less than `LEAST_FREE_MB` are free.
+    """
+    free = shutil.disk_usage(out).free / 1e6
+    if free < LEAST_FREE_MB:
+        raise RealsimError(
+            f"the disk of '{out}' has {free:.0f} MB left; {LEAST_FREE_MB} are needed. What is done "
+            "is kept. Make room, then run the same command: it goes on from here."
+        )
+
+
+def _folder(campaign: Campaign) -> Path:
+    return campaign.file.resolve().parent
+
+
+def _log(campaign: Campaign, name: str) -> Path:
+    return campaign.out.resolve() / LOGS / f"{name}.log"
+
+
+def _line(step: Step, what: str) -> str:
+    """Return a command as people type it."""
+    return " ".join(["realsim", *step.command, what, *step.options]).replace("  ", " ")
