@@ -1,7 +1,9 @@
 """The paper's way, kept as the baseline: robust ICP of each mesh in ONE reference frame.
 
 The model's points visible from the reference camera at the start pose are brought onto the cropped
-cloud of that frame by Open3D's point-to-plane ICP with Tukey's kernel, coarse to fine.
+cloud of that frame by point-to-plane ICP (Chen and Medioni 1991) with Tukey's kernel, coarse to
+fine. It does what Open3D's `registration_icp` does, whose sums over threads end in other last
+digits from run to run.
 """
 
 from collections.abc import Sequence
@@ -15,6 +17,7 @@ from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.geometry.depth import points_from_depth
+from realsim.geometry.robust import tukey_weights
 from realsim.interop import import_open3d
 from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.body import Body, footprint
@@ -31,6 +34,8 @@ class SingleViewConfig:
     """Cut-off of Tukey's kernel in each round."""
     steps: int = 40
     """Greatest number of iterations in each round."""
+    converged: float = 1e-7
+    """A round ends when the share of partners, and their RMS distance [m], change by less."""
     source_points: int = 4000
     """Visible model points used."""
     crop_m: float = 0.020
@@ -72,14 +77,58 @@ def fit_single_view(
     target = _point_cloud(o3d, target_points)
     target.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(knn=20))
     target.orient_normals_towards_camera_location(np.zeros(3))
-    cloud = _point_cloud(o3d, source)
-    registration: Any = o3d.pipelines.registration
+    normals = np.asarray(target.normals)
     T = T_cam_obj
     for reach, tukey in zip(config.reach_m, config.tukey_m, strict=True):
-        method = registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=tukey))
-        criteria = registration.ICPConvergenceCriteria(1e-7, 1e-7, config.steps)
-        T = registration.registration_icp(cloud, target, reach, T, method, criteria).transformation
-    return frame.T_world_cam @ se3.check_rigid(np.array(T), "the pose found by ICP")
+        T = _point_to_plane(source, target_points, normals, T, (reach, tukey), config)
+    return frame.T_world_cam @ se3.check_rigid(T, "the pose found by ICP")
+
+
+def _point_to_plane(
+    source: Array,
+    target: Array,
+    normals: Array,
+    T: Array,
+    round_m: tuple[float, float],
+    config: SingleViewConfig,
+) -> Array:
+    """Return the pose after one round of ICP: correspondence within reach, one Gauss-Newton step.
+
+    It ends when neither the share of points that have a partner nor their RMS distance changes.
+
+    Args:
+        source: (N, 3) points of the model, object frame [m].
+        target: (M, 3) measured points [m].
+        normals: (M, 3) of them.
+        T: (4, 4) the pose before.
+        round_m: reach of a correspondence, and Tukey's cut-off [m].
+        config: steps and when to stop.
+    """
+    from scipy.spatial import KDTree
+
+    reach, cut = round_m
+    tree = KDTree(target)
+    before = (np.inf, np.inf)
+    for _ in range(config.steps):
+        moved = se3.transform(T, source)
+        found: tuple[Any, Any] = tree.query(moved, distance_upper_bound=reach)  # pyright: ignore[reportAssignmentType]
+        gap, partner = found
+        has = np.isfinite(gap)
+        if not has.any():
+            return T
+        now = (float(np.mean(has)), float(np.sqrt(np.mean(np.square(gap[has])))))
+        if max(abs(now[0] - before[0]), abs(now[1] - before[1])) < config.converged:
+            return T
+        before = now
+        p, q, n = moved[has], target[partner[has]], normals[partner[has]]
+        r = np.sum((p - q) * n, axis=1)
+        J = np.concatenate([np.cross(p, n), n], axis=1)
+        weighted = J * tukey_weights(np.square(r / cut))[:, None]
+        # One sum in one order (einsum): a BLAS of several threads would split it anew each time.
+        H = np.einsum("ni,nj->ij", weighted, J)
+        step = np.linalg.lstsq(H, -np.einsum("ni,n->i", weighted, r), rcond=None)[0]
+        T = se3.exp(step) @ T
+    return T
 
 
 def _visible_points(
