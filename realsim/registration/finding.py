@@ -264,7 +264,7 @@ def with_flat(
     if placed:
         middle = np.mean([body.center(T) for body, T in placed.values()], axis=0)
     area_px = task.config.refine.noise.area_at(task.intake.intrinsics.width)
-    map_ = table_map(many.views, plane, task.intake.noise, middle, area_px, config)
+    map_ = table_map(many.hand_views, plane, task.intake.noise, middle, area_px, config)
     flat = {b.start.instance for b in sought}
     for instance, (body, T) in placed.items():
         if instance not in flat:

@@ -10,6 +10,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry.depth import check_depth
 from realsim.records import CameraIntrinsics, SupportPlane
+from realsim.records.depth_bias import DepthBias
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import (
     Cloud,
@@ -22,6 +23,7 @@ from realsim.registration.evidence import (
     without_table,
 )
 from realsim.registration.find_table import find_table, looked_at
+from realsim.registration.fixed_cameras import FixedFrames, noise_of, still_depth
 from realsim.registration.odometry.cross_check import KinematicsCheck, check_kinematics
 from realsim.registration.view_agreement import ViewFinding
 from realsim.registration.view_checks import check_views
@@ -57,6 +59,13 @@ class Intake:
     no_plane: str
     """Why there is no plane."""
     findings: tuple[ViewFinding, ...]
+    fixed: tuple[ViewPoints, ...] = ()
+    """Cameras that stand still, one view each: they take part in the joint fit."""
+
+    @property
+    def all_views(self) -> tuple[ViewPoints, ...]:
+        """The views of the camera in the hand, then the cameras that stand still."""
+        return (*self.views, *self.fixed)
 
     @property
     def cameras(self) -> Array:
@@ -81,6 +90,7 @@ def take_in(
     config: RegistrationConfig,
     gravity_up_world: ArrayLike | None = None,
     progress: Callable[[], None] | None = None,
+    fixed: Sequence[FixedFrames] = (),
 ) -> Intake:
     """Return what the frames hold; every image is read once.
 
@@ -123,7 +133,48 @@ def take_in(
         intrinsics=intrinsics, frames=tuple(ordered[k] for k in keep),
         views=tuple(views[k] for k in keep), noise=noise, plane=table.plane,
         no_plane=table.reason, findings=tuple(findings),
+        fixed=tuple(_still_view(-1 - k, f, config) for k, f in enumerate(fixed)),
     )  # fmt: skip
+
+
+def _still_view(index: int, frames: FixedFrames, config: RegistrationConfig) -> ViewPoints:
+    """Return all images of a fixed camera as one view.
+
+    Raises:
+        InputError: its images are not the camera's, or hold next to nothing.
+    """
+    said = frames.camera
+    try:
+        depth = still_depth(frames.read())
+        check_depth(depth, said.intrinsics)
+        depth = said.bias.corrected(depth).astype(np.float32)
+        camera = replace(
+            said, noise=noise_of(depth), bias=DepthBias(covariance=said.bias.covariance)
+        )
+    except InputError as error:
+        raise InputError(f"camera '{said.name}': {error}") from error
+    frame = DepthFrame(index=index, depth_m=depth, T_world_cam=camera.T_world_cam)
+    sample = sampling(camera.intrinsics, 1, config)
+    return replace(sample_view(camera.intrinsics, frame, camera.noise, sample), fixed=camera)
+
+
+def without_fixed(intake: Intake, least: int) -> Intake:
+    """Return the intake of a fit that takes cameras at their word: without those that stand still.
+
+    Args:
+        intake: as it was taken in.
+        least: views of all cameras that a joint fit needs.
+    """
+    if not intake.fixed:
+        return intake
+    names = ", ".join(v.fixed.name for v in intake.fixed if v.fixed is not None)
+    words = (
+        f"fixed cameras ({names}) take part where cameras and objects are fitted together, which "
+        f"needs {least} views of all cameras; here the hand's views alone were used, as they are "
+        "said to be."
+    )
+    note = ViewFinding(index=None, kind="fixed_cameras", words=words, exclude=False)
+    return replace(intake, fixed=(), findings=(*intake.findings, note))
 
 
 def check_odometry(
@@ -176,14 +227,15 @@ def scene_cloud(intake: Intake, cameras: Array, plane: SupportPlane | None) -> C
 
     Args:
         intake: the frames.
-        cameras: (V, 4, 4) where the cameras are.
+        cameras: (V, 4, 4) where the cameras are, in the order of `all_views`.
         plane: the table, whose own points are left out; or None.
     """
-    total = sum(len(v.points) for v in intake.views)
+    views = intake.all_views
+    total = sum(len(v.points) for v in views)
     every = max(1, -(-total // SCENE_POINTS))
     moved = [
         replace(v, points=v.points[::every], T_world_cam=T)
-        for v, T in zip(intake.views, cameras, strict=True)
+        for v, T in zip(views, cameras, strict=True)
     ]
     cloud = without_table(world_cloud(moved, intake.noise), plane, ABOVE_M)
     T = np.eye(4) if plane is None else plane.T_world_table

@@ -66,7 +66,7 @@ class Poses:
     contrasts: list[float | None]
     """Against the best near-symmetric rival, per object."""
     cameras: Array
-    """(V, 4, 4) of all views, refined if they were."""
+    """(V, 4, 4) of all views, refined if they were; cameras that stand still are last."""
     plane: SupportPlane | None
     known: tuple[SceneFinding, ...]
     """What has been found wrong with the objects before."""
@@ -122,7 +122,7 @@ def _features(
     """Return everything that is known of every object, by name."""
     j = config.judging
     residuals = surface_residuals(
-        given.bodies, given.poses, intake.intrinsics, intake.views, given.cameras, intake.noise,
+        given.bodies, given.poses, intake.intrinsics, intake.all_views, given.cameras, intake.noise,
         given.plane, j.residuals,
     )  # fmt: skip
     level = error_level_m(residuals, j.residuals)
@@ -130,8 +130,8 @@ def _features(
     halves: list[dict[str, float]] = [{} for _ in given.bodies]
     if len(intake.views) >= config.refine_from and given.bodies:
         owned = owned_points(
-            given.bodies, given.poses, intake.intrinsics, intake.views, given.cameras,
-            intake.noise, given.plane, j.held_out,
+            given.bodies, given.poses, intake.intrinsics, intake.views,
+            given.cameras[: len(intake.views)], intake.noise, given.plane, j.held_out,
         )  # fmt: skip
         fit = half_fit(given.bodies, given.poses, owned, j.held_out)
         found = held_out(given.bodies, owned, len(intake.views), fit, j.held_out)

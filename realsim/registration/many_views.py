@@ -16,8 +16,10 @@ from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import (
     Cloud,
     DepthFrame,
+    DepthNoise,
     average_cloud,
     correct_frame,
+    join_clouds,
     read_frame,
     without_table,
 )
@@ -54,14 +56,25 @@ class ManyViews:
     covariances: list[Array]
     """(6, 6) of each T_world_obj, right perturbation."""
     seen: list[list[SeenPose]]
-    """Per object, its pose in every view."""
+    """Per object, its pose in every view of the camera in the hand."""
     frames: tuple[DepthFrame, ...]
-    """With the refined cameras and the depth's bias taken out; read when asked."""
+    """Of the camera in the hand, with refined poses and the depth's bias taken out; read when
+    asked."""
     views: tuple[ViewPoints, ...]
-    """Their points, likewise."""
+    """Their points, likewise; then those of the cameras that stand still."""
     plane: SupportPlane | None
     arm_constant_m: float
     """1-sigma per axis of what the arm is off by everywhere: part of the covariances [m]."""
+
+    @property
+    def hand_views(self) -> tuple[ViewPoints, ...]:
+        """The views of the camera in the hand."""
+        return self.views[: len(self.frames)]
+
+    @property
+    def hand_cameras(self) -> Array:
+        """(F, 4, 4) where the camera in the hand was."""
+        return self.refined.cameras[: len(self.frames)]
 
 
 def refine_config(config: RegistrationConfig) -> RefineConfig:
@@ -138,7 +151,7 @@ def register_many(
                 T_cam_obj=p.T_cam_obj @ S,
                 covariance=_turn_covariance(p.covariance, S) + more,
             )
-            for p in of
+            for p in of[: len(frames)]
         ]
         for of, S, more in zip(
             seen_poses(refined, bodies, intake.intrinsics), back, beyond, strict=True
@@ -163,18 +176,19 @@ def _refine_once(
     """Return one refinement from rough poses, corrected frames and clouds, and the final poses."""
     rough, claimed = poses
     refined = refine(
-        intake.intrinsics, intake.views, bodies, rough, plane, intake.noise, constants, progress
+        intake.intrinsics, intake.all_views, bodies, rough, plane, intake.noise, constants, progress
     )
     scale = float(refined.state.bias[0])
+    hand = len(intake.frames)
     frames = tuple(
         correct_frame(f, T, DepthBias(scale=scale, offset_per_m=float(offset)))
         for f, T, offset in zip(
-            intake.frames, refined.cameras, refined.state.offsets(), strict=True
+            intake.frames, refined.cameras[:hand], refined.state.offsets()[:hand], strict=True
         )
     )
     views = tuple(
         replace(v, T_world_cam=T, points=refined.state.corrected(v.points, k).astype(np.float32))
-        for k, (v, T) in enumerate(zip(intake.views, refined.cameras, strict=True))
+        for k, (v, T) in enumerate(zip(intake.all_views, refined.cameras, strict=True))
     )
     clouds = _clouds(intake, views, bodies, refined, config)
     comparer = comparer_on(intake, frames, refined.plane, bodies, refined.poses, config)
@@ -266,10 +280,13 @@ def _clouds(
     """Return each object's averaged points, cameras and depth as refined."""
     total = sum(len(v.points) for v in views)
     every = max(1, -(-total // CLOUD_POINTS))
-    parts = [_points_near(v, (bodies, refined.poses), every, config) for v in views]
+    parts = [
+        _points_near(v, (bodies, refined.poses), every, v.noise(intake.noise), config)
+        for v in views
+    ]
     near: list[Cloud] = []
     for k, (body, T) in enumerate(zip(bodies, refined.poses, strict=True)):
-        cloud = _join_parts([p[k] for p in parts], intake)
+        cloud = join_clouds([p[k] for p in parts])
         above = without_table(cloud, refined.plane, config.joint.drop_height(body, refined.plane))
         near.append(average_cloud(above, T, config.joint.fine_voxel(body)))
     return assign_points(bodies, list(refined.poses), near, config.joint)
@@ -279,22 +296,18 @@ def _points_near(
     view: ViewPoints,
     objects: tuple[Sequence[Body], Array],
     every: int,
+    noise: DepthNoise,
     config: RegistrationConfig,
-) -> list[tuple[Array, Array, Array]]:
-    """Return of one view, per object, points near it in world, directions to the camera, depths."""
+) -> list[Cloud]:
+    """Return of one view, per object, the points near it in world."""
     p = view.points[::every].astype(np.float64)
     world = se3.transform(view.T_world_cam, p)
     reach = config.joint.assign_m
-    out: list[tuple[Array, Array, Array]] = []
+    out: list[Cloud] = []
     for body, T in zip(*objects, strict=True):
         close = np.linalg.norm(world - body.center(T), axis=1) < body.radius_m + reach
         some = world[close]
         towards = view.T_world_cam[:3, 3] - some
-        out.append((some, towards / np.linalg.norm(towards, axis=1, keepdims=True), p[close, 2]))
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        out.append(Cloud(points=some, towards=towards, sigmas=noise.sigma(p[close, 2])))
     return out
-
-
-def _join_parts(parts: Sequence[tuple[Array, Array, Array]], intake: Intake) -> Cloud:
-    """Return the points of all views as one cloud."""
-    points, towards, z = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Cloud(points=points, towards=towards, sigmas=intake.noise.sigma(z))

@@ -39,7 +39,8 @@ from realsim.registration.finding import (
     with_flat,
     without_objects,
 )
-from realsim.registration.intake import Intake, check_odometry, take_in
+from realsim.registration.fixed_cameras import FixedFrames
+from realsim.registration.intake import check_odometry, take_in, without_fixed
 from realsim.registration.judge import COMMON, Defect, Poses, judge_objects
 from realsim.registration.judging.verdict import CONTRAST_DECIDED
 from realsim.registration.many_views import ManyViews, comparer_on, register_many
@@ -60,10 +61,10 @@ from realsim.registration.second_look import (
     far_moved,
     is_beside_objects,
     odd_views,
+    views_off,
     without_views,
 )
 from realsim.registration.top_down import not_seen, top_down_poses
-from realsim.registration.view_checks import check_views
 from realsim.registration.views import ViewPoints
 
 __all__ = ["DepthFrame", "Registration", "RegistrationConfig", "register_scene"]
@@ -80,6 +81,8 @@ class Registration:
     cameras: dict[int, Array]
     """View number -> (4, 4) T_world_cam; refined if the views allow it. Views that were left out
     are not in it."""
+    fixed_cameras: dict[str, Array]
+    """Name -> (4, 4) T_world_cam of the cameras that stand still, likewise."""
     seen: dict[int, dict[int, SeenPose]]
     """View number -> instance -> its pose in that view, with covariance and pixel uncertainty.
     Empty if cameras were not refined."""
@@ -99,6 +102,7 @@ def register_scene(  # noqa: PLR0913 - the inputs, and two ways to follow them
     wanted: Sequence[ObjectPose] | Sequence[Wanted] | None,
     config: RegistrationConfig | None = None,
     *,
+    fixed: Sequence[FixedFrames] = (),
     gravity_up_world: ArrayLike | None = None,
     progress: Progress | None = None,
     told: Callable[[str], None] | None = None,
@@ -107,12 +111,13 @@ def register_scene(  # noqa: PLR0913 - the inputs, and two ways to follow them
 
     Args:
         name: of the scene.
-        intrinsics: the camera of all frames.
+        intrinsics: the camera of all frames, the one in the hand.
         frames: depth images with camera poses; one is enough. Their order does not matter.
         models: known objects by obj_id.
         wanted: rough poses, right to about 30 mm and 20 deg; or objects with a hint or none where
             they are; None = find out which of the models are there.
         config: see there.
+        fixed: cameras that stand still: one view more each for the joint fit.
         gravity_up_world: (3,) up; helps to tell the table from a wall.
         progress: called with (steps done, steps).
         told: called with words for what is being done.
@@ -128,7 +133,7 @@ def register_scene(  # noqa: PLR0913 - the inputs, and two ways to follow them
     sought = len(models if asked is None else asked)
     tick = Ticker(progress, len(frames) + 2 * sought + config.refine.rounds + 3, told)
     up = None if gravity_up_world is None else np.asarray(gravity_up_world, dtype=np.float64)
-    intake = take_in(intrinsics, frames, config, up, tick)
+    intake = take_in(intrinsics, frames, config, up, tick, fixed)
     asked, refused = in_units(models, asked, intake, config)
     if asked is None:
         models, refused = models_in_units(models, intake, config)
@@ -144,8 +149,9 @@ def register_scene(  # noqa: PLR0913 - the inputs, and two ways to follow them
     missing = (*refused, *found.not_placed)
     if not found.bodies:
         return _nothing(task, found, missing)
-    many = len(intake.frames) >= config.refine_from and config.refine_cameras
+    many = len(intake.all_views) >= config.refine_from and config.refine_cameras
     if not many:
+        task = replace(task, intake=without_fixed(intake, config.refine_from))
         return _registration(task, found, missing, _fit_few(task, found))
     before = task.intake.plane
     task, found, fit = _fit_many(task, found, asked or ())
@@ -171,6 +177,8 @@ class _Fit:
     """With the cameras and the depth as they are now known."""
     views: tuple[ViewPoints, ...]
     """Their points, likewise."""
+    fixed: tuple[ViewPoints, ...]
+    """Points of the cameras that stand still, likewise."""
     kept: list[Kept]
     uncertain: list[Uncertainty]
     searches: list[dict[str, Any]]
@@ -232,7 +240,8 @@ def _fit_many(
     numbers = [f.index for f in intake.frames]
     moved = far_moved(camera_moves(many, claimed), rules)
     return task, found, _Fit(
-        poses=poses, frames=many.frames, views=many.views, kept=many.kept, uncertain=uncertain,
+        poses=poses, frames=many.frames, views=many.hand_views,
+        fixed=many.views[len(many.frames):], kept=many.kept, uncertain=uncertain,
         searches=found.reports,
         seen={
             number: {
@@ -240,7 +249,7 @@ def _fit_many(
             }
             for v, number in enumerate(numbers)
         },
-        findings=[*moved, *_views_off(intake, many, claimed, config)],
+        findings=[*moved, *views_off(intake, many, claimed, config)],
         report={"refinement": camera_report(many, claimed, numbers)},
     )  # fmt: skip
 
@@ -249,18 +258,6 @@ def _starts(found: FoundObjects) -> list[Body | None]:
     """Return the bodies at the starts that somebody claimed; None = nobody did."""
     claimed = zip(claimed_bodies(found), found.claimed, strict=True)
     return [None if T is None else body for body, T in claimed]
-
-
-def _views_off(
-    intake: Intake, many: ManyViews, bodies: Sequence[Body], config: RegistrationConfig
-) -> list[Defect]:
-    """Return the views that do not fit the registered objects, their cameras refined."""
-    found = check_views(
-        many.views, many.plane, intake.noise, config.judging.views, bodies=bodies,
-        Ts_world_obj=many.poses,
-    )  # fmt: skip
-    known = {f.index for f in intake.findings}
-    return [f for f in found if f.kind == "objects_off" and f.index not in known]
 
 
 def _contrast(search: float | None, fought: Duel | None, kept: Kept) -> float | None:
@@ -351,7 +348,8 @@ def _fit_few(task: SceneTask, found: FoundObjects) -> _Fit:
         known=found.findings, with_starts=all(T is not None for T in found.claimed),
     )  # fmt: skip
     return _Fit(
-        poses=poses, frames=intake.frames, views=intake.views, kept=kept, uncertain=uncertain,
+        poses=poses, frames=intake.frames, views=intake.views, fixed=(), kept=kept,
+        uncertain=uncertain,
         searches=[{**r, **f.report} for r, f in zip(found.reports, few.found, strict=True)],
         seen={}, findings=[], report={"joint": few.history, **photo_report(photo)},
     )  # fmt: skip
@@ -362,8 +360,9 @@ def _nothing(task: SceneTask, found: FoundObjects, missing: tuple[NotPlaced, ...
     scene = Scene(name=task.name, objects=(), plane=task.intake.plane)
     return Registration(
         scene=scene, single_view=scene,
-        cameras={f.index: f.T_world_cam for f in task.intake.frames}, seen={},
-        not_placed=missing, findings=task.intake.findings,
+        cameras={f.index: f.T_world_cam for f in task.intake.frames},
+        fixed_cameras=_said(task.intake.fixed), seen={}, not_placed=missing,
+        findings=task.intake.findings,
         report={"frames": [f.index for f in task.intake.frames], "objects": [],
                 "plane": plane_report(task.intake.plane, task.intake.no_plane),
                 "search": found.report},
@@ -376,19 +375,23 @@ def _registration(
     """Return the objects judged, with the paper's way beside them."""
     given, intake, config = fit.poses, task.intake, task.config
     comparer = comparer_on(intake, fit.frames, given.plane, given.bodies, given.poses, config)
-    judgement = judge_objects(replace(intake, views=fit.views), given, comparer, config)
+    judgement = judge_objects(
+        replace(intake, views=fit.views, fixed=fit.fixed), given, comparer, config
+    )
     task.tick()
     single, single_report = top_down_poses(task, given, comparer)
     task.tick()
     objects = tuple(judgement.objects)
     scene = Scene(name=task.name, objects=objects, plane=given.plane)
     baseline = Scene(name=f"{task.name} (single view)", objects=tuple(single), plane=given.plane)
-    cameras = {f.index: T for f, T in zip(intake.frames, given.cameras, strict=True)}
+    cameras = {f.index: T for f, T in zip(intake.frames, given.cameras, strict=False)}
+    still = _said(fit.fixed or intake.fixed)
     seen = fit.seen
     if config.method == "top-down":
         scene = replace(baseline, name=task.name)
         # The paper carries its poses to the other views by the cameras as they are claimed.
         cameras, seen = {f.index: f.T_world_cam for f in intake.frames}, {}
+        still = _said(intake.fixed)
         missing = (*missing, *not_seen(given, single, single_report))
     gross = () if task.kinematics is None else task.kinematics.faults
     findings = (*intake.findings, *gross, *fit.findings, *judgement.findings)
@@ -415,9 +418,14 @@ def _registration(
         ],
     }
     return Registration(
-        scene=scene, single_view=baseline, cameras=cameras, seen=seen, not_placed=missing,
-        findings=findings, report=report,
+        scene=scene, single_view=baseline, cameras=cameras, fixed_cameras=still, seen=seen,
+        not_placed=missing, findings=findings, report=report,
     )  # fmt: skip
+
+
+def _said(fixed: Sequence[ViewPoints]) -> dict[str, Array]:
+    """Return where the cameras that stand still are, by name."""
+    return {v.fixed.name: v.T_world_cam for v in fixed if v.fixed is not None}
 
 
 def with_rejected(result: Registration, first: Registration, bad: AbstractSet[int]) -> Registration:

@@ -104,7 +104,7 @@ def camera_report(
     C = refined.covariance.shared
     mm, deg = refined.hand_eye_mm_deg
     sigma = np.sqrt(np.diag(C))
-    own = refined.state.views
+    own, still = np.split(refined.state.views, [len(numbers)])
     shared, each = common_and_own(refined, bodies)
     arm = np.repeat([0.0, many.arm_constant_m**2], 3)
     common = np.sqrt(np.diag(shared) + arm)
@@ -128,6 +128,23 @@ def camera_report(
                 "depth_offset_per_m": float(x[6]),
             }
             for i, x in zip(numbers, own, strict=True)
+        },
+        "fixed_cameras": {
+            view.fixed.name: {
+                "shift_mm": 1e3 * float(np.linalg.norm(x[3:6])),
+                "turn_deg": float(np.degrees(np.linalg.norm(x[:3]))),
+                "sigma_mm": 1e3 * float(np.sqrt(np.trace(C_view[3:6, 3:6]))),
+                "depth_scale": 1.0 + float(x[7]),
+                "depth_offset_per_m": float(x[6]),
+                "noise_per_m": view.fixed.noise.per_m,
+            }
+            for view, x, C_view in zip(
+                many.views[len(numbers) :],
+                still,
+                refined.covariance.views[len(numbers) :],
+                strict=True,
+            )
+            if view.fixed is not None
         },
         "depth_scale": float(refined.state.bias[0]),
         "depth_scale_sigma": float(sigma[BIAS][0]),

@@ -14,10 +14,11 @@ from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import ObjectModel, SupportPlane
 from realsim.registration.body import Body
-from realsim.registration.config import SecondLookConfig
+from realsim.registration.config import RegistrationConfig, SecondLookConfig
 from realsim.registration.intake import Intake
 from realsim.registration.many_views import ManyViews
 from realsim.registration.view_agreement import ViewFinding
+from realsim.registration.view_checks import check_views
 
 NO_TABLE = "what looked like a table is seen on the objects only"
 """Why there is no plane."""
@@ -59,13 +60,11 @@ def is_beside_objects(
 
 
 def camera_moves(many: ManyViews, bodies: Sequence[Body]) -> Array:
-    """Return by how much each camera alone was moved (V,), at the middle of the objects [m]."""
+    """Return by how much each view of the hand alone was moved (F,), at the objects' middle [m]."""
+    cameras = many.hand_cameras
     middle = np.mean([b.center(T) for b, T in zip(bodies, many.poses, strict=True)], axis=0)
-    x = many.refined.state.views[:, :6]
-    at = np.einsum(
-        "vij,vj->vi", np.swapaxes(many.refined.cameras[:, :3, :3], 1, 2),
-        middle - many.refined.cameras[:, :3, 3],
-    )  # fmt: skip
+    x = many.refined.state.views[: len(cameras), :6]
+    at = np.einsum("vji,vj->vi", cameras[:, :3, :3], middle - cameras[:, :3, 3])
     return np.linalg.norm(x[:, 3:] + np.cross(x[:, :3], at), axis=1)
 
 
@@ -97,6 +96,18 @@ def without_views(intake: Intake, odd: Sequence[ViewFinding]) -> Intake:
         intake, frames=tuple(intake.frames[k] for k in kept),
         views=tuple(intake.views[k] for k in kept), findings=(*intake.findings, *odd),
     )  # fmt: skip
+
+
+def views_off(
+    intake: Intake, many: ManyViews, bodies: Sequence[Body], config: RegistrationConfig
+) -> list[ViewFinding]:
+    """Return the views that do not fit the registered objects, their cameras refined."""
+    found = check_views(
+        many.hand_views, many.plane, intake.noise, config.judging.views, bodies=bodies,
+        Ts_world_obj=many.poses,
+    )  # fmt: skip
+    known = {f.index for f in intake.findings}
+    return [f for f in found if f.kind == "objects_off" and f.index not in known]
 
 
 def far_moved(moves: Array, config: SecondLookConfig) -> list[ViewFinding]:

@@ -14,6 +14,7 @@ from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics
 from realsim.registration.evidence import Cloud, DepthFrame, DepthNoise
+from realsim.registration.fixed_cameras import FixedCamera
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -48,6 +49,16 @@ class ViewPoints:
     """Pixels that each of them stands for."""
     measured_share: float
     """Share of the sampled pixels that hold any depth, trusted or not."""
+    fixed: FixedCamera | None = None
+    """The camera that stands still and saw this view; None = the one in the hand."""
+
+    def noise(self, of_hand: DepthNoise) -> DepthNoise:
+        """Return the noise of this view's camera, given that of the one in the hand."""
+        return of_hand if self.fixed is None else self.fixed.noise
+
+    def intrinsics(self, of_hand: CameraIntrinsics) -> CameraIntrinsics:
+        """Return this view's camera, given the one in the hand."""
+        return of_hand if self.fixed is None else self.fixed.intrinsics
 
     def world(self, T_world_cam: Array | None = None) -> Array:
         """Return the points (N, 3) in world, of the claimed camera or of another."""
@@ -141,5 +152,5 @@ def world_cloud(views: Sequence[ViewPoints], noise: DepthNoise) -> Cloud:
     eyes = np.concatenate([np.tile(v.T_world_cam[:3, 3], (len(v.points), 1)) for v in views])
     towards = eyes - points
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    z = np.concatenate([v.points[:, 2] for v in views])
-    return Cloud(points=points, towards=towards, sigmas=noise.sigma(z))
+    sigmas = np.concatenate([v.noise(noise).sigma(v.points[:, 2]) for v in views])
+    return Cloud(points=points, towards=towards, sigmas=sigmas)

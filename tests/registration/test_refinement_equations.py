@@ -1,7 +1,7 @@
 """Derivatives against finite differences; normal equations against dense ones."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ from realsim.registration.refinement.equations import (
     step_state,
 )
 from realsim.registration.refinement.points import exact_residuals, thin_share
-from realsim.registration.refinement.refine import OF_VIEW
+from realsim.registration.refinement.priors import OF_FIXED, OF_VIEW
 
 TINY_M = 1e-9
 """A residual so small that the ray meets the surface at the point itself."""
@@ -88,8 +88,12 @@ class OnePoint:
         assert kernels[0] == pytest.approx(1.0)
         H = H + np.swapaxes(np.triu(H, 1), 1, 2)
         own, rows = (TABLE_AT, TABLE_ROWS) if self.of_table else (object_at(0), tuple(range(6)))
-        blocks = Blocks(H=H, b=b, Ms=se3.from_translation(-center) @ M, own=own, rows=rows)
-        system = assemble([blocks], OBJECTS + 6 * len(self.bodies), OF_VIEW)
+        blocks = Blocks(
+            H=H, b=b, Ms=se3.from_translation(-center) @ M, own=own, rows=rows,
+            common=self.state.common,
+        )  # fmt: skip
+        n = self.state.views.shape[1]
+        system = assemble([blocks], OBJECTS + 6 * len(self.bodies), n)
         return -system.a / TINY_M, -system.d[0] / TINY_M
 
 
@@ -142,6 +146,22 @@ def test_derivatives_of_an_object_are_those_of_the_residual(box: Body):
         point, OF_VIEW, lambda x: step_state(point.state, point.bodies, nothing, x[None])
     )
     np.testing.assert_allclose(view, expected, atol=1e-6)
+
+
+def test_a_camera_that_stands_still_has_no_part_in_hand_eye_and_bias(box: Body):
+    point = some_point(np.random.default_rng(5), box, bias=(1.003, 0.004))
+    still = replace(point.state, views=np.zeros((1, OF_FIXED)), common=np.zeros(1))
+    point = replace(point, state=still)
+    shared, view = point.row()
+    n = OBJECTS + 6
+    no_view, nothing = np.zeros((1, OF_FIXED)), np.zeros(n)
+    expected = numeric(point, n, lambda x: step_state(still, point.bodies, x, no_view))
+    np.testing.assert_allclose(shared, expected, atol=1e-6)
+    assert not np.any(expected[: TABLE.start])
+    assert np.linalg.norm(expected[OBJECTS:]) > 0.5
+    expected = numeric(point, OF_FIXED, lambda x: step_state(still, point.bodies, nothing, x[None]))
+    np.testing.assert_allclose(view, expected, atol=1e-6)
+    assert abs(view[7]) > 0.05
 
 
 def test_derivatives_of_the_table_are_those_of_the_residual():

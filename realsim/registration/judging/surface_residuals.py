@@ -125,10 +125,10 @@ def surface_residuals(
     Args:
         bodies: the objects.
         poses: their T_world_obj (4, 4).
-        intrinsics: the camera.
+        intrinsics: the camera in the hand.
         views: what each view measured.
         Ts_world_cam: (V, 4, 4) the corrected cameras.
-        noise: of the depth.
+        noise: of the depth of the camera in the hand.
         plane: the table; its points belong to no object.
         config: see there.
 
@@ -149,9 +149,10 @@ def surface_residuals(
     step = thinning(bodies, poses, (intrinsics, views, Ts), config.points_per_object)
     every = max(1, len(views) // config.looks)
     for v, (view, T) in enumerate(zip(views, Ts, strict=True)):
-        _add_view(claims, pieces, (view, T, v % step, step), noise, sums)
-        if v % every == 0:
-            _look(poses, pieces, intrinsics, view, T, noise, looks, config)
+        own = view.noise(noise)
+        _add_view(claims, pieces, (view, T, v % step, step), own, sums)
+        if v % every == 0 or view.fixed is not None:
+            _look(poses, pieces, view.intrinsics(intrinsics), view, T, own, looks, config)
     return [
         _means_of(p, s, seen, depth, len(views), config)
         for p, s, seen, depth in zip(pieces, sums, looks, depths, strict=True)

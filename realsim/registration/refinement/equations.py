@@ -17,7 +17,8 @@ table -A[0, 1, 5], camera A Ad(M), because M exp(xi) = exp(Ad(M) xi) M. Shared u
 hand-eye, 2 of the depth's bias, 3 of the table (two tilts and the height), 6 of every object (right
 twist about its centre); then whatever the caller adds: the sizes of objects, offsets of patches of
 the surface, an offset of outlines. Every view has 6 more (see `geometry.normal_equations`), or 7:
-what a stereo camera's disparity is off by wanders, and is an offset of the view's inverse depth.
+what a stereo camera's disparity is off by wanders, and is an offset of the view's inverse depth. A
+camera that stands still is one view; it has no part in hand-eye and bias, and a scale of its own.
 
 To fit a size too (the body's frame at its centre, as large as the body now is):
     places, distances, normals = seen_distances(lattice, size, points, views, cameras, edges)
@@ -51,8 +52,8 @@ TABLE_AT: Int64 = np.arange(TABLE.start, TABLE.stop)
 HAND_EYE_AT: Int64 = np.arange(HAND_EYE.start, HAND_EYE.stop)
 BLOCK = 8
 """Columns of a block: twist and bias. A ninth is the logarithm of the body's size."""
-OFFSET = 7
-"""The block's column of the inverse depth's offset, which a view may have of its own."""
+SCALE, OFFSET = 6, 7
+"""The block's columns of the inverse depth's scale and offset, which a view may have of its own."""
 LEAST_ALONG = 0.15
 """Least cosine between ray and normal at which the ray is followed to the surface."""
 
@@ -203,6 +204,9 @@ class Blocks:
     """(n - 6,) places of the further columns."""
     offsets: Offsets | None = None
     """None = the surface is as the model says."""
+    common: Array | None = None
+    """(V,) 1 where a view shares hand-eye and depth bias, 0 where its camera stands still and has
+    its own; None = all share them."""
 
 
 def assemble(bodies: Sequence[Blocks], unknowns: int, of_view: int = 6) -> System:
@@ -211,7 +215,8 @@ def assemble(bodies: Sequence[Blocks], unknowns: int, of_view: int = 6) -> Syste
     Args:
         bodies: what the points of each say.
         unknowns: how many are shared.
-        of_view: how many every view has: 6 of its twist, or 7 with an offset of its inverse depth.
+        of_view: how many every view has: 6 of its twist, 7 with an offset of its inverse depth, or
+            8 with a scale of it, too.
     """
     V, S = len(bodies[0].H), unknowns
     system = System(
@@ -230,26 +235,31 @@ def _add(system: System, blocks: Blocks) -> None:
     # Columns of a block by unknowns of its view: the camera's twist, the inverse depth's offset.
     G = np.zeros((*b.shape, system.d.shape[1]))
     G[:, :6, :6] = se3.adjoint(blocks.Ms)
-    G[:, OFFSET, 6:] = 1.0
+    G[:, OFFSET, 6:7] = 1.0
+    G[:, SCALE, 7:] = 1.0
     back = np.swapaxes(G, 1, 2)
     HG = H @ G
     cc = back @ HG
+    cd = np.einsum("vji,vj->vi", G, b)
     A, B = system.A, system.B
     A[np.ix_(own, own)] += H[:, :6, :6].sum(0)[np.ix_(rows, rows)]
+    system.a[own] -= b[:, :6].sum(0)[rows]
+    B[:, own] -= HG[:, rows]
+    system.D[:] += cc
+    system.d[:] += cd
+    if blocks.common is not None:
+        # What follows is of the unknowns that a camera which stands still has no part in.
+        H, HG, cc = (blocks.common[:, None, None] * M for M in (H, HG, cc))
+        b, cd = (blocks.common[:, None] * x for x in (b, cd))
     A[np.ix_(more, more)] += H[:, 6:, 6:].sum(0)
     A[np.ix_(hand, hand)] += cc.sum(0)[:6, :6]
     _couple(A, own, more, -H[:, :6, 6:].sum(0)[rows])
     _couple(A, own, hand, -HG.sum(0)[rows, :6])
     _couple(A, hand, more, HG.sum(0)[6:, :6].T)
-    cd = np.einsum("vji,vj->vi", G, b)
-    system.a[own] -= b[:, :6].sum(0)[rows]
     system.a[more] += b[:, 6:].sum(0)
     system.a[hand] += cd.sum(0)[:6]
-    B[:, own] -= HG[:, rows]
     B[:, more] += HG[:, 6:]
     B[:, hand] += cc[:, :6]
-    system.D[:] += cc
-    system.d[:] += cd
     if (offsets := blocks.offsets) is not None:
         at, total = offsets.at, offsets.coupling.sum(0)
         ck = back @ offsets.coupling
@@ -279,22 +289,34 @@ class State:
     """(6,) twist of every camera [rad, m]."""
     views: Array
     """(V, 7) further twist of each, and the offset of its inverse depth [rad, m, 1/m]; (V, 6) where
-    that is the same for all."""
+    that is the same for all, (V, 8) where some have a scale of their own."""
     bias: Array
     """(2,) scale and offset [1/m] of the inverse depth."""
+    common: Array | None = None
+    """(V,) as of `Blocks`."""
+
+    @property
+    def in_hand(self) -> Array:
+        """(V,) 1 where a camera is in the hand, 0 where it stands still."""
+        return np.ones(len(self.views)) if self.common is None else self.common
 
     def cameras(self, claimed: Array) -> Array:
         """Return the cameras (V, 4, 4) as they stand now, from what is said of them."""
-        return claimed @ se3.exp(self.hand_eye + self.views[:, :6])
+        return claimed @ se3.exp(np.outer(self.in_hand, self.hand_eye) + self.views[:, :6])
+
+    def scales(self) -> Array:
+        """Return the scale of the inverse depth of every view (V,)."""
+        hand = self.in_hand
+        return hand * self.bias[0] + (1.0 - hand) + self.views[:, 7:].sum(axis=1)
 
     def offsets(self) -> Array:
         """Return the offset of the inverse depth of every view (V,) [1/m]."""
-        return self.bias[1] + self.views[:, 6:].sum(axis=1)
+        return self.in_hand * self.bias[1] + self.views[:, 6:7].sum(axis=1)
 
     def corrected(self, points: Array | Array32, views: int | Int32) -> Array:
         """Return points (N, 3) in the axes of their views' cameras without the depth's bias."""
-        offset = np.broadcast_to(self.offsets()[views], len(points))
-        return points / (self.bias[0] + offset[:, None] * points[:, 2:])
+        scale, offset = (np.reshape(of[views], (-1, 1)) for of in (self.scales(), self.offsets()))
+        return np.asarray(points / (scale + offset * points[:, 2:]), np.float64)
 
 
 def centre_pose(body: Body, T_world_obj: Array) -> Array:
@@ -325,7 +347,7 @@ def step_state(state: State, bodies: list[Body], shared: Array, views: Array) ->
         state: before.
         bodies: the objects.
         shared: (11 + 6 K,) see `equations`.
-        views: (V, 6 or 7).
+        views: (V, 6 to 8).
     """
     poses = [
         centre_pose(b, T) @ se3.exp(shared[object_at(k)])

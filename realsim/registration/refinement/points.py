@@ -30,6 +30,13 @@ class AllPoints:
     """(N,) which view (its place in the list)."""
     area_px: Array
     """(V,) pixels that each point of a view stands for."""
+    noise: tuple[Array, Array]
+    """(V,) of every view's camera: noise per m [1/m] and least sigma_z [m]."""
+
+    def sigma(self, z: Array, views: Int32) -> Array:
+        """Return the 1-sigma (N,) of depths z (N,) [m] that views (N,) measured."""
+        per_m, floor = self.noise
+        return np.maximum(floor[views], per_m[views] * np.square(z))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -44,12 +51,14 @@ class Owned:
     """(N,) pixels that each stands for, those left out for it included."""
 
 
-def join_views(views: Sequence[ViewPoints]) -> AllPoints:
-    """Return the points of all views in one piece."""
+def join_views(views: Sequence[ViewPoints], noise: DepthNoise) -> AllPoints:
+    """Return the points of all views in one piece; the noise is that of the camera in the hand."""
+    each = [v.noise(noise) for v in views]
     return AllPoints(
         points=np.concatenate([v.points for v in views]),
         views=np.repeat(np.arange(len(views), dtype=np.int32), [len(v.points) for v in views]),
         area_px=np.array([v.area_px for v in views]),
+        noise=(np.array([n.per_m for n in each]), np.array([n.floor_m for n in each])),
     )
 
 
@@ -58,7 +67,7 @@ def _sorted_in(
     points: Array32,
     views: Int32,
     cameras: Array,
-    bias: tuple[float, Array],
+    bias: tuple[Array, Array],
     spheres: tuple[Array, Array, Array],
 ) -> tuple[Array32, Mask, Int32, Int64]:
     """Return points in world, which are around a body, and each body's candidates.
@@ -67,14 +76,14 @@ def _sorted_in(
         points: (N, 3) as measured, in camera axes.
         views: (N,).
         cameras: (V, 4, 4).
-        bias: scale of the inverse depth, and its offset in every view (V,).
+        bias: scale and offset of the inverse depth in every view (V,).
         spheres: centres (K, 3), square of the reach (K,), and square of the table's (K,).
 
     Returns:
         Corrected points (N, 3) in world, flags (N,), and the candidates' numbers body after body
         with where each body's begin (K + 1,).
     """
-    scale, offsets = bias
+    scales, offsets = bias
     centers, reach, margin = spheres
     bodies = len(centers)
     out = np.empty((len(points), 3), np.float32)
@@ -82,7 +91,7 @@ def _sorted_in(
     begin = np.zeros(bodies + 1, np.int64)
     for i in range(len(points)):
         C = cameras[views[i]]
-        f = 1.0 / (scale + offsets[views[i]] * points[i, 2])
+        f = 1.0 / (scales[views[i]] + offsets[views[i]] * points[i, 2])
         a, b, c = f * points[i, 0], f * points[i, 1], f * points[i, 2]
         for k in range(3):
             out[i, k] = C[k, 0] * a + C[k, 1] * b + C[k, 2] * c + C[k, 3]
@@ -152,7 +161,6 @@ def _claim(
 
 def assign_views(
     points: AllPoints,
-    noise: DepthNoise,
     bodies: Sequence[Body],
     state: State,
     cameras: Array,
@@ -164,7 +172,6 @@ def assign_views(
 
     Args:
         points: of all views.
-        noise: of the depth.
         bodies: the objects.
         state: where they, the table and the depth's bias stand.
         cameras: (V, 4, 4) as they stand now.
@@ -173,7 +180,7 @@ def assign_views(
         flat: numbers of the flat bodies.
     """
     poses, T_world_table = list(state.poses), state.T_world_table
-    bias = (float(state.bias[0]), state.offsets())
+    bias = (state.scales(), state.offsets())
     centers = np.array([b.center(T) for b, T in zip(bodies, poses, strict=True)]).reshape(-1, 3)
     radii = np.array([b.radius_m for b in bodies])
     spheres = (
@@ -195,7 +202,7 @@ def assign_views(
         row = se3.invert(T_world_table)[2].astype(np.float32)
         some = np.flatnonzero(around)
         height = np.abs(world[some] @ row[:3] + row[3])
-        slack = 3.0 * noise.sigma(points.points[some, 2])
+        slack = 3.0 * points.sigma(points.points[some, 2].astype(np.float64), points.views[some])
         free = owner[some] == NOBODY
         table[some[free & (height < config.table_reach_m + slack)]] = True
         feet = _feet(bodies, poses, row, config)[owner[some]]

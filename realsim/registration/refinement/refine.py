@@ -14,13 +14,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from realsim.arrays import Array, Int64
+from realsim.arrays import Array, Int64, Mask
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.normal_equations import (
     Covariances,
     System,
-    add_prior,
     covariances,
     inverse,
     solve,
@@ -34,9 +33,7 @@ from realsim.registration.body import Body
 from realsim.registration.evidence import DepthNoise
 from realsim.registration.refinement.config import NoiseConfig, RefineConfig
 from realsim.registration.refinement.equations import (
-    BIAS,
     BLOCK,
-    HAND_EYE,
     LEAST_ALONG,
     OBJECTS,
     TABLE_AT,
@@ -51,26 +48,29 @@ from realsim.registration.refinement.equations import (
 )
 from realsim.registration.refinement.flat import is_flat, step_term
 from realsim.registration.refinement.points import (
+    AllPoints,
     Owned,
     assign_views,
     exact_residuals,
     join_views,
     thin_share,
 )
+from realsim.registration.refinement.priors import (
+    OF_FIXED,
+    OF_VIEW,
+    add_priors,
+    learn_sigmas,
+    said_sigmas,
+    view_precisions,
+)
 from realsim.registration.views import ViewPoints
 
-OF_VIEW, KINDS = 7, (3, 3, 1)
-"""Unknowns of a view: a turn, a shift, an offset of its inverse depth."""
-LEAST_SIGMA = (np.radians(1e-3), 1e-5, 1e-5)
-"""Least prior 1-sigma of a turn [rad], a shift [m], an offset [1/m]: nothing is perfect."""
 SIDE_COS = 0.5
 """Steeper surface of a flat object is its side: its few points are half the table's."""
 SMOOTH_WHOLE = 0.7
 """Share of the variance of smooth errors that all views have in common: set in the second lab."""
 GROUPS = 8
 """Groups of views that are left out in turn."""
-FIXED = 1e-9
-"""1-sigma of an unknown that is held [its unit]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -107,8 +107,11 @@ class _Task:
     bodies: list[Body]
     claimed: Array
     views: tuple[ViewPoints, ...]
-    noise: DepthNoise
-    area_px: float
+    points: AllPoints
+    area_px: Array
+    """(V,) pixels of one independent measurement."""
+    hand: Mask
+    """(V,) whether a view is of the camera in the hand."""
     config: RefineConfig
     thin: list[bool]
 
@@ -126,12 +129,13 @@ def refine(
     """Return everything refined together.
 
     Args:
-        intrinsics: the camera.
-        views: trusted points of all views, with the cameras' claimed poses.
+        intrinsics: the camera in the hand.
+        views: trusted points of all views, with the cameras' claimed poses; a camera that stands
+            still is one of them.
         bodies: the objects.
         poses: their T_world_obj (4, 4), right to about 3 mm and a few degrees.
         plane: the table; None = there is none.
-        noise: of the depth.
+        noise: of the depth of the camera in the hand.
         config: see there.
         progress: called with (rounds done, rounds).
 
@@ -140,26 +144,29 @@ def refine(
     """
     config = config or RefineConfig()
     task = _Task(
-        list(bodies), np.stack([v.T_world_cam for v in views]), tuple(views), noise,
-        config.noise.area_at(intrinsics.width), config,
+        list(bodies), np.stack([v.T_world_cam for v in views]), tuple(views),
+        join_views(views, noise),
+        np.array([config.noise.area_at(v.intrinsics(intrinsics).width) for v in views]),
+        np.array([v.fixed is None for v in views]), config,
         [thin_share(b, config.thin_cells) > config.thin_share for b in bodies],
     )  # fmt: skip
+    of_view = OF_VIEW if np.all(task.hand) else OF_FIXED
     state = State(
         poses=np.stack(poses) if len(poses) else np.zeros((0, 4, 4)),
         T_world_table=None if plane is None else plane.T_world_table.copy(),
-        hand_eye=np.zeros(6), views=np.zeros((len(views), OF_VIEW)),
+        hand_eye=np.zeros(6), views=np.zeros((len(views), of_view)),
         bias=np.array([config.bias.scale, config.bias.offset_per_m]),
+        common=None if np.all(task.hand) else task.hand.astype(np.float64),
     )  # fmt: skip
-    everything = join_views(views)
     misfits = np.full(len(bodies) + 1, config.noise.widest_m)
-    sigmas = _said_sigmas(config)
+    sigmas = said_sigmas(config)
     history: list[dict[str, float]] = []
     system, blocks, used = None, list[Blocks](), np.zeros(len(bodies) + 1)
     for round_ in range(config.rounds):
         last = round_ == config.rounds - 1
         flat = _flat(task, state)
         own, table, near = assign_views(
-            everything, noise, bodies, state, state.cameras(task.claimed), config.points,
+            task.points, bodies, state, state.cameras(task.claimed), config.points,
             1.0 if last else config.early_share, flat,
         )  # fmt: skip
         if sum(len(o.points) for o in own) + len(table.points) < config.points.least_points:
@@ -171,13 +178,13 @@ def refine(
         exact = round_ >= config.rounds - config.exact_rounds
         for _ in range(config.steps):
             blocks, misfits, used = _linearise(task, state, (own, table), misfits, exact)
-            system = assemble(blocks, OBJECTS + 6 * len(own), OF_VIEW)
-            _add_priors(system, task, state, sigmas)
+            system = assemble(blocks, OBJECTS + 6 * len(own), of_view)
+            add_priors(system, state, task.views, config, sigmas)
             blur = config.blur_m[min(round_, len(config.blur_m) - 1)]
             for k, points in zip(flat, near, strict=True):
                 _add_step(system, task, state, k, points, blur)
             state = step_state(state, task.bodies, *solve(system))
-            sigmas = _learn_sigmas(system, state, config, sigmas)
+            sigmas = learn_sigmas(system, state, task.hand, config, sigmas)
         history.append(_row(state, misfits, sigmas))
         if progress is not None:
             progress(round_ + 1, config.rounds)
@@ -239,7 +246,7 @@ def _linearise(
         (H, b), seen[k], used[k] = _block_sums(
             task, (surface, mine, p), (center, eyes), Ms_centred, (float(misfits[k]), 0.0), few
         )
-        blocks.append(Blocks(H=H, b=b, Ms=Ms_centred, own=object_at(k)))
+        blocks.append(Blocks(H=H, b=b, Ms=Ms_centred, own=object_at(k), common=state.common))
     if state.T_world_table is not None and len(table.points):
         Ms = se3.invert(state.T_world_table) @ cameras
         eyes = np.ascontiguousarray(Ms[:, :3, 3])
@@ -251,7 +258,7 @@ def _linearise(
             task, ((places, places[:, 2].copy(), up), table, p), (np.zeros(3), eyes), Ms,
             (float(misfits[-1]), task.config.noise.table_flat_m), False,
         )  # fmt: skip
-        blocks.append(Blocks(H=H, b=b, Ms=Ms, own=TABLE_AT, rows=TABLE_ROWS))
+        blocks.append(Blocks(H=H, b=b, Ms=Ms, own=TABLE_AT, rows=TABLE_ROWS, common=state.common))
     return blocks, seen, used
 
 
@@ -275,8 +282,8 @@ def _add_step(
     p = state.corrected(near.points, near.views)
     M = Ms[near.views]
     noise = task.config.noise
-    crowding = np.maximum(1.0, task.area_px / near.area_px)
-    sigmas = np.maximum(task.noise.sigma(p[:, 2]), noise.floor_m) * np.sqrt(crowding)
+    crowding = np.maximum(1.0, task.area_px[near.views] / near.area_px)
+    sigmas = np.maximum(task.points.sigma(p[:, 2], near.views), noise.floor_m) * np.sqrt(crowding)
     places = np.einsum("nij,nj->ni", M[:, :3, :3], p) + M[:, :3, 3]
     H, b = step_term(task.bodies[k], T @ state.poses[k], places, M[:, :3, 3], sigmas, blur_m)
     at = object_at(k)
@@ -305,9 +312,9 @@ def _block_sums(
     # Weighed by the depth of the surface: by their own, points too near would count for more.
     steep = cosine > LEAST_ALONG
     surface_z = p[:, 2] * (1.0 - np.where(steep, distances / np.where(steep, along, 1.0), 0.0))
-    sigma = task.noise.sigma(surface_z) * np.clip(cosine, noise.oblique, None)
+    sigma = task.points.sigma(surface_z, mine.views) * np.clip(cosine, noise.oblique, None)
     variance = np.square(np.maximum(sigma, noise.floor_m)) + misfit[1] ** 2
-    crowding = np.maximum(1.0, task.area_px / mine.area_px)
+    crowding = np.maximum(1.0, task.area_px[mine.views] / mine.area_px)
     weight = 1.0 / (variance * crowding + misfit[0] ** 2)
     reach = noise.cut_sigmas**2 * (variance + misfit[0] ** 2)
     kernels = np.empty(len(p))
@@ -329,35 +336,6 @@ def _misfit(distances: Array, variance: Array, noise: NoiseConfig) -> float:
     return max(noise.least_misfit_m, float(np.sqrt(max(beyond, 0.0))))
 
 
-def _add_priors(system: System, task: _Task, state: State, view_sigmas: Array) -> None:
-    """Add what is known of hand-eye, views, bias and table, and hold what nothing says."""
-    config = task.config
-    p = config.prior
-    hand = np.repeat([np.radians(p.hand_eye_deg), p.hand_eye_mm / 1e3], 3)
-    add_prior(system, HAND_EYE, state.hand_eye, np.diag(1.0 / np.square(hand)))
-    own = _view_precision(view_sigmas)
-    system.D[:] += own
-    system.d[:] -= state.views @ own
-    C = config.bias.covariance
-    if not np.any(C):
-        C = np.diag([config.unmeasured_scale**2, config.unmeasured_offset_per_m**2])
-    W: Array = np.asarray(np.linalg.inv(C), np.float64) if config.fit_bias else np.eye(2) / FIXED**2
-    said = np.array([config.bias.scale, config.bias.offset_per_m])
-    add_prior(system, BIAS, state.bias - said, W)
-    free = 1.0 / np.radians(config.free_turn_deg) ** 2
-    for k in range(len(task.bodies)):
-        turn, shift = np.split(object_at(k), 2)
-        system.A[turn, turn] += free
-        # An object without points stays where it is.
-        system.A[shift, shift] += 1.0
-    system.A[TABLE_AT, TABLE_AT] += 1.0
-
-
-def _view_precision(sigmas: Array) -> Array:
-    """Return the prior's precision (7, 7) of a view's unknowns."""
-    return np.diag(1.0 / np.square(np.repeat(np.maximum(sigmas, LEAST_SIGMA), KINDS)))
-
-
 def _apart(
     system: System, blocks: Sequence[Blocks], task: _Task, state: State, sigmas: Array
 ) -> Array:
@@ -369,16 +347,19 @@ def _apart(
     1982), each solved from the same equations.
     """
     A, a = without_views(system)
-    W = _view_precision(sigmas)
+    W = view_precisions(task.views, sigmas, task.config)
     largest = np.zeros_like(A)
-    for order in _orders(task.claimed):
+    # Cameras that stand still are no neighbours of any, and each has its own prior.
+    hand = np.flatnonzero(task.hand)
+    for order in (hand[o] for o in _orders(task.claimed[hand])):
         found = []
         for g in np.array_split(order, min(GROUPS, len(order))):
             part = assemble(
-                [replace(b, H=b.H[g], b=b.b[g], Ms=b.Ms[g]) for b in blocks], len(a), OF_VIEW
-            )
-            part.D[:] += W
-            part.d[:] -= state.views[g] @ W
+                [replace(b, H=b.H[g], b=b.b[g], Ms=b.Ms[g], common=None) for b in blocks],
+                len(a), W.shape[1],
+            )  # fmt: skip
+            part.D[:] += W[g]
+            part.d[:] -= np.einsum("vi,vij->vj", state.views[g], W[g])
             A_g, a_g = without_views(part)
             found.append(inverse(A - A_g) @ (a - a_g))
         off = np.array(found) - np.mean(found, axis=0)
@@ -397,31 +378,13 @@ def _smooth_share(task: _Task, state: State, sigmas: Array) -> float:
     An arm's errors are mostly smooth. What all views have of them moves the scene as a whole, which
     no view contradicts; how much that may be shows in neighbours, which are alike.
     """
-    at = task.claimed[:, :3, 3]
+    at = task.claimed[task.hand, :3, 3]
     gaps = np.linalg.norm(at[:, None] - at[None], axis=-1)
     np.fill_diagonal(gaps, np.inf)
-    x = state.views[:, :6] / np.repeat(sigmas[:2], 3)
+    x = state.views[task.hand, :6] / np.repeat(sigmas[:2], 3)
     return float(np.clip(np.sum(x * x[gaps.argmin(axis=1)]) / max(np.sum(x * x), 1e-12), 0.0, 1.0))
 
 
 def _orders(cameras: Array) -> tuple[Int64, Int64]:
     """Return the views (V,) by how high they look down, and by when they were taken."""
     return np.argsort(-cameras[:, 2, 2]), np.arange(len(cameras))
-
-
-def _learn_sigmas(system: System, state: State, config: RefineConfig, sigmas: Array) -> Array:
-    """Return the 1-sigma of the views' turns and shifts [rad, m]: one step of EM."""
-    p = config.prior
-    if not p.learn_views or len(state.views) < p.learn_from:
-        return sigmas
-    C = covariances(system).views
-    spread = np.square(state.views) + np.diagonal(C, axis1=1, axis2=2)
-    found = np.sqrt([part.mean() for part in np.split(spread, np.cumsum(KINDS)[:-1], axis=1)])
-    said = _said_sigmas(config)
-    return np.clip(found, p.learn_factor[0] * said, p.learn_factor[1] * said)
-
-
-def _said_sigmas(config: RefineConfig) -> Array:
-    """Return the 1-sigma of a view's turn [rad], shift [m] and offset [1/m] before it is learnt."""
-    p = config.prior
-    return np.array([np.radians(p.view_deg), p.view_mm / 1e3, p.view_offset_per_m])

@@ -74,7 +74,10 @@ def common_and_own(refined: Refined, bodies: Sequence[Body]) -> tuple[Array, Arr
 def seen_poses(
     refined: Refined, bodies: Sequence[Body], intrinsics: CameraIntrinsics
 ) -> list[list[SeenPose]]:
-    """Return for every object its pose in every view, cameras' uncertainty included."""
+    """Return for every object its pose in every view, cameras' uncertainty included.
+
+    Of a camera that stands still the pixels are counted as if it were the one in the hand.
+    """
     return [_seen(refined, body, k, intrinsics) for k, body in enumerate(bodies)]
 
 
@@ -86,7 +89,9 @@ def _seen(refined: Refined, body: Body, k: int, intrinsics: CameraIntrinsics) ->
     Ms = se3.invert(T_centre) @ refined.cameras
     Ad = se3.adjoint(Ms)
     # Columns: object, hand-eye, view. The twist of T_cam_obj is xi_o - Ad(M) (hand-eye + view).
-    J = np.concatenate([np.tile(np.eye(6), (len(Ms), 1, 1)), -Ad, -Ad], axis=2)
+    common = refined.state.common
+    hand = -Ad if common is None else -common[:, None, None] * Ad
+    J = np.concatenate([np.tile(np.eye(6), (len(Ms), 1, 1)), hand, -Ad], axis=2)
     joint = np.empty((len(Ms), 18, 18))
     joint[:, :12, :12] = C.shared[np.ix_(picked, picked)]
     joint[:, :12, 12:] = C.cross[:, picked, :6]
