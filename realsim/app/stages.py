@@ -15,6 +15,7 @@ from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim.records import ObjectModel, ObjectPose, Scene
 from realsim.store import SessionStore
+from realsim.store.cameras import session_of_camera
 from realsim.store.opening import require_header
 
 BOARD_VIEWS = "calibration/capture"
@@ -33,6 +34,11 @@ def open_session(folder: Path) -> SessionStore:
             "expected. `realsim demo` makes one in demo/session."
         )
     require_header(folder)
+    if (session := session_of_camera(folder)) is not None:
+        raise InputError(
+            f"'{folder}' is a further camera of the session '{session}', not a session of its own: "
+            f"give '{session}', which takes all of its cameras along."
+        )
     if not (folder / "session.json").is_file():
         inner = sorted(p.parent.name for p in folder.glob("*/session.json"))
         hint = f" Did you mean {', '.join(str(folder / n) for n in inner)}?" if inner else ""

@@ -46,9 +46,11 @@ class SessionScene:
         views: Mapping[int, int],
         notes: tuple[str, ...],
         is_annotated: bool,
+        seen_by: tuple[str, SessionStore],
     ) -> None:
         """Take over a session; see `open_session_scene`."""
         self.store = store
+        self._camera, self._images = seen_by
         self._number, self._split, self._notes = number, split, notes
         self._imported, self._views = imported, dict(views)
         self._is_annotated = is_annotated
@@ -56,8 +58,9 @@ class SessionScene:
 
     @property
     def name(self) -> str:
-        """The session's folder."""
-        return self.store.folder.resolve().name
+        """The session's folder, and the camera where it is a further one."""
+        own = self.store.folder.resolve().name
+        return own if self._images is self.store else f"{own}-{self._camera}"
 
     @property
     def number(self) -> int:
@@ -71,8 +74,8 @@ class SessionScene:
 
     @property
     def camera(self) -> str:
-        """Return the camera's name in the data set it was imported from; '' of a capture."""
-        return "" if self._imported is None else self._imported.camera
+        """Return the camera's name, here or in the data set it was imported from; '' = none."""
+        return self._camera or ("" if self._imported is None else self._imported.camera)
 
     @property
     def indices(self) -> tuple[int, ...]:
@@ -103,7 +106,7 @@ class SessionScene:
     def _view(self, index: int) -> int:
         if index not in self._views:
             raise InputError(
-                f"image {index} is not in {self.store.folder}; it has "
+                f"image {index} is not in {self._images.folder}; it has "
                 f"{', '.join(map(str, self.indices[:12]))}."
             )
         return self._views[index]
@@ -115,9 +118,9 @@ class SessionScene:
             InputError: there is no such image, or its labels are damaged.
         """
         number = self._view(index)
-        session = self.store.session
+        session = self._images.session
         view = session.view(number)
-        unit_m = session.depth_unit_m if self.store.has_depth(number) else None
+        unit_m = session.depth_unit_m if self._images.has_depth(number) else None
         entry: Mapping[str, Any] | None = None
         objects: tuple[LabelledObject, ...] = ()
         if self._is_annotated:
@@ -139,7 +142,7 @@ class SessionScene:
         )  # fmt: skip
 
     def _annotated(self, view: int) -> tuple[LabelledObject, ...]:
-        part = self.store.read_json(f"annotations/{view:06d}.json")
+        part = self._images.read_json(f"annotations/{view:06d}.json")
         try:
             return tuple(
                 LabelledObject(
@@ -152,23 +155,23 @@ class SessionScene:
             )  # fmt: skip
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
-                f"annotations/{view:06d}.json of {self.store.folder} is damaged ({error!r}); run "
+                f"annotations/{view:06d}.json of {self._images.folder} is damaged ({error!r}); run "
                 "`realsim annotate` again."
             ) from error
 
     def colour_file(self, index: int) -> Path:
         """Return the file of the colour image."""
-        return self.store.folder / rgb_path(self._view(index))
+        return self._images.folder / rgb_path(self._view(index))
 
     def depth_file(self, index: int) -> Path | None:
         """Return the file of the 16-bit depth image; None = there is none."""
         view = self._view(index)
-        return self.store.folder / depth_path(view) if self.store.has_depth(view) else None
+        return self._images.folder / depth_path(view) if self._images.has_depth(view) else None
 
     def mask(self, index: int, k: int, *, visible: bool) -> Mask | None:
         """Return the mask (H, W) of a frame's k-th object; None = there is none."""
         if self._is_annotated:
-            path = self.store.folder / mask_path(self._view(index), k, visible=visible)
+            path = self._images.folder / mask_path(self._view(index), k, visible=visible)
         elif self._imported is not None:
             path = self._imported.mask_file(index, k, visible=visible)
         else:
@@ -204,9 +207,15 @@ class SessionScene:
 
 
 def open_session_scene(
-    store: SessionStore, *, labels: Labels = "auto", number: int | None = None, split: str = ""
+    store: SessionStore,
+    *,
+    labels: Labels = "auto",
+    number: int | None = None,
+    split: str = "",
+    camera: str = "",
+    seen_by: SessionStore | None = None,
 ) -> SessionScene:
-    """Return a session as a labelled scene.
+    """Return a session as a labelled scene, as one of its cameras saw it.
 
     Args:
         store: the session.
@@ -215,13 +224,17 @@ def open_session_scene(
             latter; 'none' = images and cameras only.
         number: of the scene; None = that of its data set, or of its folder, or 0.
         split: of the scene; '' = that of its data set, or 'train'.
+        camera: what the camera is called; '' = the session has one.
+        seen_by: a further camera (`store.cameras`) whose images are taken; None = the session's
+            own.
 
     Raises:
         InputError: the labels that were asked for are not there, or are damaged.
     """
-    views = [v.index for v in store.session.views]
-    imported = load_imported(store)
-    annotated = [i for i in views if store.has(f"annotations/{i:06d}.json")]
+    images_of = seen_by or store
+    views = [v.index for v in images_of.session.views]
+    imported = load_imported(store) if seen_by is None else None
+    annotated = [i for i in views if images_of.has(f"annotations/{i:06d}.json")]
     chosen = labels
     if labels == "auto":
         chosen = "annotated" if annotated else "imported" if imported is not None else "none"
@@ -255,6 +268,7 @@ def open_session_scene(
         views={numbers.get(i, i): i for i in taken},
         notes=tuple(notes),
         is_annotated=chosen == "annotated",
+        seen_by=(camera, images_of),
     )
 
 

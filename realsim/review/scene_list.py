@@ -15,7 +15,17 @@ VERDICT_ORDER = ("rejected", "doubtful", "unchecked", "accepted")
 """Worst first."""
 DEEPEST = 4
 """How far below a given folder sessions are looked for: BOP's ROOT/SPLIT/SCENE, and one more."""
-INNER = ("calibration", "rgb", "depth", "models", "registration", "grasps", "labels", "annotations")
+INNER = (
+    "calibration",
+    "cameras",
+    "rgb",
+    "depth",
+    "models",
+    "registration",
+    "grasps",
+    "labels",
+    "annotations",
+)
 """Folders of a session that hold no session to be reviewed."""
 Which = Literal["all", "undecided", "decided"]
 

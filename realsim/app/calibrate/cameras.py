@@ -1,8 +1,9 @@
 """`realsim calibrate --cameras`: several cameras at once, from a folder of each or a session.
 
 Images of the same instant have the same name, or the same number in it, in every camera's folder;
-one file of poses says where the arm was. In a session the camera in the hand has `rgb/`, every
-other one `rgb_NAME/`, with the numbers of the views.
+one file of poses says where the arm was. In a session the camera in the hand is the board views
+themselves, every other one `cameras/NAME` inside them (or just its images, `rgb_NAME/`), with the
+numbers of the views. The session's own `cameras/NAME` are then placed.
 """
 
 from collections.abc import Sequence
@@ -30,6 +31,7 @@ from realsim.app.stages import BOARD_VIEWS
 from realsim.errors import InputError, RealsimError
 from realsim.store import SessionStore
 from realsim.store.atomic import write_bytes, write_text
+from realsim.store.cameras import camera_folders, open_cameras
 from realsim_calibration import calibrate_intrinsics, estimate_board_pose, prove_reading
 from realsim_calibration.cameras.calibrate import calibrate_cameras
 from realsim_calibration.cameras.files import document, write_cameras
@@ -111,16 +113,20 @@ def _run_session(
         raise InputError(f"'{source}' has no {BOARD_FILE}: give --board or --held-board.")
     views = store.session.views
     images: dict[str, dict[int, Path]] = {}
+    inner = open_cameras(store)
     for camera in cameras:
-        name = "rgb" if camera.mount == "hand" else f"rgb_{camera.name}"
-        found = {p.stem: p for p in list_images(store.folder / name).images}
+        place = store.folder / ("rgb" if camera.mount == "hand" else f"rgb_{camera.name}")
+        if camera.mount == "fixed" and camera.name in inner:
+            place = inner[camera.name].folder / "rgb"
+        found = {p.stem: p for p in list_images(place).images}
         images[camera.name] = {
             i: found[f"{v.index:06d}"] for i, v in enumerate(views) if f"{v.index:06d}" in found
         }
     frames = Frames(instants=tuple(f"{v.index:06d}" for v in views), images=images, rows={})
+    lenses = {name: s.session.intrinsics for name, s in inner.items()}
+    lenses |= {c.name: store.session.intrinsics for c in cameras if c.mount == "hand"}
     known = tuple(
-        replace(c, intrinsics0=store.session.intrinsics) if c.mount == "hand" else c
-        for c in cameras
+        replace(c, intrinsics0=lenses[c.name]) if c.name in lenses else c for c in cameras
     )
     known = with_intrinsics(known, options["camera"])
     rig = Rig(
@@ -132,7 +138,23 @@ def _run_session(
     )  # fmt: skip
     _require_seen(rig, frames)
     report = _calibrated(rig, options["arm"], console)
-    return _told(report, write_files(report, folder / "cameras"), console)
+    files = write_files(report, folder / "cameras")
+    _place(source, report, console)
+    return _told(report, files, console)
+
+
+def _place(source: Path, report: CamerasReport, console: Console) -> None:
+    """Give the session's own fixed cameras the lens and the place that were found."""
+    from realsim.app.register.results import keep_refined
+
+    there = camera_folders(source)
+    for camera, own in zip(report.rig.cameras, report.cameras, strict=True):
+        if camera.mount == "hand" or camera.name not in there:
+            continue
+        store = SessionStore.open(there[camera.name])
+        claimed = {v.index: own.X for v in store.session.views}
+        store.set_cameras(own.intrinsics, keep_refined(store, claimed))
+        console.say(f"camera {camera.name} of the session is placed ({len(claimed)} views).")
 
 
 # --- what is seen ---------------------------------------------------------------------------------

@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from realsim.app.export.request import ExportRequest
+from realsim.app.register.fixed import CALIBRATED
 from realsim.app.stages import BOARD_VIEWS
 from realsim.errors import InputError
 from realsim.formats.labelled_scene import LabelledScene
 from realsim.records import Scene
 from realsim.store import SessionStore
+from realsim.store.cameras import CAMERAS, camera_folders, session_of_camera
 from realsim.store.opening import require_header
 from realsim.store.session_store import SESSION_FILE
 
@@ -20,6 +22,8 @@ ACCEPTED = (
     "accepted are a session (session.json), a folder of sessions, a BOP data set "
     "(SPLIT/000001/scene_camera.json), a GraspNet data set (scenes/scene_0000/kinect)"
 )
+HAND = "wrist"
+"""Camera in the hand of a session whose calibration does not name it."""
 LICENCE_NAMES = ("LICENSE", "LICENCE", "COPYING")
 
 
@@ -38,6 +42,8 @@ class SourceScene:
     """Number of the scene in its source."""
     camera: str
     """'' = the source has one."""
+    is_further: bool = False
+    """Whether it is a further camera of a session: what is said of the scene is said there."""
     open: Callable[[], LabelledScene]
 
 
@@ -52,26 +58,30 @@ class SceneTrust:
     instances: int | None = None
 
 
-def source_scenes(request: ExportRequest) -> list[SourceScene]:
+def source_scenes(request: ExportRequest, *, all_cameras: bool = False) -> list[SourceScene]:
     """Return the scenes of all sources, in their order.
+
+    Args:
+        request: what was asked for.
+        all_cameras: whether further cameras of a session are scenes as well.
 
     Raises:
         InputError: a source that is none, has no scene, or not the scenes that were asked for.
     """
-    found = [s for source in request.sources for s in _scenes_of(source, request)]
+    found = [s for source in request.sources for s in _scenes_of(source, request, all_cameras)]
     if not found:
         given = ", ".join(f"'{s}'" for s in request.sources)
         raise InputError(f"there is no scene in {given}; {ACCEPTED}.")
     return found
 
 
-def _scenes_of(source: Path, request: ExportRequest) -> list[SourceScene]:
+def _scenes_of(source: Path, request: ExportRequest, all_cameras: bool) -> list[SourceScene]:
     if not source.is_dir():
         what = "a file" if source.is_file() else "not there"
         raise InputError(f"'{source}' is {what}; {ACCEPTED}.")
     sessions = session_folders(source)
     if sessions:
-        return _sessions(source, sessions, request)
+        return _sessions(source, sessions, request, all_cameras)
     if any(any(source.glob(f"{up}annotations/*.xml")) for up in ("", "*/", "*/*/", "*/*/*/")):
         return list(_graspnet(source, request))
     if any(any(source.glob(f"{up}scene_camera*.json")) for up in ("", "*/", "*/*/")):
@@ -87,38 +97,75 @@ def session_folders(source: Path) -> list[Path]:
         InputError: one of them has lost its header; what else is there would be taken for a scene.
     """
     require_header(source)
+    if (session := session_of_camera(source)) is not None:
+        raise InputError(f"'{source}' is a further camera of the session '{session}': give that.")
     if (source / SESSION_FILE).is_file():
         return [source]
     for below in ("*", "*/*"):
         folders = sorted(p for p in source.glob(below) if not p.name.startswith("."))
         for folder in folders:
             require_header(folder)
-        found = [p for p in folders if (p / SESSION_FILE).is_file() and not p.match(BOARD_VIEWS)]
+        found = [p for p in folders if (p / SESSION_FILE).is_file() and not _is_inner(p)]
         if found:
             return found
+    if left := camera_folders(source):
+        raise InputError(
+            f"'{source}' holds further cameras of a session ({', '.join(left)}), and the session's "
+            "own files are lost. Restore them from a copy; nothing was taken from the cameras."
+        )
     return []
 
 
-def _sessions(source: Path, folders: list[Path], request: ExportRequest) -> list[SourceScene]:
+def _is_inner(folder: Path) -> bool:
+    """Return whether a folder holds views of a board, or is a further camera."""
+    return folder.match(BOARD_VIEWS) or folder.parent.name == CAMERAS
+
+
+def _sessions(
+    source: Path, folders: list[Path], request: ExportRequest, all_cameras: bool
+) -> list[SourceScene]:
     from realsim.app.stages import open_session
     from realsim.formats.session_scene import open_session_scene
 
-    def opener(folder: Path) -> Callable[[], LabelledScene]:
+    def opener(folder: Path, camera: str, further: Path | None) -> Callable[[], LabelledScene]:
         return lambda: open_session_scene(
-            open_session(folder), labels=request.labels, split=request.split
-        )
+            open_session(folder), labels=request.labels, split=request.split, camera=camera,
+            seen_by=None if further is None else SessionStore.open(further),
+        )  # fmt: skip
 
     scenes: list[SourceScene] = []
     for folder in folders:
         number, camera = _place_of(folder)
-        scenes.append(
-            SourceScene(
-                name=folder.resolve().name, source=source, folder=folder, kind="session",
-                number=number, camera=camera, open=opener(folder),
-            )
-        )  # fmt: skip
+        cameras: dict[str, Path | None] = {camera: None}
+        further = camera_folders(folder) if all_cameras else {}
+        if further:
+            cameras = {_hand_name(folder): None, **further}
+            if request.camera and request.camera not in cameras:
+                raise InputError(
+                    f"'{folder}' has no camera '{request.camera}'; it has {', '.join(cameras)}."
+                )
+        for name, path in cameras.items():
+            if further and request.camera not in ("", name):
+                continue
+            own = folder.resolve().name
+            scenes.append(
+                SourceScene(
+                    name=own if path is None else f"{own}-{name}", source=source, folder=folder,
+                    kind="session", number=number, camera=name, is_further=path is not None,
+                    open=opener(folder, name if further else "", path),
+                )
+            )  # fmt: skip
     _require_scenes(source, request, [s.number for s in scenes])
     return [s for s in scenes if not request.scenes or s.number in request.scenes]
+
+
+def _hand_name(session: Path) -> str:
+    """Return what the camera in the hand is called beside others: as it was calibrated."""
+    from realsim_calibration.cameras.files import read_cameras
+
+    path = session / CALIBRATED
+    entries = read_cameras(path).cameras if path.is_file() else ()
+    return next((c.name for c in entries if c.mount == "hand"), HAND)
 
 
 def _place_of(folder: Path) -> tuple[int, str]:
@@ -203,7 +250,7 @@ def content_of(scenes: Sequence[SourceScene]) -> str:
 
 def trust_in(scene: SourceScene) -> SceneTrust:
     """Return what registration and review say of a scene; nothing of a data set."""
-    if scene.kind != "session":
+    if scene.kind != "session" or scene.is_further:
         return SceneTrust()
     from realsim.app.stages import judged_scene, open_session
 

@@ -44,6 +44,7 @@ from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import ObjectModel, Scene, bop_units
 from realsim.store import SessionStore, atomic
+from realsim.store.cameras import open_cameras
 from realsim.untrusted.own_json import to_json
 
 # --- to JSON ----------------------------------------------------------------------------------
@@ -201,7 +202,7 @@ def write_result(
     """Put a registration into its session; a kill leaves the old one or the new one.
 
     Args:
-        store: the session; its cameras become the refined ones.
+        store: the session; its cameras become the refined ones, those that stand still, too.
         result: what was found.
         models: obj_id -> model, for the names.
         pictures: path -> bytes of pictures and page.
@@ -214,6 +215,10 @@ def write_result(
     store.remove(STAGE_FILE)  # from here on the old result is not known to be whole
     store.write_bytes(NEXT_FILE, atomic.json_bytes(value, indent=None))
     finish_interrupted(store)
+    cameras = open_cameras(store) if result.fixed else {}
+    for name, change in result.fixed.items():
+        cameras[name].write_json(CAMERAS_FILE, _cameras_to_json(change))
+        cameras[name].set_cameras(cameras[name].session.intrinsics, change.session)
     for path, data in pictures.items():
         store.write_bytes(path, data)
 

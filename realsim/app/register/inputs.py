@@ -10,6 +10,7 @@ import numpy as np
 from realsim import __version__
 from realsim.app.register.config import RegisterRequest, config_of
 from realsim.app.register.files import write_claims
+from realsim.app.register.fixed import FixedInput, read_fixed
 from realsim.app.register.from_review import review_starts
 from realsim.app.register.results import claimed_cameras, load_cameras
 from realsim.app.reviewed import exclusion_words, review_of
@@ -52,6 +53,10 @@ class RegisterInputs:
     config: "RegistrationConfig"
     key: str
     """Hash of all of it."""
+    fixed: dict[str, FixedInput]
+    """Cameras that stand still, by name."""
+    fixed_out: tuple[str, ...]
+    """Why others take no part."""
 
     def frames(self, store: SessionStore) -> "list[DepthFrame]":
         """Return the frames; an image is read when it is asked for: 256 of them are a gigabyte."""
@@ -93,6 +98,7 @@ def read_inputs(
         _take(store, request, [w.obj_id for w in wanted])
         ids = {w.obj_id for w in wanted}
         available = {k: m for k, m in available.items() if k in ids}
+    fixed, fixed_out = read_fixed(store, request)
     config = config_of(store, request)
     constants = asdict(replace(config, field_folder=None, bias=DepthBias.none()))
     bias = config.bias
@@ -102,11 +108,11 @@ def read_inputs(
         _said(store, request),
         {str(k): claimed[k].tolist() for k in sorted(claimed)}, list(views),
         _image_hashes(store, views), str(store.session.intrinsics),
-        store.extra.get("gravity_up_world"),
+        store.extra.get("gravity_up_world"), *(f.key for f in fixed.values()),
     )  # fmt: skip
     return RegisterInputs(
         models=available, wanted=wanted, claimed=claimed, views=views, left_out=left_out,
-        config=config, key=key,
+        config=config, key=key, fixed=fixed, fixed_out=tuple(fixed_out),
     )  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """A registration as it lies in SESSION/registration, read again; see `register_files`."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -69,6 +69,9 @@ class Registered:
     not_placed: tuple[NotPlaced, ...]
     remarks: tuple[Remark, ...]
     report: Json
+    fixed: dict[str, CameraChange] = field(default_factory=dict[str, CameraChange])
+    """The cameras that stand still, by name; of a registration that is read again they are in their
+    own sessions (`store.cameras`)."""
 
     @property
     def is_usable(self) -> bool:

@@ -152,7 +152,7 @@ def _registered(
     with console.stage("register", f"{n}, {len(inputs.views)} views") as tick:
         found = register_scene(
             store.session.name, store.session.intrinsics, inputs.frames(store), inputs.models,
-            inputs.wanted, inputs.config,
+            inputs.wanted, inputs.config, fixed=[f.frames for f in inputs.fixed.values()],
             gravity_up_world=None if up is None else np.array(up), progress=tick,
             told=console.doing,
         )  # fmt: skip
@@ -179,12 +179,14 @@ def as_registered(
     """Return what a registration found with what was asked of it."""
     seen = found.seen or seen_at_their_word(found, inputs.models, intrinsics)
     remarks = [Remark(view=k, kind="left_out", words=why) for k, why in inputs.left_out]
+    remarks += [Remark(view=None, kind="left_out", words=why) for why in inputs.fixed_out]
     remarks += [remark_of(f) for f in found.findings]
     asked = {
         "method": request.method,
         "cameras_refined": bool(found.seen),
         "hand_held": request.hand_held,
         "views": list(inputs.views),
+        "fixed_cameras": list(inputs.fixed),
         "depth_bias_taken_out": {
             "scale": inputs.config.bias.scale,
             "offset_per_m": inputs.config.bias.offset_per_m,
@@ -195,6 +197,7 @@ def as_registered(
         cameras=CameraChange(claimed=dict(inputs.claimed), refined=dict(found.cameras)),
         seen={k: dict(poses) for k, poses in seen.items()}, not_placed=found.not_placed,
         remarks=tuple(remarks), report={"asked": asked} | dict(found.report),
+        fixed={name: inputs.fixed[name].change(T) for name, T in found.fixed_cameras.items()},
     )  # fmt: skip
 
 

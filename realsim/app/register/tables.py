@@ -135,6 +135,8 @@ def camera_line(result: Registered) -> str:
         f"cameras moved by {together} together (hand-eye), {mm:.2f} mm / {deg:.2f} deg each "
         f"(median of {n} views)."
     )
+    for name, still in found.get("fixed_cameras", {}).items():
+        line += f" {name}, which stands still, by {still['shift_mm']:.2f} mm."
     if "common_sigma_mm" in found:
         line += (
             f" All objects may be off together by {found['common_sigma_mm']:.2f} mm / "
