@@ -15,6 +15,7 @@ from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession, TagBoard, View
 from realsim.store import SessionStore
 from realsim.store.atomic import write_json
+from realsim.store.cameras import camera_folder
 from realsim_calibration.cameras.files import read_cameras
 from realsim_calibration.exports.calibration_file import read_calibration
 from realsim_calibration.inputs import load_image
@@ -226,7 +227,7 @@ def test_images_without_partners_are_left_out(photos: Path, tmp_path: Path) -> N
 
 
 def test_board_views_of_a_session(photos: Path, tmp_path: Path) -> None:
-    """The camera in the hand has rgb/, the others rgb_NAME/ beside it."""
+    """Fixed cameras are sessions in cameras/NAME, or just images in rgb_NAME/."""
     rng = np.random.default_rng(3)
     views = tuple(View(index=k, T_base_ee=T) for k, T in enumerate(hands(rng)))
     capture = tmp_path / "session/calibration/capture"
@@ -237,10 +238,15 @@ def test_board_views_of_a_session(photos: Path, tmp_path: Path) -> None:
         rgb = load_image(photos / f"wrist/{view.index:03d}.png")
         store.add_view(view, rgb, depth)
     store.close()
-    for name in FIXED:
-        (capture / f"rgb_{name}").mkdir()
-        for k in range(VIEWS):
-            shutil.copy(photos / name / f"{k:03d}.png", capture / f"rgb_{name}" / f"{k:06d}.png")
+    (capture / "rgb_right").mkdir()
+    left = SessionStore.create(camera_folder(capture, "left"), session)
+    for k in range(VIEWS):
+        left.add_view(View(index=k), load_image(photos / f"left/{k:03d}.png"))
+        shutil.copy(photos / f"right/{k:03d}.png", capture / f"rgb_right/{k:06d}.png")
+    # The session's own camera, which looks at the objects: not yet placed.
+    own = SessionStore.create(camera_folder(tmp_path / "session", "left"), session)
+    for k in range(2):
+        own.add_view(View(index=k), load_image(photos / "left/000.png"), depth)
     write_json(tmp_path / "session/calibration/board.json", target_to_json(TABLE))
     held = str(photos.parent / "held.json")
     result = CliRunner().invoke(
@@ -252,3 +258,8 @@ def test_board_views_of_a_session(photos: Path, tmp_path: Path) -> None:
     found = read_cameras(tmp_path / "session/calibration/cameras/cameras.json")
     off = se3.invert(FIXED["left"]) @ found.camera("left").T
     assert np.linalg.norm(off[:3, 3]) < 4e-3
+    placed = SessionStore.open(own.folder).session
+    assert placed.intrinsics.fx == found.camera("left").intrinsics.fx != CAMERA.fx
+    for view in placed.views:
+        assert view.T_world_cam is not None
+        np.testing.assert_allclose(view.T_world_cam, found.camera("left").T, atol=1e-9)
