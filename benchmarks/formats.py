@@ -18,7 +18,7 @@ Parts and the figures they give (keys of the JSON's "figures"):
            resume_s, graspnet_resume_s    going on with an export that is all there
   trips    bop_round_trip_diff, graspnet_round_trip_diff    numbers and images that differ after
                                 the way through a session; graspnet_meta_diff: in meta files
-           bop_graspnet_mm, bop_graspnet_deg    BOP -> GraspNet -> BOP by four decimals, the worst
+           bop_graspnet_mm, bop_graspnet_deg    BOP -> GraspNet -> BOP by the XML, the worst
            FORMAT_mm, FORMAT_deg    grasps written and read: acronym, graspgen, isaac, graspgroup
 
 Real frames are measured too where REALSIM_DATA is.

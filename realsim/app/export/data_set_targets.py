@@ -1,5 +1,7 @@
 """Data sets and cameras that `realsim export` writes."""
 
+from collections.abc import Sequence
+
 from realsim.app.export.target import (
     IMAGES,
     METRES,
@@ -28,11 +30,12 @@ def _bop(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenSc
     return write_bop_scene(scene, folder, config, progress=job.tick)
 
 
-def _bop_root(folder: ExportFolder, job: RootJob) -> None:
+def _bop_root(folder: ExportFolder, job: RootJob) -> Sequence[str]:
     from realsim.formats.bop.root_files import write_bop_models, write_bop_root
 
     write_bop_models(job.models, folder, infos=job.infos)
     write_bop_root(folder, name=job.request.name or folder.folder.resolve().name)
+    return ()
 
 
 def _graspnet(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
@@ -49,10 +52,12 @@ def _graspnet(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> Writ
     return write_graspnet_scene(scene, folder, config, progress=job.tick)
 
 
-def _graspnet_root(folder: ExportFolder, job: RootJob) -> None:
+def _graspnet_root(folder: ExportFolder, job: RootJob) -> Sequence[str]:
+    from realsim.formats.graspnet.tried_labels import write_tried_labels
     from realsim.formats.graspnet.writing import write_graspnet_models
 
     write_graspnet_models(job.models, folder)
+    return write_tried_labels(folder, ((n, again().grasps()) for n, again in job.scenes))
 
 
 def _colmap(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
@@ -96,6 +101,7 @@ DATA_SETS: dict[str, Target] = {
         write_scene=_bop,
         write_root=_bop_root,
         is_pinhole=True,
+        holds_cameras=True,
         no_place=(TABLE, TRIED),
         options=(
             "labels",
@@ -112,14 +118,21 @@ DATA_SETS: dict[str, Target] = {
     "graspnet": Target(
         name="GraspNet-1Billion",
         kind="dataset",
-        help="GraspNet's tree: annotations, camera poses, meta, labels, models",
+        help="GraspNet's tree: annotations, camera poses, meta, labels, models, grasps",
         conventions=(
             ("units", "metres; depth png in millimetres (factor_depth 1000)"),
             OPENCV,
             ("camera_poses.npy", "camera i -> camera 0: p_0 = camera_poses[i] @ p_i"),
             ("cam0_wrt_table.npy", "camera 0 -> table, z up"),
-            ("pos_in_world, ori_in_world", "object -> THIS image's camera; wxyz; four decimals"),
+            ("pos_in_world, ori_in_world", "object -> THIS image's camera; wxyz; nine decimals"),
             ("objects", "numbered from 0: realsim's and BOP's id - 1; label images hold the id"),
+            (
+                "grasp_label",
+                "of every object what held: point, view, turn, depth, opening; score = "
+                "friction, lower is better, -1 = failed or not tried",
+            ),
+            ("collision_label", "False = held in this very scene; True = not tried here"),
+            ("rect", "the grasps along the camera's axis; score 1.1 - friction"),
         ),
         loading=(
             "import numpy as np\n"
@@ -128,7 +141,7 @@ DATA_SETS: dict[str, Target] = {
         write_scene=_graspnet,
         write_root=_graspnet_root,
         is_pinhole=True,
-        no_place=(TRIED,),
+        holds_grasps=True,
         options=(
             "labels",
             "camera",

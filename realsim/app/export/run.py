@@ -27,6 +27,7 @@ from realsim.formats.grasps.scene_grasps import executed
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene
 from realsim.formats.session_scene import SessionScene
 from realsim.records import ObjectModel
+from realsim.store.cameras import camera_folders
 from realsim.store.lock import only_run_in
 
 ALWAYS = ("sources", "target", "scenes", "name", "licence", "models_licence", "attribution")
@@ -59,13 +60,13 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
             something else, or two scenes would have one name.
     """
     target = target_of(request)
-    scenes = source_scenes(request)
+    scenes = source_scenes(request, all_cameras=target.holds_cameras)
     _require_outside(request, out)
+    _tell_left_out(scenes, target, console)
     places = scene_places(scenes, target)
     if request.labels in ("auto", "annotated"):
-        for source in scenes:
-            if source.kind == "session":
-                refresh_labels(open_session(source.folder), console)
+        for folder in dict.fromkeys(s.folder for s in scenes if s.kind == "session"):
+            refresh_labels(open_session(folder), console)
     asked = request.asked() | {CONTENT: content_of(scenes)}
     if ExportFolder.is_finished(out, asked):
         return ExportResult(folder=out, card=out / CARD_FILE, scenes=(), was_finished=True)
@@ -90,12 +91,20 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
             raise
         if target.write_root is not None:
             with console.stage("models and root"):
-                target.write_root(folder, RootJob(request=request, models=models, infos=infos))
+                again = [(p.number, s.open) for s, p in zip(scenes, places, strict=True)]
+                job = RootJob(request=request, models=models, infos=infos, scenes=again)
+                told = target.write_root(folder, job)
+                facts[-1] = _with_notes(facts[-1], told)
         licences = licence_files(request.sources)
         folder.write_piece("licences", licences)
         card = _card(request, out, target, facts, models, licences)
         folder.finish({CARD_FILE: card_bytes(card)})
     return ExportResult(folder=out, card=out / CARD_FILE, scenes=tuple(f.written for f in facts))
+
+
+def _with_notes(facts: SceneFacts, told: Sequence[str]) -> SceneFacts:
+    written = replace(facts.written, notes=(*facts.written.notes, *told))
+    return replace(facts, written=written)
 
 
 def target_of(request: ExportRequest) -> Target:
@@ -134,7 +143,8 @@ def scene_places(scenes: Sequence[SourceScene], target: Target) -> list[ScenePla
         own = [(s.number, s.camera) for s in scenes]
         numbers = [s.number for s in scenes]
         if len(set(own)) < len(own):  # sources that count alike are counted anew
-            numbers = list(range(len(scenes)))
+            folders = list(dict.fromkeys(s.folder for s in scenes))
+            numbers = [folders.index(s.folder) for s in scenes]
         shared = len(set(numbers)) < len(numbers)
         return [
             ScenePlace(number=n, name=f"{n:06d}", camera=s.camera if shared else "")
@@ -147,6 +157,17 @@ def scene_places(scenes: Sequence[SourceScene], target: Target) -> list[ScenePla
             f"two scenes are called '{twice[0]}' and would be one folder; export them one by one."
         )
     return [ScenePlace(number=k, name=n, camera="") for k, n in enumerate(names)]
+
+
+def _tell_left_out(scenes: Sequence[SourceScene], target: Target, console: Console) -> None:
+    """Tell which cameras the format has no place for."""
+    folders = [] if target.holds_cameras else [s.folder for s in scenes if s.kind == "session"]
+    left = sorted({name for folder in folders for name in camera_folders(folder)})
+    if left:
+        console.warn(
+            f"{target.name} gets what the camera in the hand saw; {', '.join(left)} stay out "
+            "(--to bop takes all cameras)."
+        )
 
 
 def _require_outside(request: ExportRequest, out: Path) -> None:

@@ -45,9 +45,12 @@ class RootJob:
     """Models of all scenes, by object id."""
     infos: Mapping[int, Mapping[str, Any]]
     """BOP's own rows of models_info.json, where the sources have them."""
+    scenes: Sequence[tuple[int, Callable[[], LabelledScene]]] = ()
+    """Number of each scene in the export, and what opens it again."""
 
 
-WriteRoot = Callable[[ExportFolder, RootJob], None]
+WriteRoot = Callable[[ExportFolder, RootJob], Sequence[str]]
+"""Returns what a person should know."""
 Conventions = Sequence[tuple[str, str]]
 
 
@@ -70,6 +73,8 @@ class Target:
     """What the format has no place for, of THINGS: it is told where a scene has it."""
     holds_grasps: bool = False
     """Whether grasps tried by physics go along."""
+    holds_cameras: bool = False
+    """Whether a scene may be there as several cameras saw it."""
     options: tuple[str, ...] = ()
     """Fields of the request that say something of this format; others are refused."""
 

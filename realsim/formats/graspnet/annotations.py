@@ -4,11 +4,10 @@
     <ori_in_world>w x y z</ori_in_world></obj></scene>
 
 In spite of their names the two are the pose of the object in THIS image's camera: metres and a
-quaternion, four decimals each (xmlWriter of graspnetAPI). A written position is up to 0.09 mm off;
-of the quaternions with four decimals that are near, the one in the nearest direction is written.
+quaternion. graspnetAPI's own writer gives both four decimals, 0.09 mm; its reader takes any number
+of them, and nine are written here: nothing is lost.
 """
 
-import itertools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from realsim.records.checked_arrays import rigid
 from realsim.untrusted.xml_tree import read_xml
 
 ANNOTATIONS = "annotations"
-DECIMALS = 4
+DECIMALS = 9
 LARGEST_XML = 1_000_000
 """[bytes]: a scene of ten objects has 4 kB."""
 LARGEST_NUMBER = 99_999
@@ -37,7 +36,6 @@ FARTHEST_M = 10.0
 FIELDS = ("obj_id", "obj_name", "obj_path", "pos_in_world", "ori_in_world")
 """graspnetAPI reads them by their places, so they come first, in this order."""
 TAG = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*")
-NEIGHBOURS = np.array(list(itertools.product((-1, 0, 1), repeat=4)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -117,26 +115,8 @@ def _numbers(text: str, count: int, name: str) -> list[float]:
     return numbers
 
 
-def position_text(position: Array) -> str:
-    """Return a position (3,) [m] as the format has it."""
-    return " ".join(f"{x:.{DECIMALS}f}" for x in position)
-
-
-def quaternion_text(R: Array) -> str:
-    """Return the four decimals w x y z whose direction is nearest to a rotation (3, 3).
-
-    Readers make the quaternion unit again, so that only its direction counts. Searched are the
-    rounded numbers and those with each last digit one up or down; of equal directions the one with
-    the length nearest to 1 is taken.
-    """
-    q = se3.quaternion_wxyz(R)
-    scale = 10**DECIMALS
-    digits = np.rint(q * scale) + NEIGHBOURS
-    length = np.linalg.norm(digits, axis=1)
-    off = np.linalg.norm(digits / length[:, None] - q, axis=1)
-    # Equal directions differ by rounding errors only; no other two are so near to each other.
-    best = np.lexsort((np.abs(length - scale), np.round(off, 10)))[0]
-    return " ".join(f"{x / scale:.{DECIMALS}f}" for x in digits[best] + 0.0)
+def _text(numbers: Array) -> str:
+    return " ".join(f"{x:.{DECIMALS}f}" for x in numbers)
 
 
 def object_fields(number: int, T_cam_obj: Array) -> dict[str, str]:
@@ -145,8 +125,8 @@ def object_fields(number: int, T_cam_obj: Array) -> dict[str, str]:
         "obj_id": str(number),
         "obj_name": f"{number:03d}.ply",
         "obj_path": f"models/{number:03d}/nontextured.ply",
-        "pos_in_world": position_text(T_cam_obj[:3, 3]),
-        "ori_in_world": quaternion_text(T_cam_obj[:3, :3]),
+        "pos_in_world": _text(T_cam_obj[:3, 3]),
+        "ori_in_world": _text(se3.quaternion_wxyz(T_cam_obj[:3, :3])),
     }
 
 

@@ -12,11 +12,10 @@ from realsim import images
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.export_folder import Content
-from realsim.formats.graspnet.annotations import annotation_bytes, object_fields, pose_of
+from realsim.formats.graspnet.annotations import annotation_bytes, object_fields
 from realsim.formats.graspnet.labelled import ENTRY, FACTOR_DEPTH, GraspnetLabelledScene
 from realsim.formats.graspnet.meta import meta_bytes
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, LabelledScene
-from realsim.geometry import se3
 from realsim.images import png
 
 UNIT_M = 1.0 / FACTOR_DEPTH
@@ -29,10 +28,6 @@ MOST_IN_8_BIT = 255
 class Loss:
     """What the format could not keep of a frame."""
 
-    position_mm: float = 0.0
-    """Largest distance of a written position from the pose [mm]."""
-    rotation_deg: float = 0.0
-    """Largest angle of a written quaternion to the pose [deg]."""
     depth_mm: float = 0.0
     """Largest rounding of a depth pixel [mm]."""
     too_far_px: int = 0
@@ -80,12 +75,7 @@ def frame_files(
     }
     if with_label:
         files["label/.png"], shared, merged = _label(scene, frame, numbers)
-    off = [se3.invert(o.T_cam_obj) @ pose_of(f) for o, f in zip(objects, fields, strict=True)]
-    loss = Loss(
-        position_mm=max((1e3 * float(np.linalg.norm(T[:3, 3])) for T in off), default=0.0),
-        rotation_deg=max((float(np.degrees(se3.angle(T))) for T in off), default=0.0),
-        depth_mm=rounded_mm, too_far_px=too_far, shared_px=shared, merged=merged,
-    )  # fmt: skip
+    loss = Loss(depth_mm=rounded_mm, too_far_px=too_far, shared_px=shared, merged=merged)
     return files, loss
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.formats.graspnet.gripper_frame import HEIGHT_M, grasp_poses, graspnet_poses
-from realsim.formats.grasps.scene_grasps import measures_of_json, untried_set
+from realsim.formats.grasps.scene_grasps import executed, measures_of_json, untried_set
 from realsim.geometry import se3
 from realsim.records import GraspSet
 from realsim.records.checked_arrays import frozen
@@ -40,13 +40,15 @@ DEPTH_M = 0.02
 """Depth of grasps that bring none [m]; graspnetAPI's own for rectangles."""
 MOST_FRICTION = 1.1
 """Score and friction of a label add up to this."""
+GREATEST_LEVEL = 1.0
+"""Greatest friction of GraspNet's labels."""
 LONGEST_M = 0.5
 """Wider, higher or deeper grippers are in millimetres."""
 FARTHEST_M = 20.0
 """Likewise grasps that are farther from the camera."""
 ROTATION_TOLERANCE = 1e-3
 """How far R^T R may be from the identity: single precision, of networks' own products."""
-Scores = Literal["school", "friction"]
+Scores = Literal["school", "friction", "tried"]
 OWN = ("instance", "row", "score", "base_score", "width_m")
 """Columns of the file beside a group, besides those of MEASURES."""
 
@@ -140,7 +142,8 @@ def grasp_group(
         sets: grasps of the objects.
         Ts_a_obj: (4, 4) of each object by instance [m]: in the view's camera, as a rule.
         scores: "school": p_hold, of sets without it the score, 0 to 1; "friction": 1.1 -
-            closure_friction, as graspnetAPI makes it of labels, of grasps that close below 1.1.
+            closure_friction, as graspnetAPI makes it of labels, of grasps that close below 1.1;
+            "tried": 1.1 - `held_friction`, of grasps that held.
         depth_m: of all grasps whose set's parameters have no depths_m.
 
     Raises:
@@ -165,10 +168,25 @@ def grasp_group(
     )
 
 
+def held_friction(grasps: GraspSet) -> Array:
+    """Return the friction (N,) of the grasps that held, as GraspNet's labels have one; NaN = none.
+
+    The least at which a sweep held, where there was one; else the least at which the contacts
+    close; else GraspNet's greatest level, for physics held what no pair of points closes.
+    """
+    friction = np.full(len(grasps), GREATEST_LEVEL)
+    for name in ("closure_friction", "least_friction"):
+        known = grasps.measures.get(name, np.full(len(grasps), np.nan))
+        friction = np.where((known > 0) & (known <= GREATEST_LEVEL), known, friction)
+    return np.where(grasps.good & executed(grasps), friction, np.nan)
+
+
 def _value(grasps: GraspSet, scores: Scores) -> Array:
     """Return what a group's score is made of (N,); NaN = left out."""
     if scores == "school":
         return grasps.labels
+    if scores == "tried":
+        return MOST_FRICTION - held_friction(grasps)
     friction = grasps.measures.get("closure_friction", np.full(len(grasps), np.nan))
     return np.where(friction < MOST_FRICTION, MOST_FRICTION - friction, np.nan)
 

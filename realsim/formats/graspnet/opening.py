@@ -149,7 +149,7 @@ def _count_meta(found: dict[int, ImageObjects], notes: list[str]) -> None:
     alone = sum(not f.has_annotation for f in found.values())
     if bare:
         notes.append(
-            f"{bare} of {len(found)} images looked at have no meta file: poses have the XML's four "
+            f"{bare} of {len(found)} images looked at have no meta file: poses have the XML's "
             f"decimals, and depth is taken as {FACTOR_DEPTH:g} counts per metre."
         )
     if alone:

@@ -97,8 +97,8 @@ def rect_grasps(group: GraspGroup, intrinsics: CameraIntrinsics) -> RectGrasps:
     )
 
 
-def write_rect(path: Path | str, grasps: RectGrasps) -> Path:
-    """Write rectangles in single precision, whole or not at all."""
+def rect_bytes(grasps: RectGrasps) -> bytes:
+    """Return rectangles as an npy file in single precision."""
     columns = (
         grasps.centers_px,
         grasps.open_px,
@@ -108,8 +108,13 @@ def write_rect(path: Path | str, grasps: RectGrasps) -> Path:
     )
     buffer = io.BytesIO()
     np.save(buffer, np.concatenate(columns, axis=1).astype(np.float32), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def write_rect(path: Path | str, grasps: RectGrasps) -> Path:
+    """Write rectangles, whole or not at all."""
     path = Path(path)
-    atomic.write_bytes(path, buffer.getvalue())
+    atomic.write_bytes(path, rect_bytes(grasps))
     return path
 
 

@@ -9,7 +9,7 @@ THIS image's camera, the quaternion w x y z (graspnetAPI's xmlhandler), so that
     T_table_obj = cam0_wrt_table @ camera_poses[i] @ T_cam_obj
 
 GraspNet's objects count from 0, realsim's ids are one more (as are the dataset's cls_indexes). The
-numbers have four decimals: 0.05 mm and 0.01 deg at best.
+data set's numbers have four decimals: 0.05 mm and 0.01 deg at best.
 """
 
 from dataclasses import dataclass

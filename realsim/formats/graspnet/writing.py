@@ -5,22 +5,28 @@
                              camK.npy, camera_poses.npy, cam0_wrt_table.npy
     models/000/{nontextured.ply, textured.obj, textured.mtl, texture_map.png}
 
-The annotations have four decimals: up to 0.09 mm and some thousandths of a degree, both measured
-and said. The poses of the meta files have seven digits; a reader that knows both loses nothing.
+Grasps that physics tried become labels (`tried_labels`), when all scenes are there, and rectangles.
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from realsim.errors import InputError
 from realsim.formats.export_folder import Content, ExportFolder
 from realsim.formats.graspnet.cameras import FIRST, MATRIX, POSES, npy_bytes
 from realsim.formats.graspnet.frame_files import Loss, frame_files
+from realsim.formats.graspnet.grasp_group import grasp_group
 from realsim.formats.graspnet.instances import OBJECT_LIST
 from realsim.formats.graspnet.label_copies import keeps_numbers, label_files, rect_file
 from realsim.formats.graspnet.labelled import GraspnetLabelledScene
 from realsim.formats.graspnet.models import model_files
+from realsim.formats.graspnet.rect import rect_bytes, rect_grasps
+from realsim.formats.graspnet.tried_labels import OBJECTS, told_of
 from realsim.formats.graspnet.write_plan import GraspnetWriteConfig, WritePlan, plan_scene
+from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene, WrittenScene
 from realsim.records import ObjectModel
 from realsim.store.atomic import json_bytes
@@ -53,7 +59,7 @@ def write_graspnet_scene(
             to find them by, a table), or has what it has no place for (distortion).
         StorageError: the disk is full.
     """
-    plan = plan_scene(scene, config)
+    plan, grasps = plan_scene(scene, config), scene.grasps()
     home = f"scenes/scene_{plan.number:04d}"
     camera = f"{home}/{config.camera}"
     _claim(folder, camera, scene.name)
@@ -62,7 +68,7 @@ def write_graspnet_scene(
     for new, index in enumerate(plan.indices):
         frame = scene.frame(index)
         objects += len(frame.objects)
-        written += _write_frame(scene, frame, folder, f"{camera}/{new:04d}", plan, config)
+        written += _write_frame(scene, frame, folder, f"{camera}/{new:04d}", plan, config, grasps)
         if progress is not None:
             progress()
     _write_cameras(scene, folder, camera, plan)
@@ -70,6 +76,7 @@ def write_graspnet_scene(
     labels = label_files(scene, plan)
     for relative, file in labels.items():
         folder.write_piece(relative, {relative: file})
+    held, told = (0, ()) if grasps is None else told_of(grasps)
     losses = [Loss(**row) for _, row in folder.rows(f"{camera}.losses")]
     return WrittenScene(
         name=scene.name,
@@ -77,13 +84,16 @@ def write_graspnet_scene(
         frames=len(plan.indices),
         frames_written=written,
         objects=objects,
-        notes=(*scene.notes, *plan.notes, *_loss_notes(losses), *_model_notes(plan, models)),
+        notes=(
+            *scene.notes, *plan.notes, *_loss_notes(losses), *_model_notes(plan, models), *told,
+        ),
         counts={
             "labels": 0 if config.without_labels else len(plan.indices),
             "models": len(models),
             "copied_labels": len(labels),
+            **({} if grasps is None else {"grasps": held}),
         },
-    )
+    )  # fmt: skip
 
 
 def _claim(folder: ExportFolder, camera: str, source: str) -> None:
@@ -103,7 +113,7 @@ def _claim(folder: ExportFolder, camera: str, source: str) -> None:
 
 def _write_frame(
     scene: LabelledScene, frame: LabelledFrame, folder: ExportFolder, piece: str,
-    plan: WritePlan, config: GraspnetWriteConfig,
+    plan: WritePlan, config: GraspnetWriteConfig, grasps: SceneGrasps | None,
 ) -> int:  # fmt: skip
     """Write the files of an image; return 1, or 0 if they were there."""
     if folder.has(piece):
@@ -116,11 +126,22 @@ def _write_frame(
     files: dict[str, Content] = {
         f"{camera}/{kind.replace('/', f'/{name}')}": content for kind, content in found.items()
     }
-    rect = rect_file(scene, frame.index, plan)
+    rect: Content | None = rect_file(scene, frame.index, plan)
+    if rect is None and grasps is not None:
+        rect = _rectangles(frame, grasps, plan)
     if rect is not None:
         files[f"{camera}/rect/{name}.npy"] = rect
     folder.write_piece(piece, files, {f"{camera}.losses": (name, loss.row())})
     return 1
+
+
+def _rectangles(frame: LabelledFrame, grasps: SceneGrasps, plan: WritePlan) -> bytes:
+    """Return the rectangles of the grasps that held, of those along the camera's axis."""
+    poses = {o.instance: o.T_cam_obj for o in frame.objects if o.instance is not None}
+    sets = [s for s in grasps.sets if s.instance in poses]
+    found = rect_grasps(grasp_group(sets, poses, scores="tried"), frame.intrinsics)
+    numbers = np.array([plan.numbers[i] for i in found.obj_ids.tolist()], dtype=np.int64)
+    return rect_bytes(replace(found, obj_ids=numbers + 1))
 
 
 def _order(scene: LabelledScene, frame: LabelledFrame, plan: WritePlan) -> list[int]:
@@ -163,6 +184,9 @@ def _write_object_list(folder: ExportFolder, home: str, plan: WritePlan) -> None
         InputError: the other camera's scene has other objects.
     """
     relative = f"{home}/{OBJECT_LIST}"
+    things = sorted(plan.places, key=lambda key: plan.places[key])
+    rows = [[plan.numbers[obj_id], instance] for obj_id, instance in things]
+    folder.write_piece(f"{home} objects", {}, {OBJECTS: (str(plan.number), rows)})
     text = "".join(f"{n}\n" for n in plan.order).encode("ascii")
     if folder.has(relative):
         there = (folder.folder / relative).read_bytes()
@@ -229,12 +253,7 @@ def _own_model_folders(scene: LabelledScene, numbers: Mapping[int, int]) -> dict
 
 
 def _loss_notes(losses: list[Loss]) -> list[str]:
-    notes = [
-        "the XML's four decimals move objects by up to "
-        f"{max((x.position_mm for x in losses), default=0.0):.3f} mm and turn them by up to "
-        f"{max((x.rotation_deg for x in losses), default=0.0):.4f} deg; the meta files have the "
-        "poses in single precision."
-    ]
+    notes: list[str] = []
     rounded = max((x.depth_mm for x in losses), default=0.0)
     if rounded > 0:
         notes.append(f"depth was rounded to GraspNet's millimetres: by up to {rounded:.2f} mm.")
