@@ -125,6 +125,8 @@ class CaptureJob:
     """Take only these; by default all."""
     retake: tuple[int, ...] = ()
     """Take these again although they are stored; what was there is moved aside."""
+    fixed: Sequence["tuple[DepthCamera, SessionStore]"] = ()
+    """Cameras that stand still, each with its own session: grabbed when a view is stored."""
     on_view: OnView | None = None
     """Called with every view stored."""
     progress: Callable[[int, int], None] | None = None
@@ -271,6 +273,7 @@ class Run:
         self._tell_warnings()
         aside = ""
         if self._store is not None:
+            self._keep_fixed(k)
             state, frame = shot.state, shot.frame
             view = View(
                 index=k, T_base_ee=state.T_base_ee, joints=state.joints, time_s=frame.time_s
@@ -291,6 +294,20 @@ class Run:
             self._operator.tell(f"view {k} taken again: {reason}", trouble=True)
         self._note(k, shot.notes)
         self._show(k, "stored", shot.checks)
+
+    def _keep_fixed(self, k: int) -> None:
+        """Store what the fixed cameras see: first, because the hand's view says that all is there.
+
+        Raises:
+            DeviceError: one of them gives no frame.
+        """
+        frames = [camera.grab() for camera, _ in self._job.fixed]
+        for (_, store), frame in zip(self._job.fixed, frames, strict=True):
+            view = View(index=k, time_s=frame.time_s)
+            if k in store.completed:  # taken again, or the run ended before the hand's view
+                replace_view(store, view, frame.rgb, frame.depth_m)
+            else:
+                store.add_view(view, frame.rgb, frame.depth_m)
 
     def _count(self, k: int) -> None:
         self._done.add(k)
@@ -405,5 +422,6 @@ class Run:
             return  # no device has stopped: a person has changed something
         if isinstance(error, ArmStoppedError) or self._camera is None:
             self._arm.recover()
-        else:
-            self._camera.recover()
+            return
+        for camera in (self._camera, *(fixed for fixed, _ in self._job.fixed)):
+            camera.recover()

@@ -28,6 +28,7 @@ from realsim.app.outputs import GOES_ON
 @click.option("--robot-host", default="", help="IP address of the arm's controller.")
 @click.option("--simulated", is_flag=True, help="The simulated lab instead of a robot.")
 @click.option("--camera", default=None, help="Serial number of the RealSense.  [the only one]")
+@click.option("--fixed-cameras", default="", help="Grabbed with each view: left=SERIAL,...")
 @click.option("--board", default="", help="Capture board views: target file, or one line.")
 @click.option("--dry-run", is_flag=True, help="Drive at a quarter of the speed, store nothing.")
 @click.option("--speed", type=float, default=None, help="Share of the plan's speed.  [1]")

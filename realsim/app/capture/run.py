@@ -12,6 +12,7 @@ import numpy as np
 
 from realsim.app.calibrate.board_views import BOARD_FILE
 from realsim.app.capture.devices import open_devices
+from realsim.app.capture.fixed import fixed_stores, open_fixed
 from realsim.app.console import Console
 from realsim.app.stages import BOARD_VIEWS, save_starts
 from realsim.arrays import UInt8
@@ -66,6 +67,8 @@ class CaptureRequest:
     """The simulated lab instead of devices."""
     camera: str | None = None
     """Serial number of the RealSense; None where one is connected."""
+    fixed_cameras: str = ""
+    """Cameras that stand still: left=SERIAL,right=SERIAL."""
     board: str = ""
     """Calibration target: its file or one line. The views are then the session's board views."""
     dry_run: bool = False
@@ -110,7 +113,9 @@ def run_capture(request: CaptureRequest, console: Console) -> bool:
             assert camera is not None  # only a rehearsal does without
             store = _session(request, plan, (arm, camera), target)
             stack.enter_context(only_run_in(store.folder))
-            work = (config, store, target, lab)
+            named = open_fixed(request.fixed_cameras, request.simulated, stack)
+            fixed = fixed_stores(store, named)
+            work = (config, store, target, lab, fixed)
             return _carry_out(request, plan, (arm, camera), work, console)
         except DeviceError as error:
             sys.stderr.write(f"trouble: {error}\n")
@@ -132,12 +137,18 @@ def _carry_out(
     request: CaptureRequest,
     plan: CapturePlan,
     devices: tuple[Arm, DepthCamera],
-    work: tuple[CaptureConfig, SessionStore, Target | None, "SimulatedLab | None"],
+    work: tuple[
+        CaptureConfig,
+        SessionStore,
+        Target | None,
+        "SimulatedLab | None",
+        "list[tuple[DepthCamera, SessionStore]]",
+    ],
     console: Console,
 ) -> bool:
     """Capture, and show what was captured however it ended."""
     arm, camera = devices
-    config, store, target, lab = work
+    config, store, target, lab, fixed = work
     intrinsics = camera.intrinsics
     size = (intrinsics.width, intrinsics.height)
     taken = Thumbnails(cell_size(len(plan), size, SheetConfig())[1:])
@@ -145,7 +156,7 @@ def _carry_out(
         with _operator(request, f"{request.out}   {arm.name}, {camera.name}", console) as operator:
             job = CaptureJob(
                 operator=operator, views=request.views or None, retake=request.retake,
-                on_view=taken.add, board_check=_board_check(target),
+                on_view=taken.add, board_check=_board_check(target), fixed=fixed,
             )  # fmt: skip
             summary = capture(plan, arm, camera, store, config=config, job=job)
         if lab is not None and target is None:
