@@ -140,6 +140,9 @@ class VirtualGrid:
     """Focal length of the nominal camera [px]; only the unit of the residuals depends on it."""
     robot_ratio: float = 1.0
     """lambda of the fit."""
+    z_to_camera: bool = False
+    """Whether the measured frame's z axis points out of the target, towards the camera: the grid's
+    points into it."""
 
     @property
     def target(self) -> Chessboard:
@@ -158,7 +161,8 @@ class VirtualGrid:
     @property
     def T_grid_board(self) -> Array:
         """(4, 4) the measured target frame, in the middle of the grid."""
-        return se3.from_rt(np.eye(3), [self.pitch_m, self.pitch_m, 0.0])
+        R = np.diag([1.0, -1.0, -1.0]) if self.z_to_camera else np.eye(3)
+        return se3.from_rt(R, [self.pitch_m, self.pitch_m, 0.0])
 
 
 def held_lens_and_board(ratio: float) -> JointConfig:
@@ -183,6 +187,7 @@ def calibrate_from_poses(
     config: HandEyeConfig | None = None,
     grid: VirtualGrid | None = None,
     arm: DhArm | None = None,
+    camera: CameraIntrinsics | None = None,
 ) -> HandEyeReport:
     """Return the hand-eye calibration from poses alone.
 
@@ -194,12 +199,13 @@ def calibrate_from_poses(
         config: as for images; its joint fit is replaced by one with lens and board held.
         grid: the virtual grid.
         arm: the arm's kinematics, used with the joints.
+        camera: the lens by which the target was measured: what the report and its files hold. None:
+            a nominal one, and the report says so.
 
     Raises:
         InputError: the stacks differ in length, or a pose puts the grid behind the camera.
         DegenerateError: the poses do not determine the hand-eye.
     """
-    grid = grid or VirtualGrid()
     A = np.asarray(Ts_base_ee, dtype=np.float64).reshape(-1, 4, 4)
     C = np.asarray(Ts_cam_board, dtype=np.float64).reshape(-1, 4, 4)
     C = measured_poses(C, [f"T_cam_board of view {k}" for k in range(len(C))])
@@ -208,11 +214,14 @@ def calibrate_from_poses(
             f"hand-eye: {len(A)} hand poses and {len(C)} camera poses were given; every view needs "
             "one of each."
         )
-    camera, target = grid.camera, grid.target
+    towards = np.einsum("ni,ni->n", C[:, :3, 2], C[:, :3, 3]) < 0
+    grid = replace(grid or VirtualGrid(), z_to_camera=bool(2 * towards.sum() > len(C)))
+    pinhole = grid.camera if camera is None else replace(camera, distortion=np.zeros(8))
+    target = grid.target
     q = None if joints is None else np.asarray(joints, dtype=np.float64)
     views: list[BoardView] = []
     for n, T in enumerate(C):
-        uv = project(camera, se3.transform(T @ se3.invert(grid.T_grid_board), target.points_board))
+        uv = project(pinhole, se3.transform(T @ se3.invert(grid.T_grid_board), target.points_board))
         name = labels[n] if labels is not None else ""
         if not np.all(np.isfinite(uv)):
             raise InputError(
@@ -222,10 +231,16 @@ def calibrate_from_poses(
         views.append(
             BoardView(
                 index=n, T_base_ee=A[n], name=name, joints=None if q is None else q[n],
-                detection=detection_of(target, uv, (camera.width, camera.height)),
+                detection=detection_of(target, uv, (pinhole.width, pinhole.height)),
             )
         )  # fmt: skip
     config = replace(config or HandEyeConfig(), joint=held_lens_and_board(grid.robot_ratio))
-    report = calibrate_hand_eye_report(views, target, camera, config, arm)
+    report = calibrate_hand_eye_report(views, target, pinhole, config, arm)
     to_board = grid.T_grid_board
-    return replace(report, Z=report.Z @ to_board, Z_alone=report.Z_alone @ to_board)
+    report = replace(
+        report, Z=report.Z @ to_board, Z_alone=report.Z_alone @ to_board, T_points_board=to_board,
+        nominal_lens=camera is None,
+    )  # fmt: skip
+    if camera is None:
+        return report
+    return replace(report, intrinsics=camera, intrinsics_alone=camera)

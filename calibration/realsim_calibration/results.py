@@ -7,6 +7,7 @@ import numpy as np
 
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
+from realsim.geometry import se3
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check, HandEye, RobotErrorMap, Target
 from realsim.records.calibration import worst_sigmas
 from realsim.records.checked_arrays import frozen
@@ -106,6 +107,29 @@ class Stretch:
     """RMS without a map [px]."""
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Clock:
+    """The offset between the clocks of arm and camera."""
+
+    offset_s: float
+    """A frame stamped t was taken at t - offset_s of the robot's clock [s]."""
+    sigma_s: Real
+    """Its 1-sigma [s]; NaN where it was given."""
+    applied: bool
+    """Whether the arm's poses follow it; False where it is too small to matter."""
+
+    @property
+    def sentence(self) -> str:
+        """The offset in words."""
+        sigma = f" +-{1e3 * self.sigma_s:.2f}" if np.isfinite(self.sigma_s) else ""
+        source = "found from the motion" if sigma else "as given"
+        follows = "the arm's poses follow it" if self.applied else "too small to matter, left out"
+        return (
+            f"The camera's clock is {1e3 * self.offset_s:+.2f}{sigma} ms ahead of the robot's "
+            f"({source}; {follows})."
+        )
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class HandEyeReport:
     """A hand-eye calibration with its diagnosis.
@@ -180,6 +204,14 @@ class HandEyeReport:
     roll_range_deg: float
     """Range of camera roll about the optical axis [deg]."""
     checks: tuple[Check, ...]
+    nominal_lens: bool = False
+    """Whether nobody knows the lens: of pose pairs without a camera, px are those of a nominal one.
+    """
+    T_points_board: Array | None = None
+    """(4, 4) the board's frame in that of the target's points [m], where they differ: poses without
+    images come with a frame of their own. None: one frame."""
+    clock: Clock | None = None
+    """How the clocks of arm and camera were brought together; None: they were not looked at."""
     information: Array
     """(29, 29) information about X (6), Z (6), the camera (12) and the board's shape (5: scale,
     aspect, warp) with the robot's map held: for the next best view. What X_covariance has beyond
@@ -190,7 +222,13 @@ class HandEyeReport:
         _freeze(self, X=(4, 4), Z=(4, 4), X_alone=(4, 4), Z_alone=(4, 4), X_covariance=(6, 6),
                 X_alone_covariance=(6, 6), intrinsics_covariance=(12, 12), joint_offsets=(None, 2),
                 X_here=(4, 4), X_here_covariance=(6, 6), X_alone_here_covariance=(6, 6),
-                information=(None, None))  # fmt: skip
+                T_points_board=(4, 4), information=(None, None))  # fmt: skip
+
+    @property
+    def Z_points(self) -> Array:
+        """(4, 4) the frame of the target's points in base or hand [m]."""
+        known = self.T_points_board
+        return self.Z if known is None else self.Z @ se3.invert(known)
 
     @property
     def floor_px(self) -> float:

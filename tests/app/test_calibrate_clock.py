@@ -22,6 +22,7 @@ from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics, Chessboard
 from realsim_calibration import BoardView, detection_of, solve_pose_pairs
+from realsim_calibration.exports import read_calibration
 
 X_TRUE = se3.exp([0.1, -0.2, 0.7, 0.03, -0.05, 0.08])
 Z_TRUE = se3.from_rt(np.diag([1.0, -1, -1]), [0.4, 0.05, 0.0])
@@ -73,8 +74,19 @@ def test_two_logs_are_joined_by_their_offset(logs: Path) -> None:
     found = solve_pose_pairs(pairs[0], pairs[1])
     assert np.linalg.norm(found.X[:3, 3] - X_TRUE[:3, 3]) < 1e-3
     told = pair_pose_logs(robot, board, readings, "eye_in_hand", "0.08", quiet)
-    assert told is not None
+    assert told is not None and told[4] is not None and told[4].offset_s == 0.08
     np.testing.assert_allclose(told[0], pairs[0], atol=5e-4)
+
+
+def test_files_hold_the_offset(logs: Path, tmp_path: Path) -> None:
+    """The offset found, its sigma and that the poses follow it are in every export."""
+    done = calibrate(logs, tmp_path / "c")
+    assert done.exit_code in (0, 1), done.output
+    clock = read_calibration(tmp_path / "c/exports/calibration.json").clock
+    assert clock is not None and clock.applied and clock.sigma_s > 0
+    assert clock.offset_s == pytest.approx(0.08, abs=3e-3)
+    for name in ("camera.urdf", "easy_handeye/hand_eye.yaml", "ros2_static_transform.sh"):
+        assert clock.sentence in (tmp_path / "c/exports" / name).read_text()
 
 
 def test_a_given_offset_is_taken_and_off_pairs_rows(logs: Path, tmp_path: Path) -> None:
@@ -103,13 +115,15 @@ def recorded(d: float) -> tuple[list[BoardView], Array]:
 def test_a_recording_follows_its_clock() -> None:
     """Views 60 ms late get the arm's pose of 60 ms before; views by one clock stay as they are."""
     views, t = recorded(0.06)
-    mended = mend_views(views, t, BOARD, CAMERA, "auto", Console(quiet=True))
+    mended, clock = mend_views(views, t, BOARD, CAMERA, "auto", Console(quiet=True))
+    assert clock is not None and clock.applied and clock.offset_s == pytest.approx(0.06, abs=1e-3)
     truth = hand(t - 0.06)
     error = [np.linalg.norm(v.T_base_ee[:3, 3] - truth[v.index, :3, 3]) for v in mended]
     before = [np.linalg.norm(v.T_base_ee[:3, 3] - truth[v.index, :3, 3]) for v in views]
     assert np.median(error) < 0.05 * np.median(before)
     same, t = recorded(0.0)
-    kept = mend_views(same, t, BOARD, CAMERA, "auto", Console(quiet=True))
+    kept, clock = mend_views(same, t, BOARD, CAMERA, "auto", Console(quiet=True))
+    assert clock is not None and not clock.applied
     assert all(a is b for a, b in zip(kept, same, strict=True))
 
 

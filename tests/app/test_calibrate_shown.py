@@ -12,7 +12,10 @@ from realsim_calibration.planning import view_proposals
 
 @pytest.mark.parametrize(("sigma_mm", "gains"), [(15.77, False), (15.7, False), (9.0, True)])
 def test_views_that_gain_nothing_are_not_promised(monkeypatch, capsys, sigma_mm, gains):
-    report = SimpleNamespace(sigma_mm=15.77, sigma_deg=0.4, used=(SimpleNamespace(joints=None),))
+    report = SimpleNamespace(
+        here_mm=15.77, here_deg=0.4, sigma_mm=40.0, sigma_deg=0.9,
+        used=(SimpleNamespace(joints=None),)
+    )  # fmt: skip
     view = SimpleNamespace(
         distance_m=0.3, tilt_deg=25.0, roll_deg=15.0, sigma_mm=sigma_mm, sigma_deg=0.399
     )

@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -6,7 +7,7 @@ import pytest
 from realsim.errors import InputError, NotRigidError
 from realsim.geometry import se3
 from realsim.geometry.camera import project, undistort
-from realsim.records import Chessboard
+from realsim.records import CameraIntrinsics, Chessboard
 from realsim.robots.arm import find_arm, known_chains
 from realsim_calibration import (
     HandEyeConfig,
@@ -15,7 +16,12 @@ from realsim_calibration import (
     calibrate_from_poses,
     calibrate_hand_eye_report,
 )
+from realsim_calibration.exports import FrameNames, read_calibration, write_exports
 from realsim_calibration.fit.robot_error import RobotErrorConfig, matching_arm
+from realsim_calibration.report.summary import viewpoint
+from realsim_calibration.results import Clock
+
+CLOCK = Clock(offset_s=0.035, sigma_s=0.0004, applied=True)
 
 
 def seen_from(sim, T_cam_board, target):
@@ -61,6 +67,32 @@ def test_boards_counted_from_the_wrong_end_are_mended(simulate):
     assert "half turns" not in {c.name for c in plain.checks}
 
 
+def test_the_lens_of_pose_pairs_is_the_given_one_or_is_said_to_be_none(tmp_path):
+    rng = np.random.default_rng(0)
+    X, Z = se3.random_transform(rng, spread=0.1), se3.random_transform(rng)
+    C = np.array([se3.exp([*rng.normal(scale=0.4, size=3), 0, 0, 0]) for _ in range(9)])
+    C[:, :3, 3] = np.array([0.0, 0.0, 0.6]) + rng.normal(scale=0.05, size=(9, 3))
+    A = Z @ se3.invert(C) @ se3.invert(X)
+    lens = CameraIntrinsics(
+        width=1280, height=720, fx=910.0, fy=911.0, cx=641.0, cy=357.0, distortion=[0.1, -0.2]
+    )
+    for camera in (lens, None):
+        report = replace(calibrate_from_poses(A, C, camera=camera), clock=CLOCK)
+        folder = tmp_path / str(camera is None)
+        names = {p.name for p in write_exports(report, folder, frames=FrameNames())}
+        known = {"camera_info.yaml", "opencv.yml", "calibration.npz"}
+        assert known <= names if camera else not known & names
+        written = json.loads((folder / "calibration.json").read_text())
+        assert written["nominal_lens"] == (camera is None)
+        for key in ("intrinsics", "intrinsics_alone"):
+            assert ("do NOT use" in written[key]["use"]) == (camera is None)
+            assert camera is None or (written[key]["fx"] == 910.0 and written[key]["width"] == 1280)
+        back = read_calibration(folder / "calibration.json")
+        assert back.clock == CLOCK and np.array_equal(back.Z_points, report.Z_points)
+        assert "+35.00 +-0.40 ms" in (folder / "camera.urdf").read_text()
+        assert np.abs(se3.log(se3.invert(X) @ back.X)).max() < 1e-6
+
+
 def test_perfect_poses_alone_give_the_truth():
     rng = np.random.default_rng(0)
     X, Z = se3.random_transform(rng, spread=0.1), se3.random_transform(rng)
@@ -72,6 +104,14 @@ def test_perfect_poses_alone_give_the_truth():
     assert np.abs(se3.log(se3.invert(X) @ r.X)).max() < 1e-6
     assert np.abs(se3.log(se3.invert(Z) @ r.Z)).max() < 1e-6
     assert np.abs(se3.log(se3.invert(Z) @ r.Z_alone)).max() < 1e-6
+    outwards = np.diag([1.0, -1.0, -1.0, 1.0])  # a board's frame with z out of the print
+    flipped = calibrate_from_poses(A, C @ outwards)
+    assert np.abs(se3.log(se3.invert(Z @ outwards) @ flipped.Z)).max() < 1e-6
+    for record in (r, flipped):
+        seen = [viewpoint(record, v) for v in record.used]
+        distances = np.linalg.norm(C[:, :3, 3], axis=-1)
+        assert np.allclose([p.distance_m for p in seen], distances, atol=1e-5)
+        assert max(p.tilt_deg for p in seen) < 90
     with pytest.raises(InputError, match="12 hand poses and 11 camera poses"):
         calibrate_from_poses(A, C[1:])
     with pytest.raises(InputError, match="behind the camera"):

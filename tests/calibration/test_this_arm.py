@@ -1,5 +1,6 @@
 """Two answers: X for this arm as it moves here, X absolute; and X for programs without a map."""
 
+import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -18,7 +19,13 @@ from realsim_calibration import (
     calibrate_hand_eye_report,
 )
 from realsim_calibration.checks import CheckConfig, hand_eye_checks
-from realsim_calibration.exports import FrameNames, note_lines, read_calibration, write_calibration
+from realsim_calibration.exports import (
+    FrameNames,
+    calibration_text,
+    note_lines,
+    read_calibration,
+    write_calibration,
+)
 from realsim_calibration.fit.closed_forms import CLOSED_FORMS
 from realsim_calibration.fit.effective import places_of
 from realsim_calibration.fit.linear_model import LinearModel
@@ -26,6 +33,7 @@ from realsim_calibration.fit.robot_error import pose_features
 from realsim_calibration.fit.robust_fit import Solution, at_least, solve
 from realsim_calibration.hand_eye import setup_of
 from realsim_calibration.plain import choose_plain
+from realsim_calibration.report.summary import places_rows
 from realsim_calibration.screening import Screened, screen, stacks
 from tests.calibration.conftest import FACTORY, arm_views
 
@@ -120,6 +128,13 @@ def test_x_without_a_map_is_the_best_on_unseen_views_and_files_say_so(tmp_path: 
     assert scores[report.plain_name] == min(scores.values())
     notes = " ".join(note_lines(report, FrameNames()))
     assert f"'{report.plain_name}'" in notes and "this arm as it moves here" in notes
+    use = json.loads(calibration_text(report, FrameNames()))
+    assert "covariance: absolute" in use["X"]["use"] and "for this arm" in use["X_here"]["use"]
+    assert "here_covariance: for this arm" in use["X_alone"]["use"]
+    told = {row[1]: row[3:] for row in places_rows(report)}
+    assert told["X_here"][1] == "-" and told["X"][0] == "-" and "-" not in told["X_alone"]
+    assert f"{report.here_mm:.3f} mm" in told["X_here"][0]
+    assert f"{report.sigma_mm:.3f} mm" in told["X"][1]
     path = write_calibration(report, tmp_path / "calibration.json", frames=FrameNames())
     back = read_calibration(path)
     assert back.plain_name == report.plain_name and back.stretch == report.stretch

@@ -15,7 +15,14 @@ from realsim.records.checked_arrays import rigid
 from realsim.store import atomic
 from realsim.untrusted.own_json import OwnFile, Real, from_json, read_object, to_json
 from realsim_calibration.exports.frames import FrameNames, parent_frame, quaternion_xyzw
-from realsim_calibration.results import BoardShape, HandEyeReport, Mode, Stretch, ViewReport
+from realsim_calibration.results import (
+    BoardShape,
+    Clock,
+    HandEyeReport,
+    Mode,
+    Stretch,
+    ViewReport,
+)
 
 Record = TypeVar("Record")
 SCHEMA = "realsim.calibration"
@@ -32,8 +39,16 @@ MAP_NOTES = {
     ", and G = T_flange_tool, see ArmErrorMap; needs the joints q. Use X together with this map. "
     "X_alone needs no map.",
 }
+ABSOLUTE = "absolute, for another arm, a new mount, a drawing"
 HERE = (
-    "where this arm's camera is at the calibrated poses; covariance: the arm's constant error out"
+    "where this arm's camera is at the calibrated poses; covariance: for this arm as it moves here"
+)
+PLAIN = (
+    f"without a map, by programs that know none; covariance: {ABSOLUTE}; here_covariance: for this "
+    "arm as it moves here"
+)
+NOMINAL = (
+    "do NOT use: no camera was known, and this one only gives px a meaning; --camera FILE states it"
 )
 CONVENTIONS = {
     "transforms": "T_a_b maps points of b into a; matrices row by row; metres",
@@ -93,6 +108,7 @@ def _document(report: HandEyeReport, frames: FrameNames) -> dict[str, Any]:
     parent, other = parent_frame(report, frames), frames.robot_base if in_hand else frames.hand
     cam = frames.camera_optical
     with_map = "only together with robot_map" if report.robot_map is not None else "as it is"
+    with_map += f"; covariance: {ABSOLUTE}"
     return {
         "schema": SCHEMA,
         "version": VERSION,
@@ -111,7 +127,7 @@ def _document(report: HandEyeReport, frames: FrameNames) -> dict[str, Any]:
         if report.X_here is None
         else _transform(report.X_here, parent, cam, HERE, report.X_here_covariance),
         "X_alone": {
-            **_transform(report.X_alone, parent, cam, "without a map", report.X_alone_covariance),
+            **_transform(report.X_alone, parent, cam, PLAIN, report.X_alone_covariance),
             "origin": report.plain_name,
             "here_covariance": report.X_alone_here_covariance,
         },
@@ -130,13 +146,16 @@ def _document(report: HandEyeReport, frames: FrameNames) -> dict[str, Any]:
             "roll_range_deg": report.roll_range_deg,
         },
         "checks": [to_json(c) for c in report.checks],
+        "clock": None if report.clock is None else to_json(report.clock),
+        "nominal_lens": report.nominal_lens,
+        "T_points_board": report.T_points_board,
         "intrinsics": {
-            "use": "together with X",
+            "use": NOMINAL if report.nominal_lens else "together with X",
             **to_json(report.intrinsics),
             "covariance": report.intrinsics_covariance,
         },
         "intrinsics_alone": {
-            "use": "together with X_alone",
+            "use": NOMINAL if report.nominal_lens else "together with X_alone",
             **to_json(report.intrinsics_alone),
         },
         "target": {"type": type(report.target).__name__, **to_json(report.target)},
@@ -236,6 +255,9 @@ class _File(OwnFile, frozen=True, kw_only=True):
     Z_alone: _Transform
     accuracy: dict[str, Real]
     checks: tuple[Check, ...]
+    clock: Clock | None = None
+    nominal_lens: bool = False
+    T_points_board: Array | None = None
     intrinsics: dict[str, Any]
     intrinsics_alone: dict[str, Any]
     target: dict[str, Any]
@@ -321,5 +343,8 @@ def _report(d: _File, path: str) -> HandEyeReport:
         starts=d.starts,
         checks=d.checks,
         information=d.information,
+        clock=d.clock,
+        nominal_lens=d.nominal_lens,
+        T_points_board=d.T_points_board,
         **figures,
     )

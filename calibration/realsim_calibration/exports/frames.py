@@ -197,6 +197,8 @@ def note_lines(
             f"It is that of '{report.plain_name}', which predicts unseen views best without a map "
             f"[px]: {held}."
         )
+    if report.clock is not None:
+        lines.append(report.clock.sentence)
     if not report.checks:
         lines.append("WARNING: nothing was checked.")
     lines += [f"WARNING: {w}" for w in report.warnings]

@@ -59,15 +59,19 @@ def opencv_text(report: HandEyeReport, frames: FrameNames) -> str:
 def npz_arrays(report: HandEyeReport, frames: FrameNames) -> dict[str, Array | NDArray[np.str_]]:
     """Return the arrays of `calibration.npz`: transforms [m], covariances rotation first [rad, m].
 
-    `T_parent_cam` is X_alone, `T_target_parent_board` Z_alone, `K` and `distortion` those of
-    intrinsics_alone: one fit, without an error map. `parent`, `cam` and `target_parent` are the
-    names of the frames.
+    `T_parent_cam` is X_alone; `T_parent_cam_covariance` is absolute (another arm, a new mount, a
+    drawing), `T_parent_cam_here_covariance` for this arm as it moves here. `T_target_parent_board`
+    is Z_alone, `K` and `distortion` those of intrinsics_alone: one fit, without an error map.
+    `parent`, `cam` and `target_parent` are the names of the frames.
     """
     camera = report.intrinsics_alone
     target_parent = frames.robot_base if report.mode == "eye_in_hand" else frames.hand
+    known = report.X_alone_here_covariance
+    here = {} if known is None else {"T_parent_cam_here_covariance": np.asarray(known)}
     return {
         "T_parent_cam": np.asarray(report.X_alone),
         "T_parent_cam_covariance": np.asarray(report.X_alone_covariance),
+        **here,
         "T_target_parent_board": np.asarray(report.Z_alone),
         "K": camera.K,
         "distortion": np.asarray(camera.distortion),
@@ -80,17 +84,15 @@ def npz_arrays(report: HandEyeReport, frames: FrameNames) -> dict[str, Array | N
     }
 
 
-def write_exports(
-    report: HandEyeReport, folder: Path | str, *, frames: FrameNames, with_camera: bool = True
-) -> list[Path]:
+def write_exports(report: HandEyeReport, folder: Path | str, *, frames: FrameNames) -> list[Path]:
     """Write the calibration in every format and return the files; each is whole or not there.
+
+    Where the lens is not known (`nominal_lens`) no file that states one is written.
 
     Args:
         report: the calibration.
         folder: where to write; made where needed, files of the same names are replaced.
         frames: how the frames are called in the programs that will read it.
-        with_camera: False where there were no images: the camera is then a nominal one, and no
-            file that states a lens is written.
     """
     folder = Path(folder)
     texts: dict[str, Callable[[HandEyeReport, FrameNames], str]] = {
@@ -103,14 +105,14 @@ def write_exports(
         "camera_info.yaml": ros.camera_info_text,
         "opencv.yml": opencv_text,
     }
-    if not with_camera:
+    if report.nominal_lens:
         for name in ("camera_info.yaml", "opencv.yml"):
             del texts[name]
     written = [write_calibration(report, folder / "calibration.json", frames=frames)]
     for name, text in texts.items():
         atomic.write_text(folder / name, text(report, frames))
         written.append(folder / name)
-    if not with_camera:
+    if report.nominal_lens:
         return written
     atomic.write_npz(folder / "calibration.npz", **npz_arrays(report, frames))
     return [*written, folder / "calibration.npz"]

@@ -134,7 +134,7 @@ def predicted_boards(report: HandEyeReport, Ts_base_ee: ArrayLike) -> Array:
     if isinstance(report.robot_map, RobotErrorMap):
         A = report.robot_map.corrected(A)
     A = se3.invert(A) if report.mode == "eye_in_hand" else A
-    return se3.invert(report.X) @ A @ report.Z
+    return se3.invert(report.X) @ A @ report.Z_points
 
 
 def rank_next_views(
@@ -348,7 +348,7 @@ class _Planned:
 
     def _by_robot(self, seen: Mask, in_cam: Array, points: Array) -> Array:
         """Return d point / d robot error (m, p, 3, 6), the error right of T_base_ee."""
-        X, Z = self.report.X, self.report.Z
+        X, Z = self.report.X, self.report.Z_points
         if self.report.mode == "eye_in_hand":
             in_hand = se3.transform(X, in_cam)
             minus = np.broadcast_to(-np.eye(3), (*in_cam.shape, 3))

@@ -65,7 +65,7 @@ def propose_views(report: HandEyeReport, limits: ViewLimits | None = None) -> Ar
     """
     limits = limits or ViewLimits()
     boards = candidate_boards(report, limits)
-    X, Z = report.X, report.Z
+    X, Z = report.X, report.Z_points
     if report.mode == "eye_in_hand":
         Ts = Z @ se3.invert(boards) @ se3.invert(X)
     else:

@@ -22,10 +22,12 @@ from realsim_calibration.report import (
 )
 from realsim_calibration.report.summary import (
     NOT_KNOWN,
+    PLACES_HEADER,
     accuracy_rows,
     amount,
     carrier,
     check_rows,
+    places_rows,
     pose_rows,
     verdict,
     viewpoint,
@@ -83,7 +85,8 @@ def write_calibration_report(
     _residual_section(page, report, images)
     _coverage_section(page, report)
     _model_section(page, report)
-    _lens_section(page, report, intrinsics_report)
+    if not report.nominal_lens:
+        _lens_section(page, report, intrinsics_report)
     if depth_report is not None:
         _depth_section(page, depth_report)
     _appendix(page, report)
@@ -95,6 +98,12 @@ def _about(report: HandEyeReport) -> str:
     """Return one line on what was calibrated."""
     i, (x, y) = report.intrinsics, report.target.size_m
     where = "in the hand" if report.mode == "eye_in_hand" else "beside the robot"
+    if report.T_points_board is not None:
+        lens = "a lens that is not known" if report.nominal_lens else "the lens that was given"
+        return (
+            f"Camera {where}, pose pairs without images, {lens}, {len(report.used)} of "
+            f"{len(report.views)} pairs used"
+        )
     return (
         f"Camera {where}, {i.width} x {i.height} px, {len(report.used)} of {len(report.views)} "
         f"views used, {type(report.target).__name__} of {1e3 * x:.0f} x {1e3 * y:.0f} mm"
@@ -130,6 +139,7 @@ def _place_section(page: _Page, report: HandEyeReport) -> None:
         "scale. Yellow: the field of view. If this is not how the camera is mounted, a convention "
         "is wrong.",
     )  # fmt: skip
+    page.table(PLACES_HEADER, places_rows(report))
     page.table(["figure", "value"], [*pose_rows(report), *accuracy_rows(report)])
     page.plot(
         "scene.png", lambda: scene_3d.plot_scene(report),
@@ -318,11 +328,11 @@ def _appendix(page: _Page, report: HandEyeReport) -> None:
     suffix = ", only together with the robot's error map" if report.robot_map is not None else ""
     here = [] if report.X_here is None else [report.X_here]
     for name, T in (
-        *((f"T_{what}_cam for this arm as it moves here [m]", T) for T in here),
-        (f"T_{what}_cam{suffix} [m]", report.X),
-        (f"T_{what}_cam without a map, for other programs [m]", report.X_alone),
-        (f"T_{other}_board [m]", report.Z),
-        (f"T_{other}_board that belongs to the camera without a map [m]", report.Z_alone),
+        *((f"X_here: T_{what}_cam for this arm as it moves here [m]", T) for T in here),
+        (f"X: T_{what}_cam, absolute{suffix} [m]", report.X),
+        (f"X_alone: T_{what}_cam without a map, for other programs [m]", report.X_alone),
+        (f"Z: T_{other}_board [m]", report.Z),
+        (f"Z_alone: T_{other}_board that belongs to X_alone [m]", report.Z_alone),
     ):
         text = np.array2string(np.asarray(T), precision=9, suppress_small=True, separator=", ")
         page.code(f"{name}\n{text}")

@@ -285,9 +285,9 @@ def _scene_lines(report: HandEyeReport) -> list[tuple[ViewReport, Array]]:
     hands = np.array([corrected(report, v) for v in report.views]).reshape(-1, 4, 4)
     if report.mode == "eye_to_hand":
         outline = _target_outline(report)
-        loops = [se3.transform(A @ report.Z, outline) for A in hands]
+        loops = [se3.transform(A @ report.Z_points, outline) for A in hands]
         return [(v, np.stack([p[:-1], p[1:]], 1)) for v, p in zip(report.views, loops, strict=True)]
-    away = np.linalg.norm((hands @ report.X)[:, :3, 3] - report.Z[:3, 3], axis=-1)
+    away = np.linalg.norm((hands @ report.X)[:, :3, 3] - report.Z_points[:3, 3], axis=-1)
     depth = SCENE_FRUSTUM_SHARE * float(np.median(away)) if len(away) else 0.05
     shape = frustum(report.intrinsics, depth)
     return [
@@ -299,9 +299,9 @@ def _scene_lines(report: HandEyeReport) -> list[tuple[ViewReport, Array]]:
 def _fixed_lines(report: HandEyeReport) -> Array:
     """Return what stands still as lines (m, 2, 3) in the base frame [m]: target or camera."""
     if report.mode == "eye_in_hand":
-        loop = se3.transform(report.Z, _target_outline(report))
+        loop = se3.transform(report.Z_points, _target_outline(report))
         return np.stack([loop[:-1], loop[1:]], 1)
-    targets = np.array([(corrected(report, v) @ report.Z)[:3, 3] for v in report.views])
+    targets = np.array([(corrected(report, v) @ report.Z_points)[:3, 3] for v in report.views])
     away = np.linalg.norm(targets.reshape(-1, 3) - report.X[:3, 3], axis=-1)
     depth = 2 * SCENE_FRUSTUM_SHARE * float(np.median(away)) if len(away) else FRUSTUM_RANGE_M[1]
     return frustum_lines(se3.transform(report.X, frustum(report.intrinsics, depth)))

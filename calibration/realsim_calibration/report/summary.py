@@ -9,6 +9,7 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.geometry import metrics, se3
 from realsim.records import ArmErrorMap, Check, RobotErrorMap
+from realsim.records.calibration import worst_sigmas
 from realsim_calibration.exports.frames import quaternion_xyzw, roll_pitch_yaw
 from realsim_calibration.results import HandEyeReport, ViewReport
 
@@ -113,18 +114,10 @@ def pose_rows(report: HandEyeReport) -> list[list[str]]:
     q = ", ".join(f"{v:.6f}" for v in quaternion_xyzw(X))
     rpy = ", ".join(f"{np.degrees(v):.3f}" for v in roll_pitch_yaw(X[:3, :3]))
     rows = [
-        [f"camera in the {what} [mm], ± 1 sigma", ", ".join(place)],
+        [f"camera in the {what} for this arm [mm], ± 1 sigma", ", ".join(place)],
         ["roll, pitch, yaw about fixed axes [deg]", f"{rpy} (± {report.here_deg:.4f})"],
         ["quaternion x, y, z, w", q],
         ["looks along", looks_along(report)],
-        [
-            "1 sigma, worst axis, for this arm as it moves here",
-            f"{report.here_mm:.3f} mm, {report.here_deg:.4f} deg",
-        ],
-        [
-            "the same for another arm, a new mount, a drawing",
-            f"{report.sigma_mm:.3f} mm, {report.sigma_deg:.4f} deg",
-        ],
     ]
     moved = float(metrics.translation_error_mm(report.X, report.X_alone))
     turned = float(metrics.rotation_error_deg(report.X, report.X_alone))
@@ -134,8 +127,7 @@ def pose_rows(report: HandEyeReport) -> list[list[str]]:
         rows.append(
             [
                 "robot error map",
-                "in use, with an X of its own (calibration.json); without it (X alone, for other "
-                f"programs) the camera is {moved:.2f} mm and {turned:.3f} deg elsewhere",
+                f"in use; X_alone, which needs none, is {moved:.2f} mm and {turned:.3f} deg from X",
             ]
         )
     if report.stretch is not None:
@@ -148,8 +140,41 @@ def pose_rows(report: HandEyeReport) -> list[list[str]]:
         )
     if report.plain_scores:
         held = ", ".join(f"{name} {amount(px, 2)}" for name, px in report.plain_scores)
-        rows.append([f"X alone is '{report.plain_name}'; unseen views without a map [px]", held])
+        rows.append([f"X_alone is '{report.plain_name}'; unseen views without a map [px]", held])
     return rows
+
+
+PLACES_HEADER = (
+    "the camera's place for", "in files", "x, y, z [mm]", "1 sigma for this arm as it moves here",
+    "1 sigma absolute",
+)  # fmt: skip
+
+
+def places_rows(report: HandEyeReport) -> list[list[str]]:
+    """Return what each X is for, its name in files, its place and its sigmas, worst axis."""
+
+    def row(use: str, name: str, T: Array, here: Array | None, absolute: Array | None) -> list[str]:
+        place = ", ".join(f"{1e3 * v:.2f}" for v in T[:3, 3])
+        sigmas = ("-" if C is None else _sigmas(C) for C in (here, absolute))
+        return [use, name, place, *sigmas]
+
+    rows: list[list[str]] = []
+    if report.X_here is not None:
+        use = "this arm as it moves here"
+        rows.append(row(use, "X_here", report.X_here, report.X_here_covariance, None))
+    absolute = "another arm, a new mount, a drawing"
+    if report.robot_map is not None:
+        absolute += "; this arm through its error map"
+    rows.append(row(absolute, "X", report.X, None, report.X_covariance))
+    plain = "programs that know no error map: ROS, URDF, OpenCV"
+    here = report.X_alone_here_covariance
+    return [*rows, row(plain, "X_alone", report.X_alone, here, report.X_alone_covariance)]
+
+
+def _sigmas(covariance: Array) -> str:
+    """Return the sigmas along the worst axes in words."""
+    mm, deg = worst_sigmas(covariance)
+    return f"{mm:.3f} mm, {deg:.4f} deg"
 
 
 def looks_along(report: HandEyeReport) -> str:
@@ -197,8 +222,8 @@ def camera_in_board(report: HandEyeReport, view: ViewReport) -> Array:
     """Return T_board_cam (4, 4) [m] of a view, through the robot's pose and its map."""
     A = corrected(report, view)
     if report.mode == "eye_in_hand":
-        return se3.invert(report.Z) @ A @ report.X
-    return se3.invert(report.Z) @ se3.invert(A) @ report.X
+        return se3.invert(report.Z_points) @ A @ report.X
+    return se3.invert(report.Z_points) @ se3.invert(A) @ report.X
 
 
 def corrected(report: HandEyeReport, view: ViewReport) -> Array:

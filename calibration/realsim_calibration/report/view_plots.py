@@ -206,6 +206,10 @@ def plot_coverage(report: HandEyeReport) -> Any:
 
 def _image_coverage(figure: Any, ax: Any, report: HandEyeReport) -> None:
     """Draw the number of points per cell of the image; cells without any are hatched."""
+    if report.nominal_lens:
+        ax.set_axis_off()
+        ax.set_title("No images")
+        return
     w, h = report.intrinsics.width, report.intrinsics.height
     style.image_axes(ax, w, h)
     uv = np.concatenate([v.uv for v in report.used] or [np.zeros((0, 2))])

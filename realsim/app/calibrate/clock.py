@@ -22,7 +22,7 @@ from realsim_calibration import (
 )
 from realsim_calibration.clock.streams import checked_stream, interpolated
 from realsim_calibration.inputs import PoseReading, RawPoses
-from realsim_calibration.results import Mode
+from realsim_calibration.results import Clock, Mode
 
 STREAM_PERIOD_S = 0.5
 """Poses further apart are views at stops, not a stream."""
@@ -86,10 +86,16 @@ def arm_at(
     return Stamped(Ts_base_ee=Ts_at, joints=q, inside=inside)
 
 
-def tell(found: ClockOffset, console: Console) -> None:
-    """Say the offset."""
+def tell(found: ClockOffset, console: Console) -> Clock:
+    """Say the offset; return it as the calibration's files hold it."""
     say = console.warn if found.matters else console.say
     say(f"clocks: {found.sentence}" + (" The arm's poses follow it." if found.matters else ""))
+    return Clock(offset_s=found.offset_s, sigma_s=found.sigma_s, applied=found.matters)
+
+
+def as_given(offset_s: float) -> Clock:
+    """Return an offset that somebody gave."""
+    return Clock(offset_s=offset_s, sigma_s=float("nan"), applied=True)
 
 
 def pair_pose_logs(
@@ -99,8 +105,8 @@ def pair_pose_logs(
     mode: Mode,
     option: str,
     console: Console,
-) -> tuple[Array, Array, Array | None, list[str]] | None:
-    """Return (hand poses, board poses, joints, labels) of two logs, None where they have no stamps.
+) -> tuple[Array, Array, Array | None, list[str], Clock | None] | None:
+    """Return hand poses, board poses, joints, labels and clock of two logs, None without stamps.
 
     Raises:
         InputError: no offset explains both, or they have no time in common.
@@ -117,11 +123,13 @@ def pair_pose_logs(
     if given is None and not (is_stream(times) and is_stream(frames)):
         return None
     Ts, boards = robot.poses(readings[0]), board.poses(readings[1])
-    offset = given
-    if offset is None:
+    if given is None:
+        # The frames lie between the arm's poses: they follow even an offset that hardly matters.
         found = estimate_clock_offset(times, Ts, frames, boards, mode=mode)
-        tell(found, console)
-        offset = found.offset_s
+        clock = replace(tell(found, console), applied=True)
+    else:
+        clock = as_given(given)
+    offset = clock.offset_s
     arm = arm_at(times, Ts, robot.joints, frames, offset)
     keep = np.flatnonzero(arm.inside & board.measured)
     if not len(keep):
@@ -132,14 +140,14 @@ def pair_pose_logs(
     labels = [board.where[k] or str(k) for k in keep]
     joints = None if arm.joints is None else arm.joints[keep]
     console.say(f"{len(keep)} of {len(frames)} board poses lie in the time of {len(times)} poses.")
-    return arm.Ts_base_ee[keep], boards[keep], joints, labels
+    return arm.Ts_base_ee[keep], boards[keep], joints, labels, clock
 
 
 def mend_views(
     views: Sequence[BoardView], times: Array, target: Target, camera: CameraIntrinsics,
     option: str, console: Console,
-) -> list[BoardView]:  # fmt: skip
-    """Return views of a moving camera with the arm's poses at the times of their images.
+) -> tuple[list[BoardView], Clock | None]:  # fmt: skip
+    """Return views of a moving camera with the arm's poses at the times of their images; the clock.
 
     Args:
         views: as they were recorded, in any order.
@@ -151,10 +159,11 @@ def mend_views(
     """
     given = clock_option(option)
     if option == "off" or (given is None and not is_stream(times)):
-        return list(views)
+        return list(views), None
     Ts = np.array([v.T_base_ee for v in views])
-    offset = given
-    if offset is None:
+    if given is not None:
+        clock = as_given(given)
+    else:
         boards = np.full((len(views), 4, 4), np.nan)
         for k, view in enumerate(views):
             found = view.detection
@@ -162,17 +171,16 @@ def mend_views(
                 pose = estimate_board_pose(found.points(target), found.uv, camera)
                 boards[k] = np.nan if pose is None else pose.T_cam_board
         try:
-            clock = estimate_clock_offset(times, Ts, times, boards)
+            found = estimate_clock_offset(times, Ts, times, boards)
         except (InputError, DegenerateError) as error:
             console.warn(f"the clocks of arm and camera were not compared: {error}")
-            return list(views)
-        tell(clock, console)
-        if not clock.matters:
-            return list(views)
-        offset = clock.offset_s
+            return list(views), None
+        clock = tell(found, console)
+        if not clock.applied:
+            return list(views), clock
     joints = None if any(v.joints is None for v in views) else np.array([v.joints for v in views])
-    arm = arm_at(times, Ts, joints, times, offset)
-    return [
+    arm = arm_at(times, Ts, joints, times, clock.offset_s)
+    mended = [
         replace(
             view, T_base_ee=arm.Ts_base_ee[k],
             joints=None if arm.joints is None else arm.joints[k],
@@ -180,6 +188,7 @@ def mend_views(
         for k, view in enumerate(views)
         if arm.inside[k]
     ]  # fmt: skip
+    return mended, clock
 
 
 def read_logs(robot: Path, board: Path, key: str) -> tuple[RawPoses, RawPoses]:

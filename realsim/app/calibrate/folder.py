@@ -38,6 +38,7 @@ from realsim_calibration import (
     estimate_board_pose,
     prove_reading,
 )
+from realsim_calibration.results import Clock
 
 if TYPE_CHECKING:
     from realsim_calibration.inputs import FolderInput, PoseReading, RawPoses
@@ -306,12 +307,12 @@ def _from_pose_files(
     Ts, joints = given.robot.poses(reading), given.robot.joints
     labels = [where or str(k) for k, where in enumerate(given.robot.where)]
     console.say(f"robot poses read as {reading}, board poses as {board_reading}")
-    return _of_pairs(request, config, console, (Ts, boards, joints, labels))
+    return _of_pairs(request, config, console, (Ts, boards, joints, labels, None))
 
 
 def _from_logs(
     request: FolderRequest, console: Console
-) -> tuple[Array, Array, Array | None, list[str]] | None:
+) -> tuple[Array, Array, Array | None, list[str], Clock | None] | None:
     """Return the pairs of two logs with time stamps, None where they are paired otherwise."""
     from realsim.app.calibrate.clock import pair_pose_logs, read_logs
     from realsim_calibration.inputs import reading_from_text
@@ -329,20 +330,24 @@ def _from_logs(
 
 def _of_pairs(
     request: FolderRequest, config: CalibrationConfig, console: Console,
-    pairs: tuple[Array, Array, Array | None, list[str]],
+    pairs: tuple[Array, Array, Array | None, list[str], Clock | None],
 ) -> tuple[Calibration, list[Path]]:  # fmt: skip
-    """Return the calibration of (hand poses, board poses, joints, labels)."""
-    Ts, boards, joints, labels = pairs
+    """Return the calibration of (hand poses, board poses, joints, labels, clock)."""
+    Ts, boards, joints, labels, clock = pairs
+    camera = _camera_of(request.camera)
     arm = known_arm(request.arm, list(Ts), [] if joints is None else list(joints), console)
     with console.stage("calibrate", f"{len(Ts)} pose pairs"):
         report = calibrate_from_poses(
-            Ts, boards, labels=labels, joints=joints, config=config.hand_eye, arm=arm
+            Ts, boards, labels=labels, joints=joints, config=config.hand_eye, arm=arm,
+            camera=camera,
+        )  # fmt: skip
+    if camera is None:
+        console.warn(
+            "there are no images: figures in px are those of a nominal camera (f = 900 px) that "
+            "looks at the measured poses, and no lens is exported. --camera FILE exports the lens "
+            "by which the target was measured."
         )
-    console.warn(
-        "there are no images: figures in px are those of a nominal camera (f = 900 px) that looks "
-        "at the measured poses, and no lens is exported."
-    )
-    result = Calibration(hand_eye=report, lens=None)
+    result = Calibration(hand_eye=replace(report, clock=clock), lens=None)
     return result, write_calibration(result, request, (), console)
 
 
@@ -357,9 +362,7 @@ def write_calibration(
     out = request.out
     with console.stage("report", str(out)):
         write_text(out / MADE_OF, made_of(request.images))
-        exports = write_exports(
-            result.hand_eye, out / "exports", frames=FrameNames(), with_camera=bool(images)
-        )
+        exports = write_exports(result.hand_eye, out / "exports", frames=FrameNames())
         pages = write_calibration_report(
             result.hand_eye, out,
             images=(lambda k: load_image(images[k])) if images else None,

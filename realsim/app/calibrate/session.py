@@ -1,6 +1,6 @@
 """The hand-eye of a session, also of one with board views only: before the board is taken away."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,8 +60,9 @@ def calibrate_session(
             seen, target, known = read_board_views(store, views_store, arm, tick)
             camera = views_store.session.intrinsics
             times = np.array([v.time_s for v in views])
-            seen = mend_views(seen, times, target, camera, clock, console)
+            seen, at = mend_views(seen, times, target, camera, clock, console)
             report = calibrate_hand_eye_report(seen, target, camera, arm=known)
+            report = replace(report, clock=at)
             hand_eye = report.hand_eye
             write_results(report, seen, store, views_store)
             save_hand_eye(store, hand_eye)
@@ -135,8 +136,9 @@ def calibrate_board_only(
         seen, target, known = read_board_views(files, views_store, arm, tick)
         times = np.array([v.time_s for v in views_store.session.views])
         camera = views_store.session.intrinsics
-        seen = mend_views(seen, times, target, camera, clock, console)
-        report = calibrate_hand_eye_report(seen, target, views_store.session.intrinsics, arm=known)
+        seen, at = mend_views(seen, times, target, camera, clock, console)
+        report = calibrate_hand_eye_report(seen, target, camera, arm=known)
+        report = replace(report, clock=at)
         write_results(report, seen, files, views_store)
         files.write_json(HAND_EYE_FILE, hand_eye_to_json(report.hand_eye))
     return report.hand_eye

@@ -37,6 +37,7 @@ def report_document(
         "here_sigma_mm": report.here_mm,
         "here_sigma_deg": report.here_deg,
         "here_covariance": report.X_here_covariance,
+        "clock": None if report.clock is None else to_json(report.clock),
         "sigma_mm": report.sigma_mm,
         "sigma_deg": report.sigma_deg,
         "covariance": report.X_covariance,
@@ -93,9 +94,10 @@ def warn_of_far_views(hand_eye: HandEye, views: Sequence[View], console: Console
 
 def show_report(report: HandEyeReport, checks: Sequence[Check], console: Console) -> None:
     """Print a calibration: figures, every check, every dropped view."""
-    from realsim_calibration.report import summary_rows
+    from realsim_calibration.report.summary import PLACES_HEADER, places_rows, summary_rows
 
-    console.table("Calibration", ["", "value"], [list(row) for row in summary_rows(report)])
+    console.table("Where the camera is", PLACES_HEADER, places_rows(report))
+    console.table("Calibration", ["", "value"], summary_rows(report))
     show_checks(checks, console)
     for view in report.views:
         if not view.used:
@@ -114,11 +116,11 @@ def show_next_views(report: HandEyeReport, console: Console) -> None:
     if not views:
         return
     last = views[-1]
-    if last.sigma_mm > GAIN * report.sigma_mm and last.sigma_deg > GAIN * report.sigma_deg:
+    if last.sigma_mm > GAIN * report.here_mm and last.sigma_deg > GAIN * report.here_deg:
         joints = any(v.joints is None for v in report.used)
         console.say(
-            f"further views like these gain nothing: sigma stays at {report.sigma_mm:.2f} mm and "
-            f"{report.sigma_deg:.3f} deg. The arm's own errors are left"
+            f"further views like these gain nothing: sigma stays at {report.here_mm:.2f} mm and "
+            f"{report.here_deg:.3f} deg for this arm. The arm's own errors are left"
             + ("; joint angles with the poses let them be modelled." if joints else ".")
         )
         return
@@ -129,7 +131,7 @@ def show_next_views(report: HandEyeReport, console: Console) -> None:
         ]
         for k, v in enumerate(views)
     ]  # fmt: skip
-    header = ["view", "distance", "tilt", "roll in the image", "sigma expected then"]
+    header = ["view", "distance", "tilt", "roll in the image", "sigma for this arm then"]
     console.table("Further views that would help most, in this order", header, rows)
 
 
