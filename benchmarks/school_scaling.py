@@ -31,10 +31,9 @@ from school_cases import (
     tasks_of,
 )
 
-from realsim_sim_bridge.school.cluster import ClusterConfig, ray_workers
+from realsim.many import Pool, PoolConfig, open_pool
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.day import Day, Pupil
-from realsim_sim_bridge.school.workers import Workers, local_workers
 
 FULL, QUICK = 80, 3
 """Candidates per object."""
@@ -77,7 +76,7 @@ def _place() -> str:
 class CountedWorkers:
     """Workers whose CPU seconds are counted one by one."""
 
-    workers: Workers
+    workers: Pool
     shares_files: bool = False
     busy: dict[str, float] = field(default_factory=dict[str, float])
 
@@ -119,7 +118,7 @@ class Run:
         return self.asking_s + max(self.busy_s)
 
 
-def day(staff: AbstractContextManager[Workers], case: SchoolCase, config: SchoolConfig,
+def day(staff: AbstractContextManager[Pool], case: SchoolCase, config: SchoolConfig,
         shard_grasps: int, places: int) -> Run:  # fmt: skip
     """Run the school and return what it cost.
 
@@ -185,7 +184,7 @@ def runs(job: ScalingJob) -> tuple[Run, Run]:
     )
     size = SHARD_GRASPS_QUICK if job.quick else SHARD_GRASPS
     if job.kind == "processes":
-        one, two = (day(local_workers(n), case, config, size, n) for n in (1, 2))
+        one, two = (day(open_pool(n), case, config, size, n) for n in (1, 2))
         return one, two
     return _on_nodes(case, config, size)
 
@@ -212,7 +211,7 @@ def _on_nodes(case: SchoolCase, config: SchoolConfig, size: int) -> tuple[Run, R
         for count in (1, 2):
             if count == 2:
                 cluster.add_node(**node)
-            staff = ray_workers(ClusterConfig(address=cluster.address))
+            staff = open_pool(PoolConfig(address=cluster.address))
             found.append(day(staff, case, config, size, count))
     finally:
         cluster.shutdown()

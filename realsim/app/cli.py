@@ -4,13 +4,14 @@ Exit codes: 0 done, 1 done but a check failed, 2 something given cannot be used,
 """
 
 import os
+import signal
 import sys
 from pathlib import Path
 
 import click
 
 from realsim import __version__
-from realsim.app.command import Group
+from realsim.app.command import COMMAND_KEY, Group
 from realsim.errors import RealsimError
 
 COMMANDS = {
@@ -38,6 +39,7 @@ COMMANDS = {
     "demonstrations": "realsim.app.demonstrations.cli:demonstrations_command",
     "export": "realsim.app.export.cli:export_command",
     "stats": "realsim.app.stats.cli:stats_command",
+    "reproduce": "realsim.app.reproduce.cli:reproduce_command",
     "doctor": "realsim.app.doctor.cli:doctor_command",
     "config": "realsim.app.config.cli:CONFIG",
     "completion": "realsim.app.completion:completion_command",
@@ -45,6 +47,8 @@ COMMANDS = {
 """Where each command is defined, in the order of the work."""
 BROKEN_PIPE = 141
 """Exit code where the reader of the output has gone, as in `| head` (128 + SIGPIPE)."""
+TERMINATED = 143
+"""Exit code of a process that was asked to end (128 + SIGTERM), as shells count."""
 NO_COLOUR = "--no-color"
 
 
@@ -59,6 +63,7 @@ class Realsim(Group):
             ctx.color = False
             args = [a for k, a in enumerate(args) if k >= end or a != NO_COLOUR]
         ctx.meta[QUIET_KEY] = "--quiet" in args
+        ctx.meta[COMMAND_KEY] = tuple(args)
         return super().parse_args(ctx, args)
 
 
@@ -94,6 +99,15 @@ def commands(ctx: click.Context, config_file: Path | None, no_color: bool) -> No
     apply_config(ctx, config_file, quiet=bool(ctx.meta.get(QUIET_KEY)))
 
 
+class Terminated(KeyboardInterrupt):
+    """The process was asked to end (SIGTERM), as by a queue whose time is up."""
+
+
+def _asked_to_end(number: int, frame: object) -> None:
+    """End as after Ctrl-C: workers are ended, folders are left whole."""
+    raise Terminated
+
+
 def main() -> None:
     """Run the command line; end with exit code 2 and one paragraph on bad input."""
     from realsim.app.completion import add_bash_completion
@@ -101,6 +115,7 @@ def main() -> None:
 
     open_missing_streams()
     add_bash_completion()
+    signal.signal(signal.SIGTERM, _asked_to_end)
     try:
         commands(prog_name="realsim", standalone_mode=False)
         sys.stdout.flush()
@@ -109,9 +124,14 @@ def main() -> None:
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)
-    except (click.Abort, KeyboardInterrupt):
-        click.echo("interrupted; the same command goes on from here.", err=True)
-        sys.exit(130)
+    except (click.Abort, KeyboardInterrupt) as stop:
+        # click puts its own in the place of the one that knows how far it came.
+        reason = stop.__cause__ or stop
+        told = str(reason) or "interrupted"
+        click.echo(
+            told if told.endswith(".") else f"{told}; the same command goes on from here.", err=True
+        )
+        sys.exit(TERMINATED if isinstance(reason, Terminated) else 130)
     except RealsimError as error:
         click.echo(f"error: {error}", err=True)
         sys.exit(2)

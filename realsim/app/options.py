@@ -1,5 +1,7 @@
 """The options that many commands have, spelled and explained alike."""
 
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +41,24 @@ def workers(default: int | None = 2, help: str = "Processes.") -> Decorator:
     return click.option(
         "--workers", default=default, show_default=True, type=click.IntRange(1, 256), help=help
     )
+
+
+def many(default: int | None = 2, help: str = "Processes.") -> Decorator:
+    """Return the two options for where work is done, which the command gets as one, `where`."""
+
+    def decorated(command: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(command)
+        def with_pool(*args: Any, workers: int | None, address: str, **kwargs: Any) -> Any:
+            from realsim.many import PoolConfig
+
+            return command(*args, where=PoolConfig(workers=workers, address=address), **kwargs)
+
+        address = click.option(
+            "--address", default="", metavar="RAY", help="HOST:PORT of a Ray cluster, or local."
+        )
+        return workers(default, help)(address(with_pool))
+
+    return decorated
 
 
 def seed(what: str = "Of everything random: the same seed, the same result.") -> Decorator:

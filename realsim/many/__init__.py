@@ -17,26 +17,28 @@
 
 What a task is given can be pickled, and so can what it returns. `Sent(path)` in its arguments is a
 file or a folder that it reads, `Worked(folder)` the one folder that it changes; the function gets a
-Path for each. On this machine that is the path itself. On a cluster no disk is shared: files travel
-by hash, once to each machine, and what has changed in a `Worked` folder comes back when the task
-has succeeded, in the order in which it was written.
+Path for each; `Shared(value)` is a value that goes to each worker once. On this machine the
+path is that of the file itself. On a cluster no disk is shared: files travel by hash, once to each
+machine, and what has changed in a `Worked` folder comes back when the task has succeeded, in the
+order in which it was written.
 
 Resuming is the caller's: leave out the tasks whose result is there. `done` may return further tasks
 (shards that come out of a preparation). Errors: a task that fails is handed to `done` and listed in
 the summary, the rest go on; one whose worker is lost is begun again, three times at most; a full
 disk here, a lost head and another version of realsim end the run with a sentence; Ctrl-C raises
 KeyboardInterrupt with one. Commands take the pool from the two options of
-`realsim.app.options.many`, `--workers N` and `--address HOST:PORT|local`; a command over whole
-sessions is a task by `realsim.app.many_sessions`.
+`realsim.app.options.many`, `--workers N` and `--address HOST:PORT|local`.
 """
 
-from realsim.many.carried import Sent, Worked
+from realsim.many.carried import Sent, Shared, Worked
 from realsim.many.pool import (
     ClusterLostError,
     ForeignNodeError,
     Pool,
     PoolConfig,
     WorkerDiedError,
+    Workers,
+    at_most,
     open_pool,
 )
 from realsim.many.run import Outcome, Summary, Task, run_many
@@ -48,10 +50,13 @@ __all__ = [
     "Pool",
     "PoolConfig",
     "Sent",
+    "Shared",
     "Summary",
     "Task",
     "Worked",
     "WorkerDiedError",
+    "Workers",
+    "at_most",
     "open_pool",
     "run_many",
 ]

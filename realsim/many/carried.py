@@ -1,14 +1,17 @@
 """Files that travel with a job: named by what they hold, sent once to a machine, brought back.
 
-A job's arguments hold `Sent` and `Worked`; its function gets a Path in their place. On this machine
-that is the path itself. On another, files are addressed by the SHA-256 of their bytes, so that a
-machine that has one is not sent it again, and a folder is a list of names and addresses.
+A job's arguments hold `Sent` and `Worked`; its function gets a Path in their place, and for a
+`Shared` its value. On this machine the path is that of the file itself. On another, files are
+addressed by the SHA-256 of their bytes, so that a machine that has one is not sent it again, and a
+folder is a list of names and addresses.
 """
 
 import hashlib
 import os
+import pickle
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -38,6 +41,19 @@ class Sent:
         return hashlib.sha256(self.source).hexdigest()
 
 
+class Shared(Sent):
+    """A value that many jobs are given: it goes to each worker once, and not with every job."""
+
+    def __init__(self, value: Any) -> None:  # pyright: ignore[reportMissingSuperCall]
+        """Take the value, which can be pickled."""
+        self.value, self.name = value, "shared"
+
+    @cached_property
+    def source(self) -> bytes:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The value's bytes."""
+        return pickle.dumps(self.value)
+
+
 @dataclass(frozen=True, slots=True)
 class Worked:
     """A folder that the job changes: here in its place, elsewhere a copy whose changes come back.
@@ -48,8 +64,9 @@ class Worked:
     """
 
     folder: Path
-    without: tuple[str, ...] = ()
-    """Patterns of paths in it that are not sent, such as `rgb/*`; what is there stays."""
+    only: tuple[str, ...] = ()
+    """Patterns of the paths in it that are the job's, such as `scene_000001/*`, where several jobs
+    share a folder that the caller holds; none = all of it, and it is locked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +75,8 @@ class WireFile:
 
     digest: str
     name: str
+    is_value: bool = False
+    """Whether the job is given what is pickled in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,9 +88,22 @@ class WireFolder:
     is_worked: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """A value that is kept in a file of this machine."""
+
+    path: Path
+
+
+@lru_cache(maxsize=1)
+def loaded(path: Path) -> Any:
+    """Return the value that is kept in a file; a worker reads it once."""
+    return pickle.loads(path.read_bytes())
+
+
 def replaced(value: Any, found: Callable[[Any], Any]) -> Any:
     """Return a value with whatever travels in it, in tuples, lists and dicts too, replaced."""
-    if isinstance(value, Sent | Worked | WireFile | WireFolder):
+    if isinstance(value, Sent | Worked | WireFile | WireFolder | Kept):
         return found(value)
     if type(value) in (tuple, list):
         return type(value)(replaced(v, found) for v in value)
@@ -80,10 +112,18 @@ def replaced(value: Any, found: Callable[[Any], Any]) -> Any:
     return value
 
 
-def here(args: tuple[Any, ...], kept: Path) -> tuple[Any, ...]:
-    """Return arguments for a job on this machine: paths as they are, bytes as files in `kept`."""
+def here(args: tuple[Any, ...], kept: Path, *, apart: bool) -> tuple[Any, ...]:
+    """Return arguments for a job on this machine: paths as they are, bytes as files in `kept`.
 
-    def path(item: Any) -> Path:
+    Args:
+        args: of the function.
+        kept: folder for bytes.
+        apart: whether the job runs in another process, which calls it by `called`.
+    """
+
+    def path(item: Any) -> Any:
+        if isinstance(item, Shared):
+            return Kept(_as_file(item, kept)) if apart else item.value
         if isinstance(item, Worked):
             return item.folder
         if not isinstance(item.source, bytes):
@@ -91,6 +131,11 @@ def here(args: tuple[Any, ...], kept: Path) -> tuple[Any, ...]:
         return _as_file(item, kept)
 
     return replaced(args, path)
+
+
+def called(fn: Callable[..., Any], args: tuple[Any, ...]) -> Any:
+    """Do a job in another process of this machine."""
+    return fn(*replaced(args, lambda item: loaded(item.path)))
 
 
 def _as_file(item: Sent, kept: Path) -> Path:
@@ -120,11 +165,11 @@ def packed(
     def wire(item: Any) -> WireFile | WireFolder:
         if isinstance(item, Worked):
             worked.append(item)
-            return _listed(item.folder, item.without, needed, is_worked=True)
+            return _listed(item.folder, item.only, needed, is_worked=True)
         source = item.source
         if isinstance(source, bytes):
             needed[item.digest] = _as_file(item, kept)
-            return WireFile(item.digest, item.name)
+            return WireFile(item.digest, item.name, isinstance(item, Shared))
         if source.is_dir():
             return _listed(source, (), needed, is_worked=False)
         if not source.is_file():
@@ -140,16 +185,16 @@ def packed(
 
 
 def _listed(
-    folder: Path, without: tuple[str, ...], needed: dict[str, Path], *, is_worked: bool
+    folder: Path, only: tuple[str, ...], needed: dict[str, Path], *, is_worked: bool
 ) -> WireFolder:
     """Return a folder as it travels, and add its files to those needed."""
     files: list[tuple[str, str]] = []
     for path in files_in(folder):
-        inside = path.relative_to(folder)
-        if not any(inside.match(pattern) for pattern in without):
+        inside = path.relative_to(folder).as_posix()
+        if not only or any(fnmatch(inside, pattern) for pattern in only):
             digest = digest_of(path)
             needed[digest] = path
-            files.append((inside.as_posix(), digest))
+            files.append((inside, digest))
     return WireFolder(folder.resolve().name, tuple(files), is_worked)
 
 

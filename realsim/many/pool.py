@@ -3,7 +3,7 @@
 from collections.abc import Callable, Generator
 from concurrent.futures import Future
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from realsim.errors import InputError, RealsimError
@@ -63,8 +63,18 @@ class PoolConfig:
         return cores() if self.workers is None else self.workers
 
 
+Workers = PoolConfig | int | None
+"""Where jobs run: a number = so many processes, 1 = this one; None = one a core."""
+
+
+def at_most(where: Workers, jobs: int) -> PoolConfig:
+    """Return where jobs run, with no more workers than there are jobs."""
+    config = where if isinstance(where, PoolConfig) else PoolConfig(workers=where)
+    return replace(config, workers=max(1, min(config.processes, jobs)))
+
+
 @contextmanager
-def open_pool(where: "PoolConfig | int | None" = None) -> Generator[Pool]:
+def open_pool(where: Workers = None) -> Generator[Pool]:
     """Yield who does the work; leaving ends it, in the middle of jobs where an error leaves.
 
     Args:

@@ -21,7 +21,7 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from realsim.interop import cores
-from realsim.many.carried import here
+from realsim.many.carried import called, here
 from realsim.many.pool import Pool, WorkerDiedError
 
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -64,7 +64,7 @@ class _ThisProcess:
         future: Future[Any] = Future()
         try:
             with threadpool_limits(1):
-                future.set_result(fn(*here(args, self._kept)))
+                future.set_result(fn(*here(args, self._kept, apart=False)))
         except Exception as error:
             future.set_exception(error)
         return future
@@ -86,7 +86,7 @@ class _Processes:
 
     def submit(self, fn: Callable[..., Any], /, *args: Any) -> Future[Any]:
         """Give the job to an idle process; a new one takes the place of one that died."""
-        args = here(args, self._kept)
+        args = here(args, self._kept, apart=True)
         place = self._idle.pop()
         try:
             pool, inner = self._start(place, fn, args)
@@ -109,7 +109,7 @@ class _Processes:
                 max_workers=1, mp_context=get_context("spawn"), initializer=_end_with_parent
             )
         with _one_thread():
-            return pool, pool.submit(fn, *args)
+            return pool, pool.submit(called, fn, args)
 
     def _settle(
         self, place: int, process: BaseProcess | None, outer: Future[Any], inner: Future[Any]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from realsim.many.carried import Piece, WireFile, WireFolder, files_in, replaced
+from realsim.many.carried import Piece, WireFile, WireFolder, files_in, loaded, replaced
 from realsim.store import atomic
 from realsim.store.atomic import StorageError
 
@@ -124,8 +124,10 @@ class _Kept:
         """Return arguments with paths, and the folder that is changed, if there is one."""
         worked: list[Path] = []
 
-        def path(item: WireFile | WireFolder) -> Path:
+        def path(item: WireFile | WireFolder) -> Any:
             if isinstance(item, WireFile):
+                if item.is_value:
+                    return loaded(self.file(item.digest))
                 return self._linked(self.folder / "named" / item.digest, item.name, item.digest)
             if item.is_worked:
                 worked.append(self._copied(item, own / item.name))

@@ -158,7 +158,8 @@ class _RayPool:
             wire, files, worked = packed(args, self._kept)
             for item in worked:
                 item.folder.mkdir(parents=True, exist_ok=True)
-                stack.enter_context(only_run_in(item.folder))
+                if not item.only:
+                    stack.enter_context(only_run_in(item.folder))
                 incoming = Incoming(item.folder)
                 stack.callback(incoming.drop)
             job = pickle.dumps((fn, wire))

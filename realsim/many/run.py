@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from typing import Any
@@ -127,7 +127,7 @@ def run_many(
             "again, or leave out --address; the same command goes on from here."
         ) from None
     except KeyboardInterrupt as stop:
-        raise KeyboardInterrupt(str(stop) or f"interrupted: {run.summary}") from None
+        raise type(stop)(str(stop) or f"interrupted: {run.summary}") from None
     return run.summary
 
 
@@ -138,13 +138,14 @@ def _silent(names: Sequence[str]) -> None:
 class _Run:
     """The tasks that wait, those under way, and those whose turn has not come."""
 
-    def __init__(self, tasks: Any, pool: Pool, done: Done, in_order: bool) -> None:
+    def __init__(self, tasks: Iterator[Task], pool: Pool, done: Done, in_order: bool) -> None:
         self.summary = Summary()
-        self._tasks, self._pool, self._done, self._in_order = tasks, pool, done, in_order
+        self._sources = deque([tasks])
+        self._pool, self._done, self._in_order = pool, done, in_order
         self._waiting: deque[_Begun] = deque()
         self._under_way: dict[Future[Any], _Begun] = {}
         self._held: dict[int, Outcome] = {}
-        self._begun, self._told, self._all_begun = 0, 0, False
+        self._begun, self._told = 0, 0
 
     def all(self, tick: Callable[[Sequence[str]], None]) -> None:
         """Work until everything has ended."""
@@ -155,7 +156,7 @@ class _Run:
                     break
                 self._under_way[self._pool.submit(begun.task.fn, *begun.task.args)] = begun
             if not self._under_way:
-                if self._all_begun and not self._waiting:
+                if not self._sources and not self._waiting:
                     return
                 time.sleep(LOOK_UP_S)  # no machine has room now
                 continue
@@ -168,18 +169,13 @@ class _Run:
         if self._waiting:
             return self._waiting.popleft()
         far = self._begun - self._told >= AHEAD * max(self._pool.capacity(), 1)
-        if self._all_begun or (self._in_order and far):
-            return None
-        task = next(self._tasks, None)
-        if task is None:
-            self._all_begun = True
-            return None
-        return self._numbered(task)
-
-    def _numbered(self, task: Task) -> _Begun:
-        """Return a task with its place."""
-        self._begun += 1
-        return _Begun(task, self._begun - 1)
+        while self._sources and not (self._in_order and far):
+            task = next(self._sources[0], None)
+            if task is not None:
+                self._begun += 1
+                return _Begun(task, self._begun - 1)
+            self._sources.popleft()
+        return None
 
     def _take(self, begun: _Begun, future: Future[Any]) -> None:
         """Take what a task came to."""
@@ -216,6 +212,7 @@ class _Run:
             due, self._told = due + 1, self._told + 1
             if now.error is not None:
                 self.summary.failed.append(now)
-            more = self._done(now) or ()
+            more = self._done(now)
             self.summary.done += now.error is None
-            self._waiting.extend(self._numbered(task) for task in more)
+            if more is not None:
+                self._sources.append(iter(more))

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
+from realsim.many import WorkerDiedError, open_pool
 from realsim_sim_bridge.school import recompute_scores, run_school, run_school_results
 from realsim_sim_bridge.school.object_slips import in_words
 from realsim_sim_bridge.school.run_record import RUN_FILE, folder_of_run
-from realsim_sim_bridge.school.workers import WorkerDiedError, local_workers
 from school_scenes import at, model, same, same_motion, scene, small_worlds
 
 CONFIG = small_worlds()
@@ -171,11 +171,11 @@ def deadly(monkeypatch, whole):
     def hire(error=None):
         @contextmanager
         def staff(_):
-            with local_workers(1) as workers:
+            with open_pool(1) as workers:
                 made.append(Deadly(workers, shard[0], error))
                 yield made[-1]
 
-        monkeypatch.setattr(school, "_staff", staff)
+        monkeypatch.setattr(school, "open_pool", staff)
         return shard, made
 
     return hire
@@ -250,11 +250,11 @@ def test_another_mesh_pose_or_object_is_refused(finished):
 
 
 def test_another_version_is_refused(finished, monkeypatch):
-    from realsim_sim_bridge.school import run_record
+    from realsim.store import provenance
 
-    real = run_record.version
+    real = provenance.version
     monkeypatch.setattr(
-        run_record, "version", lambda name: "9.9" if name == "pybullet" else real(name)
+        provenance, "version", lambda name: "9.9" if name == "pybullet" else real(name)
     )
     with pytest.raises(InputError, match=r"versions.pybullet: \"[\d.]+\" -> \"9.9\""):
         run(finished)

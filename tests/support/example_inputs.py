@@ -54,7 +54,7 @@ def add_grasps(session: Path) -> None:
     """Try a few grasps and annotate the frames."""
     console = Console(quiet=True)
     store = SessionStore.open(session)
-    run_in_session(store, SchoolRequest(grasps=GRASPS, workers=1), console)
+    run_in_session(store, SchoolRequest(grasps=GRASPS, where=1), console)
     run_annotate(session, console, maps="instance,depth", workers=1, check_depth=True)
 
 

@@ -1,10 +1,12 @@
 """Functions that tasks of tests run, in whatever process or on whatever node."""
 
+import errno
 import signal
 import time
 from pathlib import Path
 
 from realsim.errors import InputError
+from realsim.store import atomic
 
 
 def doubled(number):
@@ -63,3 +65,12 @@ def rewrites(folder, text):
 def spoils_and_fails(folder):
     (folder / "changed.txt").write_text("spoiled")
     raise InputError("it cannot be done")
+
+
+def fills_the_disk(folder, is_stored):
+    """Meet a full disk, as a stage tells it or as the system does."""
+    full = OSError(errno.ENOSPC, "No space left on device")
+    if not is_stored:
+        raise full
+    with atomic.storing(Path(folder), "a result"):
+        raise full

@@ -1,41 +1,36 @@
-"""A program: two Ray nodes on loopback, of which one is killed in the middle of the school.
+"""A program: a Ray cluster on loopback loses a node, or its head, while a command runs on it.
 
-It prints what came of it as one JSON line.
+    python ray_on_loopback.py node|head FOLDER      -> what came of it, as one JSON line
+
+The command is `realsim generate`: its scenes are made on the nodes and come back as files.
 """
 
+import hashlib
 import json
 import os
 import socket
-import threading
+import subprocess
+import sys
+import time
+from pathlib import Path
 
-from realsim_sim_bridge.school import ClusterConfig, run_school_results
-from school_scenes import at, model, same, same_motion, scene, small_worlds
-
-OBJECTS = scene(at(0, 0), at(0.2, 0.1, instance=1))
-
-
-def school(workers, progress=None):
-    return run_school_results(
-        OBJECTS, {1: model()}, small_worlds(), workers=workers, shard_grasps=2, progress=progress
-    )
-
-
-def agree(a, b):
-    return all(
-        same(x.grasp_set, y.grasp_set) and same_motion(x.trajectories, y.trajectories)
-        for x, y in zip(a, b, strict=True)
-    )
+SCENES = 4
+GENERATE = ("--views", "2", "--objects", "1-2", "--size", "160x120", "--hull-only", "--no-maps",
+            "--scenes", str(SCENES))  # fmt: skip
+ONE_NODE = {"num_cpus": 1, "object_store_memory": 80_000_000}
+LONGEST_S = 200
 
 
 def nodes(count):
     """Start nodes whose every port is on loopback."""
     os.environ.update(RAY_AUTH_MODE="token", RAY_USAGE_STATS_ENABLED="0")
     os.environ.update(RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER="0", RAY_ENABLE_UV_RUN_RUNTIME_ENV="0")
+    os.environ["RAY_AUTH_TOKEN"] = "t" * 64
     from ray.cluster_utils import Cluster
 
-    one = {"num_cpus": 1, "object_store_memory": 80_000_000}
-    cluster = Cluster(initialize_head=True, head_node_args={**one, "include_dashboard": False})
-    return cluster, [cluster.add_node(**one) for _ in range(count - 1)]
+    head = {**ONE_NODE, "include_dashboard": False}
+    cluster = Cluster(initialize_head=True, head_node_args=head)
+    return cluster, [cluster.add_node(**ONE_NODE) for _ in range(count - 1)]
 
 
 def listening_beyond_loopback(address):
@@ -50,26 +45,67 @@ def listening_beyond_loopback(address):
     return found
 
 
-def two_nodes():
-    os.environ["RAY_AUTH_TOKEN"] = "t" * 64
-    cluster, (other,) = nodes(2)
-    killed = []
+def generate(out, *more):
+    """Start the command."""
+    line = "import sys; from realsim.app.cli import main; sys.argv[0] = 'realsim'; main()"
+    return subprocess.Popen(
+        [sys.executable, "-c", line, "generate", str(out), *GENERATE, *more],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
 
-    def kill_one(done, of):
-        if not killed and 4 <= done < of:
-            killed.append(done)
-            threading.Thread(target=cluster.remove_node, args=(other, False)).start()
 
-    found = school(ClusterConfig(address=cluster.address), kill_one)
-    beyond = listening_beyond_loopback(cluster.address)
-    cluster.shutdown()
+def finished(out):
+    """Return how many scenes are there."""
+    return len(list(out.glob("layouts/*.finished.json")))
+
+
+def wait_for_one(process, out):
+    """Wait until the first scene is there, or the command has ended."""
+    begun = time.monotonic()
+    while not finished(out) and process.poll() is None and time.monotonic() - begun < LONGEST_S:
+        time.sleep(0.05)
+
+
+def digests(out):
+    """Return the hashes of what a scene is; its costs and dates differ from run to run."""
+    kinds = ("rgb/*.png", "depth/*.png", "mask/*.png", "mask_visib/*.png", "annotations/*.json",
+             "models/*.ply")  # fmt: skip
     return {
-        "killed": killed,
-        "same": agree(found, school(1)),
-        "unfinished": [r.unfinished for r in found],
-        "beyond_loopback": beyond,
+        p.relative_to(out).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
+        for kind in kinds
+        for p in sorted(out.glob(f"scene_*/{kind}"))
     }
 
 
+def lose(what, folder):
+    """Lose a node, or the head, after the first scene; return what came of the command."""
+    cluster, others = nodes(2 if what == "node" else 1)
+    out = folder / what
+    process = generate(out, "--address", cluster.address)
+    wait_for_one(process, out)
+    beyond = listening_beyond_loopback(cluster.address)
+    lost = others[0] if what == "node" else cluster.head_node
+    cluster.remove_node(lost, allow_graceful=False)
+    at = finished(out)
+    _, told = process.communicate(timeout=LONGEST_S)
+    kept = digests(out)
+    again, code = "", process.returncode
+    if what == "head":
+        process = generate(out)
+        again = process.communicate(timeout=LONGEST_S)[1]
+    else:
+        cluster.shutdown()
+    whole = generate(folder / "whole")
+    whole.communicate(timeout=LONGEST_S)
+    expected = digests(folder / "whole")
+    return {
+        "finished_when_lost": at, "code": code, "told": told, "again": again,
+        "again_code": process.returncode, "same": digests(out) == expected and bool(expected),
+        "kept_same": all(expected.get(name) == digest for name, digest in kept.items()),
+        "kept": len(kept), "beyond_loopback": beyond,
+        "leftovers": [str(p) for p in out.rglob("*.part")],
+    }  # fmt: skip
+
+
 if __name__ == "__main__":
-    print(json.dumps(two_nodes()), flush=True)
+    print(json.dumps(lose(sys.argv[1], Path(sys.argv[2]))), flush=True)

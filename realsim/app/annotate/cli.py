@@ -1,11 +1,15 @@
 """`realsim annotate`: masks, maps, poses, visibility and grasps on every frame of a session."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from realsim.app.command import Command
-from realsim.app.options import FOLDER, JSON, QUIET, workers
+from realsim.app.options import FOLDER, JSON, QUIET, many
+
+if TYPE_CHECKING:
+    from realsim.many import PoolConfig
 
 
 @click.command(
@@ -16,13 +20,13 @@ from realsim.app.options import FOLDER, JSON, QUIET, workers
 @click.option("--maps", default="instance,depth", show_default=True,
               metavar="all|none|LIST",
               help="Maps of each frame: instance, depth, coordinates, normals.")  # fmt: skip
-@workers(1, "Processes that compute frames.")
+@many(1, "Frames at a time.")
 @click.option("--no-depth-check", is_flag=True,
               help="Do not look for unknown things in the measured depth.")  # fmt: skip
 @JSON
 @QUIET
 def annotate_command(
-    session: Path, maps: str, workers: int, no_depth_check: bool, as_json: bool, quiet: bool
+    session: Path, maps: str, where: "PoolConfig", no_depth_check: bool, as_json: bool, quiet: bool
 ) -> None:
     """Write masks, maps, poses, visibility and grasps for every frame of SESSION.
 
@@ -38,6 +42,6 @@ def annotate_command(
 
     console = Console(quiet=quiet, as_json=as_json)
     summary = run_annotate(
-        session, console, maps=maps, workers=workers, check_depth=not no_depth_check
+        session, console, maps=maps, workers=where, check_depth=not no_depth_check
     )
     console.result(summary)

@@ -16,6 +16,7 @@ from realsim.app.stages import (
     session_models,
 )
 from realsim.arrays import Image
+from realsim.many import Workers
 from realsim.store import SessionStore
 from realsim.store.lock import only_run_in
 
@@ -36,7 +37,7 @@ SHEET_WIDTH_PX = 960
 
 
 def run_annotate(
-    session: Path, console: Console, *, maps: str, workers: int, check_depth: bool
+    session: Path, console: Console, *, maps: str, workers: Workers, check_depth: bool
 ) -> "AnnotationSummary":
     """Annotate a session, show the summary, and draw the contact sheet and the page.
 
@@ -44,7 +45,7 @@ def run_annotate(
         session: the session's folder.
         console: where it is told.
         maps: 'all', 'none', or a list of maps.
-        workers: processes that compute frames.
+        workers: who computes frames.
         check_depth: whether the measured depth may take pixels out of the masks.
 
     Raises:

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from realsim.app.command import Command
-from realsim.app.options import FOLDER, JSON, QUIET, seed, workers
+from realsim.app.options import FOLDER, JSON, QUIET, many, seed
 from realsim.app.outputs import GOES_ON
 
 if TYPE_CHECKING:
     from realsim.app.generate.request import GenerateRequest
+    from realsim.many import PoolConfig
 
 
 @click.command(
@@ -61,11 +62,11 @@ if TYPE_CHECKING:
 @click.option("--textures", type=FOLDER, default=None,
               help="Folder of own textures: pictures, or a folder for each material.")  # fmt: skip
 @click.option("--no-maps", is_flag=True, help="No label maps (coordinates, normals, ...).")
-@workers(help="Processes: scenes at a time.")
+@many(help="Scenes at a time.")
 @JSON
 @QUIET
 def generate_command(
-    out: Path, scenes: int, workers: int, as_json: bool, quiet: bool, **options: Any
+    out: Path, scenes: int, where: "PoolConfig", as_json: bool, quiet: bool, **options: Any
 ) -> None:
     """Make tabletop scenes in OUT: objects dropped by physics, rendered, with every label.
 
@@ -93,7 +94,7 @@ def generate_command(
 
     request = _request(**options)
     console = Console(quiet=quiet, as_json=as_json)
-    outcome = generate(out, scenes, request, workers, console)
+    outcome = generate(out, scenes, request, where, console)
     layouts = finished_layouts(out, scenes, request)
     dataset = dataset_of(out, request, layouts)
     with storing(out, "the data set's tables and pictures"):

@@ -4,19 +4,20 @@ import hashlib
 import json
 import math
 import re
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from realsim import __version__
 from realsim.errors import InputError
+from realsim.many import Sent
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.store import atomic
 from realsim.untrusted.own_json import read_object
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
 from realsim_sim_bridge.table_scenes.cameras import RANGES, ViewConfig
 from realsim_sim_bridge.table_scenes.config import TableSceneConfig
-from realsim_sim_bridge.table_scenes.pool import ObjectPool
+from realsim_sim_bridge.table_scenes.pool import PYBULLET, ObjectPool, pybullet_folder
 from realsim_sim_bridge.table_scenes.scene import OwnLooks
 
 REQUEST_FILE = "generate.json"
@@ -51,6 +52,27 @@ class GenerateRequest:
             "own_looks": _looks_digest(self.looks),
         }))  # fmt: skip
         return values
+
+    def carried(self) -> tuple[Any, ...]:
+        """Return the request and its files as they travel to another machine, see `with_files`."""
+        folders = (None if s.kind == PYBULLET else Sent(s.folder) for s in self.pool.sources)
+        looks = (tuple(map(Sent, self.looks.hdris)), tuple(map(Sent, self.looks.textures)))
+        return self, tuple(folders), *looks
+
+    def with_files(
+        self, folders: tuple[Path | None, ...], hdris: tuple[Path, ...], textures: tuple[Path, ...]
+    ) -> "GenerateRequest":
+        """Return the request with its files in other places.
+
+        Args:
+            folders: of the pool's sources; None = where PyBullet is installed here.
+            hdris: the user's panoramas.
+            textures: the user's textures.
+        """
+        moved = zip(self.pool.sources, folders, strict=True)
+        sources = tuple(replace(s, folder=f or pybullet_folder()) for s, f in moved)
+        looks = OwnLooks(hdris=hdris, textures=textures)
+        return replace(self, pool=ObjectPool(sources=sources), looks=looks)
 
     @property
     def key(self) -> str:

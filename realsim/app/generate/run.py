@@ -1,22 +1,31 @@
 """All scenes of a data set: several at a time, each by one process, gone on with after a kill."""
 
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from realsim.app.console import Console
-from realsim.app.generate.request import GenerateRequest, claim, made_folder, require_usable
-from realsim.app.generate.scene import SceneCosts, is_finished, make_scene
-from realsim.errors import RealsimError
-from realsim.store.atomic import StorageError
+from realsim.app.generate.request import (
+    LAYOUTS,
+    GenerateRequest,
+    claim,
+    made_folder,
+    require_usable,
+)
+from realsim.app.generate.scene import CACHE, SceneCosts, is_finished, make_scene_of
+from realsim.many import (
+    Outcome,
+    PoolConfig,
+    Task,
+    Worked,
+    WorkerDiedError,
+    at_most,
+    open_pool,
+    run_many,
+)
 from realsim.store.lock import only_run_in
-from realsim_sim_bridge.school.workers import WorkerDiedError, local_workers
 from realsim_sim_bridge.synthetic.frame import require_renderer
 from realsim_sim_bridge.table_scenes.scene import scene_name
-
-POLL_S = 1.0
-"""The files written so far are counted this often [s]."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -32,11 +41,11 @@ class GenerateOutcome:
 
 
 def generate(
-    out: Path, scenes: int, request: GenerateRequest, workers: int, console: Console
+    out: Path, scenes: int, request: GenerateRequest, where: PoolConfig, console: Console
 ) -> GenerateOutcome:
     """Make the scenes 0 to `scenes` - 1 of a request.
 
-    A scene's bytes depend on the request and its number only, not on `workers`.
+    A scene's bytes depend on the request and its number only, not on where it is made.
 
     Raises:
         InputError: the folder holds something else, another run works in it, the pool or the
@@ -50,12 +59,14 @@ def generate(
         claim(out, request)
         kept = [k for k in range(scenes) if is_finished(out, k, request)]
         due = [k for k in range(scenes) if k not in kept]
-        at_once = max(1, min(workers, len(due)))
+        pool = at_most(where, len(due))
+        # Scenes fewer than workers: the rest help with the views.
+        each = 1 if where.address else max(1, where.processes // pool.processes)
         plural = "" if scenes == 1 else "s"
         what = f"{scenes} scene{plural} of {request.views.count} views"
         with console.stage("generate", what) as tick:
-            made, failed = _made(out, due, request, (at_once, workers // at_once), _ticker(
-                out, scenes, request.views.count, tick))  # fmt: skip
+            count = _ticker(out, scenes, request.views.count, tick)
+            made, failed = _made(out, due, request, pool, each, count)
     return GenerateOutcome(
         kept=tuple(kept), made=tuple(sorted(made, key=lambda c: c.number)),
         failed=dict(sorted(failed.items())),
@@ -66,35 +77,38 @@ def _made(
     out: Path,
     due: list[int],
     request: GenerateRequest,
-    share: tuple[int, int],
+    where: PoolConfig,
+    workers: int,
     tick: Callable[[], None],
 ) -> tuple[list[SceneCosts], dict[int, str]]:
-    """Make the scenes that are due, so many at a time, each with so many processes for its views.
+    """Make the scenes that are due, each with so many processes for its views.
 
     A scene that cannot be made is named, and the others are made all the same.
     """
     made: list[SceneCosts] = []
     failed: dict[int, str] = {}
-    waiting = list(due)
     tick()
-    under_way: dict[Future[SceneCosts], int] = {}
-    with local_workers(share[0]) as pool:
-        while waiting or under_way:
-            while waiting and len(under_way) < pool.capacity():
-                k = waiting.pop(0)
-                under_way[pool.submit(make_scene, out, k, request, max(1, share[1]))] = k
-            done, _ = wait(under_way, timeout=POLL_S, return_when=FIRST_COMPLETED)
-            for future in done:
-                k = under_way.pop(future)
-                try:
-                    made.append(future.result())
-                except StorageError:
-                    raise  # the next scenes would fall as this one, and then find no room either
-                except WorkerDiedError as error:
-                    failed[k] = f"{error}. Run the same command again: it goes on from here."
-                except RealsimError as error:
-                    failed[k] = str(error)
-            tick()
+    if not due:
+        return made, failed
+    numbers = {scene_name(k): k for k in due}
+
+    def task(name: str) -> Task:
+        own = Worked(out, only=(f"{name}/*", f"{LAYOUTS}/{name}.*", f"{CACHE}/*"))
+        args = own, numbers[name], *request.carried(), workers
+        return Task(name=name, fn=make_scene_of, args=args)
+
+    def done(outcome: Outcome) -> None:
+        if outcome.error is None:
+            made.append(outcome.value)
+        elif isinstance(outcome.error, WorkerDiedError):
+            failed[numbers[outcome.task.name]] = (
+                f"{outcome.why}. Run the same command again: it goes on from here."
+            )
+        else:
+            failed[numbers[outcome.task.name]] = outcome.why
+
+    with open_pool(where) as pool:
+        run_many(map(task, numbers), pool, done, tick=lambda _: tick())
     return made, failed
 
 

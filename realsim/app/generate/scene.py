@@ -126,6 +126,22 @@ def make_scene(out: Path, number: int, request: GenerateRequest, workers: int = 
     return costs
 
 
+def make_scene_of(
+    out: Path,
+    number: int,
+    request: GenerateRequest,
+    folders: tuple[Path | None, ...],
+    hdris: tuple[Path, ...],
+    textures: tuple[Path, ...],
+    workers: int,
+) -> SceneCosts:
+    """Make a scene, or what is missing of it, where files may lie elsewhere than the request says.
+
+    Arguments as of `GenerateRequest.with_files` and `make_scene`.
+    """
+    return make_scene(out, number, request.with_files(folders, hdris, textures), workers)
+
+
 def stored_costs(out: Path, number: int) -> dict[str, Any]:
     """Return what the run that finished a scene spent on it; empty where that is not known."""
     path = finished_path(out, number)

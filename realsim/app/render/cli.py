@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from realsim.app.command import Command
-from realsim.app.options import FOLDER, JSON, QUIET, seed, workers
+from realsim.app.options import FOLDER, JSON, QUIET, many, seed
 from realsim.app.outputs import GOES_ON
 
 
@@ -39,7 +39,7 @@ from realsim.app.outputs import GOES_ON
 @click.option("--material", "materials", multiple=True, metavar="table=KIND",
               help="Another table: oak, marble, ...  [as in the photographs]")  # fmt: skip
 @seed("Of new views and of the camera's noise.")
-@workers()
+@many(help="Frames at a time.")
 @JSON
 @QUIET
 def render_command(session: Path, as_json: bool, quiet: bool, **options: Any) -> None:

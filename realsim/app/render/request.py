@@ -10,6 +10,7 @@ from realsim.app.generate.request import depth_model_of
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.many import Workers
 from realsim.records import CameraIntrinsics, Scene
 from realsim.rendering.depth_sensors.profiles import PROFILES
 from realsim.store import SessionStore
@@ -49,7 +50,7 @@ class RenderRequest:
     materials: tuple[str, ...] = ()
     """table=KIND."""
     seed: int = 0
-    workers: int = 1
+    where: Workers = 1
 
     def __post_init__(self) -> None:
         """Check what can be checked without the session.

@@ -105,7 +105,7 @@ def _written(
     """Render and label the views in a folder of their own."""
     return write_session(
         folder, look.synthetic, wanted.intrinsics, wanted.Ts_world_cam, request.config(store),
-        request.seed, grasps, tick, request.workers, models_from=store.folder / "models",
+        request.seed, grasps, tick, request.where, models_from=store.folder / "models",
     )  # fmt: skip
 
 

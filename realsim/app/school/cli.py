@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from realsim.app.command import Command, Group
-from realsim.app.options import FOLDER, JSON, QUIET, arm, json_file, seed, workers
+from realsim.app.options import FOLDER, JSON, QUIET, arm, json_file, many, seed
 from realsim.app.outputs import GOES_ON, OutputFile, OutputFolder
 
 ENGINES = ("pybullet", "mujoco")
@@ -116,8 +116,7 @@ def SCHOOL() -> None:
 @click.option("--models", type=FOLDER, default=None, help="Models of a SOURCE that is no session.")
 @click.option("--quaternions", type=click.Choice(("wxyz", "xyzw")), default=None,
               help="Their order in a scene.yaml that does not tell it.")  # fmt: skip
-@workers()
-@click.option("--address", default="", metavar="RAY", help="HOST:PORT of a Ray cluster, or local.")
+@many()
 @click.option("--restart", is_flag=True, help="Throw away results of other parameters.")
 @seed()
 @json_file("Write the counts there, too.", "reasons", "agreement", "settings")

@@ -12,6 +12,7 @@ import numpy as np
 from realsim.app.console import Console
 from realsim.arrays import Array
 from realsim.errors import InputError
+from realsim.many import Workers
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectModel, Scene, names_of
 from realsim.robots.hand_file import STIFFEST_N_PER_M
@@ -60,9 +61,7 @@ class SchoolRequest:
     """Points on the surface that candidates start from."""
     rotations: int | None = None
     """Grasps per pair of contacts."""
-    workers: int = 2
-    address: str = ""
-    """HOST:PORT of a Ray cluster, or 'local' to start one here; '' = processes of this machine."""
+    where: Workers = 2
     restart: bool | Literal["finished"] = False
     """Whether results of other parameters are thrown away; "finished" = those of a finished run."""
     models: Path | None = None

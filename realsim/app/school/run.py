@@ -16,6 +16,7 @@ from realsim.app.school.inputs import (
     spread_of,
 )
 from realsim.app.school.settle import warn_of_falls
+from realsim.app.stages import note
 from realsim.errors import InputError
 from realsim.records import GraspSet, Scene
 from realsim.robots.robot_files import same_name
@@ -25,8 +26,9 @@ if TYPE_CHECKING:
     from realsim.robots.hand import Hand
     from realsim_sim_bridge.school import SchoolConfig
 
-LOCAL_CLUSTER = "local"
-"""Address that starts a cluster of this machine alone."""
+
+MADE_FROM = ("registration/scene.json", "review/journal.jsonl", "models/*")
+"""Files of a session that a school is made of."""
 
 
 def config_of(request: SchoolRequest, scene: Scene) -> "SchoolConfig":
@@ -138,6 +140,11 @@ def try_grasps(
     outcome = _tried(inputs, config, request, console)
     with console.stage("write", "files and pictures"):
         write_outcome(outcome)
+    read = MADE_FROM if inputs.store is not None else ()
+    note(
+        inputs.store or inputs.folder, "school", console, request=request, config=config,
+        inputs=read,
+    )  # fmt: skip
     return outcome
 
 
@@ -153,17 +160,11 @@ def _tried(
     inputs: SchoolInputs, config: "SchoolConfig", request: SchoolRequest, console: Console
 ) -> SchoolOutcome:
     """Run the school."""
-    from realsim_sim_bridge.school.cluster import ClusterConfig
     from realsim_sim_bridge.school.school import run_school_results
 
-    workers: int | ClusterConfig = request.workers
-    if request.address == LOCAL_CLUSTER:
-        workers = ClusterConfig(workers=request.workers)
-    elif request.address:
-        workers = ClusterConfig(address=request.address)
     with console.stage("school", f"up to {request.grasps} grasps an object") as tick:
         results = run_school_results(
-            inputs.scene, inputs.models, config, workers=workers, cache=inputs.folder / CACHE,
+            inputs.scene, inputs.models, config, workers=request.where, cache=inputs.folder / CACHE,
             progress=tick, solids=inputs.solids, restart=request.restart,
         )  # fmt: skip
     return SchoolOutcome(
@@ -194,7 +195,5 @@ def school_session(
         InputError: the session has not been registered, or has no supporting plane, or holds
             unfinished results of other parameters.
     """
-    request = SchoolRequest(
-        grasps=grasps_per_object, seed=seed, workers=workers, restart="finished"
-    )
+    request = SchoolRequest(grasps=grasps_per_object, seed=seed, where=workers, restart="finished")
     return run_in_session(store, request, console).sets

@@ -2,8 +2,7 @@
 
 import sys
 import time
-from collections.abc import Generator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
@@ -11,9 +10,7 @@ from typing import Protocol
 from realsim.app.console import Console
 from realsim.app.upgrade.scene import Record, SceneJob, read_source, upgrade_scene
 from realsim.errors import RealsimError
-
-ATTEMPTS = 2
-"""Times that a scene is begun: a process that was killed is gone on with once."""
+from realsim.many import Outcome, Task, open_pool, run_many
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -36,38 +33,34 @@ class Told(Protocol):
 
 
 def upgrade_in_processes(
-    jobs: Sequence[SceneJob], processes: int, tell: Told
-) -> Generator[SceneEnd]:
-    """Upgrade scenes, so many at a time, and yield each as it ends.
+    jobs: Sequence[SceneJob], processes: int, tell: Told, take: Callable[[SceneEnd], None]
+) -> None:
+    """Upgrade scenes, so many at a time, and hand on how each ended.
 
-    A scene with broken input ends with its reason. A scene whose process was killed is gone on with
-    once, from the stage where it was; what its stages had finished is not done again.
+    A scene with broken input ends with its reason. A scene whose process was killed is gone on
+    with, from the stage where it was; what its stages had finished is not done again.
     """
-    from realsim_sim_bridge.school.workers import WorkerDiedError, local_workers
+    by = {job.ref.place: job for job in jobs}
+    under_way: Sequence[str] = ()
 
-    waiting = [(job, 1) for job in reversed(jobs)]
-    running: dict[Future[SceneEnd], tuple[SceneJob, int]] = {}
-    with local_workers(processes) as pool:
-        while waiting or running:
-            while waiting and len(running) < pool.capacity():
-                job, attempt = waiting.pop()
-                running[pool.submit(upgraded, job)] = job, attempt
-            tell(None, [job.ref.place for job, _ in running.values()])
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                job, attempt = running.pop(future)
-                try:
-                    end = future.result()
-                except WorkerDiedError as died:
-                    if attempt < ATTEMPTS:
-                        waiting.append((job, attempt + 1))
-                        continue
-                    end = SceneEnd(
-                        job=job, record=None,
-                        error=f"{died}; {ATTEMPTS} times. Run the same again with fewer "
-                        "--scene-workers.",
-                    )  # fmt: skip
-                tell(end, [job.ref.place for job, _ in running.values()])
-                yield end
+    def tick(names: Sequence[str]) -> None:
+        nonlocal under_way
+        under_way = names
+        tell(None, names)
+
+    def done(outcome: Outcome) -> None:
+        end = outcome.value
+        if outcome.error is not None:
+            job, why = by[outcome.task.name], outcome.why
+            if outcome.deaths:
+                why += ". Run the same again with fewer --workers."
+            end = SceneEnd(job=job, record=None, error=why)
+        tell(end, [name for name in under_way if name != outcome.task.name])
+        take(end)
+
+    tasks = [Task(name=place, fn=upgraded, args=(job,)) for place, job in by.items()]
+    with open_pool(processes) as pool:
+        run_many(tasks, pool, done, tick=tick)
 
 
 def upgraded(job: SceneJob) -> SceneEnd:

@@ -122,12 +122,8 @@ def _many(
     processes = min(config.scene_workers or cores(), len(refs))
     workers = config.workers if processes == 1 else 1
     jobs = [_job(ref, config, out, workers) for ref in refs]
-    with (
-        scene_progress(len(refs) + len(done), len(done), quiet=console.quiet) as tell,
-        contextlib.closing(upgrade_in_processes(jobs, processes, tell)) as ends,
-    ):
-        for end in ends:
-            _take(end, done, failed, console)
+    with scene_progress(len(refs) + len(done), len(done), quiet=console.quiet) as tell:
+        upgrade_in_processes(jobs, processes, tell, lambda e: _take(e, done, failed, console))
     return failed
 
 

@@ -2,15 +2,10 @@
 
 A view's annotation file is written last and carries a digest of all its inputs. Running again after
 a kill skips the views whose digest still holds, and does the others. Views can be computed by
-several processes; this one alone writes.
+several processes or machines; this one alone writes.
 """
 
-import pickle
-import tempfile
-from collections.abc import Callable, Collection, Generator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import ExitStack, closing
-from functools import lru_cache
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +15,7 @@ from realsim import images
 from realsim.arrays import Array32
 from realsim.errors import InputError
 from realsim.geometry import mesh_shape
+from realsim.many import Outcome, Sent, Shared, Task, Workers, at_most, open_pool, run_many
 from realsim.records import GraspSet, Mesh, ObjectModel, Scene, View
 from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore
@@ -38,7 +34,6 @@ from realsim_sim_bridge.annotation.inputs import (
     gathered,
 )
 from realsim_sim_bridge.annotation.summary import AnnotationSummary, numbers, summary_of
-from realsim_sim_bridge.school.workers import local_workers
 
 # --- What holds for an object in every view: verdict, matter, box, and points on its surface -----
 
@@ -113,7 +108,7 @@ def annotate(  # noqa: PLR0913 - keywords, each with a meaning of its own
     *,
     only: Collection[int] | None = None,
     progress: Progress | None = None,
-    workers: int = 1,
+    workers: Workers = 1,
     surroundings: Sequence[PlacedMesh] | None = None,
     damaged: Collection[str] = (),
 ) -> AnnotationSummary:
@@ -128,7 +123,7 @@ def annotate(  # noqa: PLR0913 - keywords, each with a meaning of its own
         only: the views in which the objects were registered; None = all. Others get no labels:
             their camera, or their depth, is not to be trusted.
         progress: called with (views done, views in all).
-        workers: processes that compute views; 1 = this one. The files are the same.
+        workers: who computes views; 1 = this process. The files are the same.
         surroundings: what hides things without carrying a label, where it is known exactly, as in
             a synthetic scene; None = a table under the scene's plane, if it has one.
         damaged: paths of files that are not as they were written; views that have one are done
@@ -148,13 +143,14 @@ def annotate(  # noqa: PLR0913 - keywords, each with a meaning of its own
     if progress is not None:
         progress(skipped, len(views))
     new = [v for v in todo if v.index not in parts]
-    # Closed at once when it is interrupted, so that no process goes on computing.
-    with closing(_computed(store, inputs, new, workers)) as frames:
-        for index, frame in frames:
-            files.write_view(store, index, frame.files)
-            parts[index] = frame.part
-            if progress is not None:
-                progress(len(parts), len(views))
+
+    def keep(index: int, frame: FrameFiles) -> None:
+        files.write_view(store, index, frame.files)
+        parts[index] = frame.part
+        if progress is not None:
+            progress(len(parts), len(views))
+
+    _compute(store, inputs, new, workers, keep)
     parts = {index: parts[index] for index in sorted(parts)}
     files.remove_stale(store, parts, inputs.models)
     files.write_bop(store, parts, {i: m.name for i, m in inputs.models.items()})
@@ -174,30 +170,28 @@ def _calibrated_views(store: SessionStore, only: Collection[int] | None) -> tupl
     return views
 
 
-def _computed(
-    store: SessionStore, inputs: FrameInputs, views: Sequence[FrameView], workers: int
-) -> Generator[tuple[int, FrameFiles]]:
-    """Yield the number and the files of every view, as they are done."""
-    if workers <= 1 or len(views) <= 1:
-        for view in views:
-            yield view.index, frame_files(inputs, view, _measured(inputs, _depth(store, view)))
+def _compute(
+    store: SessionStore,
+    inputs: FrameInputs,
+    views: Sequence[FrameView],
+    workers: Workers,
+    keep: Callable[[int, FrameFiles], None],
+) -> None:
+    """Compute the files of views, and hand on each view's as they are done."""
+    if not views:
         return
-    with ExitStack() as stack:
-        # Meshes go to the processes by a file, once, and not with every view.
-        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="realsim-annotate-"))
-        shared = Path(folder) / "inputs.pickle"
-        shared.write_bytes(pickle.dumps(inputs))
-        pool = stack.enter_context(local_workers(min(workers, len(views))))
-        running: dict[Future[FrameFiles], int] = {}
-        waiting = list(reversed(views))
-        while waiting or running:
-            while waiting and len(running) < pool.capacity():
-                view = waiting.pop()
-                job = pool.submit(_frame_job, shared, view, _depth(store, view))
-                running[job] = view.index
-            done, _ = wait(running, return_when=FIRST_COMPLETED)
-            for job in done:
-                yield running.pop(job), job.result()
+    shared = Shared(inputs)
+
+    def task(view: FrameView) -> Task:
+        depth = _depth(store, view)
+        sent = None if depth is None else Sent(depth)
+        return Task(name=str(view.index), fn=_frame, args=(shared, view, sent))
+
+    def done(outcome: Outcome) -> None:
+        keep(int(outcome.task.name), outcome.found())
+
+    with open_pool(at_most(workers, len(views))) as pool:
+        run_many(map(task, views), pool, done)
 
 
 def _depth(store: SessionStore, view: FrameView) -> Path | None:
@@ -212,14 +206,6 @@ def _measured(inputs: FrameInputs, path: Path | None) -> Array32:
     return np.zeros((inputs.intrinsics.height, inputs.intrinsics.width), np.float32)
 
 
-def _frame_job(shared: Path, view: FrameView, depth: Path | None) -> FrameFiles:
-    """Return the files of a view; run in a process of its own."""
-    inputs = _shared_inputs(shared)
+def _frame(inputs: FrameInputs, view: FrameView, depth: Path | None) -> FrameFiles:
+    """Return the files of a view."""
     return frame_files(inputs, view, _measured(inputs, depth))
-
-
-@lru_cache(maxsize=1)
-def _shared_inputs(path: Path) -> FrameInputs:
-    """Return the inputs of all views, read once per process."""
-    inputs: FrameInputs = pickle.loads(path.read_bytes())
-    return inputs

@@ -1,13 +1,11 @@
 """Robot School: which grasps the arm reaches and physics holds, and how well."""
 
-from realsim_sim_bridge.school.cluster import ClusterConfig
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.kept_sets import SchoolResult
 from realsim_sim_bridge.school.school import run_school, run_school_results
 from realsim_sim_bridge.slip.score import ScoreLimits, recompute_scores
 
 __all__ = [
-    "ClusterConfig",
     "SchoolConfig",
     "SchoolResult",
     "ScoreLimits",

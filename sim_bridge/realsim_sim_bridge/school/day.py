@@ -1,8 +1,6 @@
 """A day at school: every object's preparation, then its grasps in shards, on whatever workers."""
 
-from collections import deque
-from collections.abc import Callable, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ from realsim.arrays import Array, Rows
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.geometry.mesh import hull_vertices
+from realsim.many import Outcome, Pool, Sent, Task, WorkerDiedError, run_many
 from realsim.models.convex import convex_parts
 from realsim_sim_bridge.school.kept_sets import (
     SchoolResult,
@@ -36,15 +35,9 @@ from realsim_sim_bridge.school.shards import (
     shards_of,
     write_tested,
 )
-from realsim_sim_bridge.school.workers import WorkerDiedError, Workers
 from realsim_sim_bridge.slip.stand import Stand
 
 Progress = Callable[[int, int], None]
-
-MOST_DEATHS = 3
-"""A job that ended so many workers is not given to another: it is the job, not the machine."""
-LOOK_UP_S = 5.0
-"""How often a waiting day asks whether there are more workers [s]."""
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
@@ -196,30 +189,11 @@ class Pupil:
         return self.path(f"shard_{int(rows[0]):06d}")
 
 
-@dataclass(eq=False, slots=True)
-class _Job:
-    """A preparation, or the test of a shard."""
-
-    pupil: Pupil
-    rows: Rows | None = None
-    """None = the preparation."""
-    deaths: int = 0
-    """Workers that ended in the middle of it."""
-
-    @property
-    def name(self) -> str:
-        """The job in words."""
-        what = "preparation" if self.rows is None else in_words(self.rows)
-        return f"{self.pupil.name}, {what}"
-
-
 class Day:
-    """Hands out the jobs; this process alone writes the files."""
+    """Hands out preparations and shards; this process alone writes the files."""
 
-    def __init__(self, workers: Workers, pupils: list[Pupil], progress: Progress | None) -> None:
-        self._workers, self._pupils, self._progress = workers, pupils, progress
-        self._waiting: deque[_Job] = deque()
-        self._under_way: dict[Future[Any], _Job] = {}
+    def __init__(self, pool: Pool, pupils: list[Pupil], progress: Progress | None) -> None:
+        self._pool, self._pupils, self._progress = pool, pupils, progress
 
     def run(self) -> None:
         """Work until every pupil has its result.
@@ -228,87 +202,87 @@ class Day:
             RealsimError: a job met input that it cannot use; object and grasps are named.
         """
         unprepared = [p for p in self._pupils if p.result is None and p.prepared is None]
-        self._waiting.extend(_Job(pupil) for pupil in unprepared)
-        if not unprepared:
-            self._go_on()
+        first = [self._preparation(p) for p in unprepared] if unprepared else self._tests()
         self._report()
-        while self._waiting or self._under_way:
-            while self._waiting and len(self._under_way) < self._workers.capacity():
-                job = self._waiting.popleft()
-                self._under_way[self._start(job)] = job
-            done, _ = wait(self._under_way, LOOK_UP_S, FIRST_COMPLETED)
-            for future in done:
-                self._take(self._under_way.pop(future), future)
-            if done:
-                self._report()
+        run_many(first, self._pool, self._take)
 
-    def _start(self, job: _Job) -> Future[Any]:
-        """Hand a job to a worker."""
-        task = job.pupil.task
-        if job.rows is None:
-            there = task if self._workers.shares_files else replace(task, cache=None)
-            return self._workers.submit(prepare, there)
-        assert job.pupil.prepared is not None, "shards come out of a preparation"
-        trial = trial_of(task, job.pupil.prepared, job.rows, job.pupil.stand)
-        return self._workers.submit(run_shard, trial, job.rows, task.config)
+    def _preparation(self, pupil: Pupil) -> Task:
+        """Return the task of preparing an object."""
+        task = pupil.task if self._pool.shares_files else replace(pupil.task, cache=None)
+        labels = None if task.labels_file is None else Sent(task.labels_file)
+        return _Job(name=f"{pupil.name}, preparation", fn=prepare, args=(task, labels), pupil=pupil)
 
-    def _take(self, job: _Job, future: Future[Any]) -> None:
-        """Take what a job came to."""
-        try:
-            found = future.result()
-        except WorkerDiedError as error:
-            self._again_or_never(job, str(error))
-            return
-        except Exception as error:
-            raise _with_name(error, job.name) from None
+    def _take(self, outcome: Outcome) -> Iterable[Task]:
+        """Take what a job came to; return those that come out of it."""
+        job: Task = outcome.task
+        more: Iterable[Task] = ()
+        assert isinstance(job, _Job), "the day hands out no other tasks"
+        gave_up = isinstance(outcome.error, WorkerDiedError)
+        if outcome.error is not None and not gave_up:
+            raise _with_name(outcome.error, job.name) from None
         if job.rows is None:
-            job.pupil.take_prepared(found)
-            self._go_on()
+            if gave_up:
+                nothing = not_prepared(job.pupil.task, f"the preparation failed: {outcome.why}")
+                job.pupil.take_prepared(nothing, keep=False)
+                job.pupil.given_up.append((np.zeros(0, dtype=np.int64), outcome.why))
+            else:
+                job.pupil.take_prepared(outcome.value)
+            more = self._tests()
         else:
-            job.pupil.take_tested(found)
-            self._finish_if_done(job.pupil)
+            if gave_up:
+                job.pupil.given_up.append((job.rows, outcome.why))
+            else:
+                job.pupil.take_tested(outcome.value)
+            _finish_if_done(job.pupil)
+        self._report()
+        return more
 
-    def _again_or_never(self, job: _Job, how: str) -> None:
-        """Put a job whose worker died back in front, or give it up."""
-        job.deaths += 1
-        if job.deaths < MOST_DEATHS:
-            self._waiting.appendleft(job)
-            return
-        why = f"{MOST_DEATHS} workers ended in the middle of it; of the last: {how}"
-        if job.rows is None:
-            nothing = not_prepared(job.pupil.task, f"the preparation failed: {why}")
-            job.pupil.take_prepared(nothing, keep=False)
-            job.pupil.given_up.append((np.zeros(0, dtype=np.int64), why))
-            self._go_on()
-        else:
-            job.pupil.given_up.append((job.rows, why))
-            self._finish_if_done(job.pupil)
-
-    def _go_on(self) -> None:
-        """Let all slip tests wait for workers once every object is prepared.
+    def _tests(self) -> Iterable[Task]:
+        """Return the slip tests that are due, once every object is prepared.
 
         Fingers close on an object among its neighbours, whose convex parts are known by then.
         """
         open_ones = [pupil for pupil in self._pupils if pupil.result is None]
         if any(pupil.prepared is None for pupil in open_ones):
-            return
+            return ()
         found = {p.task.instance: p.parts() for p in self._pupils} if open_ones else {}
         parts = {instance: own for instance, own in found.items() if own is not None}
+        due = [(pupil, rows) for pupil in open_ones for rows in pupil.open_shards]
         for pupil in open_ones:
             pupil.stand_among(parts)
-            self._waiting.extend(_Job(pupil, rows) for rows in pupil.open_shards)
-            self._finish_if_done(pupil)
-
-    def _finish_if_done(self, pupil: Pupil) -> None:
-        """Put a pupil's result together after its last shard."""
-        if not pupil.open_shards:
-            pupil.finish()
+            _finish_if_done(pupil)
+        return (_test(pupil, rows) for pupil, rows in due)
 
     def _report(self) -> None:
         """Tell how many grasps are judged."""
         if self._progress is not None:
             judged = sum(pupil.judged for pupil in self._pupils)
             self._progress(judged, sum(pupil.expected for pupil in self._pupils))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Job(Task):
+    """A preparation, or the test of a shard."""
+
+    pupil: Pupil
+    rows: Rows | None = None
+    """None = the preparation."""
+
+
+def _test(pupil: Pupil, rows: Rows) -> Task:
+    """Return the slip test of a shard."""
+    assert pupil.prepared is not None, "shards come out of a preparation"
+    trial = trial_of(pupil.task, pupil.prepared, rows, pupil.stand)
+    return _Job(
+        name=f"{pupil.name}, {in_words(rows)}", fn=run_shard, pupil=pupil, rows=rows,
+        args=(trial, rows, pupil.task.config),
+    )  # fmt: skip
+
+
+def _finish_if_done(pupil: Pupil) -> None:
+    """Put a pupil's result together after its last shard."""
+    if not pupil.open_shards:
+        pupil.finish()
 
 
 def _with_name(error: Exception, job: str) -> Exception:

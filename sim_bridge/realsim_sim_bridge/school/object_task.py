@@ -192,11 +192,17 @@ class Prepared:
         return np.nonzero(self.reachable)[0].astype(np.int64)
 
 
-def prepare(task: ObjectTask) -> Prepared:
+def prepare(task: ObjectTask, labels_file: Path | None = None) -> Prepared:
     """Return the object's candidates and which of them the arm takes.
 
     An object that cannot be tried (no volume, mass out of range) has no body; the notes say why.
+
+    Args:
+        task: the object.
+        labels_file: where its labels are, if they are not where the task says.
     """
+    if labels_file is not None:
+        task = replace(task, labels_file=labels_file)
     config, rng = task.config, chance_of(task)
     analytic = None if config.analytic is None else analytic_grasps(task, config.analytic, rng)
     found = candidates_of(task, rng) if analytic is None else analytic.candidates

@@ -1,17 +1,17 @@
 """Robot School: every object of a registered scene, every grasp, through reach and slip test."""
 
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.many import ClusterLostError, Workers, open_pool
 from realsim.models.library_records import KnownSolid
 from realsim.records import GraspSet, Mesh, ObjectModel, Scene, names_of
 from realsim_sim_bridge.grasping.surroundings import standing_object, together
-from realsim_sim_bridge.school.cluster import ClusterConfig, ray_workers
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.day import Day, Progress, Pupil
 from realsim_sim_bridge.school.kept_sets import SchoolResult
@@ -23,7 +23,6 @@ from realsim_sim_bridge.school.run_record import (
     run_record,
 )
 from realsim_sim_bridge.school.shards import default_shard_grasps
-from realsim_sim_bridge.school.workers import Workers, local_workers
 
 
 def run_school(  # noqa: PLR0913 - keywords, each with a meaning of its own
@@ -31,7 +30,7 @@ def run_school(  # noqa: PLR0913 - keywords, each with a meaning of its own
     models: Mapping[int, ObjectModel],
     config: SchoolConfig | None = None,
     *,
-    workers: int | ClusterConfig | None = None,
+    workers: Workers = None,
     cache: Path | None = None,
     progress: Progress | None = None,
     solids: Mapping[int, KnownSolid] | None = None,
@@ -63,7 +62,7 @@ def run_school_results(  # noqa: PLR0913 - as above
     models: Mapping[int, ObjectModel],
     config: SchoolConfig | None = None,
     *,
-    workers: int | ClusterConfig | None = None,
+    workers: Workers = None,
     cache: Path | None = None,
     progress: Progress | None = None,
     solids: Mapping[int, KnownSolid] | None = None,
@@ -98,7 +97,8 @@ def run_school_results(  # noqa: PLR0913 - as above
     Raises:
         InputError: the scene has no plane, or an object without a model; the cache holds a run with
             another config, other versions or other objects, or is in use.
-        KeyboardInterrupt: Ctrl-C; it says how to go on.
+        ClusterLostError: the cluster's head is gone; it says how to go on, likewise
+        KeyboardInterrupt: Ctrl-C.
     """
     config = config or SchoolConfig()
     tasks = object_tasks(scene, models, config, cache, solids, label_files)
@@ -112,21 +112,19 @@ def run_school_results(  # noqa: PLR0913 - as above
         pupils = [Pupil(task=task, folder=cache, shard_grasps=size) for task in tasks]
         try:
             if any(pupil.result is None for pupil in pupils):
-                with _staff(workers) as staff:
-                    Day(staff, pupils, progress).run()
+                with open_pool(workers) as pool:
+                    Day(pool, pupils, progress).run()
             elif progress is not None:
                 progress(*_progress(pupils))
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(_how_to_go_on(pupils, cache)) from None
+        except KeyboardInterrupt as stop:
+            raise type(stop)(f"interrupted {_how_to_go_on(pupils, cache)}") from None
+        except ClusterLostError as error:
+            lost = str(error).partition(". ")[0]
+            raise ClusterLostError(f"{lost} {_how_to_go_on(pupils, cache)}") from None
         results = [_result(pupil) for pupil in pupils]
         if cache is not None and not any(result.unfinished for result in results):
             mark_finished(cache)
     return results
-
-
-def _staff(workers: int | ClusterConfig | None) -> AbstractContextManager[Workers]:
-    """Return who does the work."""
-    return ray_workers(workers) if isinstance(workers, ClusterConfig) else local_workers(workers)
 
 
 def _progress(pupils: list[Pupil]) -> tuple[int, int]:
@@ -137,7 +135,7 @@ def _progress(pupils: list[Pupil]) -> tuple[int, int]:
 def _how_to_go_on(pupils: list[Pupil], cache: Path | None) -> str:
     """Return what is left after an interruption."""
     judged, expected = _progress(pupils)
-    done = f"interrupted after {judged} of {expected} grasps"
+    done = f"after {judged} of {expected} grasps"
     if cache is None:
         return f"{done}; nothing of it is kept, as no cache folder was given."
     return f"{done}; they are kept in {cache}. Run the same again, and it goes on from there."

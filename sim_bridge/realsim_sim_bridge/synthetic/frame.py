@@ -4,12 +4,10 @@ A frame's chance comes from (seed, number of the frame) alone, so its bytes do n
 process renders it, or after which other frames.
 """
 
-import pickle
 import time
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -148,14 +146,9 @@ def depth_camera(synthetic: SyntheticScene, config: SyntheticConfig) -> DepthCam
 # --- in another process -----------------------------------------------------------------------
 
 
-def keep_job(job: FrameJob, path: Path) -> None:
-    """Write what all frames have in common where the workers find it."""
-    path.write_bytes(pickle.dumps(job))
-
-
-def frame_of_job(path: str, index: int, T_world_cam: ArrayLike) -> SyntheticFrame:
-    """Return a frame of the job kept at `path`; a worker builds its renderer at the first one."""
-    return _renderer_of(path).render(index, T_world_cam)
+def frame_of_job(job: FrameJob, index: int, T_world_cam: ArrayLike) -> SyntheticFrame:
+    """Return a frame of a job; a worker builds its renderer at the first one."""
+    return _renderer_of(job).render(index, T_world_cam)
 
 
 def forget_job() -> None:
@@ -164,7 +157,5 @@ def forget_job() -> None:
 
 
 @lru_cache(maxsize=1)
-def _renderer_of(path: str) -> FrameRenderer:
-    # Only files that this run has written itself are unpickled.
-    job: FrameJob = pickle.loads(Path(path).read_bytes())
+def _renderer_of(job: FrameJob) -> FrameRenderer:
     return FrameRenderer(job)

@@ -12,10 +12,8 @@ has the same bytes however many workers there were and however often it was inte
 """
 
 import os
-import tempfile
 import time
-from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +23,7 @@ from numpy.typing import ArrayLike
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.many import Outcome, Shared, Task, Workers, at_most, open_pool, run_many
 from realsim.records import CameraIntrinsics, GraspSet, View
 from realsim.rendering.casting.triangle_rays import solid_angle_share
 from realsim.store import SessionStore, save_scene
@@ -32,15 +31,12 @@ from realsim.store.lock import only_run_in
 from realsim_sim_bridge.annotation.annotate import annotate
 from realsim_sim_bridge.annotation.config import AnnotationConfig, OccluderConfig
 from realsim_sim_bridge.annotation.summary import AnnotationSummary
-from realsim_sim_bridge.school.workers import Workers, local_workers
 from realsim_sim_bridge.synthetic.claim import claimed_session, with_stored_models
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
 from realsim_sim_bridge.synthetic.frame import (
     FrameJob,
-    SyntheticFrame,
     forget_job,
     frame_of_job,
-    keep_job,
     require_renderer,
 )
 from realsim_sim_bridge.synthetic.scene import SyntheticScene, save_surroundings
@@ -97,7 +93,7 @@ def write_session(  # noqa: PLR0913, PLR0917 - the inputs of a session, all of t
     seed: int = 0,
     grasp_sets: Sequence[GraspSet] = (),
     progress: Progress | None = None,
-    workers: int = 1,
+    workers: Workers = 1,
     *,
     models_from: Path | None = None,
 ) -> SyntheticSummary:
@@ -112,7 +108,7 @@ def write_session(  # noqa: PLR0913, PLR0917 - the inputs of a session, all of t
         seed: of the noise; frame k's chance comes from (seed, k) alone.
         grasp_sets: scored grasps of the instances, which are projected into every frame.
         progress: called with (steps done, steps in all); a frame is two steps, picture and labels.
-        workers: processes that render; the bytes do not depend on it.
+        workers: who renders; the bytes do not depend on it.
         models_from: a models folder whose files are copied as they are; None = written anew.
 
     Raises:
@@ -200,7 +196,7 @@ class _Spent:
 
 
 def _write_frames(
-    store: SessionStore, job: FrameJob, Ts: Array, workers: int, tick: Callable[[int], None]
+    store: SessionStore, job: FrameJob, Ts: Array, workers: Workers, tick: Callable[[int], None]
 ) -> _Spent:
     """Render and write the frames that are not there yet."""
     completed = store.completed
@@ -208,43 +204,30 @@ def _write_frames(
     tick(len(completed))
     if not due:
         return _Spent(0, {})
-    rgb, depth, write = 0.0, 0.0, 0.0
+    parts = {"rgb": 0.0, "depth": 0.0, "write": 0.0}
     notes: tuple[str, ...] = ()
-    with tempfile.TemporaryDirectory(prefix="realsim_frames_") as kept:
-        path = Path(kept) / "job.pickle"
-        keep_job(job, path)
-        try:
-            with local_workers(min(workers, len(due))) as pool:
-                for done, (k, frame) in enumerate(_in_order(pool, str(path), due, Ts), start=1):
-                    began = time.process_time()
-                    view = View(index=k, T_world_cam=Ts[k], time_s=float(k))
-                    store.add_view(view, frame.rgb, depth_counts=frame.depth_counts)
-                    write += time.process_time() - began
-                    rgb, depth = rgb + frame.rgb_cpu_s, depth + frame.depth_cpu_s
-                    notes = frame.notes
-                    tick(len(completed) + done)
-        finally:
-            forget_job()
+    shared, count = Shared(job), 0
+
+    def keep(outcome: Outcome) -> None:
+        nonlocal notes, count
+        k, frame = due[count], outcome.found()
+        began = time.process_time()
+        view = View(index=k, T_world_cam=Ts[k], time_s=float(k))
+        store.add_view(view, frame.rgb, depth_counts=frame.depth_counts)
+        parts["write"] += time.process_time() - began
+        parts["rgb"] += frame.rgb_cpu_s
+        parts["depth"] += frame.depth_cpu_s
+        notes, count = frame.notes, count + 1
+        tick(len(completed) + count)
+
+    tasks = (Task(name=f"frame {k}", fn=frame_of_job, args=(shared, k, Ts[k])) for k in due)
+    try:
+        with open_pool(at_most(workers, len(due))) as pool:
+            run_many(tasks, pool, keep, in_order=True)
+    finally:
+        forget_job()
     store.close()
-    n = len(due)
-    return _Spent(n, {"rgb": rgb / n, "depth": depth / n, "write": write / n}, notes)
-
-
-def _in_order(
-    pool: Workers, path: str, due: Sequence[int], Ts: Array
-) -> Generator[tuple[int, SyntheticFrame]]:
-    """Yield the frames in their order, a few of them ahead under way."""
-    due_now, ahead = list(due), 2 * pool.capacity()
-    under_way: dict[int, Future[SyntheticFrame]] = {}
-    for k in due:
-        while k not in under_way or not under_way[k].done():
-            busy = [f for f in under_way.values() if not f.done()]
-            if due_now and len(busy) < pool.capacity() and len(under_way) < ahead:
-                j = due_now.pop(0)
-                under_way[j] = pool.submit(frame_of_job, path, j, Ts[j])
-            else:
-                wait(busy, return_when=FIRST_COMPLETED)
-        yield k, under_way.pop(k).result()
+    return _Spent(count, {name: cpu_s / count for name, cpu_s in parts.items()}, notes)
 
 
 def _write_about(

@@ -93,7 +93,7 @@ def open_pool(texts: Sequence[str]) -> ObjectPool:
 def _source(text: str) -> PoolSource:
     name, weight = _weighed(text)
     if name == PYBULLET:
-        folder = _pybullet_folder()
+        folder = pybullet_folder()
         keys = tuple(f"{p.name}/{p.name}.obj" for p in sorted(folder.iterdir()) if p.is_dir())
         return PoolSource(label=name, kind="pybullet", folder=folder, keys=keys, weight=weight)
     folder = Path(name)
@@ -121,7 +121,8 @@ def _weighed(text: str) -> tuple[str, float]:
     return name, weight
 
 
-def _pybullet_folder() -> Path:
+def pybullet_folder() -> Path:
+    """Return where the objects that come with PyBullet are on this machine."""
     from realsim import interop
 
     with interop.quiet_output():

@@ -1,4 +1,4 @@
-"""The school's processes: one that dies takes down its own job and nothing else."""
+"""The processes of a pool: one that dies takes down its own job and nothing else."""
 
 import math
 import os
@@ -9,12 +9,12 @@ from concurrent.futures import wait
 import pytest
 
 from realsim.errors import InputError
-from realsim_sim_bridge.school.workers import WorkerDiedError, local_workers
+from realsim.many import WorkerDiedError, open_pool
 
 
 @pytest.fixture(scope="module")
 def two():
-    with local_workers(2) as workers:
+    with open_pool(2) as workers:
         # Jobs are functions of the standard library: a fresh process cannot import a test file.
         wait([workers.submit(os.getpid), workers.submit(os.getpid)])
         yield workers
@@ -51,7 +51,7 @@ def test_how_a_worker_ended_is_told(two):
 def test_what_a_job_raises_comes_out_of_its_result(two):
     with pytest.raises(ValueError, match="math domain error"):
         two.submit(math.sqrt, -1.0).result(timeout=60)
-    with local_workers(1) as workers, pytest.raises(ValueError, match="math domain error"):
+    with open_pool(1) as workers, pytest.raises(ValueError, match="math domain error"):
         workers.submit(math.sqrt, -1.0).result()
 
 
@@ -59,12 +59,12 @@ def test_every_worker_computes_with_one_thread(two):
     assert two.submit(os.getenv, "OPENBLAS_NUM_THREADS").result(timeout=60) == "1"
     from threadpoolctl import threadpool_info
 
-    with local_workers(1) as workers:
+    with open_pool(1) as workers:
         assert {lib["num_threads"] for lib in workers.submit(threadpool_info).result()} <= {1}
 
 
 def test_an_error_ends_the_workers_in_the_middle_of_their_jobs():
-    with pytest.raises(InputError, match="enough"), local_workers(2) as workers:
+    with pytest.raises(InputError, match="enough"), open_pool(2) as workers:
         job = workers.submit(time.sleep, 60.0)
         raise InputError("enough")
     assert not job.done() or job.cancelled() or job.exception() is not None
