@@ -6,6 +6,7 @@ as a least-squares solver needs. Outside the grid the field goes on as the value
 point of the box plus the distance to it: an upper bound that points the right way.
 """
 
+import contextlib
 import hashlib
 import os
 from collections import OrderedDict
@@ -21,6 +22,7 @@ from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.interop import import_open3d
 from realsim.records import Mesh
+from realsim.untrusted.arrays import read_npz
 
 MARGIN_CELLS = 6
 """Cells around the bounding box in which the field is interpolated, not extended."""
@@ -222,6 +224,8 @@ def _load(folder: Path | None, key: str) -> DistanceField | None:
     """Return the field kept under this key, or None."""
     if folder is None or not (folder / f"{key}.npz").is_file():
         return None
-    with np.load(folder / f"{key}.npz") as data:
+    with contextlib.suppress(InputError):  # a damaged one is computed again
+        data = read_npz(folder / f"{key}.npz", ("grid", "origin", "cell"))
         grid = np.ascontiguousarray(data["grid"], dtype=np.float32)
         return DistanceField(grid=grid, origin=data["origin"], cell=float(data["cell"]))
+    return None

@@ -7,10 +7,12 @@ from numpy.typing import ArrayLike
 
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.records.checked_arrays import frozen, rigid
+from realsim.records.checked_arrays import frozen, numbered, rigid
 
 DISTORTION_TERMS = 8
 """OpenCV order k1 k2 p1 p2 k3 k4 k5 k6; the Brown model leaves k4 k5 k6 at zero."""
+LONGEST_SIDE = 32_768
+"""Pixels of an image along one side; a file can claim any number, and arrays are made of it."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -37,8 +39,11 @@ class CameraIntrinsics:
 
     def __post_init__(self) -> None:
         """Check ranges and freeze the distortion."""
-        if self.width < 1 or self.height < 1:
-            raise InputError(f"the image size {self.width}x{self.height} is not positive.")
+        if not (0 < self.width <= LONGEST_SIDE and 0 < self.height <= LONGEST_SIDE):
+            raise InputError(
+                f"the image size is {self.width}x{self.height}; 1 to {LONGEST_SIDE} pixels a side "
+                "are accepted."
+            )
         for name in ("fx", "fy"):
             f = getattr(self, name)
             if not (np.isfinite(f) and f > 0):
@@ -109,6 +114,7 @@ class View:
 
     def __post_init__(self) -> None:
         """Check that the poses are rigid and freeze them."""
+        numbered(self.index, "the number of a view")
         for name in ("T_base_ee", "T_world_cam"):
             T = getattr(self, name)
             if T is not None:

@@ -11,6 +11,11 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 
 Record = TypeVar("Record")
+FARTHEST_M = 1000.0
+"""Distance from the origin of anything that an arm or its camera has to do with [m]: beyond, a file
+is damaged or of another unit, and float32 of the engines has steps of 0.1 mm."""
+MOST_ID = 999_999_999
+"""Largest number of a view, an object or an instance."""
 
 
 def frozen(value: ArrayLike, dtype: Any, shape: tuple[int | None, ...], name: str) -> NDArray[Any]:
@@ -28,7 +33,23 @@ def frozen(value: ArrayLike, dtype: Any, shape: tuple[int | None, ...], name: st
 def rigid(value: ArrayLike, name: str) -> Array:
     """Return a read-only rigid (4, 4) copy of `value`."""
     T = se3.check_rigid(value, name)
+    far = float(np.abs(T[..., :3, 3]).max(initial=0.0))
+    if far > FARTHEST_M:
+        raise InputError(
+            f"{name} is {far:.3g} m from the origin; at most {FARTHEST_M:g} m are accepted. Is it "
+            "in metres? Restore the file, or run the step that writes it again."
+        )
     return frozen(T, np.float64, (4, 4), name)
+
+
+def numbered(value: int, name: str, low: int = 0) -> None:
+    """Check that a number names something: a view, an object, an instance.
+
+    Raises:
+        InputError: it is not between `low` and a billion.
+    """
+    if not low <= value <= MOST_ID:
+        raise InputError(f"{name} is {value}; a number from {low} to {MOST_ID} is expected.")
 
 
 def rows_of(record: Record, rows: NDArray[Any] | slice) -> Record:

@@ -9,7 +9,7 @@ import numpy as np
 from realsim.arrays import Array, Int32, UInt8
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.records.checked_arrays import frozen, rigid
+from realsim.records.checked_arrays import frozen, numbered, rigid
 from realsim.untrusted.own_json import Real
 
 Verdict = Literal["accepted", "doubtful", "rejected", "unchecked"]
@@ -105,6 +105,8 @@ class ObjectPose:
 
     def __post_init__(self) -> None:
         """Check that the pose is rigid and freeze the arrays."""
+        numbered(self.obj_id, "obj_id")
+        numbered(self.instance, f"the instance of object {self.obj_id}")
         name = f"T_world_obj of object {self.obj_id} (instance {self.instance})"
         object.__setattr__(self, "T_world_obj", rigid(self.T_world_obj, name))
         if self.covariance is not None:

@@ -16,6 +16,8 @@ from realsim.errors import InputError
 TagFamily = Literal["tag16h5", "tag25h9", "tag36h10", "tag36h11"]
 TAG_CELLS: dict[str, int] = {"tag16h5": 6, "tag25h9": 7, "tag36h10": 8, "tag36h11": 8}
 """Modules along the edge of a tag's black square, its black border of one module included."""
+MOST_ROWS = 1000
+"""Rows or columns of a printed grid; a file can claim any number."""
 
 
 def _check_length(value: float, name: str, least: float = 0.0005, most: float = 1.0) -> None:
@@ -29,9 +31,9 @@ def _check_length(value: float, name: str, least: float = 0.0005, most: float = 
 
 def _check_counts(rows: int, columns: int, least: int, what: str) -> None:
     """Raise unless a grid has enough rows and columns."""
-    if rows < least or columns < least:
+    if not (least <= rows <= MOST_ROWS and least <= columns <= MOST_ROWS):
         raise InputError(
-            f"{what} needs at least {least} rows and {least} columns, got {rows}x{columns}."
+            f"{what} needs {least} to {MOST_ROWS} rows and columns, got {rows}x{columns}."
         )
 
 
@@ -65,8 +67,7 @@ class TagBoard:
 
     def __post_init__(self) -> None:
         """Check counts and sizes."""
-        if self.rows < 1 or self.columns < 1:
-            raise InputError(f"a tag board needs rows and columns, got {self.rows}x{self.columns}.")
+        _check_counts(self.rows, self.columns, 1, "a tag board")
         if self.family not in TAG_CELLS:
             raise InputError(
                 f"the tag family '{self.family}' is not known; {', '.join(TAG_CELLS)} are."

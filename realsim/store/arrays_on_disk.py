@@ -3,8 +3,6 @@
 import json
 import os
 import tempfile
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
+from realsim.untrusted.arrays import read_npz
 
 NOTES = "notes_json"
 """Name of the array that holds the notes as UTF-8 JSON."""
+MOST_BYTES = 8e9
+"""Largest sum of the arrays of one file that is read [bytes]."""
 
 
 def write_arrays(path: Path, arrays: dict[str, NDArray[Any]], notes: dict[str, Any]) -> None:
@@ -41,13 +42,10 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         InputError: the file is damaged.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files if name != NOTES}
-            notes: dict[str, Any] = json.loads(file[NOTES].tobytes().decode())
-    except (zipfile.BadZipFile, ValueError, KeyError, EOFError, OSError, zlib.error) as error:
-        raise InputError(
-            f"{path} is damaged ({type(error).__name__}). Delete it: its content is computed again."
-        ) from error
+        arrays = read_npz(path, most_bytes=MOST_BYTES, texts=True)
+        notes: dict[str, Any] = json.loads(arrays.pop(NOTES).tobytes().decode())
+    except (InputError, ValueError, KeyError) as error:
+        raise InputError(f"{error} Delete {path}: its content is computed again.") from error
     return arrays, notes
 
 

@@ -1,9 +1,6 @@
 """The results of the stages in a session's folder: hand-eye, board, scene and grasps."""
 
-import io
 import math
-import zipfile
-import zlib
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +13,8 @@ from realsim.records import STAGES, GraspSet, HandEye, Scene, TagBoard
 from realsim.records.grasps import MEASURES
 from realsim.store import atomic
 from realsim.store.session_store import SessionStore
-from realsim.untrusted.own_json import from_json, read_own, to_json
+from realsim.untrusted.arrays import read_npz
+from realsim.untrusted.own_json import read_own, to_json
 
 HAND_EYE_FILE = "calibration/hand_eye.json"
 BOARD_FILE = "calibration/board.json"
@@ -54,7 +52,7 @@ def hand_eye_to_json(result: HandEye) -> dict[str, Any]:
 
 def load_hand_eye(store: SessionStore, name: str = HAND_EYE_FILE) -> HandEye:
     """Return the calibration of the session."""
-    return from_json(store.read_json(name), HandEye, "the hand-eye calibration")
+    return read_own(store.path(name), HandEye)
 
 
 def save_board(store: SessionStore, board: TagBoard, name: str = BOARD_FILE) -> None:
@@ -64,7 +62,7 @@ def save_board(store: SessionStore, board: TagBoard, name: str = BOARD_FILE) -> 
 
 def load_board(store: SessionStore, name: str = BOARD_FILE) -> TagBoard:
     """Return the calibration board of the session."""
-    return from_json(store.read_json(name), TagBoard, "the board")
+    return read_own(store.path(name), TagBoard)
 
 
 def save_scene(store: SessionStore, scene: Scene, name: str = SCENE_FILE) -> None:
@@ -74,7 +72,7 @@ def save_scene(store: SessionStore, scene: Scene, name: str = SCENE_FILE) -> Non
 
 def load_scene(store: SessionStore, name: str = SCENE_FILE) -> Scene:
     """Return the registered scene of the session."""
-    return from_json(store.read_json(name), Scene, "the scene")
+    return read_own(store.path(name), Scene)
 
 
 # --- grasps -----------------------------------------------------------------------------------
@@ -192,24 +190,21 @@ def _load_grasp_set(file: Path) -> GraspSet:
             f"to {GRASP_FORMAT_VERSION}. Read it with the version that wrote it, or a newer one."
         )
     try:
-        with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as npz:
-            arrays = {name: npz[name] for name in ARRAYS}
-            measures = {
-                name.removeprefix(MEASURE_PREFIX): npz[name]
-                for name in npz.files
+        npz = read_npz(file, texts=True)
+        return GraspSet(
+            obj_id=head.obj_id,
+            instance=head.instance,
+            failures=tuple(str(f) for f in npz["failures"].tolist()),
+            measures={
+                name.removeprefix(MEASURE_PREFIX): values
+                for name, values in npz.items()
                 if name.startswith(MEASURE_PREFIX)
-            }
-            failures = tuple(str(f) for f in npz["failures"].tolist())
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            },
+            parameters=head.parameters,
+            **{name: npz[name] for name in ARRAYS},
+        )
+    except (InputError, ValueError, TypeError, KeyError) as error:
         raise InputError(
             f"{file} is not a complete grasp file ({error}). Delete it and its .json, and run the "
             "school again for this object."
         ) from error
-    return GraspSet(
-        obj_id=head.obj_id,
-        instance=head.instance,
-        failures=failures,
-        measures=measures,
-        parameters=head.parameters,
-        **arrays,
-    )

@@ -5,9 +5,6 @@ those of a later one.
 """
 
 import hashlib
-import io
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +16,7 @@ from realsim.records.trajectories import PHASES, GraspTrajectories
 from realsim.store import atomic
 from realsim.store.results import GRASP_FOLDER, grasp_stem
 from realsim.store.session_store import SessionStore
+from realsim.untrusted.arrays import read_npz
 
 TRAJECTORY_FOLDER = "trajectories"
 ARRAYS = ("rows", "starts", "time_s", "joints_rad", "opening_m", "phase")
@@ -75,11 +73,11 @@ def load_trajectories(
     if not path.is_file():
         return None
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as npz:
-            version, identity = int(npz["format_version"]), str(npz["grasps"])
-            arrays = {name: npz[name] for name in ARRAYS}
-            phases = tuple(str(p) for p in npz["phases"].tolist())
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        npz = read_npz(path, ("format_version", "grasps", "phases", *ARRAYS), texts=True)
+        version, identity = int(npz["format_version"]), str(npz["grasps"])
+        arrays = {name: npz[name] for name in ARRAYS}
+        phases = tuple(str(p) for p in npz["phases"].tolist())
+    except (InputError, TypeError, ValueError) as error:
         raise InputError(
             f"{path} is not a complete file of trajectories ({error}). Delete it, and run the "
             "school again for this object."

@@ -1,4 +1,4 @@
-"""Arrays of others in .npy and .npz: numbers only, and what a header claims has to be there.
+"""Arrays in .npy and .npz: numbers, texts if wanted; what a header claims has to be there.
 
 Layout of .npy: numpy.lib.format. A header of 80 bytes can claim terabytes, name a dtype that
 unpickles objects, or be a text that takes Python's parser down; an .npz is a zip, which can unfold
@@ -25,6 +25,8 @@ MOST_BYTES = 1e9
 """Largest array, and the sum of the arrays of one archive [bytes, unpacked]."""
 MOST_HEADER = 4096
 """Bytes of one .npy header; plain numbers need 128."""
+MOST_LETTERS = 10_000
+"""Characters of the texts of one array."""
 MOST_AXES, MOST_NUMBERS = 32, 1 << 48
 CHUNK = 1 << 22
 """Bytes unpacked at a time."""
@@ -51,7 +53,11 @@ def read_npy(path: Path | str, *, most_bytes: float = MOST_BYTES) -> NDArray[Any
 
 
 def read_npz(
-    path: Path | str, names: Collection[str] | None = None, *, most_bytes: float = MOST_BYTES
+    path: Path | str,
+    names: Collection[str] | None = None,
+    *,
+    most_bytes: float = MOST_BYTES,
+    texts: bool = False,
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of a .npz file by name.
 
@@ -59,6 +65,7 @@ def read_npz(
         path: the file.
         names: the arrays that are read, others are not even unpacked; None = all.
         most_bytes: largest sum of the arrays [bytes, unpacked].
+        texts: whether arrays of texts are read as well.
 
     Raises:
         InputError: it is missing, no zip, an array is missing, too large or damaged, or as
@@ -85,7 +92,7 @@ def read_npz(
             where = f"'{name}' of {path}"
             try:
                 with archive.open(there[name]) as file:
-                    found[name] = _array(file, there[name].file_size, where)
+                    found[name] = _array(file, there[name].file_size, where, texts)
             except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError) as e:
                 raise InputError(f"{where} is damaged ({e}). Copy the file again.") from e
             except (RuntimeError, ValueError) as e:
@@ -93,9 +100,9 @@ def read_npz(
         return found
 
 
-def _array(file: IO[bytes], size: int, where: str) -> NDArray[Any]:
+def _array(file: IO[bytes], size: int, where: str, texts: bool = False) -> NDArray[Any]:
     """Return the array of an open file of `size` bytes."""
-    shape, fortran, dtype = _header(file, where)
+    shape, fortran, dtype = _header(file, where, texts)
     count = math.prod(shape)
     expected = count * dtype.itemsize
     left = size - file.tell()
@@ -122,7 +129,9 @@ def _array(file: IO[bytes], size: int, where: str) -> NDArray[Any]:
     return native.reshape(shape, order="F" if fortran else "C")
 
 
-def _header(file: IO[bytes], where: str) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+def _header(
+    file: IO[bytes], where: str, texts: bool
+) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Return shape, order and type of the array.
 
     Raises:
@@ -141,7 +150,9 @@ def _header(file: IO[bytes], where: str) -> tuple[tuple[int, ...], bool, np.dtyp
         raise InputError(
             f"{where} is not a numpy array ({type(error).__name__}: {str(error)[:200]})."
         ) from error
-    if dtype.kind not in "biuf" or dtype.itemsize > 8 or dtype.subdtype is not None:
+    is_text = texts and dtype.kind == "U" and dtype.itemsize <= 4 * MOST_LETTERS
+    is_number = dtype.kind in "biuf" and dtype.itemsize <= 8
+    if not (is_number or is_text) or dtype.subdtype is not None:
         raise InputError(
             f"{where} is an array of '{dtype}'; only numbers of up to 64 bits are read, never "
             "objects: they would run a program that the file brings."

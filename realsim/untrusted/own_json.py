@@ -80,6 +80,8 @@ def from_json(data: Any, kind: type[Declared], what: str) -> Declared:
             field = told.rsplit("`", 2)[-2].rpartition(".")[2].partition("[")[0]
             told += f"; accepted: {', '.join(map(str, _words(type_info(kind), field)))}"
         raise InputError(f"{what}: {told[:1].lower()}{told[1:500]}.") from error
+    except InputError as error:  # a record's own check
+        raise type(error)(f"{what}: {error}") from error
 
 
 def number_from_json(value: Any) -> float:

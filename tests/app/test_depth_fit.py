@@ -109,7 +109,7 @@ def test_folders_that_hold_nothing_to_fit_are_named(walls: Path, tmp_path: Path)
     np.save(tmp_path / "a.npy", wall(0.3, 0.1))
     assert "uint16" in refusal(tmp_path, "--quiet")
     (tmp_path / "a.npy").write_bytes(b"\x93NUMPY")
-    assert "cannot be read as an array" in refusal(tmp_path, "--quiet")
+    assert "is not a numpy array" in refusal(tmp_path, "--quiet")
 
 
 def test_counts_in_arrays_are_taken_with_the_kinds_own_focal_length(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.profiles import NOMINAL_FOCAL_PX, DepthProfile, profile
 from realsim.store.opening import require_header
+from realsim.untrusted.arrays import read_npy
 
 if TYPE_CHECKING:
     from realsim.rendering.depth_sensors.fit import FittedDepthModel
@@ -227,10 +228,7 @@ def _depth_of(path: Path, unit_m: float) -> Array32:
 
     if path.suffix != ".npy":
         return read_depth(path, unit_m)
-    try:
-        counts = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path} cannot be read as an array ({error}). Copy it again.") from error
+    counts = read_npy(path)
     if counts.ndim != 2 or counts.dtype != np.uint16:
         raise InputError(
             f"{path} has the shape {counts.shape} and the type {counts.dtype}; depth counts of "

@@ -1,9 +1,6 @@
 """A scene that can be rendered: objects at exact poses, what stands around them, and the light."""
 
 import hashlib
-import io
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -16,6 +13,7 @@ from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, names_of
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.store import SessionStore
+from realsim.untrusted.arrays import read_npz
 
 SURROUNDINGS_FILE = "synthetic/surroundings.npz"
 """What stands around the objects, kept in the session, so that labels can be made again exactly."""
@@ -153,17 +151,16 @@ def load_surroundings(store: SessionStore) -> tuple[PlacedMesh, ...] | None:
     if not store.has(SURROUNDINGS_FILE):
         return None
     try:
-        data = io.BytesIO(store.path(SURROUNDINGS_FILE).read_bytes())
-        with np.load(data, allow_pickle=False) as npz:
-            return tuple(
-                PlacedMesh(
-                    BACKGROUND,
-                    Mesh(vertices=npz[f"vertices_{k}"], faces=npz[f"faces_{k}"]),
-                    npz[f"T_world_obj_{k}"],
-                )
-                for k in range(int(npz["count"]))
+        npz = read_npz(store.path(SURROUNDINGS_FILE))
+        return tuple(
+            PlacedMesh(
+                BACKGROUND,
+                Mesh(vertices=npz[f"vertices_{k}"], faces=npz[f"faces_{k}"]),
+                npz[f"T_world_obj_{k}"],
             )
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            for k in range(int(npz["count"]))
+        )
+    except (InputError, TypeError, ValueError, KeyError) as error:
         raise InputError(
             f"{SURROUNDINGS_FILE} of '{store.folder}' is broken ({error}). Run the command that "
             "rendered the session again: it writes this file anew."

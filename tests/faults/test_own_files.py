@@ -1,0 +1,129 @@
+"""Files of a session that claim what cannot be: an error that names file and value, no traceback."""
+
+import io
+import json
+import re
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from realsim.app.cli import commands
+from realsim.errors import InputError
+from realsim.store import SessionStore, load_grasps, load_scene, save_grasps
+from reviewed_boxes import grasp_set
+
+SCENE = "registration/scene.json"
+
+
+def claimed(shape: tuple[int, ...]) -> bytes:
+    """Return a .npy of a few bytes whose header claims an array of doubles."""
+    buffer = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        buffer, {"descr": "<f8", "fortran_order": False, "shape": shape}
+    )
+    return buffer.getvalue() + bytes(128)
+
+
+def with_claim(path: Path, name: str, shape: tuple[int, ...]) -> None:
+    """Give one array of an npz another header."""
+    with zipfile.ZipFile(path) as file:
+        parts = {n: file.read(n) for n in file.namelist()}
+    parts[f"{name}.npy"] = claimed(shape)
+    with zipfile.ZipFile(path, "w") as file:
+        for n, data in parts.items():
+            file.writestr(n, data)
+
+
+def edited(path: Path, change: Callable[[Any], None]) -> None:
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+def first_object(**values: Any) -> Callable[[Any], None]:
+    return lambda scene: scene["objects"][0].update(values)
+
+
+def moved(metres: float) -> Callable[[Any], None]:
+    def change(scene: Any) -> None:
+        scene["objects"][0]["T_world_obj"][0][3] = metres
+
+    return change
+
+
+SCENES = {
+    "an id that is a path": (first_object(obj_id="../../etc"), "expected `int`"),
+    "an id beyond all": (first_object(obj_id=10**12), "obj_id is 1000000000000"),
+    "a negative id": (first_object(obj_id=-1), "obj_id is -1"),
+    "a negative instance": (first_object(instance=-2), "the instance of object .* is -2"),
+    "an object far away": (moved(1e9), r"1e\+09 m from the origin"),
+}
+HEADERS = {
+    "a wide camera": (lambda h: h["camera"].update(width=10**9), "1000000000x"),
+    "no depth unit": (lambda h: h.update(depth_unit_m=0), "the depth unit is 0"),
+    "a far camera": (
+        lambda h: h["T_world_cam"].update({"0": [[1, 0, 0, 1e9], [0, 1, 0, 0], [0, 0, 1, 0],
+                                                 [0, 0, 0, 1]]}),
+        r"1e\+09 m from the origin",
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture()
+def session(registered_session: Path, tmp_path: Path) -> Path:
+    shutil.copytree(registered_session, tmp_path / "session")
+    return tmp_path / "session"
+
+
+def run(*words: object) -> Result:
+    return CliRunner().invoke(commands, [str(w) for w in words])
+
+
+def refusals(session: Path, out: Path) -> list[str]:
+    """Return what commands that read all of a session say; none may end otherwise."""
+    told: list[str] = []
+    for words in (
+        ("stats", session), ("annotate", session), ("school", session, "--grasps", 1),
+        ("review", session, "--static", out / "page.html"),
+        ("export", session, "--to", "bop", "--out", out / "bop"),
+    ):  # fmt: skip
+        done = run(*words, "--quiet")
+        assert isinstance(done.exception, InputError), (words, done.output, done.exc_info)
+        told.append(str(done.exception))
+    return told
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_scene_is_bounded(name: str, session: Path, tmp_path: Path) -> None:
+    change, words = SCENES[name]
+    edited(session / SCENE, change)
+    with pytest.raises(InputError, match=words) as error:
+        load_scene(SessionStore.open(session))
+    assert "scene.json" in str(error.value)
+    assert all("scene.json" in told for told in refusals(session, tmp_path))
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_a_header_is_bounded(name: str, session: Path) -> None:
+    change, words = HEADERS[name]
+    edited(session / "session.json", change)
+    done = run("stats", session)
+    assert isinstance(done.exception, InputError), done.exc_info
+    assert "session" in str(done.exception) and re.search(words, str(done.exception))
+
+
+@pytest.mark.parametrize("array", ["Ts_obj_grasp", "failures", "scores"])
+def test_what_a_grasp_set_claims_is_there(array: str, session: Path) -> None:
+    file = save_grasps(SessionStore.open(session), grasp_set(1, 0, 3))
+    with_claim(file, array, (10**11, 4, 4))
+    with pytest.raises(InputError, match="100000000000x4x4") as error:
+        load_grasps(session)
+    assert str(file) in str(error.value)
+    done = run("stats", session)
+    assert isinstance(done.exception, InputError), done.exc_info
