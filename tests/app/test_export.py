@@ -13,6 +13,7 @@ from labelled_scenes import INTRINSICS, MODELS, labelled_scene
 from realsim import images
 from realsim.app.cli import commands
 from realsim.errors import InputError
+from realsim.formats.bop.models import load_models
 from realsim.formats.bop.opening import open_labelled_bop
 from realsim.formats.bop.root_files import write_bop_models, write_bop_root
 from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
@@ -109,6 +110,26 @@ def test_graspnet_to_the_store_and_back_keeps_every_digit_of_the_format(bop, tmp
     for name in ("camera_poses.npy", "cam0_wrt_table.npy", "camK.npy"):
         a, b = (np.load(next(root.glob(f"scenes/*/*/{name}"))) for root in (first, second))
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+
+
+def test_sources_that_number_their_objects_alike_share_one_count(bop, tmp_path):
+    scene = labelled_scene(tmp_path / "images", [1, 3])
+    models = dict(scene.models())
+    changed = next(iter(models))
+    mesh = models[changed].mesh
+    models[changed] = replace(models[changed], mesh=replace(mesh, vertices=1.25 * mesh.vertices))
+    other = written_bop(tmp_path / "other", replace(scene, models_by_id=models))
+    done("export", bop, other, "--to", "bop", "--out", tmp_path / "both", "--quiet")
+    written = load_models(tmp_path / "both/models")
+    assert set(written) == {*models, max(models) + 1}
+    grown = written[max(models) + 1].mesh.vertices
+    assert np.allclose(np.ptp(grown, axis=0), 1.25 * np.ptp(written[changed].mesh.vertices, axis=0))
+    counts = [
+        {row["obj_id"] for rows in json.loads(file.read_text()).values() for row in rows}
+        for file in sorted((tmp_path / "both").glob("*/*/scene_gt.json"))
+    ]
+    assert counts[0] == set(models)
+    assert counts[1] == {*models, max(models) + 1} - {changed}
 
 
 def test_labels_that_came_along_become_starts_and_are_never_overwritten(bop, tmp_path):

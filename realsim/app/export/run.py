@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from realsim.formats.bop.labelled import BopLabelledScene
 from realsim.formats.export_folder import CONTENT, STATE, ExportFolder
 from realsim.formats.grasps.scene_grasps import executed
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene
+from realsim.formats.renumbered import RenumberedScene, shared_ids
 from realsim.formats.session_scene import SessionScene
 from realsim.records import ObjectModel
 from realsim.store.cameras import camera_folders
@@ -76,14 +78,16 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
     facts: list[SceneFacts] = []
     models: dict[int, ObjectModel] = {}
     infos: dict[int, Mapping[str, Any]] = {}
+    all_ids: list[dict[int, int]] = []
     with only_run_in(out):
         try:
             for source, place in zip(scenes, places, strict=True):
                 opened = source.open()
-                _add_models(models, opened, source)
+                ids = shared_ids(models, opened.models())
                 if isinstance(opened, BopLabelledScene):
-                    infos |= opened.models_info()
-                given = _as_asked(opened, target, request, out)
+                    infos |= {ids.get(i, i): info for i, info in opened.models_info().items()}
+                given = _as_asked(_numbered(opened, ids), target, request, out)
+                all_ids.append(ids)
                 written = _write(given, place, target, folder, request, console)
                 facts.append(_facts(source, opened, written, target))
         except InputError:
@@ -91,7 +95,10 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
             raise
         if target.write_root is not None:
             with console.stage("models and root"):
-                again = [(p.number, s.open) for s, p in zip(scenes, places, strict=True)]
+                again = [
+                    (place.number, partial(_opened, source, ids))
+                    for source, place, ids in zip(scenes, places, all_ids, strict=True)
+                ]
                 job = RootJob(request=request, models=models, infos=infos, scenes=again)
                 told = target.write_root(folder, job)
                 facts[-1] = _with_notes(facts[-1], told)
@@ -229,25 +236,13 @@ def _write(
     return replace(written, notes=notes, folder=folder.folder / place.name, objects=objects)
 
 
-def _add_models(models: dict[int, ObjectModel], scene: LabelledScene, source: SourceScene) -> None:
-    """Collect the models of all scenes; one id must be one object.
+def _numbered(scene: LabelledScene, ids: Mapping[int, int]) -> LabelledScene:
+    """Return a scene with the ids of the data set, itself where they are its own."""
+    return scene if all(i == new for i, new in ids.items()) else RenumberedScene(scene, ids)
 
-    Raises:
-        InputError: it is not.
-    """
-    for obj_id, model in scene.models().items():
-        known = models.setdefault(obj_id, model)
-        if known is model:
-            continue
-        is_same = (
-            known.name == model.name and known.mesh.vertices.shape == model.mesh.vertices.shape
-        )
-        if not is_same:
-            raise InputError(
-                f"object {obj_id} is '{known.name}' ({len(known.mesh.vertices)} vertices) in an "
-                f"earlier scene and '{model.name}' ({len(model.mesh.vertices)} vertices) in "
-                f"{source.name}: one data set has one model an id. Export them one by one."
-            )
+
+def _opened(source: SourceScene, ids: Mapping[int, int]) -> LabelledScene:
+    return _numbered(source.open(), ids)
 
 
 def _facts(
