@@ -57,6 +57,8 @@ class VideoFile:
         av = import_av()
         self._av, self._size = av, (height, width, 3)
         self.frames = 0
+        # One for all frames: each of its own would prepare its tables anew, 2 ms a frame.
+        self._reformatter = av.video.reformatter.VideoReformatter()
         self._file: Any = av.open(str(path), "w", format="mp4")
         self._stream: Any = self._file.add_stream(ENCODER, rate=fps, options=OPTIONS)
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, PIXELS
@@ -92,7 +94,7 @@ class VideoFile:
             )
         frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
         # Left to the encoder, the conversion gives other bytes in one video of a hundred.
-        frame = frame.reformat(format=PIXELS)
+        frame = self._reformatter.reformat(frame, format=PIXELS)
         frame.pts, frame.time_base = self.frames, self._stream.codec_context.time_base
         self._file.mux(self._stream.encode(frame))
         self.frames += 1

@@ -46,17 +46,19 @@ class PictureStats:
 
     def add(self, rgb: UInt8) -> None:
         """Add a picture (H, W, 3)."""
-        flat = rgb.reshape(-1, 3)
+        import cv2
+
         levels = np.arange(256.0)
         for c in range(3):
-            histogram = np.bincount(flat[:, c], minlength=256)
+            counted = cv2.calcHist([rgb], [c], None, [256], [0.0, 256.0])
+            histogram = counted.ravel().astype(np.float64)
             there = np.flatnonzero(histogram)
             self._low[c] = min(self._low[c], there[0])
             self._high[c] = max(self._high[c], there[-1])
             self._sum[c] += histogram @ levels
             self._squares[c] += histogram @ levels**2
         self._count += 1
-        self._pixels += len(flat)
+        self._pixels += rgb.shape[0] * rgb.shape[1]
 
     def result(self) -> dict[str, Any]:
         """Return the statistics, (3, 1, 1) each; count is that of the pictures."""

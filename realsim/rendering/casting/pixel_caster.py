@@ -83,14 +83,19 @@ class PixelCaster:
         for p in self.placed:
             if id(p.mesh) not in bodies:
                 bodies[id(p.mesh)] = body_of(p.mesh)
-        self._bodies = [bodies[id(p.mesh)] for p in self.placed]
+        self.bodies = [bodies[id(p.mesh)] for p in self.placed]
 
     def project(
-        self, number: int, intrinsics: CameraIntrinsics, T_world_cam: ArrayLike
+        self,
+        number: int,
+        intrinsics: CameraIntrinsics,
+        T_world_cam: ArrayLike,
+        T_world_obj: Array | None = None,
     ) -> ProjectedMesh:
-        """Return the placed mesh of this number as the camera has it."""
-        p, body = self.placed[number], self._bodies[number]
-        T_cam_obj = se3.invert(T_world_cam) @ p.T_world_obj
+        """Return the placed mesh of this number as the camera has it; None = where it was put."""
+        body = self.bodies[number]
+        T_world_obj = self.placed[number].T_world_obj if T_world_obj is None else T_world_obj
+        T_cam_obj = se3.invert(T_world_cam) @ T_world_obj
         lens = lens_array(intrinsics)
         points, seen = project_vertices(body.vertices, T_cam_obj, lens)
         eye = se3.invert(T_cam_obj)[:3, 3]

@@ -98,12 +98,40 @@ def _curved_box(low_x: float, high_x: float, low_y: float, high_y: float, lens: 
 
 
 @njit
+def _box_before_camera(points: Array, i: int, j: int, k: int, lens: Array) -> Box:
+    """Return what `_box` does without distortion, for a triangle that reaches behind the camera.
+
+    It ends where it is NEAREST_M in front of it.
+    """
+    u0 = v0 = np.inf
+    u1 = v1 = -np.inf
+    for a, b in ((i, j), (j, k), (k, i)):
+        za, zb = points[a, 2], points[b, 2]
+        for end in range(2):
+            if end == 0:
+                if za <= NEAREST_M:
+                    continue
+                x, y = points[a, 0] / za, points[a, 1] / za
+            else:
+                if (za > NEAREST_M) == (zb > NEAREST_M):
+                    continue
+                share = (NEAREST_M - za) / (zb - za)
+                x = (points[a, 0] + share * (points[b, 0] - points[a, 0])) / NEAREST_M
+                y = (points[a, 1] + share * (points[b, 1] - points[a, 1])) / NEAREST_M
+            u, v = _pixel(lens, x, y)
+            u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
+    return u0 - ROUNDING_PX, u1 + ROUNDING_PX, v0 - ROUNDING_PX, v1 + ROUNDING_PX
+
+
+@njit
 def _lens_box(points: Array, seen: Array, i: int, j: int, k: int, lens: Array) -> Box:
     """Return what `_box` does, for a triangle that bends or has a vertex without a pixel."""
     za, zb, zc = points[i, 2], points[j, 2], points[k, 2]
     if max(za, zb, zc) <= NEAREST_M:
         return NO_BOX
-    if min(za, zb, zc) <= NEAREST_M:  # it reaches behind the camera: no bounds
+    if min(za, zb, zc) <= NEAREST_M:  # it reaches behind the camera
+        if lens[14] == 0.0:
+            return _box_before_camera(points, i, j, k, lens)
         return -np.inf, np.inf, -np.inf, np.inf
     low_x, high_x = min(seen[i, 2], seen[j, 2], seen[k, 2]), max(seen[i, 2], seen[j, 2], seen[k, 2])
     low_y, high_y = min(seen[i, 3], seen[j, 3], seen[k, 3]), max(seen[i, 3], seen[j, 3], seen[k, 3])

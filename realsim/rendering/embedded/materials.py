@@ -171,15 +171,17 @@ class Surface:
         mesh, material = placed.mesh, placed.material
         R = placed.T_world_obj[:3, :3].astype(np.float32)
         local = corner_normals(mesh)
+        self.local_normals = local
         self.normals: Array32 = local @ R.T
         self.is_glossy = placed.instance != BACKGROUND
         corners = mesh.vertices[mesh.faces]
         self._colors: Array32 | None = None
-        self._texture: MipTexture | None = None
-        self._tint = np.ones(3, np.float32)
+        self.texture: MipTexture | None = None
+        self.tint = np.ones(3, np.float32)
+        self.texels_per_m = np.zeros(len(mesh.faces), np.float32)
         if material is not None:
             stored = srgb_encoded(np.array(material.base_color))
-            self._tint = np.asarray(stored**gamma, np.float32)
+            self.tint = np.asarray(stored**gamma, np.float32)
             image = material.base_color_image
             if image is None:
                 image = np.full((1, 1, 3), 255, np.uint8)
@@ -188,23 +190,30 @@ class Surface:
             if material.projection == "uv" and mesh.uv is not None:
                 wrap = repeats(mesh.uv)
                 self._uv = mesh.uv[mesh.faces].astype(np.float32)
-            self._texture = MipTexture(image, gamma, wrap=wrap)
+            self.texture = MipTexture(image, gamma, wrap=wrap)
         elif mesh.texture is not None and mesh.uv is not None:
-            self._texture = MipTexture(mesh.texture, gamma, wrap=repeats(mesh.uv))
+            self.texture = MipTexture(mesh.texture, gamma, wrap=repeats(mesh.uv))
             self._uv = mesh.uv[mesh.faces].astype(np.float32)
         elif mesh.colors is not None:
             decode = (np.arange(256) / 255.0) ** gamma
             self._colors = decode[mesh.colors][mesh.faces].astype(np.float32)
             return
         elif placed.instance == BACKGROUND:
-            self._texture = _shared_texture("wood", gamma)
+            self.texture = _shared_texture("wood", gamma)
             self._uv = box_uv(mesh, WOOD_PERIOD_M)
         else:
             paint = np.array(PLAIN_COLORS[placed.instance % len(PLAIN_COLORS)])
-            self._tint = ((paint / 255.0) ** gamma).astype(np.float32)
-            self._texture = _shared_texture("speckle", gamma)
+            self.tint = ((paint / 255.0) ** gamma).astype(np.float32)
+            self.texture = _shared_texture("speckle", gamma)
             self._uv = box_uv(mesh, SPECKLE_PERIOD_M)
-        self._texels_per_m = _texel_density(corners, self._uv, self._texture.levels[0].shape)
+        self.texels_per_m = _texel_density(corners, self._uv, self.texture.levels[0].shape)
+
+    @property
+    def paint(self) -> Array32:
+        """Linear colours of the corners (F, 3, 3), or texture coordinates with a 0 behind them."""
+        if self._colors is not None:
+            return self._colors
+        return np.concatenate([self._uv, np.zeros_like(self._uv[..., :1])], axis=-1)
 
     def normal(self, face: Int32, weights: Array32) -> Array32:
         """Return shading normals (N, 3), not normalised, at barycentric weights (N, 3)."""
@@ -212,12 +221,12 @@ class Surface:
 
     def reflectance(self, face: Int32, weights: Array32, footprint_m: Array32) -> Array32:
         """Return the linear reflectance (N, 3), averaged over a footprint (N,) [m]."""
-        if self._texture is None:
+        if self.texture is None:
             assert self._colors is not None
             return np.einsum("nij,ni->nj", self._colors[face], weights)
         uv = np.einsum("nij,ni->nj", self._uv[face], weights)
-        color = self._texture.sample(uv, footprint_m * self._texels_per_m[face])
-        return color * self._tint
+        color = self.texture.sample(uv, footprint_m * self.texels_per_m[face])
+        return color * self.tint
 
 
 def check_projection(number: int, placed: PlacedMesh) -> None:

@@ -11,18 +11,20 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from realsim.arrays import Array, Int32, Rgb
+from realsim.arrays import Array, Int32
 from realsim.geometry import se3
 from realsim.geometry.mesh_files import load_mesh
 from realsim.models.simplify import colors_at, simplified
 from realsim.records import Mesh
-from realsim.rendering.photo import Lighting, PhotoRenderer
+from realsim.rendering.moving_scene import Moment, MovingPicture, MovingScene, Seen
+from realsim.rendering.photo import Lighting
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.robots.arm import RobotArm, find_arm
 from realsim.robots.hand import FRANKA, Hand
 from realsim.robots.link_shapes import LARGEST_MM_SCALE
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.link_spheres import solid_points
+from realsim_sim_bridge.demonstrations.attempt_motion import AttemptMotion
 from realsim_sim_bridge.demonstrations.records import DemonstrationCamera
 
 # --- What arm and hand look like: an arm as its own meshes, drawn with few triangles, or as its
@@ -160,59 +162,104 @@ LIGHTING = Lighting(gamma=2.2, samples=2, psf_px=0.4)
 """As a monitor shows it; four rays at edges, since the video's colours are coarser than that."""
 
 
-class StepPictures:
-    """The pictures of one step; what its cameras share is prepared once."""
+class ScenePictures:
+    """The pictures of a scene with its arm; what does not change is prepared once."""
 
     def __init__(
         self,
         cameras: Mapping[str, DemonstrationCamera],
         objects: Mapping[int, tuple[Mesh, Array]],
         arm: GraspingArm,
-        joints_rad: Array,
-        opening_m: float,
         T_table_base: Array,
-        T_table_ee: Array,
         middle_xy: tuple[float, float],
     ) -> None:
-        """Keep what is needed; nothing is rendered yet.
+        """Keep what is needed; nothing is prepared yet.
 
         Args:
             cameras: by name.
-            objects: mesh and T_table_obj (4, 4) [m], by instance.
+            objects: mesh and T_table_obj (4, 4) [m] where it stands at first, by instance.
             arm: the arm with its hand.
-            joints_rad: (n,) [rad].
-            opening_m: distance of the finger faces [m].
             T_table_base: (4, 4) [m].
-            T_table_ee: (4, 4) the hand's grasp frame [m].
             middle_xy: middle of the scene on the table [m].
         """
-        self._cameras, self._objects = cameras, objects
-        self._arm, self._joints, self._opening = arm, joints_rad, opening_m
-        self._T_table_base, self._T_table_ee = T_table_base, T_table_ee
-        self._middle = middle_xy
-        self._renderer: PhotoRenderer | None = None
+        self.cameras, self._objects, self._arm = cameras, objects, arm
+        self.T_table_base, self._middle = T_table_base, middle_xy
+        self._known: tuple[MovingScene, dict[int, int], int] | None = None
 
-    def look(self, name: str) -> Rgb:
-        """Return the picture (H, W, 3) of a camera.
+    def scene(self) -> tuple[MovingScene, dict[int, int], int]:
+        """Return the scene, the number of each instance in it, and that of the arm's first mesh.
+
+        Raises:
+            InputError: a mesh of the arm cannot be read.
+            MissingLibraryError: the package with the meshes is not installed.
+        """
+        if self._known is None:
+            table = np.eye(4)
+            table[:2, 3] = self._middle
+            placed = [PlacedMesh(BACKGROUND, table_slab(), table)]
+            numbers = {i: 1 + k for k, i in enumerate(sorted(self._objects))}
+            placed += [PlacedMesh(i, *self._objects[i]) for i in numbers]
+            zero = np.zeros((1, len(self._arm.arm.joint_names)))
+            meshes, Ts = self.robot(zero, np.zeros(1))
+            placed += [PlacedMesh(BACKGROUND, m, T) for m, T in zip(meshes, Ts[0], strict=True)]
+            self._known = MovingScene(placed, LIGHTING), numbers, 1 + len(numbers)
+        return self._known
+
+    def robot(self, joints_rad: Array, openings_m: Array) -> tuple[tuple[Mesh, ...], Array]:
+        """Return arm and hand (L), and T_table_mesh (S, L, 4, 4); see `robot_meshes`."""
+        return robot_meshes(self._arm, joints_rad, openings_m, self.T_table_base)
+
+
+class AttemptPictures:
+    """The pictures of one attempt, step by step."""
+
+    def __init__(self, scene: ScenePictures, instance: int, motion: AttemptMotion) -> None:
+        """Keep what moves; nothing is rendered yet.
+
+        Args:
+            scene: the scene.
+            instance: the object that is grasped.
+            motion: of the arm and the object.
+        """
+        self._scene, self._instance, self._motion = scene, instance, motion
+        self._Ts_robot: Array | None = None
+        self._stills: dict[str, Seen] = {}
+        self._now: tuple[int, Moment] | None = None
+        self._last: dict[str, tuple[int, MovingPicture]] = {}
+
+    def picture(self, step: int, name: str) -> MovingPicture:
+        """Return what a camera sees at a step; asked again at once, it is not rendered again.
 
         Raises:
             KeyError: there is no camera of that name.
         """
-        camera = self._cameras[name]
-        if self._renderer is None:
-            self._renderer = PhotoRenderer(self._placed(), LIGHTING)
-        T = self._T_table_ee @ camera.T_frame_cam if camera.on_hand else camera.T_frame_cam
-        return self._renderer.render(camera.intrinsics, T).rgb
+        camera = self._scene.cameras[name]
+        if self._last.get(name, (-1,))[0] != step:
+            self._last[name] = step, self._rendered(step, camera)
+        return self._last[name][1]
 
-    def _placed(self) -> list[PlacedMesh]:
-        table = np.eye(4)
-        table[:2, 3] = self._middle
-        placed = [PlacedMesh(BACKGROUND, table_slab(), table)]
-        placed += [PlacedMesh(i, mesh, T) for i, (mesh, T) in sorted(self._objects.items())]
-        meshes, Ts = robot_meshes(
-            self._arm, self._joints[None], np.array([self._opening]), self._T_table_base
-        )
-        return placed + [PlacedMesh(BACKGROUND, m, T) for m, T in zip(meshes, Ts[0], strict=True)]
+    def T_table_cam(self, step: int, name: str) -> Array:
+        """Return where a camera is at a step (4, 4) [m]."""
+        camera = self._scene.cameras[name]
+        if not camera.on_hand:
+            return camera.T_frame_cam
+        return self._scene.T_table_base @ self._motion.Ts_base_ee[step] @ camera.T_frame_cam
+
+    def _rendered(self, step: int, camera: DemonstrationCamera) -> MovingPicture:
+        scene, numbers, first = self._scene.scene()
+        if self._Ts_robot is None:
+            self._Ts_robot = self._scene.robot(self._motion.joints_rad, self._motion.opening_m)[1]
+        if self._now is None or self._now[0] != step:
+            poses = {first + k: T for k, T in enumerate(self._Ts_robot[step])}
+            poses[numbers[self._instance]] = self._motion.Ts_table_obj[step]
+            self._now = step, scene.moment(poses)
+        moment = self._now[1]
+        if camera.on_hand:
+            return scene.picture(moment, camera.intrinsics, self.T_table_cam(step, camera.name))
+        if camera.name not in self._stills:
+            resting = [0, *(n for i, n in numbers.items() if i != self._instance)]
+            self._stills[camera.name] = scene.still(camera.intrinsics, camera.T_frame_cam, resting)
+        return scene.renewed(moment, self._stills[camera.name])
 
 
 def drawn_mesh(mesh: Mesh) -> Mesh:

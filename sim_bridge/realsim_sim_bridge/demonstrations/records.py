@@ -7,6 +7,7 @@ from typing import Any
 from realsim.arrays import Array, Rgb
 from realsim.records import CameraIntrinsics
 from realsim.records.checked_arrays import rigid
+from realsim.rendering.moving_scene import MovingPicture
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -104,5 +105,11 @@ class DemonstrationStep:
     Ts_base_obj: Mapping[int, Array]
     """(4, 4) every object in the arm's base [m], by instance."""
     action: RobotAction
-    look: Callable[[str], Rgb]
-    """Camera's name -> its picture (H, W, 3); rendered when it is asked for."""
+    picture: Callable[[str], MovingPicture]
+    """Camera's name -> its picture and depth; rendered when it is asked for."""
+    T_table_cam: Callable[[str], Array]
+    """Camera's name -> where it is (4, 4), table frame [m]."""
+
+    def look(self, name: str) -> Rgb:
+        """Return the picture (H, W, 3) of a camera."""
+        return self.picture(name).rgb

@@ -9,7 +9,8 @@ A replayed attempt is some kilobytes; its pictures are made one by one, and kept
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import overload
 
@@ -21,7 +22,7 @@ from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from realsim.geometry.mesh import hull_vertices
 from realsim.models.library_records import KnownSolid
-from realsim.records import Mesh, ObjectModel
+from realsim.records import ObjectModel
 from realsim.records.grasps import LABEL_MEASURES
 from realsim.records.trajectories import PHASES
 from realsim.untrusted.own_json import to_json
@@ -35,7 +36,7 @@ from realsim_sim_bridge.demonstrations.front_view import (
     placed_front,
     wrist_camera,
 )
-from realsim_sim_bridge.demonstrations.pictures import StepPictures, drawn_mesh
+from realsim_sim_bridge.demonstrations.pictures import AttemptPictures, ScenePictures, drawn_mesh
 from realsim_sim_bridge.demonstrations.records import (
     AttemptOutcome,
     DemonstrationCamera,
@@ -78,14 +79,12 @@ class Scenery:
     cameras: Mapping[str, DemonstrationCamera]
     models: Mapping[int, ObjectModel]
     """By instance."""
-    looks: Mapping[int, Mesh]
-    """What is drawn of them, by instance."""
     Ts_table_obj: Mapping[int, Array]
     """(4, 4) where everything stands at first [m], by instance."""
     T_table_base: Array
-    middle_xy: tuple[float, float]
     arm: GraspingArm
     """The arm that attempts, with its hand."""
+    pictures: ScenePictures
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -97,6 +96,12 @@ class Demonstration:
     outcome: AttemptOutcome
     motion: AttemptMotion
     scenery: Scenery
+    pictures: AttemptPictures = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Prepare for pictures; none is rendered yet."""
+        pictures = AttemptPictures(self.scenery.pictures, self.name.instance, self.motion)
+        object.__setattr__(self, "pictures", pictures)
 
     def __len__(self) -> int:
         """Return the number of steps."""
@@ -135,16 +140,6 @@ class Demonstration:
         after = min(k + 1, len(self) - 1)
         Ts_table_obj = {**scenery.Ts_table_obj, self.name.instance: m.Ts_table_obj[k]}
         T_base_table = se3.invert(scenery.T_table_base)
-        pictures = StepPictures(
-            scenery.cameras,
-            {i: (scenery.looks[i], T) for i, T in Ts_table_obj.items()},
-            scenery.arm,
-            m.joints_rad[k],
-            float(m.opening_m[k]),
-            scenery.T_table_base,
-            scenery.T_table_base @ m.Ts_base_ee[k],
-            scenery.middle_xy,
-        )
         return DemonstrationStep(
             index=k,
             time_s=float(m.time_s[k]),
@@ -159,7 +154,8 @@ class Demonstration:
                 opening_m=float(m.command_m[after]),
                 T_ee_next=se3.invert(m.Ts_base_ee[k]) @ m.Ts_base_ee[after],
             ),
-            look=pictures.look,
+            picture=partial(self.pictures.picture, k),
+            T_table_cam=partial(self.pictures.T_table_cam, k),
         )
 
 
@@ -325,14 +321,15 @@ class DemonstrationSource(Sequence[Demonstration]):
         seen = happening(self._grasps, models, Ts_table_obj, T_table_base, self.arm)
         chosen = [placed_front(c, seen) if isinstance(c, FrontView) else c for c in asked]
         drawn = {o: drawn_mesh(self._models[o].mesh) for o in {s.obj_id for s in self._grasps.sets}}
+        by_name = {c.name: c for c in chosen}
+        looks = {i: (drawn[s.obj_id], Ts_table_obj[i]) for i, s in self._sets.items()}
         return Scenery(
-            cameras={c.name: c for c in chosen},
-            looks={i: drawn[s.obj_id] for i, s in self._sets.items()},
+            cameras=by_name,
             models=models,
             Ts_table_obj=Ts_table_obj,
             T_table_base=T_table_base,
-            middle_xy=middle,
             arm=self.arm,
+            pictures=ScenePictures(by_name, looks, self.arm, T_table_base, middle),
         )
 
     def _replayed(self, name: AttemptName) -> Demonstration:
