@@ -1,0 +1,110 @@
+"""`realsim pipeline`: a campaign's file is checked before anything runs; scenes fail alone."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from click.testing import CliRunner
+
+from realsim.app.cli import commands
+from realsim.errors import InputError
+
+HEAD = '[campaign]\nout = "out"\nstages = ["annotate", "export", "stats"]\n'
+SCENES = '[generate]\nscenes = 2\nviews = 2\nobjects = "2"\nsize = "160x120"\nrange = "d405"\n'
+EXPORT = '[export]\nto = "bop"\n'
+
+
+def run(path, *more):
+    return CliRunner().invoke(commands, ["pipeline", str(path), "--quiet", *more])
+
+
+def written(folder, text):
+    path = folder / "campaign.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("[generate]\nscenes = 1\n", "has no table [campaign]"),
+        (HEAD.replace("stages", "stage") + SCENES, "did you mean stages"),
+        (HEAD.replace('"annotate"', '"anotate"') + SCENES, "there is no stage 'anotate'"),
+        (HEAD.replace('"annotate", "export"', '"export", "annotate"') + SCENES, "behind 'export'"),
+        (HEAD + SCENES + EXPORT.replace("to", "two"), "line 11: [export] has no option 'two'"),
+        (HEAD + SCENES + EXPORT + 'out = "x"\n', "a campaign sets --out itself"),
+        (HEAD + SCENES + EXPORT + "[register]\n", "[register] has no effect"),
+        (HEAD + EXPORT, "says nowhere where its scenes come from"),
+        (HEAD + 'sessions = ["a*"]\n' + SCENES + EXPORT, "says twice"),
+        (HEAD + 'sessions = ["a*"]\n' + EXPORT, "'a*' names nothing"),
+        (HEAD.replace('"out"', "3") + SCENES, "a folder in quotes"),
+    ],
+)
+def test_a_file_that_cannot_be_used_names_line_and_key_and_runs_nothing(tmp_path, text, told):
+    result = run(written(tmp_path, text))
+    assert isinstance(result.exception, InputError)
+    assert told in str(result.exception)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_of_something_else_is_not_filled(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/mine.txt").write_text("mine")
+    result = run(written(tmp_path, HEAD + SCENES + EXPORT))
+    assert "holds something else" in str(result.exception)
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["mine.txt"]
+
+
+def document(out):
+    return json.loads((out / "campaign.json").read_text())
+
+
+@pytest.mark.slow
+def test_a_scene_that_fails_is_listed_the_others_go_on_and_only_it_is_done_again(tmp_path):
+    path, out = written(tmp_path, HEAD + SCENES + EXPORT), tmp_path / "out"
+    assert run(path).exit_code == 0
+    whole = document(out)
+    assert whole["done"] == 2 and not whole["failed"]
+    assert len(list((out / "export").glob("*/*/scene_gt.json"))) == 2
+    # Generated anew but for one scene's list of views, which is lost.
+    record = out / "records/scene_000001.json"
+    record.unlink()
+    views = out / "scenes/scene_000001/registration/scene.json"
+    kept = views.read_bytes()
+    views.write_bytes(b"{")
+    broken = run(path)
+    assert broken.exit_code == 1
+    told = document(out)
+    assert list(told["failed"]) == ["scene_000001"] and told["done"] == 1 and told["kept"] == 1
+    assert "scene.json" in told["failed"]["scene_000001"]
+    page = (out / "campaign.html").read_text()
+    assert "scene_000001" in page and "1 failed" in page
+    views.write_bytes(kept)
+    assert run(path).exit_code == 0
+    assert document(out)["done"] == 2
+
+
+@pytest.mark.slow
+def test_a_campaign_that_was_interrupted_goes_on_and_comes_to_the_same(tmp_path):
+    path, out = written(tmp_path, HEAD + SCENES + EXPORT), tmp_path / "out"
+    line = [sys.executable, "-c", "from realsim.app.cli import main; main()", "pipeline", str(path)]
+    process = subprocess.Popen(line, start_new_session=True, stderr=subprocess.PIPE, text=True)
+    while not (out / "scenes/scene_000000/session.json").is_file():
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "the same command goes on from here" in told
+    assert run(path).exit_code == 0
+    first = {p.name: p.read_bytes() for p in (out / "export").glob("*/*/scene_gt.json")}
+    other = tmp_path / "other"
+    other.mkdir()
+    assert run(written(other, HEAD + SCENES + EXPORT)).exit_code == 0
+    assert first == {
+        p.name: p.read_bytes() for p in (other / "out/export").glob("*/*/scene_gt.json")
+    }
