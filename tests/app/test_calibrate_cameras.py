@@ -192,8 +192,11 @@ def test_what_is_missing_is_named(
     assert words in refusal(result)
 
 
+@pytest.mark.parametrize(
+    ("gray", "words"), [(90, "shows nothing that looks like a target"), (12, "is too dark")]
+)
 def test_a_camera_that_sees_no_board_is_named_with_what_it_shows(
-    photos: Path, tmp_path: Path
+    photos: Path, tmp_path: Path, gray: int, words: str
 ) -> None:
     import cv2
 
@@ -201,13 +204,13 @@ def test_a_camera_that_sees_no_board_is_named_with_what_it_shows(
     for name in ("table", "held"):
         shutil.copy(photos.parent / f"{name}.json", tmp_path)
     for path in (folder / "right").glob("*.png"):
-        cv2.imwrite(str(path), np.full((480, 640, 3), 90, np.uint8))
+        cv2.imwrite(str(path), np.full((480, 640, 3), gray, np.uint8))
     for name in ("wrist", "left"):
         for path in sorted((folder / name).glob("*.png"))[2:]:
             path.unlink()
     result = run(folder, tmp_path / "out")
     said = refusal(result)
-    assert "camera 'right' never sees a board" in said
+    assert "camera 'right' never sees a board" in said and words in said
     assert "leave the camera out" in said
 
 

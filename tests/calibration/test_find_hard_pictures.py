@@ -5,7 +5,7 @@ import pytest
 
 from pictured_targets import TARGETS, page_of, picture, pose, truth
 from realsim_calibration.detect.blur import edge_blur_px
-from realsim_calibration.detect.drawings import DRAWN, drawing_reason
+from realsim_calibration.detect.drawings import COVERED, DRAWN, drawing_reason
 from realsim_calibration.detect.find import find_target
 
 
@@ -85,3 +85,20 @@ def test_drawn_corners_are_told_after_jpeg(quality):
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     rgb = cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
     assert drawing_reason(rgb, uv).startswith(DRAWN)
+
+
+@pytest.mark.parametrize("color", [(255, 0, 0), (0, 255, 0), (0, 0, 255)])
+def test_a_target_whose_points_are_all_drawn_over_is_named(color):
+    """Discs over every point: nothing is found, and the colours say why."""
+    import cv2
+
+    board = TARGETS["chessboard"]
+    T = pose(board, 20.0)
+    image = np.repeat(picture(board, T)[..., None], 3, -1)
+    assert drawing_reason(image, np.zeros((0, 2))) == ""
+    for u, v in truth(board, T):
+        cv2.circle(image, (round(u), round(v)), 14, color, -1)
+    found = find_target(image, board)
+    assert len(found) < 4
+    said = [r for r in found.rejected if r.startswith(COVERED)]
+    assert said and "drawn over the target?" in said[0]

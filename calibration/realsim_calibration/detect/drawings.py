@@ -24,17 +24,35 @@ DRAWN = "coloured lines or dots are drawn over the target"
 """How a reason begins that says so."""
 
 
+MIN_HULL = 4
+"""Fewer points do not say where in the picture the target is."""
+PURE, PURE_SHARE = 200, 0.002
+"""Chroma of colours as programs draw them, and the share of a picture from which they are named
+where no target is found. Chosen on three real sets: untouched 0.01 %, every point of a board
+covered by a disc 0.7 % and more."""
+COVERED = "pure colours cover"
+"""How a reason begins that says so."""
+
+
 def drawing_reason(image: UInt8, uv: Array) -> str:
     """Return what to say of a picture with drawings on its target; empty where there are none.
 
     Args:
         image: (H, W, 3) RGB, or (H, W) gray, in which nothing can be told.
-        uv: (n, 2) the target's points [px].
+        uv: (n, 2) the target's points [px]; of fewer than four the whole picture is judged.
     """
     import cv2
 
-    if image.ndim != 3 or len(uv) < 4:
+    if image.ndim != 3:
         return ""
+    if len(uv) < MIN_HULL:
+        share = float((np.ptp(image.astype(np.int16), axis=-1) > PURE).mean())
+        if share <= PURE_SHARE:
+            return ""
+        return (
+            f"{COVERED} {100 * share:.1f} % of the picture, as programs draw them: are lines or "
+            "dots drawn over the target? Use the pictures as the camera gave them"
+        )
     hull = cv2.convexHull(np.rint(uv).astype(np.int32))
     u, v, w, h = cv2.boundingRect(hull)
     inside = np.zeros((h, w), np.uint8)

@@ -23,7 +23,7 @@ from realsim.app.calibrate.camera_frames import (
     with_intrinsics,
 )
 from realsim.app.calibrate.folder import MADE_OF, made_of
-from realsim.app.calibrate.images import find_in_images
+from realsim.app.calibrate.images import find_in_images, why_not_found
 from realsim.app.calibrate.show import show_checks
 from realsim.app.console import Console
 from realsim.app.outputs import require_free_folder
@@ -49,7 +49,6 @@ from realsim_calibration.cameras.rig import Instant, Rig, RigBoard, RigCamera, S
 from realsim_calibration.inputs import (
     RawPoses,
     list_images,
-    load_image,
     read_pose_file,
     reading_from_text,
 )
@@ -179,9 +178,7 @@ def _sightings(
 
 
 def _require_seen(rig: Rig, frames: Frames) -> None:
-    """Raise if a camera never sees a board, saying what its images show instead."""
-    from realsim_calibration.detect.visible import what_is_visible
-
+    """Raise if a camera never sees a board, saying what is wrong with its images."""
     for c, camera in enumerate(rig.cameras):
         own = [frames.images[camera.name][i] for i in sorted(frames.images[camera.name])]
         if not own:
@@ -192,9 +189,8 @@ def _require_seen(rig: Rig, frames: Frames) -> None:
         if not any(len(s.detection) for s in rig.of_camera(c)):
             raise InputError(
                 f"camera '{camera.name}' never sees a board: none was found in its {len(own)} "
-                f"images; {own[0].name} shows {what_is_visible(load_image(own[0]))}. Point it at "
-                "the board, give the target as it was printed, or leave the camera out of "
-                "--cameras."
+                f"images. {why_not_found(own[0], own[0].name)} Or point it at the board, or leave "
+                "the camera out of --cameras."
             )
 
 

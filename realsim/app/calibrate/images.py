@@ -21,7 +21,7 @@ from realsim_calibration import TargetDetection, find_target
 if TYPE_CHECKING:
     from realsim_calibration.inputs import FolderInput
 
-SEARCH = "3"
+SEARCH = "4"
 """Goes up when a search finds or says something else: notes of an earlier search are void."""
 LOOKED_AT = 2
 """Images without the target in which it is looked what they show, which takes a second each."""
@@ -73,11 +73,15 @@ def warn_of_pictures(
 ) -> None:
     """Say which images have drawings on the target, and which show another target."""
     from realsim_calibration.detect.blur import BLURRED
-    from realsim_calibration.detect.drawings import DRAWN
+    from realsim_calibration.detect.drawings import COVERED, DRAWN
     from realsim_calibration.detect.visible import what_is_visible
     from realsim_calibration.inputs import load_image
 
-    drawn = [k for k, d in enumerate(detections) if any(r.startswith(DRAWN) for r in d.rejected)]
+    drawn = [
+        k
+        for k, d in enumerate(detections)
+        if any(r.startswith((DRAWN, COVERED)) for r in d.rejected)
+    ]
     if drawn:
         why = detections[drawn[0]].rejected[0]
         console.warn(f"{_named(folder, drawn)}: {why}, or leave these images out.")
@@ -169,26 +173,36 @@ def require_target(
     """
     if any(len(d) for d in detections):
         return
+    from realsim_calibration.targets.target_text import format_target
+
+    raise InputError(
+        f"the target '{format_target(target)}' was found in none of the {len(detections)} images. "
+        + why_not_found(folder.images[0], folder.labels[0])
+    )
+
+
+def why_not_found(path: Path, name: str) -> str:
+    """Return what is wrong with an image in which no target was found, in sentences.
+
+    It is too dark, drawn over or blurred, or it shows something else.
+    """
     from realsim_calibration.detect.blur import blur_reason
+    from realsim_calibration.detect.drawings import drawing_reason
     from realsim_calibration.detect.images import gray_image
     from realsim_calibration.detect.visible import dark_reason, what_is_visible
     from realsim_calibration.inputs import load_image
-    from realsim_calibration.targets.target_text import format_target
 
-    image, name = load_image(folder.images[0]), folder.labels[0]
-    says = (
-        f"the target '{format_target(target)}' was found in none of the {len(detections)} images."
-    )
-    dark = dark_reason(image)
-    if dark:
-        raise InputError(f"{says} {name}: {dark}.")
+    image = load_image(path)
+    spoiled = dark_reason(image) or drawing_reason(image, np.zeros((0, 2)))
+    if spoiled:
+        return f"{name}: {spoiled}."
     shown, blurred = what_is_visible(image), blur_reason(gray_image(image))
     if blurred:
-        raise InputError(
-            f"{says} {name}: {blurred}. Then take the pictures again. As blurred as it is, it "
+        return (
+            f"{name}: {blurred}. Then take the pictures again. As blurred as it is, it "
             f"seems to show {shown}: only if the target is another than given, change --board."
         )
-    raise InputError(f"{says} {name} shows {shown}. Give --board as it was printed.")
+    return f"{name} shows {shown}. Give --board as it was printed."
 
 
 def require_one_size(
