@@ -31,6 +31,7 @@ KeyboardInterrupt with one. Commands take the pool from the two options of
 """
 
 from realsim.many.carried import Sent, Shared, Worked
+from realsim.many.opening import open_pool
 from realsim.many.pool import (
     ClusterLostError,
     ForeignNodeError,
@@ -39,7 +40,6 @@ from realsim.many.pool import (
     WorkerDiedError,
     Workers,
     at_most,
-    open_pool,
 )
 from realsim.many.run import Outcome, Summary, Task, run_many
 

@@ -1,8 +1,7 @@
 """A pool does jobs: processes of this machine, or the cores of a Ray cluster."""
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from concurrent.futures import Future
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -71,26 +70,3 @@ def at_most(where: Workers, jobs: int) -> PoolConfig:
     """Return where jobs run, with no more workers than there are jobs."""
     config = where if isinstance(where, PoolConfig) else PoolConfig(workers=where)
     return replace(config, workers=max(1, min(config.processes, jobs)))
-
-
-@contextmanager
-def open_pool(where: Workers = None) -> Generator[Pool]:
-    """Yield who does the work; leaving ends it, in the middle of jobs where an error leaves.
-
-    Args:
-        where: a number = so many processes, 1 = this one; None = one a core.
-
-    Raises:
-        InputError: the cluster is not there, lets in anyone, or Ray is not installed.
-    """
-    config = where if isinstance(where, PoolConfig) else PoolConfig(workers=where)
-    if config.address:
-        from realsim.many.ray_pool import ray_pool
-
-        with ray_pool(config) as pool:
-            yield pool
-        return
-    from realsim.many.processes import local_pool
-
-    with local_pool(config.workers) as pool:
-        yield pool

@@ -16,19 +16,24 @@ if TYPE_CHECKING:
     "annotate", cls=Command,
     examples=("realsim annotate demo/session", "realsim annotate demo/session --maps all --json"),
 )  # fmt: skip
-@click.argument("session", type=FOLDER)
+@click.argument("sessions", type=FOLDER, nargs=-1, required=True, metavar="SESSION...")
 @click.option("--maps", default="instance,depth", show_default=True,
               metavar="all|none|LIST",
               help="Maps of each frame: instance, depth, coordinates, normals.")  # fmt: skip
-@many(1, "Frames at a time.")
+@many(1, "Frames at a time; of several sessions, sessions.")
 @click.option("--no-depth-check", is_flag=True,
               help="Do not look for unknown things in the measured depth.")  # fmt: skip
 @JSON
 @QUIET
 def annotate_command(
-    session: Path, maps: str, where: "PoolConfig", no_depth_check: bool, as_json: bool, quiet: bool
+    sessions: tuple[Path, ...],
+    maps: str,
+    where: "PoolConfig",
+    no_depth_check: bool,
+    as_json: bool,
+    quiet: bool,
 ) -> None:
-    """Write masks, maps, poses, visibility and grasps for every frame of SESSION.
+    """Write masks, maps, poses, visibility and grasps for every frame of each SESSION.
 
     Where the measured depth shows something in front of an object that is not in the scene (a hand,
     a cable), it leaves the object's visible mask, and the frame is named. Frames whose inputs are
@@ -39,7 +44,9 @@ def annotate_command(
     """
     from realsim.app.annotate.run import run_annotate
     from realsim.app.console import Console
+    from realsim.app.many_sessions import one_session
 
+    session = one_session(sessions, where)
     console = Console(quiet=quiet, as_json=as_json)
     summary = run_annotate(
         session, console, maps=maps, workers=where, check_depth=not no_depth_check

@@ -2,12 +2,15 @@
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from realsim.app.command import Command
-from realsim.app.options import FOLDER, JSON, QUIET
+from realsim.app.options import FOLDER, JSON, QUIET, many
+
+if TYPE_CHECKING:
+    from realsim.many import PoolConfig
 
 LARGEST = 100_000
 """More views than this are a typing error."""
@@ -35,7 +38,7 @@ def views_of(text: str) -> int | None:
         "realsim register demo/session --from-review",
     ),
 )
-@click.argument("session", type=FOLDER)
+@click.argument("sessions", type=FOLDER, nargs=-1, required=True, metavar="SESSION...")
 @click.option("--object", "objects", metavar="SPEC", multiple=True,
               help="What is there, and where, as far as you know; repeat it.")  # fmt: skip
 @click.option("--find-all", is_flag=True, help="Find out which of the models are there.")
@@ -50,10 +53,13 @@ def views_of(text: str) -> int | None:
 @click.option("--odometry", is_flag=True, help="Check the robot's poses by the depth alone.")
 @click.option("--depth-bias", default="", metavar="FILE|off",
               help="Depth camera's bias.  [that of the session's calibration]")  # fmt: skip
+@many(help="Sessions at a time.")
 @JSON
 @QUIET
-def register_command(session: Path, as_json: bool, quiet: bool, **options: Any) -> None:
-    """Find the pose of every object of SESSION in every view, with its uncertainty.
+def register_command(
+    sessions: tuple[Path, ...], where: "PoolConfig", as_json: bool, quiet: bool, **options: Any
+) -> None:
+    """Find the pose of every object of each SESSION in every view, with its uncertainty.
 
     \b
     What is on the table is said in one of four ways:
@@ -72,6 +78,7 @@ def register_command(session: Path, as_json: bool, quiet: bool, **options: Any) 
     Exit codes: 0 done, 1 nothing was placed or everything is rejected, 2 bad input.
     """  # noqa: D301 - click's own mark for lines that stay as they are
     from realsim.app.console import Console
+    from realsim.app.many_sessions import one_session
     from realsim.app.register.config import RegisterRequest
     from realsim.app.register.run import run_register
     from realsim.app.register.tables import as_json as json_of
@@ -79,6 +86,7 @@ def register_command(session: Path, as_json: bool, quiet: bool, **options: Any) 
     from realsim.app.stages import open_session, session_models
     from realsim.store.lock import only_run_in
 
+    session = one_session(sessions, where, whole=True)
     request = RegisterRequest(
         method=options["method"], objects=options["objects"], find_all=options["find_all"],
         from_review=options["from_review"],

@@ -18,7 +18,7 @@ from realsim.app.outputs import GOES_ON
         "realsim render demo/session --views 3 --size 320x240 --seed 1",
     ),
 )
-@click.argument("session", type=FOLDER)
+@click.argument("sessions", type=FOLDER, nargs=-1, required=True, metavar="SESSION...")
 @click.option("--views", default="real", show_default=True, metavar="real|N",
               help="Twins of the real frames, or N new views.")  # fmt: skip
 @click.option("--out", type=GOES_ON, default=None, help="Folder.  [SESSION/synthetic/...]")
@@ -39,11 +39,11 @@ from realsim.app.outputs import GOES_ON
 @click.option("--material", "materials", multiple=True, metavar="table=KIND",
               help="Another table: oak, marble, ...  [as in the photographs]")  # fmt: skip
 @seed("Of new views and of the camera's noise.")
-@many(help="Frames at a time.")
+@many(help="Frames at a time; of several sessions, sessions.")
 @JSON
 @QUIET
-def render_command(session: Path, as_json: bool, quiet: bool, **options: Any) -> None:
-    """Render the registered scene of SESSION: every real frame's twin, or new views.
+def render_command(sessions: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any) -> None:
+    """Render the registered scene of each SESSION: every real frame's twin, or new views.
 
     Without --views at the real cameras, raw distortion included; with it, over the hemisphere. The
     result is a session of its own, with every label, exact depth and the depth that the camera
@@ -53,9 +53,11 @@ def render_command(session: Path, as_json: bool, quiet: bool, **options: Any) ->
     Exit codes: 0 done, 2 bad input.
     """
     from realsim.app.console import Console
+    from realsim.app.many_sessions import one_session
     from realsim.app.render.request import RenderRequest
     from realsim.app.render.run import render_document, run_render, show_render
 
+    session = one_session(sessions, options["where"])
     request = RenderRequest(**options)
     console = Console(quiet=quiet, as_json=as_json)
     outcome = run_render(session, request, console)

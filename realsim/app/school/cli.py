@@ -76,7 +76,7 @@ def SCHOOL() -> None:
         "realsim school run demo/session --grasps 4 --force 20 --restart --json",
     ),
 )
-@click.argument("source", type=FOLDER)
+@click.argument("sources", type=FOLDER, nargs=-1, required=True, metavar="SOURCE...")
 @click.option(
     "--out",
     type=GOES_ON,
@@ -123,10 +123,10 @@ def SCHOOL() -> None:
 @JSON
 @QUIET
 def run_command(
-    source: Path, out: Path | None, json_file: Path | None, as_json: bool, quiet: bool,
+    sources: tuple[Path, ...], out: Path | None, json_file: Path | None, as_json: bool, quiet: bool,
     **options: Any,
 ) -> None:  # fmt: skip
-    """Try grasps on every object of SOURCE.
+    """Try grasps on every object of each SOURCE.
 
     SOURCE is a registered session, or a BOP scene, a GraspNet scene or a scene.yaml with --out.
     A run that was interrupted goes on where it stopped.
@@ -137,6 +137,7 @@ def run_command(
     Exit codes: 0 done, 1 no grasp could be tried, 2 bad input.
     """
     from realsim.app.console import Console
+    from realsim.app.many_sessions import one_session
     from realsim.app.school.files import PAGE
     from realsim.app.school.inputs import SchoolRequest
     from realsim.app.school.run import run
@@ -144,6 +145,7 @@ def run_command(
     from realsim.app.school.tables import show_school
     from realsim.store import atomic
 
+    source = one_session(sources, options["where"])
     request = SchoolRequest(**options)
     console = Console(quiet=quiet, as_json=as_json)
     outcome = run(source, out, request, console)
