@@ -37,8 +37,8 @@ class FixedCamera:
     """1-sigma of its place along an axis [mm]."""
     sigma_deg: float
     """1-sigma of its rotation about an axis [deg]."""
-    bias: DepthBias = field(default_factory=DepthBias.none)
-    """Bias of its depth with its covariance; zero covariance = it was not measured."""
+    bias: DepthBias = field(default_factory=DepthBias.unmeasured)
+    """Bias of its depth with its covariance; by default as little is known as of any camera."""
     noise: DepthNoise = field(default_factory=lambda: DepthNoise(per_m=0.0, floor_m=NOISE_FLOOR_M))
     """Noise of the median of its images; see `noise_of`."""
 

@@ -98,9 +98,10 @@ def _input(
     from realsim.registration.fixed_cameras import FixedCamera, FixedFrames
 
     store, camera = stores
-    bias = DepthBias.none()
+    bias = DepthBias.unmeasured()
     if request.depth_bias != OFF and camera.has(BIAS_FILE):
-        bias = load_depth_bias(camera.path(BIAS_FILE))
+        measured = load_depth_bias(camera.path(BIAS_FILE))
+        bias = measured if np.any(measured.covariance) else bias
     mm, deg = _sigmas(store.path(CALIBRATED), name)
     said = FixedCamera(
         name=name, intrinsics=camera.session.intrinsics, T_world_cam=claimed[views[0]],
