@@ -10,6 +10,7 @@ from realsim.app.console import Console
 from realsim.app.stages import judged_scene, registered_views, require_sound, session_models
 from realsim.records import GraspSet, ObjectPose, Scene
 from realsim.store import SessionStore
+from realsim.store.cameras import open_cameras
 
 if TYPE_CHECKING:
     from realsim_sim_bridge.annotation.annotate import AnnotationSummary
@@ -28,6 +29,9 @@ def annotate_session(
     check_depth: bool = True,
 ) -> "AnnotationSummary":
     """Write masks, poses, visibility and grasps of every frame that the objects are registered in.
+
+    Frames of the session's further cameras (`store.cameras`) get the same scene; the summary is of
+    the camera in the hand.
 
     Args:
         store: the session.
@@ -60,13 +64,28 @@ def annotate_session(
     models = session_models(store, console)
     sets = load_grasps(store.folder / "grasps")
     grasps = grasps_of_scene(store, scene, sets, console)
-    only = registered_views(store)
-    n = len(store.session.views) if only is None else len(only)
-    with console.stage("annotate", f"{n} frames") as tick:
-        return annotate(
-            store, scene, models, grasps, config,
-            only=only, progress=tick, workers=workers, surroundings=surroundings, damaged=damaged,
-        )  # fmt: skip
+    cameras = {name: c for name, c in open_cameras(store).items() if _is_placed(c)}
+    wrong = {name: require_sound(camera) for name, camera in cameras.items()}
+
+    def write(words: str, of: SessionStore, broken: list[str]) -> "AnnotationSummary":
+        only = registered_views(of)
+        n = len(of.session.views) if only is None else len(only)
+        with console.stage("annotate", f"{n} frames{words}") as tick:
+            return annotate(
+                of, scene, models, grasps, config,
+                only=only, progress=tick, workers=workers, surroundings=surroundings,
+                damaged=broken,
+            )  # fmt: skip
+
+    for name, camera in cameras.items():
+        write(f" of {name}", camera, wrong[name])
+    return write("", store, damaged)
+
+
+def _is_placed(store: SessionStore) -> bool:
+    """Return whether it is known where a further camera stands, in all of its views."""
+    views = store.session.views
+    return bool(views) and all(v.T_world_cam is not None for v in views)
 
 
 def is_annotated(store: SessionStore) -> bool:
@@ -76,6 +95,9 @@ def is_annotated(store: SessionStore) -> bool:
 
 def what_is_stale(store: SessionStore) -> str:
     """Return in which way the labels differ from the reviewed scene; '' = they do not."""
+    for name, camera in open_cameras(store).items():
+        if _is_placed(camera) and not is_annotated(camera):
+            return f"camera {name} has none"
     labelled: dict[int, dict[str, Any]] = {
         row["instance"]: row for row in store.read_json(OBJECTS_FILE)["objects"]
     }
