@@ -1,12 +1,16 @@
 """The command line: one command per job, each imported only when it is asked for.
 
-Exit codes: 0 done, 1 done but a check failed, 2 something given cannot be used, 130 interrupted.
+Exit codes: 0 done, 1 done but a check failed, 2 something given cannot be used, 130 interrupted,
+141 the reader of the output has gone, 143 asked to end.
 """
 
 import os
 import signal
 import sys
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -66,6 +70,25 @@ class Realsim(Group):
         ctx.meta[COMMAND_KEY] = tuple(args)
         return super().parse_args(ctx, args)
 
+    def make_context(self, *given: Any, **more: Any) -> click.Context:
+        """Read the line; `--help` writes already here."""
+        with _pipes_passed_on():
+            return super().make_context(*given, **more)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command."""
+        with _pipes_passed_on():
+            return super().invoke(ctx)
+
+
+@contextmanager
+def _pipes_passed_on() -> Generator[None]:
+    """Keep click from ending with 1, which says that a check failed, where a reader has gone."""
+    try:
+        yield
+    except BrokenPipeError:
+        raise BrokenPipeError from None  # one without a number is not click's
+
 
 QUIET_KEY = "realsim.quiet"
 """In the context: whether --quiet was typed."""
@@ -117,6 +140,20 @@ def main() -> None:
     add_bash_completion()
     signal.signal(signal.SIGTERM, _asked_to_end)
     try:
+        _run()
+    except BrokenPipeError:
+        # Python writes what is left when it ends; nobody reads it.
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.stdout, sys.stderr):
+            try:
+                stream.flush()
+            except BrokenPipeError:
+                os.dup2(nowhere, stream.fileno())
+        sys.exit(BROKEN_PIPE)
+
+
+def _run() -> None:
+    try:
         commands(prog_name="realsim", standalone_mode=False)
         sys.stdout.flush()
     except click.exceptions.Exit as stop:
@@ -143,9 +180,7 @@ def main() -> None:
         click.echo(f"error: {missing_library(error.name or 'a library', error)}", err=True)
         sys.exit(2)
     except BrokenPipeError:
-        # Python writes what is left when it ends; nobody reads it.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(BROKEN_PIPE)
+        raise
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
         click.echo(

@@ -18,7 +18,6 @@ scene_camera.json, which only repeats what the others say. `open` does what a ki
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
@@ -204,9 +203,11 @@ class SessionStore:
     def _view(self, index: int) -> View:
         # Kept, because the capture of view 256 should not take longer than that of view 1.
         if index not in self._views:
-            view = from_json(self._robot[index], View, f"view {index}")
-            T = self._header["T_world_cam"].get(str(index))
-            self._views[index] = view if T is None else replace(view, T_world_cam=np.asarray(T))
+            record, T = dict(self._robot[index]), self._header["T_world_cam"].get(str(index))
+            if T is not None:
+                record["T_world_cam"] = T
+            where = f"view {index} in {SESSION_FILE} or {ROBOT_FILE} of {self.folder}"
+            self._views[index] = from_json(record, View, where)
         return self._views[index]
 
     # --- images -------------------------------------------------------------------------------

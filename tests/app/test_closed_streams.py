@@ -1,8 +1,12 @@
 """Commands whose output nobody wants (`>&-`, `2>&-`) do their work all the same."""
 
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 from typed_commands import realsim
 
@@ -38,3 +42,25 @@ def test_what_a_library_prints_never_lands_in_a_file(tmp_path: Path) -> None:
     path = tmp_path / "file"
     assert run(script, f"'{path}'", CLOSED).returncode == 0
     assert path.read_text() == "kept"
+
+
+@pytest.mark.parametrize("words", [["--help"], ["stats", "S"], ["stats", "S", "--json"], ["no"]])
+@pytest.mark.parametrize("also_errors", [False, True])
+def test_a_reader_that_has_gone_is_no_failed_check(
+    words: list[str], also_errors: bool, small_session: Path
+) -> None:
+    typed = [str(small_session) if w == "S" else w for w in words]
+    reading, writing = os.pipe()
+    os.close(reading)
+    errors = writing if also_errors else subprocess.PIPE
+    done = subprocess.run(
+        [sys.executable, "-c", MAIN, *typed],
+        stdout=writing,
+        stderr=errors,
+        timeout=120,
+        check=False,
+    )
+    os.close(writing)
+    writes = also_errors or words != ["no"]
+    assert done.returncode == (128 + signal.SIGPIPE if writes else 2)
+    assert not done.stderr or b"Traceback" not in done.stderr

@@ -31,7 +31,8 @@ from realsim.app.outputs import GOES_ON
 )
 @click.option("--list", "list_only", is_flag=True, help="Say what is inside; import nothing.")
 @click.option("--camera", type=FOLDER, default=None, help="File with the intrinsics.")
-@click.option("--depth-unit", type=float, default=None, help="Metres per count: 0.001, 0.0001 ...")
+@click.option("--depth-unit", type=click.FloatRange(1e-6, 0.01), default=None,
+              help="Metres per count: 0.001, 0.0001 ...")  # fmt: skip
 @click.option("--depth-coding", default=None, type=click.Choice(["auto", "plain", "apc"]),
               help="How depth is packed into the images.  [auto]")  # fmt: skip
 @click.option("--no-depth", is_flag=True, default=None, help="Colour only.")
