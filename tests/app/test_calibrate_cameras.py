@@ -214,6 +214,37 @@ def test_a_camera_that_sees_no_board_is_named_with_what_it_shows(
     assert "leave the camera out" in said
 
 
+@pytest.mark.parametrize("stated", [True, False], ids=["quaternions", "unclear"])
+@pytest.mark.parametrize(
+    ("cameras", "option", "file", "words"),
+    [
+        ("wrist=hand,left=fixed", "--held-board", "table", "board 'held' is on the table (give it"),
+        ("left=fixed,right=fixed", "--board", "held", "board 'table' is in the hand (give it"),
+    ],
+)
+def test_a_board_that_is_said_to_be_elsewhere_is_named(
+    photos: Path, tmp_path: Path, stated: bool, cameras: str, option: str, file: str, words: str
+) -> None:
+    """Whether the poses' reading is stated or must be proven, and whatever lens cannot be told."""
+    source = photos
+    if not stated:
+        source = shutil.copytree(photos, tmp_path / "lab")
+        rows = ["name,x,y,z,rx,ry,rz"]
+        for k, T in enumerate(hands(np.random.default_rng(3))):
+            numbers = [*T[:3, 3], *se3.log_so3(T[:3, :3])]
+            rows.append(f"{k:03d}.png," + ",".join(f"{v:.9f}" for v in numbers))
+        (source / "arm.csv").write_text("\n".join(rows) + "\n")
+    board = [option, str(photos.parent / f"{file}.json")]
+    out = str(photos.parent / "refused")  # the points found are noted there
+    said = refusal(
+        CliRunner().invoke(
+            commands,
+            ["calibrate", str(source), "--cameras", cameras, *board, "--out", out],
+        )
+    )
+    assert "contradict the robot" in said and words in said
+
+
 def test_images_without_partners_are_left_out(photos: Path, tmp_path: Path) -> None:
     from realsim.app.calibrate.camera_frames import cameras_of, frames_of
     from realsim_calibration.inputs import read_pose_file

@@ -61,7 +61,12 @@ def calibrate_cameras(
     require_distinct(rig.boards)
     require_sightings(rig)
     require_sizes(rig)
-    lenses, joints, own = _lenses(rig, config)
+    try:
+        lenses, joints, own = _lenses(rig, config)
+    except DegenerateError:
+        # A board said to move that stands still tells no lens: then that is the cause to name.
+        require_motion(rig, board_poses(rig, _rough_lenses(rig), config.hand_eye)[0])
+        raise
     require_lenses(rig, own, config.hand_eye.checks.focal[0])
     require_motion(rig, board_poses(rig, lenses, config.hand_eye)[0])
     start = find_start(rig, lenses, config.hand_eye, arm)
@@ -92,6 +97,17 @@ def _only_instants(rig: Rig, rows: Sequence[int]) -> Rig:
         cameras=rig.cameras, boards=rig.boards, instants=tuple(rig.instants[i] for i in rows),
         sightings=tuple(replace(s, instant=place[s.instant]) for s in rig.sightings),
     )  # fmt: skip
+
+
+def _rough_lenses(rig: Rig) -> list[CameraIntrinsics]:
+    """Return the given lenses, of other cameras one by which turns are seen roughly."""
+    lenses: list[CameraIntrinsics] = []
+    for c, camera in enumerate(rig.cameras):
+        w, h = next(s.detection.image_size for s in rig.of_camera(c))
+        f, cx, cy = float(max(w, h)), (w - 1) / 2, (h - 1) / 2
+        rough = CameraIntrinsics(width=w, height=h, fx=f, fy=f, cx=cx, cy=cy)
+        lenses.append(camera.intrinsics0 or rough)
+    return lenses
 
 
 def _lenses(

@@ -34,6 +34,7 @@ from realsim.store.atomic import write_bytes, write_text
 from realsim.store.cameras import camera_folders, open_cameras
 from realsim_calibration import calibrate_intrinsics, estimate_board_pose, prove_reading
 from realsim_calibration.cameras.calibrate import calibrate_cameras
+from realsim_calibration.cameras.faults import FEW_VIEWS
 from realsim_calibration.cameras.files import document, write_cameras
 from realsim_calibration.cameras.page import (
     CAMERA_HEADER,
@@ -46,7 +47,9 @@ from realsim_calibration.cameras.page import (
 )
 from realsim_calibration.cameras.results import CamerasReport
 from realsim_calibration.cameras.rig import Instant, Rig, RigBoard, RigCamera, Sighting
+from realsim_calibration.faults.diagnosis import ReadingProof
 from realsim_calibration.inputs import (
+    PoseReading,
     RawPoses,
     list_images,
     read_pose_file,
@@ -220,44 +223,71 @@ def _with_poses(
     return replace(rig, instants=instants)
 
 
-def _proven(rig: Rig, poses: RawPoses) -> Any:
+def _proven(rig: Rig, poses: RawPoses) -> PoseReading:
     """Return the reading that the images of a camera prove.
+
+    Where a camera and a board that are said to move together prove one, they do not: the reading is
+    taken, and the check of who is where names them.
 
     Raises:
         InputError: no camera moves against a board, or the images do not decide.
     """
-    said = "no camera moves against a board"
+    said, denied = "no camera moves against a board.", None
     for c, camera in enumerate(rig.cameras):
         for b, board in enumerate(rig.boards):
-            own = [s for s in rig.of_camera(c) if s.board == b and len(s.detection)]
-            if board.place == "free" or not rig.moves(c, b) or len(own) < 3:
+            moves = rig.moves(c, b)
+            if board.place == "free" or (denied is not None and not moves):
                 continue
             try:
-                lens = (
-                    camera.intrinsics0
-                    or calibrate_intrinsics(
-                        [s.detection for s in own], board.target, names=[s.name for s in own]
-                    ).intrinsics
-                )
+                proof = _proof(rig, c, b, poses)
             except RealsimError:
+                if moves:
+                    raise
+                continue  # as it is said, the board stands still in the image
+            if proof is None:
                 continue
-            pairs = [
-                (s.instant, pose.T_cam_board)
-                for s in own[:PROOF_VIEWS]
-                if (pose := estimate_board_pose(
-                    s.detection.points(board.target), s.detection.uv, lens)) is not None
-            ]  # fmt: skip
-            rows = poses.subset([i for i, _ in pairs])
-            candidates = [(str(r), rows.poses(r)) for r in rows.possible]
-            proof = prove_reading(candidates, np.array([T for _, T in pairs]), target=board.target)
             mode = "eye_in_hand" if camera.mount == "hand" else "eye_to_hand"
-            if proof.decisive and proof.best_mode == mode:
-                return reading_from_text(proof.best)
-            said = proof.sentence
+            if proof.decisive and (proof.best_mode == mode or not moves):
+                if moves:
+                    return reading_from_text(proof.best)
+                denied = reading_from_text(proof.best)
+            elif moves:
+                said = proof.sentence
+    if denied is not None:
+        return denied
     raise InputError(
         f"how the poses are to be read is not clear from the file, and the images do not decide: "
-        f"{said} Give --reading, such as --reading rotvec,m."
+        f"{said} Is every camera and every board where it is said to be (--cameras NAME=hand or "
+        "fixed; --board on the table, --held-board in the hand)? Else give --reading, such as "
+        "--reading rotvec,m."
     )
+
+
+def _proof(rig: Rig, c: int, b: int, poses: RawPoses) -> ReadingProof | None:
+    """Return what the views of a board by a camera say of the readings, None if they are too few.
+
+    A board that stands still in the image tells no lens, and nothing of the poses.
+    """
+    camera, target = rig.cameras[c], rig.boards[b].target
+    own = [s for s in rig.of_camera(c) if s.board == b and len(s.detection)]
+    if len(own) < FEW_VIEWS:
+        return None
+    lens = camera.intrinsics0
+    if lens is None:
+        try:
+            names = [s.name for s in own]
+            lens = calibrate_intrinsics([s.detection for s in own], target, names=names).intrinsics
+        except RealsimError:
+            return None
+    pairs = [
+        (s.instant, pose.T_cam_board)
+        for s in own[:PROOF_VIEWS]
+        if (pose := estimate_board_pose(s.detection.points(target), s.detection.uv, lens))
+        is not None
+    ]
+    rows = poses.subset([i for i, _ in pairs])
+    candidates = [(str(r), rows.poses(r)) for r in rows.possible]
+    return prove_reading(candidates, np.array([T for _, T in pairs]), target=target)
 
 
 # --- the calibration ------------------------------------------------------------------------------
