@@ -9,6 +9,8 @@ from click.core import ParameterSource
 
 LONGEST_SENTENCE = 200
 """Characters of a command's first sentence in the list of commands: it is wrapped, not cut."""
+COMMAND_KEY = "realsim.command"
+"""In the context: the words that were typed after `realsim`."""
 ENVIRONMENT = "REALSIM"
 """Begins the names of all variables: REALSIM_SCHOOL_RUN_FORCE is --force of `school run`."""
 

@@ -7,16 +7,21 @@ imports none of them.
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import click
+
+from realsim.app.command import COMMAND_KEY
 from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim.records import ObjectModel, ObjectPose, Scene
-from realsim.store import SessionStore
+from realsim.store import SessionStore, provenance
 from realsim.store.cameras import session_of_camera
 from realsim.store.opening import require_header
+from realsim.untrusted.own_json import to_json
 
 BOARD_VIEWS = "calibration/capture"
 """Where in a session the views of the tag board lie: a session of their own."""
@@ -83,18 +88,57 @@ def content_key(*parts: Any) -> str:
     return digest.hexdigest()
 
 
-def is_current(store: SessionStore, stage: str, key: str) -> bool:
-    """Return whether this stage has already been done with these inputs."""
-    path = store.folder / "stages" / f"{stage}.json"
-    try:
-        return path.is_file() and json.loads(path.read_text())["key"] == key
-    except (ValueError, KeyError, TypeError):
-        return False  # a damaged note is no note: the stage is done again
+def note(
+    place: SessionStore | Path,
+    stage: str,
+    console: Console,
+    *,
+    request: Any,
+    config: Any = None,
+    inputs: Iterable[str] | Mapping[str, str] = (),
+    key: str = "",
+    more_times: Sequence[Mapping[str, Any]] = (),
+) -> None:
+    """Leave the record of what a stage's result was made of; see `realsim.store.provenance`.
+
+    Args:
+        place: the session, or the folder of a result that is no session.
+        stage: the stage's name.
+        console: knows what the parts of the run cost.
+        request: what was asked for, a dataclass or a dictionary.
+        config: every setting in force, likewise.
+        inputs: the session's files that were read, as patterns; or hashes by name.
+        key: hash by which the stage knows that nothing has changed.
+        more_times: costs that the console does not know.
+    """
+    record, run = made_of(stage, console, place, request=request, config=config, inputs=inputs)
+    times = [*run.times, *(dict(t) for t in more_times)]
+    provenance.write(place, replace(record, key=key), replace(run, times=times))
 
 
-def mark_current(store: SessionStore, stage: str, key: str) -> None:
-    """Note that this stage has been done with these inputs."""
-    store.write_json(f"stages/{stage}.json", {"key": key})
+def made_of(
+    stage: str,
+    console: Console,
+    place: SessionStore | Path | None = None,
+    *,
+    request: Any,
+    config: Any = None,
+    inputs: Iterable[str] | Mapping[str, str] = (),
+) -> tuple[provenance.Provenance, provenance.Run]:
+    """Return the record of a result and that of its run, as `note` writes them."""
+    said, places = provenance.plain_request(request)
+    hashes = dict(inputs) if isinstance(inputs, Mapping) else {}
+    if isinstance(place, SessionStore) and not isinstance(inputs, Mapping):
+        hashes = provenance.inputs_of(place, inputs, places)
+    context = click.get_current_context(silent=True)
+    record = provenance.Provenance(
+        stage=stage, request=said, config=to_json(config or {}), inputs=hashes,
+        versions=provenance.versions(),
+    )  # fmt: skip
+    return record, provenance.Run(
+        command=() if context is None else tuple(context.meta.get(COMMAND_KEY, ())),
+        places=places, times=[asdict(t) for t in console.times],
+    )  # fmt: skip
 
 
 def save_starts(store: SessionStore, starts: Sequence[ObjectPose], source: str) -> None:

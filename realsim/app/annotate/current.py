@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from realsim.app.console import Console
-from realsim.app.stages import judged_scene, registered_views, require_sound, session_models
+from realsim.app.stages import judged_scene, note, registered_views, require_sound, session_models
+from realsim.many import Workers
 from realsim.records import GraspSet, ObjectPose, Scene
 from realsim.store import SessionStore
 from realsim.store.cameras import open_cameras
@@ -16,6 +17,11 @@ if TYPE_CHECKING:
     from realsim_sim_bridge.annotation.annotate import AnnotationSummary
 
 OBJECTS_FILE = "annotations/objects.json"
+MADE_FROM = (
+    "rgb/*", "depth/*", "registration/scene.json", "registration/cameras.json", "models/*",
+    "review/journal.jsonl", "grasps/*.npz",
+)  # fmt: skip
+"""Files of a session that its labels are made of."""
 SAME = 1e-9
 """Greatest difference of the numbers of two poses that are one."""
 
@@ -25,7 +31,7 @@ def annotate_session(
     console: Console,
     *,
     maps: str = "",
-    workers: int = 1,
+    workers: Workers = 1,
     check_depth: bool = True,
 ) -> "AnnotationSummary":
     """Write masks, poses, visibility and grasps of every frame that the objects are registered in.
@@ -37,7 +43,7 @@ def annotate_session(
         store: the session.
         console: where progress is shown.
         maps: 'all', 'none' or a list of maps; '' = instances and exact depth.
-        workers: processes that compute frames.
+        workers: who computes frames.
         check_depth: whether what the measured depth shows in front of an object leaves its mask.
 
     Raises:
@@ -79,7 +85,10 @@ def annotate_session(
 
     for name, camera in cameras.items():
         write(f" of {name}", camera, wrong[name])
-    return write("", store, damaged)
+    summary = write("", store, damaged)
+    asked = {"maps": maps, "check_depth": check_depth}
+    note(store, "annotate", console, request=asked, config=config, inputs=MADE_FROM)
+    return summary
 
 
 def _is_placed(store: SessionStore) -> bool:

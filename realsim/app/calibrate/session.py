@@ -9,12 +9,13 @@ import numpy as np
 from realsim.app.calibrate.board_views import read_board_views, write_results
 from realsim.app.calibrate.clock import mend_views
 from realsim.app.console import Console
-from realsim.app.stages import BOARD_VIEWS, content_key, is_current, mark_current, require_sound
+from realsim.app.stages import BOARD_VIEWS, content_key, note, require_sound
 from realsim.errors import InputError
 from realsim.records import HandEye
 from realsim.store import SessionStore
 from realsim.store.atomic import json_bytes, write_bytes
-from realsim.store.results import HAND_EYE_FILE, hand_eye_to_json
+from realsim.store.provenance import is_current
+from realsim.store.results import BOARD_FILE, HAND_EYE_FILE, hand_eye_to_json
 from realsim.store.session_check import is_session
 from realsim.untrusted.own_json import read_values
 
@@ -67,7 +68,9 @@ def calibrate_session(
             write_results(report, seen, store, views_store)
             save_hand_eye(store, hand_eye)
         place_cameras(store, hand_eye)
-        mark_current(store, "calibrate", key)
+        read = (BOARD_FILE, f"{BOARD_VIEWS}/robot.jsonl", f"{BOARD_VIEWS}/rgb/*")
+        asked = {"arm": arm, "clock": clock}
+        note(store, "calibrate", console, request=asked, inputs=read, key=key)
     return hand_eye
 
 

@@ -20,7 +20,7 @@ from realsim.app.export.sources import (
 )
 from realsim.app.export.target import TABLE, TRIED, RootJob, SceneJob, ScenePlace, Target
 from realsim.app.export.targets import TARGETS
-from realsim.app.stages import open_session
+from realsim.app.stages import made_of, open_session
 from realsim.errors import InputError
 from realsim.formats.bop.labelled import BopLabelledScene
 from realsim.formats.export_folder import CONTENT, STATE, ExportFolder
@@ -29,6 +29,7 @@ from realsim.formats.labelled_scene import LabelledScene, WrittenScene
 from realsim.formats.renumbered import RenumberedScene, shared_ids
 from realsim.formats.session_scene import SessionScene
 from realsim.records import ObjectModel
+from realsim.store import provenance
 from realsim.store.cameras import camera_folders
 from realsim.store.lock import only_run_in
 
@@ -105,7 +106,20 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
         licences = licence_files(request.sources)
         folder.write_piece("licences", licences)
         card = _card(request, out, target, facts, models, licences)
-        folder.finish({CARD_FILE: card_bytes(card)})
+        record, run = made_of(
+            "export", console, request=request,
+            inputs={
+                f"{provenance.GIVEN}sources.{k}": provenance.sha256_of(source)
+                for k, source in enumerate(request.sources)
+            },
+        )  # fmt: skip
+        folder.finish(
+            {
+                CARD_FILE: card_bytes(card),
+                provenance.FOLDER_FILE: provenance.record_bytes(record),
+            }
+        )
+        provenance.write(out, record, run)
     return ExportResult(folder=out, card=out / CARD_FILE, scenes=tuple(f.written for f in facts))
 
 

@@ -16,6 +16,7 @@ from realsim.records import Scene
 from realsim.store import SessionStore
 from realsim.store.cameras import CAMERAS, camera_folders, session_of_camera
 from realsim.store.opening import require_header
+from realsim.store.provenance import BESIDE
 from realsim.store.session_store import SESSION_FILE
 
 ACCEPTED = (
@@ -226,10 +227,6 @@ def _graspnet(source: Path, request: ExportRequest) -> Iterator[SourceScene]:
             name=ref.name, source=source, folder=ref.folder, kind="graspnet", number=ref.number,
             camera=ref.camera, open=lambda ref=ref: open_scene(ref),
         )  # fmt: skip
-
-
-BESIDE = ("reports/", "review/thumbnails/", "registration/cache/", "registration/pictures/")
-"""What a session has for people to look at, or to be quicker: nothing of it is exported."""
 
 
 def content_of(scenes: Sequence[SourceScene]) -> str:

@@ -90,6 +90,7 @@ def generate_command(
         tables_of,
         write_dataset,
     )
+    from realsim.app.stages import note
     from realsim.store.atomic import storing
 
     request = _request(**options)
@@ -104,6 +105,7 @@ def generate_command(
             out, layouts, request.views.count, tables_of(out, dataset), summary_of(dataset),
             notes_of(dataset, outcome),
         )  # fmt: skip
+    note(out, "generate", console, request={"scenes": scenes}, config=request.told)
     show(out, dataset, outcome, console)
     if sheet is not None:
         console.say(f"pictures  {sheet}")

@@ -12,7 +12,7 @@ from realsim import __version__
 from realsim.errors import InputError
 from realsim.many import Sent
 from realsim.rendering.depth_sensors.model import DepthSensorModel
-from realsim.store import atomic
+from realsim.store import atomic, provenance
 from realsim.untrusted.own_json import read_object
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
 from realsim_sim_bridge.table_scenes.cameras import RANGES, ViewConfig
@@ -227,7 +227,12 @@ def claim(out: Path, request: GenerateRequest) -> None:
         if found.get("key") == request.key:
             return
         if any(out.glob("scene_*")) or any(out.glob(f"{LAYOUTS}/*")):
-            differs = _differences(found.get("request", {}), request.told)
+            said = list(provenance.differences(found.get("request", {}), request.told))
+            differs = "; ".join(
+                f"{name} ({json.dumps(was)} there, {json.dumps(now)} wanted)"
+                for name, was, now in said
+            )
+            differs = differs or "the version of realsim's results"
             raise InputError(
                 f"'{out}' holds scenes of another request; what differs: {differs}. Choose another "
                 "folder, or delete this one to begin anew; the same request goes on where it "
@@ -240,16 +245,3 @@ def claim(out: Path, request: GenerateRequest) -> None:
         )
     value = {"format": FORMAT, "key": request.key, "version": __version__, "request": request.told}
     atomic.write_json(note, value)
-
-
-def _differences(found: Any, wanted: Any, name: str = "") -> str:
-    """Return where two JSON values differ, each with both values."""
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        keys = sorted({*found, *wanted})
-        told = [
-            _differences(found.get(k), wanted.get(k), f"{name}.{k}" if name else str(k))
-            for k in keys
-            if found.get(k) != wanted.get(k)
-        ]
-        return "; ".join(told) or "the version of realsim's results"
-    return f"{name} ({json.dumps(found)} there, {json.dumps(wanted)} wanted)"

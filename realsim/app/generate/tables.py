@@ -1,25 +1,21 @@
 """What generated scenes are like: dataset.json, tables for people."""
 
 from collections import Counter
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from realsim import __version__
 from realsim.app.console import Console
 from realsim.app.generate.request import GenerateRequest
 from realsim.app.generate.run import GenerateOutcome
 from realsim.app.generate.scene import is_finished, load_layout, stored_costs
-from realsim.store import atomic
+from realsim.store import atomic, provenance
 from realsim.untrusted.own_json import read_object
 from realsim_sim_bridge.table_scenes.sample import Layout
 from realsim_sim_bridge.table_scenes.scene import scene_name
 
 DATASET_FILE = "dataset.json"
-LIBRARIES = ("numpy", "scipy", "pybullet", "open3d-cpu")
-"""Whose versions decide on bytes."""
 BANDS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
 """Borders of the visibility table."""
 
@@ -48,7 +44,7 @@ def dataset_of(out: Path, request: GenerateRequest, layouts: list[Layout]) -> di
         "format": 1,
         "key": request.key,
         "request": request.told,
-        "versions": {"realsim": __version__} | {name: _version(name) for name in LIBRARIES},
+        "versions": provenance.versions(),
         "scenes": [
             {
                 "name": scene_name(layout.number),
@@ -72,15 +68,6 @@ def dataset_of(out: Path, request: GenerateRequest, layouts: list[Layout]) -> di
         ],
         "statistics": statistics(layouts, [x for v in seen for x in v], request.views.count),
     }  # fmt: skip
-
-
-def _version(name: str) -> str:
-    from importlib.metadata import PackageNotFoundError
-
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "unknown"
 
 
 def statistics(layouts: list[Layout], seen: list[float], views: int) -> dict[str, Any]:

@@ -82,9 +82,30 @@ def documents(
         f"{FOLDER}/scene_gt.json": _bop_objects(result),
         f"{FOLDER}/scene_camera.json": _bop_cameras(result, store),
         SINGLE_FILE: to_json(result.single_view),
-        REPORT_FILE: plain(report),
+        REPORT_FILE: plain(_without_costs(report)),
         SCENE_FILE: to_json(result.scene),
     }
+
+
+COSTS = "cpu_s"
+"""In a report's parts: what is told apart from it, since it differs from run to run."""
+
+
+def _without_costs(report: Json) -> Json:
+    """Return a report without what its parts cost."""
+    return {
+        name: {k: v for k, v in part.items() if k != COSTS} if isinstance(part, dict) else part
+        for name, part in report.items()
+    }
+
+
+def costs_of(report: Json) -> list[Json]:
+    """Return what the parts of a report cost."""
+    return [
+        {"name": name, COSTS: plain(part[COSTS])}
+        for name, part in report.items()
+        if isinstance(part, dict) and COSTS in part
+    ]
 
 
 def _cameras_to_json(cameras: CameraChange) -> Json:

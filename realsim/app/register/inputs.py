@@ -58,6 +58,10 @@ class RegisterInputs:
     fixed_out: tuple[str, ...]
     """Why others take no part."""
 
+    def settings(self) -> dict[str, Any]:
+        """Return every setting in force, but for where things are kept between runs."""
+        return asdict(replace(self.config, field_folder=None))
+
     def frames(self, store: SessionStore) -> "list[DepthFrame]":
         """Return the frames; an image is read when it is asked for: 256 of them are a gigabyte."""
         from realsim.registration.evidence import LazyFrame

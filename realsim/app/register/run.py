@@ -1,7 +1,7 @@
 """The registration of a session: read what is there, find the objects, write, draw."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from realsim.app.console import Console
 from realsim.app.register.colour import colour_remark
 from realsim.app.register.config import RegisterRequest
-from realsim.app.register.files import finish_interrupted, remark_of, write_result
+from realsim.app.register.files import costs_of, finish_interrupted, remark_of, write_result
 from realsim.app.register.from_review import (
     REVIEW_FILE,
     instances_ever,
@@ -31,15 +31,21 @@ from realsim.app.register.results import (
     load_registered,
 )
 from realsim.app.reviewed import damage_words, review_of, stray_words
-from realsim.app.stages import content_key, is_current, mark_current, require_sound, take_models
+from realsim.app.stages import content_key, note, require_sound, take_models
 from realsim.arrays import Array
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, ObjectModel, Scene
 from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.registration.register import Registration
 from realsim.store import SessionStore
+from realsim.store.provenance import is_current
 
 STAGE = "register"
+READ = (
+    "rgb/*", "depth/*", "robot.jsonl", "calibration/hand_eye.json", "calibration/depth_bias.json",
+    "registration/starts.json", "registration/masks/*", "review/journal.jsonl", "models/*",
+)  # fmt: skip
+"""Files of a session that a registration is made of."""
 BESIDE = "the depth does not lie on the photographs, and labels would lie beside the object"
 """Why no pose is accepted then."""
 Amend = Callable[[Registered], Registered]
@@ -106,7 +112,10 @@ def run_register(
             store.write_json(REVIEW_FILE, starts.to_json())
         else:
             store.remove(REVIEW_FILE)
-    mark_current(store, STAGE, key)
+    note(
+        store, STAGE, console, request=asdict(request) | {"amended": amend is not None},
+        config=inputs.settings(), inputs=READ, key=key, more_times=costs_of(result.report),
+    )  # fmt: skip
     return result
 
 

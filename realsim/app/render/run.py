@@ -90,6 +90,14 @@ def run_render(session: Path, request: RenderRequest, console: Console) -> Rende
             look=look, real=wanted.real, sheet=twin.path(SHEET_FILE), page=twin.path(PAGE_FILE),
         )  # fmt: skip
         write_page(outcome)
+    from realsim.app.stages import note
+    from realsim.store import provenance
+
+    read = ("rgb/*", "registration/scene.json", "models/*", "review/journal.jsonl")
+    note(
+        twin, "render", console, request=request, config=request.config(store),
+        inputs=provenance.inputs_of(store, read),
+    )  # fmt: skip
     return outcome
 
 

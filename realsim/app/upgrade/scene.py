@@ -17,7 +17,7 @@ from realsim.app.register.results import Registered
 from realsim.app.register.run import run_register
 from realsim.app.school.run import school_session
 from realsim.app.school.tables import why_no_grasp
-from realsim.app.stages import save_starts
+from realsim.app.stages import note, save_starts
 from realsim.app.upgrade.analytic import AnalyticJob, agreement_of, try_analytic
 from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig, open_scene
 from realsim.app.upgrade.files import NOTE, keep_imported, key_of
@@ -30,7 +30,7 @@ from realsim.registration.compare import spread_frames
 from realsim.registration.evidence import LazyFrame
 from realsim.registration.photo import Picture
 from realsim.registration.refinement.uncertainty import SeenPose
-from realsim.store import SessionStore
+from realsim.store import SessionStore, provenance
 from realsim.store.lock import only_run_in
 from realsim.untrusted.own_json import read_values
 
@@ -142,6 +142,10 @@ def upgrade_scene(job: SceneJob, source: SceneSource, shown: Console | None) -> 
             write_report(store, None, notes=notes)
         record = _record(job, source, store, scene, starts, grasps, notes)
         record["analytic"] = agreement_of(analytic)
+        note(
+            store, "upgraded", console, request=job.config, key=key,
+            inputs={f"{provenance.GIVEN}scene": provenance.sha256_of(job.ref.folder)},
+        )  # fmt: skip
         store.write_json(NOTE, {"key": key, "record": record})
     return record
 

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,14 @@ from realsim.geometry import se3
 from realsim.scanning.scale.measured import Measurement
 from realsim.scanning.scale.measured_check import MeasuredCheck
 from realsim.scanning.scale.result import ScaleFit, Similarity
+from realsim.store import provenance
 from realsim.untrusted.own_json import from_json, read_object, to_json
 from realsim.untrusted.values import need
 
 Json = dict[str, Any]
 FORMAT = "realsim scale"
 FORMAT_VERSION = 1
-VERSIONS_OF = ("realsim", "numpy", "scipy", "open3d", "trimesh")
+VERSIONS_OF = ("realsim", "numpy", "scipy", "open3d-cpu", "trimesh")
 SHAPES = {"T_world_obj": (4, 4), "covariance": (7, 7), "extent_mm": (3,)}
 """Shapes of a fit's arrays."""
 FIRST = ("verdict", "reasons", "scale", "sigma")
@@ -48,13 +48,7 @@ class ScaleRecord:
 
 def installed_versions() -> dict[str, str]:
     """Return the versions of the libraries that a fit depends on."""
-    found: dict[str, str] = {}
-    for name in VERSIONS_OF:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    return provenance.versions(VERSIONS_OF)
 
 
 def similarity_from_json(data: Any, what: str = "similarity") -> Similarity:

@@ -8,9 +8,7 @@ OUT/sfm.json          result, checks, config, versions, hash of the images
 OUT/database.db       features and matches, kept
 """
 
-import platform
 from dataclasses import asdict
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +18,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.scanning.sfm.config import SfmConfig
 from realsim.scanning.sfm.result import Alignment, SfmResult
+from realsim.store import provenance
 from realsim.store.atomic import write_bytes, write_json
 from realsim.untrusted.own_json import read_object, to_json
 
@@ -136,7 +135,7 @@ def result_json(result: SfmResult, config: SfmConfig) -> dict[str, Any]:
         "pairs_verified": sum(1 for p in result.matching.pairs if p[3] > 0),
         "pairs_matched": len(result.matching.pairs),
         "config": asdict(config),
-        "versions": _versions(),
+        "versions": provenance.versions(PACKAGES),
     }  # fmt: skip
 
 
@@ -168,13 +167,3 @@ def _camera_sigmas(result: SfmResult) -> list[dict[str, Any]]:
             }
         )
     return rows
-
-
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found

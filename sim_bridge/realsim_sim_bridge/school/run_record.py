@@ -6,15 +6,14 @@ and new grasps side by side look alike and mean different things.
 """
 
 import json
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import asdict
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
 from realsim.errors import InputError
-from realsim.store import atomic
+from realsim.store import atomic, provenance
 from realsim.store.lock import only_run_in
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.object_task import ObjectTask
@@ -30,7 +29,6 @@ RESULTS_VERSION = 4
 """Raised whenever the same inputs give other results with the same versions of all packages."""
 PACKAGES = ("realsim", "numpy", "numba", "scipy", "coacd", "eaik", "coal", "pin", "ompl", "toppra")
 """Besides the engines: what the grasps and trajectories come from."""
-ABSENT = "(nothing)"
 MOST_TOLD = 8
 """Changed fields that a refusal names; another engine changes them all."""
 
@@ -44,12 +42,7 @@ def versions(config: SchoolConfig) -> dict[str, str]:
         if engine is not None
     }
     found = {"results": str(RESULTS_VERSION)}
-    for name in (*PACKAGES, *sorted(engines)):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    return found | provenance.versions((*PACKAGES, *sorted(engines)))
 
 
 def run_record(tasks: list[ObjectTask], config: SchoolConfig, shard_grasps: int) -> dict[str, Any]:
@@ -102,7 +95,7 @@ def _gives_way(folder: Path, path: Path, record: dict[str, Any]) -> bool:
         old = json.loads(path.read_text(encoding="utf-8"))
     except ValueError:
         return False
-    return any(True for _ in differences(old, record))
+    return any(True for _ in provenance.differences(old, record))
 
 
 def mark_finished(folder: Path) -> None:
@@ -130,7 +123,7 @@ def _refuse_others(folder: Path, path: Path, record: dict[str, Any]) -> None:
             f"{path} is damaged, so it is not known what the grasps beside it were made with. "
             f"{remedy}"
         ) from None
-    changed = list(differences(old, record))
+    changed = [(f, *map(provenance.in_short, v)) for f, *v in provenance.differences(old, record)]
     if changed:
         told = "".join(f"\n  {field}: {was} -> {now}" for field, was, now in changed[:MOST_TOLD])
         if len(changed) > MOST_TOLD:
@@ -138,35 +131,3 @@ def _refuse_others(folder: Path, path: Path, record: dict[str, Any]) -> None:
         raise InputError(
             f"{folder} holds a run that was started with something else:{told}\n{remedy}"
         )
-
-
-def differences(old: Any, new: Any, field: str = "") -> Iterator[tuple[str, str, str]]:
-    """Yield (field, old value, new value) of all that differs between two JSON values."""
-    was, now = _children(old), _children(new)
-    if was is None or now is None:
-        if old != new:
-            yield field, _short(old), _short(new)
-        return
-    for key in [*was, *(k for k in now if k not in was)]:
-        name = f"{field}.{key}" if field else key
-        if key not in was:
-            yield name, ABSENT, _short(now[key])
-        elif key not in now:
-            yield name, _short(was[key]), ABSENT
-        else:
-            yield from differences(was[key], now[key], name)
-
-
-def _children(value: Any) -> dict[str, Any] | None:
-    """Return what a JSON value is made of by name, or None if it is one value."""
-    if isinstance(value, dict):
-        return {str(key): child for key, child in value.items()}  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
-    if isinstance(value, list):
-        return {str(key): child for key, child in enumerate(value)}  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
-    return None
-
-
-def _short(value: Any) -> str:
-    """Return a JSON value in at most a line."""
-    text = json.dumps(value)
-    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,1 @@
+"""`realsim reproduce`: a result made again from its record, and compared."""

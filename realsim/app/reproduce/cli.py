@@ -1,0 +1,55 @@
+"""`realsim reproduce`: make a result again from its record, and compare."""
+
+import sys
+from pathlib import Path
+
+import click
+
+from realsim.app.command import Command
+from realsim.app.options import FOLDER, JSON, QUIET, workers
+
+
+@click.command(
+    "reproduce", cls=Command,
+    examples=("realsim reproduce demo/session annotate",
+              "realsim reproduce demo/session register --json"),
+)  # fmt: skip
+@click.argument("result", type=FOLDER)
+@click.argument("stage", default="", metavar="[STAGE]")
+@workers()
+@JSON
+@QUIET
+def reproduce_command(result: Path, stage: str, workers: int, as_json: bool, quiet: bool) -> None:
+    """Make RESULT again from its record and compare, file by file and value by value.
+
+    RESULT is a session with a STAGE (register, school, annotate), or the folder of an export. What
+    is there is only read: the stage runs in a copy, in a temporary folder (TMPDIR). The record
+    (SESSION/stages/STAGE.json, OUT/provenance.json) says what was asked for, every setting, and
+    the sha256 of all inputs; inputs that have changed are named. Of other versions it is told.
+
+    Exit codes: 0 equal, 1 something differs, 2 it cannot be made again.
+    """
+    from dataclasses import asdict
+    from math import isfinite
+
+    from realsim.app.console import Console
+    from realsim.app.reproduce.run import reproduce
+
+    console = Console(quiet=quiet, as_json=as_json)
+    found = reproduce(result, stage, console, workers)
+    for d in found.differing:
+        size = f" (by at most {d.greatest:.3g})" if isfinite(d.greatest) else ""
+        console.warn(f"{d.path} differs{size}: {'; '.join(d.words)}".replace("[", r"\["))
+    counts = f"{found.files} files"
+    if found.equal:
+        console.say(f"{found.stage}: equal, {counts}")
+    else:
+        console.say(f"{found.stage}: {len(found.differing)} of {counts} differ")
+    rows = [asdict(d) | {"greatest": d.greatest if isfinite(d.greatest) else None}
+            for d in found.differing]  # fmt: skip
+    console.result({
+        "stage": found.stage, "equal": found.equal, "files": found.files, "differing": rows,
+        "other_versions": list(found.other_versions),
+    })  # fmt: skip
+    if not found.equal:
+        sys.exit(1)
