@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from realsim.arrays import Array
-from realsim.errors import InputError
+from realsim.errors import DegenerateError, InputError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.dh import DhArm
@@ -19,7 +19,15 @@ from realsim_calibration.lens.fit import IntrinsicsConfig
 from realsim_calibration.lens.intrinsics import calibrate_intrinsics
 from realsim_calibration.lens.report import IntrinsicsReport
 from realsim_calibration.results import HandEyeReport
-from realsim_calibration.views import BoardView, detection_of, measured_poses
+from realsim_calibration.views import (
+    BoardView,
+    TargetDetection,
+    detection_of,
+    measured_poses,
+)
+
+CAMERA_SIGMAS = 4.0
+"""A given focal length this many sigma of the images' own away is another one."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -115,13 +123,63 @@ def calibrate(
             distortion_sd=determined_priors(hand_eye.joint.distortion_sd, lens, config.border_px),
         )
         hand_eye = replace(hand_eye, joint=joint)
-    report = calibrate_hand_eye_report(views, target, camera, hand_eye, arm)
+    try:
+        report = calibrate_hand_eye_report(views, target, camera, hand_eye, arm)
+    except (InputError, UnitError):
+        if intrinsics0 is not None:
+            seen = sorted(views, key=lambda v: v.index)
+            require_given_camera(
+                intrinsics0, [v.detection for v in seen], target, [v.label for v in seen], config
+            )
+        raise
     if lens is not None:  # no camera was given, so nothing is said of one
         alone, fitted = (float(np.sqrt(c.fx * c.fy)) for c in (camera, report.intrinsics))
         own = own_lens_check(alone, fitted, hand_eye.checks)
         checks = tuple(own if c.name == "given camera" else c for c in report.checks)
         report = replace(report, checks=checks)
     return Calibration(hand_eye=report, lens=lens)
+
+
+def require_given_camera(
+    given: CameraIntrinsics,
+    detections: Sequence[TargetDetection],
+    target: Target,
+    names: Sequence[str],
+    config: CalibrationConfig,
+) -> None:
+    """Raise if the images alone show another focal length than the camera that was given.
+
+    A wrong focal length makes every board too near or too far, and the target's size or the poses
+    would be blamed: it is asked when something was.
+
+    Args:
+        given: the camera.
+        detections: the target in the images.
+        target: the target.
+        names: of the images.
+        config: how a lens is calibrated, and by how much a focal length may be off.
+
+    Raises:
+        InputError: names both focal lengths. Nothing is said where the images do not tell theirs.
+    """
+    try:
+        lens = calibrate_intrinsics(
+            list(detections), target, names=list(names), config=config.intrinsics
+        )
+    except (InputError, DegenerateError):
+        return
+    own = lens.intrinsics
+    sd = float(np.sqrt(max(lens.covariance[0, 0], lens.covariance[1, 1]))) / own.fx
+    off = float(np.sqrt(given.fx * given.fy / (own.fx * own.fy))) - 1
+    if abs(off) < max(config.hand_eye.checks.focal[1], CAMERA_SIGMAS * sd):
+        return
+    raise InputError(
+        f"the given camera has a focal length of {np.sqrt(given.fx * given.fy):.1f} px, and the "
+        f"images alone show {np.sqrt(own.fx * own.fy):.1f} +- {sd * own.fx:.1f} px: it is "
+        f"{100 * off:+.1f} % off, so that the board seems too {'far' if off > 0 else 'near'}. Is "
+        "it the camera, the resolution and the focus of these images? Leave --camera out to have "
+        "the lens calibrated from these views."
+    )
 
 
 # --- from poses alone ----------------------------------------------------------------------------

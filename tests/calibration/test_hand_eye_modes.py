@@ -67,6 +67,16 @@ def test_boards_counted_from_the_wrong_end_are_mended(simulate):
     assert "half turns" not in {c.name for c in plain.checks}
 
 
+@pytest.mark.parametrize("factor", [1.2, 0.8])
+def test_a_given_camera_of_another_focal_length_is_named_and_not_the_board(simulate, factor):
+    """Every board seems too far by as much: the target's size would be blamed."""
+    sim = simulate(3, views=12, robot=(0.0, 0.0), pixel=0.1)
+    lens = sim.intrinsics
+    wrong = replace(lens, fx=factor * lens.fx, fy=factor * lens.fy)
+    with pytest.raises(InputError, match=r"given camera has a focal length.*Leave --camera out"):
+        calibrate(sim.views, sim.board, intrinsics0=wrong)
+
+
 def test_the_lens_of_pose_pairs_is_the_given_one_or_is_said_to_be_none(tmp_path):
     rng = np.random.default_rng(0)
     X, Z = se3.random_transform(rng, spread=0.1), se3.random_transform(rng)

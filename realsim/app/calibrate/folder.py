@@ -38,6 +38,7 @@ from realsim_calibration import (
     estimate_board_pose,
     prove_reading,
 )
+from realsim_calibration.calibrate import require_given_camera
 from realsim_calibration.results import Clock
 
 if TYPE_CHECKING:
@@ -208,7 +209,12 @@ def _stated_or_proven(
         if pose is not None:
             rows.append(k)
             boards.append(pose.T_cam_board)
-    return _proven(folder.poses.subset(rows), np.array(boards), target, request, console)
+    try:
+        return _proven(folder.poses.subset(rows), np.array(boards), target, request, console)
+    except InputError:
+        if camera is not None:
+            require_given_camera(camera, detections, target, names, CalibrationConfig())
+        raise
 
 
 def _proven(
