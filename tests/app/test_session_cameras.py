@@ -11,8 +11,9 @@ from realsim.app.annotate.current import annotate_session, what_is_stale
 from realsim.app.cli import commands
 from realsim.app.console import Console
 from realsim.app.register.config import RegisterRequest
-from realsim.app.register.results import claimed_cameras, load_cameras
+from realsim.app.register.results import claimed_cameras, load_cameras, load_registered
 from realsim.app.register.run import run_register
+from realsim.app.register.tables import camera_line
 from realsim.app.stages import open_session, save_starts
 from realsim.errors import InputError
 from realsim.formats.bop.opening import open_labelled_bop
@@ -85,6 +86,7 @@ def test_register_takes_the_fixed_camera_and_leaves_it_where_it_stands(registere
     assert all(T is not None and np.array_equal(T, poses[0]) for T in poses)
     change = load_cameras(left)
     assert change is not None and sorted(change.refined) == list(range(IMAGES))
+    assert "left, which stands still, by " in camera_line(load_registered(store))
     # What it sees of the objects is what it saw.
     for o, true in zip(load_scene(store).objects, true_poses(), strict=True):
         assert o.verdict == "accepted"
