@@ -25,6 +25,15 @@ SESSION_FOLDERS = (
     "models", "registration", "review", "rgb", "stages",
 )  # fmt: skip
 """Folders of a session that hold data; into `reports`, `scans` and others anything may go."""
+SESSION_NAMES = (*SESSION_FILES, SESSION_PLAN, *SESSION_FOLDERS)
+BOARD_FOLDER = "calibration"
+"""The one of them in which a session of its own lies, which is captured or imported."""
+INPUTS = frozenset((
+    "base_pose board_poses calibration camera campaign config_file dataset depth_model hdri "
+    "hdris images library limits masks meshes models mount obstacles poses result session "
+    "sessions source sources start supports textures token_file trials truth"
+).split())  # fmt: skip
+"""Parameters that name what is read, or a session or library that is worked on: no outputs."""
 
 
 class OutputFile(click.Path):
@@ -70,13 +79,81 @@ class OutputFolder(click.Path):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """Return the path, if it may be filled."""
         path = Path(value)
-        if not (self.goes_on or (ctx is not None and ctx.resilient_parsing)):
+        if ctx is not None and ctx.resilient_parsing:
+            return path
+        if self.goes_on:
+            require_no_data(path, _spelled(param), besides=(BOARD_FOLDER,))
+        else:
             require_free_folder(path, _spelled(param), self.files, self.own)
         return path
 
 
 GOES_ON = OutputFolder(goes_on=True)
 """A place of a command that says itself, and better, what it does with what is there."""
+
+
+def unguarded(name: str, parameter: click.Parameter) -> bool:
+    """Return whether a parameter may name an output and is of none of the types here.
+
+    Args:
+        name: of the parameter.
+        parameter: of any command.
+    """
+    is_path = isinstance(parameter.type, click.Path | click.File)
+    return is_path and not (isinstance(parameter.type, OutputFile | OutputFolder) or name in INPUTS)
+
+
+def require_no_data(path: Path, name: str, besides: Sequence[str] = ()) -> None:
+    """Raise where a path lies in a folder of a session's data, or is reached by a link from there.
+
+    Args:
+        path: of a file or folder, there or not.
+        name: of the option, for messages.
+        besides: folders of data in which it may lie.
+
+    Raises:
+        InputError: it does, is one of a session's own files, or holds links that lead out of it.
+    """
+    for real in {path.resolve(), Path(os.path.abspath(path))}:
+        for session in real.parents:
+            first, *further = real.relative_to(session).parts
+            own = SESSION_FOLDERS if further else SESSION_NAMES
+            if first in own and first not in besides and _is_session(session):
+                raise _is_data(path, name, session)
+    require_no_links(path, name)
+
+
+def require_no_links(path: Path, name: str, files: Sequence[str] | None = None) -> None:
+    """Raise where a folder has links that lead out of it: results would be written there.
+
+    Args:
+        path: the folder, there or not.
+        name: of the option, for messages.
+        files: those that are looked at; None = all at its top.
+
+    Raises:
+        InputError: there is such a link.
+    """
+    if not path.is_dir():
+        return
+    real = path.resolve()
+    for entry in path.iterdir() if files is None else (path / file for file in files):
+        if entry.is_symlink() and not entry.resolve().is_relative_to(real):
+            raise InputError(
+                f"{name} '{path}': {entry} is a link to {entry.resolve()}, out of the folder; "
+                "nothing is written through it. Take the link away, or give another folder."
+            )
+
+
+def _is_session(folder: Path) -> bool:
+    return any((folder / file).is_file() for file in SESSION_FILES)
+
+
+def _is_data(path: Path, name: str, session: Path) -> InputError:
+    return InputError(
+        f"{name} '{path}' is part of the session '{session}', whose own files are not replaced; "
+        "give another place."
+    )
 
 
 def require_free_file(
@@ -114,8 +191,12 @@ def require_free_file(
         )
     if not os.access(folder, os.W_OK):
         raise InputError(f"the folder '{path.parent}' for {name} may not be written by you.")
-    of_session = any((folder / file).is_file() for file in SESSION_FILES)
-    if path.name in SESSION_FILES or (of_session and path.name == SESSION_PLAN):
+    if path.is_symlink():
+        raise InputError(
+            f"{shown} is a link to {path.resolve()}; nothing is written through links. Give that "
+            "name, or another one."
+        )
+    if path.name in SESSION_FILES or (path.name == SESSION_PLAN and _is_session(folder)):
         raise InputError(f"{shown} is a name of a session's own files; give another name.")
     is_own = path.is_file() and has_texts(path, own[path.suffix.lower()])
     others = [p for p in (path.with_suffix(suffix) for suffix in beside) if os.path.lexists(p)]
@@ -139,16 +220,9 @@ def require_free_folder(
     """
     if os.path.lexists(path) and not path.is_dir():
         raise InputError(f"{name} '{path}' is a file; give a folder.")
-    real = path.resolve()
-    for session in (real, *real.parents):
-        inside = real.relative_to(session).parts[:1]
-        if (not inside or inside[0] in SESSION_FOLDERS) and any(
-            (session / file).is_file() for file in SESSION_FILES
-        ):
-            raise InputError(
-                f"{name} '{path}' is part of the session '{session}', whose own files are not "
-                "replaced; give another folder."
-            )
+    if _is_session(path):
+        raise _is_data(path, name, path)
+    require_no_data(path, name)
     there = [path / file for file in files if os.path.lexists(path / file)]
     marked = [file for file in path.glob(own[0]) if file.is_file()] if own[0] else []
     if there and not (marked and all(has_texts(file, own[1]) for file in marked)):

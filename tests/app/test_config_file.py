@@ -154,7 +154,7 @@ def another_value(option: click.Option) -> Any:
     elif isinstance(kind, click.IntRange):
         value = int(kind.max if kind.max is not None else (kind.min or 0) + 7)
     elif isinstance(kind, click.FloatRange):
-        value = 0.75
+        value = kind.max if kind.max is not None and kind.max < 0.75 else 0.75
     elif kind is click.INT:
         value = 11
     elif kind is click.FLOAT:

@@ -4,12 +4,13 @@ import json
 import os
 from pathlib import Path
 
+import click
 import pytest
 from click.testing import CliRunner
 
 from realsim.app.cli import commands
 from realsim.app.command import walk
-from realsim.app.outputs import OutputFile, OutputFolder
+from realsim.app.outputs import INPUTS, OutputFile, OutputFolder, unguarded
 from realsim.errors import InputError
 from realsim.store import atomic
 from synthetic_scenes import captured_session
@@ -47,6 +48,42 @@ def test_every_output_option_has_the_guard() -> None:
     kinds = {name: p.type for name, (_, p) in OUTPUTS.items()}
     assert not [n for n, kind in kinds.items() if not isinstance(kind, OutputFile | OutputFolder)]
     assert len(FILES) >= 8 and len(FOLDERS) >= 6
+    # Whatever it is called: a path that is not known to be read is an output.
+    everything = {**walk(commands), (): commands}
+    loose = {(path, p.name) for path, c in everything.items() for p in c.params
+             if unguarded(str(p.name), p)}  # fmt: skip
+    assert not loose, "give it a type of realsim.app.outputs, or its name to INPUTS there"
+    names = {p.name for c in everything.values() for p in c.params}
+    assert names >= INPUTS, "names that no command has"
+
+
+def test_an_option_that_goes_round_the_guard_is_seen() -> None:
+    for kind in (
+        click.Path(path_type=Path),
+        click.File("w"),
+        OutputFile({".json": ()}, "document"),
+    ):
+        option = click.Option(["--save-to"], type=kind)
+        assert unguarded("save_to", option) == (not isinstance(kind, OutputFile))
+
+
+@pytest.mark.parametrize("name", [n for n in OUTPUTS if n not in FILES])
+def test_nothing_goes_into_data_or_through_a_link(name: str, session: Path, tmp_path: Path) -> None:
+    outside, out = tmp_path / "outside", tmp_path / "out"
+    outside.mkdir()
+    out.mkdir()
+    for path in (session / "rgb/more", session / "registration", session / "plan.json",
+                 session / "session.json"):  # fmt: skip
+        with pytest.raises(InputError, match=r"part of the session|is a file"):
+            convert(name, path)
+    assert convert(name, out) == out
+    (out / "rgb").symlink_to(outside)
+    with pytest.raises(InputError, match="out of the folder"):
+        convert(name, out)
+    via = tmp_path / "via"
+    via.symlink_to(session / "rgb")
+    with pytest.raises(InputError, match="part of the session"):
+        convert(name, via)
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -154,7 +191,7 @@ def test_overwrite_is_for_what_the_command_wrote(session: Path, tmp_path: Path) 
         assert "part of the session" in str(convert_to(inside))
     (session / "plan.json").write_bytes((own / "plan.json").read_bytes())
     words = ["plan", "--views", "4", "--out", str(session / "plan.json"), "--overwrite"]
-    assert "a session's own files" in str(CliRunner().invoke(commands, words).exception)
+    assert "part of the session" in str(CliRunner().invoke(commands, words).exception)
     (session / "plan.json").unlink()
 
 
