@@ -1,23 +1,26 @@
 """LeRobot v3.0 data sets: what is written is what was given, wherever it was interrupted."""
 
 import json
+import pickle
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from realsim.errors import InputError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.lerobot import episodes as layout
-from realsim.formats.lerobot.episodes import LeRobotEpisode, LeRobotFeature
+from realsim.formats.lerobot import spool
+from realsim.formats.lerobot.episodes import LeRobotCamera, LeRobotEpisode, LeRobotFeature
 from realsim.formats.lerobot.writer import LeRobotConfig, write_lerobot
 
 LENGTHS = (3, 7, 4, 1, 5)
 FPS = 10
 SIZE = (32, 48)
-CAMERAS = {"observation.images.a": SIZE, "observation.images.b": SIZE}
+CAMERAS = {f"observation.images.{n}": LeRobotCamera(size=SIZE) for n in "ab"}
 FEATURES = {
     "observation.state": LeRobotFeature(dtype="float32", names=("x", "y")),
     "action": LeRobotFeature(dtype="float32", names=("x", "y")),
@@ -227,8 +230,8 @@ def test_columns_without_pictures_are_a_data_set(tmp_path):
 @pytest.mark.parametrize(
     ("source", "words"),
     [
-        (Source(cameras={"a/b": SIZE}), "no '/'"),
-        (Source(cameras={"timestamp": SIZE}), "cannot be called"),
+        (Source(cameras={"a/b": LeRobotCamera(size=SIZE)}), "no '/'"),
+        (Source(cameras={"timestamp": LeRobotCamera(size=SIZE)}), "cannot be called"),
         (Source(change={"task": "another"}), "not among its tasks"),
         (Source(change={"columns": {**numbers(0), "action": np.full((3, 2), np.nan)}}), "finite"),
         (Source(change={"frames": iter(())}), "0 pictures for 3 steps"),
@@ -247,3 +250,54 @@ def test_a_missing_pyav_is_said_before_anything_is_written(tmp_path, monkeypatch
     with pytest.raises(InputError, match=r"realsim\[lerobot\]"):
         write(tmp_path / "set", source)
     assert source.asked == []
+
+
+def test_depth_comes_back_within_its_codes_and_says_how_they_are_read(tmp_path):
+    key = "observation.images.a_depth"
+    ramp = np.linspace(0.15, 2.0, SIZE[0] * SIZE[1], dtype=np.float32).reshape(SIZE)
+    ramp[:3] = 0.0  # nothing
+    frames = iter([{key: ramp + np.float32(0.01 * s) * (ramp > 0)} for s in range(LENGTHS[0])])
+    camera = LeRobotCamera(size=SIZE, is_depth=True, info={"camera.intrinsics": {"fx": 40.0}})
+    source = Source(cameras={key: camera}, change={"frames": frames})
+    done = spool.encoded(source, 0)
+    path = tmp_path / "depth.mp4"
+    path.write_bytes(done.videos[key])
+    found = [picture for _, picture in spool.read_video(path)]
+    assert len(found) == LENGTHS[0]
+    for s, depth in enumerate(found):
+        given = ramp + np.float32(0.01 * s) * (ramp > 0)
+        # Half a step of the logarithm of z + 3.5 m.
+        assert np.all(np.abs(depth - given) <= 1.7e-4 * (given + 3.5) + 1e-6)
+        assert np.array_equal(depth == 0, given == 0)
+    stats = done.said["pictures"][key]
+    assert stats["min"] == [[[pytest.approx(ramp[ramp > 0].min())]]]
+    feature = layout.info(source, 1, 3)["features"][key]
+    assert feature["shape"] == [*SIZE, 1]
+    said = {"is_depth_map": True, "depth_unit": "m", "video.codec": "hevc",
+            "video.pix_fmt": "gray12le", "video.depth_min": 0.01, "video.depth_max": 10.0,
+            "video.shift": 3.5, "video.use_log": True,
+            "camera.intrinsics": {"fx": 40.0}}  # fmt: skip
+    assert {k: feature["info"][k] for k in said} == said
+
+
+def test_what_is_known_of_an_episode_is_a_column_of_meta_episodes(tmp_path):
+    known = {"success": True, "p_hold": 0.75, "failure": ""}
+    write(tmp_path / "set", Source(change={"metadata": known}))
+    rows = [r for f in sorted((tmp_path / "set/meta/episodes").rglob("*.parquet"))
+            for r in pq.read_table(f).to_pylist()]  # fmt: skip
+    assert len(rows) == len(LENGTHS)
+    assert all({k: r[k] for k in known} == known for r in rows)
+
+
+def test_encoding_elsewhere_gives_the_same_bytes(folder, tmp_path):
+    """Episodes may come from other processes, as long as they come in order."""
+    source = Source()
+    export = ExportFolder.begin(tmp_path / "set", {"what": "test"})
+
+    def elsewhere(numbers, take):
+        for k, episode in [(k, spool.encoded(source, k)) for k in numbers]:
+            take(k, pickle.loads(pickle.dumps(episode)))
+
+    write_lerobot(source, export, LeRobotConfig(episodes_per_file=2), encode=elsewhere)
+    export.finish({})
+    assert files_of(tmp_path / "set") == files_of(folder)

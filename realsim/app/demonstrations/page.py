@@ -43,7 +43,8 @@ def page_file(folder: Path, fps: int, name: str) -> Mapping[str, Content]:
     rows: list[dict[str, Any]] = [
         row for file in files for row in pq.read_table(file, columns=columns).to_pylist()
     ]
-    cameras = [c.split("/")[1] for c in columns if c.endswith("/from_timestamp")]
+    features = json.loads((folder / layout.INFO).read_text())["features"]
+    cameras = [key for key, f in features.items() if f["dtype"] == "video" and f["shape"][2] == 3]
     succeeded = sum(bool(n["success"]) for n in notes)
     summary = (
         f"{len(notes)} attempts, {succeeded} successful, at {fps} steps per second. Each row shows "
@@ -113,7 +114,7 @@ def _pictures(path: Path, first: int, steps: Collection[int]) -> dict[int, Rgb]:
     found: dict[int, Rgb] = {}
     for k, (_, rgb) in enumerate(read_video(path)):
         if k - first in steps:
-            found[k - first] = rgb
+            found[k - first] = np.asarray(rgb, np.uint8)
         if k - first >= max(steps):
             break
     return found

@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.arrays import Rgb
+from realsim.arrays import Array32, Rgb, UInt16
 from realsim.errors import InputError
 
 DTYPES = ("float32", "int64", "bool")
@@ -51,6 +51,18 @@ class LeRobotFeature:
         return max(1, len(self.names))
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LeRobotCamera:
+    """One camera: colours, or depth."""
+
+    size: tuple[int, int]
+    """Height and width of its pictures [px]."""
+    is_depth: bool = False
+    """Whether its pictures are depth (H, W) [m], 0 = nothing, in place of colours (H, W, 3)."""
+    info: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """What else is said of it in meta/info.json, as plain JSON values."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class LeRobotEpisode:
     """One episode of S steps."""
@@ -59,8 +71,12 @@ class LeRobotEpisode:
     """In words."""
     columns: Mapping[str, NDArray[Any]]
     """(S,) or (S, width) of every feature."""
-    frames: Iterator[Mapping[str, Rgb]]
-    """The pictures (H, W, 3) of every camera, step by step; taken once, one at a time."""
+    frames: Iterator[Mapping[str, Rgb | Array32]]
+    """The pictures of every camera, step by step; taken once, one at a time."""
+    metadata: Mapping[str, bool | int | float | str] = field(
+        default_factory=dict[str, "bool | int | float | str"]
+    )
+    """What is known of it as a whole: columns of meta/episodes, the same of every episode."""
     notes: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """What else is known of it, as plain JSON values; kept in realsim/episodes.jsonl."""
 
@@ -89,8 +105,8 @@ class LeRobotSource(Protocol):
         ...
 
     @property
-    def cameras(self) -> Mapping[str, tuple[int, int]]:
-        """Key of each camera, such as observation.images.wrist -> height and width [px]."""
+    def cameras(self) -> Mapping[str, LeRobotCamera]:
+        """The cameras by key, such as observation.images.wrist."""
         ...
 
     @property
@@ -123,7 +139,8 @@ def check_source(source: LeRobotSource) -> None:
                 f"a column cannot be called '{key}': LeRobot takes no '/', and "
                 f"{', '.join(GIVEN_BY_WRITER)} are written by themselves."
             )
-    for key, (height, width) in source.cameras.items():
+    for key, camera in source.cameras.items():
+        height, width = camera.size
         if height % 2 or width % 2 or min(height, width) < 16:
             raise InputError(
                 f"the pictures of '{key}' are {width} x {height} px; a video needs even numbers of "
@@ -221,22 +238,59 @@ def _numbers(features: Mapping[str, LeRobotFeature]) -> dict[str, Any]:
     }
 
 
-def _videos(cameras: Mapping[str, tuple[int, int]], fps: int) -> dict[str, Any]:
-    return {
-        key: {
-            "dtype": "video",
-            "shape": [height, width, 3],
-            "names": ["height", "width", "channels"],
-            "info": {
-                "video.height": height,
-                "video.width": width,
-                "video.codec": CODEC,
-                "video.pix_fmt": PIXELS,
-                "video.is_depth_map": False,
-                "video.fps": fps,
-                "video.channels": 3,
-                "has_audio": False,
-            },
+def _videos(cameras: Mapping[str, LeRobotCamera], fps: int) -> dict[str, Any]:
+    """Return the features of the videos; of depth as LeRobot's own reader undoes its codes."""
+    out: dict[str, Any] = {}
+    for key, camera in cameras.items():
+        height, width = camera.size
+        channels = 1 if camera.is_depth else 3
+        said = {
+            "video.height": height,
+            "video.width": width,
+            "video.codec": DEPTH_CODEC if camera.is_depth else CODEC,
+            "video.pix_fmt": DEPTH_PIXELS if camera.is_depth else PIXELS,
+            "video.fps": fps,
+            "video.channels": channels,
+            "has_audio": False,
+            "is_depth_map": camera.is_depth,
+            "video.is_depth_map": camera.is_depth,
         }
-        for key, (height, width) in cameras.items()
-    }
+        if camera.is_depth:
+            said |= {
+                "depth_unit": "m",
+                "video.depth_min": DEPTH_MIN_M,
+                "video.depth_max": DEPTH_MAX_M,
+                "video.shift": DEPTH_SHIFT_M,
+                "video.use_log": True,
+            }
+        out[key] = {
+            "dtype": "video",
+            "shape": [height, width, channels],
+            "names": ["height", "width", "channels"],
+            "info": said | dict(camera.info),
+        }
+    return out
+
+
+DEPTH_CODEC, DEPTH_PIXELS = "hevc", "gray12le"
+DEPTH_MIN_M, DEPTH_MAX_M, DEPTH_SHIFT_M = 0.01, 10.0, 3.5
+"""Depth of the lowest and the highest code, and the shift under the logarithm [m]: LeRobot's."""
+DEPTH_CODES = 4095
+"""The highest code of 12 bits."""
+
+
+def depth_codes(depth_m: Array32) -> UInt16:
+    """Return the codes of depths [m], as LeRobot has them: log(z + shift) in 4096 steps.
+
+    A step is 1.4 mm at 0.7 m. Nothing (0) and all that is nearer than 1 cm is code 0.
+    """
+    low, high = np.log(DEPTH_MIN_M + DEPTH_SHIFT_M), np.log(DEPTH_MAX_M + DEPTH_SHIFT_M)
+    share = (np.log(depth_m + np.float32(DEPTH_SHIFT_M)) - low) / (high - low)
+    return np.rint(share * DEPTH_CODES).clip(0, DEPTH_CODES).astype(np.uint16)
+
+
+def depth_of_codes(codes: UInt16) -> Array32:
+    """Return the depths [m] of codes, the inverse of `depth_codes`; code 0 is 0, nothing."""
+    low, high = np.log(DEPTH_MIN_M + DEPTH_SHIFT_M), np.log(DEPTH_MAX_M + DEPTH_SHIFT_M)
+    depth = np.exp(codes * ((high - low) / DEPTH_CODES) + low) - DEPTH_SHIFT_M
+    return np.where(codes == 0, 0.0, depth).astype(np.float32)

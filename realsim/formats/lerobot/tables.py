@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.arrays import Array, UInt8
+from realsim.arrays import Array, Array32, UInt8
 from realsim.formats.lerobot.episodes import LeRobotFeature
 
 Stats = dict[str, dict[str, Any]]
@@ -36,37 +36,51 @@ def column_stats(columns: Mapping[str, NDArray[Any]]) -> Stats:
 
 
 class PictureStats:
-    """Statistics of the pictures of one camera, each channel from 0 to 1."""
+    """Statistics of one camera's pictures: channels from 0 to 1, or what depth is seen [m]."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, depth: bool = False) -> None:
         """Begin with none."""
+        n, self._scale = (1, 1.0) if depth else (3, 255.0)
         self._count = self._pixels = 0
-        self._low, self._high = np.full(3, 255.0), np.zeros(3)
-        self._sum, self._squares = np.zeros(3), np.zeros(3)
+        self._low, self._high = np.full(n, np.inf), np.full(n, -np.inf)
+        self._sum, self._squares = np.zeros(n), np.zeros(n)
 
-    def add(self, rgb: UInt8) -> None:
-        """Add a picture (H, W, 3)."""
+    def add(self, picture: UInt8 | Array32) -> None:
+        """Add colours (H, W, 3), or depth (H, W) [m], 0 = nothing."""
         import cv2
 
-        levels = np.arange(256.0)
-        for c in range(3):
-            counted = cv2.calcHist([rgb], [c], None, [256], [0.0, 256.0])
-            histogram = counted.ravel().astype(np.float64)
-            there = np.flatnonzero(histogram)
-            self._low[c] = min(self._low[c], there[0])
-            self._high[c] = max(self._high[c], there[-1])
-            self._sum[c] += histogram @ levels
-            self._squares[c] += histogram @ levels**2
         self._count += 1
-        self._pixels += rgb.shape[0] * rgb.shape[1]
+        if len(self._low) == 1:
+            seen = picture[picture > 0].astype(np.float64)
+            self._take(0, seen, np.ones(len(seen)))
+            self._pixels += len(seen)
+            return
+        for c in range(3):
+            counted = cv2.calcHist([picture], [c], None, [256], [0.0, 256.0])
+            self._take(c, np.arange(256.0), counted.ravel().astype(np.float64))
+        self._pixels += picture.shape[0] * picture.shape[1]
+
+    def _take(self, c: int, values: Array, counts: Array) -> None:
+        """Add values that occur so often."""
+        there = values[counts > 0]
+        self._low[c] = min(self._low[c], there.min(initial=np.inf))
+        self._high[c] = max(self._high[c], there.max(initial=-np.inf))
+        self._sum[c] += counts @ values
+        self._squares[c] += counts @ values**2
 
     def result(self) -> dict[str, Any]:
-        """Return the statistics, (3, 1, 1) each; count is that of the pictures."""
-        mean = self._sum / self._pixels
-        sd = np.sqrt(np.maximum(self._squares / self._pixels - mean**2, 0.0))
+        """Return the statistics, (C, 1, 1) each; count is that of the pictures."""
+        n, seen = len(self._low), max(self._pixels, 1)
+        mean = self._sum / seen
+        sd = np.sqrt(np.maximum(self._squares / seen - mean**2, 0.0))
         values = {"min": self._low, "max": self._high, "mean": mean, "std": sd}
         return {
-            **{name: (v / 255.0).reshape(3, 1, 1).tolist() for name, v in values.items()},
+            **{
+                name: (np.nan_to_num(v, posinf=0.0, neginf=0.0) / self._scale)
+                .reshape(n, 1, 1)
+                .tolist()
+                for name, v in values.items()
+            },
             "count": [self._count],
         }
 
@@ -160,7 +174,8 @@ def _kind(value: Any) -> Any:
     if isinstance(value, list):
         first: Any = value[0]  # pyright: ignore[reportUnknownVariableType]
         return pa.list_(_kind(first))
-    return {int: pa.int64(), float: pa.float64(), str: pa.string()}[type(value)]
+    kinds = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
+    return kinds[type(value)]
 
 
 def tasks_bytes(tasks: Sequence[str]) -> bytes:

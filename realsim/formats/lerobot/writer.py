@@ -5,7 +5,7 @@ until its file is full (`spool`), so that a killed export goes on at the next ep
 """
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,12 @@ from realsim.formats.lerobot import episodes as layout
 from realsim.formats.lerobot.episodes import LeRobotSource, check_source
 from realsim.formats.lerobot.spool import (
     SPOOL,
+    EncodedEpisode,
     SpooledEpisode,
+    encoded,
     forget,
     import_av,
+    is_spooled,
     join,
     spool,
     spooled,
@@ -61,12 +64,16 @@ class LeRobotConfig:
             )
 
 
+Take = Callable[[int, EncodedEpisode], None]
+
+
 def write_lerobot(
     source: LeRobotSource,
     folder: ExportFolder,
     config: LeRobotConfig | None = None,
     *,
     progress: Callable[[], None] | None = None,
+    encode: Callable[[Sequence[int], Take], None] | None = None,
 ) -> WrittenScene:
     """Write all episodes of a source.
 
@@ -75,6 +82,8 @@ def write_lerobot(
         folder: where to; `finish` is called by whoever made it.
         config: how the files are filled.
         progress: called once an episode.
+        encode: given the numbers of the episodes that are missing, hands each on, encoded
+            (`spool.encoded`), in their order: the place for other processes. None = one by one.
 
     Raises:
         InputError: PyAV is not installed, or the source cannot be written.
@@ -82,39 +91,90 @@ def write_lerobot(
     config = config or LeRobotConfig()
     import_av()
     check_source(source)
-    size, written = config.episodes_per_file, 0
-    first_frame = 0
-    known = {int(key): row for key, row in folder.rows(GROUPS)}
-    for group, first in enumerate(range(0, len(source), size)):
-        numbers = range(first, min(first + size, len(source)))
-        if group not in known:
-            episodes: list[SpooledEpisode] = []
-            for k in numbers:
-                there = spooled(folder, source, k)
-                episodes.append(there or spool(folder, source, k))
-                written += 0 if there else episodes[-1].steps
-                if progress is not None:
-                    progress()
-            known[group] = _write_group(folder, source, group, first, first_frame, episodes)
-        elif progress is not None:
-            for _ in numbers:
-                progress()
-        first_frame += int(known[group]["frames"])
-    _write_meta(folder, source, first_frame)
-    notes = [note for row in known.values() for e in row["episodes"] for note in e.get("notes", ())]
-    return WrittenScene(
-        name=source.name,
-        folder=folder.folder,
-        frames=first_frame,
-        frames_written=written,
-        objects=first_frame,
-        notes=tuple(dict.fromkeys(notes)),
-        counts={
-            "episodes": len(source),
-            "tasks": len(source.tasks),
-            "videos": len(source.cameras) * len(known),
-        },
-    )
+    writer = _Writer(source, folder, config, progress or _silent)
+    missing = writer.begin()
+    if encode is None:
+        for k in missing:
+            writer.take(k, encoded(source, k))
+    else:
+        encode(missing, writer.take)
+    return writer.finish()
+
+
+def _silent() -> None:
+    """Tell nobody."""
+
+
+class _Writer:
+    """Puts episodes into files as they come."""
+
+    def __init__(
+        self,
+        source: LeRobotSource,
+        folder: ExportFolder,
+        config: LeRobotConfig,
+        progress: Callable[[], None],
+    ) -> None:
+        self._source, self._folder, self._progress = source, folder, progress
+        self._size = config.episodes_per_file
+        self._known = {int(key): row for key, row in folder.rows(GROUPS)}
+        self._frames = self._written = 0
+
+    def _numbers(self, group: int) -> range:
+        """Return the episodes of a group."""
+        first = group * self._size
+        return range(first, min(first + self._size, len(self._source)))
+
+    def begin(self) -> list[int]:
+        """Return the episodes that are not there; write the files that only wait for theirs."""
+        count = -(-len(self._source) // self._size)
+        of = [k for g in range(count) if g not in self._known for k in self._numbers(g)]
+        missing = [k for k in of if not is_spooled(self._folder, k)]
+        for _ in range(len(self._source) - len(missing)):
+            self._progress()
+        self._fill()
+        return missing
+
+    def take(self, k: int, episode: EncodedEpisode) -> None:
+        """Keep an episode, and write its file if it is full now."""
+        spool(self._folder, k, episode)
+        self._written += len(next(iter(episode.columns.values())))
+        self._progress()
+        self._fill()
+
+    def _fill(self) -> None:
+        """Write the files whose episodes are there, in their order."""
+        frames, group = 0, 0
+        while group * self._size < len(self._source):
+            numbers = self._numbers(group)
+            if group not in self._known:
+                if not all(is_spooled(self._folder, k) for k in numbers):
+                    return
+                episodes = [spooled(self._folder, self._source, k) for k in numbers]
+                self._known[group] = _write_group(
+                    self._folder, self._source, group, numbers[0], frames, episodes
+                )
+            frames, group = frames + int(self._known[group]["frames"]), group + 1
+        self._frames = frames
+
+    def finish(self) -> WrittenScene:
+        """Write what is said of all episodes."""
+        _write_meta(self._folder, self._source, self._frames)
+        rows = self._known.values()
+        notes = [note for row in rows for e in row["episodes"] for note in e.get("notes", ())]
+        return WrittenScene(
+            name=self._source.name,
+            folder=self._folder.folder,
+            frames=self._frames,
+            frames_written=self._written,
+            objects=self._frames,
+            notes=tuple(dict.fromkeys(notes)),
+            counts={
+                "episodes": len(self._source),
+                "tasks": len(self._source.tasks),
+                "videos": len(self._source.cameras) * len(self._known),
+            },
+        )
 
 
 def _write_group(
@@ -192,6 +252,7 @@ def _episode_row(
         **{f"data/{name}": value for name, value in place.items()},
         "dataset_from_index": first_frame,
         "dataset_to_index": first_frame + episode.steps,
+        **episode.metadata,
     }
     for key in source.cameras:
         row |= {f"videos/{key}/{name}": value for name, value in place.items()}

@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim import interop
-from realsim.arrays import Array, Rgb
-from realsim.formats.lerobot.episodes import LeRobotEpisode, LeRobotFeature
+from realsim.arrays import Array, Array32, Rgb
+from realsim.formats.lerobot.episodes import LeRobotCamera, LeRobotEpisode, LeRobotFeature
 from realsim.geometry import se3
 from realsim.records.trajectories import PHASES
 from realsim_sim_bridge.demonstrations.source import Demonstration, DemonstrationSource
 
 STATE, ACTION, GOAL = "observation.state", "action", "observation.goal.grasp_pose"
 EE, OBJECT, DELTA = "ee_pose", "object_pose", "delta_ee"
-IMAGES = "observation.images."
+IMAGES, EXTRINSICS, DEPTH = "observation.images.", "observation.extrinsics.", "_depth"
 POSE_NAMES = ("x", "y", "z", "qx", "qy", "qz", "qw")
 FEATURES = {
     STATE: LeRobotFeature(dtype="float32"),
@@ -46,6 +46,7 @@ CONVENTIONS = (
     (EE, "the hand's grasp frame in the arm's base, as the goal"),
     (OBJECT, "the object that is to be grasped, in the arm's base, likewise: what a camera does "
              "not tell"),
+    (EXTRINSICS + "NAME", "the camera in the arm's base, as the goal; x right, y down, z forward"),
     ("phase", ", ".join(f"{k} {name}" for k, name in enumerate(PHASES))),
     ("held", "whether both fingers hold the object"),
     ("next.reward", "1 at the last step of an attempt that passed all stages, else 0"),
@@ -58,15 +59,24 @@ CONVENTIONS = (
 class LeRobotDemonstrations:
     """Chosen attempts of a source; a `LeRobotSource`."""
 
-    def __init__(self, source: DemonstrationSource, name: str, chosen: Sequence[int]) -> None:
+    def __init__(
+        self,
+        source: DemonstrationSource,
+        name: str,
+        chosen: Sequence[int],
+        *,
+        depth: bool = False,
+    ) -> None:
         """Choose attempts.
 
         Args:
             source: all attempts.
             name: what messages call them.
             chosen: numbers of those that are written, in this order.
+            depth: whether depth is written beside the colours.
         """
         self.name, self._source, self._chosen = name, source, tuple(chosen)
+        self._depth = depth
         self.tasks = sorted({source.goal(k).language for k in self._chosen})
 
     @property
@@ -83,18 +93,32 @@ class LeRobotDemonstrations:
     def features(self) -> Mapping[str, LeRobotFeature]:
         """The columns."""
         names = self._source.arm.arm.joint_names
+        extrinsics = LeRobotFeature(dtype="float32", names=POSE_NAMES)
         return FEATURES | {
             STATE: replace(FEATURES[STATE], names=(*names, "opening")),
             ACTION: replace(FEATURES[ACTION], names=(*names, "opening_command")),
+            **{EXTRINSICS + name: extrinsics for name in self._source.scenery.cameras},
         }
 
     @property
-    def cameras(self) -> Mapping[str, tuple[int, int]]:
-        """Height and width [px] of each camera, by LeRobot's key."""
-        return {
-            IMAGES + name: (c.intrinsics.height, c.intrinsics.width)
-            for name, c in self._source.scenery.cameras.items()
-        }
+    def cameras(self) -> Mapping[str, LeRobotCamera]:
+        """The cameras by LeRobot's key, with what they measure by."""
+        out: dict[str, LeRobotCamera] = {}
+        for name, camera in self._source.scenery.cameras.items():
+            i = camera.intrinsics
+            info = {
+                "camera.intrinsics": {
+                    "fx": i.fx, "fy": i.fy, "cx": i.cx, "cy": i.cy,
+                    "distortion_model": "opencv", "distortion": i.distortion.tolist(),
+                },
+                "camera.extrinsics": EXTRINSICS + name,
+            }  # fmt: skip
+            size = i.height, i.width
+            out[IMAGES + name] = LeRobotCamera(size=size, info=info)
+            if self._depth:
+                key = IMAGES + name + DEPTH
+                out[key] = LeRobotCamera(size=size, is_depth=True, info=info)
+        return out
 
     def __len__(self) -> int:
         """Return the number of episodes."""
@@ -106,8 +130,9 @@ class LeRobotDemonstrations:
         return LeRobotEpisode(
             task=demonstration.goal.language,
             columns=episode_columns(demonstration),
-            frames=_frames(demonstration),
+            frames=_frames(demonstration, self._depth),
             notes=_notes(demonstration),
+            metadata=_metadata(demonstration),
         )
 
 
@@ -131,6 +156,13 @@ def episode_columns(demonstration: Demonstration) -> dict[str, NDArray[Any]]:
         "next.reward": succeeded.astype(np.float32),
         "next.done": last,
         "next.success": succeeded,
+        **{
+            EXTRINSICS + name: poses(
+                T_base_table
+                @ np.array([demonstration.pictures.T_table_cam(k, name) for k in range(steps)])
+            )
+            for name in demonstration.scenery.cameras
+        },
     }
 
 
@@ -153,10 +185,26 @@ def _deltas(Ts: Array, after: Array) -> Array:
     return np.concatenate([np.array(turns).reshape(-1, 3), moved[:, :3, 3]], axis=1)
 
 
-def _frames(demonstration: Demonstration) -> Iterator[Mapping[str, Rgb]]:
+def _frames(demonstration: Demonstration, depth: bool) -> Iterator[Mapping[str, Rgb | Array32]]:
     """Yield the pictures of every camera, step by step."""
     for step in demonstration:
-        yield {IMAGES + name: step.look(name) for name in demonstration.scenery.cameras}
+        seen = {name: step.picture(name) for name in demonstration.scenery.cameras}
+        out: dict[str, Rgb | Array32] = {IMAGES + name: p.rgb for name, p in seen.items()}
+        if depth:
+            out |= {IMAGES + name + DEPTH: p.depth_m for name, p in seen.items()}
+        yield out
+
+
+def _metadata(demonstration: Demonstration) -> dict[str, bool | int | float | str]:
+    """Return what a row of meta/episodes says; NaN where p_hold was not measured."""
+    outcome = demonstration.outcome
+    p_hold = outcome.labels.get("p_hold")
+    return {
+        "success": outcome.success,
+        "p_hold": float("nan") if p_hold is None else float(p_hold),
+        "failure": outcome.failure,
+        "object": demonstration.goal.name,
+    }
 
 
 def _notes(demonstration: Demonstration) -> dict[str, Any]:
