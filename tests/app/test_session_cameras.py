@@ -165,6 +165,8 @@ def test_check_looks_at_every_camera(registered: Path, tmp_path: Path) -> None:
     (folder / "cameras/left/depth/000001.png").unlink()
     result = call("check", folder, "--json")
     assert result.exit_code == 1
+    with pytest.raises(InputError, match=r"cameras/left' is not as it was captured: depth/000001"):
+        run_register(SessionStore.open(folder), QUIET, RegisterRequest())
     inner = [r for r in json.loads(result.output)["inner"] if r["folder"].endswith("left")]
     assert [f["path"] for f in inner[0]["findings"]] == ["depth/000001.png"]
 

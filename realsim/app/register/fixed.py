@@ -9,6 +9,7 @@ import numpy as np
 
 from realsim.app.register.config import BIAS_FILE, OFF, RegisterRequest, load_depth_bias
 from realsim.app.register.results import CameraChange, claimed_cameras
+from realsim.app.stages import require_sound
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.records.depth_bias import DepthBias
@@ -52,7 +53,7 @@ def read_fixed(
     """Return the cameras that take part, by name, and why others do not.
 
     Raises:
-        InputError: one moves, or its files are damaged.
+        InputError: one moves, or an image of it is not as it was captured.
     """
     found: dict[str, FixedInput] = {}
     told: list[str] = []
@@ -71,6 +72,7 @@ def read_fixed(
         elif not deep:
             told.append(f"camera '{name}' is left out: it was recorded without depth.")
         else:
+            require_sound(camera)
             _require_still(name, claimed)
             some = np.unique(np.linspace(0, len(deep) - 1, MOST_IMAGES).round().astype(int))
             views = [deep[k] for k in some]
