@@ -1,13 +1,16 @@
 """`realsim demonstrations` on the command line."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from realsim.app.command import Command
-from realsim.app.options import FOLDER, JSON, QUIET
+from realsim.app.options import FOLDER, JSON, QUIET, many
 from realsim.app.outputs import GOES_ON
+
+if TYPE_CHECKING:
+    from realsim.many import PoolConfig
 
 
 @click.command(
@@ -42,6 +45,7 @@ from realsim.app.outputs import GOES_ON
               help="View of the session for the fixed camera.  [beside the table]")  # fmt: skip
 @click.option("--hand-eye", is_flag=True,
               help="Mount the hand's camera as the session's calibration says.")  # fmt: skip
+@click.option("--depth", is_flag=True, help="Depth beside the pictures.")
 @click.option("--mass", "masses", multiple=True, metavar="NAME=KG", help="As the school was told.")
 @click.option("--episodes-per-file", default=50, show_default=True, type=click.IntRange(1, 10_000),
               help="Attempts in one file of data/ and videos/.")  # fmt: skip
@@ -49,16 +53,18 @@ from realsim.app.outputs import GOES_ON
 @click.option("--licence", default="", help="Of the pictures, on the card.")
 @click.option("--models-licence", default="", help="Of the object models, on the card.")
 @click.option("--attribution", default="", help="Whom to name, on the card.")
+@many(1, "Processes; all give the same bytes.")
 @JSON
 @QUIET
 def demonstrations_command(
-    source: Path, out: Path, as_json: bool, quiet: bool, **options: Any
+    source: Path, out: Path, as_json: bool, quiet: bool, where: "PoolConfig", **options: Any
 ) -> None:
     """Replay the school's attempts on SOURCE and write them as a LeRobot v3.0 data set.
 
     SOURCE is a session, or a folder of results of `realsim school`. Every attempt that the arm
     made is replayed, successful or failed, with its physics: joints, actions, the object, and
-    pictures from a fixed camera and one in the hand. Interrupted, the same command goes on.
+    pictures from a fixed camera and one in the hand, and where the cameras are. Interrupted, the
+    same command goes on.
 
     Writes meta/, data/ and videos/ (LeRobot), realsim/episodes.jsonl, demonstrations.html.
     """
@@ -70,6 +76,6 @@ def demonstrations_command(
     )
 
     console = Console(quiet=quiet, as_json=as_json)
-    result = export_demonstrations(source, out, DemonstrationRequest(**options), console)
+    result = export_demonstrations(source, out, DemonstrationRequest(**options), console, where)
     show_demonstrations(result, console)
     console.result(result)

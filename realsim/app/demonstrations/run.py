@@ -1,8 +1,10 @@
 """`realsim demonstrations`: attempts of the school as a LeRobot data set with pictures."""
 
 import hashlib
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,12 +17,16 @@ from realsim.errors import InputError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.labelled_scene import WrittenScene
+from realsim.formats.lerobot.spool import EncodedEpisode, encoded, import_av
 from realsim.geometry import se3
+from realsim.many import Outcome, PoolConfig, Sent, Task, open_pool, run_many
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectModel, Scene
 
 if TYPE_CHECKING:
+    from realsim.formats.lerobot.writer import Take
     from realsim_sim_bridge.demonstrations.front_view import FrontView
+    from realsim_sim_bridge.demonstrations.lerobot_episodes import LeRobotDemonstrations
     from realsim_sim_bridge.demonstrations.records import DemonstrationCamera
     from realsim_sim_bridge.demonstrations.source import DemonstrationSource
 
@@ -47,6 +53,8 @@ class DemonstrationRequest:
     """View of the session that the fixed camera stands at; None = beside the table."""
     hand_eye: bool = False
     """Whether the hand's camera is mounted as the session's hand-eye calibration says."""
+    depth: bool = False
+    """Whether depth is written beside the pictures."""
     masses: tuple[str, ...] = ()
     """NAME=KG, as the school was told; the density it was told is kept with the grasps."""
     episodes_per_file: int = 50
@@ -232,7 +240,11 @@ def _named(text: str) -> tuple[int, int]:
 
 
 def export_demonstrations(
-    source: Path, out: Path, request: DemonstrationRequest, console: Console
+    source: Path,
+    out: Path,
+    request: DemonstrationRequest,
+    console: Console,
+    where: PoolConfig | None = None,
 ) -> DemonstrationsResult:
     """Write attempts of the school as a LeRobot v3.0 data set with a page and a card.
 
@@ -241,38 +253,44 @@ def export_demonstrations(
         out: a new or empty folder, or one that the same request has begun to fill.
         request: which attempts, seen from where.
         console: progress and notes go there.
+        where: processes that render and encode; None = this one alone. All give the same bytes.
 
     Raises:
         InputError: something given cannot be used, PyAV is missing, or `out` holds something else.
     """
     from realsim.app.demonstrations.page import demonstrations_card, page_file
     from realsim.app.export.card import CARD_FILE
-    from realsim.formats.lerobot.spool import import_av
     from realsim.formats.lerobot.writer import LeRobotConfig, write_lerobot
     from realsim.store.lock import only_run_in
-    from realsim_sim_bridge.demonstrations.lerobot_episodes import LeRobotDemonstrations
 
     import_av()
     _require_outside(source, out)
-    attempts = open_source(source, request, console)
-    episodes = LeRobotDemonstrations(
-        attempts, source.resolve().name, chosen_attempts(attempts, request)
-    )
+    attempts, episodes = _episodes(source, request, console)
     folder = ExportFolder.begin(out, _asked(source, attempts, request))
     if folder.resumed:
         console.say(f"going on with the demonstrations in {out}.")
     with only_run_in(out):
         with console.stage("demonstrations", f"{len(episodes)} attempts") as tick:
+            encoding = _Encoding(source, request, episodes, where or PoolConfig(workers=1), console)
             written = write_lerobot(
                 episodes, folder, LeRobotConfig(episodes_per_file=request.episodes_per_file),
-                progress=_counter(tick, len(episodes)),
+                progress=_counter(tick, len(episodes)), encode=encoding.encode,
             )  # fmt: skip
         with console.stage("page"):
             folder.write_piece("page", page_file(folder.folder, attempts.config.rate_hz, PAGE))
         chosen = chosen_attempts(attempts, request)
         successes = sum(attempts.succeeded(k) for k in chosen)
         card = demonstrations_card(request, written, _names(attempts), successes, out)
-        folder.finish({CARD_FILE: card})
+        from realsim.app.stages import made_of
+        from realsim.store import provenance
+
+        record, run = made_of(
+            "demonstrations", console, request=asdict(request) | {"source": source},
+            config=attempts.config,
+            inputs={f"{provenance.GIVEN}source": provenance.sha256_of(source)},
+        )  # fmt: skip
+        folder.finish({CARD_FILE: card, provenance.FOLDER_FILE: provenance.record_bytes(record)})
+        provenance.write(out, record, run)
     return DemonstrationsResult(
         folder=out,
         page=out / PAGE,
@@ -280,6 +298,76 @@ def export_demonstrations(
         successes=successes,
         not_attempted=len(attempts.not_attempted),
     )
+
+
+def _episodes(
+    source: Path, request: DemonstrationRequest, console: Console
+) -> "tuple[DemonstrationSource, LeRobotDemonstrations]":
+    """Return the attempts, and those that are asked for as episodes."""
+    from realsim_sim_bridge.demonstrations.lerobot_episodes import LeRobotDemonstrations
+
+    attempts = open_source(source, request, console)
+    chosen = chosen_attempts(attempts, request)
+    name = source.resolve().name
+    return attempts, LeRobotDemonstrations(attempts, name, chosen, depth=request.depth)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Encoding:
+    """Episodes rendered and encoded by this process, or by others that open the source again."""
+
+    source: Path
+    request: DemonstrationRequest
+    episodes: "LeRobotDemonstrations"
+    where: PoolConfig
+    console: Console
+
+    def encode(self, numbers: "Sequence[int]", take: "Take") -> None:
+        """Hand the episodes of these numbers on, in order; say after the first what all cost."""
+        costs: list[float] = []
+
+        def cost(cpu_s: float) -> None:
+            costs.append(cpu_s)
+            if len(costs) == 1 and len(numbers) > 1:
+                minutes = cpu_s * (len(numbers) - 1) / 60.0
+                self.console.say(
+                    f"the first of {len(numbers)} attempts took {cpu_s:.1f} CPU s; the others "
+                    f"will take about {minutes:.1f} CPU min."
+                )
+
+        if self.where.workers == 1 and not self.where.address:
+            for k in numbers:
+                begun = time.process_time()
+                episode = encoded(self.episodes, k)
+                cost(time.process_time() - begun)
+                take(k, episode)
+            return
+
+        def done(outcome: Outcome) -> None:
+            k, episode, cpu_s = outcome.found()
+            cost(cpu_s)
+            take(k, episode)
+
+        sent = Sent(self.source)
+        tasks = (Task(name=f"attempt {k}", fn=_encoded, args=(sent, self.request, k))
+                 for k in numbers)  # fmt: skip
+        with open_pool(self.where) as pool:
+            run_many(tasks, pool, done, in_order=True)
+
+
+def _encoded(
+    source: Path, request: DemonstrationRequest, k: int
+) -> "tuple[int, EncodedEpisode, float]":
+    """Return an episode's number, the episode encoded, and what it took [CPU s]."""
+    begun = time.process_time()
+    episode = encoded(_opened(source, request), k)
+    return k, episode, time.process_time() - begun
+
+
+@lru_cache(maxsize=1)
+def _opened(source: Path, request: DemonstrationRequest) -> "LeRobotDemonstrations":
+    """Return the episodes of a source; a worker opens it once."""
+    return _episodes(source, request, Console(quiet=True))[1]
 
 
 def _require_outside(source: Path, out: Path) -> None:
