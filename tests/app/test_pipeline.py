@@ -70,7 +70,7 @@ def test_a_scene_that_fails_is_listed_the_others_go_on_and_only_it_is_done_again
     whole = document(out)
     assert whole["done"] == 2 and not whole["failed"]
     assert len(list((out / "export").glob("*/*/scene_gt.json"))) == 2
-    # Generated anew but for one scene's list of views, which is lost.
+    # One scene's poses are damaged, and it has to be done again.
     record = out / "records/scene_000001.json"
     record.unlink()
     views = out / "scenes/scene_000001/registration/scene.json"
@@ -80,6 +80,9 @@ def test_a_scene_that_fails_is_listed_the_others_go_on_and_only_it_is_done_again
     assert broken.exit_code == 1
     told = document(out)
     assert list(told["failed"]) == ["scene_000001"] and told["done"] == 1 and told["kept"] == 1
+    assert told["waiting"] == ["export", "stats"] and not told["of_all"][1:]
+    assert run(path, "--without-failed").exit_code == 1
+    assert len(list((out / "export_1_of_2").glob("*/*/scene_gt.json"))) == 1
     assert "scene.json" in told["failed"]["scene_000001"]
     page = (out / "campaign.html").read_text()
     assert "scene_000001" in page and "1 failed" in page

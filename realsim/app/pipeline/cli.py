@@ -20,12 +20,15 @@ from realsim.app.options import FOLDER, JSON, QUIET, workers
 @click.argument("campaign", type=FOLDER)
 @workers(help="Scenes at a time.")
 @click.option("--plan", "only_plan", is_flag=True, help="Print what would run, and run nothing.")
+@click.option("--without-failed", is_flag=True,
+              help="Export what is done, although scenes failed.")  # fmt: skip
 @JSON
 @QUIET
 @click.pass_context
 def pipeline_command(
-    ctx: click.Context, campaign: Path, workers: int, only_plan: bool, as_json: bool, quiet: bool
-) -> None:
+    ctx: click.Context, campaign: Path, workers: int, only_plan: bool, without_failed: bool,
+    as_json: bool, quiet: bool,
+) -> None:  # fmt: skip
     """Run a campaign: the scenes and stages that the file CAMPAIGN names.
 
     \b
@@ -40,8 +43,8 @@ def pipeline_command(
       to = "bop"
 
     Tables hold the options of a command, as in realsim.toml; paths count from the file's folder. A
-    scene that fails is listed, and the others go on. Run again, the same command does what is not
-    done yet, and what failed.
+    scene that fails is listed, and the others go on; stages over all scenes wait for it. Run again,
+    the same command does what is not done yet, and what failed.
 
     Writes OUT/campaign.html and campaign.json, renewed after each scene; OUT/scenes; OUT/logs.
 
@@ -59,7 +62,9 @@ def pipeline_command(
     if only_plan:
         show_plan(asked, console)
         return
-    result = run_pipeline(asked, PoolConfig(workers=workers), console)
+    result = run_pipeline(
+        asked, PoolConfig(workers=workers), console, without_failed=without_failed
+    )
     show_pipeline(asked, result, console)
     console.result(result.told)
     if result.failed:

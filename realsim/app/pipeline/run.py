@@ -45,6 +45,8 @@ class PipelineResult:
     """Commands that made the scenes, and those over all of them."""
     kept: int = 0
     """Scenes that an earlier run had finished."""
+    waiting: tuple[str, ...] = ()
+    """Stages over all scenes that were not begun, because a scene failed."""
     stages: tuple[str, ...] = ()
 
     def is_done(self, scene: SceneState) -> bool:
@@ -69,14 +71,23 @@ class PipelineResult:
             "stages": list(self.stages),
             "commands": {s.name: to_json(s.ends) for s in self.scenes if s.ends},
             "of_all": to_json(self.of_all),
+            "waiting": list(self.waiting),
         }  # fmt: skip
 
 
-def run_pipeline(campaign: Campaign, where: PoolConfig, console: Console) -> PipelineResult:
+def run_pipeline(
+    campaign: Campaign, where: PoolConfig, console: Console, *, without_failed: bool = False
+) -> PipelineResult:
     """Run what a campaign has not done yet.
 
-    A scene that fails is listed, and the others go on; stages over all scenes take those that went
-    through.
+    A scene that fails is listed, and the others go on.
+
+    Args:
+        campaign: what its file asks for.
+        where: its scenes are worked at.
+        console: for progress.
+        without_failed: whether stages over all scenes take those that are done, into a folder that
+            says how many; else they wait for all.
 
     Raises:
         InputError: OUT is a file, or of another campaign, or another run works there.
@@ -93,14 +104,31 @@ def run_pipeline(campaign: Campaign, where: PoolConfig, console: Console) -> Pip
         result.kept = sum(result.is_done(s) for s in result.scenes)
         _run_scenes(campaign, where, console, result)
         done = [s for s in result.scenes if result.is_done(s)]
-        for step in campaign.of_all if done else ():
-            _require_room(out)
-            with console.stage(step.stage, f"{len(done)} scenes"):
-                result.of_all.append(
-                    _run(campaign, step, _words_of_all(campaign, step, done), where.processes)
-                )
+        if len(done) == len(result.scenes) or without_failed:
+            _run_of_all(campaign, where, console, result, done)
+        else:
+            result.waiting = tuple(step.stage for step in campaign.of_all)
         _write(campaign, result)
     return result
+
+
+def _run_of_all(
+    campaign: Campaign, where: PoolConfig, console: Console, result: PipelineResult,
+    done: Sequence[SceneState],
+) -> None:  # fmt: skip
+    """Run the stages over all scenes, or over those that are done."""
+    part = "" if len(done) == len(result.scenes) else f"_{len(done)}_of_{len(result.scenes)}"
+    for step in campaign.of_all if done else ():
+        _require_room(campaign.out)
+        with console.stage(step.stage, f"{len(done)} scenes"):
+            words = _words_of_all(campaign, step, done, part)
+            out = Path(words[-1])
+            before = out.with_name(f"{out.name}.before")
+            if result.kept < len(done) and out.is_dir() and not before.exists():
+                out.rename(before)  # its scenes have changed; kept until there is a new one
+            result.of_all.append(_run(campaign, step, words, where.processes))
+            if result.of_all[-1].is_done and before.is_dir():
+                shutil.rmtree(before)
 
 
 def scenes_of(campaign: Campaign) -> list[tuple[str, Path]]:
@@ -146,6 +174,11 @@ def show_pipeline(campaign: Campaign, result: PipelineResult, console: Console) 
         console.warn(f"{name}: {why}")
     done = sum(result.is_done(s) for s in result.scenes)
     console.say(f"{done} of {len(result.scenes)} scenes done, {result.kept} of them before")
+    if result.waiting:
+        console.warn(
+            f"{' and '.join(result.waiting)} wait for the scenes that failed; `--without-failed` "
+            "takes the others."
+        )
     console.say(f"page      {campaign.out / PAGE}")
     if result.failed:
         console.say(f"next      realsim pipeline {campaign.file}   (what failed is tried again)")
@@ -247,11 +280,13 @@ def _command(step: Step, words: Sequence[str], workers: int) -> Command:
     )
 
 
-def _words_of_all(campaign: Campaign, step: Step, done: Sequence[SceneState]) -> list[str]:
+def _words_of_all(
+    campaign: Campaign, step: Step, done: Sequence[SceneState], part: str
+) -> list[str]:
     """Return what a stage over all scenes takes and fills."""
     kinds = [s for s in campaign.of_all if s.stage == step.stage]
     number = f"_{kinds.index(step) + 1}" if len(kinds) > 1 else ""
-    out = campaign.out.resolve() / f"{step.stage}{number}"
+    out = campaign.out.resolve() / f"{step.stage}{number}{part}"
     return [*(str(s.folder.resolve()) for s in done), "--out", str(out)]
 
 
