@@ -2,11 +2,15 @@
 
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from realsim.app.command import Command, Group
-from realsim.app.options import FOLDER, JSON, QUIET, workers
+from realsim.app.options import FOLDER, JSON, QUIET, many
+
+if TYPE_CHECKING:
+    from realsim.many import PoolConfig
 
 
 @click.command(
@@ -18,7 +22,7 @@ from realsim.app.options import FOLDER, JSON, QUIET, workers
     ),
 )
 @click.argument("campaign", type=FOLDER)
-@workers(help="Scenes at a time.")
+@many(help="Scenes at a time.")
 @click.option("--plan", "only_plan", is_flag=True, help="Print what would run, and run nothing.")
 @click.option("--without-failed", is_flag=True,
               help="Export what is done, although scenes failed.")  # fmt: skip
@@ -26,7 +30,7 @@ from realsim.app.options import FOLDER, JSON, QUIET, workers
 @QUIET
 @click.pass_context
 def pipeline_command(
-    ctx: click.Context, campaign: Path, workers: int, only_plan: bool, without_failed: bool,
+    ctx: click.Context, campaign: Path, where: "PoolConfig", only_plan: bool, without_failed: bool,
     as_json: bool, quiet: bool,
 ) -> None:  # fmt: skip
     """Run a campaign: the scenes and stages that the file CAMPAIGN names.
@@ -53,7 +57,6 @@ def pipeline_command(
     from realsim.app.console import Console
     from realsim.app.pipeline.campaign import read_campaign
     from realsim.app.pipeline.run import run_pipeline, show_pipeline, show_plan
-    from realsim.many import PoolConfig
 
     root = ctx.find_root().command
     assert isinstance(root, Group)
@@ -62,9 +65,7 @@ def pipeline_command(
     if only_plan:
         show_plan(asked, console)
         return
-    result = run_pipeline(
-        asked, PoolConfig(workers=workers), console, without_failed=without_failed
-    )
+    result = run_pipeline(asked, where, console, without_failed=without_failed)
     show_pipeline(asked, result, console)
     console.result(result.told)
     if result.failed:
