@@ -206,3 +206,42 @@ def test_nothing_is_written_in_an_unknown_format_or_name(tmp_path):
     with pytest.raises(InputError, match="letters"):
         write_camera(tmp_path / "a", CAMERA, format="ros", name="x\ny: 1")
     assert not list(tmp_path.iterdir())
+
+
+def visp(model, *, extra="", size="<image_width>1280</image_width>"):
+    values = "<px>912.25</px><py>911.5</py><u0>641.125</u0><v0>355.75</v0>"
+    return (
+        f"<?xml version='1.0'?><root><!--ViSP--><camera><name>c</name>{size}"
+        f"<image_height>720</image_height>{extra}<model><type>{model}</type>{values}"
+        "<kud>-0.125</kud><kdu>0.13</kdu></model></camera></root>"
+    )
+
+
+def test_visps_camera_is_read_with_its_distortion(tmp_path):
+    """Of both models the one with distortion counts; kud moves a pixel as ViSP says it does."""
+    pinhole = visp("perspectiveProjWithoutDistortion")
+    assert not np.any(read_camera(given_file(tmp_path, "p.xml", pinhole)).distortion)
+    other = "<model><type>perspectiveProjWithoutDistortion</type><px>1</px></model>"
+    text = visp("perspectiveProjWithDistortion", extra=other)
+    camera = read_camera(given_file(tmp_path, "camera.xml", text))
+    assert (camera.width, camera.height) == (1280, 720)
+    x, y = 0.2, -0.1
+    seen = project(camera, np.array([[x, y, 1.0]]))[0]
+    share = 1 - 0.125 * (x * x + y * y)
+    assert np.allclose(seen, [641.125 + 912.25 * x * share, 355.75 + 911.5 * y * share])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (visp("ProjWithKannalaBrandtDistortion"), "ProjWithKannalaBrandtDistortion; perspective"),
+        (visp("perspectiveProjWithDistortion", size=""), "no number <image_width>"),
+        (visp("perspectiveProjWithDistortion").replace("<px>912.25", "<px>x"), "number <px>"),
+        (visp("p").replace("</camera>", "</camera><camera><name>d</name></camera>"), "2 cam"),
+        ("<root></root>", "holds 0 cameras"),
+        ("<!DOCTYPE root [<!ENTITY a 'b'>]>" + visp("x").split("?>")[1], "camera file"),
+    ],
+)  # fmt: skip
+def test_what_is_no_camera_of_visp_is_named(tmp_path, text, words):
+    with pytest.raises(InputError, match=words):
+        read_camera(given_file(tmp_path, "camera.xml", text))

@@ -10,6 +10,7 @@
 | bop | json with fx fy cx cy depth_scale | |
 | realsense | json with fx fy ppx ppy coeffs | |
 | colmap | cameras.txt | |
+| visp | XML with camera, model, px py u0 v0 (camera.xml) | |
 
 COLMAP counts pixels from the image's corner, everybody else here from the first pixel's centre.
 What a file does not say (the image size) or what has no place in the record (a fisheye, skew) is an
