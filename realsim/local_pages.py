@@ -14,6 +14,7 @@ Nothing is encrypted; over a network that is not one's own, forward the port wit
 """
 
 import contextlib
+import gzip
 import hmac
 import http
 import inspect
@@ -24,9 +25,9 @@ import secrets
 import socket
 import stat
 import threading
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs
@@ -304,14 +305,20 @@ def _cookie(headers: Any, name: str) -> str:
 
 WELCOME = (
     "<!doctype html><meta charset=utf-8><title>realsim</title>"
-    '<meta http-equiv="refresh" content="0; url=/"><p><a href="/">Go on</a></p>'
+    '<script>location.replace("/" + location.hash)</script>'
+    '<noscript><meta http-equiv="refresh" content="0; url=/"></noscript>'
+    '<p><a href="/">Go on</a></p>'
 )
 """A page of our own goes on to the review: the browser gives a strict cookie only to such."""
 
 
 @contextlib.contextmanager
-def guarded(door: Door) -> Generator[None]:
+def guarded(door: Door, dress: Callable[[bytes], bytes] | None = None) -> Generator[None]:
     """Put a door before the websocket servers that are started inside this block.
+
+    Args:
+        door: who may enter.
+        dress: makes the HTML page that is served out of the library's; None = it stays as it is.
 
     Viser checks nothing and offers no setting for it, but the websockets library that it calls
     asks a function about every request; the door is put before that function.
@@ -321,14 +328,16 @@ def guarded(door: Door) -> Generator[None]:
     module: Any = server
     with _patching:
         serve = module.serve
-        module.serve = partial(_serve_behind, door, serve)
+        module.serve = partial(_serve_behind, door, None if dress is None else cache(dress), serve)
         try:
             yield
         finally:
             module.serve = serve
 
 
-def _serve_behind(door: Door, serve: Any, *args: Any, **kwargs: Any) -> Any:
+def _serve_behind(
+    door: Door, dress: Callable[[bytes], bytes] | None, serve: Any, *args: Any, **kwargs: Any
+) -> Any:
     inner = kwargs.pop("process_request", None)
 
     async def process_request(connection: Any, request: Any) -> Any:
@@ -345,12 +354,25 @@ def _serve_behind(door: Door, serve: Any, *args: Any, **kwargs: Any) -> Any:
             status = http.HTTPStatus.BAD_REQUEST
             return _response(Answer(status=status, text="The request was not understood."))
         if response is not None:
+            if dress is not None and response.headers.get("Content-Type", "").startswith(
+                "text/html"
+            ):
+                _dressed(response, dress)
             for name, value in _page_headers(request.headers["Host"]).items():
                 response.headers[name] = value
         return response
 
     kwargs.setdefault("logger", _sockets_log)
     return serve(*args, process_request=process_request, **kwargs)
+
+
+def _dressed(response: Any, dress: Callable[[bytes], bytes]) -> None:
+    """Change the page of a response, whether it is compressed or not."""
+    is_packed = response.headers.get("Content-Encoding") == "gzip"
+    page = dress(gzip.decompress(response.body) if is_packed else response.body)
+    response.body = gzip.compress(page, mtime=0) if is_packed else page
+    del response.headers["Content-Length"]
+    response.headers["Content-Length"] = str(len(response.body))
 
 
 def _without_failed_handshakes(record: logging.LogRecord) -> bool:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from realsim.arrays import UInt8
+from realsim.arrays import Array32
 from realsim.errors import InputError, RealsimError
 from realsim.formats.bop.models import model_file
 from realsim.records import ObjectModel, ObjectPose, Scene
@@ -392,13 +392,13 @@ class ReviewedSession:
             self._snapper[1].scene = scene
             return self._snapper[1]
 
-    def residual_rgb(self, objects: Sequence[ObjectPose]) -> UInt8:
-        """Return the colours (N, 3) of the measured points by their distance from the models.
+    def residuals_m(self, objects: Sequence[ObjectPose]) -> Array32:
+        """Return the signed distances (N,) of the measured points from the models [m].
 
         Args:
             objects: where they stand.
         """
-        from realsim.review.placing.depth_residuals import CloudResiduals, residual_rgb
+        from realsim.review.placing.depth_residuals import CloudResiduals
 
         content = self.content()
         with self._measuring:
@@ -413,7 +413,7 @@ class ReviewedSession:
             objects = self.with_models(objects)
             Ts = np.array([o.T_world_obj for o in objects]).reshape(-1, 4, 4)
             meshes = [content.models[o.obj_id].mesh for o in objects]
-            return residual_rgb(self._residuals.against(Ts, meshes))
+            return self._residuals.against(Ts, meshes)
 
 
 def _names(store: SessionStore) -> dict[int, str]:

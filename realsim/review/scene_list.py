@@ -95,15 +95,15 @@ def _sessions_in(folder: Path, deepest: int) -> list[Path]:
 
 
 def worst_first(rows: Sequence[ObjectRow]) -> list[ObjectRow]:
-    """Return the objects, worst verdict first, then by the smallest agreement with the depth.
+    """Return the objects: those that wait for a person first, then by verdict and agreement.
 
-    Judging an object moves it to the end of the list only by its verdict; the order among equals
-    stays, so that the list does not jump under the reviewer's hand.
+    The worst verdict comes first, then the smallest agreement with the measured depth.
     """
 
-    def badness(row: ObjectRow) -> tuple[int, float, int, int]:
+    def badness(row: ObjectRow) -> tuple[bool, int, float, int, int]:
         agree = 0.0 if math.isnan(row.agree) else row.agree
-        return VERDICT_ORDER.index(row.verdict), agree, row.session, row.instance
+        verdict = VERDICT_ORDER.index(row.verdict)
+        return row.is_decided, verdict, agree, row.session, row.instance
 
     return sorted(rows, key=badness)
 

@@ -26,6 +26,7 @@ from realsim.review.content.config import SceneConfig
 from realsim.review.journal import Entry
 from realsim.review.replay.grasp_replay import Motions
 from realsim.review.reviewed_session import ReviewedSession
+from realsim.review.window import page_head
 from realsim.review.window.window import Window
 from realsim.store import SessionStore
 
@@ -155,7 +156,10 @@ class ReviewServer:
         port = local_pages.free_port(self._host, self._port)
         self._stop.clear()
         # Viser prints a banner with its address; the caller says what is to be said.
-        with local_pages.guarded(self._door), contextlib.redirect_stdout(io.StringIO()):
+        with (
+            local_pages.guarded(self._door, page_head.dressed),
+            contextlib.redirect_stdout(io.StringIO()),
+        ):
             server = viser.ViserServer(
                 host=self._host, port=port, label="realsim review", verbose=False
             )

@@ -10,6 +10,7 @@ from realsim.geometry.mesh_shape import sample_surface
 from realsim.geometry.parts import part
 from realsim.review.placing.depth_residuals import (
     CloudResiduals,
+    noise_of,
     residual_rgb,
     residuals,
 )
@@ -93,8 +94,21 @@ def test_what_is_no_cloud_is_refused() -> None:
         CloudResiduals(np.zeros((4, 3)), within_m=0.0)
     with pytest.raises(InputError, match="one of each"):
         residuals(np.zeros((4, 3)), np.eye(4)[None], [])
-    with pytest.raises(InputError, match="positive"):
+    with pytest.raises(InputError, match="times the noise"):
         residual_rgb([0.0], 0.0)
+
+
+def test_noise_looks_like_noise_and_an_error_does_not() -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.normal(scale=0.0007, size=4000)
+    sigma = noise_of(np.append(noise, np.nan))
+    assert sigma == pytest.approx(0.0007, rel=0.05)
+    on = residual_rgb([0.0])[0]
+    assert np.mean((residual_rgb(noise, noise_m=sigma) == on).all(1)) > 0.93
+    off = residual_rgb(noise + 0.003, noise_m=sigma)
+    assert np.mean((off == on).all(1)) < 0.02
+    # A scene in which most stands wrong must not pass for a noisy one.
+    assert noise_of(noise + 0.006) <= 0.001
 
 
 def test_points_of_the_table_are_no_residual_of_what_stands_on_it() -> None:

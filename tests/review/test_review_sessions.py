@@ -51,6 +51,11 @@ def test_worst_comes_first_whatever_the_order() -> None:
         assert [r.key for r in scene_list.worst_first(shuffled)] == expected
 
 
+def test_what_waits_for_a_person_stands_before_what_is_judged() -> None:
+    rows = [row(0, "rejected", 0.1, decided=True), row(1, "accepted", 0.99)]
+    assert [r.instance for r in scene_list.worst_first(rows)] == [1, 0]
+
+
 def test_stepping_through_the_undecided_meets_each_once_and_comes_round() -> None:
     rows = [row(k, "doubtful", 0.1 * k, decided=k in (2, 5)) for k in range(7)]
     for step, order in ((1, [0, 1, 3, 4, 6]), (-1, [6, 4, 3, 1, 0])):
@@ -260,7 +265,7 @@ def test_a_swap_to_a_missing_model_is_shown_and_can_be_undone(session: ReviewedS
         session.model(99)
     objects = session.standing.scene.objects
     assert [o.instance for o in session.with_models(objects)] == [0]
-    assert len(session.residual_rgb(objects)) == len(session.content().cloud)
+    assert len(session.residuals_m(objects)) == len(session.content().cloud)
     assert [o.instance for o in session.snapper().scene.objects] == [0]
     session.undo(swapped, session.standing.state.of(3)[-1], "ada")
     assert seen(session, 3).obj_id == FLAT

@@ -2,15 +2,18 @@
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from realsim.geometry import se3
+from realsim.records import SupportPlane
 from realsim.review import ReviewServer
 from realsim.review.journal import Entry
-from realsim.store import SessionStore
+from realsim.store import SessionStore, load_scene, save_scene
 from tests.support.review_browser import (
     SMALL,
     ReviewBrowser,
@@ -70,6 +73,45 @@ def share_of(image: Any, rgb: tuple[int, int, int]) -> float:
     return float(np.mean(off < 30))
 
 
+def test_a_scene_of_any_up_is_framed_at_once_and_a_link_shows_the_same(
+    browser: ReviewBrowser, server: ReviewServer, tmp_path: Path
+) -> None:
+    shutil.copytree(server.sessions[0].store.folder, tmp_path / "tilted")
+    store = SessionStore.open(tmp_path / "tilted")
+    turned = se3.from_rt(se3.exp_so3(np.array([2.2, 0.4, 0.0])), np.array([0.5, 0.0, 0.0]))
+    save_scene(store, replace(load_scene(store), plane=SupportPlane(T_world_table=turned)))
+    tilted = ReviewServer(store, port=0, config=SMALL)
+    tilted.start()
+    try:
+        with browser.page(tilted.url, width=1280, height=800) as page:
+            page.wait_for("objects judged", "computed:")
+            page.wait_until(lambda: _scene_share(page) > 0.02, "the scene in the middle")
+            assert page.page.title() == "flat \u00b7 two boxes \u00b7 realsim review"
+            panels = page.page.evaluate(PANELS)
+            assert len(panels) == 2 and 1 - sum(panels) / (1280 * 800) >= 0.75
+            page.press("0 tall")
+            page.wait_until(lambda: "object=tall" in page.page.url, "the address")
+            page.tab("Views")
+            link = page.page.url
+        with browser.page(link, width=1280, height=800) as page:
+            page.wait_for("instance 0, object 1", "Stand in this camera")
+            page.wait_until(lambda: "tab=Views" in page.page.url, "the tab")
+    finally:
+        tilted.stop()
+
+
+PANELS = """[...document.querySelectorAll('[data-dock-window], .mantine-Paper-root')]
+    .map(e => e.getBoundingClientRect()).filter(r => r.width > 150 && r.height > 250)
+    .map(r => r.width * r.height)"""
+"""Areas of the panels that float over the scene [px^2]."""
+
+
+def _scene_share(page: ReviewPage) -> float:
+    """Return how much of the window's middle shows the measured table and boxes."""
+    image = page.screenshot()[200:600, 300:900]
+    return share_of(image, TABLE_RGB) + share_of(image, BOX_RGB)
+
+
 def test_the_worst_object_stands_first_and_is_judged(
     browser: ReviewBrowser, server: ReviewServer
 ) -> None:
@@ -78,7 +120,10 @@ def test_the_worst_object_stands_first_and_is_judged(
         page.press("Accept")
         page.wait_message("fill in your name")
         text = loaded(page)
-        assert [r.split(" \u00b7 ")[0] for r in rows(page)] == ["\u25b6 3 flat", "0 tall"]
+        assert [r.splitlines() for r in rows(page)] == [
+            ["\u25b6 3 flat", "computed: doubtful \u00b7 fits 71 %"],
+            ["0 tall", "computed: accepted \u00b7 fits 98 %"],
+        ]
         assert "0 of 2 objects judged" in text and "computed: doubtful" in text
         assert "seen by one view" in text
         page.write("Comment", "it <b>floats</b>")
@@ -94,7 +139,9 @@ def test_the_worst_object_stands_first_and_is_judged(
         page.key("x")
         page.wait_for("2 of 2 objects judged")
         # Judged bad, it is the worst now.
-        page.wait_until(lambda: rows(page)[0].startswith("\u25b6 \u2713 0 tall"), "another order")
+        page.wait_until(
+            lambda: rows(page)[0].startswith("\u25b6 0 tall\n\u2713 rejected"), "another order"
+        )
         page.reload()
         page.wait_for("2 of 2 objects judged")
         page.wait_until(lambda: page.value("Your name") == "ada", "the name")
@@ -185,7 +232,7 @@ def test_filters_legends_and_marks(browser: ReviewBrowser, server: ReviewServer)
         page.wait_for("10 of 80 grasps drawn")
         page.tab("Show")
         page.choose("Points", "distance from the models")
-        page.wait_for("yellow = on the surface", "mm")
+        page.wait_for("pale green = on the surface", "mm")
         page.tab("Correct")
         page.unfold("Symmetry of the model")
         page.choose("It is", "alike after a quarter turn about z")

@@ -22,6 +22,8 @@ BLOCK = 500_000
 """Samples averaged at a time: 70 bytes each."""
 TRIED_PER_POINT = 10
 """Points that are looked at per point of the coarse level: hardly a cell is missed."""
+AREA_POINTS, AREA_CELL = 100_000, 5
+"""Points by which the measured area is found, and edge of its cells in voxels."""
 LEVEL_GROWTH = 4
 """Points of a level over those of the next coarser one: half the distance between neighbours."""
 
@@ -38,10 +40,16 @@ class LeveledCloud:
     """Points of every level, coarse first; the last is N."""
     voxel_m: float
     """Edge of the voxels of the finest level [m]."""
+    area_m2: float
+    """Area of the surfaces that were measured [m^2]."""
 
     def __len__(self) -> int:
         """Return the number of points of the finest level."""
         return len(self.points)
+
+    def spacing_m(self, count: int) -> float:
+        """Return the distance of neighbours among the first `count` points, on a surface [m]."""
+        return float(np.sqrt(self.area_m2 / max(1, min(count, len(self)))))
 
     def level(self, k: int) -> slice:
         """Return what of the points level k is; -1 = the finest."""
@@ -112,7 +120,14 @@ def fused_cloud(
     points, rgb = points[order], rgb[order]
     points.setflags(write=False)
     rgb.setflags(write=False)
-    return LeveledCloud(points=points, colors=rgb, ends=ends, voxel_m=voxel_m)
+    area = _area_m2(points[:AREA_POINTS], voxel_m)
+    return LeveledCloud(points=points, colors=rgb, ends=ends, voxel_m=voxel_m, area_m2=area)
+
+
+def _area_m2(points: Array32, voxel_m: float) -> float:
+    """Return the area that points (N, 3) cover [m^2]: that of the cells of a grid they lie in."""
+    size = AREA_CELL * voxel_m
+    return len(np.unique(_cells(points, size))) * size**2 if len(points) else 0.0
 
 
 def _seen(

@@ -12,8 +12,8 @@ from realsim.errors import InputError
 from realsim.review.content.clouds import LeveledCloud
 from realsim.review.content.config import SceneConfig
 
-POINT_SHARE = 0.8
-"""Size of a point over the distance of neighbours: a surface looks closed, its points apart."""
+POINT_SHARE = 1.0
+"""Size of a point over the distance of neighbours: a surface looks closed."""
 PAUSE_S = 0.02
 """Between two pieces [s], and between two looks whether the last one has left: clicks come first.
 """
@@ -117,14 +117,15 @@ class CloudNodes:
     def _send(self, k: int) -> None:
         piece = self._pieces[k]
         shown = self._cloud.colors if self._colors is None else self._colors
+        # The more points there are, the smaller each is.
+        size = POINT_SHARE * self._cloud.spacing_m(piece.stop)
+        for handle in self._handles:
+            handle.point_size = size
         # In float32: viser's float16 has steps of 1 mm a metre away.
         self._handles.append(
             self._api.add_point_cloud(
                 f"/cloud/{k}", self._cloud.points[piece], shown[piece],
-                point_size=self._point_size(), point_shape="circle", point_shading="flat",
+                point_size=size, point_shape="circle", point_shading="flat",
                 precision="float32",
             )
         )  # fmt: skip
-
-    def _point_size(self) -> float:
-        return POINT_SHARE * self._cloud.voxel_m

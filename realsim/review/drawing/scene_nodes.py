@@ -7,7 +7,7 @@ switched by one message. What is rarely looked at is sent when it is first asked
 
 import threading
 from collections.abc import Callable, Mapping
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import viser
@@ -26,14 +26,18 @@ from realsim.review.placing.ellipsoid import Ellipsoid, unit_sphere
 
 __all__ = ["GraspFilter", "SceneConfig", "SceneNodes"]
 
-Look = Literal["appearance", "verdict", "hidden"]
+Look = Literal["appearance", "verdict", "faded", "hidden"]
 OnInstance = Callable[[int], None]
 OnGrasp = Callable[[int, int], None]
 FRUSTUM_RGB = (70, 96, 140)
 HIGHLIGHT_RGB = (255, 120, 0)
 ELLIPSOID_RGB = (130, 80, 220)
+FADED_RGB, FADED = (150, 155, 165), 0.3
+"""Colour and opacity of faded models: measured points inside them are seen."""
 BOX_MARGIN_M = 0.004
 """The box about a highlighted object keeps so far off it [m], not to be lost in its faces."""
+SIGHT_SHARE, SIGHT_COS = 0.7, 0.8
+"""Share of the line of sight, and cosine of the angle about it, in which a frustum is hidden."""
 FRUSTUM_LINE_M = 0.001
 """Thickness of a frustum's lines [m]."""
 
@@ -131,20 +135,19 @@ class SceneNodes:
         self._root(instance)
         if verdict not in VERDICT_RGB:
             raise InputError(f"'{verdict}' is no verdict; there are {', '.join(VERDICT_RGB)}.")
-        self._verdicts[instance] = verdict
-        if instance in self._judged:
-            self._judged[instance].color = VERDICT_RGB[verdict]
+        if self._verdicts[instance] != verdict:
+            self._verdicts[instance] = verdict
+            self._paint(instance)
 
     def show_objects(self, look: Look) -> None:
-        """Show the objects as they look, in the colours of their verdicts, or not at all.
+        """Show the objects as they look, in the colours of their verdicts, faded, or not at all.
 
         Raises:
             InputError: another look is asked for.
         """
-        if look not in ("appearance", "verdict", "hidden"):
-            raise InputError(
-                f"objects cannot be shown as '{look}'; 'appearance', 'verdict' or 'hidden' can."
-            )
+        if look not in get_args(Look):
+            listed = ", ".join(get_args(Look))
+            raise InputError(f"objects cannot be shown as '{look}'; {listed} are accepted.")
         with self._lock:
             self._look = look
             for instance in self._roots:
@@ -209,12 +212,22 @@ class SceneNodes:
         """Bring what is seen of an object in line with the look that is asked for."""
         if self._look == "appearance" and instance not in self._appearance:
             self._add_appearance(instance)
-        if self._look == "verdict" and instance not in self._judged:
+        plain = self._look in ("verdict", "faded")
+        if plain and instance not in self._judged:
             self._add_judged(instance)
+        self._paint(instance)
         if instance in self._appearance:
             self._appearance[instance].visible = self._look == "appearance"
         if instance in self._judged:
-            self._judged[instance].visible = self._look == "verdict"
+            self._judged[instance].visible = plain
+
+    def _paint(self, instance: int) -> None:
+        """Give an object's plain mesh the colour of its verdict, or fade it."""
+        if instance in self._judged and self._look != "hidden":
+            is_faded = self._look == "faded"
+            color = FADED_RGB if is_faded else VERDICT_RGB[self._verdicts[instance]]
+            handle = self._judged[instance]
+            handle.color, handle.opacity = color, FADED if is_faded else None
 
     def _add_appearance(self, instance: int) -> None:
         mesh = self._content.meshes[self._models[instance]]
@@ -263,6 +276,26 @@ class SceneNodes:
         """Show or hide the cameras."""
         if self._cameras is not None:
             self._cameras.visible = visible
+
+    def clear_sight(self, eye: Array, look_at: Array) -> None:
+        """Hide the frustums between an eye (3,) and what it looks at (3,), and show the others [m].
+
+        A frustum in the way is one in the nearer `SIGHT_SHARE` of the line of sight or nearer, in a
+        cone about it.
+        """
+        views = self._content.shown_views
+        offset = np.array([v.T_world_cam for v in views])[:, :3, 3] - eye
+        line = np.asarray(look_at) - eye
+        length = float(np.linalg.norm(line))
+        along = offset @ line / max(length, 1e-9)
+        far = np.linalg.norm(offset, axis=1)
+        in_cone = along > SIGHT_COS * far
+        blocks = (in_cone & (far < SIGHT_SHARE * length)) | (far < 4 * self._config.frustum_m)
+        with self._lock:
+            for view, is_hidden in zip(views, blocks.tolist(), strict=True):
+                handle = self._frustums.get(view.index)
+                if handle is not None and handle.visible == is_hidden:
+                    handle.visible = not is_hidden
 
     def show_table(self, visible: bool) -> None:
         """Show or hide the table."""

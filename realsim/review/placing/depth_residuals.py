@@ -25,10 +25,15 @@ FULL_M = 0.005
 """Distance at which the colours are full [m]: what tells a wrong pose from a right one."""
 TABLE_M = 0.004
 """How far from the plane points may be the table's [m]: twice the depth's noise at 0.4 m."""
-STOPS_RGB = np.array(
-    [[49, 54, 149], [116, 173, 209], [255, 255, 191], [253, 141, 60], [165, 0, 38]], np.float64
-)
-"""Blue, pale yellow, red: ColorBrewer's RdYlBu, which stays apart without red-green vision."""
+STOPS_RGB = np.array([[49, 54, 149], [116, 173, 209], [253, 141, 60], [165, 0, 38]], np.float64)
+"""Blue to the noise, and from the noise to red: ColorBrewer's RdYlBu, which stays apart without
+red-green vision."""
+NOISE_RGB = (205, 226, 190)
+"""Colour of what the depth's noise explains: pale, whatever its sign."""
+NOISE_M = (0.0005, 0.001)
+"""Least and greatest noise that is taken for such [m]: a pose off by more is never hidden in it."""
+SIGMAS = 2.0
+"""Distances up to so many standard deviations of the noise are noise."""
 NONE_RGB = (140, 140, 140)
 """Colour of a point that is near no model."""
 
@@ -154,45 +159,70 @@ def residuals(
     return CloudResiduals(points, within_m=within_m).against(T_world_objs, meshes)
 
 
-def residual_rgb(residuals_m: ArrayLike, full_m: float = FULL_M) -> Rgb:
+def noise_of(residuals_m: ArrayLike) -> float:
+    """Return the standard deviation of the depth's noise [m], within `NOISE_M`.
+
+    Taken from the median distance: most objects stand right, or at least most of their surface.
+
+    Args:
+        residuals_m: (N,) signed distances [m]; NaN = none.
+    """
+    r = np.abs(np.asarray(residuals_m, dtype=np.float64).reshape(-1))
+    r = r[np.isfinite(r)]
+    return float(np.clip(1.4826 * np.median(r) if len(r) else NOISE_M[0], *NOISE_M))
+
+
+def residual_rgb(
+    residuals_m: ArrayLike, full_m: float = FULL_M, noise_m: float = NOISE_M[0]
+) -> Rgb:
     """Return the colours (N, 3) of signed distances (N,) [m]: blue inside, red outside, grey none.
+
+    What is within `SIGMAS` of the noise is pale: noise must not look like an error.
 
     Args:
         residuals_m: (N,); NaN = none.
         full_m: distance at which the colour is full [m].
+        noise_m: standard deviation of the measured depth [m].
 
     Raises:
-        InputError: `full_m` is not positive.
+        InputError: `full_m` is not more than the noise.
     """
-    if not 0 < full_m < np.inf:
-        raise InputError(f"colours that are full at {full_m} m; a positive distance is needed.")
+    if not 0 <= SIGMAS * noise_m < full_m < np.inf:
+        raise InputError(
+            f"colours that are full at {full_m} m with a noise of {noise_m} m; a distance of more "
+            f"than {SIGMAS:g} times the noise is needed."
+        )
     r = np.asarray(residuals_m, dtype=np.float32).reshape(-1)
     # A table of 511 colours instead of three interpolations of 200,000 points.
-    levels = np.linspace(0, len(STOPS_RGB) - 1, 511)
-    at = np.arange(len(STOPS_RGB))
+    levels = np.linspace(-full_m, full_m, 511)
+    edge = SIGMAS * noise_m
+    at = np.array([-full_m, -edge, edge, full_m])
     table = np.stack([np.interp(levels, at, STOPS_RGB[:, k]) for k in range(3)], axis=-1)
+    table[np.abs(levels) <= edge] = NOISE_RGB
     colors = np.concatenate([np.rint(table), [NONE_RGB]]).astype(np.uint8)
     known = np.isfinite(r)
     step = np.rint(255.0 * np.clip(np.where(known, r, 0.0) / full_m, -1.0, 1.0)).astype(np.int64)
     return colors[np.where(known, step + 255, 511)]
 
 
-def legend(full_m: float = FULL_M, within_m: float = 0.01) -> Legend:
+def legend(full_m: float = FULL_M, within_m: float = 0.01, noise_m: float = NOISE_M[0]) -> Legend:
     """Return what the colours mean.
 
     Args:
         full_m: as of `residual_rgb` [m].
         within_m: as of `residuals` [m].
+        noise_m: as of `residual_rgb` [m].
     """
-    values = np.linspace(-full_m, full_m, len(STOPS_RGB))
+    edge = SIGMAS * noise_m
+    values = np.array([-full_m, -0.5 * (full_m + edge), 0.0, 0.5 * (full_m + edge), full_m])
     words = (
-        f"distance of the measured points from the models: blue = {1e3 * full_m:g} mm or more "
-        f"inside, yellow = on the surface, red = {1e3 * full_m:g} mm or more in front of it, "
-        f"grey = farther than {1e3 * within_m:g} mm from every model"
+        f"distance of the measured points from the models: pale green = on the surface, within the "
+        f"noise of {1e3 * edge:.2g} mm; red = in front of it, blue = inside, full at "
+        f"{1e3 * full_m:g} mm; grey = farther than {1e3 * within_m:g} mm from every model"
     )
     return Legend(
-        values_mm=tuple(float(v) for v in 1e3 * values), rgb=residual_rgb(values, full_m),
-        words=words,
+        values_mm=tuple(float(v) for v in 1e3 * values),
+        rgb=residual_rgb(values, full_m, noise_m), words=words,
     )  # fmt: skip
 
 

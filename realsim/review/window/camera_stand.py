@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from realsim.arrays import Array
 from realsim.geometry import se3
@@ -107,11 +108,16 @@ class StandIn:
 
     def first_look(self) -> None:
         """Look at the whole scene."""
-        look, camera = self._window.content.look, self._window.client.camera
+        look = self._window.content.look
+        self.look_from(look.position, look.look_at)
+
+    def look_from(self, eye: ArrayLike, look_at: ArrayLike) -> None:
+        """Stand at a place (3,) and look at another (3,), the table's normal up [m]."""
+        camera = self._window.client.camera
         with self._window.client.atomic():
-            camera.up_direction = look.up
-            camera.position = look.position
-            camera.look_at = look.look_at
+            camera.up_direction = self._window.content.look.up
+            camera.position = np.asarray(eye, dtype=np.float64)
+            camera.look_at = np.asarray(look_at, dtype=np.float64)
 
     def look_at(self, center: Array, radius_m: float) -> None:
         """Look at an object from outside of the scene, where no other stands before it.
@@ -122,7 +128,7 @@ class StandIn:
         """
         if self.view is not None:
             return
-        content, camera = self._window.content, self._window.client.camera
+        content = self._window.content
         up = content.look.up
         offset = center - content.region.center
         if np.linalg.norm(offset - up * (up @ offset)) < NEAR_MIDDLE_M:
@@ -130,10 +136,7 @@ class StandIn:
         side = offset - up * (up @ offset)
         side = side / max(float(np.linalg.norm(side)), 1e-9)
         direction = np.cos(LOOK_DOWN_RAD) * side + np.sin(LOOK_DOWN_RAD) * up
-        with self._window.client.atomic():
-            camera.up_direction = up
-            camera.position = center + (LOOK_RADII * radius_m + LOOK_M) * direction
-            camera.look_at = center
+        self.look_from(center + (LOOK_RADII * radius_m + LOOK_M) * direction, center)
 
     def look_past(self, center: Array, before: Array) -> None:
         """Look at a place from afar, so that what stands at another one is beside it.
@@ -144,7 +147,7 @@ class StandIn:
         """
         if self.view is not None:
             return
-        content, camera = self._window.content, self._window.client.camera
+        content = self._window.content
         up = content.look.up
         away = center - before
         away = away - up * (up @ away)
@@ -153,10 +156,7 @@ class StandIn:
         direction = np.cos(BESIDE_DOWN_RAD) * side + np.sin(BESIDE_DOWN_RAD) * up
         eyes = np.array([v.T_world_cam for v in content.views])[:, :3, 3]
         distance = BEHIND_CAMERAS * float(np.median(np.linalg.norm(eyes - center, axis=1)))
-        with self._window.client.atomic():
-            camera.up_direction = up
-            camera.position = center + distance * direction
-            camera.look_at = center
+        self.look_from(center + distance * direction, center)
 
     def close(self) -> None:
         """Draw no more: the browser is gone."""

@@ -11,8 +11,17 @@ from realsim.review.window import window_text
 if TYPE_CHECKING:
     from realsim.review.window.window import Window
 
+LIST_PX, LIST_HEIGHT_PX, EDGE_PX = 230, 340, 8
+"""Width and height of the list, and how far from the window's corner it floats [px]."""
 ROWS = 16
 """Objects on one page of the list: as many as stand one above the other on a laptop's screen."""
+ROW_STYLE = """
+:is({ids}) {{ height: auto !important; min-height: 2.9em; padding: 3px 8px !important; }}
+:is({ids}) .mantine-Button-inner {{ justify-content: flex-start; }}
+:is({ids}) .mantine-Button-label {{ white-space: pre-line; text-align: left; line-height: 1.3;
+  overflow-wrap: anywhere; height: auto; }}
+"""
+"""Two lines that begin at one place and are never cut off."""
 ALL_SCENES = "all scenes"
 SHOWN: dict[str, scene_list.Which] = {
     "all objects": "all",
@@ -33,27 +42,25 @@ class ListPanel:
         self._window = window
         gui = window.client.gui
         panel = gui.add_panel()
-        panel.dock_left()
-        panel.set_width(290)
+        panel.float(x=EDGE_PX, y=EDGE_PX, width=LIST_PX, height=LIST_HEIGHT_PX)
         self._page = 0
         self._rows: list[ObjectRow] = []
         names = [s.name for s in window.server.sessions]
         self._numbers = {_scene_label(k, n, names): k for k, n in enumerate(names)}
         with panel.add_tab("Scenes and objects"):
-            self._head = gui.add_markdown("")
+            self._head = gui.add_html("")
             self._scene = gui.add_dropdown(
                 "Scene", (ALL_SCENES, *self._numbers), visible=len(names) > 1
             )
             self._which = gui.add_dropdown("Show", tuple(SHOWN))
             self._step = gui.add_button_group(
-                "Undecided", ("\u25c0 Previous", "Next \u25b6"), hint="Keys P and N."
+                "Undecided", ("\u25c0 Prev", "Next \u25b6"), hint="Keys P and N."
             )
             self._buttons = [gui.add_button("-", visible=False) for _ in range(ROWS)]
             self._pages = gui.add_button_group("Page", ("\u2191 worse", "\u2193 better"))
             self._remarks = gui.add_markdown("")
-        # Names that begin at one place are read faster than names in the middle.
-        ids = ", ".join(f"[id='{b._impl.uuid}'] .mantine-Button-inner" for b in self._buttons)  # pyright: ignore[reportPrivateUsage]
-        gui.add_html(f"<style>{ids} {{ justify-content: flex-start; }}</style>")
+        self._ids = ", ".join(f"button[id='{_uuid(b)}']" for b in self._buttons)
+        self._style = gui.add_html("")
         for k, button in enumerate(self._buttons):
             button.on_click(window.guarded(lambda _, k=k: self._open(k)))
         self._scene.on_update(window.guarded(lambda _: self._filtered()))
@@ -64,10 +71,8 @@ class ListPanel:
     def refresh(self) -> None:
         """Show the list as the journals have it."""
         window, every = self._window, self._window.rows()
-        judged, total = scene_list.counts(every)
         scenes = len(window.server.sessions)
-        more = f" in {scenes} scenes" if scenes > 1 else ""
-        self._head.content = f"**{judged} of {total}** objects judged{more}"
+        self._head.content = window_text.progress_html(*scene_list.counts(every), scenes)
         chosen = every
         if self._scene.value in self._numbers:
             number = self._numbers[self._scene.value]
@@ -76,24 +81,27 @@ class ListPanel:
         pages = max(1, -(-len(self._rows) // ROWS))
         self._page = min(self._page, pages - 1)
         self._pages.visible = pages > 1
-        for k, button in enumerate(self._buttons):
-            self._show(button, self._page * ROWS + k)
+        styles = [self._show(b, self._page * ROWS + k) for k, b in enumerate(self._buttons)]
+        style = f"<style>{ROW_STYLE.format(ids=self._ids)}{''.join(styles)}</style>"
+        if style != self._style.content:
+            self._style.content = style
         lines = [f"- {window_text.escaped(text)}" for text in window.server.remarks]
         if pages > 1:
             lines.insert(0, f"page {self._page + 1} of {pages}")
         self._remarks.content = "\n".join(lines)
 
-    def _show(self, button: viser.GuiButtonHandle, at: int) -> None:
+    def _show(self, button: viser.GuiButtonHandle, at: int) -> str:
+        """Show a row of the list, or none; return its style."""
         if at >= len(self._rows):
             button.visible = False
-            return
+            return ""
         row, window = self._rows[at], self._window
         scene = window.server.sessions[row.session].name
         label = window_text.list_label(row, scene, with_scene=len(self._numbers) > 1)
         is_here = window.is_open and row.key == (window.session.number, window.selected)
         button.label = f"\u25b6 {label}" if is_here else label
-        button.color = window_text.verdict_rgb(row.verdict)
         button.visible = True
+        return window_text.row_style(_uuid(button), row, is_here=is_here)
 
     def _open(self, k: int) -> None:
         at = self._page * ROWS + k
@@ -116,3 +124,8 @@ class ListPanel:
 def _scene_label(number: int, name: str, names: list[Any]) -> str:
     """Return a scene's name; with its number where two scenes have one name."""
     return name if names.count(name) == 1 else f"{name} ({number + 1})"
+
+
+def _uuid(button: viser.GuiButtonHandle) -> str:
+    """Return the id of a button's element in the page."""
+    return button._impl.uuid  # pyright: ignore[reportPrivateUsage]

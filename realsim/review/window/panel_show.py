@@ -1,9 +1,10 @@
 """The panel of what is shown: colours of the points, looks of the objects, how sure a pose is."""
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import viser
 
+from realsim.review.drawing.scene_nodes import Look
 from realsim.review.placing import depth_residuals
 from realsim.review.placing.ellipsoid import ellipsoid_of
 from realsim.review.reviewed_session import Standing
@@ -12,7 +13,6 @@ from realsim.review.window.latest import LatestOnly
 if TYPE_CHECKING:
     from realsim.review.window.window import Window
 
-Look = Literal["appearance", "verdict", "hidden"]
 LOOKS: dict[str, Look] = {
     "as they look": "appearance",
     "in the colour of the verdict": "verdict",
@@ -43,7 +43,7 @@ class ShowPanel:
         self._look = gui.add_dropdown("Objects", tuple(LOOKS))
         self._cloud = gui.add_checkbox("Measured points", True)
         self._colors = gui.add_dropdown("Points", (PHOTO, RESIDUAL))
-        self._legend = gui.add_html(_legend_html(), visible=False)
+        self._legend = gui.add_html("", visible=False)
         every = gui.add_button(
             "Load all points", icon=viser.Icon.DOTS, hint="More detail, slower to turn."
         )
@@ -90,8 +90,11 @@ class ShowPanel:
 
     def _switch(self) -> None:
         nodes, free = self._window.nodes, not self._is_in_camera
+        look = LOOKS[self._look.value] if free else "hidden"
+        if look == "appearance" and self._colors.value == RESIDUAL:
+            look = "faded"  # points inside a model are the ones that matter
         with self._window.client.atomic():
-            nodes.show_objects(LOOKS[self._look.value] if free else "hidden")
+            nodes.show_objects(look)
             nodes.show_cloud(self._cloud.value and free)
             nodes.show_cameras(self._cameras.value and free)
             nodes.show_table(self._table.value and free)
@@ -102,6 +105,8 @@ class ShowPanel:
         self._legend.visible = is_residual
         wanted = self._window.standing if is_residual else None
         if wanted is not self._colored:
+            if (wanted is None) != (self._colored is None):
+                self._switch()
             self._colored = wanted
             self._painter.ask()
 
@@ -113,7 +118,10 @@ class ShowPanel:
         def paint() -> None:
             colors = None
             if isinstance(wanted, Standing):
-                colors = window.session.residual_rgb(wanted.scene.objects)
+                r = window.session.residuals_m(wanted.scene.objects)
+                noise_m = depth_residuals.noise_of(r)
+                colors = depth_residuals.residual_rgb(r, noise_m=noise_m)
+                self._legend.content = _legend_html(noise_m)
             if self._colored is wanted:
                 window.nodes.set_cloud_colors(colors)
 
@@ -133,12 +141,12 @@ class ShowPanel:
         self._said.content = text
 
 
-def _legend_html() -> str:
-    """Return the legend of the residuals."""
-    legend = depth_residuals.legend()
+def _legend_html(noise_m: float) -> str:
+    """Return the legend of the residuals at a noise of the depth [m]."""
+    legend = depth_residuals.legend(noise_m=noise_m)
     cells = "".join(
         f'<div style="flex:1;background:rgb({r},{g},{b});color:{_ink(r, g, b)};'
-        f'text-align:center;padding:3px 0">{value:+g}</div>'
+        f'text-align:center;padding:3px 0">{value:+.2g}</div>'
         for value, (r, g, b) in zip(legend.values_mm, legend.rgb.tolist(), strict=True)
     )
     return (

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import viser
+from numpy.typing import ArrayLike
 
 from realsim.arrays import Array
 from realsim.errors import InputError
@@ -104,6 +105,10 @@ class ViewsPanel:
         placed, mesh = window.placed, window.model_of(window.placed).mesh
         center = se3.transform(placed.T_world_obj, mesh.bounds.mean(0)[None])[0]
         self._stand.look_at(center, 0.5 * float(np.linalg.norm(mesh.extent)))
+
+    def look_from(self, eye: ArrayLike, look_at: ArrayLike) -> None:
+        """Stand at a place (3,) and look at another (3,), in world [m]."""
+        self._stand.look_from(eye, look_at)
 
     def look_past(self, base: Array) -> None:
         """Look at the selected object so that an arm on this base (3,) is not in the way [m]."""

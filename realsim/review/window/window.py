@@ -25,6 +25,7 @@ from realsim.review.refusals import SessionGone, disk_words
 from realsim.review.replay.grasp_replay import Motions
 from realsim.review.reviewed_session import ReviewedSession, Standing
 from realsim.review.window import window_text
+from realsim.review.window.browser import Browser
 from realsim.review.window.gui_values import refuse_foreign_values
 from realsim.review.window.keys import bind_keys
 from realsim.review.window.panel_correct import CorrectPanel
@@ -34,12 +35,9 @@ from realsim.review.window.panel_object import ObjectPanel
 from realsim.review.window.panel_show import ShowPanel
 from realsim.review.window.panel_views import ViewsPanel
 
-LIST_PX, PANEL_PX = 290, 400
-"""Widths of the list on the left and of the panel on the right [px]."""
-NAME_KEY = "realsim reviewer"
-"""Under which the browser keeps the reviewer's name."""
-NAME_WAIT_S = 60.0
-"""How long a browser is waited for that does not tell the name it keeps [s]; nothing else waits."""
+PANEL_PX, PANEL_HEIGHT_PX, EDGE_PX = 300, 560, 8
+"""Width and height of the panel on the right, and how far from the window's edges it floats [px]:
+with the list it leaves three quarters of 1280x800 to the scene."""
 log = logging.getLogger(__name__)
 
 
@@ -93,14 +91,14 @@ class Window:
         """Instance of the object that is looked at."""
         self._opened: Opened | None = None
         self._busy = threading.Lock()
+        self._browser = Browser(self)
         self._seen: object = None
         self._standing: Standing | None = None
         self._is_closed = False
         self._trouble: Exception | None = None
         """What kept the journals from being shown when they were looked at last."""
         gui = client.gui
-        gui.main_panel.dock_right()
-        gui.main_panel.set_width(PANEL_PX)
+        gui.main_panel.float(x=-EDGE_PX, y=EDGE_PX, width=PANEL_PX, height=PANEL_HEIGHT_PX)
         self._name = gui.add_text("Your name", reviewer, hint="Decisions are signed with it.")
         self._message = gui.add_html("")
         self.list = ListPanel(self)
@@ -115,19 +113,28 @@ class Window:
             self.grasps = GraspsPanel(self)
         with tabs.add_tab("Show"):
             self.show = ShowPanel(self)
-        self._name.on_update(self.guarded(lambda _: self._keep_name()))
+        self._name.on_update(self.guarded(lambda _: self._browser.keep_name(self.reviewer)))
+        self._up = np.array([0.0, 0.0, 1.0])
+        """What is up in the browser's scene, in world."""
+        client.camera.on_update(lambda _: self._looked())
         bind_keys(self)
         refuse_foreign_values(gui, self.refuse)
 
     def start(self) -> None:
-        """Open the scene of the worst object that nobody judged, and recall the reviewer's name."""
+        """Open what the address names, else the worst object that nobody judged."""
+        if not self._browser.go_to_place():
+            self._go_to_worst()
+        kept = "" if self.reviewer else self._browser.name()
+        if kept and not self.reviewer:
+            self._name.value = kept
+
+    def _go_to_worst(self) -> None:
         rows = scene_list.worst_first(self.rows())
         first = scene_list.next_undecided(rows, None, 1) or (rows[0] if rows else None)
         if first is not None:
             self.go_to(*first.key)
         elif self.server.sessions:
             self.go_to(0, None)
-        self._recall_name()
 
     def close(self) -> None:
         """Forget the browser: it is gone."""
@@ -259,6 +266,13 @@ class Window:
                 self.selected, self._seen, self._standing = None, None, None
                 for panel in (self.views, self.grasps, self.show):
                     panel.opened()
+            # A browser maps a camera by the direction that was up before the batch it comes in:
+            # the camera is sent when the browser has answered that it has turned the scene.
+            self.client.flush()
+            if not np.allclose(content.look.up, self._up):
+                self._browser.wait()
+                self._up = content.look.up
+            with self.lock:
                 self.views.first_look()
 
     # --- what changed -----------------------------------------------------------------------------
@@ -299,6 +313,14 @@ class Window:
         elif trouble is None and self._trouble is not None:
             self.say("The session can be read again.")
         self._trouble = trouble
+
+    def _looked(self) -> None:
+        """The browser's camera was moved: the address follows, and frustums make way."""
+        if self._is_closed or self._opened is None:
+            return
+        camera = self.client.camera
+        self._opened.nodes.clear_sight(camera.position, camera.look_at)
+        self._browser.tell_place(self._opened.session.name)
 
     def _place_all(self) -> None:
         """Put every object where the reviewers left it, in the colour of its verdict."""
@@ -406,22 +428,6 @@ class Window:
             note.remove()
             self._busy.release()
             self.correct.enable(True)
-
-    # --- the reviewer's name ----------------------------------------------------------------------
-
-    def _recall_name(self) -> None:
-        """Take the name that this browser keeps, unless one was given."""
-        if self.reviewer:
-            return
-        try:
-            kept = self.client.local_storage.get_item(NAME_KEY, timeout=NAME_WAIT_S)
-        except (RuntimeError, TimeoutError):
-            return  # a browser that keeps nothing: the reviewer writes the name
-        if kept and not self.reviewer:
-            self._name.value = kept
-
-    def _keep_name(self) -> None:
-        self.client.local_storage.set_item(NAME_KEY, self.reviewer.strip())
 
 
 def _tell(note: Any, body: str, done: int, total: int) -> None:

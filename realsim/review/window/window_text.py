@@ -197,15 +197,43 @@ def clock(entry: Entry) -> str:
 
 
 def list_label(row: ObjectRow, scene: str, *, with_scene: bool) -> str:
-    """Return one line of the list."""
-    parts = [f"{row.instance} {row.name}"]
+    """Return the two lines of an object in the list: what it is, and what is said of it."""
+    what = [f"{row.instance} {row.name}"]
     if with_scene:
-        parts.insert(0, scene)
-    parts.append(row.verdict + (" (moved)" if row.is_changed else ""))
-    if not row.is_decided and np.isfinite(row.agree):
-        parts.append(f"fits {percent(row.agree)}")
-    mark = "\u2713 " if row.is_decided else ""
-    return one_line(mark + " \u00b7 ".join(parts))
+        what.append(scene)
+    moved = ["moved"] if row.is_changed else []
+    if row.is_decided:
+        said = [f"\u2713 {row.verdict} by a person", *moved]
+    else:
+        said = [f"computed: {row.verdict}", *moved]
+        if np.isfinite(row.agree):
+            said.append(f"fits {100 * row.agree:.0f} %")
+    return "\n".join(one_line(" \u00b7 ".join(parts)) for parts in (what, said))
+
+
+def progress_html(judged: int, total: int, scenes: int) -> str:
+    """Return how far the review has come, in words and as a bar."""
+    more = f" in {scenes} scenes" if scenes > 1 else ""
+    share = 100.0 * judged / max(total, 1)
+    return (
+        f'<div style="margin:2px 10px"><b>{judged} of {total}</b> objects judged{more}'
+        '<div style="height:5px;margin-top:4px;background:#dee2e6;border-radius:3px">'
+        f'<div style="height:5px;width:{share:.1f}%;background:#1864ab;border-radius:3px"></div>'
+        "</div></div>"
+    )
+
+
+def row_style(uuid: str, row: ObjectRow, *, is_here: bool) -> str:
+    """Return the style of a list's button: a person's word is filled, a computed one an edge."""
+    color = f"rgb{verdict_rgb(row.verdict)}"
+    button = f"button[id='{uuid}']"
+    frame = "outline:2px solid #ff7800;outline-offset:1px;" if is_here else ""
+    if row.is_decided:
+        return f"{button} {{ background:{color} !important; color:#fff !important; {frame} }}"
+    return (
+        f"{button} {{ background:#fff !important; color:#212529 !important; "
+        f"border:1px solid #ced4da; border-left:6px dashed {color}; {frame} }}"
+    )
 
 
 def message_html(text: str, kind: str) -> str:

@@ -1,0 +1,49 @@
+// The review's page: the address says what is looked at, so that a link shows a colleague the same.
+// The server reads and writes it as an item of the browser's storage that is none: PLACE.
+(() => {
+  const PLACE = "realsim place", read = Storage.prototype.getItem, write = Storage.prototype.setItem;
+  const is = (key) => String(key).endsWith(PLACE);
+  const said = () => new URLSearchParams(location.hash.slice(1));
+  const tell = (place) => history.replaceState(null, "", "#" + place.toString());
+  Storage.prototype.getItem = function (key) {
+    return is(key) ? said().toString() : read.call(this, key);
+  };
+  Storage.prototype.setItem = function (key, value) {
+    if (!is(key)) return write.call(this, key, value);
+    const place = new URLSearchParams(value), tab = said().get("tab");
+    if (tab) place.set("tab", tab);
+    tell(place);
+    const words = [place.get("object"), place.get("scene"), "realsim review"];
+    document.title = words.filter((word) => word).join(" \u00b7 ");
+  };
+  addEventListener("hashchange", () => location.reload());
+  // The chosen tab is the browser's own.
+  const tabs = () => [...document.querySelectorAll("[role=tab]")];
+  addEventListener("click", (event) => {
+    const tab = event.target instanceof Element && event.target.closest("[role=tab]");
+    if (!tab) return;
+    const place = said();
+    place.set("tab", tab.textContent.trim());
+    tell(place);
+  });
+  const wanted = said().get("tab");
+  const look = new MutationObserver(() => {
+    const tab = tabs().find((t) => t.textContent.trim() === wanted);
+    if (!tab) return;
+    look.disconnect();
+    const at = tab.getBoundingClientRect();
+    const where = { bubbles: true, clientX: at.x + at.width / 2, clientY: at.y + at.height / 2, button: 0 };
+    for (const kind of ["pointerdown", "pointerup", "click"])
+      tab.dispatchEvent(new PointerEvent(kind, { ...where, pointerId: 1, isPrimary: true }));
+  });
+  if (wanted) look.observe(document, { childList: true, subtree: true });
+  addEventListener("DOMContentLoaded", () => {
+    const canvas = document.createElement("canvas");
+    if (canvas.getContext("webgl2") || canvas.getContext("webgl")) return;
+    const note = document.createElement("p");
+    note.className = "realsim-no-webgl";
+    note.textContent = "This browser cannot draw in three dimensions (WebGL is off), so the scene stays "
+      + "empty. Switch on hardware acceleration in its settings, or use another browser.";
+    document.body.append(note);
+  });
+})();
