@@ -1,0 +1,182 @@
+"""Records of what results were made of, and results made again from them."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from threadpoolctl import threadpool_limits
+
+from realsim.app.cli import commands
+from realsim.app.reproduce.compare import compare_folders
+from realsim.errors import InputError
+from realsim.store import atomic, provenance
+from registered_sessions import table_session
+from school_sessions import QUICK, registered
+
+
+def realsim(*words: object) -> Result:
+    """Run the command line in this process."""
+    return CliRunner().invoke(commands, [str(w) for w in words])
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    """Return every file of a session but its list, caches and what tells runs apart."""
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes()
+        for p in sorted(folder.rglob("*"))
+        if p.is_file() and "cache" not in p.parts and not p.name.endswith(provenance.MADE_AGAIN)
+    }
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session that is not registered."""
+    return table_session(tmp_path_factory.mktemp("captured") / "s", views=4).folder
+
+
+@pytest.fixture(scope="module")
+def made(captured: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same session registered and annotated, with one thread of BLAS and OpenMP."""
+    folder = tmp_path_factory.mktemp("made") / "s"
+    shutil.copytree(captured, folder)
+    with threadpool_limits(1):
+        for words in (("register", folder, "--object", "mug"), ("annotate", folder)):
+            result = realsim(*words, "--quiet")
+            assert result.exit_code == 0, (result.output, result.exception)
+    return folder
+
+
+@pytest.fixture
+def copy(made: Path, tmp_path: Path) -> Path:
+    """A copy to be changed."""
+    shutil.copytree(made, tmp_path / "s")
+    return tmp_path / "s"
+
+
+def test_register_gives_the_same_bytes_with_other_threads(
+    captured: Path, made: Path, tmp_path: Path
+) -> None:
+    again = tmp_path / "s"
+    shutil.copytree(captured, again)
+    with threadpool_limits(2):
+        assert realsim("register", again, "--object", "mug", "--quiet").exit_code == 0
+        assert realsim("annotate", again, "--workers", 2, "--quiet").exit_code == 0
+    first, second = bytes_of(made), bytes_of(again)
+    assert {"registration/single_view.json", "registration/report.json"} <= set(first)
+    assert [n for n in first if first[n] != second.get(n)] == []
+    assert set(first) == set(second)
+    assert "cpu_s" not in first["registration/report.json"].decode()
+
+
+def test_a_record_names_versions_settings_inputs_and_command(made: Path) -> None:
+    record, run = provenance.read(made, "register")
+    assert record.request["objects"] == ["mug"]
+    assert record.config["refine"] and record.versions["open3d-cpu"][0].isdigit()
+    assert {"python", "platform", "realsim"} <= set(record.versions)
+    for name in ("rgb/000002.png", "depth/000000.png", "robot.jsonl"):
+        assert record.inputs[name] == provenance.sha256_of(made / name)
+    assert record.inputs["calibration/hand_eye.json"] == provenance.ABSENT
+    assert run.command[:1] == ("register",) and run.ended and run.machine
+    assert {t["name"] for t in run.times} >= {"register", "search"}
+    assert str(made) not in (made / provenance.file_of("register")).read_text()
+
+
+@pytest.mark.parametrize("stage", ["register", "annotate"])
+def test_a_session_is_made_again_and_left_alone(made: Path, stage: str) -> None:
+    before = {p: p.stat().st_mtime_ns for p in made.rglob("*")}
+    result = realsim("reproduce", made, stage, "--json")
+    assert result.exit_code == 0, (result.output, result.exception)
+    told = json.loads(result.stdout)
+    assert told["equal"] and told["files"] > 20 and told["differing"] == []
+    assert before == {p: p.stat().st_mtime_ns for p in made.rglob("*")}
+
+
+def test_what_differs_is_named_with_its_size(copy: Path) -> None:
+    path = copy / "annotations/000001.json"
+    value = json.loads(path.read_text())
+    value["digest"], value["spoiled"] = value.get("digest"), 3
+    path.write_text(json.dumps(value))
+    mask = next((copy / "mask").glob("*.png"))
+    mask.unlink()
+    result = realsim("reproduce", copy, "annotate", "--json")
+    assert result.exit_code == 1, (result.output, result.exception)
+    rows = {r["path"]: r["words"] for r in json.loads(result.stdout)["differing"]}
+    assert set(rows) == {"annotations/000001.json", f"mask/{mask.name}"}
+    assert rows[f"mask/{mask.name}"] == ["it is new"]
+    assert any("spoiled: 3 -> (nothing)" in w for w in rows["annotations/000001.json"])
+
+
+def test_changed_inputs_are_named(copy: Path) -> None:
+    model = next((copy / "models").glob("*.ply"))
+    model.write_bytes(model.read_bytes() + b"\n")
+    (copy / "review").mkdir(exist_ok=True)
+    (copy / "review/journal.jsonl").write_text("")
+    result = realsim("reproduce", copy, "register")
+    assert isinstance(result.exception, InputError)
+    assert "2 inputs" in str(result.exception) and f"models/{model.name}: " in str(result.exception)
+    assert "review/journal.jsonl: (nothing)" in str(result.exception)
+
+
+def test_other_versions_are_told_and_it_goes_on(copy: Path) -> None:
+    path = copy / provenance.file_of("annotate")
+    record = json.loads(path.read_text())
+    record["versions"]["numpy"] = "1.0"
+    path.write_text(json.dumps(record))
+    result = realsim("reproduce", copy, "annotate", "--json")
+    told = json.loads(result.stdout)
+    assert told["other_versions"][0].startswith("numpy 1.0 -> ")
+    assert [r["path"] for r in told["differing"]] == ["stages/annotate.json"]
+
+
+def test_what_cannot_be_made_again_is_said(copy: Path, tmp_path: Path) -> None:
+    for words, told in (
+        ((copy,), "say which stage"),
+        ((copy, "school"), "holds no stages/school.json"),
+        ((tmp_path / "none",), "is no folder"),
+        ((tmp_path, "school"), "is no session"),
+        ((tmp_path,), "holds no provenance.json"),
+    ):
+        result = realsim("reproduce", *words)
+        assert isinstance(result.exception, InputError), result.output
+        assert told in str(result.exception)
+    path = copy / provenance.file_of("register")
+    record = json.loads(path.read_text())
+    record["request"]["from_review"] = True
+    path.write_text(json.dumps(record))
+    refused = str(realsim("reproduce", copy, "register").exception)
+    assert "from-review" in refused and "realsim register" in refused
+
+
+def test_a_school_and_an_export_are_made_again(tmp_path: Path) -> None:
+    session, out = registered(tmp_path / "s"), tmp_path / "out"
+    assert realsim("school", session, *QUICK).exit_code == 0
+    assert realsim("export", session, "--to", "hdf5", "--out", out, "--quiet").exit_code == 0
+    for words in ((session, "school", "--workers", 1), (out,)):
+        result = realsim("reproduce", *words, "--json")
+        assert result.exit_code == 0, (result.output, result.exception)
+        assert json.loads(result.stdout)["equal"]
+    listed = (out / "SHA256SUMS").read_text()
+    assert " provenance.json\n" in listed and "run.json" not in listed
+    assert str(tmp_path) not in (out / "provenance.json").read_text()
+
+
+def test_arrays_and_pictures_are_compared_value_by_value(tmp_path: Path) -> None:
+    from realsim import images
+
+    for name, off in (("a", 0.0), ("b", 0.25)):
+        values = np.array([1.0, np.nan, 3.0])
+        values[2] += off
+        atomic.write_npz(tmp_path / name / "x.npz", same=np.arange(3), moved=values)
+        picture = np.full((4, 5), 7, np.uint8)
+        picture[1, 2] += int(8 * off)
+        (tmp_path / name / "p.png").write_bytes(images.png_bytes(picture))
+        (tmp_path / name / "t.html").write_bytes(b"abc" if off else b"abd!")
+    count, found = compare_folders(tmp_path / "a", tmp_path / "b")
+    by = {f.path: f for f in found}
+    assert count == 3 and set(by) == {"x.npz", "p.png", "t.html"}
+    assert by["x.npz"].greatest == 0.25 and by["x.npz"].words == ("moved[2]: 3.0 -> 3.25",)
+    assert by["p.png"].greatest == 2 and by["p.png"].words == ("pixels[7]: 7 -> 9",)
+    assert by["t.html"].words == ("2 of 4 bytes differ",)
