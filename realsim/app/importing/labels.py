@@ -13,6 +13,7 @@ from realsim.errors import InputError
 from realsim.formats.bop.models import save_models
 from realsim.formats.bop.source import BopSource
 from realsim.formats.frame_source import FrameSource
+from realsim.formats.graspnet.models import what_to_give
 from realsim.formats.graspnet.placed_cameras import CameraPlacer
 from realsim.formats.imported_labels import load_imported, save_imported
 from realsim.formats.labelled_frames import LabelledFrames
@@ -67,12 +68,13 @@ def import_labels(
     Raises:
         InputError: a pose, a mask or a model cannot be used.
     """
+    ids = {o.obj_id for i in indices for o in scene.frame(i).objects}
     with only_run_in(folder), SessionStore.open(folder) as store:
+        models = scene.models()
+        if models and not any((folder / "models").glob("obj_*.ply")):
+            save_models(folder / "models", models)
         if load_imported(store) is not None:
             return
-        models = scene.models()
-        if models:
-            save_models(folder / "models", models)
         _place_cameras(store, scene, indices, console)
         starts = starts_of(scene, indices, {v.index: v.T_world_cam for v in store.session.views})
         if starts:
@@ -83,11 +85,28 @@ def import_labels(
         if note.startswith("the labels"):  # what they are worth must not be missed
             console.warn(f"{scene.name}: {note}".replace("[", r"\["))
     poses = sum(len(scene.frame(i).objects) for i in indices)
+    missing = sorted(ids - set(models))
     console.say(
         f"labels    {poses} poses in {len(indices)} frames, {len(models)} models: kept in "
-        f"{folder / 'imported'} as they are, not checked. `realsim register {folder}` refines and "
-        "judges them."
+        f"{folder / 'imported'} as they are, not checked."
+        + ("" if missing else f" `realsim register {folder}` refines and judges them.")
     )
+    if missing:
+        console.warn(
+            f"{what_to_give(missing)} The same import again with it adds them, and then `realsim "
+            f"register {folder}` refines and judges the poses."
+        )
+
+
+def require_models(scene: LabelledScene, indices: tuple[int, ...], folder: Path) -> None:
+    """Check that a folder of models that was given has a mesh of some object of the scene.
+
+    Raises:
+        InputError: it has none.
+    """
+    ids = {o.obj_id for i in indices for o in scene.frame(i).objects}
+    if ids and not scene.models():
+        raise InputError(f"{what_to_give(sorted(ids))} '{folder}' has none of them.")
 
 
 def _place_cameras(

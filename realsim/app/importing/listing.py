@@ -102,11 +102,11 @@ def _colmap_rows(root: Path) -> tuple[Sequence[str], list[Sequence[object]]]:
 
 def _graspnet_rows(root: Path) -> tuple[Sequence[str], list[Sequence[object]]]:
     from realsim.formats.graspnet.opening import open_scene
-    from realsim.formats.graspnet.single_frame import open_graspnet_frame
+    from realsim.formats.graspnet.single_frame import is_graspnet_frame, open_graspnet_frame
     from realsim.formats.graspnet.tree import open_graspnet
 
     rows: list[Sequence[object]] = []
-    if (root / "meta.mat").is_file():
+    if is_graspnet_frame(root):
         frame = open_graspnet_frame(root)
         objects = len(frame.frame(frame.indices[0]).objects)
         return ("scene", "camera", "images", "objects in the first"), [

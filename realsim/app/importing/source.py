@@ -142,7 +142,7 @@ def run_import(
         InputError: it is not known what it is, or it cannot be read or joined.
     """
     from realsim.app.importing.archive import unpacked
-    from realsim.app.importing.labels import import_labels, labels_of
+    from realsim.app.importing.labels import import_labels, labels_of, require_models
 
     if out.resolve() == request.source.resolve():
         raise InputError(f"{out} is the source itself: give another folder for the session.")
@@ -150,6 +150,8 @@ def run_import(
         given = replace(request, source=place)
         source = open_source(given, console)
         labels = None if request.no_labels else labels_of(given, source)
+        if labels is not None and request.models is not None:
+            require_models(*labels, request.models)
         summary = import_session(source, out, console, overwrite=overwrite)
         if labels is not None:
             import_labels(*labels, out, console)
@@ -198,15 +200,12 @@ def kinds_of(path: Path) -> list[KindFit]:
 
 def _is_graspnet(path: Path) -> bool:
     """Return whether a folder is a GraspNet data set, one of its scenes, or a scene's camera."""
-    return _is_graspnet_frame(path) or any(
+    from realsim.formats.graspnet.single_frame import is_graspnet_frame
+
+    return is_graspnet_frame(path) or any(
         any(path.glob(f"{above}annotations/*.xml")) and any(path.glob(f"{above}rgb"))
         for above in ("", "*/", "*/*/", "*/*/*/")
     )
-
-
-def _is_graspnet_frame(path: Path) -> bool:
-    """Return whether a folder is one frame as GraspNet's demo has it."""
-    return all((path / name).is_file() for name in ("color.png", "depth.png", "meta.mat"))
 
 
 def _of_file(path: Path) -> list[KindFit]:
@@ -355,11 +354,11 @@ def _open_bop(request: ImportRequest, console: Console) -> FrameSource:
 
 def _open_graspnet(request: ImportRequest, _: Console) -> FrameSource:
     from realsim.formats.graspnet.opening import open_scene
-    from realsim.formats.graspnet.single_frame import open_graspnet_frame
+    from realsim.formats.graspnet.single_frame import is_graspnet_frame, open_graspnet_frame
     from realsim.formats.graspnet.tree import open_graspnet
     from realsim.formats.labelled_frames import LabelledFrames
 
-    if _is_graspnet_frame(request.source):
+    if is_graspnet_frame(request.source):
         frame = open_graspnet_frame(request.source, models=request.models)
         return LabelledFrames(frame, "graspnet", use_depth=not request.no_depth)
     tree = open_graspnet(

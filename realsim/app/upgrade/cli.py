@@ -55,7 +55,8 @@ def upgrade_command(
 ) -> None:
     """Refine the poses of a BOP or GraspNet data set, try grasps, write it out with labels.
 
-    DATASET is a BOP root, a split or one scene; or a GraspNet root, a scene or one camera of it.
+    DATASET is a BOP root, a split or one scene; or a GraspNet root, a scene, one camera of it
+    or one image (color.png, depth.png, meta.mat).
     Nothing in it is changed: what it had goes along to OUT/SPLIT/SCENE/imported. Run again, it goes
     on where it stopped; finished scenes are not done again.
 

@@ -9,6 +9,7 @@ from realsim.errors import InputError
 from realsim.formats.bop.scene import BopSceneRef, find_scenes
 from realsim.formats.graspnet.labelled import FIRST_TEST_SCENE, GraspnetSceneRef
 from realsim.formats.graspnet.scene import CAMERAS, cameras_of
+from realsim.formats.graspnet.single_frame import is_graspnet_frame, open_graspnet_frame
 from realsim.formats.labelled_scene import LabelledScene
 
 Kind = Literal["auto", "bop", "graspnet"]
@@ -108,7 +109,7 @@ def _kind_of(dataset: Path, asked: Kind) -> Kind:
     """Return what a data set is; BOP where nothing says GraspNet (BOP's reader says what lacks)."""
     if asked != "auto":
         return asked
-    return "graspnet" if _graspnet_cameras(dataset) else "bop"
+    return "graspnet" if is_graspnet_frame(dataset) or _graspnet_cameras(dataset) else "bop"
 
 
 def _require_places(refs: Sequence[SceneRef]) -> None:
@@ -161,6 +162,14 @@ def _graspnet_cameras(dataset: Path) -> list[Path]:
 
 def _graspnet(dataset: Path, config: UpgradeConfig) -> list[SceneRef]:
     """Return the scenes of a GraspNet tree; each camera's images are a scene of their own."""
+    if is_graspnet_frame(dataset):
+        models = config.models or dataset / "models"
+        return [
+            SceneRef(
+                kind="graspnet", root=dataset, folder=dataset, number=0, camera="",
+                place="train/000000", models=models,
+            )
+        ]  # fmt: skip
     folders = _graspnet_cameras(dataset)
     if config.camera:
         folders = [f for f in folders if f.name == config.camera]
@@ -168,7 +177,8 @@ def _graspnet(dataset: Path, config: UpgradeConfig) -> list[SceneRef]:
         raise InputError(
             f"'{dataset}' holds no GraspNet scene"
             + (f" of the camera {config.camera}" if config.camera else "")
-            + ": scenes/scene_0000/{kinect,realsense}/camera_poses.npy is expected."
+            + ": scenes/scene_0000/{kinect,realsense}/camera_poses.npy is expected, or one image "
+            "as color.png, depth.png and meta.mat."
         )
     refs: list[SceneRef] = []
     for folder in folders:
@@ -194,6 +204,8 @@ def open_scene(ref: SceneRef) -> LabelledScene:
     Raises:
         InputError: something of it is missing or broken.
     """
+    if is_graspnet_frame(ref.folder):
+        return open_graspnet_frame(ref.folder, models=ref.models)
     if ref.kind == "graspnet":
         from realsim.formats.graspnet.opening import open_scene as open_graspnet
 

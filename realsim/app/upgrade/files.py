@@ -27,7 +27,7 @@ IMAGE_FOLDERS = ("mask", "mask_visib", "label", "rect", "meta")
 """Folders of a scene: not read, and no reason to upgrade it again."""
 DOCUMENTS = {
     "bop": ("scene_gt*.json", "scene_camera*.json"),
-    "graspnet": ("annotations/*.xml", "*.npy"),
+    "graspnet": ("annotations/*.xml", "*.npy", "meta.mat"),
 }
 """Copied to imported/: small, and all that before and after can be compared by."""
 LABELS = "grasp_label/{:03d}_labels.npz"

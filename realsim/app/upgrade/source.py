@@ -69,6 +69,7 @@ def prepare(scene: LabelledScene, ref: SceneRef, config: UpgradeConfig) -> Scene
         UnitError: something has another unit than it claims.
     """
     from realsim.formats.bop.models import require_meshes
+    from realsim.formats.graspnet.models import require_meshes as require_graspnet
 
     indices = _chosen(scene.indices, config.views)
     frames = {i: scene.frame(i) for i in indices}
@@ -76,7 +77,8 @@ def prepare(scene: LabelledScene, ref: SceneRef, config: UpgradeConfig) -> Scene
     poses = _start_poses(scene, frames, ref, config)
     used = sorted({obj_id for rows in poses.values() for obj_id, _, _ in rows})
     models = scene.models()
-    require_meshes(used, models, str(ref.models))
+    require = require_graspnet if ref.kind == "graspnet" else require_meshes
+    require(used, models, str(ref.models))
     Ts_world_cam = camera_poses(frames, poses, scene.name)
     seen, notes = told_apart(poses, Ts_world_cam, models)
     digests: dict[int, str] = {}

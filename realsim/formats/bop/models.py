@@ -110,7 +110,8 @@ def load_models(
     if not files:
         raise InputError(
             f"{folder} has no models; files obj_000001.ply, obj_000002.ply, ... are expected, as "
-            "in the folder 'models' of a BOP dataset."
+            "in the folder 'models' of a BOP dataset. Of a data set whose models lie elsewhere, "
+            "give them with --models FOLDER (to `realsim import`, run again, of a session)."
         )
     if not (folder / INFO_FILE).is_file():
         raise InputError(
@@ -135,8 +136,8 @@ def require_meshes(wanted: Collection[int], present: Collection[int], where: str
     if missing:
         raise InputError(
             f"object {', '.join(map(str, missing))} has no mesh in {where}; there are "
-            f"{', '.join(map(str, sorted(present))) or 'none'}. Add {model_file(missing[0])}, or "
-            "leave these objects out."
+            f"{', '.join(map(str, sorted(present))) or 'none'}. Add {model_file(missing[0])}, give "
+            f"a folder that has it (--models FOLDER, with {INFO_FILE}), or leave these objects out."
         )
 
 

@@ -1,16 +1,19 @@
 """The models folder of GraspNet-1Billion: one folder an object, named by its number, in metres.
 
 Each holds nontextured.ply, textured.obj, mtl and png. An OBJ's texture coordinates have v up, as
-realsim's meshes do.
+realsim's meshes do. Read is a BOP models folder, too: obj_000001.ply is GraspNet's object 000.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from realsim import images
+from realsim.errors import InputError
+from realsim.formats.bop.models import INFO_FILE, model_file
+from realsim.formats.bop.models import load_models as bop_models
 from realsim.geometry.mesh import load_mesh, ply_bytes
 from realsim.records import Mesh, ObjectModel
 
@@ -24,7 +27,36 @@ MESH_FILES = ("nontextured.ply", "textured.ply", "textured.obj", "nontextured_si
 def mesh_file(models: Path, number: int) -> Path | None:
     """Return the mesh of an object, None where there is none."""
     home = models / f"{number:03d}"
-    return next((home / name for name in MESH_FILES if (home / name).is_file()), None)
+    found = next((home / name for name in MESH_FILES if (home / name).is_file()), None)
+    as_bop = models / model_file(number + 1)
+    return as_bop if found is None and as_bop.is_file() else found
+
+
+def require_meshes(wanted: Collection[int], present: Collection[int], where: str) -> None:
+    """Raise if an object id has no mesh.
+
+    Args:
+        wanted: ids of a scene.
+        present: ids that have one.
+        where: what was looked in.
+
+    Raises:
+        InputError: what is missing, and what to give.
+    """
+    missing = sorted(set(wanted) - set(present))
+    if missing:
+        raise InputError(f"{what_to_give(missing)} Looked in: {where}.")
+
+
+def what_to_give(missing: Sequence[int]) -> str:
+    """Return which meshes are missing, by object ids, and how they are given."""
+    first = missing[0]
+    return (
+        f"there is no mesh of object(s) {', '.join(f'{i - 1:03d}' for i in missing[:12])}. Give "
+        f"the models with --models FOLDER: {first - 1:03d}/{PLAIN} or {TEXTURED} [m], as GraspNet "
+        f"has them, or {model_file(first)} and {INFO_FILE} [mm], as BOP has them (ids are "
+        "GraspNet's numbers + 1)."
+    )
 
 
 def load_models(models: Path, numbers: Collection[int], notes: list[str]) -> dict[int, ObjectModel]:
@@ -40,9 +72,12 @@ def load_models(models: Path, numbers: Collection[int], notes: list[str]) -> dic
         UnitError: a mesh is not in metres.
     """
     found: dict[int, ObjectModel] = {}
-    for number in sorted(numbers):
-        file = mesh_file(models, number)
-        if file is not None:
+    files = {number: mesh_file(models, number) for number in sorted(numbers)}
+    as_bop = [n + 1 for n, file in files.items() if file and file.parent == models]
+    if as_bop:
+        found |= bop_models(models, as_bop, notes=notes)
+    for number, file in files.items():
+        if file is not None and number + 1 not in found:
             mesh = load_mesh(file, "m", notes)
             found[number + 1] = ObjectModel(obj_id=number + 1, name=f"{number:03d}", mesh=mesh)
     return found

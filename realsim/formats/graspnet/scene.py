@@ -21,10 +21,9 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.graspnet.annotations import ANNOTATIONS, read_objects
 from realsim.formats.graspnet.cameras import POSES, read_camera_poses
-from realsim.formats.graspnet.models import MESH_FILES, mesh_file
+from realsim.formats.graspnet.models import load_models, require_meshes
 from realsim.formats.graspnet.tree import CAMERAS
 from realsim.geometry import se3
-from realsim.geometry.mesh import load_mesh
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
 
 CHECKED_VIEWS = 8
@@ -135,17 +134,9 @@ def read_annotation(path: Path) -> dict[int, Array]:
 
 
 def _load_models(folder: Path, Ts: dict[int, Array]) -> tuple[dict[int, ObjectModel], list[str]]:
-    models: dict[int, ObjectModel] = {}
     notes = ["ids are GraspNet's object numbers + 1; names are its numbers."]
-    for i in Ts:
-        file = mesh_file(folder, i)
-        if file is None:
-            raise InputError(
-                f"object {i} has no mesh: none of {', '.join(MESH_FILES)} is in "
-                f"{folder / f'{i:03d}'}. Give the dataset's 'models' folder."
-            )
-        mesh = load_mesh(file, "m", notes)
-        models[i + 1] = ObjectModel(obj_id=i + 1, name=f"{i:03d}", mesh=mesh)
+    models = load_models(folder, list(Ts), notes)
+    require_meshes([i + 1 for i in Ts], models, str(folder))
     return models, notes
 
 

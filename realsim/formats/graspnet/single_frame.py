@@ -111,7 +111,7 @@ class GraspnetFrame:
 
     def models(self) -> Mapping[int, ObjectModel]:
         """Return the models by object id; none unless their folder was given."""
-        if self._models_folder is None:
+        if self._models_folder is None or not self._models_folder.is_dir():
             return {}
         numbers = {o.obj_id - 1 for o in self._frame.objects}
         return load_models(self._models_folder, numbers, [])
@@ -119,6 +119,11 @@ class GraspnetFrame:
     def grasps(self) -> SceneGrasps | None:
         """None: there are none."""
         return None
+
+
+def is_graspnet_frame(folder: Path) -> bool:
+    """Return whether a folder is one image as GraspNet's demo has it."""
+    return all((folder / name).is_file() for name in (COLOUR_FILE, DEPTH_FILE, META_FILE))
 
 
 def open_graspnet_frame(folder: Path | str, *, models: Path | str | None = None) -> GraspnetFrame:

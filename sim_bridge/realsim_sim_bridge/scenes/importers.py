@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from realsim.arrays import Array
+from realsim import images
+from realsim.arrays import Array, Array32
 from realsim.errors import InputError
 from realsim.formats.graspit.scene import (
     SCENE_FILE,
@@ -16,10 +16,12 @@ from realsim.formats.graspit.scene import (
     read_graspit_scene,
 )
 from realsim.formats.graspnet.cameras import POSES
+from realsim.formats.graspnet.models import require_meshes
 from realsim.formats.graspnet.scene import GraspnetScene, cameras_of, read_graspnet_scene
+from realsim.formats.graspnet.single_frame import is_graspnet_frame, open_graspnet_frame
 from realsim.geometry import se3
 from realsim.models.library_records import KnownSolid
-from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
+from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.store.session_store import CAMERA_FILE
 from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, Support, known_solids
 
@@ -124,7 +126,8 @@ def from_bop(
     rows = {i: [(a.obj_id, a.T_cam_obj) for a in bop.ground_truth[i]] for i in used}
     objects, said = _consensus(rows, cameras)
     notes += said
-    plane, said = _table(bop, used, cameras)
+    depths = {i: bop.depth_m(i) for i in _some(used)}
+    plane, said = _table(str(bop.ref.folder), bop.session.intrinsics, depths, cameras)
     notes += said
     models_folder = models or bop.ref.folder.parent.parent / "models"
     loaded = load_models(models_folder, {o.obj_id for o in objects})
@@ -178,10 +181,50 @@ def _consensus(
     return tuple(objects), [words]
 
 
+def from_graspnet_frame(
+    folder: Path | str,
+    matter: Matter | None = None,
+    *,
+    models: Path | None = None,
+    supports: Sequence[Support] = (),
+) -> SchoolScene:
+    """Return one image of GraspNet on its own: objects as its meta file has them, world its camera.
+
+    Raises:
+        InputError: a file is missing or damaged, an object has no mesh, the depth shows no table.
+    """
+    found = open_graspnet_frame(folder, models=models or Path(folder) / "models")
+    frame, loaded = found.frame(0), dict(found.models())
+    require_meshes(
+        [o.obj_id for o in frame.objects], loaded, str(models or Path(folder) / "models")
+    )
+    objects = tuple(
+        ObjectPose(obj_id=o.obj_id, instance=k, T_world_obj=o.T_cam_obj)
+        for k, o in enumerate(frame.objects)
+    )
+    depth_file, unit_m = found.depth_file(0), frame.depth_unit_m
+    assert depth_file is not None and unit_m is not None
+    depths = {0: images.read_depth(depth_file, unit_m)}
+    plane, said = _table(str(folder), frame.intrinsics, depths, {0: np.eye(4)})
+    return SchoolScene(
+        scene=Scene(name=found.name, objects=objects, plane=plane),
+        models=loaded,
+        solids=known_solids(loaded, matter),
+        supports=tuple(supports),
+        notes=(*found.notes, *said, *_sunk(objects, loaded, plane)),
+    )
+
+
+def _some(images: Sequence[int]) -> Sequence[int]:
+    """Return the images whose depth is looked at for the table."""
+    return images[:: max(1, -(-len(images) // 8))]
+
+
 def _table(
-    bop: Any, images: Sequence[int], cameras: Mapping[int, Array]
-) -> tuple[SupportPlane, list[str]]:
-    """Return the table that the depth images show.
+    name: str, intrinsics: CameraIntrinsics, depths_m: Mapping[int, Array32],
+    cameras: Mapping[int, Array],
+) -> tuple[SupportPlane, list[str]]:  # fmt: skip
+    """Return the table that depth images (H, W) [m] show.
 
     Raises:
         InputError: they show none.
@@ -190,13 +233,12 @@ def _table(
     from realsim.registration.find_table import TableSearchConfig, find_table
     from realsim.registration.views import SampleConfig, sample_views
 
-    some = images[:: max(1, -(-len(images) // 8))]
-    frames = [DepthFrame(index=i, depth_m=bop.depth_m(i), T_world_cam=cameras[i]) for i in some]
+    frames = [DepthFrame(index=i, depth_m=d, T_world_cam=cameras[i]) for i, d in depths_m.items()]
     noise = measure_noise(frames, EvidenceConfig())
-    views = sample_views(bop.session.intrinsics, frames, noise, SampleConfig(stride=TABLE_STRIDE))
+    views = sample_views(intrinsics, frames, noise, SampleConfig(stride=TABLE_STRIDE))
     found = find_table(views, noise, TableSearchConfig())
     if found.plane is None:
-        raise InputError(f"no table is seen in the depth of {bop.ref.folder}: {found.reason}")
+        raise InputError(f"no table is seen in the depth of {name}: {found.reason}")
     return found.plane, [
         f"the table is the plane of {100 * found.share:.0f} % of the depth around the middle, RMS "
         f"{1e3 * found.plane.rms_m:.1f} mm."
@@ -236,7 +278,7 @@ def load_scene_source(
     """Read a scene of any known kind, told apart by what the folder holds.
 
     Args:
-        path: a scene.yaml or its folder, a GraspNet scene, or a BOP dataset, split or scene.
+        path: a scene.yaml or its folder, a GraspNet scene or image, a BOP dataset, split or scene.
         matter: weighed masses, convex parts.
         models: folder of the models (meshes), where it is not at its usual place.
         scene_id: number of the scene in a BOP dataset of several.
@@ -252,6 +294,8 @@ def load_scene_source(
     if is_graspit_scene(path):
         return from_graspit_yaml(path, matter, supports=supports, order=order, meshes=models)
     if path.is_dir():
+        if is_graspnet_frame(path):
+            return from_graspnet_frame(path, matter, models=models, supports=supports)
         if cameras_of(path) or ((path / POSES).is_file() and cameras_of(path.parent)):
             return from_graspnet(path, matter, models=models, supports=supports)
         if any(next(path.glob(f"{p}{CAMERA_FILE}"), None) for p in ("", "*/", "*/*/")):
@@ -259,8 +303,8 @@ def load_scene_source(
     raise InputError(
         f"'{path}' holds no scene that is known: {_contents(path)}. Read are a {SCENE_FILE} of "
         "GraspIT (object1: {file_path, name, orientation, position}), a scene of GraspNet-1Billion "
-        f"(realsense/{POSES} or kinect/{POSES}), and a BOP dataset, split or scene "
-        f"({CAMERA_FILE})."
+        f"(realsense/{POSES} or kinect/{POSES}), one image of it (color.png, depth.png, meta.mat), "
+        f"and a BOP dataset, split or scene ({CAMERA_FILE})."
     )
 
 

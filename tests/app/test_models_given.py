@@ -1,0 +1,75 @@
+"""Data sets without meshes: every command says what to give, and takes it alike."""
+
+import shutil
+
+import pytest
+from click.testing import CliRunner
+
+from labelled_scenes import MODELS, labelled_scene
+from realsim.app.cli import commands
+from realsim.app.console import Console
+from realsim.app.school.inputs import SchoolRequest, read_inputs
+from realsim.app.upgrade.dataset import UpgradeConfig, open_scene, scenes_of
+from realsim.app.upgrade.source import prepare
+from realsim.errors import InputError
+from realsim.formats.bop.models import load_models, save_models
+from realsim.formats.export_folder import ExportFolder
+from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
+
+
+@pytest.fixture(scope="module")
+def frame(tmp_path_factory):
+    """One image as graspnet-baseline's demo has it, its meshes in two layouts elsewhere."""
+    home = tmp_path_factory.mktemp("frame")
+    folder = ExportFolder.begin(home / "tree", {})
+    write_graspnet_scene(labelled_scene(home / "images", [0]), folder, GraspnetWriteConfig())
+    folder.finish({})
+    camera, image = home / "tree/scenes/scene_0003/realsense", home / "frame"
+    image.mkdir()
+    names = (("rgb", "png", "color"), ("depth", "png", "depth"), ("meta", "mat", "meta"))
+    for kind, ending, name in names:
+        shutil.copy(camera / f"{kind}/0000.{ending}", image / f"{name}.{ending}")
+    shutil.copytree(home / "tree/models", home / "as_graspnet")
+    save_models(home / "as_bop", MODELS)
+    return image
+
+
+def run(*args):
+    return CliRunner().invoke(commands, [str(a) for a in args], catch_exceptions=True)
+
+
+def school_of(frame, out, models):
+    return read_inputs(frame, out, SchoolRequest(models=models), Console(quiet=True))
+
+
+def upgrade_of(frame, models):
+    (ref,) = scenes_of(frame, config := UpgradeConfig(models=models))
+    return prepare(open_scene(ref), ref, config)
+
+
+def test_every_command_says_what_to_give(frame, tmp_path):
+    imported = run("import", frame, tmp_path / "s", "--quiet")
+    said = " ".join(imported.output.split())
+    assert imported.exit_code == 0 and "register" in said
+    for ask in (lambda: school_of(frame, tmp_path / "o", None), lambda: upgrade_of(frame, None)):
+        with pytest.raises(InputError) as error:
+            ask()
+        assert "000, 006, 029" in str(error.value) and "--models FOLDER" in str(error.value)
+    assert "000, 006, 029" in said and "--models FOLDER" in said
+    wrong = run("import", frame, tmp_path / "t", "--models", frame, "--quiet").exception
+    assert isinstance(wrong, InputError) and "none of them" in str(wrong)
+    assert not (tmp_path / "t").exists()
+
+
+@pytest.mark.parametrize("layout", ["as_graspnet", "as_bop"])
+def test_meshes_that_are_given_go_through_all_commands(frame, tmp_path, layout):
+    models, session = frame.parent / layout, tmp_path / "s"
+    assert run("import", frame, session, "--quiet").exit_code == 0
+    again = run("import", frame, session, "--models", models, "--quiet")
+    assert again.exit_code == 0, (again.output, again.exception)
+    assert load_models(session / "models").keys() == MODELS.keys()
+    tried = school_of(frame, tmp_path / "o", models)
+    assert sorted(o.obj_id for o in tried.scene.objects) == sorted(MODELS)
+    assert tried.scene.plane is not None
+    ready = upgrade_of(frame, models)
+    assert ready.models.keys() == MODELS.keys() and len(ready.seen[0]) == 3
