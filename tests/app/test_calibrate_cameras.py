@@ -9,10 +9,13 @@ import pytest
 from click.testing import CliRunner, Result
 
 from realsim.app.cli import commands
+from realsim.app.register.config import load_depth_bias
 from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, CaptureSession, TagBoard, View
+from realsim.records.depth_bias import DepthBias
 from realsim.store import SessionStore
 from realsim.store.atomic import write_json
 from realsim.store.cameras import camera_folder
@@ -31,6 +34,8 @@ FIXED = {
     "left": se3.look_at([0.75, 0.5, 0.85], [0.42, 0.05, 0.35], 0.0),
     "right": se3.look_at([0.75, -0.45, 0.85], [0.42, 0.05, 0.35], 0.0),
 }
+BIAS = DepthBias(offset_per_m=0.02)
+"""Of a fixed camera's depth."""
 VIEWS, MODULES, TEXTURE, SUPER = 10, 8, 8, 2
 
 
@@ -260,6 +265,14 @@ def test_images_without_partners_are_left_out(photos: Path, tmp_path: Path) -> N
     assert all(names["wrist"][i] == name for i, name in names["left"].items())
 
 
+def plane_depth(T_cam_board: Array) -> Array:
+    """Return the depth (H, W) of a board's plane, as if it filled the image [m]."""
+    normal = T_cam_board[:3, 2]
+    along = ray_table(CAMERA) @ normal
+    z = (normal @ T_cam_board[:3, 3]) / np.where(np.abs(along) > 0.05, along, np.inf)
+    return np.where((z > 0.1) & (z < 3.0), z, 0.0)
+
+
 def test_board_views_of_a_session(photos: Path, tmp_path: Path) -> None:
     """Fixed cameras are sessions in cameras/NAME, or just images in rgb_NAME/."""
     rng = np.random.default_rng(3)
@@ -275,7 +288,11 @@ def test_board_views_of_a_session(photos: Path, tmp_path: Path) -> None:
     (capture / "rgb_right").mkdir()
     left = SessionStore.create(camera_folder(capture, "left"), session)
     for k in range(VIEWS):
-        left.add_view(View(index=k), load_image(photos / f"left/{k:03d}.png"))
+        hand = views[k].T_base_ee
+        assert hand is not None
+        held = se3.invert(FIXED["left"]) @ hand @ Z_HELD
+        seen = BIAS.measured(plane_depth(held)).astype(np.float32)
+        left.add_view(View(index=k), load_image(photos / f"left/{k:03d}.png"), seen)
         shutil.copy(photos / f"right/{k:03d}.png", capture / f"rgb_right/{k:06d}.png")
     # The session's own camera, which looks at the objects: not yet placed.
     own = SessionStore.create(camera_folder(tmp_path / "session", "left"), session)
@@ -292,6 +309,8 @@ def test_board_views_of_a_session(photos: Path, tmp_path: Path) -> None:
     found = read_cameras(tmp_path / "session/calibration/cameras/cameras.json")
     off = se3.invert(FIXED["left"]) @ found.camera("left").T
     assert np.linalg.norm(off[:3, 3]) < 4e-3
+    bias = load_depth_bias(own.folder / "calibration/depth_bias.json")
+    assert abs(bias.offset_per_m - BIAS.offset_per_m) < 0.5 * BIAS.offset_per_m
     placed = SessionStore.open(own.folder).session
     assert placed.intrinsics.fx == found.camera("left").intrinsics.fx != CAMERA.fx
     for view in placed.views:

@@ -22,6 +22,7 @@ from realsim.app.calibrate.camera_frames import (
     pose_file_of,
     with_intrinsics,
 )
+from realsim.app.calibrate.fixed import place_fixed
 from realsim.app.calibrate.folder import MADE_OF, made_of
 from realsim.app.calibrate.images import find_in_images, why_not_found
 from realsim.app.calibrate.show import show_checks
@@ -31,7 +32,7 @@ from realsim.app.stages import BOARD_VIEWS
 from realsim.errors import InputError, RealsimError
 from realsim.store import SessionStore
 from realsim.store.atomic import write_bytes, write_text
-from realsim.store.cameras import camera_folders, open_cameras
+from realsim.store.cameras import open_cameras
 from realsim_calibration import calibrate_intrinsics, estimate_board_pose, prove_reading
 from realsim_calibration.cameras.calibrate import calibrate_cameras
 from realsim_calibration.cameras.faults import FEW_VIEWS
@@ -141,22 +142,8 @@ def _run_session(
     _require_seen(rig, frames)
     report = _calibrated(rig, options["arm"], console)
     files = write_files(report, folder / "cameras")
-    _place(source, report, console)
+    place_fixed(source, store, report, console)
     return _told(report, files, console)
-
-
-def _place(source: Path, report: CamerasReport, console: Console) -> None:
-    """Give the session's own fixed cameras the lens and the place that were found."""
-    from realsim.app.register.results import keep_refined
-
-    there = camera_folders(source)
-    for camera, own in zip(report.rig.cameras, report.cameras, strict=True):
-        if camera.mount == "hand" or camera.name not in there:
-            continue
-        store = SessionStore.open(there[camera.name])
-        claimed = {v.index: own.X for v in store.session.views}
-        store.set_cameras(own.intrinsics, keep_refined(store, claimed))
-        console.say(f"camera {camera.name} of the session is placed ({len(claimed)} views).")
 
 
 # --- what is seen ---------------------------------------------------------------------------------
