@@ -56,9 +56,16 @@ def run_report(request: ReportRequest) -> bool:
     return _several(request, limits)
 
 
+MADE_FROM = (
+    "session.json", "calibration/*.json", "registration/*.json", "review/journal.jsonl",
+    "grasps/*.json", "annotations/*.json", "models/*",
+)  # fmt: skip
+"""Files of a session that its report is made of."""
+
+
 def _one(request: ReportRequest, limits: Sequence[Limit]) -> bool:
     """Report one session."""
-    from realsim.app.stages import open_session
+    from realsim.app.stages import note, open_session
     from realsim.app.truth import loop_errors
 
     if request.sources[0].suffix.lower() == ".json" and not request.sources[0].is_dir():
@@ -69,6 +76,8 @@ def _one(request: ReportRequest, limits: Sequence[Limit]) -> bool:
     if request.out is None:
         report = report_of(store, errors, "kept")
         path = write_report_of(store, report)
+        asked = {"truth": request.truth}
+        note(store, "report", console, request=asked, inputs=MADE_FROM)
     else:
         report = report_of(store, errors, "shown")
         path = _written(request.out, page_of(store, report))
