@@ -13,9 +13,9 @@ ratio stands beside it. Workers are warm: each has tried one small object before
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, wait
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -191,6 +191,19 @@ def runs(job: ScalingJob) -> tuple[Run, Run]:
 
 def _on_nodes(case: SchoolCase, config: SchoolConfig, size: int) -> tuple[Run, Run]:
     """Return the runs on one and on two Ray nodes, every port of which is on loopback."""
+    found: list[Run] = []
+    with ray_nodes() as (address, add):
+        for count in (1, 2):
+            if count == 2:
+                add()
+            staff = open_pool(PoolConfig(address=address))
+            found.append(day(staff, case, config, size, count))
+    return found[0], found[1]
+
+
+@contextmanager
+def ray_nodes() -> Generator[tuple[str, Callable[[], Any]]]:
+    """Yield the address of a cluster of one node on loopback, and what adds another."""
     import secrets
 
     os.environ.update(
@@ -207,15 +220,9 @@ def _on_nodes(case: SchoolCase, config: SchoolConfig, size: int) -> tuple[Run, R
         initialize_head=True, head_node_args={**node, "include_dashboard": False}
     )
     try:
-        found: list[Run] = []
-        for count in (1, 2):
-            if count == 2:
-                cluster.add_node(**node)
-            staff = open_pool(PoolConfig(address=cluster.address))
-            found.append(day(staff, case, config, size, count))
+        yield cluster.address, lambda: cluster.add_node(**node)
     finally:
         cluster.shutdown()
-    return found[0], found[1]
 
 
 # --- figures -----------------------------------------------------------------------------------

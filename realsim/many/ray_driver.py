@@ -74,6 +74,8 @@ class Opening:
     """Of one that is started."""
     run: str
     """Names the folder where machines keep this run's files."""
+    paths: tuple[str, ...]
+    """Where the one who asks looks for modules: a machine looks there, too."""
 
 
 # --- the cluster ----------------------------------------------------------------------------------
@@ -173,7 +175,9 @@ def _first_line(error: BaseException) -> str:
 # --- on a node; these two are sent as they are, for a machine may have no such module -------------
 
 
-def on_node(own_version: str, run: str, job: bytes, files: dict[str, list[Any]]) -> Iterator[Any]:
+def on_node(
+    own_version: str, run: str, paths: tuple[str, ...], job: bytes, files: dict[str, list[Any]]
+) -> Iterator[Any]:
     """Do a job on a machine: yield its pieces and its end as bytes, or a text if it is foreign."""
     import socket
     from importlib.metadata import PackageNotFoundError, version
@@ -186,9 +190,13 @@ def on_node(own_version: str, run: str, job: bytes, files: dict[str, list[Any]])
         has = f"realsim {found}" if found else "no realsim"
         yield f"the machine {socket.gethostname()} has {has}, this one {own_version}"
         return
+    import sys
+
     import ray
 
     from realsim.many.ray_node import work
+
+    sys.path.extend(path for path in paths if path not in sys.path)
 
     def fetch(digest: str) -> bytes:
         # In a list, for Ray would send what stands alone whether it is needed or not.
@@ -253,7 +261,9 @@ class Driver:
                 return
             number, job, files, comes_back = told
             refs = {digest: [self._kept(digest, source)] for digest, source in files.items()}
-            found = self._task.remote(version("realsim"), self._opening.run, job, refs)
+            found = self._task.remote(
+                version("realsim"), self._opening.run, self._opening.paths, job, refs
+            )
             threading.Thread(
                 target=self._watch, args=(number, found, tuple(files), comes_back), daemon=True
             ).start()

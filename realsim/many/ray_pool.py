@@ -68,6 +68,7 @@ def ray_pool(config: PoolConfig) -> Generator[Pool]:
     opening = Opening(
         address="" if config.address == LOCAL_CLUSTER else config.address,
         workers=config.processes, run=secrets.token_hex(8),
+        paths=tuple(path for path in sys.path if path),
     )  # fmt: skip
     if opening.address:
         require_address(opening.address)

@@ -74,7 +74,7 @@ def test_without_ray_it_is_said_what_to_install(monkeypatch):
 
 
 def test_a_machine_with_another_version_does_nothing_and_is_named():
-    (told,) = on_node("0.0.7", "run", b"", {})
+    (told,) = on_node("0.0.7", "run", (), b"", {})
     assert "realsim" in told and "this one 0.0.7" in told
     error = _ending("foreign", told)
     assert isinstance(error, ForeignNodeError) and "Install the same version" in str(error)
@@ -95,15 +95,8 @@ def test_a_machine_whose_disk_is_full_counts_as_lost(is_stored, monkeypatch, tmp
 @pytest.fixture(scope="module")
 def cluster():
     pytest.importorskip("ray")
-    before = os.environ.get("PYTHONPATH")
-    os.environ["PYTHONPATH"] = str(SUPPORT)
-    try:
-        with open_pool(PoolConfig(workers=2, address="local")) as pool:
-            yield pool
-    finally:
-        del os.environ["PYTHONPATH"]
-        if before is not None:
-            os.environ["PYTHONPATH"] = before
+    with open_pool(PoolConfig(workers=2, address="local")) as pool:
+        yield pool
 
 
 def ran(pool, *tasks):

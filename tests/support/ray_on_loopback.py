@@ -99,7 +99,7 @@ def lose(what, folder):
     whole.communicate(timeout=LONGEST_S)
     expected = digests(folder / "whole")
     return {
-        "finished_when_lost": at, "code": code, "told": told, "again": again,
+        "scenes": SCENES, "finished_when_lost": at, "code": code, "told": told, "again": again,
         "again_code": process.returncode, "same": digests(out) == expected and bool(expected),
         "kept_same": all(expected.get(name) == digest for name, digest in kept.items()),
         "kept": len(kept), "beyond_loopback": beyond,

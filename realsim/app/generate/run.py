@@ -1,6 +1,6 @@
 """All scenes of a data set: several at a time, each by one process, gone on with after a kill."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -92,11 +92,6 @@ def _made(
         return made, failed
     numbers = {scene_name(k): k for k in due}
 
-    def task(name: str) -> Task:
-        own = Worked(out, only=(f"{name}/*", f"{LAYOUTS}/{name}.*", f"{CACHE}/*"))
-        args = own, numbers[name], *request.carried(), workers
-        return Task(name=name, fn=make_scene_of, args=args)
-
     def done(outcome: Outcome) -> None:
         if outcome.error is None:
             made.append(outcome.value)
@@ -108,8 +103,25 @@ def _made(
             failed[numbers[outcome.task.name]] = outcome.why
 
     with open_pool(where) as pool:
-        run_many(map(task, numbers), pool, done, tick=lambda _: tick())
+        run_many(scene_tasks(out, due, request, workers), pool, done, tick=lambda _: tick())
     return made, failed
+
+
+def scene_tasks(
+    out: Path, due: Sequence[int], request: GenerateRequest, workers: int
+) -> Iterator[Task]:
+    """Yield the tasks that make scenes; each changes its own files in the folder.
+
+    Args:
+        out: folder of the data set, which the caller holds.
+        due: numbers of the scenes.
+        request: what is wanted.
+        workers: processes of each for its views.
+    """
+    for k in due:
+        name = scene_name(k)
+        own = Worked(out, only=(f"{name}/*", f"{LAYOUTS}/{name}.*", f"{CACHE}/*"))
+        yield Task(name=name, fn=make_scene_of, args=(own, k, *request.carried(), workers))
 
 
 def _ticker(

@@ -1,12 +1,16 @@
 """`realsim stats` on the command line."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from realsim.app.command import Command
-from realsim.app.options import FOLDER, JSON, QUIET, json_file
+from realsim.app.options import FOLDER, JSON, QUIET, json_file, many
 from realsim.app.outputs import OutputFolder
+
+if TYPE_CHECKING:
+    from realsim.many import PoolConfig
 
 KEYS = ("statistics", "landscape")
 OUT = OutputFolder(
@@ -22,11 +26,12 @@ OUT = OutputFolder(
 @click.argument("sources", type=FOLDER, nargs=-1, required=True, metavar="SOURCE...")
 @click.option("--out", type=OUT, default=None, help="Folder for CSV, JSON and an HTML page.")
 @json_file("File for the JSON alone.", *KEYS)
+@many(1, "Sessions at a time.")
 @JSON
 @QUIET
 def stats_command(
-    sources: tuple[Path, ...], out: Path | None, json_file: Path | None, as_json: bool,
-    quiet: bool,
+    sources: tuple[Path, ...], out: Path | None, json_file: Path | None, where: "PoolConfig",
+    as_json: bool, quiet: bool,
 ) -> None:  # fmt: skip
     """Count what sessions hold, row by row as in the paper: scenes, frames, grasps, scores.
 
@@ -35,4 +40,4 @@ def stats_command(
     from realsim.app.console import Console
     from realsim.app.stats.run import run_stats
 
-    run_stats(sources, out, json_file, Console(quiet=quiet, as_json=as_json))
+    run_stats(sources, out, json_file, Console(quiet=quiet, as_json=as_json), where)

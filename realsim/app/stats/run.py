@@ -4,6 +4,7 @@ import csv
 import io
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from realsim.app.stats.statistics import (
     statistics_of,
 )
 from realsim.errors import InputError, RealsimError
+from realsim.many import Outcome, Sent, Task, Workers, at_most, open_pool, run_many
 from realsim.pages import Page
 from realsim.store import atomic
 
@@ -33,7 +35,11 @@ PAGE, DOCUMENT = "statistics.html", "statistics.json"
 
 
 def run_stats(
-    sources: Sequence[Path], out: Path | None, json_file: Path | None, console: Console
+    sources: Sequence[Path],
+    out: Path | None,
+    json_file: Path | None,
+    console: Console,
+    where: Workers = 1,
 ) -> Statistics:
     """Show the statistics of sessions, and write them where that was asked for.
 
@@ -44,6 +50,7 @@ def run_stats(
         out: folder for statistics.csv, sessions.csv, objects.csv, statistics.json and .html.
         json_file: file for the JSON document alone.
         console: where tables go.
+        where: who reads the sessions.
 
     Raises:
         InputError: no session there, one given twice, or none that can be read.
@@ -54,14 +61,21 @@ def run_stats(
     facts: list[SessionFacts] = []
     left_out: list[str] = []
     with console.stage("read", f"{len(folders)} sessions") as tick:
-        for k, folder in enumerate(folders):
-            try:
-                facts.append(session_facts(folder))
-            except RealsimError as error:
-                if len(folders) == 1:
-                    raise
-                left_out.append(f"{folder} is left out: {error}")
-            tick(k + 1, len(folders))
+        by = {str(folder): folder for folder in folders}
+
+        def keep(outcome: Outcome) -> None:
+            folder = by[outcome.task.name]
+            if outcome.error is None:
+                facts.append(replace(outcome.value, name=folder.resolve().name, folder=folder))
+            elif len(folders) == 1 or not isinstance(outcome.error, RealsimError):
+                raise outcome.error
+            else:
+                left_out.append(f"{folder} is left out: {outcome.error}")
+            tick(len(facts) + len(left_out), len(folders))
+
+        tasks = [Task(name=n, fn=session_facts, args=(Sent(f),)) for n, f in by.items()]
+        with open_pool(at_most(where, len(tasks))) as pool:
+            run_many(tasks, pool, keep, in_order=True)
     stats = statistics_of(facts)
     notes = [*left_out, *same_content(stats)]
     rows = all_rows(stats)

@@ -1,0 +1,33 @@
+"""A campaign: many scenes on many machines, and what losing some of them costs.
+
+  school      ray_two_nodes_ratio            what a second node brings the School
+  generate    ray_two_nodes_generate_ratio   what it brings the generation of scenes
+  losses      lost_node_equal                1 = a node killed in the middle changes no byte
+              lost_head_told                 1 = a lost head ends in a sentence, what was made is
+                                             kept, and the same command goes on
+  reproduce   reproduce_equal            1 = register, school, annotate and export are made again
+                                         bit for bit from their records
+
+    uv run --extra cluster python benchmarks/campaign.py [--quick] [--only PART] [--json FILE]
+
+A part is a function of a module; further ones are added to FIGURES and PARTS.
+"""
+
+from figures import Figure, Goal, run
+
+FIGURES = {
+    "ray_two_nodes_ratio": Figure(unit="x", goal=Goal(low=1.8)),
+    "ray_two_nodes_generate_ratio": Figure(unit="x", goal=Goal(low=1.7)),
+    "lost_node_equal": Figure(unit="", goal=Goal(low=1, high=1)),
+    "lost_head_told": Figure(unit="", goal=Goal(low=1, high=1)),
+    "reproduce_equal": Figure(unit="", goal=Goal(low=1, high=1)),
+}
+PARTS = {
+    "school": "campaign_ray:school",
+    "generate": "campaign_ray:generate",
+    "losses": "campaign_ray:losses",
+    "reproduce": "campaign_reproduce:reproduce",
+}
+
+if __name__ == "__main__":
+    run("campaign", __doc__ or "", ("realsim", "ray", "numpy", "mujoco"), FIGURES, PARTS)

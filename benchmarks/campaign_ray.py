@@ -1,0 +1,146 @@
+"""Work on two nodes of a Ray cluster: what the second brings, and what losing one costs.
+
+Nodes have one core each, on loopback. How long a run takes is counted in CPU seconds along its
+longest way (`school_scaling`), so that others on the machine do not change it:
+
+    ratio = (asking + only node) with one node / (asking + busiest node) with two
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from figures import Found
+from school_cases import in_fresh_process
+from school_scaling import CountedWorkers, ScalingJob, ray_nodes, runs
+
+from realsim.app.generate.request import GenerateRequest, claim, made_folder
+from realsim.app.generate.run import scene_tasks
+from realsim.many import PoolConfig, open_pool, run_many
+from realsim_sim_bridge.synthetic.config import SyntheticConfig
+from realsim_sim_bridge.table_scenes.cameras import ViewConfig
+from realsim_sim_bridge.table_scenes.config import PoolConfig as ObjectPoolConfig
+from realsim_sim_bridge.table_scenes.config import TableSceneConfig
+from realsim_sim_bridge.table_scenes.pool import open_pool as open_objects
+
+SCENES, QUICK_SCENES = 16, 6
+VIEWS, QUICK_VIEWS = 12, 4
+SIZE = (320, 240)
+PROGRAM = Path(__file__).resolve().parents[1] / "tests/support/ray_on_loopback.py"
+LONGEST_S = 600
+
+
+def school(args: argparse.Namespace) -> Found:
+    """Return what a second node brings the School."""
+    found = Found()
+    with tempfile.TemporaryDirectory(prefix="campaign_ray_") as keep:
+        job = ScalingJob(kind="nodes", seed=args.seed, keep=Path(keep), quick=args.quick)
+        one, two = in_fresh_process(runs, job)
+    shares = ", ".join(f"{s:.1f}" for s in two.busy_s)
+    found.add(
+        "ray_two_nodes_ratio", one.longest_s / two.longest_s,
+        f"school: {one.longest_s:.1f} CPU s with one node; of two: asking {two.asking_s:.1f}, "
+        f"nodes {shares}",
+    )  # fmt: skip
+    return found
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class GenerateJob:
+    """Scenes that are made by one node and by two."""
+
+    seed: int
+    quick: bool
+
+
+def generate(args: argparse.Namespace) -> Found:
+    """Return what a second node brings the generation of scenes."""
+    found = Found()
+    one, two = in_fresh_process(made, GenerateJob(seed=args.seed, quick=args.quick))
+    shares = ", ".join(f"{s:.1f}" for s in two["busy"])
+    found.add(
+        "ray_two_nodes_generate_ratio", one["longest"] / two["longest"],
+        f"generate: {one['longest']:.1f} CPU s with one node; of two: asking {two['asking']:.1f}, "
+        f"nodes {shares}; {one['scenes']} scenes",
+    )  # fmt: skip
+    return found
+
+
+def made(job: GenerateJob) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the cost of the scenes on one node and on two."""
+    request = GenerateRequest(
+        pool=open_objects(("pybullet",)), seed=job.seed,
+        scene=TableSceneConfig(objects=(3, 5), pool=ObjectPoolConfig(hull_only=True)),
+        views=ViewConfig(count=QUICK_VIEWS if job.quick else VIEWS, size=SIZE),
+        rendering=SyntheticConfig(profile="d435", maps=()),
+    )  # fmt: skip
+    numbers = range(QUICK_SCENES if job.quick else SCENES)
+    found: list[dict[str, Any]] = []
+    with ray_nodes() as (address, add), tempfile.TemporaryDirectory(prefix="campaign_") as folder:
+        for count in (1, 2):
+            if count == 2:
+                add()
+            out = Path(folder) / str(count)
+            made_folder(out)
+            claim(out, request)
+            warm = Path(folder) / f"warm{count}"
+            made_folder(warm)
+            with open_pool(PoolConfig(address=address)) as pool:
+                # Two scenes a node, so that each has loaded everything.
+                run_many(scene_tasks(warm, range(2 * count), request, 1), pool, _silent)
+                counted = CountedWorkers(pool)
+                begun = time.process_time()
+                summary = run_many(scene_tasks(out, numbers, request, 1), counted, _silent)
+                asking = time.process_time() - begun
+            busy = tuple(counted.busy.values())
+            found.append({
+                "asking": asking, "busy": busy, "longest": asking + max(busy),
+                "scenes": summary.done,
+            })  # fmt: skip
+    return found[0], found[1]
+
+
+def _silent(outcome: Any) -> None:
+    """Raise what went wrong."""
+    outcome.found()
+
+
+def losses(args: argparse.Namespace) -> Found:
+    """Return whether a lost node changes nothing, and a lost head is told in a sentence."""
+    found = Found()
+    node, head = (_program(what) for what in ("node", "head"))
+    in_middle = 1 <= node["finished_when_lost"] < node["scenes"]
+    found.add(
+        "lost_node_equal", float(in_middle and node["code"] == 0 and node["same"]),
+        f"a node killed after {node['finished_when_lost']} of {node['scenes']} scenes",
+    )  # fmt: skip
+    lines = [line for line in head["told"].splitlines() if line.strip()] or [""]
+    is_told = (
+        head["code"] == 2
+        and lines[-1].startswith("error: the Ray cluster")
+        and not any("Traceback" in line or "ray." in line for line in lines)
+        and head["kept_same"] and head["again_code"] == 0 and head["same"]
+    )  # fmt: skip
+    found.add("lost_head_told", float(is_told), lines[-1])
+    return found
+
+
+def _program(what: str) -> dict[str, Any]:
+    """Return what came of a command whose cluster lost a node or its head."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+    with tempfile.TemporaryDirectory(prefix="campaign_") as folder:
+        done = subprocess.run(
+            [sys.executable, str(PROGRAM), what, folder], env=kept, capture_output=True, text=True,
+            timeout=LONGEST_S, check=True,
+        )  # fmt: skip
+    told: dict[str, Any] = json.loads(
+        next(line for line in done.stdout.splitlines() if line.startswith("{"))
+    )
+    return told

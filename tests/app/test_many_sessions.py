@@ -1,0 +1,57 @@
+"""A command on several sessions: each by a process, failures named, the rest done."""
+
+import json
+import shutil
+
+import pytest
+from click.testing import CliRunner
+
+from realsim.app.cli import commands
+from realsim.errors import InputError
+from synthetic_scenes import captured_session
+
+
+@pytest.fixture(scope="module")
+def sessions(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("many")
+    first = captured_session(folder / "a", 2).folder
+    shutil.copytree(first, folder / "b")
+    (folder / "c").mkdir()
+    return [first, folder / "b", folder / "c"]
+
+
+def run(*words):
+    return CliRunner().invoke(commands, [str(w) for w in words])
+
+
+def labels(session):
+    return {
+        p.relative_to(session).as_posix(): p.read_bytes()
+        for kind in ("mask/*.png", "annotations/*.json")
+        for p in sorted(session.glob(kind))
+    }
+
+
+def test_each_session_is_done_and_the_one_that_fails_is_named(sessions, tmp_path):
+    alone = tmp_path / "alone"
+    shutil.copytree(sessions[0], alone)
+    assert run("annotate", alone, "--maps", "none", "--quiet").exit_code == 0
+    done = run("annotate", *sessions, "--maps", "none", "--workers", "2", "--json", "--quiet")
+    assert done.exit_code == 1, done.output
+    document = json.loads(done.stdout)
+    assert document["done"] == {str(s): 0 for s in sessions[:2]}
+    assert list(document["failed"]) == [str(sessions[2])]
+    assert "session.json" in document["failed"][str(sessions[2])]
+    assert labels(sessions[0]) == labels(sessions[1]) == labels(alone) and labels(alone)
+
+
+def test_what_cannot_be_for_several_is_refused(sessions):
+    for words, told in (
+        (("annotate", sessions[0], sessions[0]), "given twice"),
+        (("render", *sessions[:2], "--out", sessions[0].parent / "out"), "--out .* is one place"),
+        (("school", *sessions[:2], "--json-file", sessions[0].parent / "x.json"), "--json-file"),
+    ):
+        done = run(*words, "--quiet")
+        assert isinstance(done.exception, InputError), done.output
+        with pytest.raises(InputError, match=told):
+            raise done.exception
