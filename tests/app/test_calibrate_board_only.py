@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from realsim.app.calibrate.run import require_no_bag
+from realsim.app.calibrate.session import keep_board
 from realsim.app.cli import commands
 from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
@@ -166,6 +168,33 @@ def refused(folder: Path, *options: str) -> str:
     assert isinstance(done.exception, InputError), done.output
     assert bytes_of(folder) == before
     return str(done.exception)
+
+
+def test_the_target_of_imported_board_views_is_given_once(lab: Path) -> None:
+    """Board views of a recording come without their target; the command notes it."""
+    known = lab / "calibration/board.json"
+    before = known.read_bytes()
+    known.unlink()
+    assert "--poses" in refused(lab, "--board", "aprilgrid:4x3,tag=40mm,gap=10mm", "--poses", "x")
+    keep_board(lab, "aprilgrid:4x3,tag=40mm,gap=10mm")
+    assert json.loads(known.read_bytes()) == json.loads(before)
+
+
+@pytest.mark.parametrize("name", ["run.bag", "run.mcap", "run/run_0.db3"])
+def test_a_recording_is_told_the_two_commands(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(b"#ROSBAG V2.0")
+    if path.parent != tmp_path:
+        (path.parent / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
+        path = path.parent
+    with pytest.raises(InputError) as said:
+        require_no_bag(path, "tag:7,size=80mm")
+    _, first, second = str(said.value).splitlines()
+    assert first == f"  realsim import {path} run/calibration/capture"
+    assert second == "  realsim calibrate run --board tag:7,size=80mm"
+    done = calibrate(path)
+    assert isinstance(done.exception, InputError) and "is a recording" in str(done.exception)
 
 
 def test_what_is_damaged_missing_or_said_twice_is_refused(lab: Path, tmp_path: Path) -> None:

@@ -18,6 +18,8 @@ OUT = Path("calibration")
 """Where the calibration of a plain folder goes, if nobody says."""
 
 
+BAG_ENDINGS = (".bag", ".mcap", ".db3")
+"""Of recordings."""
 TOLERANCE_MM = 1.0
 """What `--check` allows, if nobody says [mm at the objects]."""
 
@@ -61,8 +63,9 @@ def run_calibrate(source: Path, console: Console, *, live: bool, **options: Any)
 
 def _run(source: Path, console: Console, *, live: bool, **options: Any) -> bool:
     """Calibrate what `source` holds; return whether no check is bad."""
-    from realsim.app.calibrate.session import has_board_views_only
+    from realsim.app.calibrate.session import has_board_views_only, keep_board
     from realsim.store.opening import require_header
+    from realsim.store.results import BOARD_FILE
 
     if options.get("cameras"):
         from realsim.app.calibrate.cameras import run_cameras
@@ -73,8 +76,12 @@ def _run(source: Path, console: Console, *, live: bool, **options: Any) -> bool:
         raise InputError(f"{alone[0]} is for several cameras: name them with --cameras.")
     require_header(source)
     if (source / "session.json").is_file() or has_board_views_only(source):
-        _refuse_folder_options(options)
+        lacks = has_board_views_only(source) and not (source / BOARD_FILE).exists()
+        _refuse_folder_options({**options, "board": ""} if lacks else options)
+        if lacks and options["board"]:
+            keep_board(source, options["board"])
         return _run_session(source, console, options["arm"] or "", options["clock_offset"])
+    require_no_bag(source, options["board"])
     if not source.is_dir():
         raise InputError(
             f"'{source}' is not a folder; a session (it holds session.json) or a folder of images "
@@ -102,6 +109,24 @@ def _run(source: Path, console: Console, *, live: bool, **options: Any) -> bool:
     console.say(f"{len(files) - 1} pictures and files for other tools beside it, in {request.out}")
     console.result(report_document(result.hand_eye, result.checks, files))
     return not any(c.verdict == "bad" for c in result.checks)
+
+
+def require_no_bag(source: Path, board: str) -> None:
+    """Raise if the source is a recording.
+
+    Raises:
+        InputError: it is one; names the two commands that calibrate it.
+    """
+    inside = source.iterdir() if (source / "metadata.yaml").is_file() else (source,)
+    if not any(p.suffix.lower() in BAG_ENDINGS for p in inside):
+        return
+    lab = source.stem or "lab"
+    raise InputError(
+        f"'{source}' is a recording. Make board views of it, then calibrate these:\n"
+        f"  realsim import {source} {lab}/calibration/capture\n"
+        f"  realsim calibrate {lab} --board "
+        f"{board or 'charuco:5x7,square=33mm,marker=20mm,dict=6X6_100'}"
+    )
 
 
 def _run_session(source: Path, console: Console, arm: str, clock: str) -> bool:

@@ -113,6 +113,18 @@ class CalibrationFolder:
         write_bytes(self.folder / relative, json_bytes(value))
 
 
+def keep_board(folder: Path, board: str) -> None:
+    """Write the target of board views that came without one, such as those of a recording.
+
+    Raises:
+        InputError: no target is meant.
+    """
+    from realsim.app.calibrate.folder import target_of
+    from realsim_calibration.targets.target_file import target_to_json
+
+    CalibrationFolder(folder=folder).write_json(BOARD_FILE, target_to_json(target_of(board)))
+
+
 def has_board_views_only(folder: Path) -> bool:
     """Return whether board views were captured there, and no view of objects yet."""
     return not is_session(folder) and (folder / BOARD_VIEWS / "session.json").is_file()
