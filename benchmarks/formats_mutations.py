@@ -33,8 +33,9 @@ from formats_mutations_worker import (
     read_mutation,
     sample_files,
 )
+from reliability_own import OWN
 
-SAMPLES = {sample.name: sample for sample in (*SCENES, *FILES)}
+SAMPLES = {sample.name: sample for sample in (*SCENES, *FILES, *OWN)}
 CLASSES = ("read", "refused", "traceback", "nan", "hang", "memory", "crash")
 RIGHT = ("read", "refused")
 OFFENDERS_KEPT = 20

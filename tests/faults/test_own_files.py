@@ -1,4 +1,4 @@
-"""Files of a session that claim what cannot be: an error that names file and value, no traceback."""
+"""Files of a session that claim what cannot be: an error names file and value."""
 
 import io
 import json

@@ -56,13 +56,17 @@ def test_a_profile_written_and_loaded_is_the_same(name: str, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("{", "cannot be read as JSON"),
+        ("{", "is not valid JSON"),
         ("[1]", "no depth sensor model"),
         ('{"format": "realsim depth sensor 1", "model": {"colour": 1}}', "has no 'colour'"),
         ('{"format": "realsim depth sensor 1", "model": {"baseline_m": "0.018"}}', "finite float"),
         ('{"format": "realsim depth sensor 1", "model": {"baseline_m": 18}}', "millimetres"),
         ('{"format": "realsim depth sensor 1", "model": {"border": 1}}', "finite bool"),
-        ('{"format": "realsim depth sensor 1", "model": {"quantum_px": NaN}}', "finite float"),
+        ('{"format": "realsim depth sensor 1", "model": {"quantum_px": NaN}}', "NaN is no number"),
+        (
+            f'{{"format": "realsim depth sensor 1", "model": {{"quantum_px": {10**309}}}}}',
+            "finite float",
+        ),
         ('{"format": "realsim depth sensor 1"}', "no object 'model'"),
     ],
 )

@@ -4,15 +4,14 @@ The profiles' figures are those of the makers' data sheets; what differs from un
 loss) is fitted to a user's own frames and stands in a sensor's file.
 """
 
-import json
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
-import numpy as np
-
 from realsim.errors import InputError
+from realsim.untrusted import json_text
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -114,7 +113,7 @@ class SensorRecord:
             right = isinstance(value, bool) if kind is bool else _is_number(value, kind)
             if not right:
                 raise InputError(
-                    f"{source}: {name} is {value!r}; a finite {kind.__name__} is accepted."
+                    f"{source}: {name} is {value!r:.60}; a finite {kind.__name__} is accepted."
                 )
         return cls(**{n: known[n](v) for n, v in values.items()})
 
@@ -127,12 +126,9 @@ class SensorRecord:
         """
         path = Path(path)
         try:
-            document = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, ValueError) as error:
-            raise InputError(
-                f"{path} cannot be read as JSON ({error}); give the file that `{cls.COMMAND}` "
-                "writes."
-            ) from error
+            document = json_text.read_json(path)
+        except InputError as error:
+            raise InputError(f"{error} Give the file that `{cls.COMMAND}` writes.") from error
         if not isinstance(document, dict) or document.get("format") != cls.FORMAT:
             raise InputError(
                 f"{path} is no {cls.FORMAT.removeprefix('realsim ').rstrip(' 0123456789')} model: "
@@ -152,4 +148,5 @@ def _is_number(value: object, kind: type) -> bool:
     """Return whether a value is a finite number, and a whole one where that is wanted."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
-    return bool(np.isfinite(value)) and (kind is float or float(value).is_integer())
+    is_finite = abs(value) <= sys.float_info.max  # of whole numbers beyond all floats as well
+    return is_finite and (kind is float or float(value).is_integer())
