@@ -45,6 +45,29 @@ def test_each_session_is_done_and_the_one_that_fails_is_named(sessions, tmp_path
     assert labels(sessions[0]) == labels(sessions[1]) == labels(alone) and labels(alone)
 
 
+@pytest.mark.slow
+def test_sessions_that_travel_to_a_cluster_come_back_as_if_they_had_stayed(sessions, tmp_path):
+    pytest.importorskip("ray")
+    before = {p for p in sessions[0].rglob("*") if p.is_file()}
+    places = [tmp_path / name for name in ("here", "a", "b")]
+    for place in places:
+        shutil.copytree(sessions[0], place)
+    words = ("--library", sessions[0] / "models", "--views", "2", "--quiet")
+    objects = ("--object", "1", "--object", "7")
+    here = run("register", places[0], *objects, *words)
+    done = run("register", *places[1:], *objects, *words, "--address", "local", "--workers", "1",
+               "--json")  # fmt: skip
+    assert here.exception is None or isinstance(here.exception, SystemExit), here.exception
+    code = here.exit_code
+    assert done.exit_code == code and code in (0, 1), done.output
+    assert json.loads(done.stdout)["done"] == {str(p): code for p in places[1:]}
+    scenes = [json.loads((p / "registration/scene.json").read_text()) for p in places]
+    poses = [[o["T_world_obj"] for o in s["objects"]] for s in scenes]
+    assert poses[0] and poses[1] == poses[2] == poses[0]
+    files = [{p.relative_to(place) for p in place.rglob("*") if p.is_file()} for place in places]
+    assert files[1] == files[2] == files[0] and len(files[0]) > len(before)
+
+
 def test_what_cannot_be_for_several_is_refused(sessions):
     for words, told in (
         (("annotate", sessions[0], sessions[0]), "given twice"),
