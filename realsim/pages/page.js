@@ -65,3 +65,12 @@ box.onkeydown = e => {
 };
 // A printed page shows what is folded away.
 addEventListener("beforeprint", () => { for (const d of document.querySelectorAll("details")) d.open = true; });
+
+// A link into a folded stage opens it; what is printed is open.
+const unfold = () => {
+  const at = location.hash.length > 1 && document.getElementById(decodeURIComponent(location.hash.slice(1)));
+  if (at) { const stage = at.closest("details"); if (stage) stage.open = true; at.scrollIntoView(); }
+};
+addEventListener("hashchange", unfold);
+addEventListener("beforeprint", () => { for (const d of document.querySelectorAll("details")) d.open = true; });
+unfold();

@@ -92,9 +92,30 @@ class Page:
         """Add lead figures: value and what it is."""
         self._add("cards", figures=figures)
 
-    def section(self, title: str, text: str = "", key: str = "") -> None:
-        """Begin a section; `key` is its anchor."""
-        self._add("section", title=title, key=key)
+    def lead(
+        self, picture: Picture | None, caption: str, figures: Sequence[tuple[str, str]]
+    ) -> None:
+        """Add what is seen first: one picture, with the figures that matter beside it.
+
+        Args:
+            picture: the picture; None = there is none.
+            caption: under it.
+            figures: value and what it is.
+        """
+        made = [] if picture is None else [shown(picture, caption)]
+        self._add("lead", pictures=made, figures=figures)
+
+    def section(self, title: str, text: str = "", key: str = "", *, folded: str = "") -> None:
+        """Begin a section.
+
+        Args:
+            title: of the section.
+            text: its first paragraph.
+            key: its anchor.
+            folded: what is said beside the title of a section that opens when it is asked for; '' =
+                it is open.
+        """
+        self._add("section", title=title, key=key, folded=folded)
         if text:
             self.text(text)
 

@@ -11,8 +11,11 @@ import pytest
 from realsim.app.annotate.run import run_annotate
 from realsim.app.console import Console
 from realsim.app.report.compare_page import comparison_of, comparison_page
+from realsim.app.report.section import Section, built
 from realsim.app.report.session import write_report
 from realsim.app.report.sources import sources_of
+from realsim.app.report.summary import Report
+from realsim.pages import Cell, Page
 from realsim.store import SessionStore
 from shared_sessions import copy_of
 
@@ -41,6 +44,29 @@ def test_tables_scroll_inside_the_page_and_every_check_is_in_one(pages: dict[str
         assert text.count("<table>") == text.count('<div class="scroll"><table>') > 0
     rows = re.findall(r"<tr><td>(.*?)</td>", pages["report"].read_text("utf-8"))
     assert {"agree", "probability"} <= set(rows)
+
+
+def test_the_first_screen_has_a_picture_three_figures_and_what_to_do_next(
+    pages: dict[str, Path],
+) -> None:
+    text = pages["report"].read_text("utf-8")
+    first, *stages = re.split(r"<details class=\"stage\">", text)
+    assert "<img" in first and first.index("<img") < first.index("<table>")
+    assert first.count('class="card"') == 3 and "Next: realsim" in first
+    assert {"registration", "capture", "labels"} <= set(
+        re.findall(r'<h2 id="(\w+)"', "".join(stages))
+    )
+    assert text.count("<details") == text.count("</details>")
+
+
+def test_what_a_table_marks_is_also_found() -> None:
+    def build(section: Section) -> None:
+        section.page.table(["check", "state"], [["drift", Cell("warn", kind="warn")]])
+
+    told = built(Section(key="capture", title="Capture", page=Page()), build)
+    report = Report(name="", about="", sections=(told,))
+    assert [f.severity for f in report.findings] == ["warn"] and "drift" in report.findings[0].text
+    assert report.verdict == "look"
 
 
 @pytest.mark.slow

@@ -37,6 +37,8 @@ def everything() -> Page:
     page = Page(title="A & B", about="<b>two</b> views", hidden={"/data/s": "SESSION"})
     page.verdict("good", "Accepted.", "Use it.", [[Cell("warn", kind="warn"), "but <look>"]])
     page.cards([("0.2 mm", "1 sigma")])
+    page.lead(flat(7, 7, 7), "first of all", [("3 of 4", "objects")])
+    page.section("Folded", "Inside.", key="folded", folded="2 of 3")
     page.section("Objects", "Worst first.", key="objects")
     page.heading("Part")
     page.text("in /data/s and /home/me/secret/file.txt", "note")
@@ -90,7 +92,7 @@ def test_a_page_is_whole_escaped_and_asks_for_nothing() -> None:
         assert told in text, told
     sources = [a["src"] for tag, a in Tags(text).seen if tag == "img" and "src" in a]
     # The large picture stands there once; the dialog's picture has no source of its own.
-    assert len(sources) == 1 + 1 + 4 + 2 + 3
+    assert len(sources) == 1 + 1 + 1 + 4 + 2 + 3
     shown = [_picture(s) for s in sources]
     assert shown[0].shape == (720, 1280, 3)
     np.testing.assert_allclose(shown[2], flat(200, 30, 30), atol=4)

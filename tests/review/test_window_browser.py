@@ -86,7 +86,7 @@ def test_a_scene_of_any_up_is_framed_at_once_and_a_link_shows_the_same(
         with browser.page(tilted.url, width=1280, height=800) as page:
             page.wait_for("objects judged", "computed:")
             page.wait_until(lambda: _scene_share(page) > 0.02, "the scene in the middle")
-            assert page.page.title() == "flat \u00b7 two boxes \u00b7 realsim review"
+            assert page.page.title() == "flat \u00b7 tilted \u00b7 realsim review"
             panels = page.page.evaluate(PANELS)
             assert len(panels) == 2 and 1 - sum(panels) / (1280 * 800) >= 0.75
             page.press("0 tall")

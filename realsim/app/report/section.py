@@ -101,7 +101,20 @@ def built(section: Section, build: Callable[[Section], None]) -> Section:
         build(section)
     except READING as error:
         section.damaged(error)
+    _say_what_is_marked(section)
+    section.page.parts[0]["folded"] = section.headline or section.state
     return section
+
+
+def _say_what_is_marked(section: Section) -> None:
+    """Say that values of a table are marked, where no finding says so: both must agree."""
+    if any(f.severity in ("bad", "warn") for f in section.findings):
+        return
+    rows = [r for p in section.page.parts if p["part"] == "table" for r in p["rows"]]
+    named = [str(r[0]) for r in rows if any(c.kind == "warn" for c in r)]
+    if named:
+        listed = ", ".join(named[:3]) + ", ..." * (len(named) > 3)
+        section.say("warn", f"{section.title}: marked in its table: {listed}.")
 
 
 def drawn(section: Section, what: str, draw: Callable[[], None]) -> None:

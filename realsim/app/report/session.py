@@ -14,11 +14,11 @@ from realsim.app.report.labelling import labels_section
 from realsim.app.report.registering import registration_section
 from realsim.app.report.reviewing import review_section, review_state
 from realsim.app.report.schooling import school_section
-from realsim.app.report.section import Pictures, Section, built, counted
+from realsim.app.report.section import READING, Pictures, Section, built, counted
 from realsim.app.report.storage import files_section, settings_section
 from realsim.app.report.summary import Report, truth_section, write_summary
 from realsim.app.truth import LoopErrors
-from realsim.pages import Page
+from realsim.pages import Page, Picture
 from realsim.store import SessionStore
 
 PAGE, DOCUMENT = "reports/report.html", "reports/report.json"
@@ -125,7 +125,7 @@ def page_of(
     """Return the page of a report; see `write_report`."""
     page = Page(title=report.name, about=report.about, hidden=hidden_of(store))
     page.document = report.document(page)
-    write_summary(page, report, notes)
+    write_summary(page, report, notes, _first_picture(store))
     for section in report.sections:
         page.parts += section.page.parts
     if times:
@@ -133,6 +133,22 @@ def page_of(
         rows = [[t.name, f"{t.cpu_s:.1f}", f"{t.wall_s:.1f}"] for t in times]
         page.table(["stage", "CPU [s]", "clock [s]"], rows)
     return page
+
+
+def _first_picture(store: SessionStore) -> tuple[Picture | None, str]:
+    """Return the picture that tells most of a session, and its caption."""
+    drawn = store.folder / "registration/pictures/overlay.jpg"
+    labelled = sorted((store.folder / "reports").glob("overlay_*.png"))
+    try:
+        if drawn.is_file():
+            return drawn.read_bytes(), "The models' outlines in the colours of their verdicts."
+        if labelled:
+            return labelled[0].read_bytes(), "A frame with the outlines of its labels."
+        if store.session.views:
+            return store.rgb(store.session.views[0].index), "The first photograph."
+    except READING:
+        pass  # its section says what is wrong with it
+    return None, ""
 
 
 def _about(store: SessionStore) -> str:

@@ -7,10 +7,10 @@ from typing import Any
 
 from realsim.app.report.figures import Figure, count, figures_to_json
 from realsim.app.report.section import SEVERITIES, ReportFinding, Section
-from realsim.pages import Cell, Page
+from realsim.pages import Cell, Page, Picture
 
 SCHEMA, SCHEMA_VERSION = "realsim report", 1
-SHOWN = 6
+SHOWN = 3
 """Findings on the first screen; all of them stand in the sections, and in report.json."""
 NOTES_SHOWN = 3
 """Notes of the run there; the others open when they are asked for."""
@@ -19,6 +19,11 @@ LONGEST = 260
 STATE_KIND = {"done": "good", "missing": "off", "damaged": "bad"}
 NEEDED = ("calibration", "capture", "registration", "labels")
 """Stages without which a session is not finished."""
+LEADING = (
+    "truth.object_mssd_mm", "registration.accepted", "registration.sigma_mm_max",
+    "school.good_share", "registration.agree_min", "calibration.sigma_mm", "registration.doubtful",
+)  # fmt: skip
+"""What matters, the most first: three of the figures that there are lead the page."""
 VERDICTS = {
     "bad": ("Do not use it yet", "bad"),
     "look": ("Look first", "warn"),
@@ -97,13 +102,19 @@ class Report:
         }
 
 
-def write_summary(page: Page, report: Report, notes: Sequence[str] = ()) -> None:
-    """Write the first screen.
+def write_summary(
+    page: Page,
+    report: Report,
+    notes: Sequence[str] = (),
+    picture: tuple[Picture | None, str] = (None, ""),
+) -> None:
+    """Write the first screen: verdict, one picture, the figures that matter, what to do next.
 
     Args:
         page: to write on.
         report: what was found.
         notes: what the reader must know first.
+        picture: that picture, and its caption.
     """
     found = [f for f in report.findings if f.severity != "note"]
     title, kind = VERDICTS[report.verdict]
@@ -112,9 +123,14 @@ def write_summary(page: Page, report: Report, notes: Sequence[str] = ()) -> None
          Cell("more", href=f.section)]
         for f in found[:SHOWN]
     ]  # fmt: skip
-    page.verdict(kind, f"{title}.", _why(report), rows)
+    page.verdict(kind, f"{title}.", f"{_why(report)} {_next(report)}".strip(), rows)
+    page.lead(*picture, _leading(report))
     if len(found) > SHOWN:
-        page.text(f"... and {len(found) - SHOWN} more, in the sections below.")
+        more = [
+            [Cell(f.severity, kind=f.severity), f.text, Cell("more", href=f.section)]
+            for f in found[SHOWN:]
+        ]
+        page.table(["", "what", ""], more, folded=f"{len(more)} more things to look at")
     rows = []
     for s in report.sections:
         run = f"run {s.command}" if s in report.missing else ""
@@ -122,6 +138,35 @@ def write_summary(page: Page, report: Report, notes: Sequence[str] = ()) -> None
         rows.append([Cell(text=s.title, href=s.key), state, s.headline, run])
     page.table(["stage", "state", "in short", "next"], rows)
     _notes(page, notes)
+
+
+def _leading(report: Report) -> list[tuple[str, str]]:
+    """Return value and meaning of the three figures that lead the page."""
+    figures = report.figures
+    found: list[tuple[str, str]] = []
+    for name in LEADING:
+        if name not in figures or len(found) == 3:
+            continue
+        f = figures[name]
+        value = f"{f.shown} {f.meaning.unit}".strip()
+        if name == "registration.accepted":
+            value = f"{f.value:.0f} of {figures['registration.objects'].value:.0f}"
+        found.append((value, f.meaning.text))
+    return found
+
+
+def _next(report: Report) -> str:
+    """Return what to do next; '' = nothing is left."""
+    needed = [s.command for s in report.missing if s.key in NEEDED and s.command]
+    if needed:
+        return f"Next: {needed[0]}."
+    if any(
+        f.section in ("registration", "review") for f in report.findings if f.severity != "note"
+    ):
+        return "Next: realsim review SESSION."
+    if any(f.severity == "bad" for f in report.findings):
+        return "Next: realsim check SESSION."
+    return ""
 
 
 def _notes(page: Page, notes: Sequence[str]) -> None:
@@ -153,7 +198,7 @@ def _why(report: Report) -> str:
     if missing:
         told.append(f"missing: {', '.join(missing)}")
     if not told:
-        return "No check says that anything is wrong."
+        return "Every check that was made is passed."
     text = "; ".join(told)
     return f"{text[0].upper()}{text[1:]}."
 

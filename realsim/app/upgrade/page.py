@@ -1,7 +1,7 @@
 """The page of an upgrade: where every object was said to be, where it is, worst first."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,9 @@ from realsim.store.atomic import write_bytes
 
 PAIRS = 60
 """Objects with pictures, the worst; a page of more is not looked at."""
+FRAMES = 12
+"""Whole frames at the top of the page."""
+POSES = ("T_cam_obj_before", "T_cam_obj")
 ROWS = 400
 """Objects in the page's table; upgrade.csv has all."""
 CROP_WIDTH_PX = 560
@@ -58,11 +61,19 @@ def write_page(
     page = Page(title="Upgraded data set", about=summary_line(summary))
     for line in notes_line(notes, len(failed)):
         page.text(line, "note")
+    frames = _frames(out, pictured)
+    if frames:
+        page.section(
+            "Frames",
+            "Magenta, on both sides of the handle: the poses as the data set has them. Right of "
+            "the handle also those that are written, in the colours of their verdicts.",
+        )
+        page.sliders(frames)
     pairs = [_pair(out, r, o) for r, o in pictured[:PAIRS]]
     if pairs:
         more = "" if len(pairs) == len(pictured) else f" The worst {PAIRS} of {len(pictured)}."
         page.section(
-            "Before and after",
+            "Objects one by one",
             "Magenta and thin, on both sides of the handle: the pose as the data set has it. Right "
             "of the handle also the pose that is written, in the colour of its verdict: the same "
             "where the annotation was kept or the new pose rejected. Whole outlines, as "
@@ -106,6 +117,35 @@ def _counted(n: int, word: str) -> str:
     return f"{n} {word}" if n == 1 else f"{n} {word}s"
 
 
+def _frames(out: Path, pictured: Sequence[tuple[Record, Mapping[str, Any]]]) -> list[View]:
+    """Return whole frames with the outlines of their objects, those of the worst objects first."""
+    frames: dict[tuple[str, int], list[Mapping[str, Any]]] = {}
+    for record, o in pictured:
+        frames.setdefault((str(record["place"]), int(o["shown"]["image"])), []).append(o)
+    views: list[View] = []
+    for (place, image), objects in list(frames.items())[:FRAMES]:
+        before, after = (partial(_frame, out / place, image, objects, k) for k in (1, 2))
+        names = ", ".join(str(o["name"]) for o in objects)
+        views.append(
+            View(f"{place} image {image}: {names}", {"as given": before, "refined": after})
+        )
+    return views
+
+
+def _frame(folder: Path, image: int, objects: Sequence[Mapping[str, Any]], poses: int) -> Image:
+    """Return a photograph with the outlines of objects as given, and as refined if poses is 2."""
+    store, models = _scene(folder)
+    picture: Image = store.rgb(image)
+    for key, thickness in zip(POSES[:poses], THICKNESS_PX, strict=False):
+        for o in objects:
+            placed = PlacedMesh(0, models[int(o["obj_id"])].mesh, np.array(o["shown"][key]))
+            ids = FirstSurfaces([placed]).look(store.session.intrinsics, np.eye(4))[0]
+            refined = VERDICT_RGB.get(o["verdict"], (255, 255, 255))
+            color = BEFORE_RGB if key == POSES[0] else refined
+            picture = draw_outlines(picture, ids, colors={0: color}, thickness=thickness)
+    return picture
+
+
 def _pair(out: Path, record: Record, o: Mapping[str, Any]) -> View:
     """Return the two pictures of an object, drawn when the page asks for them."""
     before, after = _pictures(out, str(record["place"]), o)
@@ -122,7 +162,7 @@ def _pictures(
 ) -> tuple[Callable[[], Image], Callable[[], Image]]:
     """Return what draws the pose as given and the refined one, in the same window."""
     shown = o["shown"]
-    Ts = (np.array(shown["T_cam_obj_before"]), np.array(shown["T_cam_obj"]))
+    Ts = [np.array(shown[key]) for key in POSES]
 
     def drawn(k: int) -> Image:
         store, models = _scene(out / place)
