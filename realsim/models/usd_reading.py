@@ -7,6 +7,9 @@ cage.
 """
 
 import importlib
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +32,18 @@ from realsim.models.mesh_usd_materials import (
 from realsim.models.model_records import ScanUnit, UpAxis
 
 USD_FORMATS = (".usd", ".usda", ".usdc", ".usdz")
+TEXT_FORMAT = ".usda"
+TRIAL_S = 120
+"""How long one file may be read [s]."""
+TRIAL = """
+import sys, pathlib
+from realsim.errors import RealsimError
+from realsim.models import usd_reading as usd
+try:
+    usd._content(usd._Pxr(), pathlib.Path(sys.argv[1]))
+except RealsimError:
+    pass  # it is said in the process that asked
+"""
 UNITS: tuple[tuple[ScanUnit, float], ...] = (
     ("m", 1.0),
     ("cm", 0.01),
@@ -49,6 +64,34 @@ def load_usd(path: Path) -> FileContent:
         MissingLibraryError: Pixar's library is not installed.
     """
     pxr = _Pxr()
+    if path.suffix.lower() != TEXT_FORMAT:
+        _require_survivable(path)
+    return _content(pxr, path)
+
+
+def _require_survivable(path: Path) -> None:
+    """Read a file in a process of its own first: at damaged ones the library ends the process.
+
+    Raises:
+        InputError: it does, or needs longer than anybody waits.
+    """
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", TRIAL, str(path)], capture_output=True, timeout=TRIAL_S,
+            check=False,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired as error:
+        raise InputError(
+            f"{path} cannot be read as a USD file: its library takes more than {TRIAL_S} s."
+        ) from error
+    if done.returncode < 0:
+        raise InputError(
+            f"{path} is damaged: the library for USD files breaks down at it (signal "
+            f"{signal.Signals(-done.returncode).name}). Export it again, or as .usda or .glb."
+        )
+
+
+def _content(pxr: "_Pxr", path: Path) -> FileContent:
     notes: list[str] = []
     with quiet_output():  # the library prints its warnings straight to stderr
         try:
