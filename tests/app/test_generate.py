@@ -42,7 +42,9 @@ def _content(folder: Path) -> dict[str, str]:
     return {
         str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest()
         for p in sorted(folder.rglob("*"))
-        if p.is_file() and p.name not in UNREPEATED and not p.name.endswith(".finished.json")
+        if p.is_file()
+        and p.name not in UNREPEATED
+        and not p.name.endswith((".finished.json", ".run.json"))
     }
 
 
