@@ -214,12 +214,17 @@ class ExportFolder:
             atomic.write_json(self.folder / FINISHED, _request(self.asked))
             shutil.rmtree(self.folder / STATE)
 
+    def written(self) -> Iterator[tuple[str, int, str]]:
+        """Yield path, size [bytes] and SHA-256 of every file of the pieces that are there."""
+        for line in _lines(self.folder / PIECES):
+            for relative, (size, digest) in json.loads(line)["files"].items():
+                yield relative, size, digest
+
     def _sums(self, files: Mapping[str, bytes]) -> Iterator[bytes]:
         for relative, data in files.items():
             yield f"{hashlib.sha256(data).hexdigest()}  {relative}\n".encode()
-        for line in _lines(self.folder / PIECES):
-            for relative, (_, digest) in json.loads(line)["files"].items():
-                yield f"{digest}  {relative}\n".encode()
+        for relative, _, digest in self.written():
+            yield f"{digest}  {relative}\n".encode()
 
     def _append(self, entry: dict[str, Any]) -> None:
         with (self.folder / PIECES).open("a", encoding="utf-8") as file:

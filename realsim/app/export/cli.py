@@ -47,6 +47,7 @@ FORMATS = (
 @click.option("--no-masks", is_flag=True, help="Leave the masks out.")
 @click.option("--points", default=100_000, show_default=True, type=click.IntRange(0),
               help="Coloured points of a COLMAP model.")  # fmt: skip
+@click.option("--shards", is_flag=True, help="BOP once more as tar shards (webdataset).")
 @click.option(
     "--undistort", is_flag=True, help="As an ideal camera sees it; BOP, GraspNet: always."
 )

@@ -35,7 +35,11 @@ def _bop_root(folder: ExportFolder, job: RootJob) -> Sequence[str]:
 
     write_bop_models(job.models, folder, infos=job.infos)
     write_bop_root(folder, name=job.request.name or folder.folder.resolve().name)
-    return ()
+    if not job.request.shards:
+        return ()
+    from realsim.formats.bop.webdataset import write_shards
+
+    return (f"{write_shards(folder)} images of all scenes are in tar shards (SPLIT_web), too.",)
 
 
 def _graspnet(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
@@ -111,6 +115,7 @@ DATA_SETS: dict[str, Target] = {
             "colour",
             "jpeg_quality",
             "masks",
+            "shards",
             "undistort",
             "keep_distortion",
         ),

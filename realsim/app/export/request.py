@@ -33,6 +33,8 @@ class ExportRequest:
     """[%]: mean error of one grey level on real frames, a fifth of PNG's bytes."""
     masks: bool = True
     """Whether masks are written."""
+    shards: bool = False
+    """Whether a BOP export is written once more as tar shards."""
     undistort: bool = False
     """Write images as an ideal camera would have seen them; BOP and GraspNet are always so."""
     keep_distortion: bool = False

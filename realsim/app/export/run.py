@@ -10,6 +10,7 @@ from typing import Any
 from realsim.app.annotate.current import refresh_labels
 from realsim.app.console import Console
 from realsim.app.export.card import CARD_FILE, DatasetCard, SceneFacts, card_bytes
+from realsim.app.export.croissant import CROISSANT_FILE, croissant_bytes
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.sources import (
     SourceScene,
@@ -116,6 +117,9 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
         folder.finish(
             {
                 CARD_FILE: card_bytes(card),
+                CROISSANT_FILE: croissant_bytes(
+                    card, {name: (size, digest) for name, size, digest in folder.written()}
+                ),
                 provenance.FOLDER_FILE: provenance.record_bytes(record),
             }
         )
