@@ -3,17 +3,23 @@
 (() => {
   const PLACE = "realsim place", read = Storage.prototype.getItem, write = Storage.prototype.setItem;
   const is = (key) => String(key).endsWith(PLACE);
-  const said = () => new URLSearchParams(location.hash.slice(1));
-  const tell = (place) => history.replaceState(null, "", "#" + place.toString());
+  // Viser takes its server's address from the page's: at that moment there must be no fragment.
+  let place = location.hash.slice(1);
+  history.replaceState(null, "", location.pathname);
+  const said = () => new URLSearchParams(place);
+  const tell = (fields) => {
+    place = fields.toString();
+    history.replaceState(null, "", location.pathname + "#" + place);
+  };
   Storage.prototype.getItem = function (key) {
     return is(key) ? said().toString() : read.call(this, key);
   };
   Storage.prototype.setItem = function (key, value) {
     if (!is(key)) return write.call(this, key, value);
-    const place = new URLSearchParams(value), tab = said().get("tab");
-    if (tab) place.set("tab", tab);
-    tell(place);
-    const words = [place.get("object"), place.get("scene"), "realsim review"];
+    const fields = new URLSearchParams(value), tab = said().get("tab");
+    if (tab) fields.set("tab", tab);
+    tell(fields);
+    const words = [fields.get("object"), fields.get("scene"), "realsim review"];
     document.title = words.filter((word) => word).join(" \u00b7 ");
   };
   addEventListener("hashchange", () => location.reload());
@@ -22,9 +28,9 @@
   addEventListener("click", (event) => {
     const tab = event.target instanceof Element && event.target.closest("[role=tab]");
     if (!tab) return;
-    const place = said();
-    place.set("tab", tab.textContent.trim());
-    tell(place);
+    const fields = said();
+    fields.set("tab", tab.textContent.trim());
+    tell(fields);
   });
   const wanted = said().get("tab");
   const look = new MutationObserver(() => {
