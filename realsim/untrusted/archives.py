@@ -23,6 +23,9 @@ from realsim.untrusted.zip_members import opened_zip
 
 MOST_PACKED = 1e12
 """Largest archive [bytes]; what it unpacks to is limited by the caller."""
+MOST_UNFOLDED, ALWAYS_UNFOLDED = 100, 1e8
+"""Bytes out of one packed byte, and bytes that any archive may unpack to: data sets shrink by less
+than ten, zeros by a thousand."""
 MOST_MEMBERS = 2_000_000
 MOST_HEADER_READ = 1 << 20
 """Bytes of a header that extends the next one, such as a long name; it can claim terabytes."""
@@ -90,8 +93,10 @@ def extract(path: Path | str, folder: Path | str, *, most_bytes: float) -> tuple
 
 def _unpacked(path: Path, folder: Path, most_bytes: float) -> list[str]:
     names: list[str] = []
-    left = most_bytes
-    for entry in _entries(path, most_bytes):
+    left = min(most_bytes, MOST_UNFOLDED * path.stat().st_size + ALWAYS_UNFOLDED)
+    if zipfile.is_zipfile(path) and sum(m.size for m in members(path)) > left:
+        raise InputError(f"{path} unpacks to more than is allowed, by its table of contents.")
+    for entry in _entries(path, left):
         target = folder / entry.name
         if entry.is_folder:
             target.mkdir(parents=True, exist_ok=True)

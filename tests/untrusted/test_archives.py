@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from realsim.errors import InputError
+from realsim.untrusted import archives
 from realsim.untrusted.archives import Member, extract, members
 
 FILES = {"train/000001/scene_gt.json": b"{}", "a" * 140 + ".bin": bytes(range(256)) * 9, "x": b""}
@@ -146,6 +147,23 @@ def test_what_unfolds_a_thousandfold_is_refused(tmp_path: Path, kind: str) -> No
     assert path.stat().st_size < 100_000
     with pytest.raises(InputError, match="more than is allowed"):
         extract(path, tmp_path / "out", most_bytes=1e6)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("kind", ["zip", "tar.gz"])
+def test_a_bomb_is_refused_by_its_size_whatever_room_there_is(
+    tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(archives, "ALWAYS_UNFOLDED", 1e6)
+    zeros = bytes(20_000_000)
+    path = tmp_path / f"a.{kind}"
+    if kind == "zip":
+        _zip(path, {f"{k}": zeros for k in range(3)})
+        monkeypatch.setattr(archives, "_written", lambda *_: pytest.fail("a byte was unpacked"))
+    else:
+        _tar(path, (_info("x", len(zeros)), zeros), mode="w:gz")
+    with pytest.raises(InputError, match="more than is allowed"):
+        extract(path, tmp_path / "out", most_bytes=1e12)
     assert not (tmp_path / "out").exists()
 
 

@@ -1,0 +1,52 @@
+"""The table of readers is the code's; damaged files of our own are read or refused."""
+
+import importlib
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+ROOT = Path(__file__).parents[2]
+sys.path.append(str(ROOT / "benchmarks"))
+mutations: Any = importlib.import_module("formats_mutations")
+worker: Any = importlib.import_module("formats_mutations_worker")
+own: Any = importlib.import_module("reliability_own")
+
+ROW = re.compile(r"^\| [^|]+ \| `([\w.]+)\.([A-Z_]+)` \| (\d+) \|$", re.M)
+TABLE = ROW.findall((ROOT / "docs/reliability.md").read_text())
+
+
+def test_the_limits_are_those_of_the_code() -> None:
+    assert len(TABLE) >= 30
+    for module, name, value in TABLE:
+        assert getattr(importlib.import_module(module), name) == int(value), (module, name)
+
+
+def test_every_reader_of_untrusted_files_is_in_the_table() -> None:
+    listed = {module for module, _, _ in TABLE}
+    for file in (ROOT / "realsim/untrusted").glob("*.py"):
+        if re.search(r"^MOST_", file.read_text(), re.M):
+            assert f"realsim.untrusted.{file.stem}" in listed, file.name
+
+
+@pytest.mark.parametrize("sample", own.OWN, ids=lambda s: s.name)
+def test_damaged_files_of_our_own_are_read_or_refused(sample: Any) -> None:
+    files = worker.sample_files(sample)
+
+    @given(seed=st.integers(0, 2**31))
+    @settings(max_examples=25, deadline=None, database=None)
+    def holds(seed: int) -> None:
+        found = worker.read_mutation(sample, files, seed, frozenset())
+        assert found.kind in mutations.RIGHT, found
+
+    holds()
+
+
+def test_a_usd_file_at_which_the_library_breaks_down_is_refused() -> None:
+    pytest.importorskip("pxr")
+    found = mutations.replay("mesh usdc", 32_000_140)
+    assert found.kind == "refused" and "damaged" in found.detail
