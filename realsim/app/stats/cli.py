@@ -26,18 +26,33 @@ OUT = OutputFolder(
 @click.argument("sources", type=FOLDER, nargs=-1, required=True, metavar="SOURCE...")
 @click.option("--out", type=OUT, default=None, help="Folder for CSV, JSON and an HTML page.")
 @json_file("File for the JSON alone.", *KEYS)
+@click.option("--compare", type=FOLDER, default=None, metavar="OLD",
+              help="Say what differs from an older release instead.")  # fmt: skip
 @many(1, "Sessions at a time.")
 @JSON
 @QUIET
 def stats_command(
-    sources: tuple[Path, ...], out: Path | None, json_file: Path | None, where: "PoolConfig",
-    as_json: bool, quiet: bool,
+    sources: tuple[Path, ...], out: Path | None, json_file: Path | None, compare: Path | None,
+    where: "PoolConfig", as_json: bool, quiet: bool,
 ) -> None:  # fmt: skip
     """Count what sessions hold, row by row as in the paper: scenes, frames, grasps, scores.
 
     SOURCE is a session or a folder of sessions (of `realsim generate` or `upgrade`).
+
+    With --compare, SOURCE and OLD are two releases of one data set, BOP or GraspNet data sets too:
+    scenes, frames, objects, poses that moved and by how much, grasps that came, went or changed.
     """
     from realsim.app.console import Console
     from realsim.app.stats.run import run_stats
 
+    if compare is not None:
+        from realsim.app.stats.compare import compare_releases
+
+        if out is not None or json_file is not None:
+            raise click.UsageError(
+                "--compare shows or prints (--json); leave --out, --json-file out."
+            )
+        console = Console(quiet=quiet, as_json=as_json)
+        console.result(compare_releases(sources, compare, console))
+        return
     run_stats(sources, out, json_file, Console(quiet=quiet, as_json=as_json), where)
