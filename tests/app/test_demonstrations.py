@@ -49,7 +49,8 @@ def written(school, tmp_path_factory):
 
 def files_of(folder):
     return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
-            for p in sorted(folder.rglob("*")) if p.is_file() and not p.name.endswith(".run.json")}  # fmt: skip
+            for p in sorted(folder.rglob("*"))
+            if p.is_file() and not p.name.endswith(".run.json")}  # fmt: skip
 
 
 @pytest.mark.slow
