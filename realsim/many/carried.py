@@ -25,14 +25,20 @@ CHUNK_BYTES = 1 << 20
 class Sent:
     """A file, a folder, or bytes that become a file: only read where the job runs."""
 
-    def __init__(self, source: Path | bytes, *, name: str = "sent") -> None:
+    only: tuple[str, ...] = ()
+
+    def __init__(
+        self, source: Path | bytes, *, name: str = "sent", only: tuple[str, ...] = ()
+    ) -> None:
         """Take what is sent.
 
         Args:
-            source: what is there; a folder goes with everything in it.
+            source: what is there; a folder goes with what is in it.
             name: of the file that bytes become.
+            only: patterns of the paths in a folder that are sent, such as `scene_000001/*`; none =
+                everything.
         """
-        self.source, self.name = source, name
+        self.source, self.name, self.only = source, name, only
 
     @cached_property
     def digest(self) -> str:
@@ -171,7 +177,7 @@ def packed(
             needed[item.digest] = _as_file(item, kept)
             return WireFile(item.digest, item.name, isinstance(item, Shared))
         if source.is_dir():
-            return _listed(source, (), needed, is_worked=False)
+            return _listed(source, item.only, needed, is_worked=False)
         if not source.is_file():
             raise InputError(f"'{source}' is not there, and a job needs it.")
         digest = digest_of(source)

@@ -65,7 +65,7 @@ def upgraded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Resu
     file = dataset / "test/000002/depth/000003.png"
     file.write_bytes(file.read_bytes()[:200])
     before = content_and_times(dataset)
-    done = upgrade(dataset, root / "out", "--scene-workers", "1")
+    done = upgrade(dataset, root / "out", "--workers", "1")
     assert content_and_times(dataset) == before, "the data set is only read"
     return dataset, root / "out", done
 
@@ -123,7 +123,7 @@ def test_a_second_run_does_nothing_again_and_takes_in_what_was_mended(upgraded, 
     mended = dataset / "test/000001/depth/000003.png"
     (copy / "test/000002/depth/000003.png").write_bytes(mended.read_bytes())
     # Of another scene: the objects lie elsewhere, so the pose is judged, the scene is not refused.
-    done = upgrade(copy, again, "--scene-workers", "1")
+    done = upgrade(copy, again, "--workers", "1")
     assert done.exit_code == 0, done.output
     assert "1 of 2 scenes are upgraded already" in done.output
     after = content_and_times(again / "test")

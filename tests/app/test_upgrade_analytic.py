@@ -53,7 +53,7 @@ def test_labels_and_scores_that_rank_alike_have_the_correlation_minus_one() -> N
 @pytest.mark.slow
 def test_analytic_grasps_are_tried_and_kept_beside_the_schools_own(tmp_path: Path) -> None:
     dataset, out = bop_dataset(tmp_path / "dataset"), tmp_path / "out"
-    config = UpgradeConfig(grasps_per_object=2, workers=1)
+    config = UpgradeConfig(grasps_per_object=2, where=1)
     run_upgrade(config, dataset, out, QUIET)
     scene = out / "test/000001"
     own = content_and_times(scene / "grasps")
@@ -94,7 +94,7 @@ def _a_graspnet_roots_own_labels_are_taken(tmp_path: Path, labels: Path) -> None
     for file in labels.glob("*.npz"):
         shutil.copy(file, dataset / "grasp_label" / file.name)
     before, out = content_and_times(dataset), tmp_path / "from_graspnet"
-    run_upgrade(UpgradeConfig(grasps_per_object=2, analytic=4, workers=1), dataset, out, QUIET)
+    run_upgrade(UpgradeConfig(grasps_per_object=2, analytic=4, where=1), dataset, out, QUIET)
     assert content_and_times(dataset) == before
     scene = out / "test_kinect/000100"
     xml = "annotations/0001.xml"

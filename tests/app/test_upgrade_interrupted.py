@@ -22,7 +22,7 @@ LIMIT_S = 300.0
 def start(dataset: Path, out: Path) -> "subprocess.Popen[str]":
     arguments = [str(dataset), "--out", str(out), "--quiet", "--grasps", "12"]
     return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, *arguments, "--scene-workers", "2"],
+        [sys.executable, "-c", PROGRAM, *arguments, "--workers", "2"],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
     )  # fmt: skip
 

@@ -18,6 +18,7 @@ from realsim.app.school.inputs import (
 from realsim.app.school.settle import warn_of_falls
 from realsim.app.stages import note
 from realsim.errors import InputError
+from realsim.many import Workers
 from realsim.records import GraspSet, Scene
 from realsim.robots.robot_files import same_name
 from realsim.store import SessionStore
@@ -183,7 +184,7 @@ def school_session(
     *,
     grasps_per_object: int,
     seed: int = 0,
-    workers: int = 2,
+    workers: Workers = 2,
 ) -> list[GraspSet]:
     """Try grasps on every registered object in the Robot School and keep them in the session.
 

@@ -17,6 +17,7 @@ from realsim.app.console import Console
 from realsim.app.stages import content_key, judged_scene, session_models
 from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig
 from realsim.errors import InputError
+from realsim.many import Workers
 from realsim.records import GraspSet, ObjectModel
 from realsim.store import SessionStore, atomic
 from realsim.untrusted.own_json import read_object
@@ -40,8 +41,8 @@ class AnalyticJob:
     config: UpgradeConfig
     out: Path
     """Folder of the whole upgrade, where computed labels are kept."""
-    workers: int
-    """Processes of the School."""
+    workers: Workers
+    """Who tries them."""
 
 
 def try_analytic(store: SessionStore, job: AnalyticJob, console: Console) -> list[GraspSet]:

@@ -8,7 +8,7 @@ import click
 
 from realsim.app.command import Command
 from realsim.app.option_values import numbers_of
-from realsim.app.options import FOLDER, JSON, QUIET, workers
+from realsim.app.options import FOLDER, JSON, QUIET, many
 from realsim.app.outputs import GOES_ON
 
 
@@ -45,9 +45,7 @@ from realsim.app.outputs import GOES_ON
               help="Candidates to try on each object, at most.")  # fmt: skip
 @click.option("--analytic", default=0, show_default=True, type=click.IntRange(0, 2000),
               help="Analytic grasps to try on each object beside these.")  # fmt: skip
-@click.option("--scene-workers", default=None, type=click.IntRange(1, 256),
-              help="Scenes at a time.  [one a core]")  # fmt: skip
-@workers(help="Processes of one scene, where it is upgraded alone.")
+@many(None, "Scenes at a time, or processes of the only one.  [one a core]")
 @JSON
 @QUIET
 def upgrade_command(

@@ -11,6 +11,7 @@ from realsim.formats.graspnet.labelled import FIRST_TEST_SCENE, GraspnetSceneRef
 from realsim.formats.graspnet.scene import CAMERAS, cameras_of
 from realsim.formats.graspnet.single_frame import is_graspnet_frame, open_graspnet_frame
 from realsim.formats.labelled_scene import LabelledScene
+from realsim.many import Workers
 
 Kind = Literal["auto", "bop", "graspnet"]
 GT = "gt"
@@ -40,10 +41,8 @@ class UpgradeConfig:
     """Analytic grasps tried on each object beside these, at most; 0 = none."""
     seed: int = 0
     """Seed of everything random."""
-    workers: int = 2
-    """Processes in the Robot School where one scene is upgraded at a time."""
-    scene_workers: int | None = None
-    """Scenes upgraded at a time; None = one a core. More than one: each has one process."""
+    where: Workers = None
+    """Who upgrades scenes; of several each has one process, of one the grasps are divided."""
 
     def __post_init__(self) -> None:
         """Check what would be silently wrong.

@@ -72,8 +72,30 @@ def all_records(out: Path) -> list[dict[str, Any]]:
     return records
 
 
-def keep_imported(store: SessionStore, ref: SceneRef, digests: dict[int, str]) -> None:
+def labels_of(ref: SceneRef) -> tuple[str, ...]:
+    """Return the files of grasp labels that a scene's data set has, as paths in it."""
+    if ref.kind != "graspnet":
+        return ()
+    labels = [ref.root / COLLISIONS.format(ref.number)]
+    labels += sorted((ref.root / "grasp_label").glob("*_labels.npz"))
+    return tuple(str(p.relative_to(ref.root)) for p in labels if p.is_file())
+
+
+def keep_imported(
+    store: SessionStore,
+    ref: SceneRef,
+    at: SceneRef,
+    labels: Sequence[str],
+    digests: dict[int, str],
+) -> None:
     """Copy the data set's annotations beside the new ones, and say where they came from.
+
+    Args:
+        store: the session.
+        ref: the scene.
+        at: where its files are on this machine.
+        labels: the data set's files of grasp labels.
+        digests: of the images.
 
     Raises:
         InputError: the session was made from other images.
@@ -88,19 +110,15 @@ def keep_imported(store: SessionStore, ref: SceneRef, digests: dict[int, str]) -
                 f"'{store.folder}' holds an upgrade of other images (image {differing[0]} has "
                 "changed, or is not asked for). Give another --out, or delete that folder."
             )
-    files = [p for pattern in DOCUMENTS[ref.kind] for p in sorted(ref.folder.glob(pattern))]
+    files = [p for pattern in DOCUMENTS[ref.kind] for p in sorted(at.folder.glob(pattern))]
     for path in files:
-        relative = f"{IMPORTED}/{path.relative_to(ref.folder).as_posix()}"
+        relative = f"{IMPORTED}/{path.relative_to(at.folder).as_posix()}"
         data = path.read_bytes()
         if not store.has(relative) or store.path(relative).read_bytes() != data:
             store.write_bytes(relative, data)
-    labels: list[Path] = []
-    if ref.kind == "graspnet":
-        labels = [ref.root / COLLISIONS.format(ref.number)]
-        labels += sorted((ref.root / "grasp_label").glob("*_labels.npz"))
     record = {
         "kind": ref.kind, "dataset": str(ref.root), "scene": str(ref.folder),
-        "grasp_labels": [str(p.relative_to(ref.root)) for p in labels if p.is_file()],
+        "grasp_labels": list(labels),
         "images": said,
     }  # fmt: skip
     if not store.has(source) or store.read_json(source) != record:

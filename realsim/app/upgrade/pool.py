@@ -1,16 +1,25 @@
-"""Scenes upgraded in processes beside this one: one that breaks or is killed harms no other."""
+"""Scenes upgraded by processes or machines: one that breaks or is killed harms no other."""
 
 import sys
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Protocol
 
 from realsim.app.console import Console
 from realsim.app.upgrade.scene import Record, SceneJob, read_source, upgrade_scene
-from realsim.errors import RealsimError
-from realsim.many import Outcome, Task, open_pool, run_many
+from realsim.many import (
+    Outcome,
+    Sent,
+    Task,
+    Worked,
+    Workers,
+    at_most,
+    open_pool,
+    run_many,
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -32,13 +41,17 @@ class Told(Protocol):
         ...
 
 
-def upgrade_in_processes(
-    jobs: Sequence[SceneJob], processes: int, tell: Told, take: Callable[[SceneEnd], None]
+def upgrade_scenes(
+    jobs: Sequence[SceneJob], where: Workers, tell: Told, take: Callable[[SceneEnd], None]
 ) -> None:
-    """Upgrade scenes, so many at a time, and hand on how each ended.
+    """Upgrade scenes, as many at a time as there are workers, and hand on how each ended.
 
     A scene with broken input ends with its reason. A scene whose process was killed is gone on
     with, from the stage where it was; what its stages had finished is not done again.
+
+    Raises:
+        StorageError: the disk is full.
+        ClusterLostError: the cluster's head is gone.
     """
     by = {job.ref.place: job for job in jobs}
     under_way: Sequence[str] = ()
@@ -49,30 +62,49 @@ def upgrade_in_processes(
         tell(None, names)
 
     def done(outcome: Outcome) -> None:
-        end = outcome.value
-        if outcome.error is not None:
-            job, why = by[outcome.task.name], outcome.why
-            if outcome.deaths:
-                why += ". Run the same again with fewer --workers."
-            end = SceneEnd(job=job, record=None, error=why)
+        why = outcome.why + (". Run the same again with fewer --workers." if outcome.deaths else "")
+        end = SceneEnd(job=by[outcome.task.name], record=outcome.value, error=why)
         tell(end, [name for name in under_way if name != outcome.task.name])
         take(end)
 
-    tasks = [Task(name=place, fn=upgraded, args=(job,)) for place, job in by.items()]
-    with open_pool(processes) as pool:
-        run_many(tasks, pool, done, tick=tick)
+    with open_pool(at_most(where, len(jobs))) as pool:
+        run_many(map(_task, jobs), pool, done, tick=tick)
 
 
-def upgraded(job: SceneJob) -> SceneEnd:
-    """Upgrade a scene quietly; whatever breaks it is told, not raised."""
-    try:
-        return SceneEnd(job=job, record=upgrade_scene(job, read_source(job), None))
-    except (RealsimError, OSError) as error:
-        return SceneEnd(job=job, record=None, error=str(error))
-    except Exception as error:  # a fault of the program in one scene of many
-        return SceneEnd(
-            job=job, record=None, error=f"the program failed: {type(error).__name__}: {error}"
-        )
+def _task(job: SceneJob) -> Task:
+    """Return the task of a scene: what it reads of the data set, and the folder that it fills."""
+    ref = job.ref
+    scene = ref.folder.relative_to(ref.root)
+    # Of the scene's folder and those above it; models and labels are the data set's.
+    only = [f"{scene}/*" if scene.parts else "*", f"keyframe_poses/{job.config.start}/*"]
+    only += [
+        p.relative_to(ref.root).as_posix()
+        for above in ref.folder.parents
+        if above == ref.root or ref.root in above.parents
+        for p in above.iterdir()
+        if p.is_file()
+    ]
+    only += job.labels if job.config.analytic else ()
+    root = Sent(ref.root, only=tuple(only))
+    models = Sent(ref.models) if ref.models.is_dir() else None
+    out = Worked(job.out, only=(f"{ref.place}/*", "grasp_label/*"))
+    return Task(name=ref.place, fn=upgraded, args=(out, job, root, models))
+
+
+def upgraded(out: Path, job: SceneJob, root: Path, models: Path | None) -> Record:
+    """Upgrade a scene quietly.
+
+    Args:
+        out: folder of the whole upgrade.
+        job: the scene.
+        root: folder of the data set.
+        models: folder of the models, if there is one.
+    """
+    ref = job.ref
+    folder = root / ref.folder.relative_to(ref.root)
+    at = replace(ref, root=root, folder=folder, models=models or ref.models)
+    job = replace(job, out=out, at=at)
+    return upgrade_scene(job, read_source(job), None)
 
 
 @contextmanager

@@ -19,12 +19,14 @@ from realsim.app.upgrade.files import (
     finished_record,
     gather_models,
     key_of,
+    labels_of,
     write_root_files,
 )
-from realsim.app.upgrade.pool import SceneEnd, scene_progress, upgrade_in_processes
+from realsim.app.upgrade.pool import SceneEnd, scene_progress, upgrade_scenes
 from realsim.app.upgrade.scene import Record, SceneJob, read_source, upgrade_scene
 from realsim.app.upgrade.tables import show_upgrade, write_tables
 from realsim.errors import InputError
+from realsim.many import Workers
 from realsim.store.lock import only_run_in
 
 __all__ = ["UpgradeConfig", "UpgradeResult", "run_upgrade", "show_upgrade"]
@@ -68,7 +70,7 @@ def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Consol
         console.say(f"{skipped} of {len(refs)} scenes are upgraded already, with the same inputs")
     with contextlib.ExitStack() as lock:
         if len(refs) == 1 and todo:
-            failed = _alone(_job(todo[0], config, out, config.workers), lock, console, done)
+            failed = _alone(_job(todo[0], config, out, config.where), lock, console, done)
         else:
             failed = _many(todo, config, out, lock, console, done)
         if not done:
@@ -80,8 +82,11 @@ def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Consol
     return UpgradeResult(out=out, scenes=scenes, failed=failed, skipped=skipped, analytic=analytic)
 
 
-def _job(ref: SceneRef, config: UpgradeConfig, out: Path, workers: int) -> SceneJob:
-    return SceneJob(ref=ref, config=config, out=out, workers=workers)
+def _job(ref: SceneRef, config: UpgradeConfig, out: Path, workers: Workers) -> SceneJob:
+    return SceneJob(
+        ref=ref, config=config, out=out, workers=workers, key=key_of(ref, config),
+        labels=labels_of(ref),
+    )  # fmt: skip
 
 
 def _alone(
@@ -112,18 +117,14 @@ def _many(
     Raises:
         InputError: another run is working in the folder.
     """
-    from realsim.interop import cores
-
     out.mkdir(parents=True, exist_ok=True)
     lock.enter_context(only_run_in(out))
     if not refs:
         return {}
     failed: dict[str, str] = {}
-    processes = min(config.scene_workers or cores(), len(refs))
-    workers = config.workers if processes == 1 else 1
-    jobs = [_job(ref, config, out, workers) for ref in refs]
+    jobs = [_job(ref, config, out, 1) for ref in refs]
     with scene_progress(len(refs) + len(done), len(done), quiet=console.quiet) as tell:
-        upgrade_in_processes(jobs, processes, tell, lambda e: _take(e, done, failed, console))
+        upgrade_scenes(jobs, config.where, tell, lambda e: _take(e, done, failed, console))
     return failed
 
 

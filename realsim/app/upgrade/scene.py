@@ -20,11 +20,12 @@ from realsim.app.school.tables import why_no_grasp
 from realsim.app.stages import note, save_starts
 from realsim.app.upgrade.analytic import AnalyticJob, agreement_of, try_analytic
 from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig, open_scene
-from realsim.app.upgrade.files import NOTE, keep_imported, key_of
+from realsim.app.upgrade.files import NOTE, keep_imported
 from realsim.app.upgrade.outcome import Outcome, OutcomeConfig, decide
 from realsim.app.upgrade.source import SceneSource, moved_from_start, prepare, world_starts
 from realsim.formats.grasps.scene_grasps import executed
 from realsim.geometry import se3
+from realsim.many import Workers
 from realsim.records import CaptureSession, GraspSet, ObjectPose, Scene, View
 from realsim.registration.compare import spread_frames
 from realsim.registration.evidence import LazyFrame
@@ -54,8 +55,19 @@ class SceneJob:
     config: UpgradeConfig
     out: Path
     """Folder of the whole upgrade."""
-    workers: int
-    """Processes that the scene may use."""
+    workers: Workers
+    """Who tries its grasps."""
+    key: str
+    """A hash of everything that the result depends on."""
+    labels: tuple[str, ...]
+    """Files of grasp labels in the data set."""
+    at: SceneRef | None = None
+    """Where the data set's files are on another machine; None = where `ref` says."""
+
+    @property
+    def given(self) -> SceneRef:
+        """Where the data set's files are."""
+        return self.at or self.ref
 
     @property
     def folder(self) -> Path:
@@ -99,7 +111,7 @@ def read_source(job: SceneJob) -> SceneSource:
     Raises:
         InputError: something is missing or broken.
     """
-    return prepare(open_scene(job.ref), job.ref, job.config)
+    return prepare(open_scene(job.given), job.given, job.config)
 
 
 def upgrade_scene(job: SceneJob, source: SceneSource, shown: Console | None) -> Record:
@@ -117,7 +129,7 @@ def upgrade_scene(job: SceneJob, source: SceneSource, shown: Console | None) -> 
     from realsim.app.report.session import write_report
     from realsim.formats.bop.models import save_models
 
-    key, console = key_of(job.ref, job.config), SceneConsole(shown)
+    key, console = job.key, SceneConsole(shown)
     job.folder.mkdir(parents=True, exist_ok=True)
     with only_run_in(job.folder):
         store = _session_of(job, source)
@@ -134,7 +146,7 @@ def upgrade_scene(job: SceneJob, source: SceneSource, shown: Console | None) -> 
         )  # fmt: skip
         analytic: list[GraspSet] = []
         if job.config.analytic:
-            asked = AnalyticJob(ref=job.ref, config=job.config, out=job.out, workers=job.workers)
+            asked = AnalyticJob(ref=job.given, config=job.config, out=job.out, workers=job.workers)
             analytic = try_analytic(store, asked, console)
         annotate_session(store, console)
         notes = [*source.notes, *registration_notes(store), *console.told]
@@ -144,7 +156,7 @@ def upgrade_scene(job: SceneJob, source: SceneSource, shown: Console | None) -> 
         record["analytic"] = agreement_of(analytic)
         note(
             store, "upgraded", console, request=job.config, key=key,
-            inputs={f"{provenance.GIVEN}scene": provenance.sha256_of(job.ref.folder)},
+            inputs={f"{provenance.GIVEN}scene": provenance.sha256_of(job.given.folder)},
         )  # fmt: skip
         store.write_json(NOTE, {"key": key, "record": record})
     return record
@@ -244,7 +256,7 @@ def _session_of(job: SceneJob, source: SceneSource) -> SessionStore:
         if scene.T_world_table is not None:
             extra["gravity_up_world"] = scene.T_world_table[:3, 2].tolist()
         store = SessionStore.create(folder, session, extra)
-    keep_imported(store, job.ref, source.digests)
+    keep_imported(store, job.ref, job.given, job.labels, source.digests)
     for index in source.indices:
         depth_file = scene.depth_file(index)
         if index not in store.completed and depth_file is not None:
