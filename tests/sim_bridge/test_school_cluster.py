@@ -1,4 +1,4 @@
-"""Robot School on a Ray cluster: what it finds is what one process finds, a killed worker and all."""
+"""Robot School on a Ray cluster that loses a worker: it finds what one process finds."""
 
 import os
 import signal
