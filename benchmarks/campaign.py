@@ -5,6 +5,7 @@
   losses      lost_node_equal                1 = a node killed in the middle changes no byte
               lost_head_told                 1 = a lost head ends in a sentence, what was made is
                                              kept, and the same command goes on
+  graspnet    graspnet_grasps_back       grasps of a GraspNet export that another reader gets back
   reproduce   reproduce_equal            1 = register, school, annotate and export are made again
                                          bit for bit from their records
 
@@ -21,12 +22,16 @@ FIGURES = {
     "lost_node_equal": Figure(unit="", goal=Goal(low=1, high=1)),
     "lost_head_told": Figure(unit="", goal=Goal(low=1, high=1)),
     "reproduce_equal": Figure(unit="", goal=Goal(low=1, high=1)),
+    "graspnet_grasps_back": Figure(unit="", goal=Goal(low=0.999)),
+    "graspnet_worst_mm": Figure(unit="mm", goal=Goal(high=0.1)),
+    "graspnet_view_deg": Figure(unit="deg"),
 }
 PARTS = {
     "school": "campaign_ray:school",
     "generate": "campaign_ray:generate",
     "losses": "campaign_ray:losses",
     "reproduce": "campaign_reproduce:reproduce",
+    "graspnet": "campaign_graspnet:grasps_back",
 }
 
 if __name__ == "__main__":

@@ -38,11 +38,12 @@ def grasps_back(args: argparse.Namespace) -> Found:
     """Return how many grasps of an export of a session are read back."""
     found = Found()
     with tempfile.TemporaryDirectory(prefix="campaign_graspnet_") as place:
-        session = args.session or _demo(Path(place), args.quick)
+        given: Path | None = getattr(args, "session", None)
+        session = given or _demo(Path(place), args.quick)
         out = Path(place) / "graspnet"
         _realsim("export", session, "--to", "graspnet", "--out", out, "--quiet")
         right, count, worst, turned = _compared(session, out)
-    words = f"{count} grasps of all images of {'a demo' if args.session is None else session}"
+    words = f"{count} grasps of all images of {given or 'a demo'}"
     found.add("graspnet_grasps_back", right / max(count, 1), words)
     found.add("graspnet_worst_mm", worst, "the worst of them")
     found.add("graspnet_view_deg", turned, "median; 300 views are up to 8.8 deg from a direction")

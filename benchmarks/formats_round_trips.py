@@ -39,8 +39,8 @@ from tried_grasps import tried_set
 FRAMES, QUICK_FRAMES = 60, 8
 POSES = 20_000
 GRASPS = 2_000
-BOUND_MM = 0.5e-4 * np.sqrt(3) * 1e3
-"""Half of the fourth decimal of a metre along three axes."""
+BOUND_MM = 1e-4
+"""Nine decimals of a metre, and the single precision of meta files."""
 CAMERA_FILES = ("camera_poses.npy", "cam0_wrt_table.npy", "camK.npy")
 SINGLE = 2e-7
 """What the single precision of the meta files, which are read, may change [m, entries]."""

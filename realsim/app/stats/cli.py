@@ -49,9 +49,7 @@ def stats_command(
         from realsim.app.stats.compare import compare_releases
 
         if out is not None or json_file is not None:
-            raise click.UsageError(
-                "--compare shows or prints (--json); leave --out, --json-file out."
-            )
+            raise click.UsageError("--compare shows or prints (--json): no --out, no --json-file.")
         console = Console(quiet=quiet, as_json=as_json)
         console.result(compare_releases(sources, compare, console))
         return

@@ -162,9 +162,9 @@ def _same(before: GraspSet, after: GraspSet) -> list[tuple[int, int]]:
     """Return the rows of grasps that are in both sets, each once."""
     if not len(before) or not len(after):
         return []
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    tree = cKDTree(after.Ts_obj_grasp[:, :3, 3])
+    tree = KDTree(after.Ts_obj_grasp[:, :3, 3])
     pairs: list[tuple[int, int]] = []
     taken: set[int] = set()
     for i, T in enumerate(before.Ts_obj_grasp):
