@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     required=True,
     help="Folder to fill; new, or to go on in.",
 )
+@click.option("--task", default="grasp", show_default=True, type=click.Choice(("grasp", "place")),
+              help="Grasp and shake, or put it somewhere.")  # fmt: skip
 @click.option("--fps", default=20, show_default=True, type=click.IntRange(1, 240),
               help="Steps per second.")  # fmt: skip
 @click.option("--outcome", default="all", show_default=True,

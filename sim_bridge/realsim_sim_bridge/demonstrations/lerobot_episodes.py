@@ -5,7 +5,7 @@ LeRobot's training takes the others for nothing, so that what only a simulation 
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from realsim import interop
 from realsim.arrays import Array, Array32, Rgb
 from realsim.formats.lerobot.episodes import LeRobotCamera, LeRobotEpisode, LeRobotFeature
 from realsim.geometry import se3
-from realsim.records.trajectories import PHASES
+from realsim_sim_bridge.demonstrations.records import ALL_PHASES
 from realsim_sim_bridge.demonstrations.source import Demonstration, DemonstrationSource
 
 STATE, ACTION, GOAL = "observation.state", "action", "observation.goal.grasp_pose"
@@ -47,7 +47,7 @@ CONVENTIONS = (
     (OBJECT, "the object that is to be grasped, in the arm's base, likewise: what a camera does "
              "not tell"),
     (EXTRINSICS + "NAME", "the camera in the arm's base, as the goal; x right, y down, z forward"),
-    ("phase", ", ".join(f"{k} {name}" for k, name in enumerate(PHASES))),
+    ("phase", ", ".join(f"{k} {name}" for k, name in enumerate(ALL_PHASES))),
     ("held", "whether both fingers hold the object"),
     ("next.reward", "1 at the last step of an attempt that passed all stages, else 0"),
     ("next.done", "true at the last step"),
@@ -223,4 +223,6 @@ def _notes(demonstration: Demonstration) -> dict[str, Any]:
         "failure": outcome.failure,
         "replay_agrees": outcome.agrees,
         "notes": list(demonstration.notes),
+        "place": None if goal.place is None else asdict(goal.place),
+        "Ts_base_obj": {str(i): T.tolist() for i, T in demonstration.step(0).Ts_base_obj.items()},
     }

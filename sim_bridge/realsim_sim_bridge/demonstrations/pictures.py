@@ -183,7 +183,7 @@ class ScenePictures:
             middle_xy: middle of the scene on the table [m].
         """
         self.cameras, self._objects, self._arm = cameras, objects, arm
-        self.T_table_base, self._middle = T_table_base, middle_xy
+        self.T_table_base, self.middle_xy = T_table_base, np.array(middle_xy)
         self._known: tuple[MovingScene, dict[int, int], int] | None = None
 
     def scene(self) -> tuple[MovingScene, dict[int, int], int]:
@@ -195,7 +195,7 @@ class ScenePictures:
         """
         if self._known is None:
             table = np.eye(4)
-            table[:2, 3] = self._middle
+            table[:2, 3] = self.middle_xy
             placed = [PlacedMesh(BACKGROUND, table_slab(), table)]
             numbers = {i: 1 + k for k, i in enumerate(sorted(self._objects))}
             placed += [PlacedMesh(i, *self._objects[i]) for i in numbers]

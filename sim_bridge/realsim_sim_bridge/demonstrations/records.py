@@ -7,7 +7,12 @@ from typing import Any
 from realsim.arrays import Array, Rgb
 from realsim.records import CameraIntrinsics
 from realsim.records.checked_arrays import rigid
+from realsim.records.trajectories import PHASES
 from realsim.rendering.moving_scene import MovingPicture
+from realsim_sim_bridge.demonstrations.placing import PlaceGoal
+
+ALL_PHASES = (*PHASES, "carry", "lower", "release", "withdraw")
+"""The parts of a demonstration, in order: those of an attempt, and of putting the object down."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -51,6 +56,8 @@ class GraspGoal:
     """(4, 4) the grasp in the arm's base [m]."""
     language: str
     """The task in words."""
+    place: PlaceGoal | None = None
+    """Where it is to be put; None = the grasp is all."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -93,7 +100,7 @@ class DemonstrationStep:
     time_s: float
     """Since the attempt's start [s]."""
     phase: str
-    """One of PHASES: reach, approach, close, lift, oscillate, pendulum."""
+    """One of ALL_PHASES."""
     joints_rad: Array
     """(7,) [rad]."""
     opening_m: float

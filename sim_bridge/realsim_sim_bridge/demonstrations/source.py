@@ -24,7 +24,6 @@ from realsim.geometry.mesh import hull_vertices
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectModel
 from realsim.records.grasps import LABEL_MEASURES
-from realsim.records.trajectories import PHASES
 from realsim.untrusted.own_json import to_json
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.reach_config import base_on_table, grasping_arm
@@ -38,6 +37,7 @@ from realsim_sim_bridge.demonstrations.front_view import (
 )
 from realsim_sim_bridge.demonstrations.pictures import AttemptPictures, ScenePictures, drawn_mesh
 from realsim_sim_bridge.demonstrations.records import (
+    ALL_PHASES,
     AttemptOutcome,
     DemonstrationCamera,
     DemonstrationConfig,
@@ -143,7 +143,7 @@ class Demonstration:
         return DemonstrationStep(
             index=k,
             time_s=float(m.time_s[k]),
-            phase=PHASES[m.phase[k]],
+            phase=ALL_PHASES[m.phase[k]],
             joints_rad=m.joints_rad[k],
             opening_m=float(m.opening_m[k]),
             held=bool(m.held[k]),
