@@ -23,6 +23,11 @@ Parts and the figures they give (keys of the JSON's "figures"):
            click_wall_ms       until the first bytes of the answer, the slowest kind
            click_first_wall_ms    the same of the first click of every kind, which also starts
                                preparing in the background for those that follow
+  page     first_frame_s       from the address until the scene of 24 views is in the middle of a
+                               window of 1280x800, in Chromium without a graphics card
+           scene_share         share of this window that no panel covers
+           report_first_photo_px    where the report's first picture begins
+           console_errors      what the browser calls an error, on both pages
 """
 
 import os
@@ -49,11 +54,16 @@ FIGURES = {
     "big_open_cpu_s": Figure(unit="s", goal=Goal(high=5.0)),
     "big_open_mb": Figure(unit="MB", goal=Goal(high=600.0)),
     "big_sent_mb": Figure(unit="MB"),
+    "first_frame_s": Figure(unit="s", goal=Goal(high=2.5)),
+    "scene_share": Figure(unit="", goal=Goal(low=0.75)),
+    "report_first_photo_px": Figure(unit="px", goal=Goal(high=900.0)),
+    "console_errors": Figure(unit="", goal=Goal(high=0.0)),
 }
 PARTS = {
     "opening": "review_opening:opening",
     "clicks": "review_clicks:clicks",
     "big": "review_opening:big_scene",
+    "page": "review_page:page",
 }
 
 if __name__ == "__main__":

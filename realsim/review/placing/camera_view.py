@@ -33,7 +33,7 @@ KEPT_PHOTOS = 6
 """Straightened photographs that are kept; 1.6 MB each at 960 px."""
 KEPT_CASTS = 128
 """Outlines that are kept: of 15 objects in 8 views."""
-THIN_PX, BOLD_PX = 2, 4
+THIN_PX, BOLD_PX = 2, 3
 """Width of an outline and of the highlighted one [px]."""
 DASH_PX, GAP_PX = 6, 6
 """Dash and gap of the hidden part of an outline [px]."""
@@ -294,7 +294,7 @@ def _draw(
     canvas: Any = rgb
     for lines, ink, thick in (
         (dashes, INK, width_px + 1), (dashes, dim, width_px),
-        (solid, INK, width_px + 2), (solid, color, width_px),
+        (solid, INK, width_px + 1), (solid, color, width_px),
     ):  # fmt: skip
         cv2.polylines(canvas, lines, False, ink, thick, cv2.LINE_AA)
 

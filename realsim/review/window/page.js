@@ -33,16 +33,17 @@
     tell(fields);
   });
   const wanted = said().get("tab");
-  const look = new MutationObserver(() => {
+  // A tab that is there may not listen yet: it is pressed until it is chosen.
+  let tries = 0;
+  const press = setInterval(() => {
     const tab = tabs().find((t) => t.textContent.trim() === wanted);
+    if (!wanted || (tab && tab.ariaSelected === "true") || ++tries > 300) return clearInterval(press);
     if (!tab) return;
-    look.disconnect();
     const at = tab.getBoundingClientRect();
     const where = { bubbles: true, clientX: at.x + at.width / 2, clientY: at.y + at.height / 2, button: 0 };
     for (const kind of ["pointerdown", "pointerup", "click"])
       tab.dispatchEvent(new PointerEvent(kind, { ...where, pointerId: 1, isPrimary: true }));
-  });
-  if (wanted) look.observe(document, { childList: true, subtree: true });
+  }, 200);
   addEventListener("DOMContentLoaded", () => {
     const canvas = document.createElement("canvas");
     if (canvas.getContext("webgl2") || canvas.getContext("webgl")) return;

@@ -11,7 +11,7 @@ from realsim.review.window import window_text
 if TYPE_CHECKING:
     from realsim.review.window.window import Window
 
-LIST_PX, LIST_HEIGHT_PX, EDGE_PX = 230, 340, 8
+LIST_PX, LIST_HEIGHT_PX, EDGE_PX = 230, 310, 8
 """Width and height of the list, and how far from the window's corner it floats [px]."""
 ROWS = 16
 """Objects on one page of the list: as many as stand one above the other on a laptop's screen."""

@@ -64,7 +64,9 @@ class ObjectPanel:
         """Take back the last line on this object."""
         window = self._window
         entry = window.session.undo(window.placed, self._last, window.reviewer)
-        window.decided(entry, "the last line on this object is taken back")
+        last = self._last
+        what = "" if last is None else window_text.undo_label(last).removeprefix("Undo: ")
+        window.decided(entry, f"taken back on {window.model_of(window.placed).name}: {what}")
 
     def selected(self) -> None:
         """Begin with another object."""

@@ -95,6 +95,7 @@ class ShowPanel:
             look = "faded"  # points inside a model are the ones that matter
         with self._window.client.atomic():
             nodes.show_objects(look)
+            nodes.show_box(free)
             nodes.show_cloud(self._cloud.value and free)
             nodes.show_cameras(self._cameras.value and free)
             nodes.show_table(self._table.value and free)

@@ -35,7 +35,7 @@ from realsim.review.window.panel_object import ObjectPanel
 from realsim.review.window.panel_show import ShowPanel
 from realsim.review.window.panel_views import ViewsPanel
 
-PANEL_PX, PANEL_HEIGHT_PX, EDGE_PX = 300, 560, 8
+PANEL_PX, PANEL_HEIGHT_PX, EDGE_PX = 300, 530, 8
 """Width and height of the panel on the right, and how far from the window's edges it floats [px]:
 with the list it leaves three quarters of 1280x800 to the scene."""
 log = logging.getLogger(__name__)
