@@ -14,9 +14,10 @@ rotation first). Every other one is converted here, each by a function with a kn
 
 import ctypes
 import os
+import signal
 import sys
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import ModuleType
 from typing import Any
 
@@ -110,6 +111,16 @@ def import_open3d() -> Any:
         raise missing_library("open3d", error) from error
     module: ModuleType = open3d
     return module
+
+
+def import_pycolmap() -> Any:
+    """Return the module `pycolmap`, which must not answer SIGTERM with a stack trace as it does."""
+    answer = signal.getsignal(signal.SIGTERM)
+    import pycolmap
+
+    with suppress(ValueError):  # not the main thread: whoever runs that handles signals
+        signal.signal(signal.SIGTERM, answer)
+    return pycolmap
 
 
 def import_pyrealsense2() -> Any:

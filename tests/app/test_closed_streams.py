@@ -64,3 +64,16 @@ def test_a_reader_that_has_gone_is_no_failed_check(
     writes = also_errors or words != ["no"]
     assert done.returncode == (128 + signal.SIGPIPE if writes else 2)
     assert not done.stderr or b"Traceback" not in done.stderr
+
+
+def test_pycolmap_leaves_the_answer_to_sigterm_alone() -> None:
+    script = """if True:
+        import os, signal, sys, time
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+        from realsim.interop import import_pycolmap
+        import_pycolmap()
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(5)
+    """
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
+    assert done.returncode == 143 and b"stack trace" not in done.stderr

@@ -10,6 +10,7 @@ from realsim.app.console import Console, Tick
 from realsim.app.scan.sfm.dense import mesh_from_depth
 from realsim.app.scan.sfm.inputs import SfmInputs, SfmRequest, sfm_inputs, sfm_masks
 from realsim.errors import InputError
+from realsim.interop import import_pycolmap
 from realsim.scanning.sfm.config import SfmConfig
 from realsim.scanning.sfm.result import SfmResult
 
@@ -98,6 +99,7 @@ def _reconstructed(
     """Run the reconstruction."""
     from realsim.scanning.sfm.reconstruct import reconstruct, with_depth
 
+    import_pycolmap()  # before anything else does
     with _steps(console) as progress:
         result = reconstruct(
             inputs.paths, inputs.intrinsics, config, poses=inputs.poses,
