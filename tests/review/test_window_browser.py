@@ -94,7 +94,7 @@ def test_a_scene_of_any_up_is_framed_at_once_and_a_link_shows_the_same(
             page.tab("Views")
             link = page.page.url
         with browser.page(link, width=1280, height=800) as page:
-            page.wait_for("instance 0, object 1", "Stand in this camera")
+            page.wait_for("\u25b6 0 tall", "Leave this view out")
             page.wait_until(lambda: "tab=Views" in page.page.url, "the tab")
     finally:
         tilted.stop()
