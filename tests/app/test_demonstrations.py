@@ -11,8 +11,11 @@ from realsim.app.demonstrations import run as demonstrations
 from realsim.app.demonstrations.cli import demonstrations_command
 from realsim.app.demonstrations.run import DemonstrationRequest, open_source
 from realsim.errors import InputError
-from realsim_sim_bridge.demonstrations import lerobot_episodes
-from realsim_sim_bridge.demonstrations.lerobot_episodes import episode_columns
+from realsim_sim_bridge.demonstrations.lerobot_episodes import (
+    GOAL,
+    LeRobotDemonstrations,
+    episode_columns,
+)
 from school_sessions import registered, run
 
 WEAK = ("--engine", "mujoco", "--grasps", "8", "--workers", "1", "--quiet", "--force", "4",
@@ -63,6 +66,7 @@ def test_what_is_streamed_is_what_is_written(school, written):
     chosen = demonstrations.chosen_attempts(source, request)
     table = [r for f in sorted(written.glob("data/*/*.parquet"))
              for r in pq.read_table(f).to_pylist()]  # fmt: skip
+    features = LeRobotDemonstrations(source, "", chosen).features
     frames = {}
     for camera in ("front", "wrist"):
         frames[camera] = []
@@ -75,7 +79,7 @@ def test_what_is_streamed_is_what_is_written(school, written):
         rows = table[at : at + len(d)]
         assert {r["episode_index"] for r in rows} == {episode}
         for key, values in episode_columns(d).items():
-            kind = lerobot_episodes.FEATURES[key].dtype
+            kind = features[key].dtype
             found = np.array([r[key] for r in rows]).astype(kind)
             np.testing.assert_array_equal(found, np.asarray(values).astype(kind), err_msg=key)
         for step in (d.step(0), d.step(len(d) - 1)):
@@ -99,7 +103,7 @@ def test_page_checksums_and_card_are_there(written):
         assert hashlib.sha256((written / name).read_bytes()).hexdigest() == digest, name
     card = (written / "README.md").read_text()
     assert "LeRobot v3.0" in card
-    assert lerobot_episodes.GOAL in card
+    assert GOAL in card
     assert not (written / ".export").exists()
 
 
@@ -107,7 +111,7 @@ def test_page_checksums_and_card_are_there(written):
 def test_an_interrupted_export_goes_on_and_gives_the_same_bytes(
     school, written, tmp_path, monkeypatch
 ):
-    asked, real = [], lerobot_episodes.LeRobotDemonstrations.episode
+    asked, real = [], LeRobotDemonstrations.episode
 
     def dying(self, k):
         if k == 1:
@@ -116,7 +120,7 @@ def test_an_interrupted_export_goes_on_and_gives_the_same_bytes(
         return real(self, k)
 
     with monkeypatch.context() as patch:
-        patch.setattr(lerobot_episodes.LeRobotDemonstrations, "episode", dying)
+        patch.setattr(LeRobotDemonstrations, "episode", dying)
         assert demonstrate(school, "--out", tmp_path / "demos", *SMALL).exit_code != 0
     other = (*SMALL[:1], "6", *SMALL[2:])
     assert "another request" in refused(school, "--out", tmp_path / "demos", *other)
@@ -125,12 +129,22 @@ def test_an_interrupted_export_goes_on_and_gives_the_same_bytes(
         asked.append(k)
         return real(self, k)
 
-    monkeypatch.setattr(lerobot_episodes.LeRobotDemonstrations, "episode", counting)
+    monkeypatch.setattr(LeRobotDemonstrations, "episode", counting)
     result = demonstrate(school, "--out", tmp_path / "demos", *SMALL)
     assert result.exception is None, result.output
     assert asked == [0, 1, 2]
     assert files_of(tmp_path / "demos") == files_of(written)
     assert "finished export" in refused(school, "--out", written)
+
+
+@pytest.mark.slow
+def test_two_processes_write_the_same_bytes(school, written, tmp_path):
+    result = demonstrate(school, "--out", tmp_path / "demos", *SMALL[:-1], "2", "--workers", "2")
+    assert result.exception is None, result.output
+    other, one = files_of(tmp_path / "demos"), files_of(written)
+    data = [n for n in one if n.startswith(("data/", "videos/", "meta/", "realsim/"))]
+    assert data
+    assert {n: other[n] for n in data} == {n: one[n] for n in data}
 
 
 @pytest.mark.slow
