@@ -9,7 +9,7 @@
   reproduce   reproduce_equal            1 = register, school, annotate and export are made again
                                          bit for bit from their records
 
-    uv run --extra cluster python benchmarks/campaign.py [--quick] [--only PART] [--json FILE]
+    uv run --extra cluster python benchmarks/campaign.py [--quick] [--part PART] [--json FILE]
 
 A part is a function of a module; further ones are added to FIGURES and PARTS.
 """
