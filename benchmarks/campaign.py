@@ -8,6 +8,7 @@
   graspnet    graspnet_grasps_back       grasps of a GraspNet export that another reader gets back
   reproduce   reproduce_equal            1 = register, school, annotate and export are made again
                                          bit for bit from their records
+  demonstrations  see campaign_demonstrations.py
 
     uv run --extra cluster python benchmarks/campaign.py [--quick] [--part PART] [--json FILE]
 
@@ -31,6 +32,7 @@ PARTS = {
     "generate": "campaign_ray:generate",
     "losses": "campaign_ray:losses",
     "reproduce": "campaign_reproduce:reproduce",
+    "demonstrations": "campaign_demonstrations:demonstrations",
     "graspnet": "campaign_graspnet:grasps_back",
 }
 
