@@ -31,7 +31,7 @@ from realsim.formats.graspnet.meta import read_meta
 from realsim.formats.grasps.acronym import AcronymObject, read_acronym, write_acronym
 from realsim.formats.grasps.graspgen import read_graspgen, write_graspgen
 from realsim.formats.grasps.isaac_grasp import read_isaac_grasp, write_isaac_grasp
-from realsim.formats.grasps.scene_grasps import executed
+from realsim.formats.grasps.scene_grasps import executed, labelled
 from realsim.geometry import se3
 from realsim.records import GraspSet
 from tried_grasps import tried_set
@@ -215,13 +215,13 @@ def _grasps(found: Found, home: Path, seed: int) -> None:
     grasps = tried_set(np.random.default_rng(seed), GRASPS)
     kept = grasps.Ts_obj_grasp[executed(grasps)]
     T = np.eye(4)
-    scored = grasps.Ts_obj_grasp[~np.isnan(grasps.scores)]
+    scored = grasps.Ts_obj_grasp[~np.isnan(grasps.labels)]
     ways: dict[str, tuple[Array, Callable[[GraspSet], Array]]] = {
         "acronym": (kept, lambda s: read_acronym(
             write_acronym(home / "a.h5", s, AcronymObject(file="a.obj"))).Ts_obj_grasp),
         "graspgen": (kept, lambda s: read_graspgen(
             write_graspgen(home / "g.json", s, file="a.obj")).Ts_obj_grasp),
-        "isaac": (kept, lambda s: read_isaac_grasp(
+        "isaac": (grasps.Ts_obj_grasp[labelled(grasps)], lambda s: read_isaac_grasp(
             write_isaac_grasp(home / "i.yaml", s, object_frame="a")).Ts_obj_grasp),
         "graspgroup": (scored, lambda s: read_grasp_group(
             write_grasp_group(home / "g.npy", grasp_group([s], {s.instance: T}))).Ts_a_grasp),
