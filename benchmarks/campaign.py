@@ -23,6 +23,8 @@ FIGURES = {
     "lost_node_equal": Figure(unit="", goal=Goal(low=1, high=1)),
     "lost_head_told": Figure(unit="", goal=Goal(low=1, high=1)),
     "reproduce_equal": Figure(unit="", goal=Goal(low=1, high=1)),
+    "demo_attempt_cpu_s": Figure(unit="s", goal=Goal(high=5.0)),
+    "languages_checked_share": Figure(unit="", goal=Goal(low=1.0, high=1.0)),
     "graspnet_grasps_back": Figure(unit="", goal=Goal(low=0.999)),
     "graspnet_worst_mm": Figure(unit="mm", goal=Goal(high=0.1)),
     "graspnet_view_deg": Figure(unit="deg"),
