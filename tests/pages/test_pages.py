@@ -94,9 +94,9 @@ def test_a_page_is_whole_escaped_and_asks_for_nothing() -> None:
     # The large picture stands there once; the dialog's picture has no source of its own.
     assert len(sources) == 1 + 1 + 1 + 4 + 2 + 3
     shown = [_picture(s) for s in sources]
-    assert shown[0].shape == (720, 1280, 3)
-    np.testing.assert_allclose(shown[2], flat(200, 30, 30), atol=4)
-    np.testing.assert_allclose(shown[3], flat(30, 30, 200), atol=4)
+    assert shown[1].shape == (720, 1280, 3)
+    np.testing.assert_allclose(shown[3], flat(200, 30, 30), atol=4)
+    np.testing.assert_allclose(shown[4], flat(30, 30, 200), atol=4)
     assert page.shown == {"Sliders": (2, 2), "Layers": (1, 1), "Sheet": (3, 3)}
 
 
