@@ -20,6 +20,7 @@ from realsim.formats.bop.labels import mask_path
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.imported_labels import ImportedLabels, load_imported
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
+from realsim.geometry import se3
 from realsim.records import GraspSet, ObjectModel
 from realsim.records import bop_units as units
 from realsim.store import SessionStore, load_grasps, load_scene
@@ -31,6 +32,10 @@ SPLIT = re.compile(r"(train|val|test)(_\w+)?")
 GT_INFO_KEYS = (
     "bbox_obj", "bbox_visib", "px_count_all", "px_count_valid", "px_count_visib", "visib_fract"
 )  # fmt: skip
+
+
+MOVED_M = 0.001
+"""Objects that were moved by more than this since their grasps were tried are told of [m]."""
 
 
 class SessionScene:
@@ -206,6 +211,26 @@ class SessionScene:
         )
 
 
+def _moved_since_tried(store: SessionStore) -> list[float]:
+    """Return how far objects have been moved on the table since their grasps were tried [m]."""
+    if not store.has("registration/scene.json"):
+        return []
+    scene = load_scene(store)
+    if scene.plane is None:
+        return []
+    T_table_world = se3.invert(scene.plane.T_world_table)
+    stands = {o.instance: T_table_world @ o.T_world_obj for o in scene.objects}
+    moved: list[float] = []
+    for tried in load_grasps(store):
+        then = np.array((tried.parameters.get("inputs") or {}).get("T_table_obj", np.nan))
+        now = stands.get(tried.instance)
+        if now is not None and then.shape == (4, 4):
+            corners = 0.05 * np.vstack([np.zeros(3), np.eye(3)])
+            apart = se3.transform(now, corners) - se3.transform(then, corners)
+            moved.append(float(np.linalg.norm(apart, axis=1).max()))
+    return [d for d in moved if d > MOVED_M]
+
+
 def open_session_scene(
     store: SessionStore,
     *,
@@ -259,6 +284,13 @@ def open_session_scene(
         notes += imported.notes
     if chosen == "none" and labels != "none":
         notes.append("it has no labels: images and cameras only.")
+    moved = _moved_since_tried(store)
+    if moved:
+        notes.append(
+            f"the grasps of {len(moved)} object{'s' if len(moved) > 1 else ''} were tried where "
+            f"they no longer stand (moved by up to {1e3 * max(moved):.1f} mm): run `realsim school "
+            f"{store.folder.name} --restart` and annotate again."
+        )
     numbers = {i: i for i in views} if imported is None else imported.number_of_view
     return SessionScene(
         store,

@@ -35,6 +35,7 @@ def written(folder, text):
         (HEAD.replace("stages", "stage") + SCENES, "did you mean stages"),
         (HEAD.replace('"annotate"', '"anotate"') + SCENES, "there is no stage 'anotate'"),
         (HEAD.replace('"annotate", "export"', '"export", "annotate"') + SCENES, "behind 'export'"),
+        (HEAD.replace('"annotate"', '"school", "register"') + SCENES, "works on its result"),
         (HEAD + SCENES + EXPORT.replace("to", "two"), "line 11: [export] has no option 'two'"),
         (HEAD + SCENES + EXPORT + 'out = "x"\n', "a campaign sets --out itself"),
         (HEAD + SCENES + EXPORT + "[register]\n", "[register] has no effect"),
@@ -89,6 +90,17 @@ def test_a_scene_that_fails_is_listed_the_others_go_on_and_only_it_is_done_again
     views.write_bytes(kept)
     assert run(path).exit_code == 0
     assert document(out)["done"] == 2
+    # Other options of an export: it is made anew. A photograph is damaged: the others are kept.
+    written(tmp_path, HEAD + SCENES + EXPORT + 'licence = "CC0-1.0"\n')
+    assert run(path).exit_code == 0
+    assert "CC0-1.0" in (out / "export/README.md").read_text()
+    assert not (out / "export.before").exists()
+    photograph = out / "scenes/scene_000000/rgb/000000.png"
+    photograph.write_bytes(photograph.read_bytes()[:100])
+    assert run(path).exit_code == 1
+    told = document(out)
+    assert told["done"] == 2 and list(told["failed"]) == ["generate"]
+    assert "scenes/scene_000000/rgb/000000.png" in (out / "campaign.html").read_text()
 
 
 @pytest.mark.slow

@@ -37,8 +37,8 @@ OF_A_SCENE = {
     "render": ("render",),
     "report": ("report",),
 }
-"""Stages that each scene goes through, and their commands."""
-OF_ALL = {"export": ("export",), "stats": ("stats",), "demonstrations": ("demonstrations",)}
+"""Stages that each scene goes through, in this order, and their commands."""
+OF_ALL = {"export": ("export",), "stats": ("stats",)}
 """Stages over all finished scenes."""
 FROM = ("generate", "sources", "sessions")
 """Where scenes come from."""
@@ -57,6 +57,8 @@ class Step:
     """As they are typed."""
     has_workers: bool = False
     """Whether the command takes --workers."""
+    has_restart: bool = False
+    """Whether it takes --restart, and refuses to go on with other options without."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -73,6 +75,8 @@ class Campaign:
     """Generates or imports; None = the sessions are there."""
     of_a_scene: tuple[Step, ...]
     of_all: tuple[Step, ...]
+    scenes: int | None = None
+    """Of generated ones, so many are taken."""
 
 
 def read_campaign(path: Path, root: Group) -> Campaign:
@@ -86,6 +90,11 @@ def read_campaign(path: Path, root: Group) -> Campaign:
         InputError: it is not there or not TOML, a table or key that there is not (with its line),
             scenes from nowhere or from two places, a stage in the wrong place.
     """
+    if not path.is_file():
+        raise InputError(
+            f"'{path}' is {'no file' if path.exists() else 'not there'}; a campaign's file is TOML "
+            "with a table [campaign]: see `realsim pipeline --help`."
+        )
     file = read_config(path, "CAMPAIGN", is_named=True)
     tables = {k: v for k, v in file.tables.items() if k != "campaign"}
     head = _head(file)
@@ -95,8 +104,8 @@ def read_campaign(path: Path, root: Group) -> Campaign:
     several = cast("list[Any]", exports) if isinstance(exports, list) else [exports]
     commands = walk(root)
     steps = {
-        name: _steps(file, root, commands, tables, name)[0]
-        for name in ("generate", "import", *OF_A_SCENE, "stats", "demonstrations")
+        name: _step(file, root, commands, tables, name)
+        for name in ("generate", "import", *OF_A_SCENE, "stats")
     }
     _require_used(file, tables, stages, source)
     of_all = [
@@ -104,11 +113,17 @@ def read_campaign(path: Path, root: Group) -> Campaign:
         for name in stages
         if name in OF_ALL
         for step in (
-            [_steps(file, root, commands, {"export": each}, name)[0] for each in several]
+            [_step(file, root, commands, {"export": each}, name) for each in several]
             if name == "export"
             else [steps[name]]
         )
     ]
+    if len(several) > 1:
+        numbers = iter(range(1, len(several) + 1))
+        of_all = [
+            replace(s, stage=f"export_{next(numbers)}") if s.stage == "export" else s
+            for s in of_all
+        ]
     first = {"generate": steps["generate"], "sources": steps["import"]}.get(source)
     return Campaign(
         file=path,
@@ -118,6 +133,7 @@ def read_campaign(path: Path, root: Group) -> Campaign:
         first=first,
         of_a_scene=tuple(steps[name] for name in stages if name in OF_A_SCENE),
         of_all=tuple(of_all),
+        scenes=_count(steps["generate"]) if source == "generate" else None,
     )
 
 
@@ -164,11 +180,11 @@ def _stages(file: ConfigFile, head: Mapping[str, Any]) -> list[str]:
             raise InputError(f"{where}: there is no stage '{name}'. Stages: {', '.join(known)}.")
         if name in stages[:k]:
             raise InputError(f"{where}: '{name}' stands twice.")
-        before = next((s for s in stages[:k] if s in OF_ALL), None)
-        if name in OF_A_SCENE and before:
+        before = next((s for s in stages[:k] if known.index(s) > known.index(name)), None)
+        if before and not {name, before} <= set(OF_ALL):
             raise InputError(
-                f"{where}: '{name}' stands behind '{before}', which is done once, over all scenes. "
-                f"Put {', '.join(OF_ALL)} last."
+                f"{where}: '{name}' stands behind '{before}', which works on its result. The order "
+                f"is: {', '.join(known)}."
             )
     return stages
 
@@ -204,13 +220,13 @@ def _places(file: ConfigFile, patterns: Sequence[str], source: str) -> list[Path
     return found
 
 
-def _steps(
+def _step(
     file: ConfigFile,
     root: Group,
     commands: Mapping[tuple[str, ...], click.Command],
     tables: Mapping[str, Any],
     name: str,
-) -> list[Step]:
+) -> Step:
     """Return the step of a stage with its options as they are typed."""
     path = {**OF_A_SCENE, **OF_ALL}.get(name, (name,))
     command = commands[path]
@@ -230,8 +246,17 @@ def _steps(
                 + (" Give --workers to the pipeline." if word == "workers" else "")
             )
         typed += _typed(option, value)
-    has_workers = any(spelling(o) == "workers" for o in options.values())
-    return [Step(stage=name, command=path, options=tuple(typed), has_workers=has_workers)]
+    words = {spelling(o) for o in options.values()}
+    return Step(
+        stage=name, command=path, options=tuple(typed), has_workers="workers" in words,
+        has_restart="restart" in words,
+    )  # fmt: skip
+
+
+def _count(generate: Step) -> int | None:
+    """Return the number of scenes that are asked for, None where it is the command's default."""
+    at = generate.options.index("--scenes") if "--scenes" in generate.options else -1
+    return int(generate.options[at + 1]) if at >= 0 else None
 
 
 def _typed(option: click.Option, value: Any) -> list[str]:
@@ -255,5 +280,5 @@ def _require_used(
         if name not in used:
             raise InputError(
                 f"{file.place((name,))}: [{name}] has no effect: '{name}' is not among the stages "
-                f"({', '.join(stages)}). Name it there, or leave the table out."
+                f"({', '.join(stages) or 'there are none'}). Name it there, or leave the table out."
             )

@@ -128,11 +128,9 @@ def _last_words(written: BinaryIO, start: int, code: int) -> str:
     """Return why a command failed, in its own words."""
     written.seek(max(start, written.seek(0, os.SEEK_END) - TAIL_BYTES))
     lines = written.read().decode("utf-8", "replace").strip().splitlines()
-    told = next((line for line in reversed(lines) if line.startswith("error: ")), "")
-    if told:
-        told = told.removeprefix("error: ")
-    elif lines:
-        told = lines[-1]
+    errors = [k for k, line in enumerate(lines) if line.lower().startswith("error: ")]
+    told = " ".join(lines[errors[-1] if errors else -1 :])
+    told = told[len("error: ") :] if errors else told
     if code < 0:
         told = f"ended by signal {-code}, as when memory runs out{f'; {told}' if told else ''}"
     return told[:WORDS] or f"exit code {code}"

@@ -38,7 +38,7 @@ def pipeline_command(
     \b
       [campaign]
       out = "tables"
-      stages = ["register", "school", "annotate", "export", "stats"]
+      stages = ["school", "annotate", "export", "stats"]
       [generate]            or: sources = ["recordings/*.bag"], to import
       scenes = 20               sessions = ["captures/*"], that are there
       [school.run]

@@ -1,16 +1,19 @@
 """The page of a campaign: how far it is, what failed and why, what it costs."""
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from realsim.app.console import duration
 from realsim.app.pipeline.campaign import Campaign
 from realsim.app.pipeline.chain import LOOK, Ended
+from realsim.errors import InputError
 from realsim.pages import Page, View
 from realsim.pages.page import Cell
 from realsim.pages.pictures import spread
+from realsim.untrusted.own_json import read_object
 
 STAGE_HEADER = ("stage", "done", "to look at", "failed", "CPU", "longest", "peak MB")
 if TYPE_CHECKING:
@@ -26,14 +29,30 @@ REPORTS = {
 }
 """Page that a stage leaves in a scene."""
 
+PAGES = ("scenes/index.html", "stats/statistics.html")
+"""Of the generator, and of the statistics."""
+
+
+def verdicts_of(scene: "SceneState") -> dict[str, int]:
+    """Return how many objects of a registered scene have which verdict."""
+    try:
+        found: Any = read_object(scene.folder / "registration/scene.json")["objects"]
+        return dict(Counter(str(o["verdict"]) for o in found))
+    except (InputError, KeyError, TypeError):
+        return {}
+
 
 def page_of(campaign: Campaign, result: "PipelineResult") -> Page:
     """Return the page of a campaign as it stands."""
     done = sum(result.is_done(s) for s in result.scenes)
     total, failed = len(result.scenes), result.failed
-    page = Page(title=f"Campaign {campaign.file.name}", about=f"Scenes from {campaign.source}.")
+    page = Page(
+        title=f"Campaign {campaign.file.name}",
+        about=f"Scenes from {campaign.source}.",
+        hidden={f"{campaign.out.resolve()}/": ""},
+    )
     if failed:
-        page.verdict("bad", f"{len(failed)} failed", "the others are not touched by it",
+        page.verdict("bad", f"{len(failed)} failed", "the other scenes went on",
                      rows=[[Cell(name, "bad"), why] for name, why in failed.items()])  # fmt: skip
     elif total and done == total:
         page.verdict("good", "Done", f"{total} scenes went through all stages")
@@ -48,7 +67,16 @@ def page_of(campaign: Campaign, result: "PipelineResult") -> Page:
     page.section("Stages")
     page.table(STAGE_HEADER, stage_rows(result.stages, ends))
     page.section("Scenes", "Seconds by the clock; a link opens the stage's own page.")
-    page.table(["scene", *result.stages], [_row(campaign, result, s) for s in result.scenes])
+    header = ["scene", *result.stages, "objects"]
+    page.table(header, [_row(campaign, result, s) for s in result.scenes])
+    made = [Cell(p, href=f"./{p}") for p in PAGES if (campaign.out / p).is_file()]
+    made += [
+        Cell(f"{p.parent.name}/{p.name}", href=f"./{p.parent.name}/{p.name}")
+        for p in sorted(campaign.out.glob("export*/README.md"))
+    ]
+    if made:
+        page.section("Results")
+        page.table(["page"], [[cell] for cell in made])
     order = [result.scenes[k] for k in spread(total)]
     views = [View(s.name, {"": p.read_bytes()}) for s in order if (p := _photograph(s)) is not None]
     if views:
@@ -78,7 +106,14 @@ def _stage_row(stage: str, ends: Sequence[Ended]) -> list[object]:
 
 def _row(campaign: Campaign, result: "PipelineResult", scene: "SceneState") -> list[Cell]:
     ends = {e.stage: e for e in scene.ends}
-    return [Cell(scene.name), *(_cell(campaign, scene, ends.get(name)) for name in result.stages)]
+    verdicts = verdicts_of(scene)
+    told = ", ".join(f"{n} {word}" for word, n in sorted(verdicts.items()))
+    kind = "warn" if {"doubtful", "rejected"} & set(verdicts) else "good"
+    return [
+        Cell(scene.name),
+        *(_cell(campaign, scene, ends.get(name)) for name in result.stages),
+        Cell(told or "-", kind if told else "off"),
+    ]
 
 
 def _cell(campaign: Campaign, scene: "SceneState", end: Ended | None) -> Cell:

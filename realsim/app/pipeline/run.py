@@ -1,6 +1,7 @@
 """A campaign as it runs: first its scenes, then each one's stages, then what is made of all."""
 
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from realsim.untrusted.own_json import read_own, to_json
 
 SCENES, RECORDS, LOGS = "scenes", "records", "logs"
 DOCUMENT, PAGE = "campaign.json", "campaign.html"
+RESTART = "--restart"
 LEAST_FREE_MB = 200
 """With less room on the disk [MB] no further command is begun."""
 
@@ -97,14 +99,17 @@ def run_pipeline(
     with only_run_in(out), storing(out, "the campaign's records"):
         (out / LOGS).mkdir(exist_ok=True)
         result = PipelineResult(scenes=[], stages=tuple(s.stage for s in campaign.of_a_scene))
-        if not _make_scenes(campaign, where, console, result):
-            _write(campaign, result)
-            return result
-        result.scenes = [_known(campaign, name, place) for name, place in scenes_of(campaign)]
+        _write(campaign, result)
+        unmade = _make_scenes(campaign, where, console, result)
+        result.scenes = [
+            replace(state, ends=(unmade[name],)) if name in unmade else state
+            for name, place in scenes_of(campaign)
+            for state in [_known(campaign, name, place)]
+        ]
         result.kept = sum(result.is_done(s) for s in result.scenes)
         _run_scenes(campaign, where, console, result)
         done = [s for s in result.scenes if result.is_done(s)]
-        if len(done) == len(result.scenes) or without_failed:
+        if not result.failed or without_failed:
             _run_of_all(campaign, where, console, result, done)
         else:
             result.waiting = tuple(step.stage for step in campaign.of_all)
@@ -117,16 +122,22 @@ def _run_of_all(
     done: Sequence[SceneState],
 ) -> None:  # fmt: skip
     """Run the stages over all scenes, or over those that are done."""
-    part = "" if len(done) == len(result.scenes) else f"_{len(done)}_of_{len(result.scenes)}"
+    part = f"_{len(done)}_of_{len(result.scenes)}" if result.failed else ""
     for step in campaign.of_all if done else ():
         _require_room(campaign.out)
         with console.stage(step.stage, f"{len(done)} scenes"):
             words = _words_of_all(campaign, step, done, part)
             out = Path(words[-1])
             before = out.with_name(f"{out.name}.before")
-            if result.kept < len(done) and out.is_dir() and not before.exists():
-                out.rename(before)  # its scenes have changed; kept until there is a new one
+            record = campaign.out / RECORDS / f"of_all.{step.stage}.json"
+            asked = _plain(_command(step, words, 1).words)
+            is_same = result.kept == len(done) and [_plain(e.words) for e in _ends(record)] == [
+                asked
+            ]
+            if not is_same and out.is_dir() and not before.exists():
+                out.rename(before)  # kept until there is a new one
             result.of_all.append(_run(campaign, step, words, where.processes))
+            write_json(record, to_json(result.of_all[-1:]))
             if result.of_all[-1].is_done and before.is_dir():
                 shutil.rmtree(before)
 
@@ -138,17 +149,15 @@ def scenes_of(campaign: Campaign) -> list[tuple[str, Path]]:
         InputError: two sources would be imported as the same scene.
     """
     if campaign.source == "generate":
-        folder = campaign.out / SCENES
-        return [
-            (p.name, p) for p in sorted(folder.glob("scene_*")) if (p / "session.json").is_file()
-        ]
-    names = [p.stem if campaign.source == "sources" else p.name for p in campaign.places]
+        made = sorted((campaign.out / SCENES).glob("scene_*/session.json"))
+        return [(p.parent.name, p.parent) for p in made[: campaign.scenes]]
+    names = [p.stem if p.is_file() else p.name for p in campaign.places]
     for k, name in enumerate(names):
         if name in names[:k]:
             first = campaign.places[names.index(name)]
             raise InputError(
                 f"{campaign.file}: {first} and {campaign.places[k]} would both be the scene "
-                f"'{name}'; rename one."
+                f"'{name}'; rename one, or make a campaign of each."
             )
     at = [campaign.out / SCENES / n for n in names]
     return list(zip(names, campaign.places if campaign.source == "sessions" else at, strict=True))
@@ -165,13 +174,17 @@ def show_plan(campaign: Campaign, console: Console) -> None:
 
 def show_pipeline(campaign: Campaign, result: PipelineResult, console: Console) -> None:
     """Print what became of a campaign."""
-    from realsim.app.pipeline.page import STAGE_HEADER, stage_rows
+    from realsim.app.pipeline.page import STAGE_HEADER, stage_rows, verdicts_of
 
     ends = [e for s in result.scenes for e in s.ends] + result.of_all
     rows = stage_rows(result.stages, ends)
     console.table(f"Campaign {campaign.file.name}", STAGE_HEADER, rows)
     for name, why in result.failed.items():
         console.warn(f"{name}: {why}")
+    verdicts = sum((Counter(verdicts_of(s)) for s in result.scenes), Counter[str]())
+    if {"doubtful", "rejected"} & set(verdicts):
+        told = ", ".join(f"{n} {word}" for word, n in sorted(verdicts.items()))
+        console.warn(f"objects: {told}; `realsim review` shows those that need a person.")
     done = sum(result.is_done(s) for s in result.scenes)
     console.say(f"{done} of {len(result.scenes)} scenes done, {result.kept} of them before")
     if result.waiting:
@@ -206,16 +219,16 @@ def _own_folder(campaign: Campaign) -> Path:
 
 def _make_scenes(
     campaign: Campaign, where: PoolConfig, console: Console, result: PipelineResult
-) -> bool:
-    """Generate or import the scenes; return whether there can be any."""
-    step, out = campaign.first, campaign.out.resolve()
+) -> dict[str, Ended]:
+    """Generate or import the scenes; return those that could not be imported."""
+    step, out, unmade = campaign.first, campaign.out.resolve(), dict[str, Ended]()
     if step is None:
-        return True
+        return unmade
     _require_room(out)
     if campaign.source == "generate":
         with console.stage("generate", "scenes"):
             result.of_all.append(_run(campaign, step, [str(out / SCENES)], where.processes))
-        return result.of_all[-1].is_done
+        return unmade
     missing = [
         (name, source, place)
         for (name, place), source in zip(scenes_of(campaign), campaign.places, strict=True)
@@ -225,8 +238,9 @@ def _make_scenes(
         for k, (name, source, place) in enumerate(missing):
             tick(k, len(missing))
             end = _run(campaign, step, [str(source.resolve()), str(place)], where.processes)
-            result.of_all.append(replace(end, stage=f"import {name}"))
-    return True
+            if not end.is_done:
+                unmade[name] = end
+    return unmade
 
 
 def _run_scenes(
@@ -234,7 +248,7 @@ def _run_scenes(
 ) -> None:
     """Take scenes through their stages, as many at a time as there are workers."""
     place = {s.name: k for k, s in enumerate(result.scenes)}
-    due = [s for s in result.scenes if not result.is_done(s)]
+    due = [s for s in result.scenes if not result.is_done(s) and s.folder.is_dir()]
     total, ended = len(due), 0
     share = max(1, where.processes // max(1, total))
     commands = [_command(step, [SCENE], share) for step in campaign.of_a_scene]
@@ -243,7 +257,9 @@ def _run_scenes(
         for s in due:
             _require_room(campaign.out)
             log = _log(campaign, s.name)
-            args = (commands, Worked(s.folder.resolve()), _folder(campaign), log)
+            record = _ends(campaign.out / RECORDS / f"{s.name}.json")
+            args = (_anew(commands, campaign.of_a_scene, record), Worked(s.folder.resolve()),
+                    _folder(campaign), log)  # fmt: skip
             yield Task(name=s.name, fn=run_chain, args=args)
 
     def keep(outcome: Outcome) -> None:
@@ -284,9 +300,7 @@ def _words_of_all(
     campaign: Campaign, step: Step, done: Sequence[SceneState], part: str
 ) -> list[str]:
     """Return what a stage over all scenes takes and fills."""
-    kinds = [s for s in campaign.of_all if s.stage == step.stage]
-    number = f"_{kinds.index(step) + 1}" if len(kinds) > 1 else ""
-    out = campaign.out.resolve() / f"{step.stage}{number}{part}"
+    out = campaign.out.resolve() / f"{step.stage}{part}"
     return [*(str(s.folder.resolve()) for s in done), "--out", str(out)]
 
 
@@ -299,24 +313,44 @@ def _run(campaign: Campaign, step: Step, words: Sequence[str], workers: int) -> 
 def _known(campaign: Campaign, name: str, place: Path) -> SceneState:
     """Return a scene as an earlier run left it, with those commands that are still asked for."""
     scene = SceneState(name=name, folder=place)
-    record = campaign.out / RECORDS / f"{name}.json"
-    if not (record.is_file() and place.is_dir()):
+    if not place.is_dir():
         return scene
-    try:
-        ends = read_own(record, list[Ended])
-    except InputError:
-        return scene  # a damaged record is no record: the commands find out what is done
+    ends = _ends(campaign.out / RECORDS / f"{name}.json")
     commands = [_command(step, [SCENE], 1) for step in campaign.of_a_scene]
-    asked = [_without_workers(c.words) for c in commands]
-    same = [_without_workers(e.words) == a for e, a in zip(ends, asked, strict=False)]
-    kept = ends[: same.index(False)] if False in same else ends[: len(asked)]
-    return replace(scene, ends=tuple(kept))
+    same = _same(commands, ends)
+    return replace(scene, ends=ends[: same.index(False)] if False in same else ends[: len(same)])
 
 
-def _without_workers(words: Sequence[str]) -> list[str]:
-    """Return a command without its number of processes, on which no result depends."""
+def _ends(record: Path) -> tuple[Ended, ...]:
+    """Return what a record holds; a damaged one holds nothing: the commands find out themselves."""
+    try:
+        return tuple(read_own(record, list[Ended])) if record.is_file() else ()
+    except InputError:
+        return ()
+
+
+def _same(commands: Sequence[Command], ends: Sequence[Ended]) -> list[bool]:
+    """Return which commands were run as they are asked for now."""
+    return [_plain(c.words) == _plain(e.words) for c, e in zip(commands, ends, strict=False)]
+
+
+def _anew(
+    commands: Sequence[Command], steps: Sequence[Step], ends: Sequence[Ended]
+) -> list[Command]:
+    """Return commands that begin anew what was done with other options, or of other results."""
+    same = _same(commands, ends)
+    return [
+        replace(c, words=(*c.words, RESTART))
+        if step.has_restart and RESTART not in c.words and False in same[: k + 1] and k < len(same)
+        else c
+        for k, (c, step) in enumerate(zip(commands, steps, strict=True))
+    ]
+
+
+def _plain(words: Sequence[str]) -> list[str]:
+    """Return a command without what changes no result: its processes, and that it begins anew."""
     at = words.index("--workers") if "--workers" in words else len(words)
-    return [*words[:at], *words[at + 2 :]]
+    return [word for word in (*words[:at], *words[at + 2 :]) if word != RESTART]
 
 
 def _write(campaign: Campaign, result: PipelineResult) -> None:
