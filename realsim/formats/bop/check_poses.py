@@ -112,7 +112,7 @@ def pose_findings(
             agree=covered >= COVERED,
         )
     if whole is not None and shape.box is not None and pixels >= SMALLEST_PX:
-        overlap = _overlap(shape.box, whole)
+        overlap = _overlap(_visible_box(shape), whole)
         sheet.compare(
             "scene_gt",
             "pose and box",
@@ -147,6 +147,19 @@ def _compare_depth(shape: Silhouette, depth_m: Array, delta_m: float, sheet: "Sh
             f"{behind:.1%}",
             agree=behind <= BEHIND_SHARE,
         )
+
+
+def _visible_box(shape: Silhouette) -> Array:
+    """Return the box [px] of what the image shows of a model: its border may cut a corner off."""
+    assert shape.box is not None
+    if shape.is_inside or shape.hull is None or not shape.hull.any():
+        return shape.box
+    x, y, w, h = bbox_of(shape.hull)
+    border = np.array(shape.hull.shape[::-1]) - 1
+    low, high = np.array([x, y]), np.array([x + w, y + h])
+    return np.concatenate([
+        np.where(low > 0, low + GROWN_PX, low), np.where(high < border, high - GROWN_PX, high)
+    ]).astype(np.float64)  # fmt: skip
 
 
 def _overlap(box: Array, mask: Mask) -> float:
