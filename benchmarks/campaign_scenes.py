@@ -8,7 +8,7 @@ scenes      scenes_done       scenes that went through all stages, of 20 (--quic
 
   uv run python benchmarks/campaign_scenes.py [--quick] [--keep FOLDER]
 
-Each scene has 64 views of 320 x 240 pixels and 6 to 10 objects, which are found (`--find-all`), not
+Each scene has 64 views of 848 x 480 pixels and 6 to 10 objects, which are found (`--find-all`), not
 given. The notes hold the cost of the paper's data set (1,135 scenes, 256 views, 2.3 million grasps)
 on 1, 10 and 100 machines of eight cores.
 """
@@ -40,7 +40,7 @@ stages = ["register", "school", "annotate", "export", "stats"]
 scenes = {scenes}
 views = {views}
 objects = "6-10"
-size = "320x240"
+size = "848x480"
 range = "d405"
 seed = {seed}
 no-maps = true
