@@ -64,7 +64,11 @@ def test_sessions_that_travel_to_a_cluster_come_back_as_if_they_had_stayed(sessi
     scenes = [json.loads((p / "registration/scene.json").read_text()) for p in places]
     poses = [[o["T_world_obj"] for o in s["objects"]] for s in scenes]
     assert poses[0] and poses[1] == poses[2] == poses[0]
-    files = [{p.relative_to(place) for p in place.rglob("*") if p.is_file()} for place in places]
+    # A process that has a model's distance field in memory keeps none in the cache.
+    files = [
+        {p.relative_to(place) for p in place.rglob("*") if p.is_file() and p.parent.name != "cache"}
+        for place in places
+    ]
     assert files[1] == files[2] == files[0] and len(files[0]) > len(before)
 
 

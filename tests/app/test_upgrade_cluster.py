@@ -33,7 +33,7 @@ def content(out):
         p.relative_to(out).as_posix(): p.read_bytes()
         for p in sorted(out.glob("*/*/**/*"))
         if p.is_file() and p.name not in DATED and "report" not in p.name
-        and not p.name.endswith(".run.json")
+        and not p.name.endswith(".run.json") and p.parent.name != "cache"
     }  # fmt: skip
 
 

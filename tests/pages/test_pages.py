@@ -240,8 +240,8 @@ def test_in_chromium_sliders_views_layers_and_the_lightbox_work(browser: Any) ->
     assert browser.locator("dialog span").text_content() == "picture 1"
     browser.keyboard.press("Escape")
     assert not browser.locator("dialog").is_visible()
-    assert not browser.locator("details").get_attribute("open")
+    assert not browser.locator("details:not(.stage)").get_attribute("open")
     browser.emulate_media(media="print")
     browser.evaluate("dispatchEvent(new Event('beforeprint'))")
     assert browser.locator(".views .view").last.is_visible()
-    assert browser.locator("details").get_attribute("open") is not None
+    assert browser.locator("details:not(.stage)").get_attribute("open") is not None

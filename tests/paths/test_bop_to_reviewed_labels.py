@@ -66,6 +66,12 @@ def page_of(session: Path) -> Generator[ReviewPage]:
         server.wait()
 
 
+def moved_by_key(page: ReviewPage) -> bool:
+    """Press the key that moves the object; keys count once the scene stands before the camera."""
+    page.key("l")
+    return "Nothing is written yet" in page.text()
+
+
 def review(session: Path) -> Scene:
     """Move and accept one object, reject the next; return the scene as the reviewer left it."""
     store = SessionStore.open(session)
@@ -74,8 +80,7 @@ def review(session: Path) -> Scene:
     with page_of(session) as page:
         page.wait_for("objects judged", "computed:", seconds=PATIENCE_S)
         page.tab("Correct")
-        page.key("l")
-        page.wait_for("Nothing is written yet", seconds=PATIENCE_S)
+        page.wait_until(lambda: moved_by_key(page), "a move by key", PATIENCE_S)
         page.key("v")
         page.wait_message("Recorded")
         page.tab("Object")
