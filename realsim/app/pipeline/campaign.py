@@ -191,10 +191,11 @@ def _stages(file: ConfigFile, head: Mapping[str, Any]) -> list[str]:
 
 def _source(file: ConfigFile, head: Mapping[str, Any]) -> str:
     given = [name for name in FROM if name in (file.tables if name == "generate" else head)]
+    both = " and ".join(given)
     if len(given) != 1:
         raise InputError(
             f"{file.path} says {'nowhere' if not given else 'twice'} where its scenes come from"
-            f"{f' ({chr(44).join(given)})' if given else ''}. Give one of: a table [generate]; "
+            f"{f' ({both})' if given else ''}. Give one of: a table [generate]; "
             'sources = ["recordings/*.bag"], which are imported; sessions = ["captures/*"], which '
             "are there."
         )

@@ -50,7 +50,7 @@ def pipeline_command(
     scene that fails is listed, and the others go on; stages over all scenes wait for it. Run again,
     the same command does what is not done yet, and what failed.
 
-    Writes OUT/campaign.html and campaign.json, renewed after each scene; OUT/scenes; OUT/logs.
+    Writes OUT/campaign.html and campaign.json, renewed as scenes end; OUT/scenes; OUT/logs.
 
     Exit codes: 0 done, 1 a scene or a stage failed, 2 bad input, 130 interrupted.
     """  # noqa: D301 - click's own mark for lines that stay as they are

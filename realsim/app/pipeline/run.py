@@ -1,6 +1,7 @@
 """A campaign as it runs: first its scenes, then each one's stages, then what is made of all."""
 
 import shutil
+import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,6 +20,8 @@ from realsim.untrusted.own_json import read_own, to_json
 SCENES, RECORDS, LOGS = "scenes", "records", "logs"
 DOCUMENT, PAGE = "campaign.json", "campaign.html"
 RESTART = "--restart"
+RENEWED_S = 10.0
+"""Least time between two writings of the page [s]."""
 LEAST_FREE_MB = 200
 """With less room on the disk [MB] no further command is begun."""
 
@@ -249,7 +252,7 @@ def _run_scenes(
     """Take scenes through their stages, as many at a time as there are workers."""
     place = {s.name: k for k, s in enumerate(result.scenes)}
     due = [s for s in result.scenes if not result.is_done(s) and s.folder.is_dir()]
-    total, ended = len(due), 0
+    total, ended, written = len(due), 0, time.monotonic()
     share = max(1, where.processes // max(1, total))
     commands = [_command(step, [SCENE], share) for step in campaign.of_a_scene]
 
@@ -263,13 +266,15 @@ def _run_scenes(
             yield Task(name=s.name, fn=run_chain, args=args)
 
     def keep(outcome: Outcome) -> None:
-        nonlocal ended
+        nonlocal ended, written
         ended += 1
         k = place[outcome.task.name]
         ends: tuple[Ended, ...] = outcome.value or (_lost(outcome),)
         write_json(campaign.out / RECORDS / f"{outcome.task.name}.json", to_json(ends))
         result.scenes[k] = replace(result.scenes[k], ends=ends)
-        _write(campaign, result)
+        if time.monotonic() - written > RENEWED_S:  # a thousand scenes have a long page
+            _write(campaign, result)
+            written = time.monotonic()
 
     with console.stage("scenes", " ".join(result.stages)) as tick, open_pool(where) as pool:
 
