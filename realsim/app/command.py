@@ -139,6 +139,15 @@ def settable(command: click.Command) -> list[click.Option]:
     ]
 
 
+def typed(option: click.Option, value: Any) -> list[Any]:
+    """Return an option as it is typed: its name, and its values as they are."""
+    word = max(option.opts, key=len)
+    if option.is_flag:
+        return [word] if value else list(option.secondary_opts[:1])
+    each = value if option.multiple else (value,)
+    return [w for one in each for w in (word, *(one if option.nargs > 1 else (one,)))]
+
+
 def default_of(option: click.Option) -> Any:
     """Return the default of an option, None where there is none."""
     value = option.to_info_dict().get("default")

@@ -9,6 +9,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
+from realsim.app.command import typed
 from realsim.app.console import Console
 from realsim.app.outputs import OutputFile, OutputFolder
 from realsim.app.pipeline.chain import SCENE, Command, Ended, run_command
@@ -107,11 +108,8 @@ def _typed(ctx: click.Context) -> list[Any]:
                 f"{spelled} '{value}' is one place, and several sessions are given; leave it away, "
                 "or run them one by one."
             )
-        if isinstance(option, click.Option) and option.is_flag:
-            words += [spelled] if value else []
-        else:
-            for one in value if option.multiple else (value,):
-                words += [spelled, *(_word(v) for v in (one if option.nargs > 1 else (one,)))]
+        if isinstance(option, click.Option):
+            words += map(_word, typed(option, value))
     if any(p.name == "workers" for p in ctx.command.params):
         words += ["--workers", "1"]
     return words

@@ -24,7 +24,7 @@ from typing import Any, cast
 
 import click
 
-from realsim.app.command import Group, settable, spelling, walk
+from realsim.app.command import Group, settable, spelling, typed, walk
 from realsim.app.config.files import ConfigFile, read_config
 from realsim.app.config.settings import settings_of
 from realsim.errors import InputError
@@ -237,7 +237,7 @@ def _step(
     for part in path:
         settings = settings.get(part, {})
     options = {o.name: o for o in settable(command)}
-    typed: list[str] = []
+    words: list[str] = []
     for key, value in settings.items():
         option = options[key]
         word = spelling(option)
@@ -246,11 +246,11 @@ def _step(
                 f"{file.place(path, word)}: a campaign sets --{word} itself; leave it out."
                 + (" Give --workers to the pipeline." if word == "workers" else "")
             )
-        typed += _typed(option, value)
-    words = {spelling(o) for o in options.values()}
+        words += map(str, typed(option, value))
+    names = {spelling(o) for o in options.values()}
     return Step(
-        stage=name, command=path, options=tuple(typed), has_workers="workers" in words,
-        has_restart="restart" in words,
+        stage=name, command=path, options=tuple(words), has_workers="workers" in names,
+        has_restart="restart" in names,
     )  # fmt: skip
 
 
@@ -258,18 +258,6 @@ def _count(generate: Step) -> int | None:
     """Return the number of scenes that are asked for, None where it is the command's default."""
     at = generate.options.index("--scenes") if "--scenes" in generate.options else -1
     return int(generate.options[at + 1]) if at >= 0 else None
-
-
-def _typed(option: click.Option, value: Any) -> list[str]:
-    """Return an option and its value as words of a command line."""
-    word = max(option.opts, key=len)
-    if option.is_flag:
-        return [word] if value else list(option.secondary_opts[:1])
-    if option.multiple:
-        return [w for each in value for w in (word, str(each))]
-    if option.nargs > 1:
-        return [word, *(str(each) for each in value)]
-    return [word, str(value)]
 
 
 def _require_used(
