@@ -9,12 +9,16 @@
   reproduce   reproduce_equal            1 = register, school, annotate and export are made again
                                          bit for bit from their records
   demonstrations  see campaign_demonstrations.py
+  scenes          see campaign_scenes.py; --keep FOLDER keeps its campaign
+  whole_loop, upgrade  see campaign_loop.py
 
     uv run --extra cluster python benchmarks/campaign.py [--quick] [--part PART] [--json FILE]
 
 A part is a function of a module; further ones are added to FIGURES and PARTS.
 """
 
+from campaign_scenes import FIGURES as SCENES
+from campaign_scenes import keep
 from figures import Figure, Goal, run
 
 FIGURES = {
@@ -28,6 +32,10 @@ FIGURES = {
     "graspnet_grasps_back": Figure(unit="", goal=Goal(low=0.999)),
     "graspnet_worst_mm": Figure(unit="mm", goal=Goal(high=0.1)),
     "graspnet_view_deg": Figure(unit="deg"),
+    "upgrade_cpu_s": Figure(unit="s", goal=Goal(high=240)),
+    "whole_loop_min": Figure(unit="min", goal=Goal(high=25)),
+    "whole_loop_cpu_min": Figure(unit="min"),
+    **SCENES,
 }
 PARTS = {
     "school": "campaign_ray:school",
@@ -36,7 +44,11 @@ PARTS = {
     "reproduce": "campaign_reproduce:reproduce",
     "demonstrations": "campaign_demonstrations:demonstrations",
     "graspnet": "campaign_graspnet:grasps_back",
+    "scenes": "campaign_scenes:scenes",
+    "whole_loop": "campaign_loop:whole_loop",
+    "upgrade": "campaign_loop:upgrade",
 }
 
 if __name__ == "__main__":
-    run("campaign", __doc__ or "", ("realsim", "ray", "numpy", "mujoco"), FIGURES, PARTS)
+    run("campaign", __doc__ or "", ("realsim", "ray", "numpy", "mujoco"), FIGURES, PARTS,
+        options=keep)  # fmt: skip

@@ -4,7 +4,7 @@ reproduce   reproduce_equal    1 = register, school, annotate and export of a si
                                are equal to what `realsim reproduce` makes of their records, with
                                another number of threads and workers
 
-  uv run python benchmarks/campaign_reproduce.py [--quick]
+  uv run python benchmarks/campaign.py --part reproduce [--quick]
 """
 
 import argparse
@@ -14,9 +14,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from figures import Figure, Found, Goal, run
+from figures import Found
 
-FIGURES = {"reproduce_equal": Figure(unit="", goal=Goal(low=1, high=1))}
 STAGES = ("register", "school", "annotate")
 
 
@@ -48,8 +47,3 @@ def _realsim(threads: str, *words: object, check: bool = True) -> int:
     return subprocess.run(
         command, check=check, env=os.environ | dict.fromkeys(names, threads)
     ).returncode
-
-
-if __name__ == "__main__":
-    run("campaign_reproduce", __doc__ or "", ("realsim", "numpy", "open3d-cpu"), FIGURES,
-        {"reproduce": "campaign_reproduce:reproduce"})  # fmt: skip

@@ -6,7 +6,7 @@ scenes      scenes_done       scenes that went through all stages, of 20 (--quic
                               second [share]
             paper_scene_cpu_s CPU time of one scene at the paper's size, from these rates [s]
 
-  uv run python benchmarks/campaign_scenes.py [--quick] [--keep FOLDER]
+  uv run python benchmarks/campaign.py --part scenes [--quick] [--keep FOLDER]
 
 Each scene has 64 views of 848 x 480 pixels and 6 to 10 objects, which are found (`--find-all`), not
 given. The notes hold the cost of the paper's data set (1,135 scenes, 256 views, 2.3 million grasps)
@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from figures import Figure, Found, Goal, run
+from figures import Figure, Found, Goal
 
 FIGURES = {
     "scenes_done": Figure(unit="", goal=Goal(low=20, high=20)),
@@ -184,8 +184,3 @@ class Rates:
 def keep(parser: argparse.ArgumentParser) -> None:
     """Add the option of this benchmark."""
     parser.add_argument("--keep", default="", help="folder that keeps the campaign")
-
-
-if __name__ == "__main__":
-    run("campaign_scenes", __doc__ or "", ("realsim", "numpy", "mujoco"), FIGURES,
-        {"scenes": scenes}, options=keep)  # fmt: skip
