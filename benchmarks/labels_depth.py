@@ -12,6 +12,7 @@ What is fitted never is what is tested:
                         the lower half; no hole ratio
   apc_shelf_multiview   F200, no meshes: walls of the shelf; fitted to even frames, tested on odd
                         ones; no hole ratio
+The method was changed three times after looking at these frames, so new frames should decide.
 """
 
 from collections.abc import Sequence
