@@ -2,8 +2,8 @@
 
 Imported by `formats.py`. Every way writes the same frames into an `ExportFolder`, in turn, so that
 a busy machine slows all of them. A second is one of CPU, of the process and the kernel for it.
-On frames of five sensors ISA-L's level 2 changed sizes by less than 1 %, and level 3 made real colour
-and all depth larger; naming OpenCV's level 1 took twice the time of its default for larger files.
+On frames of five sensors ISA-L's level 2 changed sizes by less than 1 %, and level 3 made real
+colour and all depth larger. OpenCV's level 1 took twice the time of its default for larger files.
 """
 
 import shutil

@@ -27,10 +27,10 @@ Parts and the figures they give (keys of the JSON's "figures"):
                       the paper counts. With --quick coarser parts and fewer candidates.
 The spread of poses, frictions and forces are those of a prototype that was made on all of GRASPA's
 trials. On the open ones the conformity (of 0.5, 1, 1.5 and 2 mm), the palm's stop, what is combined
-and how (about 150 variants, most to see what does not matter) were chosen; nothing on others. AUC of
-the alternatives on them, over all and within objects: nominal score with closing on the table 0.61
-and 0.60, five simulated draws 0.60 and 0.62, safety factor at the nominal pose 0.63 and 0.71, limit
-analysis on draws 0.67 and 0.69, the same if the table stops the hand 0.63 and 0.69.
+and how (about 150 variants, most to see what does not matter) were chosen; nothing on others.
+AUC of alternatives on them, over all and within objects: nominal score with closing on the table
+0.61 and 0.60, five simulated draws 0.60 and 0.62, safety factor at the nominal pose 0.63 and 0.71,
+limit analysis on draws 0.67 and 0.69, the same if the table stops the hand 0.63 and 0.69.
 """
 
 import os
