@@ -58,9 +58,9 @@ AIM_SD_M = 0.03
 WHITE = (3e-4, 3e-4)
 """1-sigma of white robot noise per axis [rad, m]."""
 DH_SD = (2e-4, 1e-4)
-"""1-sigma of the errors of an arm's angles [rad] and lengths [m] ..."""
+"""1-sigma of the errors of an arm's angles [rad] and lengths [m]."""
 REPEAT = (5e-5, 3e-5)
-"""... and of its repeatability per axis [rad, m]."""
+"""1-sigma of the arm's repeatability per axis [rad, m]."""
 START_OFF = 3e-3
 """1-sigma of a closed form's error [rad, m]."""
 WARM_UP_VIEWS = 20
@@ -174,7 +174,7 @@ class CoverageTrial:
     kind: Kind
     chi2: float
     chi2_alone: float
-    """Of the X that is fitted without a map."""
+    """chi2 of the X that is fitted without a map."""
     mm: float
     deg: float
     map_name: str = ""

@@ -53,7 +53,7 @@ to = "bop"
 """
 PAPER_SCENES, PAPER_VIEWS, PAPER_GRASPS = 1135, 256, 2.3e6
 CORES, NETWORK_BYTES_S, DISK_BYTES_S = 8, 110e6, 400e6
-"""Of a machine; a gigabit network; one writer's disk."""
+"""Cores of a machine, a gigabit network, one writer's disk."""
 PER_VIEW, PER_GRASP = ("generate", "register", "annotate", "export"), ("school",)
 
 

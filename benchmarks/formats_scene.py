@@ -22,7 +22,7 @@ from realsim.records import CameraIntrinsics, Mesh, ObjectModel
 
 WIDTH, HEIGHT, FOCAL_PX = 64, 48, 60.0
 HEIGHT_M = 0.7
-"""Of the camera over the table."""
+"""Height of the camera over the table."""
 BETWEEN_M = 0.1
 """Between two objects."""
 COLUMNS = 5
@@ -36,7 +36,7 @@ class LongScene:
     """A `LabelledScene`; made by `long_scene`."""
 
     folder: Path
-    """Of the two images."""
+    """Folder of the two images."""
     frames: int
     objects: int
     number: int = 0

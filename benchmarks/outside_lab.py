@@ -38,7 +38,7 @@ class Lab:
     height: int = 480
     focal_px: float = 440.0
     baseline_m: float = 0.018
-    """Of the stereo pair, as the D405's."""
+    """Baseline of the stereo pair, the D405's."""
     step_px: float = 1.0 / 32.0
     """Disparities are multiples of this."""
     noise_px: float = 0.06
@@ -50,7 +50,7 @@ class Lab:
     fattening_px: int = 2
     """Near surfaces are wider than they are by this in places."""
     flying_share: float = 0.5
-    """Of the pixels at an edge, those that lie between near and far."""
+    """Share of the pixels at an edge that lie between near and far."""
     holes_share: float = 0.01
     """Dropouts anywhere."""
     lens_px: float = 0.5
@@ -60,7 +60,7 @@ class Lab:
     arm_mm: float = 0.3
     arm_deg: float = 0.05
     arm_smooth_share: float = 0.7
-    """Of the arm's error, what changes smoothly with the place."""
+    """Share of the arm's error that changes smoothly with the place."""
     table: str = "flat"
     """'flat', 'wavy' (+-`wave_m`) or 'none'."""
     wave_m: float = 0.006

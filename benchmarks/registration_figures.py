@@ -62,7 +62,7 @@ class Row:
     part: str
     """'rough', 'cold', ..., 'rival p2l fine', ...; of `PROVOKED` a wrong pose that was given."""
     name: str
-    """Of the object."""
+    """Name of the object."""
     mssd_mm: float = LOST_MM
     adds_mm: float = LOST_MM
     verdict: str = "not placed"

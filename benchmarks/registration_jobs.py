@@ -20,7 +20,7 @@ from registration_cases import OBJECTS, SceneKey
 from registration_figures import Done
 
 PR_SET_PDEATHSIG = 1
-"""Of Linux's prctl: the signal that a process gets when its parent ends."""
+"""Option of Linux's prctl: the signal that a process gets when its parent ends."""
 WARM_UP = SceneKey(seed=0, views=6, objects=3)
 """The scene on which everything is compiled, so that no other pays for it."""
 COUNTED = ("rough", "cold", "unknown", "piles", "refined", "biased")
@@ -32,7 +32,7 @@ class Job:
     """What one process does at a time."""
 
     parts: tuple[str, ...]
-    """Of one scene; or one of 'cost', 'real'."""
+    """Parts of one scene; or one of 'cost', 'real'."""
     key: SceneKey
     keep: Path | None
     quick: bool = False

@@ -24,7 +24,7 @@ SCALE = 10.0
 """Metres of the engine per metre."""
 GRAVITY = 9.81
 STEP_S = 1 / 480
-"""Of the real world; the engine's is sqrt(SCALE) longer."""
+"""Step of the real world [s]; the engine's is sqrt(SCALE) longer."""
 HEAP_M = 0.09
 """Objects are dropped with their middle in a disc of this radius [m]."""
 RING_M = 0.13

@@ -18,7 +18,7 @@ ARGS = (
     "--ignore-gpu-blocklist", "--disable-dev-shm-usage",
 )  # fmt: skip
 HARMLESS = ("GPU stall due to ReadPixels", "GL Driver Message")
-"""Of the software renderer, not of the page."""
+"""Messages of the software renderer, not of the page."""
 LONGEST_S = 60.0
 DRAWN_SIGMA = 12.0
 """Spread of the grey values in the middle of the window from which on a scene is drawn."""

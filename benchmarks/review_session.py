@@ -36,7 +36,7 @@ DEPTH_SIGMA = 8.0
 """Noise of the depth [counts]: 0.8 mm, that of a D405 at 0.5 m."""
 GRASPS = 5_000
 OBJECTS = 8
-"""Of the 15 real CAD meshes of the labels' benchmark every other one: 190,000 faces."""
+"""Every other one of the 15 real CAD meshes of the labels' benchmark: 190,000 faces."""
 CAMERA = CameraIntrinsics(
     width=WIDTH, height=HEIGHT, fx=650.0, fy=650.0, cx=(WIDTH - 1) / 2, cy=(HEIGHT - 1) / 2,
     distortion=np.array([-0.055, 0.062, 0.0005, -0.0007, -0.02]),

@@ -44,7 +44,7 @@ from realsim_sim_bridge.slip.world import SlipBody
 PAPER_GRASPS_PER_S = 100 * 2198 / (7 * 86400)
 """The paper: 100 scenes of 2198 candidates in a week on one RTX 6000."""
 PROCESSES = 2
-"""Of this benchmark, whatever the machine has."""
+"""Processes of this benchmark, whatever the machine has."""
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
@@ -54,7 +54,7 @@ class Spent:
     """What something cost."""
 
     cpu_s: float = 0.0
-    """Of this process and of its children that ended within [s]."""
+    """CPU time of this process and of its children that ended within [s]."""
     wall_s: float = 0.0
 
 

@@ -38,9 +38,9 @@ from realsim_sim_bridge.school.day import Day, Pupil
 FULL, QUICK = 80, 3
 """Candidates per object."""
 SHARD_GRASPS, SHARD_GRASPS_QUICK = 24, 8
-"""Of a job: small ones, so that the last one does not decide."""
+"""Grasps per job: few, so that the last job does not decide."""
 SCENES, CANDIDATES = 1035, 2198
-"""Of the paper's data set; candidates per scene."""
+"""Size of the paper's data set; candidates per scene."""
 CLUSTERS = (1, 4, 16)
 """Machines like this one that the data set is worked out for."""
 TOKEN_BYTES = 32

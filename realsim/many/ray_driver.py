@@ -71,7 +71,7 @@ class Opening:
     address: str
     """HOST:PORT; '' = one is started on this machine."""
     workers: int
-    """Of one that is started."""
+    """Number of workers of a cluster that is started."""
     run: str
     """Names the folder where machines keep this run's files."""
     paths: tuple[str, ...]

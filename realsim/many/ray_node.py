@@ -17,7 +17,7 @@ from realsim.store import atomic
 from realsim.store.atomic import StorageError
 
 PIECE_BYTES = 8_000_000
-"""Of a file that goes back: a machine never holds more of it in memory."""
+"""Size of a returned file's pieces [bytes]: a machine never holds more of it in memory."""
 KEPT_PREFIX = "realsim_many_"
 
 Fetch = Callable[[str], bytes]
@@ -164,7 +164,7 @@ class _Kept:
 
 
 State = Mapping[str, tuple[int, int, int]]
-"""Of every file in a folder by its path: size, time of its last change [ns], inode."""
+"""Size, time of the last change [ns] and inode of every file in a folder, by path."""
 
 
 def _state(folder: Path) -> State:

@@ -29,7 +29,7 @@ class Task:
     name: str
     """In words, for messages and progress; the caller tells tasks apart by it."""
     fn: Callable[..., Any]
-    """Of a module, so that another process finds it; its result can be pickled."""
+    """Function of a module, so that another process finds it; its result can be pickled."""
     args: tuple[Any, ...] = ()
     """What can be pickled; files go as `Sent`, and a folder that is changed as `Worked`."""
 

@@ -75,7 +75,7 @@ class Poses:
     table_off_m: float = 0.0
     """By how much the table is not flat, 1-sigma [m]."""
     around: Sequence[Around] = ()
-    """Of few views: what the images say of each pose and those around it."""
+    """What the images say of each pose and those around it; empty with many views."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -58,7 +58,7 @@ class ManyViews:
     seen: list[list[SeenPose]]
     """Per object, its pose in every view of the camera in the hand."""
     frames: tuple[DepthFrame, ...]
-    """Of the camera in the hand, with refined poses and the depth's bias taken out; read when
+    """Frames of the camera in the hand, with refined poses and the depth bias removed; read when
     asked."""
     views: tuple[ViewPoints, ...]
     """Their points, likewise; then those of the cameras that stand still."""

@@ -67,20 +67,20 @@ class AlignmentConfig:
     """A stretch or shift is believed if outlines lie on edges so many times as often beyond chance
     as they do unmoved."""
     few_confidence: float = 3.4
-    """One or two views cannot vote. There the best shift stands out by so much (here and below:
-    five frames of YCB-Video, aligned, shifted and stretched, 15 of an F200, and ten of a UR5e's
-    camera whose depth was resized)..."""
+    """Least confidence of the best shift in one or two views, which cannot vote. The values from
+    here to `few_resized_gain` were set on five frames of YCB-Video (aligned, shifted, stretched),
+    15 of an F200 and ten resized ones of a UR5e's camera."""
     few_stretch_confidence: float = 3.9
-    """...or the best stretch by so much (4.0 to 7.7; of an aligned frame 3.3)..."""
+    """Least confidence of the best stretch: misaligned frames 4.0 to 7.7, an aligned one 3.3."""
     few_share: float = 0.3
-    """...so many of the outlines lie on edges beyond chance..."""
+    """Least share of outlines that lie on edges beyond chance."""
     few_gain: float = 2.0
-    """...and so many times as many as unmoved: 2.2 to 5 times where depth was moved or stretched,
-    1.05 to 1.41 where it was not..."""
+    """Least ratio of that share to the unmoved one: 2.2 to 5 where depth was moved or stretched,
+    1.05 to 1.41 where it was not."""
     few_stretch_gain: float = 1.5
-    """...a stretch being so many times better than any shift (1.7 to 12; aligned up to 1.17)..."""
+    """Least ratio of a stretch to the best shift: 1.7 to 12; aligned frames have up to 1.17."""
     few_resized_gain: float = 1.2
-    """...or so many times, if it is what resizing from 4:3 to 16:9, or back, did (1.2 to 2)."""
+    """The same ratio for a stretch that is a resize from 4:3 to 16:9 or back: 1.2 to 2."""
     seed: int = 0
     """Seed of the choice of outline pixels."""
 

@@ -40,9 +40,9 @@ class PhotoConfig:
     step_px: float = 0.5
     """Steps of the search; a parabola through the crest finds the rest."""
     noise: float = 1.2
-    """An edge changes by more than so many times what the photograph changes by in the median..."""
+    """Least change at an edge, in units of the photograph's median change."""
     least_change: float = 0.7
-    """...and by this at least [of 255, per px]."""
+    """Least change at an edge in absolute terms [of 255, per px]."""
     front_m: float = 0.015
     """What was measured by more than this in front of a model hides its outline [m]."""
     behind_m: float = 0.004

@@ -82,7 +82,7 @@ class Edges:
     beside_px: Array
     """(2,) how far the photograph lies beside the depth [px]."""
     rim_px: float
-    """Of the object [px]."""
+    """Width of the object's rim [px]."""
     sigma_px: float
     """1-sigma of one edge [px]."""
     count: int
@@ -132,7 +132,7 @@ class PhotoFit:
     poses: list[Array]
     """(4, 4) each."""
     offset_per_m: float
-    """Of the view's inverse depth [1/m]: to be taken out."""
+    """Offset of the view's inverse depth [1/m], which must be removed."""
     offset_sigma_per_m: float
     """Its 1-sigma."""
     beside_px: Array

@@ -35,7 +35,7 @@ FIXED = {
     "right": se3.look_at([0.75, -0.45, 0.85], [0.42, 0.05, 0.35], 0.0),
 }
 BIAS = DepthBias(offset_per_m=0.02)
-"""Of a fixed camera's depth."""
+"""Bias of a fixed camera's depth."""
 VIEWS, MODULES, TEXTURE, SUPER = 10, 8, 8, 2
 
 

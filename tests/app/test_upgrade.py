@@ -42,7 +42,7 @@ OFF_M = 0.003
 """Annotations of the BOP scenes are off by this along the camera's x."""
 GRASPS = ("--grasps", "2")
 PAINTS = np.array([[200, 40, 40], [40, 60, 190], [120, 120, 110]], np.uint8)
-"""Of the box, the wedge and, at -1, what lies behind."""
+"""Colours of the box, the wedge and, at -1, what lies behind."""
 
 
 def upgrade(dataset: Path, out: Path, *more: str) -> Result:

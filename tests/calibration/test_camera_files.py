@@ -218,7 +218,7 @@ def visp(model, *, extra="", size="<image_width>1280</image_width>"):
 
 
 def test_visps_camera_is_read_with_its_distortion(tmp_path):
-    """Of both models the one with distortion counts; kud moves a pixel as ViSP says it does."""
+    """The model with distortion counts of the two; kud moves a pixel as ViSP says it does."""
     pinhole = visp("perspectiveProjWithoutDistortion")
     assert not np.any(read_camera(given_file(tmp_path, "p.xml", pinhole)).distortion)
     other = "<model><type>perspectiveProjWithoutDistortion</type><px>1</px></model>"

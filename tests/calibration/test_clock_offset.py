@@ -123,7 +123,7 @@ def test_streams_of_different_recordings_are_named() -> None:
 
 
 def test_an_offset_larger_than_the_recording_is_named() -> None:
-    """Of a motion the robot saw the beginning and the camera the end."""
+    """The robot saw the beginning of a motion and the camera its end."""
     s = streams(seconds=20.0)
     early, late = s.tr < 8, s.tc > 11
     with pytest.raises(InputError, match="larger than the recording"):

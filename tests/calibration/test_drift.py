@@ -42,7 +42,7 @@ def test_a_known_slip_is_found() -> None:
 
 
 def test_sigma_and_false_alarms() -> None:
-    """Of 24 sessions without a slip none is called moved; the squared distance is that of F."""
+    """None of 24 sessions without a slip is called moved; the squared distance is that of F."""
     found = [drift(np.zeros(6), seed) for seed in range(24)]
     assert not any(f.moved for f in found)
     distance = [float(f.twist @ np.linalg.solve(f.covariance, f.twist)) for f in found]

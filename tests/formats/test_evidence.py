@@ -95,7 +95,7 @@ def test_a_camera_that_hardly_moves_decides_nothing():
 
 
 def test_two_alike_are_not_confused():
-    """Of an object that a frame shows twice without instances, nothing can be said."""
+    """Nothing can be said of an object that a frame shows twice without instances."""
     T = np.eye(4)
 
     def frame(index, *objects):

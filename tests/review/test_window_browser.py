@@ -24,7 +24,7 @@ from tests.support.review_browser import (
 from tests.support.reviewed_boxes import boxes_session
 
 TABLE_RGB, BOX_RGB = (100, 100, 100), (210, 210, 210)
-"""Of the photographs; noise of 10 on them."""
+"""Colours of the photographs, with noise of 10."""
 pytestmark = [needs_chromium, pytest.mark.slow]
 
 

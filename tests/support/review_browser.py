@@ -21,7 +21,7 @@ ARGS = (
 WAIT_S = 60.0
 """How long is waited for a page without a graphics card on a busy machine [s]."""
 HARMLESS = ("GPU stall due to ReadPixels", "GL Driver Message")
-"""Of the software renderer, not of the page."""
+"""Messages of the software renderer, not of the page."""
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 SMALL = SceneConfig(coarse_points=4_000, shown_points=4_000, most_points=20_000)
 """So little that a processor draws it fast enough."""

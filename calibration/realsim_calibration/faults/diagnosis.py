@@ -58,9 +58,9 @@ class DiagnosisConfig:
     same_pose_deg: float = 0.002
     """The same for the angle [deg]."""
     same_view: float = 0.5
-    """Images of one pose are one view below this error, in units of `FitConfig` ..."""
+    """Error below which images of one pose are one view, in units of `FitConfig`."""
     other_view: float = 2.0
-    """They are different views beyond this."""
+    """Error above which they are different views."""
     least_turn_deg: float = 2.0
     """RMS turn about the second axis below which conventions cannot be tested [deg]."""
     small_turn_part: float = 0.2

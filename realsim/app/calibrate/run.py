@@ -19,7 +19,7 @@ OUT = Path("calibration")
 
 
 BAG_ENDINGS = (".bag", ".mcap", ".db3")
-"""Of recordings."""
+"""Endings of recordings."""
 TOLERANCE_MM = 1.0
 """What `--check` allows, if nobody says [mm at the objects]."""
 

@@ -76,7 +76,7 @@ class Campaign:
     of_a_scene: tuple[Step, ...]
     of_all: tuple[Step, ...]
     scenes: int | None = None
-    """Of generated ones, so many are taken."""
+    """Number of generated scenes to take; None = all."""
 
 
 def read_campaign(path: Path, root: Group) -> Campaign:

@@ -15,7 +15,7 @@ from typing import BinaryIO
 
 PROGRAM = (sys.executable, "-c", "from realsim.app.pipeline.chain import child; child()")
 PR_SET_PDEATHSIG = 1
-"""Of Linux' prctl: the signal that a process gets when its parent ends."""
+"""Option of Linux's prctl: the signal that a process gets when its parent ends."""
 DONE, LOOK = 0, 1
 """Exit codes of a command that did its work; 1: one of its checks failed."""
 WORDS, TAIL_BYTES = 600, 20_000

@@ -30,7 +30,7 @@ REPORTS = {
 """Page that a stage leaves in a scene."""
 
 PAGES = ("scenes/index.html", "stats/statistics.html")
-"""Of the generator, and of the statistics."""
+"""Pages of the generator and of the statistics."""
 
 
 def verdicts_of(scene: "SceneState") -> dict[str, int]:

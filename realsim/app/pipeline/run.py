@@ -33,7 +33,7 @@ class SceneState:
     name: str
     folder: Path
     ends: tuple[Ended, ...] = ()
-    """Of its commands, as far as they ran."""
+    """How each command that ran ended."""
 
     @property
     def failure(self) -> Ended | None:

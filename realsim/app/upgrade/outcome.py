@@ -42,18 +42,18 @@ class OutcomeConfig:
     far_m: float = 0.015
     """A pose that moved further is a proposal and must win clearly [m]."""
     depth_t: float = 3.0
-    """Standard errors by which the new pose must be better on depth..."""
+    """Standard errors by which a new pose must be better on depth."""
     far_depth_t: float = 6.0
-    """...and a proposal."""
+    """Standard errors by which a proposal must be better on depth."""
     photo_t: float = 3.0
-    """The same on the photograph, of which half is looked at..."""
+    """Standard errors by which a new pose must be better on the photograph, half of it used."""
     photo_ratio: float = 0.85
-    """...and the mean distance from its edges is less than this share of the annotation's; a
-    proposal's less than the square of this."""
+    """Greatest ratio of the mean distance from the photograph's edges to the annotation's; the
+    square of it for a proposal."""
     least_visible: float = 0.3
-    """A thing of which less is seen, at either pose, keeps its annotation..."""
+    """Visible share, at either pose, below which an object keeps its annotation."""
     far_visible: float = 0.5
-    """...and where it is to move far."""
+    """The same share for an object that is to move far."""
     far_agree: float = 0.15
     """Share of its pixels by which more must agree with the depth where it moves far."""
     wrong_agree: float = 0.4
@@ -101,7 +101,7 @@ class Outcome:
     T_world_obj: Array
     """(4, 4) the pose to go on with."""
     evidence: Evidence | None
-    """Of the new pose; None = there is none."""
+    """Evidence of the new pose; None = there is none."""
     looks_wrong: bool = False
     """Whether the annotation that was kept does not fit what was measured."""
 

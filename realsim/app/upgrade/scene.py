@@ -44,7 +44,7 @@ UNDECIDED: Record = {
     "photo_t": None, "agree_annotation": None, "agree_new": None, "edge_px_annotation": None,
     "edge_px_new": None, "visible": None, "proposed_mm": None,
 }  # fmt: skip
-"""Of an object whose annotation lies in no image that took part."""
+"""Columns for an object whose annotation lies in no image that took part."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -47,9 +47,9 @@ class PeelConfig:
     rotations: int = 24
     """Random turns tried at each place of a cluster for each object."""
     most_starts: int = 160
-    """So many starts of one object and round at most, of all places alike: 2 ms each..."""
+    """Maximum number of starts of one object in a round, spread over all places: 2 ms each."""
     most_starts_together: int = 1600
-    """...and so many of all objects of a round: with 30 models 53 each, and 3 s."""
+    """Maximum number of starts of all objects in a round: 53 each with 30 models, 3 s."""
     least_extent: float = 0.25
     """A cluster smaller than this share of the object's size is not it."""
     greatest_extent: float = 2.5

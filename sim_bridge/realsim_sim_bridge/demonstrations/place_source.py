@@ -36,7 +36,7 @@ CARRY, LOWER, RELEASE, WITHDRAW = (
     ALL_PHASES.index(n) for n in ("carry", "lower", "release", "withdraw")
 )
 SPEED, ACCELERATION = 0.15, 0.5
-"""Of the hand as it carries [m/s, m/s^2]: less than in the lift."""
+"""Speed and acceleration of the hand as it carries [m/s, m/s^2]: less than in the lift."""
 DROP_M = 0.001
 """Height over the table at which the fingers open [m]."""
 WITHDRAW_M = 0.10
