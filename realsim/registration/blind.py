@@ -34,7 +34,7 @@ class CovarianceConfig:
     systematic_translation_m: float = 0.0002
     """1-sigma common to all points: camera poses and depth bias do not average out."""
     systematic_rotation_deg: float = 0.03
-    """Likewise for the rotation."""
+    """1-sigma of the rotation that is common to all points."""
     correlation_area_px: float = 50.0
     """Pixels that share one matching window's noise: 12 200 px of a D405 hold 243 independent
     samples. 1 for independent pixels."""

@@ -92,7 +92,7 @@ class RegistrationConfig:
     start_radius_m: float = 0.045
     """How far an object may be from a start pose: 1.5 times what a start may be off by."""
     start_turn_deg: float = 38.0
-    """How far it may be turned from there, likewise."""
+    """How far an object may be turned from a start pose, with the same factor."""
     regather_m: float = 0.012
     """If an object moved further than this, its points are collected again around its new pose."""
     dense_views: int = 48
@@ -100,11 +100,11 @@ class RegistrationConfig:
     hand_eye_sigma_mm: float | None = None
     """1-sigma of the hand-eye [mm], from its calibration; None = the refinement's own prior."""
     hand_eye_sigma_deg: float | None = None
-    """Likewise [deg]."""
+    """1-sigma of the hand-eye's rotation [deg]; None = the refinement's own prior."""
     arm_sigma_mm: float | None = None
-    """1-sigma of each robot pose [mm]; None likewise."""
+    """1-sigma of each robot pose [mm]; None = the refinement's own prior."""
     arm_sigma_deg: float | None = None
-    """Likewise [deg]."""
+    """1-sigma of each robot pose's rotation [deg]; None = the refinement's own prior."""
     bias: DepthBias = field(default_factory=DepthBias.none)
     """Bias of the depth camera, from its calibration; the images are given as measured."""
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)

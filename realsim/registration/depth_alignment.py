@@ -72,7 +72,7 @@ def check_alignment(
         rgb: (H, W, 3).
         depth_m: (H, W) depth along z [m]; 0 = none.
         intrinsics: the camera both are said to be of.
-        config: see there.
+        config: settings.
 
     Raises:
         InputError: the colour image is not (H, W, 3) of 8 bits.
@@ -249,7 +249,7 @@ def _agrees(finding: AlignmentFinding, at: tuple[Any, ...], config: AlignmentCon
     Args:
         finding: of one view.
         at: stretch along x and y, row and column; the stretches are slices if there is none.
-        config: see there.
+        config: settings.
     """
     s, cube = finding.shift_scores, finding.stretch_scores
     if isinstance(at[0], int):

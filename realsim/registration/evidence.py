@@ -184,7 +184,7 @@ def gather(
         intrinsics: the camera.
         frames: depth images with poses.
         bodies: the objects at their start poses.
-        config: see there.
+        config: settings.
         progress: called with (frames done, frames).
     """
     noise = measure_noise(frames, config)

@@ -121,7 +121,7 @@ def register_few(
     Args:
         intake: the frames.
         bodies: the objects at their starts.
-        config: see there.
+        config: settings.
         up: (3,) direction up in world, or None.
         tick: called after each object.
     """
@@ -143,7 +143,7 @@ def with_photograph(
         intake: the frames.
         few: the fits.
         bodies: the objects.
-        config: see there.
+        config: settings.
     """
     (frame, *more) = intake.frames
     if more or frame.read_rgb is None:
@@ -213,7 +213,7 @@ def few_around(
         bodies: the objects.
         claimed: (4, 4) starts that somebody claimed; None = a search found them.
         photo: what the photograph says; None = there is none.
-        config: see there.
+        config: settings.
     """
     taken = photo if photo is not None and photo.taken else None
     comparer = make_comparer(

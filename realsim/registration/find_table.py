@@ -116,7 +116,7 @@ def find_table(
     Args:
         views: the trusted points of the views, where their cameras are said to be.
         noise: of the depth.
-        config: see there.
+        config: settings.
         gravity_up_world: (3,) direction up, or None.
     """
     full = [v for v in views if len(v.points)]

@@ -87,7 +87,7 @@ def contradiction(
         held: the views.
         k: which is asked about.
         others: the views that it is held against.
-        config: see there.
+        config: settings.
         T_world_cam: (4, 4) where it is supposed to be; None = where it is said to be.
     """
     maps = held.maps if T_world_cam is None else _move_camera(held.maps, k, T_world_cam)

@@ -61,7 +61,7 @@ class ManyViews:
     """Frames of the camera in the hand, with refined poses and the depth bias removed; read when
     asked."""
     views: tuple[ViewPoints, ...]
-    """Their points, likewise; then those of the cameras that stand still."""
+    """Points of these frames, then those of the cameras that stand still."""
     plane: SupportPlane | None
     arm_constant_m: float
     """1-sigma per axis of what the arm is off by everywhere: part of the covariances [m]."""
@@ -113,7 +113,7 @@ def register_many(
         claimed: the same at the starts that somebody claimed, None = nobody did: turns that the
             points do not show stay as they were claimed.
         plane: the table, or None.
-        config: see there.
+        config: settings.
         progress: called with (rounds done, rounds).
 
     Raises:

@@ -93,7 +93,7 @@ def duel(
         T_rival: (4, 4) the other, near enough to be fitted.
         cloud: the object's averaged points, cameras refined.
         misfit_m: by how much the object's mesh is off everywhere [m].
-        config: see there.
+        config: settings.
     """
     fitted = [
         solve_pose(body, cloud, X, config.solver.fine, config.solver).T_world_obj
@@ -147,7 +147,7 @@ def duels_by_print(
         rivals: of each, by depth; None = none.
         contrasts: to these.
         intake: the frames.
-        config: see there.
+        config: settings.
     """
     rules, poses = config.rivals, [b.T_start for b in bodies]
     out, fought = list(contrasts), list[Duel | None]([None] * len(poses))
@@ -201,7 +201,7 @@ def print_duel(
         number: which of them has rivals.
         rivals: (4, 4) each.
         pictures: the photographs.
-        config: see there.
+        config: settings.
 
     Returns:
         The duel with the best rival; contrast 0 = two rivals are alike. None = the object has no

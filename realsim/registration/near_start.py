@@ -61,7 +61,7 @@ def perturbed_starts(body: Body, up_world: Array | None, config: SearchConfig) -
     Args:
         body: the object at its start.
         up_world: (3,) the table's normal, or None: the object's own z.
-        config: see there.
+        config: settings.
     """
     T = body.T_start
     up = np.array([0.0, 0.0, 1.0]) if up_world is None else T[:3, :3].T @ up_world
@@ -176,7 +176,7 @@ class JointConfig:
     coarse_m: tuple[float, float] = (0.002, 0.005)
     """Least and greatest coarse voxel."""
     fine_share: float = 1 / 60
-    """Fine voxel likewise."""
+    """Fine voxel as a share of the bounding box's diagonal, within `fine_m`."""
     fine_m: tuple[float, float] = (0.001, 0.0025)
     """Least and greatest fine voxel."""
     assign_m: float = 0.010

@@ -138,7 +138,7 @@ def hidden_by_measured(measured: Array32, own: Array32, config: PhotoConfig) -> 
     Args:
         measured: (H, W) depth; 0 = none [m].
         own: (H, W) the mesh's depth, inf beside it [m].
-        config: see there.
+        config: settings.
     """
     # Beside the mesh the nearest depth of its rim.
     rim = np.where(np.isfinite(own), own, cv2.erode(np.minimum(own, 99.0), np.ones((5, 5))))
@@ -153,7 +153,7 @@ def outline_of(picture: Picture, own: Array32, others: Array32, config: PhotoCon
         picture: the photograph.
         own: (H, W) the mesh's depth, inf beside it [m].
         others: (H, W) that of all other things.
-        config: see there.
+        config: settings.
     """
     size = own.shape[::-1]
     inside = np.isfinite(own) & (own <= others)
@@ -217,7 +217,7 @@ def shifted(
         picture: the photograph.
         meshes: of the objects.
         poses: (4, 4) each, as depth has them.
-        config: see there.
+        config: settings.
     """
     now = list(poses)
     for _ in range(config.rounds):
@@ -326,7 +326,7 @@ def print_errors(
         T_world_obj: (4, 4).
         own: (H, W) the object's depth, inf beside it [m].
         others: (H, W) that of all other things.
-        config: see there.
+        config: settings.
 
     Returns:
         The correlation of all colours (0 where they go against each other); and the mean square

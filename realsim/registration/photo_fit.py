@@ -44,9 +44,9 @@ class PhotoFitConfig:
     rim_px: float = 0.3
     """1-sigma of an object's rim [px]: a mesh that is 0.5 % too large."""
     depth_m: float = 0.0006
-    """What the points of an object are off by in common, shift, 1-sigma [m]."""
+    """Common shift of an object's points, 1-sigma [m]."""
     depth_deg: float = 0.4
-    """Likewise, turn [deg]."""
+    """Common turn of an object's points, 1-sigma [deg]."""
     blind_m: float = 0.01
     """1-sigma of motions that points do not determine, of the surface [m]."""
     most_m: float = 0.012
@@ -140,7 +140,7 @@ class PhotoFit:
     edges: list[Edges]
     """Per object; none where nothing was moved."""
     covariances: list[Array]
-    """(6, 6) per object, of the right twist about its origin, rotation first [rad, m]; likewise."""
+    """(6, 6) per object, of the right twist about its origin, rotation first [rad, m]."""
     edge_px: tuple[float, float]
     """Mean distance of the edges from the outlines, before and after [px]."""
     agreements: list[tuple[float, str]]
@@ -171,7 +171,7 @@ def photo_fit(
         fits: of their points.
         together: so many points of the fits share one error.
         noise: of the depth.
-        config: see there.
+        config: settings.
     """
     offset = max(config.offset_noises * noise.per_m, LEAST_OFFSET_PER_M)
     T_cam_world = se3.invert(picture.T_world_cam)

@@ -82,7 +82,7 @@ class Registration:
     """View number -> (4, 4) T_world_cam; refined if the views allow it. Views that were left out
     are not in it."""
     fixed_cameras: dict[str, Array]
-    """Name -> (4, 4) T_world_cam of the cameras that stand still, likewise."""
+    """Name -> (4, 4) T_world_cam of the cameras that stand still; refined if the views allow it."""
     seen: dict[int, dict[int, SeenPose]]
     """View number -> instance -> its pose in that view, with covariance and pixel uncertainty.
     Empty if cameras were not refined."""
@@ -116,7 +116,7 @@ def register_scene(  # noqa: PLR0913 - the inputs, and two ways to follow them
         models: known objects by obj_id.
         wanted: rough poses, right to about 30 mm and 20 deg; or objects with a hint or none where
             they are; None = find out which of the models are there.
-        config: see there.
+        config: settings.
         fixed: cameras that stand still: one view more each for the joint fit.
         gravity_up_world: (3,) up; helps to tell the table from a wall.
         progress: called with (steps done, steps).
@@ -174,11 +174,11 @@ class _Fit:
 
     poses: Poses
     frames: Sequence[DepthFrame]
-    """With the cameras and the depth as they are now known."""
+    """Frames with the cameras and the depth as they are now known."""
     views: tuple[ViewPoints, ...]
-    """Their points, likewise."""
+    """Points of the frames."""
     fixed: tuple[ViewPoints, ...]
-    """Points of the cameras that stand still, likewise."""
+    """Points of the cameras that stand still."""
     kept: list[Kept]
     uncertain: list[Uncertainty]
     searches: list[dict[str, Any]]

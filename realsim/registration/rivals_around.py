@@ -130,7 +130,7 @@ def around(
         others: the other objects and their poses (4, 4).
         claimed: (4, 4) the start, if somebody claimed it; None = a search found it.
         edges: what the photograph shows of it; None = nothing.
-        images: see there.
+        images: what the poses are compared with.
         configs: see `AroundConfig`; of the fits.
     """
     config, solver = configs

@@ -40,7 +40,7 @@ def is_beside_objects(
         bodies: the objects that were placed.
         plane: what may be a table.
         wanted: the models of all objects that should be there.
-        config: see there.
+        config: settings.
     """
     every = max(1, sum(len(v.points) for v in many.views) // POINTS)
     points = np.concatenate([

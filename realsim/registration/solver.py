@@ -232,7 +232,7 @@ def solve_pose(
         cloud: measured points near it; others are tolerated up to the kernel's width.
         T_world_obj: (4, 4) where to start.
         stages: the annealing.
-        config: see there.
+        config: settings.
         free_space: images that the model may not stand in front of; None = not checked.
         held: (6, K) orthonormal motions that are left as they are, about the box's centre, rotation
             first, turns times the radius; None = none.

@@ -274,7 +274,7 @@ def find_support_plane(
         points: (N, 3) measured points around the objects but not on them, world [m].
         centers: (K, 3) the objects' centres at their start poses, world [m].
         cameras: (F, 3) camera positions, world [m].
-        config: see there.
+        config: settings.
         noise_m: typical 1-sigma of a point [m].
         gravity_up_world: (3,) direction up, or None.
     """

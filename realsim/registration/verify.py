@@ -90,7 +90,7 @@ def verify_objects(
         poses: their T_world_obj (4, 4).
         clouds: their measured points (those assigned to each).
         comparer: frames, noise and table.
-        config: see there.
+        config: settings.
     """
     stride = max(
         1, min((comparer.stride_of(b, T) for b, T in zip(bodies, poses, strict=True)), default=1)
@@ -314,7 +314,7 @@ def common_offset(
         bodies: the objects at their starts.
         poses: where they were found.
         use: which of them were found well enough to count.
-        config: see there.
+        config: settings.
     """
     moves = np.array(
         [
@@ -372,7 +372,7 @@ def common_sinking(
         poses: where they were found.
         use: which of them were found well enough to count.
         plane: what they stand on; None = nothing to compare with.
-        config: see there.
+        config: settings.
     """
     nothing: dict[str, object] = {
         "share_of_height": None,

@@ -65,7 +65,7 @@ def check_views(
         views: the trusted points of the views, where their cameras are said to be.
         plane: the table that they share, or None if none was found.
         noise: of the depth.
-        config: see there.
+        config: settings.
         bodies: the registered objects; only after registration.
         Ts_world_obj: per body (4, 4) its pose.
 

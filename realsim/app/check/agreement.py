@@ -12,7 +12,7 @@ class AgreementConfig:
     """Median over the frames, of the silhouette: renderers differ along the outline only, which is
     a twentieth of an object 80 px wide."""
     least_visible_iou: float = 0.80
-    """Likewise of the visible part: there BOP asks the measured depth, which is noisy."""
+    """Median over the frames, of the visible part, for which BOP uses the noisy measured depth."""
     least_single_iou: float = 0.50
     """Least IoU of one frame's silhouette and visible part: below it the mask is another
     thing's."""

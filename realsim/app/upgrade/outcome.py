@@ -278,7 +278,7 @@ def decide(
         annotations: one per instance.
         registered: the new poses; an instance that is missing was not placed.
         plane: the table; None = not known.
-        config: see there.
+        config: settings.
     """
     config = config or OutcomeConfig()
     of = {a.instance: models[a.obj_id] for a in annotations}

@@ -102,7 +102,7 @@ class SceneConsole(Console):
         self.told.append(text)
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-        """Leave it out, likewise."""
+        """Leave the table out."""
 
 
 def read_source(job: SceneJob) -> SceneSource:

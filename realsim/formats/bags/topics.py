@@ -33,7 +33,7 @@ class BagChoice:
     camera_info: str | None = None
     """Topic of the colour camera's CameraInfo, where its name does not follow from the images'."""
     depth_camera_info: str | None = None
-    """Topic of the depth camera's CameraInfo, likewise."""
+    """Topic of the depth camera's CameraInfo, where its name does not follow from the images'."""
     intrinsics: CameraIntrinsics | None = None
     """The colour camera, for a recording without CameraInfo (or one that is wrong)."""
     T_colour_depth: Array | None = None

@@ -45,7 +45,7 @@ GREATEST_LEVEL = 1.0
 LONGEST_M = 0.5
 """Wider, higher or deeper grippers are in millimetres."""
 FARTHEST_M = 20.0
-"""Likewise grasps that are farther from the camera."""
+"""Grasps farther from the camera are in millimetres."""
 ROTATION_TOLERANCE = 1e-3
 """How far R^T R may be from the identity: single precision, of networks' own products."""
 Scores = Literal["school", "friction", "tried"]

@@ -45,7 +45,7 @@ MOST_GRASPS = 5_000_000
 LARGEST_M = 2.0
 """Farther points are in millimetres: no object of a hand is so large."""
 WIDEST_M, DEEPEST_M = 0.25, 0.15
-"""Likewise of openings (GraspNet's gripper: 0.1 m) and depths (0.04 m)."""
+"""Wider openings (GraspNet's gripper: 0.1 m) and greater depths (0.04 m) are in millimetres."""
 MOST_FRICTION = 2.0
 
 

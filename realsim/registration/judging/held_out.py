@@ -158,7 +158,7 @@ def held_out(
         views: how many views there are.
         fit: from view numbers to the poses of all objects; a pose that is not finite says that it
             could not be fitted.
-        config: see there.
+        config: settings.
 
     Raises:
         InputError: there are not two views.
@@ -190,7 +190,7 @@ def _unused_agree(
         body: the object.
         owned: its points.
         tests: pairs of a pose (4, 4) and the views (N,) to test it on.
-        config: see there.
+        config: settings.
     """
     agree: list[Mask] = []
     for T, unused in tests:

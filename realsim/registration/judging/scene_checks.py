@@ -98,7 +98,7 @@ def scene_findings(
         probabilities: that each is right.
         cloud: the scene's measured points, averaged on voxels of 2 or 3 mm, the table's left out.
         comparer: frames, noise and table.
-        config: see there.
+        config: settings.
         with_starts: whether the starts were given by someone; else no common shift is looked for.
         usable: which objects count for what all have in common; None = those of `config.good`.
     """
@@ -187,7 +187,7 @@ def swap_findings(
         gains: of each there, over the bare table: in all and per pixel.
         cloud: the scene's measured points, the table's left out.
         comparer: frames, noise and table.
-        config: see there.
+        config: settings.
     """
     pairs: list[tuple[float, int, int, float, float]] = []
     for i, a in enumerate(bodies):
@@ -275,7 +275,8 @@ class SwappedConfig:
     """An object that gains less than this per pixel was not surely found at its place: right ones
     gain 1.1 to 1.25 over the bare table."""
     failed_agree: float = 0.94
-    """Likewise one of whose pixels less than this share agrees; right ones reach 0.95."""
+    """An object with a smaller share of agreeing pixels was not surely found either; right ones
+    reach 0.95."""
     found_gain: float = 1.0
     """One that explains this much elsewhere is there."""
 
@@ -294,7 +295,7 @@ def with_swaps(
         asked: what was sought.
         models: by id.
         search: seeks objects.
-        config: see there.
+        config: settings.
     """
     good = {
         p.instance

@@ -130,7 +130,7 @@ def surface_residuals(
         Ts_world_cam: (V, 4, 4) the corrected cameras.
         noise: of the depth of the camera in the hand.
         plane: the table; its points belong to no object.
-        config: see there.
+        config: settings.
 
     Raises:
         InputError: there are not as many cameras as views.

@@ -41,7 +41,7 @@ def unit_errors(
         starts: the instances at their start poses.
         cameras_m: (F, 3) camera positions in world [m].
         depth_m: median depth that the cameras measure [m].
-        config: see there.
+        config: settings.
     """
     config = config or UnitConfig()
     errors: dict[int, UnitError] = {}

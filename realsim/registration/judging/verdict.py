@@ -348,7 +348,7 @@ def verdict_of(
     Args:
         probability: that the pose is right, of `probability_right`.
         features: the checks it was told from.
-        config: see there.
+        config: settings.
     """
     reasons = reasons_of(features, config)
     contrast = features.get("contrast")

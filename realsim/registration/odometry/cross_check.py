@@ -123,7 +123,7 @@ class ViewDifference:
     mm: float
     """Shift of the camera [mm]; of a view after a change, the change included; NaN = unknown."""
     deg: float
-    """Turn [deg]; likewise."""
+    """Turn of the camera [deg]; after a change it includes the change; NaN = unknown."""
     pairs: int
     """Pairs it was measured from."""
     overlap: float
@@ -143,7 +143,7 @@ class Fault:
     mm: float
     """Size [mm]; NaN where images and poses are mixed up."""
     deg: float
-    """Size [deg]; likewise."""
+    """Size [deg]; NaN where images and poses are mixed up."""
     words: str
     """A sentence."""
 
@@ -157,7 +157,7 @@ class KinematicsCheck:
     noise_mm: float
     """Median difference of a pair [mm], faults left aside."""
     noise_deg: float
-    """Likewise [deg]."""
+    """Median turn of a pair [deg], faults left aside."""
     pairs: int
     """Pairs that were aligned."""
     unchecked: tuple[tuple[int, str], ...]
@@ -205,7 +205,7 @@ def check_kinematics(
     Args:
         views: in the order in which they were captured, at the poses that forward kinematics claim.
         plane: the table in world; None = the largest plane of each view.
-        config: see there.
+        config: settings.
 
     Raises:
         InputError: fewer than two views hold anything above the table.

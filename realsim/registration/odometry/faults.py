@@ -42,16 +42,16 @@ class FaultConfig:
     most_noise_mm: float = 1.2
     """Noise is not believed to be above this [mm], or a scene full of faults would hide them."""
     most_noise_deg: float = 0.25
-    """Likewise [deg]."""
+    """Greatest noise of a turn that is believed [deg]."""
     screen_mm: float = 0.35
     """Sigma of a component at most while the gravest fault is sought [mm]; a mount that slipped
     early spoils most pairs, and noise measured from those would hide it."""
     screen_deg: float = 0.07
-    """Likewise [deg]."""
+    """Greatest sigma of a component of a turn while the gravest fault is sought [deg]."""
     floor_mm: float = 0.15
     """Least sigma of a component of a pair's difference [mm]."""
     floor_deg: float = 0.03
-    """Likewise [deg]."""
+    """Least sigma of a component of a pair's turn [deg]."""
     cauchy: float = 12.0
     """Squared whitened residual from which a pair counts less; a good one has 6 on average."""
     least_gain: float = 8.0
@@ -133,7 +133,7 @@ def find_faults(
         Ts_world_cam: (F, 4, 4) claimed.
         edges: the pairs whose alignment can be trusted.
         aim: (3,) what the views look at, world [m]: a moved table is measured there.
-        config: see there.
+        config: settings.
     """
     Ts = Ts_world_cam.copy()
     faults: list[PoseFault] = []

@@ -40,7 +40,7 @@ from realsim.registration.views import SampleConfig, sample_view
 FREE = 1.0
 """Sigma of what the table does not tell (place on it [m] and turn about its normal [rad])."""
 FIXED = 1e-6
-"""Likewise of the first view, which is where it is: the table fixes the rest of it as well."""
+"""Sigma of the first view's place [m] and turn [rad], which the table fixes as well."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -88,7 +88,7 @@ def optimise_poses(
         edges: measured pairs.
         levelled: (F,) whether the view saw the table, so that its height, roll and pitch are good.
         angles: (F, F) how different the views are [deg].
-        config: see there.
+        config: settings.
     """
     import gtsam
 
@@ -188,7 +188,7 @@ class HandHeld:
     residual_mm: float
     """Median of what is left of a pair's shift [mm]."""
     residual_deg: float
-    """Likewise of its turn [deg]."""
+    """Median of what is left of a pair's turn [deg]."""
     cpu_s: float
     """CPU time [s]."""
 
@@ -211,7 +211,7 @@ def hand_held_poses(
     Args:
         intrinsics: the camera.
         depths: (H, W) each, along z [m], 0 = none, in the order in which they were taken.
-        config: see there.
+        config: settings.
 
     Raises:
         InputError: a view overlaps too little with those before it, or holds nothing above the

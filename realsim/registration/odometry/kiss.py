@@ -135,7 +135,7 @@ def odometry(
 
     Args:
         clouds: per view (N, 3) points in camera axes, the table removed [m].
-        config: see there.
+        config: settings.
         guesses: per view a guess of its T_first_cam (4, 4), of which the motion from view to view
             is used; None = the camera goes on as it did.
 

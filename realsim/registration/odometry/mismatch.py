@@ -26,7 +26,7 @@ class MismatchConfig:
     gross_mm: float = 10.0
     """A difference beyond this is no inaccuracy [mm]."""
     gross_deg: float = 2.0
-    """Likewise [deg]."""
+    """A turn beyond this is no inaccuracy [deg]."""
     suspect_share: float = 0.6
     """A view is suspect if this share of its pairs failed or differ grossly."""
     references: int = 3
@@ -87,7 +87,7 @@ def find_mismatches(
         Ts_world_cam: (F, 4, 4) claimed.
         edges: all pairs as measured.
         angles: (F, F) how different the views are [deg].
-        config: see there.
+        config: settings.
     """
     n = len(Ts_world_cam)
     own = np.arange(n)

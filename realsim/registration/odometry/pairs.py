@@ -38,7 +38,8 @@ class AboveTableConfig:
     map_spacing_m: float = 0.004
     """Edge of the voxels in which points are averaged that others are aligned to [m]."""
     source_spacing_m: float = 0.008
-    """Likewise of the points that are aligned: half as many cost 1.5 times the accuracy."""
+    """Edge of the voxels of the points that are aligned [m]; half as many points cost 1.5 times the
+    accuracy."""
     least_points: int = 60
     """A view with fewer averaged points above the table cannot be aligned."""
 
@@ -79,7 +80,7 @@ def view_cloud(
         view: its trusted points and where the camera is said to be.
         plane: the table in world, where the view's own is looked for first; None = the largest
             plane of the view.
-        config: see there.
+        config: settings.
         rng: of the random search.
     """
     p = view.points.astype(np.float64)
@@ -264,7 +265,7 @@ def neighbour_pairs(angles: Array, config: PairConfig) -> list[tuple[int, int]]:
 
     Args:
         angles: (F, F) of `view_angles`.
-        config: see there.
+        config: settings.
     """
     from scipy.sparse.csgraph import minimum_spanning_tree
 

@@ -66,7 +66,7 @@ class CameraPrior:
     """Standard deviation of the constant error of all cameras [mm]: loose, the depth knows it
     better."""
     hand_eye_deg: float = 0.25
-    """Likewise [deg]."""
+    """Standard deviation of the constant turn of all cameras [deg]."""
     arm_constant_mm: float = 0.08
     """Standard deviation per axis of what the arm is off by everywhere alike [mm]: it moves cameras
     and objects together, so that no view shows it. Set on the whole loop, seeds 2000 to 2009 and
@@ -75,14 +75,14 @@ class CameraPrior:
     """Standard deviation of each view on its own [mm]: the repeatable part of an arm's error is in
     the hand-eye."""
     view_deg: float = 0.03
-    """Likewise [deg]."""
+    """Standard deviation of each view's own turn [deg]."""
     view_offset_per_m: float = 0.002
     """Standard deviation of a view's own offset of the inverse depth [1/m]: 0.02 px of a D405,
     whose disparity wanders."""
     learn_views: bool = True
     """Whether the views' sigmas are found from the views (if there are `learn_from` or more)."""
     learn_from: int = 6
-    """See there."""
+    """Least number of views from which the views' sigmas are found."""
     learn_factor: tuple[float, float] = (0.25, 40.0)
     """Least and greatest factor by which they may differ from what was said: a real arm in the
     data was off by 4 mm between neighbouring views."""
@@ -120,7 +120,7 @@ class RefineConfig:
     unmeasured_scale: float = 0.001
     """1-sigma of the depth's scale if no calibration says it."""
     unmeasured_offset_per_m: float = 0.0035
-    """1-sigma of the inverse depth's offset likewise [1/m]: 0.04 px of a D405."""
+    """1-sigma of the inverse depth's offset if no calibration says it [1/m]: 0.04 px of a D405."""
     points: PointConfig = field(default_factory=PointConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     prior: CameraPrior = field(default_factory=CameraPrior)

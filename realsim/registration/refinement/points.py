@@ -175,7 +175,7 @@ def assign_views(
         bodies: the objects.
         state: where they, the table and the depth's bias stand.
         cameras: (V, 4, 4) as they stand now.
-        config: see there.
+        config: settings.
         share: of the points that the configuration allows.
         flat: numbers of the flat bodies.
     """

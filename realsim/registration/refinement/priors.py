@@ -45,7 +45,7 @@ def add_priors(
         system: added to.
         state: where the unknowns stand.
         views: whose camera each is.
-        config: see there.
+        config: settings.
         sigmas: of the hand's views, as `said_sigmas` gives them.
     """
     p = config.prior

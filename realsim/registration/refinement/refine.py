@@ -136,7 +136,7 @@ def refine(
         poses: their T_world_obj (4, 4), right to about 3 mm and a few degrees.
         plane: the table; None = there is none.
         noise: of the depth of the camera in the hand.
-        config: see there.
+        config: settings.
         progress: called with (rounds done, rounds).
 
     Raises:

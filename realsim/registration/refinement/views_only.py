@@ -132,7 +132,7 @@ def refine_views(
         intrinsics: the camera.
         views: trusted points of all views, with the cameras' claimed poses.
         noise: of the depth.
-        config: see there.
+        config: settings.
         progress: called with (rounds done, rounds).
 
     Raises:

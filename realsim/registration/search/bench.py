@@ -175,7 +175,7 @@ def make_bench(
         views: thinned points of all views.
         seen: the table and the depth noise.
         models: those that may be there.
-        config: see there.
+        config: settings.
         field_folder: where what is derived from meshes is kept between runs; None = in memory.
         told: called with words for what is being done.
 
@@ -284,7 +284,7 @@ def fitted_candidates(
     """Return the distinct poses that starts lead to, those outside of the region left out.
 
     Args:
-        bench: see there.
+        bench: what the search works with.
         obj_id: the model.
         starts: poses (4, 4) and their names.
         region: where the object may be.

@@ -337,7 +337,7 @@ def candidates(
         fused: the measured points.
         canvas: where poses are rendered.
         starts: poses (4, 4) and where they come from.
-        config: see there.
+        config: settings.
         buffer: what is there already; None = the bare table.
     """
     Ts = [fit_start(sought, fused.coarse, T, False, config) for T, _ in starts]

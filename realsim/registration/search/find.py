@@ -61,7 +61,7 @@ def find_objects(  # noqa: PLR0913 - the stage's inputs, all of them needed
         noise: of the depth.
         models: by id.
         wanted: what is sought; None = all models compete, number and identity unknown.
-        config: see there.
+        config: settings.
         field_folder: where what is derived from meshes is kept between runs; None = in memory.
         progress: called with (groups of hypotheses made, groups).
         told: called with words for what is being done.

@@ -101,7 +101,7 @@ def table_map(
         noise: of the depth.
         middle: (3,) in world, around which is looked [m].
         area_px: pixels of one independent measurement.
-        config: see there.
+        config: settings.
     """
     T = se3.invert(plane.T_world_table)
     low = se3.transform(T, middle[None])[0, :2] - config.reach_m

@@ -79,7 +79,7 @@ def height_grid(cloud: Cloud, plane: SupportPlane, config: GridConfig) -> Height
     Args:
         cloud: in world; raw points or averaged ones.
         plane: what the objects stand on.
-        config: see there.
+        config: settings.
 
     Raises:
         DegenerateError: no point lies over the plane.

@@ -136,7 +136,7 @@ def match_templates(
     Args:
         grid: the measured heights.
         templates: of the object.
-        config: see there.
+        config: settings.
         region: where the object may be and how it may be turned; None = anywhere.
         plane: the plane of the grid.
         taken: (X, Y) cells that other objects explain; nothing is found there.

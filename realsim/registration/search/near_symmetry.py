@@ -137,7 +137,7 @@ def near_symmetries(model: ObjectModel, config: NearSymmetryConfig, folder: Path
 
     Args:
         model: need not declare its symmetries.
-        config: see there.
+        config: settings.
         folder: where results are kept between runs; None = nowhere.
     """
     if is_ball(model):

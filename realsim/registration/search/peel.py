@@ -116,7 +116,7 @@ def suspects(
         cloud: measured points above the table.
         left: clusters (K, 3) of those that no object explains [m].
         placed: all objects.
-        config: see there.
+        config: settings.
     """
     if not left:
         return []
@@ -169,7 +169,7 @@ def residual_starts(
         groups: clusters of points.
         up_world: (3,) the table's normal.
         rng: of the turns.
-        config: see there.
+        config: settings.
         models: so many are sought in the same clusters.
     """
     body = sought.body

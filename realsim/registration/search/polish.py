@@ -113,7 +113,7 @@ def polish_poses(
         canvas: where poses are rendered.
         cloud: fine points above the table.
         placed: models and poses.
-        config: see there.
+        config: settings.
         refine: stages and constants of the fit.
     """
     now = [c for _, c in placed]
@@ -198,7 +198,7 @@ def decide_rivals(
         others: buffer of the canvas with all other objects in place.
         evidence: canvas, measured points (of the object and around it), and the
             near-symmetries (N, 4, 4).
-        config: see there.
+        config: settings.
         refine: constants of the fit.
     """
     canvas, cloud, near = evidence

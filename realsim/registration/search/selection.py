@@ -80,7 +80,7 @@ def select(
         canvas: where the poses were rendered.
         pool: poses of all objects.
         slots: what is to be placed.
-        config: see there.
+        config: settings.
         first: what is chosen already (per slot); the greedy choice fills the rest.
     """
     chosen: list[int | None] = list(first) if first is not None else [None] * len(slots)
@@ -105,7 +105,7 @@ def select_any(
     Args:
         canvas: where the poses were rendered.
         pool: poses of all objects that may be there.
-        config: see there.
+        config: settings.
         first: poses that are chosen already.
         clash: tells whether two poses of the pool cannot both be; None = never.
     """
@@ -228,7 +228,7 @@ def select_pair(
         slots: of the two objects.
         chosen: what they have; at most one of them may have none.
         buffer: holds all other objects.
-        config: see there.
+        config: settings.
     """
     now, filled = config.better, buffer
     for c in chosen:

@@ -103,7 +103,7 @@ def model_templates(
 
     Args:
         model: need not be watertight, and need not declare its symmetries.
-        config: see there.
+        config: settings.
         folder: where templates are kept between runs; None = nowhere.
 
     Raises:

@@ -149,7 +149,7 @@ def trusted_depth(
         depth_m: (h, w) a depth image or a part of one [m].
         intrinsics: gives the size of a pixel only.
         noise: of the camera.
-        config: see there.
+        config: settings.
     """
     import cv2
 
@@ -227,7 +227,7 @@ def cropped(
         frames: the frames.
         box: T_world_table (4, 4), least and greatest corner (3,) in that frame [m].
         noise: of the camera.
-        config: see there.
+        config: settings.
     """
     T_world_table, low, high = box
     grid = np.stack(np.meshgrid(*[np.linspace(0, 1, 5)] * 3, indexing="ij"), -1).reshape(-1, 3)

@@ -71,7 +71,7 @@ def fuse_object(
         intrinsics: of the depth camera.
         frames: at least three; their order does not matter.
         plane: the table in world, or None to find it in the depth.
-        config: see there.
+        config: settings.
         progress: is told in a few words what is being done.
 
     Raises:

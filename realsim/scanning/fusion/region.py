@@ -146,7 +146,7 @@ def _things(
         points: (N, 3) in the table's frame [m].
         owners: (N,) their frames.
         sizes: edge of a cell [m] and the number of frames.
-        config: see there.
+        config: settings.
     """
     from scipy import ndimage
 

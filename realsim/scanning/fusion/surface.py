@@ -54,7 +54,7 @@ def closed_surface(volume: Volume, cut_m: float, config: FusionConfig) -> Surfac
     Args:
         volume: the fused distances in the table's frame.
         cut_m: height below which rays to the table disturb those to the object [m].
-        config: see there.
+        config: settings.
 
     Raises:
         InputError: nothing is left.
@@ -287,7 +287,7 @@ def vertex_evidence(
         crops: the trusted depth.
         Ts_cam_table: (F, 4, 4).
         frames: for the colours.
-        config: see there.
+        config: settings.
     """
     sums = np.zeros((len(points), 8))
     nothing = np.zeros((1, 1, 3), np.uint8)

@@ -171,7 +171,7 @@ def fused_volume(
         box: least and greatest corner (3,) and the edge of a cell [m]. Along z the nodes lie at
             half cells, so that the plane is midway between two layers.
         before: fused distances of the round before, for the normals; None in the first.
-        config: see there.
+        config: settings.
     """
     low, high, cell = box
     first = np.floor(low / cell)

@@ -181,11 +181,11 @@ class ScaleConfig:
     hand_eye_sigma_mm: float | None = None
     """1-sigma of the hand-eye per axis [mm], from the session's calibration; None = the prior's."""
     hand_eye_sigma_deg: float | None = None
-    """Likewise about each axis [deg]."""
+    """1-sigma of the hand-eye about each axis [deg]; None = the prior's."""
     arm_sigma_mm: float | None = None
     """1-sigma of each robot pose per axis [mm]; None = the prior's."""
     arm_sigma_deg: float | None = None
-    """Likewise about each axis [deg]."""
+    """1-sigma of each robot pose about each axis [deg]; None = the prior's."""
     seed: int = 0
     """Seed of everything that is drawn."""
     table: TableConfig = field(default_factory=TableConfig)

@@ -126,7 +126,7 @@ def new_round(
         evidence: what was measured.
         state: where everything stands.
         within_m: 1-sigma of the shape inside a patch, shared among the patch's points [m].
-        config: see there.
+        config: settings.
     """
     points, views = stacked([v.points for v in evidence.views])
     cameras = state.cameras(claimed_cameras(evidence.views))
@@ -157,7 +157,7 @@ def linearised(
         held: what the round holds fixed.
         limits: where the real surface is believed to lie outside of the mesh (K,) [m], Tukey's
             cut-off [sigma], and the shape's 1-sigma [m].
-        config: see there.
+        config: settings.
     """
     offsets, cut, width = limits
     cameras = state.cameras(claimed_cameras(evidence.views))

@@ -40,7 +40,7 @@ class Rim:
     left: int
     """Column of the crop's first pixel in the image."""
     top: int
-    """Row likewise."""
+    """Row of the crop's first pixel in the image."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

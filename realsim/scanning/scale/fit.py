@@ -53,7 +53,7 @@ def fit_scale(  # noqa: PLR0913 - keywords, each with a meaning of its own
         mesh: the object in any unit and attitude; its shape may be off by some per cent.
         intrinsics: the camera of all frames.
         frames: depth images [m] with camera poses; three or more, from all around.
-        config: see there.
+        config: settings.
         start: rough scale and pose (15 %, 10 mm, 10 deg); None = found from nothing.
         plane: the table, where it is known already; None = found.
         at: (x, y) in world [m] near the object, where several stand on the table.
@@ -222,7 +222,7 @@ def _if_mirrored(
         evidence: what was measured.
         fit: the state, and how much the mesh explained after the coarse fit, as its mirror image's.
         judged: the verdict so far.
-        config: see there.
+        config: settings.
     """
     (state, gain), c = fit, config.search
     if gain > c.sure_gain:

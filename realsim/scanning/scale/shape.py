@@ -146,7 +146,7 @@ def shape_models(
         information: (K, K) Lambda of the offsets, all else integrated out [1/m^2].
         offered: (K,) eta, likewise [1/m].
         scale: metres per unit of the inner mesh, and the object's size [m].
-        config: see there.
+        config: settings.
     """
     s, size = scale
     k = len(offered)

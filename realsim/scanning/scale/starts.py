@@ -100,7 +100,7 @@ def find_starts(
         shape: the object in any attitude.
         cloud: measured points of this one object above the table, in world [m].
         plane: the table it stands on.
-        config: see there.
+        config: settings.
 
     Raises:
         DegenerateError: the points are too few, or do not lie above the plane.
@@ -129,7 +129,7 @@ def starts_near(
 
     Args:
         given: an operator's or another program's start.
-        config: see there.
+        config: settings.
         rng: direction of the small turns about the box axes, so that no attitude is preferred.
     """
 

@@ -90,7 +90,7 @@ def find_object(
         frames: depth images with camera poses.
         plane: the table.
         noise: of the depth.
-        config: see there.
+        config: settings.
         at: (x, y) in world [m] near the object, where several stand there.
 
     Raises:

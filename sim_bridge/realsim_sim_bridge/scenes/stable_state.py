@@ -31,11 +31,11 @@ class StandConfig:
     rest_m_s: float = 0.002
     """Centres of mass slower than this rest [m/s]: 0.5 mm in the time above."""
     rest_rad_s: float = 0.02
-    """And turning slower than this [rad/s]."""
+    """Greatest turning speed of an object at rest [rad/s]."""
     stands_m: float = 0.002
     """What moved no more still stands where it did [m]: poses are not known better."""
     stands_deg: float = 2.0
-    """What turned no more, likewise [deg]."""
+    """What turned no more still stands as it did [deg]."""
     jump_window_s: float = 0.05
     """How long after the start a speed counts as a jump [s]: free fall is left out of it."""
     jump_m_s: float = 0.1
@@ -134,7 +134,7 @@ def stable_state(world: TableWorld, config: StandConfig | None = None) -> StandR
 
     Args:
         world: as it was built; it is in its final state afterwards.
-        config: see there.
+        config: settings.
 
     Raises:
         RealsimError: the engine's numbers are no longer finite.

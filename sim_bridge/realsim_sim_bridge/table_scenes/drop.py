@@ -61,7 +61,7 @@ def drop(
         table: what they fall on.
         counts: how many are enough in the end, and how many are wanted on the table.
         next_solid: number of an object, from 0 -> its body; called once for each, in order.
-        config: see there.
+        config: settings.
         rng: where and how each is let go.
     """
     enough, wanted = counts
