@@ -27,7 +27,7 @@ of small pieces and none of them is stray."""
 NEEDLE_AREA_SHARE = 1e-14
 """A face of less area than this share of the size squared has no normal worth the name."""
 NAMED_BODIES = 4
-"""So many bodies are listed with their shares; the rest is summed up."""
+"""Number of bodies that are listed with their shares; the rest is summed up."""
 
 
 def _percent(share: float) -> str:

@@ -28,7 +28,7 @@ GLB_JSON = 0x4E4F534A
 PACKED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
 """Packed geometry that cannot be unpacked here."""
 HEADER_BYTES = 4096
-"""So much of a text header is looked at for what the file says of itself."""
+"""Length of a text header that is read for what the file says of itself."""
 
 
 def load_pieces(path: Path) -> FileContent:

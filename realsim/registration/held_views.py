@@ -25,7 +25,7 @@ from realsim.registration.views import ViewPoints
 T_CAM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL's camera (y up, z backward) in OpenCV's."""
 OVERDRAWN = 20
-"""So many times the points are drawn before those above the table are picked: they may be few."""
+"""Factor of points drawn before those above the table, which may be few, are picked."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

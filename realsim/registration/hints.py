@@ -62,7 +62,7 @@ KEYS = ("obj_id", "instance", *KINDS, "radius_mm", "turn_deg")
 FARTHEST_M = 10.0
 """An object that is further from the robot's base than this was given in millimetres [m]."""
 TABLE_VIEWS = 12
-"""So many views show where the table is; hints need no more."""
+"""Number of views in which the table is sought; hints need no more."""
 TABLE_STRIDE = 8
 """Every so many pixels of them."""
 NUMBER = r"-?\d+(?:\.\d+)?"

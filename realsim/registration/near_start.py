@@ -37,7 +37,7 @@ class SearchConfig:
     """Share of the gain that a half turn from the start costs: 1 % for 36 deg, less than any real
     difference in fit, more than the facets of a round body make."""
     refined: int = 3
-    """So many of the best hypotheses are refined on the fine cloud and compared again."""
+    """Number of best hypotheses that are refined on the fine cloud and compared again."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

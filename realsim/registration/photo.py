@@ -50,7 +50,7 @@ class PhotoConfig:
     block_px: int = 16
     """Blocks of a checkerboard: a correction is fitted on every other one."""
     together: float = 8.0
-    """So many neighbouring outline points count as one: they see the same edge."""
+    """Neighbouring outline points that count as one, because they see the same edge."""
     common_px: float = 3.0
     """1-sigma of the common shift [px]: published depth lies up to 5 px off its photograph."""
     own_px: float = 1.0

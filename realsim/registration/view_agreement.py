@@ -224,9 +224,10 @@ class ViewCheckConfig:
     """The table may be this far from where the others see it [m]: a hand-eye off by 1.5 mm and
     0.4 deg moves it by 2 mm, forward kinematics by 1 mm."""
     table_tilt_deg: float = 2.0
-    """And be tilted by so much [deg]: the same hand-eye tilts it by 0.6 deg."""
+    """Greatest tilt of the table against what the others see [deg]: the same hand-eye tilts it by
+    0.6 deg."""
     table_spreads: float = 6.0
-    """Or by so many median absolute deviations of the views, if that is more."""
+    """The same limits in median absolute deviations of the views, if that is more."""
     table_kept: float = 0.8
     """The common table holds less than this share of the points on the view's own: it is off."""
     above_m: float = 0.008
@@ -240,7 +241,7 @@ class ViewCheckConfig:
     near: int = 3
     """Partners of a view: the nearest."""
     spread: int = 5
-    """And views spread over the session."""
+    """Further partners of a view, spread over the session."""
     worst_share: float = 0.6
     """At first only views with this share of the worst one's contradictions are set aside."""
     rounds: int = 6
@@ -253,7 +254,7 @@ class ViewCheckConfig:
     partly_share: float = 0.10
     """More than this: something was moved, or the pose is off by a centimetre."""
     spreads: float = 8.0
-    """Or so many median absolute deviations of the views above their median, if that is more."""
+    """The same limit as median absolute deviations above the views' median, if that is more."""
     solved_share: float = 0.3
     """Another pose explains a view if it leaves less than this share of its contradictions."""
     scene_support: float = 0.2

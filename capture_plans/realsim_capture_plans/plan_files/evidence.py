@@ -35,8 +35,8 @@ FITS_DEG = 3.0
 CLEARLY = 3.0
 """Another robot's reading is this many times worse, otherwise the poses decide nothing."""
 NOMINAL_OFF_M = 0.005
-"""Nor do they where another robot's reading is off by less than this [m]: so far a real arm may be
-from its own nominal numbers."""
+"""Error of another robot's reading below which the poses decide nothing either [m]: a real arm may
+be this far from its own nominal numbers."""
 EXACT_M = 1e-4
 """Poses computed from the same joints agree to this [m], however they were rounded."""
 NOMINAL = 1e-6

@@ -51,7 +51,7 @@ PAGE_FILE = "reports/annotated.html"
 MAP_VIEWS = 6
 """Views whose maps are shown: four pictures each."""
 MOST_NOTES = 40
-"""So many notes are on the page; all are in the annotations."""
+"""Number of notes on the page; all are in the annotations."""
 LEGEND = (
     "Outlines and names: green accepted, amber doubtful, red rejected, grey unchecked. Axes: x "
     "red, y green, z blue. Grippers: p_hold (else score) 0 red, 0.5 yellow, 1 green, dashed where "

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from realsim_sim_bridge.annotation.annotate import AnnotationSummary
 
 MOST_NOTES = 12
-"""So many notes are shown; the rest are in the annotations."""
+"""Number of notes that are shown; the rest are in the annotations."""
 PAGE_PICTURES = 12
 """Frames on the page."""
 PICTURES = 8

@@ -38,7 +38,7 @@ PLAN_MARKS = {
 ODD_ROW_M = 0.010
 """A tool pose that is farther than this from its joints' is named [m]; arms leave 1 to 3 mm."""
 ODD_ROW_TIMES = 5.0
-"""And that is this many times the median's distance."""
+"""Least ratio of a named pose's distance to the median distance."""
 LOOKING_BACK = -0.2
 """Cosine between optical axis and tool z below which a camera looks back."""
 NO_PLAN_DEG = 180.0

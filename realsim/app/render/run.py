@@ -25,7 +25,7 @@ from realsim_sim_bridge.synthetic.write import SyntheticSummary, write_session
 
 FIGURES_HEADER = ["figure", "real", "synthetic", "together"]
 MOST_NAMED = 8
-"""So many views are named in a message."""
+"""Number of views that a message names."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -21,7 +21,7 @@ SCHOOL_HEADER = [
     "p_hold", "margin", "agree [%]",
 ]  # fmt: skip
 MEASURED = 3
-"""So many of its last columns are left out where nothing has been measured."""
+"""Number of its last columns that are left out where nothing has been measured."""
 FILTER_HEADER = [
     "object", "turned", "in the table", "in the object", "in a neighbour", "free", "kept",
 ]  # fmt: skip

@@ -75,7 +75,7 @@ class SceneCheckConfig:
     """A model whose best pose explains its pixels by less than this each better than the bare table
     is not in the scene."""
     absent_probability: float = 0.1
-    """And whose pose is right with less than this."""
+    """Probability below which the pose of such a model counts as absent."""
     good: float = 0.5
     """Objects of this probability or more count for what all have in common."""
 

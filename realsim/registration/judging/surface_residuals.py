@@ -60,9 +60,9 @@ class ResidualConfig:
     wrong_m: float = 0.001
     """Least mean residual of a wrong patch [m]."""
     wrong_sigmas: float = 3.0
-    """And so many standard errors."""
+    """Least mean residual of a wrong patch, in standard errors."""
     level_factor: float = 2.5
-    """And so many times the session's level of error."""
+    """Least mean residual of a wrong patch, in units of the session's level of error."""
     level_m: tuple[float, float] = (0.0002, 0.002)
     """Least and greatest level [m]: beyond, poses are wrong, not meshes and cameras."""
     level_per_m: float = 0.003
@@ -77,7 +77,7 @@ class ResidualConfig:
     look_cos: float = 0.35
     """Least cosine at which a patch is looked at: flatter, the next pixel is millimetres off."""
     through_m: float = 0.0035
-    """So much farther than the patch must the measurement be to have gone through it [m]."""
+    """Distance behind a patch from which a measurement has gone through it [m]."""
     through_sigmas: float = 2.0
     """Plus so many sigma_z, plus `level_per_m` z^2: a camera at 1 m is 3 mm off."""
     through_looks: int = 2

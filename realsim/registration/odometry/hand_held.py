@@ -154,7 +154,7 @@ class HandHeldConfig:
     """A view this far from the last key view becomes one [deg]; drift grows with their number, and
     at 8 degrees the path turned 0.7 degrees too far in simulation instead of 0.1 to 0.7."""
     key_overlap: float = 0.8
-    """Or one that overlaps less with it."""
+    """Overlap with the last key view below which a view becomes one."""
     least_overlap: float = 0.6
     """A view that overlaps less with those before it cannot be placed; wrong alignments have 0.6
     at most in simulation."""
@@ -164,7 +164,7 @@ class HandHeldConfig:
     loop_deg: float = 35.0
     """Key views at most this far apart are aligned if they do not follow each other [deg]."""
     loops: int = 3
-    """So many others are tried for each key view."""
+    """Number of other views that are tried for each key view."""
     seed: int = 0
     """Seed of the random search for the table."""
 

@@ -37,7 +37,7 @@ class MismatchConfig:
     """An image fits a pose if its distance to what is seen there is at most so many times that of
     aligned pairs (unaligned right ones: 1.05 times)."""
     better_factor: float = 0.75
-    """And at most this part of its distance at its own pose."""
+    """Greatest ratio of that distance to the distance at the image's own pose."""
     shifts: tuple[int, ...] = (1, -1, 2, -2)
     """Shifts of one list against the other that are tried."""
     least_shifted: int = 3

@@ -166,7 +166,7 @@ class CandidateConfig:
     same_m: float = 0.002
     """Poses nearer than this, modulo symmetry, are one hypothesis [m]."""
     refined: int = 5
-    """So many of the best hypotheses of an object are refined on the fine points."""
+    """Number of an object's best hypotheses that are refined on the fine points."""
     solver: SolverConfig = field(default_factory=SolverConfig)
     """The Gauss-Newton fit."""
     coarse: tuple[Stage, ...] = (

@@ -55,7 +55,7 @@ class FlatConfig:
     explained: float = 0.5
     """Least share of the heights that a pose must explain."""
     polished: int = 6
-    """So many best poses are fitted to the map."""
+    """Number of best poses that are fitted to the map."""
     steps: int = 8
     """Steps of that fit."""
     floor_m: float = 2e-4

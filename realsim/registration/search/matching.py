@@ -73,7 +73,7 @@ class MatchConfig:
     """A candidate may score so much less than the same one turned by one step: small features
     decide the yaw of a flange, and only its rendering shows them."""
     refined: int = 160
-    """So many best candidates are moved to the best place nearby; each costs 20 us."""
+    """Number of best candidates that are moved to the best place nearby; each costs 20 us."""
     climb_m: float = 0.003
     """First step of the climb [m]: half the step of the search."""
     climb_deg: float = 5.0

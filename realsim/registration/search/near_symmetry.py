@@ -69,9 +69,9 @@ class NearSymmetryConfig:
     judging_points: int = 700
     """Surface points by which it is judged, by exact distances."""
     screened: int = 110
-    """So many best turns are fitted: 0.7 ms each."""
+    """Number of best turns that are fitted: 0.7 ms each."""
     judged: int = 90
-    """So many of the fitted ones are judged: 2 ms each."""
+    """Number of fitted turns that are judged: 2 ms each."""
     cells: int = 36
     """Cells of the distance field that ranks and fits, along the longest side."""
     scales: tuple[float, ...] = (0.15, 0.12, 0.1, 0.08, 0.06, 0.05, 0.04, 0.03, 0.03)

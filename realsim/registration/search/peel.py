@@ -31,7 +31,7 @@ class PeelConfig:
     a share of its own: of a pipe in the wrong turn inside a pile all agrees that shows, but half of
     its true place is left over."""
     most_suspects: int = 3
-    """So many of these at most, those with the greatest share first."""
+    """Greatest number of these, those with the greatest share first."""
     explained_m: float = 0.006
     """Points this near to a sure object are explained [m]."""
     least_height_m: float = 0.007
@@ -41,7 +41,7 @@ class PeelConfig:
     least_points: int = 40
     """Smaller clusters are left-overs at the edges of sure objects."""
     most_clusters: int = 12
-    """So many clusters are looked at, the largest first."""
+    """Number of clusters that are searched, the largest first."""
     rounds: int = 3
     """Times that unsure objects are sought in what is left."""
     rotations: int = 24

@@ -21,7 +21,7 @@ SHINY_LOSS = 0.6
 """Share lost of a polished metal seen from the working distance: its highlight blinds, and its
 mirror image of the surroundings gives wrong matches."""
 TEXELS = 10_000
-"""So many texels, evenly spread, are a texture's mean."""
+"""Number of texels, evenly spread, that make a texture's mean."""
 
 
 def signal_loss(

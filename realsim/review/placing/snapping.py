@@ -68,7 +68,7 @@ class Snapped:
     """(6, 6) of the right perturbation, rotation first [rad, m], cameras taken at their word; None
     where the depth says nothing."""
     checks: dict[str, float]
-    """There, as the registration's: agree, gain, cover, hidden, free_space_violation ..."""
+    """Checks of the snapped pose, the registration's: agree, gain, cover, hidden, ..."""
     checks_before: dict[str, float]
     """The same at the start."""
     moved_mm: float

@@ -32,7 +32,7 @@ RIM_PX = 0.35
 LEAST_HEIGHT_M = 0.005
 """Outline points nearer to the table than this are not used [m]: the foot is not measured."""
 LEAST_JUMP_M = 0.010
-"""Nor where the depth behind the outline jumps by less than this [m]."""
+"""Outline points with a smaller jump of the depth behind them are not used [m]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

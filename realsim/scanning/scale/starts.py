@@ -72,7 +72,7 @@ class StartsConfig:
     tolerance_share: float = 0.03
     """Heights agree within this share of the size: 2 % of shape error, some tilt."""
     tolerance_m: float = 0.003
-    """But never within less [m]: two cells of a slope."""
+    """Least value of that tolerance [m]: two cells of a slope."""
     low_cost: float = 0.5
     """What a model that is lower than the measurement costs; one that is higher costs 1. Lower may
     be a hole of the mesh that the cameras could not look into."""

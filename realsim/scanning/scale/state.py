@@ -18,7 +18,7 @@ SIMILARITY = np.array([*OBJECT, SIZE])
 LARGEST_SCALE_STEP = 0.2
 """No step changes the scale by more than this factor: without a bound far starts collapse."""
 LARGEST_TURN_RAD = 0.35
-"""Nor turns the object by more: the equations are linear."""
+"""Largest turn of the object in a step [rad]: the equations are linear."""
 LEAST_SIGMA = (np.radians(1e-3), 1e-5)
 """Least prior 1-sigma of a camera's turn [rad] and shift [m]: none is perfect."""
 

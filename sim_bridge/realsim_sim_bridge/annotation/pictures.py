@@ -25,7 +25,7 @@ UNKNOWN_RGB = (255, 0, 200)
 AXIS_SHARE = 0.3
 """Length of a drawn axis as a share of the object's longest side."""
 MOST_NAMED = 4
-"""So many objects that are not visible are named in the legend."""
+"""Number of invisible objects that the legend names."""
 
 
 def overlay_picture(

@@ -11,7 +11,7 @@ from realsim_sim_bridge.annotation.inputs import FrameInputs
 
 Parts = Mapping[int, Mapping[str, Any]]
 MOST_NAMED = 8
-"""So many views are named in a message."""
+"""Number of views that a message names."""
 WORTH_TELLING = 0.005
 """Share of an object that must be hidden in a view for the view to be told."""
 

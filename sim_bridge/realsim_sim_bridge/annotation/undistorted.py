@@ -33,7 +33,7 @@ from realsim_sim_bridge.annotation.unmodelled import object_masks
 STANDS_STILL = 1e-9
 """Poses in world [m, rotation entries] that differ by less are one scene to cast."""
 COMPARED_FRAMES = 8
-"""So many frames, evenly spread, say what a lens costs."""
+"""Number of frames, evenly spread, from which the cost of a lens is measured."""
 GOOD_IOU = 0.99
 THIN_PX = 3
 """What is hidden in a strip thinner than this is the rim of another program's rasteriser [px]."""

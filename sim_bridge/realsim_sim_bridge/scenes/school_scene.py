@@ -24,7 +24,7 @@ class Support:
     mesh: Mesh | None = None
     """Its surface in its frame [m]; its convex parts are what collides."""
     urdf: Path | None = None
-    """Or a URDF file, which stands at its base link's frame."""
+    """URDF file instead of a mesh, which stands at its base link's frame."""
 
     def __post_init__(self) -> None:
         """Check that there is exactly one shape and that its file exists."""

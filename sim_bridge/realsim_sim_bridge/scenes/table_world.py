@@ -54,7 +54,7 @@ class WorldConfig:
     fat_ratio: float = 1.10
     """Convex parts of a larger share of the mesh's volume are named: they meet too early."""
     thin_ratio: float = 0.90
-    """And those of a smaller share: bodies sink into each other."""
+    """Convex parts of a smaller share are named: bodies sink into each other."""
 
     def __post_init__(self) -> None:
         """Check what would make the physics meaningless."""

@@ -26,7 +26,7 @@ class PoolConfig:
     hull_only: bool = False
     """Whether the hull stands for meshes without known convex parts: quick, but no hollow."""
     tries: int = 40
-    """So many meshes in a row that cannot be used are skipped before the pool is refused."""
+    """Number of unusable meshes in a row that are skipped before the pool is refused."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -64,7 +64,7 @@ class DropConfig:
     rest_m_s: float = 0.002
     """Centres of mass slower than this rest [m/s]; the Robot School's."""
     rest_rad_s: float = 0.02
-    """And turning slower than this [rad/s]."""
+    """Greatest turning speed of an object at rest [rad/s]."""
     rest_s: float = 0.25
     """Rest has to last so long [s]."""
     check_s: float = 1.0

@@ -54,7 +54,7 @@ class LimitConfig:
     ramp_s: float = 0.125
     """The load grows from zero within this time [s]: a sudden one would overshoot."""
     hold_s: float = 0.5
-    """And then stands [s]."""
+    """Time for which the full load stands [s]."""
     held_m: float = 1e-3
     """A cube that moved less is held [m]."""
     held_deg: float = 2.0
