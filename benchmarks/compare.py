@@ -99,26 +99,28 @@ def compare(before: dict[str, Document], after: dict[str, Document]) -> tuple[li
 
 
 def page_of(documents: dict[str, Document]) -> str:
-    """Return the page of what was measured last, a table a benchmark."""
+    """Return the page of what was measured last: figures with a goal as tables, others as lists."""
     lines = [
         "# Measured", "",
-        "Written by `benchmarks/compare.py --page` from `benchmarks/measured/`; do not edit.",
-        "Goals are those of full runs; quick ones take fewer samples, some of them one. Noise "
-        "is the spread over runs that were kept together.", "",
+        "Written by `benchmarks/compare.py --page` from `benchmarks/measured/`; do not edit it.",
+        "Goals are those of full runs. Quick runs take fewer samples, some of them one. A value "
+        "behind +- is the spread over several runs.", "",
     ]  # fmt: skip
     for name, document in documents.items():
         machine, goals = document.get("machine") or {}, document.get("goals") or {}
         seeds = ", ".join(map(str, document.get("seeds") or [document.get("seed")]))
         kind = "quick" if document.get("quick") else "full"
         lines += [f"## {name}", "", f"{kind}, seeds {seeds}, {machine.get('cores', '?')} cores", ""]
-        lines += ["| figure | measured | noise | goal |", "|---|---|---|---|"]
-        for key, value in document["figures"].items():
-            noise = document.get("noise", {}).get(key)
-            said = "not measured" if value is None else f"{value:.4g}"
-            spread = "" if noise is None else f"{noise:.2g}"
-            goal = goals.get(key, "")
-            lines.append(f"| {key} | {said} | {spread} | {'' if 'inf' in goal else goal} |")
-        lines.append("")
+        noise = {k: f" +- {v:.2g}" for k, v in document.get("noise", {}).items()}
+        said = {
+            key: "not measured" if value is None else f"{value:.4g}{noise.get(key, '')}"
+            for key, value in document["figures"].items()
+        }
+        asked = [key for key in said if "inf" not in goals.get(key, "inf")]
+        lines += ["| figure | measured | goal |", "|---|---|---|"]
+        lines += [f"| {key} | {said[key]} | {goals[key]} |" for key in asked]
+        others = ", ".join(f"{k} {v}" for k, v in said.items() if k not in asked and v[0] != "n")
+        lines += ["", f"Without a goal: {others}.", ""]
     return "\n".join(lines)
 
 

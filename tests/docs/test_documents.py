@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import re
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -122,6 +123,16 @@ def test_the_documents_have_commands_snippets_and_links() -> None:
     assert sum(len(typed_commands(t)) for t in texts) > 150
     assert sum(b.kind == "python" for t in texts for b in blocks(t)) > 15
     assert sum(len(LINK.findall(t)) for t in texts) > 150
+
+
+def test_the_figures_of_the_readme_are_those_that_were_measured() -> None:
+    measured = read(ROOT / "docs/measured.md")
+    told = re.findall(r"<!-- (\w+) -->([\d.]+)", read(ROOT / "README.md"))
+    assert len(told) > 12
+    for key, value in told:
+        found = re.search(rf"(?<!\w){key} (?:\| )?([-\d.e]+)", measured)
+        digits = len(value.partition(".")[2])
+        assert found and f"{float(found[1].rstrip('.')):.{digits}f}" == value, (key, value)
 
 
 def test_every_guide_is_on_the_entry_page() -> None:
