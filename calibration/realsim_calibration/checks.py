@@ -102,8 +102,8 @@ def _views(r: HandEyeReport, c: CheckConfig) -> Check:
         name="views",
         verdict=worst,
         sentence=f"{used} of {given} views were used{names}{more}.",
-        advice=_advice(worst, "Take 24 views or more in which the whole target is sharp, and look "
-                       "at the reasons of the dropped ones."),
+        advice=_advice(worst, "Take 24 views or more in which the whole target is sharp. The table "
+                       "of views says why the others were dropped."),
         value=used,
         views=tuple(v.index for v in gone),
     )  # fmt: skip
@@ -156,7 +156,7 @@ def _absolute(r: HandEyeReport, c: CheckConfig) -> tuple[Check, ...]:
         Check(
             name="uncertainty elsewhere",
             verdict="good" if known else "unknown",
-            sentence="what the arm may be off by in all poses alike is not seen from these views: "
+            sentence="these views cannot show an arm error that is the same in all poses: "
             "for another arm, a new mount or a drawing the camera's place is known to "
             f"{r.sigma_mm:.2f} mm and {r.sigma_deg:.3f} deg (1 sigma, worst axis).",
             advice="" if known else advice,
@@ -199,8 +199,8 @@ def _held_out(r: HandEyeReport, c: CheckConfig) -> Check:
         sentence=f"views that the fit has not seen are predicted to {r.held_out_px:.2f} px, "
         f"{r.held_out_mm:.2f} mm and {r.held_out_deg:.3f} deg; worst "
         + ", ".join(f"{v.label} ({v.unseen_px:.2f} px)" for v in worst) + ".",
-        advice=_advice(verdict, "Is the board fixed, the arm at rest at every picture, the robot's "
-                       "own calibration in use? The views named are where to look."),
+        advice=_advice(verdict, "Check that the board was fixed, the arm at rest in every picture "
+                       "and the robot's own calibration in use. Begin with the views named."),
         value=r.held_out_px,
         unit="px",
         views=tuple(v.index for v in worst),
@@ -215,7 +215,7 @@ def _optimism(r: HandEyeReport, c: CheckConfig) -> Check:
         verdict=verdict,
         sentence=f"seen views fit to {r.seen_px:.2f} px, unseen ones to {r.held_out_px:.2f} px "
         f"({ratio:.1f} times).",
-        advice=_advice(verdict, "The fit follows single views: take more."),
+        advice=_advice(verdict, "The fit follows single views: take more views."),
         value=ratio,
     )  # fmt: skip
 
@@ -233,7 +233,7 @@ def _scale(r: HandEyeReport, c: CheckConfig) -> Check:
         name="board size",
         verdict=verdict,
         sentence=f"by the robot's metres the board is {b.scale:.4f} +-{sd:.4f} times the size "
-        f"given; its height against its width is {1 + b.aspect:.4f}.",
+        f"given; its ratio of height to width is {1 + b.aspect:.4f}.",
         advice=_advice(verdict, "Measure the print over several squares with a calliper: by the "
                        f"robot {size_name(r.target, b.scale)}. If the calliper agrees, give "
                        f"{option_of(r.target, b.scale)} in --board."),
@@ -258,8 +258,8 @@ def given_camera_check(f_given: float, f_fitted: float, config: CheckConfig) -> 
     return _focal_check(
         f_given, f_fitted, config, "given camera",
         "the views show a focal length of {:.1f} px, the given camera has {:.1f} px ({:+.1f} %).",
-        "Is it the camera, the resolution and the focus of these images? Leave the camera out to "
-        "have the lens calibrated from these views.",
+        "Check that it is the camera, resolution and focus of these images, or leave the camera "
+        "out to calibrate the lens from these views.",
     )  # fmt: skip
 
 

@@ -188,8 +188,8 @@ def _counted_from_one_end(
         name="half turns",
         verdict="good",
         sentence=f"the target looks the same turned by 180 deg; in {len(names)} of "
-        f"{len(candidates)} views it was counted from the other end, which is mended by the "
-        f"robot's turns ({turns.before_deg:.1f} deg misfit before, {turns.after_deg:.2f} after).",
+        f"{len(candidates)} views it was counted from the other end; the robot's turns corrected "
+        f"that (misfit {turns.before_deg:.1f} deg before, {turns.after_deg:.2f} after).",
         value=float(len(names)),
         views=tuple(c.view.index for c, f in zip(candidates, turns.flips, strict=True) if f),
     )
@@ -220,7 +220,7 @@ def _candidates(
             raise InputError(
                 f"hand-eye: the image of view {view.label} is {found.image_size[0]}x"
                 f"{found.image_size[1]} px, the camera's are {size[0]}x{size[1]}. Images of one "
-                "size are needed: leave this view out or rescale nothing."
+                "size are needed: leave this view out, and do not rescale images."
             )
         if len(found) < least:
             why = f"shows {len(found)} points of the target; at least {least} are needed"

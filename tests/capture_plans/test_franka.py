@@ -122,7 +122,7 @@ def test_what_cannot_be_driven_is_refused_before_anything_moves(
 @pytest.mark.parametrize(
     ("what", "stop", "said"),
     [
-        ("reflex joint_reflex", "protective stop", r"reflex \(joint_reflex\).*see what it touched"),
+        ("reflex joint_reflex", "protective stop", r"reflex \(joint_reflex\).*free what it touched"),
         *(
             pytest.param(*row, marks=pytest.mark.slow)
             for row in (
@@ -160,7 +160,7 @@ def test_a_stop_in_mid_move_is_named_and_gone_after_recovery(
 
 
 def test_another_robot_than_expected_is_named(server: FrankaServer) -> None:
-    with pytest.raises(InputError, match=r"is to be a Panda.* says that it is: fr3"):
+    with pytest.raises(InputError, match=r"a Panda is expected.* says that it is: fr3"):
         connect(server.host, chain=find_arm("Panda").chain)
     d = FR3.chain.d.copy()
     d[0] += 0.01

@@ -75,8 +75,8 @@ def _odd(r: CamerasReport) -> list[Check]:
     return [
         Check(
             name="views that disagree", verdict="warn", value=len(odd),
-            sentence=f"three times worse predicted than their cameras' others: {names}{more}.",
-            advice="Look at these images: a blurred one, a board that moved, an arm not at rest.",
+            sentence=f"predicted three times worse than their camera's other views: {names}{more}.",
+            advice="Check these images: is one blurred, did the board move, was the arm at rest?",
             views=tuple(v.instant for v in odd),
         )
     ]  # fmt: skip
@@ -90,7 +90,7 @@ def _base(r: CamerasReport) -> list[Check]:
             name="reference", verdict="warn",
             sentence=f"no arm ties the cameras to a robot: all places are in camera "
             f"'{r.reference}'.",
-            advice="Let the arm carry a board before them (--held-board), or add a camera in the "
-            "hand, if the robot's base is wanted.",
+            advice="If you need the robot's base, let the arm carry a board in view "
+            "(--held-board), or add a camera in the hand.",
         )
     ]  # fmt: skip

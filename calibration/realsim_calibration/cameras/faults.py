@@ -104,7 +104,7 @@ def require_sizes(rig: Rig) -> None:
         raise InputError(
             f"camera '{camera.name}': its intrinsics are for images of {given.width}x"
             f"{given.height} px, its images are {w}x{h}.{hint} Give the file of this camera, at "
-            "this resolution, with --camera."
+            "this resolution, with --intrinsics."
         )
 
 
@@ -137,7 +137,7 @@ def require_lenses(rig: Rig, own: Sequence[CameraIntrinsics | None], limit: floa
             raise InputError(
                 f"cameras '{names[0]}' and '{names[1]}' look exchanged: the images of each fit the "
                 "other's intrinsics, and not its own. Exchange their folders, or their files of "
-                "intrinsics (--camera)."
+                "intrinsics (--intrinsics)."
             )
 
 
@@ -170,8 +170,8 @@ def require_motion(rig: Rig, C: dict[int, Array]) -> None:
     )
     if not explained:
         raise InputError(
-            f"{found}; exchanging cameras or boards does not explain it. Do images and poses "
-            "belong together, and does the board stay where it is said to be?"
+            f"{found}; exchanging cameras or boards does not explain it. Check that images and "
+            "poses belong together and that the board stays where you said."
         )
     raise InputError(f"{found}. This fits if {' or if '.join(explained[:3])}.")
 

@@ -207,8 +207,8 @@ class _Finder:
         seen = sorted(self.rig.cameras[c].name for c in self.X)
         return (
             f"cameras: nothing ties {what} '{name}' to the robot or to the other cameras (placed: "
-            f"{', '.join(seen)}). Let it and one of them see the same board at the same instant, "
-            "or let the arm carry a board before it."
+            f"{', '.join(seen)}). Show the same board to it and to one of them at the same "
+            "instant, or let the arm carry a board in its view."
         )
 
     def _vote(self, k: int, votes: dict[tuple[str, int, int], list[Array]]) -> None:

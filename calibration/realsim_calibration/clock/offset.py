@@ -183,7 +183,7 @@ def first_offset(
     if not len(lags):
         raise InputError(
             f"clock: the streams ({tr[-1] - tr[0]:.1f} s and {tc[-1] - tc[0]:.1f} s) are too short "
-            "to be laid over each other. Record longer."
+            "to be compared. Record longer."
         )
     best = int(np.argmax(value))
     away = np.abs(lags - lags[best]) > 2 * window

@@ -175,12 +175,12 @@ def _without_copies(
     text = {
         "frozen_pose": ("share one hand pose to the last digit although their images differ: the "
                         "controller delivered an old pose", "Read the pose after the arm has "
-                        "stopped and check that it changed; leave the views named out."),
+                        "stopped and check that it changed, or leave these views out."),
         "repeated_image": ("share one image although their hand poses differ",
-                           "Save every image anew; leave the views named out."),
+                           "Save every image anew, or leave these views out."),
         "duplicated_views": ("are the same view twice: pose and image are equal",
-                             "Leave the copies out: they count a view twice and make the result "
-                             "look surer than it is."),
+                             "Leave the copies out: they count a view twice, so the stated sigma "
+                             "is too small."),
     }[fault]  # fmt: skip
     named = tuple(sorted(set(range(n)) - set(rows.tolist())))
     groups_text = "; ".join(p.names(g) for g in groups[fault])

@@ -210,8 +210,8 @@ def _sentence(
             + f" and moved by {1e3 * np.linalg.norm(L[:3, 3]):.1f} mm against the nominal one"
             + (" (`base` and `base_link` of ROS)." if z and angle > 178 else ".")
         )
-        advice = (advice + " The base does no harm to the camera in the hand, but poses of the "
-                  "board and of objects are in the controller's base.").strip()  # fmt: skip
+        advice = (advice + " This does not affect a camera in the hand, but poses of the board "
+                  "and of objects are in the controller's base.").strip()  # fmt: skip
     if not parts:
         return f"The poses are those of the flange: {rest}.", ""
     return " ".join([*parts, f"{rest[0].upper()}{rest[1:]}."]), advice

@@ -220,7 +220,7 @@ def _camera(fields: Fields, path: Path, size: tuple[int, int] | None = None) -> 
         InputError: they are none.
     """
     if "fisheye" in fields and fields["fisheye"] not in (False, 0, "false"):
-        raise InputError(f"{path} describes a fisheye lens, which the record has no place for.")
+        raise InputError(f"{path} describes a fisheye lens, which realsim does not support.")
     own = ("width", "height", "fx", "fy", "cx", "cy", "distortion")
     if set(own) <= set(fields):
         return from_json({k: fields[k] for k in own}, CameraIntrinsics, f"the camera file {path}")
@@ -269,8 +269,8 @@ def _colmap(text: str, path: Path) -> CameraIntrinsics:
     model = words[1] if len(words) > 1 else ""
     if model not in COLMAP_MODELS:
         raise InputError(
-            f"{path}: the camera model '{model}' has no place in the record; "
-            f"{', '.join(COLMAP_MODELS)} have."
+            f"{path}: the camera model '{model}' is not supported; accepted: "
+            f"{', '.join(COLMAP_MODELS)}."
         )
     try:
         width, height = int(words[2]), int(words[3])

@@ -252,7 +252,7 @@ class LiveCalibration:
             more |= {"next_view": None, "move": ""}
             return self._status("done", note, needs, f"Done. {figures}. {end}{lacking}", **more)
         if end:
-            lacking = f" Before the end: {hidden}: errors may hide that no view so far shows."
+            lacking = f" Before you stop: {hidden}, because no view so far shows these errors."
         todo = move or (needs[0].sentence if needs else "go on with other poses")
         said = f"{figures}. Next: {todo}.{lacking if move or end else ''}"
         return self._status("improving", note, needs, said, **more)
@@ -279,7 +279,7 @@ class LiveCalibration:
         if best is not None and best.gain < c.least_gain and not reached:
             return (
                 f"Further views gain less than {c.least_gain:.0%} each, though the goal is not "
-                "reached: measure the board, or calibrate the arm, to get further."
+                "reached. To improve further, measure the board or calibrate the arm."
             )
         if best is not None and best.gain < c.least_gain:
             return f"Further views gain less than {c.least_gain:.0%} each."

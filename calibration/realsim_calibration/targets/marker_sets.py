@@ -79,7 +79,7 @@ def check_markers(target: Target) -> None:
     """
     if max(target.rows, target.columns) > MOST_ROWS:
         raise InputError(
-            f"a target of {target.columns} x {target.rows} (columns x rows) cannot be meant; at "
+            f"a target of {target.columns} x {target.rows} (columns x rows) is too large; at "
             f"most {MOST_ROWS} of each are accepted."
         )
     if isinstance(target, TagBoard):

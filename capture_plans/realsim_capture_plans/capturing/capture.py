@@ -116,8 +116,8 @@ def _check_session(plan: CapturePlan, camera: DepthCamera, store: "SessionStore"
         if (begun := store.extra.get("arm")) not in (None, plan.robot):
             raise InputError(
                 f"the session '{store.folder}' was begun with a {begun}, and this plan is for a "
-                f"{plan.robot}. Views of two arms do not go together: choose a new folder, or go "
-                f"on with the plan in {store.folder / PLAN_FILE}."
+                f"{plan.robot}. A session cannot hold views of two arms: choose a new folder, or "
+                f"continue with the plan in {store.folder / PLAN_FILE}."
             )
         raise InputError(
             f"the session was begun with the plan {str(expected)[:12]}..., this plan is "
@@ -161,9 +161,9 @@ def _check_stored(store: "SessionStore") -> None:
     if store.extra.get(RECOVERED):
         known = ", ".join(f"{k}: {v}" for k, v in store.extra.items() if k != RECOVERED)
         raise InputError(
-            f"the {SESSION_FILE} of '{store.folder}' was made anew by a repair, and with which "
-            f"arm, camera and lab it was begun is not known for certain ({known}). Views of "
-            "another arm or camera would spoil it: capture into a new folder. If you know that "
-            f'all are the same, take "{RECOVERED}" out of "extra" in {SESSION_FILE}, and run '
+            f"the {SESSION_FILE} of '{store.folder}' was made anew by a repair, so its arm, "
+            f"camera and lab are not known for certain ({known}). Views of another arm or "
+            "camera would spoil it: capture into a new folder. If you know that all are the "
+            f'same, delete "{RECOVERED}" from "extra" in {SESSION_FILE}, and run '
             f"{repair_command(store.folder)}."
         )

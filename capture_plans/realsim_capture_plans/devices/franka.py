@@ -283,7 +283,7 @@ class FrankaArm:
         if (model and not model.startswith(expected)) or off[0] > most_m or off[1] > most_rad:
             says = f"says that it is: {model}" if model else "does not say what it is"
             raise InputError(
-                f"the robot is to be a {chain.name}. The one at {self._host} {says}, and its "
+                f"a {chain.name} is expected. The one at {self._host} {says}, and its "
                 f"flange is {1e3 * off[0]:.1f} mm and {deg(off[1]):.2f} deg from where that "
                 f"chain has it at the present joints ({1e3 * most_m:g} mm and {deg(most_rad):.2f} "
                 "deg are accepted). Use the plan of this robot, or connect the right one."

@@ -7,11 +7,12 @@ from realsim_capture_plans.devices.interfaces import ArmStoppedError, Stop
 
 TROUBLES: dict[str, tuple[Stop, str, str]] = {
     "Reflex": ("protective stop", "a reflex",
-               "see what it touched, or what the errors say, and free it; going on clears it"),
+               "read the errors, free what it touched, and go on: that clears it"),
     "UserStopped": ("not ready", "a user stop: the external activation device is pressed",
-                    "see that the cell is clear and release it; the lights turn blue"),
+                    "check that the cell is clear and release it; the lights turn blue"),
     "Other": ("emergency stop", "locked joints, or an emergency stop",
-              "see that the cell is clear, release the emergency stop, unlock the joints in Desk"),
+              "check that the cell is clear, release the emergency stop, unlock the joints in "
+              "Desk"),
     "Guiding": ("not ready", "that it is guided by hand",
                 "let go of the buttons at its wrist, and switch Desk to Execution"),
     "AutomaticErrorRecovery": ("not ready", "that it recovers from an error", "wait, and go on"),
@@ -20,7 +21,7 @@ TROUBLES: dict[str, tuple[Stop, str, str]] = {
 """libfranka's RobotMode, but Idle: kind of stop, what is reported, what a person does."""
 REMEDIES = {
     "communication_constraints_violation": "it missed set-points: give this computer a real-time "
-    "kernel, a cable straight to the controller and no other work; going on clears the reflex",
+    "kernel, a cable straight to the controller and no other work, and go on: that clears it",
     "joint_position_limits_violation": "guide it by hand back inside its limits, and go on",
 }
 """What a person does about one of libfranka's Errors, where a reflex's remedy does not help."""

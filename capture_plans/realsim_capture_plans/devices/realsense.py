@@ -131,7 +131,7 @@ class RealSenseCamera:
         self._intrinsics = intrinsics_of(self._lenses[COLOR])
         units = facts.options_json(rs, depth_sensor).get("depth_units")
         if not units:
-            raise DeviceError(f"{self._name} does not tell its depth unit; a guess is none.")
+            raise DeviceError(f"{self._name} does not report its depth unit.")
         self._depth_unit_m = units
         self._T_color_depth = facts.T_of(depth.get_extrinsics_to(color))
         self._alignment = None
@@ -399,7 +399,7 @@ class RealSenseCamera:
             there = ", ".join(_serials(self._rs, devices)) or "no other"
             raise DeviceError(
                 f"{self._name} is not connected (connected: {there}). Plug it in again; another "
-                "camera cannot go on in its place, its lens and mount are not the same."
+                "camera cannot replace it, because its lens and mount differ."
             )
         self._start(_chosen(self._rs, devices, self._serial))
 

@@ -243,7 +243,7 @@ class UrConnection:
             raise self.stop_error(
                 "protective stop",
                 f"the controller did not unlock it ({error})",
-                "wait 5 s after the stop, see that the arm is free, and try again",
+                "wait 5 s after the stop, check that the arm is free, and try again",
             ) from error
         finally:
             link.close()

@@ -27,13 +27,12 @@ class Trouble(NamedTuple):
 _PROTECTIVE = Trouble(
     "protective stop",
     "a protective stop: it touched something, or was asked for too much force",
-    "look what it touched and free it, then unlock the protective stop at the pendant (possible 5 "
-    "s after it)",
+    "free what it touched, then unlock the protective stop at the pendant (possible 5 s after it)",
 )
 _EMERGENCY = Trouble(
     "emergency stop",
     "an emergency stop",
-    "see that the cell is clear, pull out the red button, then at the pendant switch the arm on "
+    "check that the cell is clear, pull out the red button, then at the pendant switch the arm on "
     "and release its brakes (ON, START)",
 )
 _SAFEGUARD = Trouble(
@@ -88,7 +87,7 @@ LOCAL = Trouble(
 PROGRAM_STOPPED = Trouble(
     "not ready",
     "that its program was stopped, at the pendant or by an error in it",
-    "see that nobody works at the pendant, and go on",
+    "check that nobody works at the pendant, and go on",
 )
 PROGRAM_PAUSED = Trouble(
     "not ready",

@@ -151,8 +151,8 @@ def why_poses_disagree(joints: ArrayLike, Ts_base_ee: ArrayLike, chain: DhChain)
             best = nominal[0]
     if best is None or best.gap_m > FITS_M:
         return (
-            "no known robot model and no mixed-up unit explains it: joints or poses were changed, "
-            "or their order was"
+            "no known robot model and no wrong unit explains it: joints, poses or their order "
+            "were changed"
         )
     causes: list[str] = []
     if best.chain.name != chain.name:
@@ -191,8 +191,8 @@ def proven_reading(
         best = f" The best is {found[0].text()}." if found else ""
         raise InputError(
             f"{source}: its joints and its tool poses do not belong together, whatever the robot "
-            f"({', '.join(alike)}), the units and the tool offset.{best} Is a column missing, or "
-            "are poses and joints of different moments?"
+            f"({', '.join(alike)}), the units and the tool offset.{best} Check that no "
+            "column is missing and that poses and joints are of the same moments."
         )
     best = found[0]
     if chain is not None and best.chain is not chain:
@@ -211,7 +211,7 @@ def proven_reading(
     if chain is None and second is not None and second.gap_m < undecided:
         raise InputError(
             f"{source}: its poses do not tell which robot it is: {best.text()}, and "
-            f"{second.text()}. Say which with --arm."
+            f"{second.text()}. Name it with --arm."
         )
     return best
 

@@ -183,7 +183,7 @@ def axes_meeting_point(Ts_base_cam: Array) -> Array:
     total = across.sum(axis=0)
     if float(np.linalg.eigvalsh(total)[0]) < LEAST_AXIS_SPREAD * len(axis):
         raise DegenerateError(
-            "the cameras all look the same way, so what they look at cannot be found. Say it with "
+            "the cameras all look the same way, so what they look at cannot be found. Give it with "
             "--center x,y,z [m]."
         )
     return np.linalg.solve(total, np.einsum("nij,nj->i", across, eye))
@@ -216,7 +216,7 @@ def _check_limits(path: JointPath, chain: DhChain) -> None:
             f"{path.source}, {path.rows[i]}: {joint_names(chain)[j]} is "
             f"{np.degrees(path.joints[i, j]):.1f} deg; a {chain.name} goes from "
             f"{np.degrees(low[j]):.0f} to {np.degrees(high[j]):.0f} deg ({len(beyond)} such "
-            "values in all). Take out a whole turn, or the row."
+            "values in all). Subtract a whole turn, or delete the row."
         )
 
 

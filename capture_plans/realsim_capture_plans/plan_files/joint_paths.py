@@ -117,7 +117,7 @@ def _json_path(path: Path, chain: DhChain | None, unit: JointUnit | None) -> Joi
         if unit is None:
             raise UnitError(
                 f"{path} does not say whether its joints are degrees or radians: it has no "
-                "'cart_pose' that would prove it. Say it with --joints-unit."
+                "'cart_pose' that would prove it. Give it with --joints-unit."
             )
         check_joint_unit(rows, unit, list(names), str(path))
         q = rows if unit == "rad" else np.radians(rows)
@@ -138,7 +138,7 @@ def _json_path(path: Path, chain: DhChain | None, unit: JointUnit | None) -> Joi
     if unit is not None and unit != reading.joint_unit:
         raise UnitError(
             f"{path}: its joints were said to be in {unit}, but with its tool poses they fit "
-            f"{reading.text()}. Leave --joints-unit away."
+            f"{reading.text()}. Leave out --joints-unit."
         )
     q = rows if reading.joint_unit == "rad" else np.radians(rows)
     return JointPath(source=str(path), joints=q, via=via, rows=names, reading=reading)
