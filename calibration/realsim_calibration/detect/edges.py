@@ -104,7 +104,7 @@ def _measure(
     clear: tuple[float, float],
     how: tuple[EdgeConfig, CameraIntrinsics | None],
 ) -> RefinedQuads:
-    """One pass: profiles across the sides of `corners`, edge points, lines, intersections."""
+    """Run one pass: profiles across the sides of `corners`, edge points, lines, intersections."""
     config, intrinsics = how
     start, along, outward, s, depth = _sides(corners, config)
     reach = np.minimum(config.inner_share * clear[0], config.clear_share * clear[1]) * depth

@@ -156,7 +156,7 @@ def _measure(
     blur: Array | None,
     how: tuple[SaddleConfig, CameraIntrinsics | None],
 ) -> _Pass:
-    """One pass: profiles across the arms, edge points, two lines, their crossing."""
+    """Run one pass: profiles across the arms, edge points, two lines, their crossing."""
     config, intrinsics = how
     uv, toward, length, reach = where
     s, foot = _feet(uv, toward, length, reach, blur, config)
