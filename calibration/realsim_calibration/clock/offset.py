@@ -190,7 +190,7 @@ def first_offset(
     rival = float(value[away].max()) if away.any() else -1.0
     if value[best] < config.least_correlation or rival > value[best] - config.distinct:
         raise InputError(
-            f"clock: at no offset do the turns of hand and camera agree (best correlation "
+            f"clock: the turns of hand and camera agree at no offset (best correlation "
             f"{value[best]:.2f} at {lags[best]:+.2f} s from the beginnings of both, next best "
             f"{rival:.2f}). {NO_OFFSET}"
         )
@@ -289,7 +289,7 @@ class _Fit:
             require_explained(linear.residuals, Ts[used], self.config.pairs)
         except InputError as error:
             raise InputError(
-                f"clock: at no offset do hand and camera agree: {NO_OFFSET} ({error})"
+                f"clock: hand and camera agree at no offset: {NO_OFFSET} ({error})"
             ) from error
         whole = offset + self.apart
         moved = (linear.E @ V[used][..., None])[:, 3:, 0] * whole

@@ -365,7 +365,7 @@ def _unnamed(
     columns = [k for k in range(table.values.shape[1]) if not names[k] and k not in used]
     unknown = [table.names[k] for k in columns if table.names[k]]
     if unknown:
-        table.notes.append(f"The names {', '.join(unknown)} are not known: they say nothing.")
+        table.notes.append(f"The column names {', '.join(unknown)} are not known and are ignored.")
     values = table.values[:, columns]
     width = values.shape[1]
     ascending = len(values) > 1 and bool(np.all(np.diff(values[:, 0]) > 0)) if width else False

@@ -141,10 +141,10 @@ def _center(report: IntrinsicsReport, prior: Prior, limits: CheckLimits) -> Chec
     sentence = f"Principal point ({i.cx:.2f} +- {sd[0]:.2f}, {i.cy:.2f} +- {sd[1]:.2f}) px."
     advice = ""
     if unmeasured:
-        sentence += " The views hardly determine it; it stays where it was believed to be."
+        sentence += " The views hardly determine it, so it keeps its expected value."
         advice = "Add views that tilt the board to all four sides, some with the board turned."
     elif odd:
-        sentence += f" It is {float(np.abs(offset).max()):.1f} sigmas from where one expects it."
+        sentence += f" It is {float(np.abs(offset).max()):.1f} sigmas from the expected place."
         advice = "Were the images cropped, or resized in one direction?"
     return Check(
         name="principal point", verdict="warn" if unmeasured or odd else "good",

@@ -208,5 +208,5 @@ def _checked_joints(joints: ArrayLike, count: int) -> Array:
     if q.ndim != 2 or q.shape[1] != count:
         raise InputError(f"joints have the shape {q.shape}; (N, {count}) is needed.")
     if not np.all(np.isfinite(q)):
-        raise InputError("joints hold NaN or infinite numbers; nothing can be said about those.")
+        raise InputError("joints hold NaN or infinite numbers; finite angles [rad] are needed.")
     return q
