@@ -25,7 +25,7 @@ import secrets
 import socket
 import stat
 import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -47,6 +47,8 @@ TOKEN_LETTERS = re.compile(r"[A-Za-z0-9_-]*")
 AUTHORITY = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9._-]+))(?::([0-9]{1,5}))?", re.IGNORECASE)
 """What a Host header may be, for it is copied into the page's policy: an IPv6 address in brackets,
 or a name or IPv4 address; and a port."""
+MOST_FRAME_BYTES = 1_000_000
+"""A message from a browser is no longer: the page sends clicks, values and short texts."""
 _patching = threading.Lock()
 log = logging.getLogger(__name__)
 _sockets_log = logging.getLogger(f"{__name__}.sockets")
@@ -303,6 +305,8 @@ def _cookie(headers: Any, name: str) -> str:
 
 # --- the door before viser ------------------------------------------------------------------------
 
+PRIVATE = {"Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
+"""Headers of every answer."""
 WELCOME = (
     "<!doctype html><meta charset=utf-8><title>realsim</title>"
     '<script>location.replace("/" + location.hash)</script>'
@@ -363,6 +367,7 @@ def _serve_behind(
         return response
 
     kwargs.setdefault("logger", _sockets_log)
+    kwargs["max_size"] = MOST_FRAME_BYTES
     return serve(*args, process_request=process_request, **kwargs)
 
 
@@ -375,19 +380,27 @@ def _dressed(response: Any, dress: Callable[[bytes], bytes]) -> None:
     response.headers["Content-Length"] = str(len(response.body))
 
 
-def _without_failed_handshakes(record: logging.LogRecord) -> bool:
-    """Keep tracebacks of connections that were never opened off the terminal.
-
-    Port scanners, health checks and browsers that think better of it connect and go.
-    """
-    if record.getMessage() != "opening handshake failed":
-        return True
+def _without_tracebacks(record: logging.LogRecord) -> bool:
+    """Keep tracebacks of what strangers send, such as port scanners, off the terminal."""
+    said = record.getMessage()
     error = record.exc_info[1] if record.exc_info else None
-    log.debug("a connection ended before it was open: %s", error)
+    if said == "opening handshake failed":
+        log.debug("a connection ended before it was open: %s", error)
+    elif said == "connection handler failed":
+        _not_understood(None, {"exception": error})
+    else:
+        return True
     return False
 
 
-_sockets_log.addFilter(_without_failed_handshakes)
+def _not_understood(_loop: object, context: Mapping[str, Any]) -> None:
+    """Log in one line that a browser sent what is no message of the page."""
+    error = context.get("exception")
+    log.warning("a message from a browser was not understood: %.200r", error or context["message"])
+    log.debug("where it was read:", exc_info=error)
+
+
+_sockets_log.addFilter(_without_tracebacks)
 
 
 def _response(said: Answer) -> Any:
@@ -400,8 +413,8 @@ def _response(said: Answer) -> Any:
     headers["Content-Type"] = f"{kind}; charset=utf-8"
     headers["Content-Length"] = str(len(body.encode()))
     headers["Cache-Control"] = "no-store"
-    headers["Referrer-Policy"] = "no-referrer"
-    headers["X-Content-Type-Options"] = "nosniff"
+    for name, value in PRIVATE.items():
+        headers[name] = value
     if said.cookie:
         headers["Set-Cookie"] = said.cookie
     return Response(said.status.value, said.status.phrase, headers, body.encode())
@@ -410,40 +423,33 @@ def _response(said: Answer) -> Any:
 def _page_headers(authority: str) -> dict[str, str]:
     """Return what the page may do: talk to this server only, and stand in no other page's frame."""
     rules = (
-        "default-src 'none'",
-        "script-src 'self' 'unsafe-inline' 'unsafe-eval' blob: data:",
-        "worker-src 'self' blob: data:",
-        "style-src 'self' 'unsafe-inline'",
-        "img-src 'self' data: blob:",
-        "font-src 'self' data:",
-        f"connect-src 'self' ws://{authority} wss://{authority} data: blob:",
-        "frame-ancestors 'none'",
-        "base-uri 'none'",
-        "form-action 'none'",
+        "default-src 'none'; script-src 'self' 'unsafe-inline' 'unsafe-eval' blob: data:; "
+        "worker-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; "
+        "img-src 'self' data: blob:; font-src 'self' data:; "
+        f"connect-src 'self' ws://{authority} wss://{authority} data: blob:; "
+        "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
     )
-    return {
-        "Content-Security-Policy": "; ".join(rules),
-        "Referrer-Policy": "no-referrer",
-        "X-Content-Type-Options": "nosniff",
-        "Cache-Control": "no-cache",
-    }
+    return {"Content-Security-Policy": rules, "Cache-Control": "no-cache", **PRIVATE}
 
 
-def local_origins_only() -> contextlib.AbstractContextManager[None]:
-    """Return the door of a page for this machine only, see `guarded`.
+def refuse_foreign_messages(server: Any) -> None:
+    """Make a viser server deaf to what the page never sends: public tunnels and uploads.
 
-    Programs that are no browsers send no Origin and may enter: they run on this machine, and could
-    read the files as well.
-    """
-    return guarded(Door())
-
-
-def refuse_share(server: Any) -> None:
-    """Make a viser server deaf to its clients' requests for a public tunnel.
-
-    Hiding the button is not enough: any client can send the message.
+    Hiding a button is not enough: any client can send the message.
     """
     from viser import _messages as viser_messages
 
+    sockets = server._websock_server
     for message in (viser_messages.ShareUrlRequest, viser_messages.ShareUrlDisconnect):
-        server._websock_server.unregister_handler(message)
+        sockets.unregister_handler(message)
+    refuse_uploads(sockets)
+    loop = server.get_event_loop()
+    loop.call_soon_threadsafe(loop.set_exception_handler, _not_understood)
+
+
+def refuse_uploads(wire: Any) -> None:
+    """Make one end of a viser connection deaf to files, which would fill the memory."""
+    from viser import _messages as viser_messages
+
+    for message in (viser_messages.FileTransferStartUpload, viser_messages.FileTransferPart):
+        wire.unregister_handler(message)

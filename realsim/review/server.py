@@ -10,6 +10,7 @@ looked at, so that what another reviewer decides appears by itself, even one at 
 
 import contextlib
 import io
+import json
 import logging
 import threading
 from collections.abc import Callable, Sequence
@@ -157,13 +158,14 @@ class ReviewServer:
         self._stop.clear()
         # Viser prints a banner with its address; the caller says what is to be said.
         with (
+            page_head.answering(self._asked),
             local_pages.guarded(self._door, page_head.dressed),
             contextlib.redirect_stdout(io.StringIO()),
         ):
             server = viser.ViserServer(
                 host=self._host, port=port, label="realsim review", verbose=False
             )
-        local_pages.refuse_share(server)
+        local_pages.refuse_foreign_messages(server)
         self._server = server
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         server.on_client_connect(self._came)
@@ -189,6 +191,19 @@ class ReviewServer:
         They are remembered: a session that was moved meanwhile does not make them none.
         """
         return [e for s in self._sessions for e in s.entries_seen() if e.id not in self._begun]
+
+    def _asked(self, path: str) -> tuple[str, bytes]:
+        """Answer what a page's script asks for: /photograph/BROWSER/STATE/WHAT/NUMBERS..."""
+        try:
+            client, _, what, *numbers = path.removeprefix(page_head.ASKED).split("/")
+            with self._lock:
+                window = self._windows[int(client)]
+            return window.photographs.answer(what, [float(n) for n in numbers])
+        except (RealsimError, OSError) as error:
+            said = {"error": str(error)}
+        except (LookupError, ValueError):
+            said = {"error": "there is nothing of this address; load the page anew."}
+        return "application/json", json.dumps(said).encode()
 
     # --- browsers come and go ---------------------------------------------------------------------
 

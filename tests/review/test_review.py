@@ -1,5 +1,6 @@
 """Who may enter the review page: host, origin, token, tunnel; asked with raw sockets."""
 
+import contextlib
 import http.client
 import os
 import re
@@ -9,7 +10,8 @@ from pathlib import Path
 
 import pytest
 import viser
-from websockets.exceptions import InvalidStatus
+from msgspec.msgpack import encode as msgpack
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
@@ -184,11 +186,9 @@ def test_nobody_can_ask_for_a_public_tunnel(server: ReviewServer) -> None:
     called: list[bool] = []
     running = server._running()  # type: ignore[reportPrivateUsage]
     running.request_share_url = lambda verbose=True: called.append(True)  # type: ignore[method-assign]
-    import msgspec
-
     with connect(f"ws://127.0.0.1:{port_of(server)}", subprotocols=[SOCKET], max_size=None) as line:
         line.recv(timeout=20)
-        line.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
+        line.send(msgpack({"type": "ShareUrlRequest"}))
         assert line.ping().wait(20)
     assert called == []
 
@@ -203,6 +203,36 @@ def test_addresses_that_are_none_are_answered_without_a_traceback(
     status = raw(server, f"{head}\n").split(" ")[1]
     assert status in ("400", "404")
     assert [r for r in caplog.records if r.levelname in ("WARNING", "ERROR")] == []
+
+
+@pytest.mark.parametrize(
+    "frame", [b"", b"\xff" * 9, "text", msgpack(None), msgpack([1]), msgpack({"type": "No"}),
+              msgpack({"type": "GuiUpdateMessage", "uuid": [], "updates": 3}),
+              msgpack({"type": "FileTransferStartUpload", "part_count": -1}),
+              msgpack({"type": "ViewerCameraMessage", "position": "far"})]
+)  # fmt: skip
+def test_a_frame_that_is_no_message_gets_a_line_in_the_log(
+    server: ReviewServer, frame: bytes | str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with connect(f"ws://127.0.0.1:{port_of(server)}", subprotocols=[SOCKET], max_size=None) as line:
+        line.send(frame)
+        with contextlib.suppress(ConnectionClosed):
+            assert line.ping().wait(20)
+    assert handshake(server) == 101  # by then it has been read
+    told = [r for r in caplog.records if r.levelname in ("WARNING", "ERROR")]
+    assert {"was not understood" in r.getMessage() and not r.exc_info for r in told} == {True}
+
+
+def test_a_frame_beyond_all_sizes_and_an_upload_fill_no_memory(server: ReviewServer) -> None:
+    from viser import _messages
+
+    running = server._running()  # type: ignore[reportPrivateUsage]
+    assert _messages.FileTransferPart not in running._websock_server._incoming_handlers  # type: ignore[reportPrivateUsage]
+    with connect(f"ws://127.0.0.1:{port_of(server)}", subprotocols=[SOCKET], max_size=None) as line:
+        with pytest.raises(ConnectionClosed, match="1009"):
+            line.send(b"\x00" * (local_pages.MOST_FRAME_BYTES + 1))
+            while True:
+                line.recv(timeout=20)
 
 
 # --- with a token -----------------------------------------------------------------------------

@@ -73,11 +73,11 @@ class PlanReplay:
         sensor = sensor_of(plan)
         self._host = local_pages.check_host(host, "the replay")
         # Viser prints a banner with its address; the caller says what is to be said.
-        with local_pages.local_origins_only(), contextlib.redirect_stdout(io.StringIO()):
+        with local_pages.guarded(local_pages.Door()), contextlib.redirect_stdout(io.StringIO()):
             self.server = viser.ViserServer(
                 host=host, port=port, label="realsim plan", verbose=False
             )
-        local_pages.refuse_share(self.server)
+        local_pages.refuse_foreign_messages(self.server)
         self.scene = ReplayScene(self.server, plan, sensor, looks)
         self.time_s = 0.0
         self._stopping = threading.Event()

@@ -71,7 +71,7 @@ def viewer_html(content: SceneContent, scene: Scene, size: StaticSize) -> str:
     import viser
 
     # Viser prints a banner with an address that nobody is to open.
-    with local_pages.local_origins_only(), contextlib.redirect_stdout(io.StringIO()):
+    with local_pages.guarded(local_pages.Door()), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         try:
             look = content.look

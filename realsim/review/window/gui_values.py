@@ -11,6 +11,7 @@ from typing import Any
 import viser
 
 from realsim.errors import InputError
+from realsim.local_pages import refuse_uploads
 from realsim.review.replay.grasp_words import one_line
 
 MOST_TEXT = 20_000
@@ -44,6 +45,7 @@ def refuse_foreign_values(gui: viser.GuiApi, refuse: Callable[[str], None]) -> N
                 return
         await take(client_id, message)
 
+    refuse_uploads(wire)
     wire.unregister_handler(viser_messages.GuiUpdateMessage, take)
     wire.register_handler(viser_messages.GuiUpdateMessage, checked)
 
