@@ -17,7 +17,6 @@ from realsim.formats.graspit.writing import (
     paired_grasps,
     write_graspit,
 )
-from realsim.formats.robot_scenes.placing import place_scene
 from realsim.geometry import se3
 from realsim.records import GraspSet
 
@@ -50,9 +49,9 @@ def grasps():
     return [paired_grasps(s) for s in sets]
 
 
-def write(scene, sets, folder, source=None, **config):
+def write(scene, sets, folder, **config):
     out = ExportFolder.begin(folder, {"scene": scene.name})
-    written = write_graspit(scene, sets, out, GraspitConfig(**config), source=source)
+    written = write_graspit(scene, sets, out, GraspitConfig(**config))
     out.finish({})
     return written
 
@@ -130,30 +129,6 @@ def test_the_same_scene_gives_the_same_bytes_and_several_go_into_one_export(tmp_
     same(read_graspit_scene(tmp_path / "c/scenes/scene_1"), scene, grasps())
     text = (tmp_path / "c/scenes/scene_1/scene.yaml").read_text()
     assert text.startswith("grasp_path: scenes/scene_1/grasps.hdf5\n")
-
-
-def test_what_the_source_says_survives_and_what_moved_is_new(tmp_path):
-    scene = placed_scenes.placed_scene()
-    write(scene, grasps(), tmp_path / "a")
-    path = tmp_path / "a/scene.yaml"
-    text = path.read_text().replace("  name: _2_box\n", "  name: _2_box\n  owner: lab\n")
-    path.write_text(text + "camera: left\n")
-    source = read_graspit_scene(tmp_path / "a")
-    again = place_scene(source.scene, source.models)
-    sets = read_graspit_grasps(source)
-    write(again, sets, tmp_path / "b", source)
-    copy = (tmp_path / "b/scene.yaml").read_text()
-    assert sorted(copy.splitlines()) == sorted(path.read_text().splitlines())
-    moved = dataclasses.replace(
-        again.objects[1],
-        T_world_obj=se3.from_translation([0.01, 0, 0]) @ again.objects[1].T_world_obj,
-    )
-    objects = (again.objects[0], moved, again.objects[2])
-    write(dataclasses.replace(again, objects=objects), sets, tmp_path / "c", source)
-    changed = set((tmp_path / "c/scene.yaml").read_text().splitlines()) - set(copy.splitlines())
-    assert [line.split(":")[0] for line in changed if "orientation" not in line] == ["  position"]
-    found = read_graspit_scene(tmp_path / "c")
-    assert np.allclose(found.scene.objects[1].T_world_obj, moved.T_world_obj, atol=1e-12)
 
 
 def test_grasps_of_nothing_are_refused(tmp_path):

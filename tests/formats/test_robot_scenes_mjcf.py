@@ -1,4 +1,4 @@
-"""Scenes as MJCF: read back by MuJoCo, at rest there, and read back by realsim."""
+"""Scenes as MJCF: read back by MuJoCo, and at rest there."""
 
 import dataclasses
 
@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 import placed_scenes
-from realsim.errors import InputError, UnitError
 from realsim.formats.export_folder import ExportFolder
-from realsim.formats.robot_scenes.mesh_obj import look_of
+from realsim.formats.robot_scenes.mesh_obj import collision_parts, look_of
 from realsim.formats.robot_scenes.mjcf import MjcfConfig, write_mjcf_scene
-from realsim.formats.robot_scenes.mjcf_reading import read_mjcf_scene
 
 
 def write(scene, folder, **config):
@@ -38,16 +36,25 @@ def model(folder):
     return mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
 
 
-def test_what_is_written_is_read_again(scene, folder):
-    """Shapes to float32, in which MuJoCo keeps meshes; everything else to a double's rounding."""
-    found = read_mjcf_scene(folder)
-    placed_scenes.same_bodies(scene, found, 1e-14, shapes=1e-8)
-    assert found.name == scene.name and np.array_equal(found.gravity, scene.gravity)
-    assert [len(found.body(o).parts) for o in found.objects] == [2, 1, 2]
-    for o, p in zip(scene.objects, found.objects, strict=True):
-        known, look = (look_of(s.body(x).model.mesh) for s, x in ((scene, o), (found, p)))
-        assert np.array_equal(look.texture, known.texture)
-        assert np.allclose(look.corner_uv, known.corner_uv, rtol=0, atol=1e-6)
+def test_mujoco_finds_meshes_parts_and_textures(scene, model):
+    """MuJoCo keeps meshes as float32, in their own principal frame."""
+    for o in scene.objects:
+        name, body = o.name, scene.body(o)
+        geom = model.geom(f"{name}_visual")
+        mesh = model.mesh(int(geom.dataid[0]))
+        first = int(mesh.vertadr[0])
+        points = model.mesh_vert[first : first + int(mesh.vertnum[0])]
+        R = np.zeros(9)
+        mujoco.mju_quat2Mat(R, geom.quat)
+        at = points @ R.reshape(3, 3).T + geom.pos
+        known = body.model.mesh.vertices
+        far = np.linalg.norm(at[:, None] - known[None], axis=2)
+        assert far.min(axis=0).max() < 1e-8 and far.min(axis=1).max() < 1e-8
+        parts = [g for g in range(model.ngeom) if model.geom(g).name.startswith(f"{name}_part")]
+        assert len(parts) == len(collision_parts(body))
+        texture = model.texture(int(model.mat_texid[int(geom.matid[0])].max()))
+        look = look_of(body.model.mesh).texture
+        assert (int(texture.height[0]), int(texture.width[0])) == look.shape[:2]
 
 
 def test_mujoco_finds_masses_inertias_and_poses(scene, model):
@@ -99,69 +106,8 @@ def test_the_cameras_frustum_is_that_of_its_intrinsics(scene, model):
     assert np.allclose(eye.up, -T[:3, 1], atol=1e-6)
 
 
-# --- what others write --------------------------------------------------------------------------
-
-
 def test_distortion_that_has_no_place_is_told(scene, tmp_path):
     lens = dataclasses.replace(placed_scenes.CAMERA, distortion=np.array([0.1, 0, 0, 0, 0]))
     views = (dataclasses.replace(scene.cameras[0], intrinsics=lens),)
     told = write(dataclasses.replace(scene, cameras=views), tmp_path / "s")
     assert any("distortion of view_0" in n for n in told.notes)
-
-
-def mjcf(tmp_path, world, before=""):
-    path = tmp_path / "w.xml"
-    path.write_text(f"<mujoco>{before}<worldbody>{world}</worldbody></mujoco>")
-    return path
-
-
-def test_defaults_includes_and_degrees_are_mujocos_own(tmp_path):
-    (tmp_path / "more.xml").write_text('<mujoco><default><geom friction="0.3"/></default></mujoco>')
-    path = mjcf(
-        tmp_path,
-        '<geom type="plane" size="1 2 0.1" pos="0 0 0.5"/>'
-        '<body name="a" pos="0 0 1" euler="0 0 90"><freejoint/>'
-        '<geom type="box" size="0.02 0.03 0.05" mass="0.3"/></body>',
-        '<include file="more.xml"/>',
-    )
-    found = read_mjcf_scene(path)
-    body, placed = found.bodies[1], found.objects[0]
-    assert np.isclose(body.friction, 0.3) and np.isclose(body.mass_kg, 0.3)
-    assert np.allclose(body.model.mesh.extent, [0.04, 0.06, 0.1])
-    assert np.allclose(placed.T_world_obj[:3, :3] @ [1, 0, 0], [0, 1, 0], atol=1e-9)
-    assert found.table.size_m == (2.0, 4.0) and found.table.T_world_table[2, 3] == 0.5
-    known = np.array([0.06**2 + 0.1**2, 0.04**2 + 0.1**2, 0.04**2 + 0.06**2]) * 0.3 / 12
-    assert np.allclose(np.linalg.eigvalsh(body.inertia), np.sort(known))
-
-
-FREE_MESH = (
-    '<body name="a"><freejoint/><inertial pos="0 0 0" mass="0.3" diaginertia="1e-3 1e-3 1e-3"/>'
-    '<geom type="mesh" mesh="m"/></body>'
-)
-
-
-def test_a_mesh_whose_size_cannot_be_is_refused(tmp_path):
-    size, scale = (50, 60, 100), 1.0
-    import trimesh
-
-    (tmp_path / "m.stl").write_bytes(trimesh.creation.box(size).export(file_type="stl"))
-    assets = f'<asset><mesh name="m" file="m.stl" scale="{scale} {scale} {scale}"/></asset>'
-    with pytest.raises(UnitError, match="shape of 'a'"):
-        read_mjcf_scene(mjcf(tmp_path, FREE_MESH, assets))
-
-
-@pytest.mark.parametrize(
-    ("world", "before", "what"),
-    [
-        (FREE_MESH, '<asset><mesh name="m" file="../m.stl"/></asset>', "leads out"),
-        (FREE_MESH, '<include file="../other.xml"/>', "leads out"),
-        (FREE_MESH, '<include file="w.xml"/>', "circle"),
-        (FREE_MESH, '<extension><plugin plugin="x.y"/></extension>', "loads programs"),
-        ("<body><joint/><geom size='0.1'/></body>", "", "has joints"),
-        ("<body><geom size='.1'/><body><geom size='.1'/></body></body>", "", "another body"),
-        ("<bodyy/>", "", "bodyy"),
-    ],
-)
-def test_what_cannot_be_read_is_named(tmp_path, world, before, what):
-    with pytest.raises(InputError, match=what):
-        read_mjcf_scene(mjcf(tmp_path, world, before))

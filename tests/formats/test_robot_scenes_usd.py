@@ -10,7 +10,7 @@ from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdSemantics, UsdShade
 import placed_scenes
 from realsim.errors import MissingLibraryError
 from realsim.formats.export_folder import ExportFolder
-from realsim.formats.robot_scenes.mesh_reading import collision_parts
+from realsim.formats.robot_scenes.mesh_obj import collision_parts
 from realsim.formats.robot_scenes.usd_scene import UsdConfig, write_usd_scene
 
 

@@ -58,16 +58,6 @@ class OrderEvidence:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class SourceFile:
-    """The values of a scene.yaml."""
-
-    values: dict[str, Any]
-    """Everything, keys that are not known here too."""
-    keys: dict[int, str]
-    """Keys of the objects, by instance."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class GraspitScene:
     """A scene.yaml as it was read."""
 
@@ -79,8 +69,6 @@ class GraspitScene:
     """None: there is none beside the scene."""
     names: dict[int, str]
     """Names of the objects in the file, by instance; grasps are kept under them."""
-    source: SourceFile
-    """What the file holds; a writer gives its numbers back to the last digit."""
     notes: tuple[str, ...]
 
 
@@ -88,7 +76,6 @@ class GraspitScene:
 class _Entry:
     """One object of the file."""
 
-    key: str
     name: str
     mesh_file: Path
     numbers: Array
@@ -167,7 +154,6 @@ def read_graspit_scene(
         evidence=evidence,
         grasp_file=grasp_file,
         names={k: e.name for k, e in enumerate(entries)},
-        source=SourceFile(values=data, keys={k: e.key for k, e in enumerate(entries)}),
         notes=tuple(notes),
     )
 
@@ -221,7 +207,6 @@ def _entries(data: dict[str, Any], path: Path, meshes: Path | None) -> list[_Ent
             )
         found.append(
             _Entry(
-                key=key,
                 name=str(fields["name"]),
                 mesh_file=_mesh_file(str(fields["file_path"]), path.parent, meshes, where),
                 numbers=np.array(q),

@@ -10,7 +10,6 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import PurePosixPath
 from typing import Any, cast
 
 import numpy as np
@@ -19,11 +18,10 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspit.grasps import GRASP_FILE, WorldGrasps
-from realsim.formats.graspit.scene import SCENE_FILE, TABLE, GraspitScene, QuaternionOrder
+from realsim.formats.graspit.scene import SCENE_FILE, TABLE
 from realsim.formats.labelled_scene import WrittenScene
 from realsim.formats.robot_scenes.mesh_obj import part_file
 from realsim.formats.robot_scenes.placed_scene import (
-    PlacedObject,
     PlacedScene,
     TableBox,
     seen_from,
@@ -37,9 +35,6 @@ ASSETS = "assets"
 UPRIGHT_RAD = 0.02
 """A table that leans less in world is level: calibrations are off by so much."""
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
-SAME_POSE = 1e-5
-"""Rotation entries and position [m] of the source's row and of the scene agree to this: then the
-row is written as it was."""
 PLAIN_TEXT = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")
 NOT_TEXT = frozenset(("y", "n", "yes", "no", "on", "off", "true", "false", "null"))
 """What YAML would take for something else."""
@@ -72,7 +67,6 @@ def write_graspit(
     folder: ExportFolder,
     config: GraspitConfig | None = None,
     *,
-    source: GraspitScene | None = None,
     progress: Callable[[], None] | None = None,
 ) -> WrittenScene:
     """Write a scene and its grasps.
@@ -83,8 +77,6 @@ def write_graspit(
         grasps: of its objects, in the objects' frames; see `paired_grasps`.
         folder: what is filled; a mesh is a piece.
         config: how.
-        source: the scene.yaml that the scene was read from. Rows of objects that have not moved
-            are written as they were, and so is what is not known here.
         progress: called once a mesh.
 
     Raises:
@@ -96,9 +88,7 @@ def write_graspit(
     at = f"{config.under.strip('/')}/" if config.under.strip("/") else ""
     scene, notes = _upright(scene)
     names = unique_names({o.instance: o.name for o in scene.objects})
-    if source is not None:
-        names = {o.instance: source.names.get(o.instance, names[o.instance]) for o in scene.objects}
-    files = scene.body_names() if source is None else _mesh_names(scene, source)
+    files = scene.body_names()
     for obj_id, name in files.items():
         _write_mesh(scene, obj_id, f"{at}{ASSETS}/{name}", name, folder, config)
         if progress is not None:
@@ -107,10 +97,9 @@ def write_graspit(
     bare += [n for i, n in files.items() if scene.bodies[i].model.mesh.colors is not None]
     if bare and not config.with_usd:
         notes.append(f"STL has no colours; those of {', '.join(bare)} are not written.")
-    rows = _rows(scene, names, files, config, source)
+    rows = _rows(scene, names, files, config)
     last = {f"{at}{SCENE_FILE}": yaml_text(rows).encode("utf-8")}
-    if scene.table is not None and source is None:
-        last[f"{at}{ASSETS}/{TABLE}.obj"] = part_file(table_mesh(scene.table))
+    last[f"{at}{ASSETS}/{TABLE}.obj"] = part_file(table_mesh(scene.table))
     by_name = _world_grasps(scene, grasps, names)
     if by_name:
         last[f"{at}{GRASP_FILE}"] = hdf5_bytes(by_name)
@@ -126,20 +115,8 @@ def write_graspit(
     )
 
 
-def _mesh_names(scene: PlacedScene, source: GraspitScene) -> dict[int, str]:
-    """Return names of the mesh files by object id: those of the source, where it has one."""
-    names = dict(scene.body_names())
-    for o in reversed(scene.objects):
-        key = source.source.keys.get(o.instance)
-        if key is not None:
-            names[o.obj_id] = PurePosixPath(str(source.source.values[key]["file_path"])).stem
-    return unique_names(names)
-
-
 def _upright(scene: PlacedScene) -> tuple[PlacedScene, list[str]]:
     """Return the scene with z up, and what was done."""
-    if scene.table is None:
-        return scene, []
     up = scene.table.T_world_table[:3, 2]
     if np.arccos(np.clip(up[2], -1.0, 1.0)) <= UPRIGHT_RAD:
         return scene, []
@@ -179,61 +156,26 @@ def _rows(
     names: Mapping[int, str],
     files: Mapping[int, str],
     config: GraspitConfig,
-    source: GraspitScene | None,
 ) -> dict[str, Any]:
     """Return the values of scene.yaml, in the order of the authors' file."""
     rows: dict[str, Any] = {"grasp_path": f"{config.under.strip('/')}/{GRASP_FILE}".lstrip("/")}
-    if source is not None:
-        objects = set(source.source.keys.values())
-        rows |= {k: v for k, v in source.source.values.items() if k not in objects}
     suffix = "usd" if config.with_usd else "stl"
-    fresh = 0
-    for o in scene.objects:
-        known = None if source is None else source.source.keys.get(o.instance)
-        row = {
+    for k, o in enumerate(scene.objects):
+        rows[f"object{k + 1}"] = {
             "file_path": f"{ASSETS}/{files[o.obj_id]}.{suffix}",
             "name": names[o.instance],
             "orientation": se3.quaternion_wxyz(o.T_world_obj[:3, :3]).tolist(),
             "position": o.T_world_obj[:3, 3].tolist(),
             "scale": [1, 1, 1],
         }
-        if source is not None and known is not None:
-            rows[known] = _kept(row, source.source.values[known], o, source.order)
-            continue
-        fresh += 1
-        while f"object{fresh}" in rows:
-            fresh += 1
-        rows[f"object{fresh}"] = row
-    if scene.table is not None and source is None:
-        rows[TABLE] = {
-            "file_path": f"{ASSETS}/{TABLE}.obj",
-            "name": TABLE,
-            "orientation": [1.0, 0.0, 0.0, 0.0],
-            "position": [0.0, 0.0, 0.0],
-            "scale": [1, 1, 1],
-        }
-    ending = {TABLE: rows.pop(TABLE)} if TABLE in rows else {}
-    return {**rows, **ending}
-
-
-def _kept(
-    row: dict[str, Any], before: Any, o: PlacedObject, order: QuaternionOrder
-) -> dict[str, Any]:
-    """Return the source's row, its pose and mesh replaced where they are others."""
-    old = cast("dict[str, Any]", before)
-    q = np.array(old["orientation"], dtype=np.float64)
-    q = q if order == "wxyz" else np.roll(q, 1)
-    T = se3.from_rt(se3.from_quaternion_wxyz(q), old["position"])
-    kept = {**old}
-    if np.abs(T - o.T_world_obj).max() > SAME_POSE or order != "wxyz":
-        kept |= {"orientation": row["orientation"], "position": row["position"]}
-    # The scale of the source is in the meshes that are written.
-    if any(s != 1 for s in old.get("scale", (1, 1, 1))):
-        kept["scale"] = row["scale"]
-    stem = row["file_path"].rpartition("/")[2].rpartition(".")[0]
-    if old["file_path"].rpartition("/")[2].rpartition(".")[0] != stem:
-        kept["file_path"] = row["file_path"]
-    return kept
+    rows[TABLE] = {
+        "file_path": f"{ASSETS}/{TABLE}.obj",
+        "name": TABLE,
+        "orientation": [1.0, 0.0, 0.0, 0.0],
+        "position": [0.0, 0.0, 0.0],
+        "scale": [1, 1, 1],
+    }
+    return rows
 
 
 def yaml_text(rows: Mapping[str, Any]) -> str:

@@ -22,10 +22,10 @@ from realsim.formats.robot_scenes.mesh_obj import (
     TABLE_RGB,
     TEXTURE,
     VISUAL,
+    collision_parts,
     part_file,
     visual_files,
 )
-from realsim.formats.robot_scenes.mesh_reading import collision_parts
 from realsim.formats.robot_scenes.placed_scene import (
     TABLE_NAME,
     PlacedObject,
@@ -33,6 +33,8 @@ from realsim.formats.robot_scenes.placed_scene import (
     RigidBody,
     SceneCamera,
     spaced,
+    told,
+    without_lens,
 )
 from realsim.geometry import se3
 
@@ -94,21 +96,9 @@ def write_mjcf_scene(
             progress()
     text = scene_xml(scene, names, counts, config)
     folder.write_piece(f"{at}{SCENE_FILE}", {f"{at}{SCENE_FILE}": text})
-    lens = [c.name for c in scene.cameras if c.intrinsics.is_distorted]
-    notes = [f"MJCF has no place for the distortion of {', '.join(lens)}."] if lens else []
-    return WrittenScene(
-        name=scene.name,
-        folder=folder.folder / config.under,
-        frames=0,
-        frames_written=0,
-        objects=len(scene.objects),
-        notes=(*scene.notes, *notes),
-        counts={
-            "bodies": len(names),
-            "collision shapes": sum(counts.values()),
-            "cameras": len(scene.cameras),
-        },
-    )
+    shapes = sum(counts.values())
+    counted = {"bodies": len(names), "collision shapes": shapes, "cameras": len(scene.cameras)}
+    return told(scene, folder.folder / config.under, counted, without_lens(scene, "MJCF"))
 
 
 def part_name(k: int) -> str:
@@ -154,16 +144,15 @@ def scene_xml(
     _light(world, scene)
     for camera in scene.cameras:
         _camera(world, camera)
-    if scene.table is not None:
-        table = scene.table
-        half = [table.size_m[0] / 2, table.size_m[1] / 2, table.thickness_m / 2]
-        ET.SubElement(
-            world,
-            "geom",
-            {"name": TABLE_NAME, "type": "box", "size": spaced(half), **_pose(table.T_world_box)},
-            rgba=f"{spaced(TABLE_RGB)} 1",
-            friction="1",
-        )
+    table = scene.table
+    half = [table.size_m[0] / 2, table.size_m[1] / 2, table.thickness_m / 2]
+    ET.SubElement(
+        world,
+        "geom",
+        {"name": TABLE_NAME, "type": "box", "size": spaced(half), **_pose(table.T_world_box)},
+        rgba=f"{spaced(TABLE_RGB)} 1",
+        friction="1",
+    )
     for o in scene.objects:
         _body(world, o, scene.body(o), names[o.obj_id], counts[o.obj_id])
     ET.indent(root)
@@ -188,8 +177,7 @@ def _assets(assets: ET.Element, body: RigidBody, name: str, count: int) -> None:
 
 def _body(world: ET.Element, o: PlacedObject, body: RigidBody, name: str, count: int) -> None:
     element = ET.SubElement(world, "body", {"name": o.name, **_pose(o.T_world_obj)})
-    if not o.is_fixed:
-        ET.SubElement(element, "freejoint", name=f"{o.name}_free")
+    ET.SubElement(element, "freejoint", name=f"{o.name}_free")
     I = body.inertia  # noqa: E741 - the tensor's letter
     ET.SubElement(
         element,
@@ -226,8 +214,7 @@ def _body(world: ET.Element, o: PlacedObject, body: RigidBody, name: str, count:
 def _light(world: ET.Element, scene: PlacedScene) -> None:
     """Hang a lamp two metres above the scene, against gravity."""
     at = np.array([o.T_world_obj[:3, 3] for o in scene.objects] or [[0.0, 0.0, 0.0]]).mean(axis=0)
-    strength = float(np.linalg.norm(scene.gravity))
-    down = scene.gravity / strength if strength > 0 else np.array([0.0, 0.0, -1.0])
+    down, _ = scene.down
     ET.SubElement(world, "light", pos=spaced(at - 2.0 * down), dir=spaced(down))
 
 

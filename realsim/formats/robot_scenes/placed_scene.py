@@ -1,6 +1,6 @@
 """A scene as physics engines take it: rigid bodies, where they stand, a table, gravity, cameras.
 
-Writers of URDF, MJCF and USD take one; readers give one. World is the scene's world, in metres,
+Writers of URDF, MJCF and USD take one. World is the scene's world, in metres,
 kilograms and seconds. One body may stand in several places.
 """
 
@@ -8,11 +8,13 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from realsim.arrays import Array
 from realsim.errors import InputError
+from realsim.formats.labelled_scene import WrittenScene
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Mesh, ObjectModel
 from realsim.records.checked_arrays import frozen, rigid
@@ -73,8 +75,6 @@ class PlacedObject:
     """Object id of its body."""
     T_world_obj: Array
     """(4, 4) [m]."""
-    is_fixed: bool = False
-    """Whether it stands still whatever hits it."""
 
     def __post_init__(self) -> None:
         """Check the name and that the pose is rigid."""
@@ -138,8 +138,7 @@ class PlacedScene:
     bodies: dict[int, RigidBody]
     """By object id."""
     objects: tuple[PlacedObject, ...]
-    table: TableBox | None
-    """None = there is none; the objects fall."""
+    table: TableBox
     gravity: Array
     """(3,) acceleration in world [m/s^2]."""
     cameras: tuple[SceneCamera, ...] = ()
@@ -175,11 +174,38 @@ class PlacedScene:
         """Return the body of an object."""
         return self.bodies[placed.obj_id]
 
+    @property
+    def down(self) -> tuple[Array, float]:
+        """The direction of gravity (3,), -z where there is none, and its size [m/s^2]."""
+        strength = float(np.linalg.norm(self.gravity))
+        return (self.gravity / strength if strength > 0 else np.array([0.0, 0.0, -1.0])), strength
+
     def body_names(self) -> dict[int, str]:
         """Return a name for the files of each body that stands somewhere, by object id."""
         used = {o.obj_id for o in self.objects}
         bodies = {i: body.model.name for i, body in self.bodies.items() if i in used}
         return unique_names(bodies)
+
+
+def told(
+    scene: PlacedScene, folder: Path, counts: dict[str, int], notes: Iterable[str] = ()
+) -> WrittenScene:
+    """Return what a writer tells of a scene that it wrote into a folder."""
+    return WrittenScene(
+        name=scene.name,
+        folder=folder,
+        frames=0,
+        frames_written=0,
+        objects=len(scene.objects),
+        notes=(*scene.notes, *notes),
+        counts=counts,
+    )
+
+
+def without_lens(scene: PlacedScene, format_name: str) -> list[str]:
+    """Return a note where cameras are distorted, which a format cannot say."""
+    lens = [c.name for c in scene.cameras if c.intrinsics.is_distorted]
+    return [f"{format_name} has no place for the distortion of {', '.join(lens)}."] if lens else []
 
 
 def seen_from(scene: PlacedScene, T_world_new: Array) -> PlacedScene:
@@ -190,11 +216,10 @@ def seen_from(scene: PlacedScene, T_world_new: Array) -> PlacedScene:
         T_world_new: (4, 4) the new frame in the scene's world [m].
     """
     T = se3.invert(se3.check_rigid(T_world_new, "T_world_new"))
-    table = scene.table
     return replace(
         scene,
         objects=tuple(replace(o, T_world_obj=T @ o.T_world_obj) for o in scene.objects),
-        table=None if table is None else replace(table, T_world_table=T @ table.T_world_table),
+        table=replace(scene.table, T_world_table=T @ scene.table.T_world_table),
         gravity=T[:3, :3] @ scene.gravity,
         cameras=tuple(replace(c, T_world_cam=T @ c.T_world_cam) for c in scene.cameras),
     )

@@ -7,7 +7,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.formats.robot_scenes.mesh_reading import convex_part
+from realsim.formats.robot_scenes.mesh_obj import convex_part
 from realsim.formats.robot_scenes.placed_scene import (
     GRAVITY,
     PlacedObject,

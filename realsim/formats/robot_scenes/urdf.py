@@ -13,8 +13,13 @@ from realsim import interop
 from realsim.arrays import Array
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.labelled_scene import WrittenScene
-from realsim.formats.robot_scenes.mesh_obj import TABLE_RGB, VISUAL, part_file, visual_files
-from realsim.formats.robot_scenes.mesh_reading import collision_parts
+from realsim.formats.robot_scenes.mesh_obj import (
+    TABLE_RGB,
+    VISUAL,
+    collision_parts,
+    part_file,
+    visual_files,
+)
 from realsim.formats.robot_scenes.placed_scene import (
     TABLE_NAME,
     WORLD_NAME,
@@ -24,6 +29,7 @@ from realsim.formats.robot_scenes.placed_scene import (
     SceneCamera,
     TableBox,
     spaced,
+    told,
 )
 from realsim.geometry import se3
 from realsim.store import atomic
@@ -106,20 +112,12 @@ def write_urdf_scene(
             progress()
     files = {f"{at}{SCENE_FILE}": atomic.json_bytes(scene_json(scene, names))}
     files[f"{at}{SCRIPT}"] = Path(__file__).with_name(SCRIPT).read_bytes()
-    if scene.table is not None:
-        files[f"{at}{TABLE_NAME}.urdf"] = _robot(TABLE_NAME, [table_link(scene.table)])
+    files[f"{at}{TABLE_NAME}.urdf"] = _robot(TABLE_NAME, [table_link(scene.table)])
     if config.with_world:
         files[f"{at}{WORLD_FILE}"] = _world(scene, names)
     folder.write_piece(f"{at}{SCENE_FILE}", files)
-    return WrittenScene(
-        name=scene.name,
-        folder=folder.folder / config.under,
-        frames=0,
-        frames_written=0,
-        objects=len(scene.objects),
-        notes=scene.notes,
-        counts={"bodies": len(names), "collision shapes": shapes, "cameras": len(scene.cameras)},
-    )
+    counts = {"bodies": len(names), "collision shapes": shapes, "cameras": len(scene.cameras)}
+    return told(scene, folder.folder / config.under, counts)
 
 
 def _part_name(k: int) -> str:
@@ -199,17 +197,13 @@ def _robot(name: str, elements: list[ET.Element]) -> bytes:
 
 def _world(scene: PlacedScene, names: dict[int, str]) -> bytes:
     """Return one URDF of everything: the bodies hang on the world by floating joints."""
-    elements = [ET.Element("link", name=WORLD_NAME)]
-    if scene.table is not None:
-        elements += [
-            table_link(scene.table),
-            _joint(TABLE_NAME, "fixed", scene.table.T_world_table),
-        ]
+    elements = [ET.Element("link", name=WORLD_NAME), table_link(scene.table)]
+    elements.append(_joint(TABLE_NAME, "fixed", scene.table.T_world_table))
     for o in scene.objects:
         body, name = scene.body(o), names[o.obj_id]
         count = len(collision_parts(body))
         elements.append(body_link(body, o.name, f"objects/meshes/{name}", count))
-        elements.append(_joint(o.name, "fixed" if o.is_fixed else "floating", o.T_world_obj))
+        elements.append(_joint(o.name, "floating", o.T_world_obj))
     return _robot(scene.name, elements)
 
 
@@ -231,9 +225,7 @@ def scene_json(scene: PlacedScene, names: dict[int, str]) -> dict[str, Any]:
         "about": ABOUT,
         "name": scene.name,
         "gravity": scene.gravity.tolist(),
-        "table": None
-        if table is None
-        else {
+        "table": {
             "urdf": f"{TABLE_NAME}.urdf",
             **_pose(table.T_world_table, "T_world_table"),
             "size_m": list(table.size_m),
@@ -251,7 +243,7 @@ def _object(o: PlacedObject, body: RigidBody, name: str) -> dict[str, Any]:
         "obj_id": o.obj_id,
         "model": body.model.name,
         "urdf": f"objects/{name}.urdf",
-        "fixed": o.is_fixed,
+        "fixed": False,
         "friction": body.friction,
         **_pose(o.T_world_obj, "T_world_obj"),
     }

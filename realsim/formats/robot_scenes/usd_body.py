@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from realsim.errors import MissingLibraryError
-from realsim.formats.robot_scenes.mesh_obj import PLAIN_RGB, Look, look_of
-from realsim.formats.robot_scenes.mesh_reading import collision_parts
+from realsim.formats.robot_scenes.mesh_obj import PLAIN_RGB, Look, collision_parts, look_of
 from realsim.formats.robot_scenes.placed_scene import RigidBody, principal_inertia
 from realsim.geometry import se3
 from realsim.images.png import encode_png

@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from realsim import interop
 from realsim.arrays import Array
 from realsim.formats.export_folder import ExportFolder
@@ -26,6 +24,8 @@ from realsim.formats.robot_scenes.placed_scene import (
     PlacedScene,
     SceneCamera,
     TableBox,
+    told,
+    without_lens,
 )
 from realsim.formats.robot_scenes.usd_body import (
     Pixar,
@@ -96,17 +96,8 @@ def write_usd_scene(
     files = {n: f"./{OBJECTS}/{name}.{kind}" for n, name in names.items()}
     data = layer_bytes(_scene_layer(pxr, scene, files), "usda")
     folder.write_piece(f"{at}{SCENE_FILE}", {f"{at}{SCENE_FILE}": data})
-    lens = [c.name for c in scene.cameras if c.intrinsics.is_distorted]
-    notes = [f"USD has no place for the distortion of {', '.join(lens)}."] if lens else []
-    return WrittenScene(
-        name=scene.name,
-        folder=folder.folder / config.under,
-        frames=0,
-        frames_written=0,
-        objects=len(scene.objects),
-        notes=(*scene.notes, *notes),
-        counts={"bodies": len(names), "cameras": len(scene.cameras)},
-    )
+    counts = {"bodies": len(names), "cameras": len(scene.cameras)}
+    return told(scene, folder.folder / config.under, counts, without_lens(scene, "USD"))
 
 
 def layer_bytes(layer: Any, kind: str) -> bytes:
@@ -133,12 +124,10 @@ def _scene_layer(pxr: Pixar, scene: PlacedScene, files: dict[int, str]) -> Any:
     stage.SetDefaultPrim(root)
     root.SetDisplayName(scene.name)
     physics = pxr.UsdPhysics.Scene.Define(stage, f"{ROOT}/physics")
-    strength = float(np.linalg.norm(scene.gravity))
-    down = scene.gravity / strength if strength > 0 else np.array([0.0, 0.0, -1.0])
+    down, strength = scene.down
     physics.CreateGravityDirectionAttr().Set(pxr.Gf.Vec3f(*down.tolist()))
     physics.CreateGravityMagnitudeAttr().Set(strength)
-    if scene.table is not None:
-        _add_table(pxr, stage, scene.table)
+    _add_table(pxr, stage, scene.table)
     for o in scene.objects:
         _add_object(pxr, stage, o)
     for camera in scene.cameras:
@@ -157,8 +146,6 @@ def _scene_layer(pxr: Pixar, scene: PlacedScene, files: dict[int, str]) -> Any:
 def _add_object(pxr: Pixar, stage: Any, o: PlacedObject) -> None:
     prim = stage.DefinePrim(f"{ROOT}/{o.name}", "Xform")
     _place(pxr, prim, o.T_world_obj)
-    if o.is_fixed:
-        pxr.UsdPhysics.RigidBodyAPI(prim).CreateRigidBodyEnabledAttr().Set(False)
 
 
 def _add_table(pxr: Pixar, stage: Any, table: TableBox) -> None:
