@@ -117,8 +117,8 @@ def page_of(documents: dict[str, Document]) -> str:
             for key, value in document["figures"].items()
         }
         asked = [key for key in said if "inf" not in goals.get(key, "inf")]
-        lines += ["| figure | measured | goal |", "|---|---|---|"]
-        lines += [f"| {key} | {said[key]} | {goals[key]} |" for key in asked]
+        lines += ["figure | measured | goal", "---|---|---"]
+        lines += [f"{key} | {said[key]} | {goals[key]}" for key in asked]
         others = ", ".join(f"{k} {v}" for k, v in said.items() if k not in asked and v[0] != "n")
         lines += ["", f"Without a goal: {others}.", ""]
     return "\n".join(lines)
