@@ -16,8 +16,9 @@ import ctypes
 import os
 import signal
 import sys
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from types import ModuleType
 from typing import Any
 
@@ -98,6 +99,27 @@ def missing_library(module: str, error: Exception) -> MissingLibraryError:
     )
 
 
+def _plotly_when_called() -> None:
+    """Put a module before Open3D's figures in Plotly, whose import costs 2.5 CPU s, until a call.
+
+    A figure that is asked for imports the real module, Plotly and Dash.
+    """
+    name = "open3d.visualization.draw_plotly"
+
+    def later(function: str) -> Callable[..., Any]:
+        def call(*arguments: Any, **options: Any) -> Any:
+            if sys.modules.get(name) is module:
+                del sys.modules[name]
+            return getattr(import_module(name), function)(*arguments, **options)
+
+        return call
+
+    module = ModuleType(name)
+    for function in ("get_plotly_fig", "draw_plotly", "draw_plotly_server"):
+        setattr(module, function, later(function))
+    sys.modules.setdefault(name, module)
+
+
 def import_open3d() -> Any:
     """Return the module `open3d`; the only way realsim imports it.
 
@@ -106,6 +128,7 @@ def import_open3d() -> Any:
     """
     try:
         _preload_libusb()
+        _plotly_when_called()
         import open3d  # pyright: ignore[reportMissingTypeStubs]
     except (ImportError, OSError) as error:
         raise missing_library("open3d", error) from error

@@ -146,6 +146,25 @@ except MissingLibraryError as error:
     assert library in done.stdout
 
 
+def test_open3d_asks_for_plotly_only_when_a_figure_is_asked_for():
+    done = run("""
+import sys
+class Asked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("plotly", "dash"):
+            raise ImportError(f"{name} is asked for")
+sys.meta_path.insert(0, Asked())
+from realsim.interop import import_open3d
+figure = import_open3d().visualization.get_plotly_fig
+for _ in range(2):
+    try:
+        figure([])
+    except ImportError as error:
+        print(error)
+""")
+    assert done.stdout.split("\n")[:2] == ["plotly is asked for"] * 2, done.stderr
+
+
 def test_realsim_itself_loads_numpy_only():
     done = run(
         "import sys, realsim\n"
