@@ -50,8 +50,10 @@ def test_it_tells_of_every_object_and_draws_the_frames(store: SessionStore) -> N
     assert images.read_rgb(store.path(SHEET_FILE)).shape[0] > 100
     for name in ("instance", "depth", "coordinates", "normals"):
         assert len(list(store.path(f"labels/{name}").iterdir())) == 4
+    page = store.path(PAGE_FILE).read_bytes()
     told = run(store, "--maps", "all").output
     assert "4 views annotated (4 still held)" in told
+    assert store.path(PAGE_FILE).read_bytes() == page
     assert str(store.path(PAGE_FILE)) in told.replace("\n", "")
     the_page_shows_photographs_maps_objects_and_the_registration(store)
 

@@ -82,7 +82,7 @@ def write_page(
         Where it is.
     """
     flagged = set(summary.flagged_views)
-    page = Page(title=f"Annotation of {store.session.name}", about=str(summary))
+    page = Page(title=f"Annotation of {store.session.name}", about=summary.told())
     for note in _notes(summary):
         page.text(note, "note")
     page.section("Photographs and labels", _which(summary, views) + LEGEND)

@@ -69,6 +69,10 @@ class AnnotationSummary:
 
     def __str__(self) -> str:
         """Return one line for the terminal."""
+        return self.told(f", {self.skipped} still held")
+
+    def told(self, held: str = "") -> str:
+        """Return one line: the same of every run that ends so, but for what is `held`."""
         shares = ", ".join(
             f"{i}: unknown" if np.isnan(a) else f"{i}: {100 * a:.0f} %"
             for i, a in self.agreement.items()
@@ -76,9 +80,10 @@ class AnnotationSummary:
         which = numbers(self.views_left_out)
         without = f", {len(self.views_left_out)} not registered ({which})" if which else ""
         empty = f", {len(self.empty_views)} without any object" if self.empty_views else ""
+        aside = f"{held}{without}{empty}"[2:]
         return (
-            f"{self.views} {'view' if self.views == 1 else 'views'} annotated "
-            f"({self.skipped} still held{without}{empty}), "
+            f"{self.views} {'view' if self.views == 1 else 'views'} annotated"
+            f"{f' ({aside})' if aside else ''}, "
             f"{len(self.objects)} objects ({len(self.doubtful)} not accepted, "
             f"{len(self.left_out)} rejected and left out), {self.grasps} grasps a view; "
             f"agreement with the depth {shares or 'unknown'}"
