@@ -24,6 +24,8 @@ PAGE = HERE.parent / "docs" / "measured.md"
 TIME_NOISE, NOISE = 0.25, 0.10
 TIMED = ("cpu_s", "_ms", "per_s", "_mb", "_over_", "ratio", "wall")
 """Parts of the names of figures that a busy machine moves."""
+TOOLS = ("_closed_", "open3d", "rival", "poisson", "default_world")
+"""Parts of the names of figures that other tools reach."""
 Document = dict[str, Any]
 
 
@@ -104,7 +106,7 @@ def page_of(documents: dict[str, Document]) -> str:
         "# Measured", "",
         "Written by `benchmarks/compare.py --page` from `benchmarks/measured/`; do not edit it.",
         "Goals are those of full runs. Quick runs take fewer samples, some of them one. A value "
-        "behind +- is the spread over several runs.", "",
+        "behind +- is the spread over several runs. The folder holds further figures.", "",
     ]  # fmt: skip
     for name, document in documents.items():
         machine, goals = document.get("machine") or {}, document.get("goals") or {}
@@ -119,8 +121,8 @@ def page_of(documents: dict[str, Document]) -> str:
         asked = [key for key in said if "inf" not in goals.get(key, "inf")]
         lines += ["figure | measured | goal", "---|---|---"]
         lines += [f"{key} | {said[key]} | {goals[key]}" for key in asked]
-        others = ", ".join(f"{k} {v}" for k, v in said.items() if k not in asked and v[0] != "n")
-        lines += ["", f"Without a goal: {others}.", ""]
+        tools = ", ".join(f"{k} {said[k]}" for k in said if any(word in k for word in TOOLS))
+        lines += ["", f"Other tools: {tools}." if tools else "", ""]
     return "\n".join(lines)
 
 
