@@ -196,9 +196,6 @@ def free_port(host: str, port: int) -> int:
     )
 
 
-# --- what the door says ---------------------------------------------------------------------------
-
-
 def answer_to(door: Door, path: str, headers: Any) -> Answer | None:
     """Return what is said instead of the page or the websocket, or None: come in.
 
@@ -303,8 +300,6 @@ def _cookie(headers: Any, name: str) -> str:
     return ""
 
 
-# --- the door before viser ------------------------------------------------------------------------
-
 PRIVATE = {"Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
 """Headers of every answer."""
 WELCOME = (
@@ -324,8 +319,8 @@ def guarded(door: Door, dress: Callable[[bytes], bytes] | None = None) -> Genera
         door: who may enter.
         dress: makes the HTML page that is served out of the library's; None = it stays as it is.
 
-    Viser checks nothing and offers no setting for it, but the websockets library that it calls
-    asks a function about every request; the door is put before that function.
+    Viser checks nothing, but the websockets library that it calls asks a function about every
+    request; the door is put before that function.
     """
     from websockets.asyncio import server
 
@@ -355,19 +350,16 @@ def _serve_behind(
         except Exception as error:
             # Anybody can send any bytes: what nobody understands is refused, and fills no terminal.
             log.debug("a request was refused: %r", error)
-            status = http.HTTPStatus.BAD_REQUEST
-            return _response(Answer(status=status, text="The request was not understood."))
+            said = Answer(status=http.HTTPStatus.BAD_REQUEST, text="This was not understood.")
+            return _response(said)
         if response is not None:
-            if dress is not None and response.headers.get("Content-Type", "").startswith(
-                "text/html"
-            ):
+            kind = response.headers.get("Content-Type", "")
+            if dress is not None and kind.startswith("text/html"):
                 _dressed(response, dress)
-            for name, value in _page_headers(request.headers["Host"]).items():
-                response.headers[name] = value
+            response.headers.update(_page_headers(request.headers["Host"]))
         return response
 
-    kwargs.setdefault("logger", _sockets_log)
-    kwargs["max_size"] = MOST_FRAME_BYTES
+    kwargs |= {"logger": _sockets_log, "max_size": MOST_FRAME_BYTES}
     return serve(*args, process_request=process_request, **kwargs)
 
 
