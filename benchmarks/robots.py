@@ -42,6 +42,7 @@ from realsim.app.console import Console
 from realsim.arrays import Array, Mask
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
+from realsim.interop import import_pinocchio
 from realsim.robots.arm import RobotArm, find_arm
 from realsim.robots.check_arm import check_arm
 from realsim.robots.check_hand import check_hand
@@ -130,7 +131,7 @@ def _poses(arm: RobotArm, count: int, seed: int) -> Array:
 
 def _searched(arm: RobotArm, Ts: Array, starts: int, rng: np.random.Generator) -> Mask:
     """Return which poses Pinocchio's damped Newton steps reach inside the limits from any start."""
-    import pinocchio as pin  # pyright: ignore[reportMissingImports]
+    pin = import_pinocchio()
 
     model, frames = pinocchio_model(arm.chain)
     data, end = model.createData(), pin.SE3(frames[-1])

@@ -19,20 +19,23 @@ import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim import stand_ins
 from realsim.arrays import Array
 from realsim.errors import InputError, MissingLibraryError
 from realsim.geometry import se3
 
 APT_PACKAGES = {
-    "libEGL": "libegl1", "libGL": "libgl1", "libusb": "libusb-1.0-0", "libgomp": "libgomp1",
+    "libusb": "libusb-1.0-0", "libudev": "libudev1", "libstdc++": "libstdc++6", "libz": "zlib1g",
 }  # fmt: skip
-"""Debian/Ubuntu package of each shared library that the wheels expect from the system."""
+"""Debian/Ubuntu package of each shared library that the wheels expect from the system and call."""
 T_CAM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL camera axes (x right, y up, z backward) in OpenCV's; its own inverse."""
 COLMAP_PIXEL_SHIFT = 0.5
@@ -56,6 +59,18 @@ def _preload_libusb() -> None:
 def cores() -> int:
     """Return how many processors this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _folder_of(package: str) -> Path:
+    """Return the folder of an installed package.
+
+    Raises:
+        ImportError: it is not installed.
+    """
+    found = find_spec(package)
+    if found is None or found.origin is None:
+        raise ImportError(f"No module named '{package}'", name=package)
+    return Path(found.origin).parent
 
 
 @contextmanager
@@ -87,15 +102,13 @@ def missing_library(module: str, error: Exception) -> MissingLibraryError:
     if not packages:
         return MissingLibraryError(
             f"{module} cannot be imported: {text}. Install it with the project's dependencies "
-            "(`uv sync`, or `pip install realsim`)."
+            "(`uv sync --inexact`, or `pip install realsim`); `realsim doctor` says what else is "
+            "missing."
         )
-    # The loader names only the first missing library; libEGL and libGL go together.
-    if "libegl1" in packages or "libgl1" in packages:
-        packages = ["libegl1", "libgl1"]
     return MissingLibraryError(
         f"{module} is installed, but a library of the system is missing: {text}. It comes with "
-        f"{' and '.join(packages)}; install with `sudo apt-get install --no-install-recommends "
-        f"{' '.join(packages)}`."
+        f"{packages[0]}; install with `sudo apt-get install --no-install-recommends "
+        f"{packages[0]}`. `realsim doctor` says what else is missing."
     )
 
 
@@ -124,15 +137,27 @@ def import_open3d() -> Any:
     """Return the module `open3d`; the only way realsim imports it.
 
     Raises:
-        MissingLibraryError: a shared library is missing; the message names the apt packages.
+        MissingLibraryError: it, or a library that it calls, is missing.
     """
     try:
         _preload_libusb()
         _plotly_when_called()
+        stand_ins.for_windows(_folder_of("open3d").glob("libOpen3D.so*"))
         import open3d  # pyright: ignore[reportMissingTypeStubs]
     except (ImportError, OSError) as error:
         raise missing_library("open3d", error) from error
     module: ModuleType = open3d
+    return module
+
+
+def import_pinocchio() -> Any:
+    """Return the module `pinocchio`, with an OpenMP of another wheel where the system has none."""
+    try:
+        stand_ins.lend("libgomp.so.1", _folder_of("numpy").parent.glob("*.libs/libgomp-*"))
+        import pinocchio  # pyright: ignore[reportMissingImports]
+    except (ImportError, OSError) as error:
+        raise missing_library("pinocchio", error) from error
+    module: ModuleType = pinocchio
     return module
 
 

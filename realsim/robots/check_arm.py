@@ -6,6 +6,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.geometry import se3
+from realsim.interop import import_pinocchio
 from realsim.robots.arm import ArmFile, RobotArm, find_arm
 from realsim.robots.coal_geometry import Body, Geometry
 from realsim.robots.inverse import NO_CLOSED_FORM, held_joint
@@ -66,7 +67,7 @@ def _frames(arm: RobotArm, file: ArmFile, q: Array) -> list[Finding]:
     """Compare the chain with pinocchio's own reading of the URDF."""
     if file.urdf is None:
         return []
-    import pinocchio as pin  # pyright: ignore[reportMissingImports]
+    pin = import_pinocchio()
 
     path = arm.folder.file(file.urdf.file, "the URDF")
     # pinocchio complains of what it does not need (materials, transmissions) on stderr.

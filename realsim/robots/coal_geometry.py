@@ -7,6 +7,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.geometry import se3
+from realsim.interop import import_pinocchio
 from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Shape
 
@@ -19,7 +20,7 @@ def pinocchio_model(chain: DhChain) -> tuple[Any, Array]:
     Joint i turns about z of frame i - 1; frame i is `Tz(d) Tx(a) Rx(alpha)` behind it, the last one
     the flange. Frame 0 is the world, which is the base.
     """
-    import pinocchio as pin  # pyright: ignore[reportMissingImports]
+    pin = import_pinocchio()
 
     model, n = pin.Model(), chain.joints
     frames = np.tile(np.eye(4), (n + 1, 1, 1))
@@ -82,7 +83,7 @@ class Geometry:
 
     def __init__(self, chain: DhChain, placements: Array, bodies: tuple[Body, ...]) -> None:
         """Place the bodies: links in their physical frames, everything else in the DH frames."""
-        import pinocchio as pin  # pyright: ignore[reportMissingImports]
+        pin = import_pinocchio()
 
         self.model, frames = pinocchio_model(chain)
         self.geometry = pin.GeometryModel()
@@ -109,7 +110,7 @@ class PairDistances:
 
     def __init__(self, model: Any, geometry: Any, pairs: list[Pair]) -> None:
         """Copy the geometry with these pairs only."""
-        import pinocchio as pin  # pyright: ignore[reportMissingImports]
+        pin = import_pinocchio()
 
         self.model = model
         self.data = model.createData()
@@ -140,7 +141,7 @@ class Collider:
 
     def __init__(self, pairs: PairDistances, margin_m: float) -> None:
         """Set the margin for every pair."""
-        import pinocchio as pin  # pyright: ignore[reportMissingImports]
+        pin = import_pinocchio()
 
         self._pairs = pairs
         work = pairs.geometry.createData()

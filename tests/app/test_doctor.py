@@ -68,11 +68,11 @@ def test_a_package_that_cannot_be_loaded_says_why() -> None:
 
 
 def test_a_missing_library_is_a_problem_with_its_debian_package() -> None:
-    library, package = "libEGL.so.1", "libegl1"
-    told = dict(outcomes()) | {f"library:{library}": Outcome(ok=False, told="no such file")}
-    found = named(software.software_findings(told), library)
-    assert found.kind == "problem" and f"apt-get install --no-install-recommends {package}" in (
-        found.todo
+    missing = Outcome(ok=False, told="no such file")
+    told = {**outcomes(), "library:libusb-1.0.so.0": missing, "import:pyrealsense2": missing}
+    found = named(software.software_findings(told), "libusb-1.0.so.0")
+    assert (
+        found.kind == "problem" and "apt-get install" in found.todo and "libusb-1.0-0" in found.todo
     )
 
 

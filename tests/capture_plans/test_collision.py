@@ -7,6 +7,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.interop import import_pinocchio
 from realsim.robots.arm import UR5, UR5E, arm_of, find_arm
 from realsim.robots.coal_geometry import pinocchio_model
 from realsim.robots.kinematics import DhChain
@@ -46,7 +47,7 @@ def calibrated(seed: int = 1) -> DhChain:
 
 @pytest.mark.parametrize("chain", [UR5E, calibrated()], ids=["UR5e", "calibrated"])
 def test_pinocchio_walks_the_same_chain(chain: DhChain) -> None:
-    import pinocchio as pin
+    pin = import_pinocchio()
 
     walker, frames = pinocchio_model(chain)
     data = walker.createData()

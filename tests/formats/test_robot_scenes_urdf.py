@@ -4,7 +4,6 @@ import importlib.util
 import json
 
 import numpy as np
-import pinocchio
 import pybullet
 import pytest
 import trimesh
@@ -14,7 +13,7 @@ from pybullet_utils.bullet_client import BulletClient
 import placed_scenes
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.robot_scenes.urdf import UrdfConfig, write_urdf_scene
-from realsim.interop import T_from_pybullet, quiet_output
+from realsim.interop import T_from_pybullet, import_pinocchio, quiet_output
 
 
 def write(scene, folder, **config):
@@ -72,6 +71,7 @@ def found_texture(folder):
 
 
 def test_pinocchio_finds_the_same_scene_in_the_world_file(scene, folder):
+    pinocchio = import_pinocchio()
     model = pinocchio.buildModelFromUrdf(str(folder / "world.urdf"))
     data = model.createData()
     pinocchio.framesForwardKinematics(model, data, pinocchio.neutral(model))

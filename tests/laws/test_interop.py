@@ -121,8 +121,8 @@ def test_open3d_and_pyrealsense2_really_import():
 @pytest.mark.parametrize(
     ("module", "function", "library", "package"),
     [
-        ("open3d", "import_open3d", "libGL.so.1", "libgl1"),
-        ("open3d", "import_open3d", "libEGL.so.1", "libegl1"),
+        ("open3d", "import_open3d", "libz.so.1", "zlib1g"),
+        ("pinocchio", "import_pinocchio", "libstdc++.so.6", "libstdc++6"),
         ("pyrealsense2", "import_pyrealsense2", "libusb-1.0.so.0", "libusb-1.0-0"),
     ],
 )

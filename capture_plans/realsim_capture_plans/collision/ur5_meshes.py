@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from realsim.arrays import Array, Mask
 from realsim.errors import MissingLibraryError
+from realsim.interop import import_pinocchio
 from realsim.robots.arm import UR5, arm_of
 from realsim.robots.coal_geometry import coal_shape
 from realsim.robots.shapes import Mount, WorkCell
@@ -58,7 +59,7 @@ class MeshModel:
         Raises:
             MissingLibraryError: `example-robot-data` is not installed.
         """
-        import pinocchio as pin  # pyright: ignore[reportMissingImports]
+        pin = import_pinocchio()
 
         folder = robots_folder()
         urdf, packages = str(folder / URDF), [str(folder.parent.parent)]
@@ -97,7 +98,7 @@ class MeshModel:
 
     def touches(self, joints: ArrayLike) -> Mask:
         """Return (N,) whether any two parts touch at joints (N, 6)."""
-        import pinocchio as pin  # pyright: ignore[reportMissingImports]
+        pin = import_pinocchio()
 
         rows = np.ascontiguousarray(joints, dtype=np.float64)
         model, data, geometry, work = self._model, self._data, self._geometry, self._work
@@ -107,7 +108,7 @@ class MeshModel:
 
     def triangles(self, joints: ArrayLike) -> dict[str, Array]:
         """Return each link's triangles (T, 3, 3) in the controller's base at joints (6,) [m]."""
-        import pinocchio as pin  # pyright: ignore[reportMissingImports]
+        pin = import_pinocchio()
 
         q = np.ascontiguousarray(joints, dtype=np.float64)
         pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._work, q)

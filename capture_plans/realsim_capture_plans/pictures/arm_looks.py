@@ -9,6 +9,7 @@ from realsim.arrays import Array, Int64
 from realsim.errors import MissingLibraryError, RealsimError
 from realsim.geometry import se3
 from realsim.geometry.mesh_files import load_mesh
+from realsim.interop import import_pinocchio
 from realsim.models.convex_hulls import hull_triangles
 from realsim.robots.arm import arm_of
 from realsim.robots.link_shapes import LARGEST_MM_SCALE, link_placements, link_shape
@@ -140,7 +141,7 @@ def _ur5_looks(plan: CapturePlan) -> list[Part] | None:
         folder = robots_folder()
     except MissingLibraryError:
         return None
-    import pinocchio as pin  # pyright: ignore[reportMissingImports]
+    pin = import_pinocchio()
     import trimesh
 
     urdf = str(folder / URDF)

@@ -38,12 +38,8 @@ def imported(module: str) -> str:
     """Import a module as realsim does."""
     from realsim import interop
 
-    if module == "open3d":
-        interop.import_open3d()
-    elif module == "pyrealsense2":
-        interop.import_pyrealsense2()
-    else:
-        import_module(module)
+    own = getattr(interop, f"import_{module}", None)
+    own() if own else import_module(module)
     return ""
 
 

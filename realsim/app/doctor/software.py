@@ -16,20 +16,14 @@ PYTHON = (3, 11)
 """The only one that every required package has a wheel for."""
 LEAST_GLIBC = (2, 35)
 """Least version of glibc that open3d's wheel runs on."""
-LIBRARIES = {
-    "libEGL.so.1": ("libegl1", "open3d"),
-    "libGL.so.1": ("libgl1", "open3d"),
-    "libgomp.so.1": ("libgomp1", "pinocchio, which plans the arm's moves"),
-    "libusb-1.0.so.0": ("libusb-1.0-0", "RealSense cameras"),
-}
-"""Shared library -> Debian's package, and what needs it."""
+LIBUSB = "libusb-1.0.so.0"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox")
 
 
 def software_probes() -> list[str]:
     """Return the probes that `software_findings` needs."""
     modules = [p.module for p in (*REQUIRED, *EXTRAS) if p.module and _version(p) is not None]
-    return [*(f"library:{name}" for name in LIBRARIES), *(f"import:{m}" for m in modules)]
+    return [f"library:{LIBUSB}", *(f"import:{m}" for m in modules)]
 
 
 def software_findings(outcomes: Mapping[str, Outcome]) -> list[Finding]:
@@ -38,7 +32,7 @@ def software_findings(outcomes: Mapping[str, Outcome]) -> list[Finding]:
         *_platform(),
         *(_package(p, outcomes) for p in REQUIRED),
         *(_package(p, outcomes) for p in EXTRAS),
-        *(_library(name, outcomes[f"library:{name}"], outcomes) for name in LIBRARIES),
+        _libusb(outcomes),
         _browser(),
     ]
 
@@ -100,20 +94,14 @@ def _extras() -> str:
     return ", ".join(dict.fromkeys(p.extra for p in EXTRAS))
 
 
-def _library(name: str, outcome: Outcome, outcomes: Mapping[str, Outcome]) -> Finding:
-    group = "Libraries of the system"
-    package, use = LIBRARIES[name]
-    if outcome.ok:
-        return Finding(group=group, name=name, kind="ok", found=use)
-    if name.startswith("libusb"):
-        camera = outcomes.get("import:pyrealsense2", Outcome(ok=False, told=""))
-        if camera.ok:  # the wheel libusb-package brings one
-            return Finding(
-                group=group, name=name, kind="ok", found=f"{use}: of the package libusb-package"
-            )
+def _libusb(outcomes: Mapping[str, Outcome]) -> Finding:
+    group, use = "Libraries of the system", "RealSense cameras"
+    camera = outcomes.get("import:pyrealsense2", Outcome(ok=False, told=""))
+    if camera.ok or outcomes[f"library:{LIBUSB}"].ok:  # the wheel libusb-package brings one
+        return Finding(group=group, name=LIBUSB, kind="ok", found=use)
     return Finding(
-        group=group, name=name, kind="problem", found=f"missing: {use} needs it",
-        todo=f"`sudo apt-get install --no-install-recommends {package}`",
+        group=group, name=LIBUSB, kind="problem", found=f"missing: {use} need it",
+        todo="`sudo apt-get install --no-install-recommends libusb-1.0-0`",
     )  # fmt: skip
 
 
