@@ -137,7 +137,7 @@ def test_live_does_not_end_while_roll_or_the_second_tilt_lack(lacking: str) -> N
     almost, twice = end(1.9), end(2.1)
     told = {"roll": "roll the hand by 60 deg", "tilt": "tilt about a second axis"}[lacking]
     assert almost.state == "improving" and not almost.stop and almost.next_view is not None
-    assert f"Before the end: {told}" in almost.sentence
+    assert f"Before you stop: {told}" in almost.sentence
     assert twice.stop and f"Still missing: {told}" in twice.sentence
     assert told in almost.needs[0]
 
