@@ -42,17 +42,17 @@ from review_opening import clean_up
 
 PACKAGES = ("realsim", "numpy", "viser", "websockets", "isal", "opencv-python-headless")
 FIGURES = {
-    "click_ms": Figure(unit="ms", goal=Goal(high=150.0)),
+    "click_ms": Figure(unit="ms", goal=Goal(high=50.0)),
     "click_median_ms": Figure(unit="ms"),
     "click_wall_ms": Figure(unit="ms"),
     "click_first_wall_ms": Figure(unit="ms"),
-    "open_cpu_s": Figure(unit="s", goal=Goal(high=5.0)),
+    "open_cpu_s": Figure(unit="s", goal=Goal(high=3.0)),
     "open_over_decoding": Figure(unit="x", goal=Goal(high=1.0)),
     "open_warm_cpu_s": Figure(unit="s"),
-    "open_mb": Figure(unit="MB", goal=Goal(high=600.0)),
+    "open_mb": Figure(unit="MB", goal=Goal(high=400.0)),
     "open_sent_mb": Figure(unit="MB"),
-    "big_open_cpu_s": Figure(unit="s", goal=Goal(high=5.0)),
-    "big_open_mb": Figure(unit="MB", goal=Goal(high=600.0)),
+    "big_open_cpu_s": Figure(unit="s", goal=Goal(high=4.5)),
+    "big_open_mb": Figure(unit="MB", goal=Goal(high=400.0)),
     "big_sent_mb": Figure(unit="MB"),
     "first_frame_s": Figure(unit="s", goal=Goal(high=2.5)),
     "scene_share": Figure(unit="", goal=Goal(low=0.75)),

@@ -96,7 +96,6 @@ def _kinds(browser: Browser) -> list[Click]:
     if frustums:
         name, owner = str(frustums[40 % len(frustums)]["name"]), str(frustums[0]["owner"])
         kinds.append(("camera", lambda: browser.click_node(name, owner)))
-        press("leave camera", "Leave the camera", button, True)
     return kinds
 
 

@@ -3,6 +3,8 @@
 import tempfile
 import time
 from argparse import Namespace
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,25 +36,16 @@ FIRST_PHOTO = """Math.min(...[...document.images].filter(i => i.src && i.offsetP
 
 def page(_: Namespace) -> Found:
     """Open the review of 24 views and the report of the same session at 1280x800."""
-    from playwright.sync_api import sync_playwright
-
     from realsim.app.report.session import page_of, report_of
     from realsim.store import SessionStore
 
     found = Found()
-    errors: list[str] = []
     with tempfile.TemporaryDirectory(prefix="review_page_") as scratch:
         folder, report = Path(scratch) / "session", Path(scratch) / "report.html"
         make_session(folder, VIEWS, 0)
         store = SessionStore.open(folder)
         report.write_bytes(page_of(store, report_of(store, None, "shown")).encode(np.inf))
-        with sync_playwright() as playwright, serving(folder, USUAL) as server:
-            browser = playwright.chromium.launch(
-                executable_path="/usr/bin/chromium", args=list(ARGS)
-            )
-            window = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
-            window.on("console", lambda m: errors.append(m.text) if _is_error(m) else None)
-            window.on("pageerror", lambda e: errors.append(str(e)))
+        with serving(folder, USUAL) as server, chromium_page() as (window, errors):
             start = time.perf_counter()
             window.goto(server.url)
             while _spread(window) < DRAWN_SIGMA and time.perf_counter() - start < LONGEST_S:
@@ -67,9 +60,24 @@ def page(_: Namespace) -> Found:
             window.goto(report.as_uri())
             window.wait_for_timeout(500)
             found.add("report_first_photo_px", float(window.evaluate(FIRST_PHOTO)))
-            browser.close()
     found.add("console_errors", len(errors), "; ".join(errors)[:300])
     return found
+
+
+@contextmanager
+def chromium_page(url: str = "about:blank") -> Generator[tuple[Any, list[str]]]:
+    """Open a page in Chromium; give it, and what the browser calls an error, as it comes."""
+    from playwright.sync_api import sync_playwright
+
+    errors: list[str] = []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=list(ARGS))
+        window = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+        window.on("console", lambda m: errors.append(m.text) if _is_error(m) else None)
+        window.on("pageerror", lambda e: errors.append(str(e)))
+        window.goto(url)
+        yield window, errors
+        browser.close()
 
 
 def _is_error(message: Any) -> bool:

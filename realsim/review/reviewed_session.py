@@ -24,8 +24,8 @@ from realsim.store import SessionStore, load_scene
 
 if TYPE_CHECKING:
     from realsim.review.content.content import SceneContent
-    from realsim.review.placing.camera_view import CameraViews
     from realsim.review.placing.depth_residuals import CloudResiduals
+    from realsim.review.placing.photograph import Photographs
     from realsim.review.placing.snapping import Snapper
 
 Progress = Callable[[int, int], None]
@@ -84,7 +84,7 @@ class ReviewedSession:
         """Every line that was read or written, by id, whatever became of the file."""
         self._loading = threading.Lock()
         self._content: SceneContent | None = None
-        self._views: CameraViews | None = None
+        self._photographs: Photographs | None = None
         self._snapper: tuple[tuple[int, ...], Snapper] | None = None
         self._measuring = threading.Lock()
         self._residuals: CloudResiduals | None = None
@@ -368,15 +368,15 @@ class ReviewedSession:
 
         return marked_models(self.content().models, self.standing.state)
 
-    def camera_views(self) -> "CameraViews":
-        """Return who draws outlines over the photographs; made once."""
-        from realsim.review.placing.camera_view import CameraViews
+    def photographs(self) -> "Photographs":
+        """Return who compares the photographs with the objects; made once."""
+        from realsim.review.placing.photograph import Photographs
 
         content = self.content()
         with self._loading:
-            if self._views is None:
-                self._views = CameraViews(self.store, content.models)
-            return self._views
+            if self._photographs is None:
+                self._photographs = Photographs(content)
+            return self._photographs
 
     def snapper(self) -> "Snapper":
         """Return who snaps objects onto the measured depth; made once for the same views."""

@@ -125,6 +125,10 @@ class ReviewServer:
         """Show a decision in all windows at once."""
         self._is_told.set()
 
+    def others(self, window: Window) -> list[str]:
+        """Return what the other reviewers look at, in words."""
+        return sorted(w.browser.looks_at() for w in self.windows if w is not window)
+
     # --- running ----------------------------------------------------------------------------------
 
     @property

@@ -195,29 +195,83 @@ def test_keys_move_a_copy_and_saving_writes_one_line(
     np.testing.assert_allclose(step, [0.015, 0, 0], atol=1e-9)
 
 
-def test_in_a_camera_one_stands_before_its_photograph(
+def photograph(page: ReviewPage, script: str) -> Any:
+    """Return what a script finds in the photographs, r."""
+    return page.page.evaluate(f"(r => r && {script})(document.querySelector('.rs-photograph'))")
+
+
+def test_the_photographs_open_at_the_worst_view_and_follow_the_object(
     browser: ReviewBrowser, server: ReviewServer
 ) -> None:
-    with browser.page(server.url) as page:
-        loaded(page)
-        page.tab("Show")
-        page.tick("Measured points")
-        page.wait_until(lambda: _share(page, TABLE_RGB) < 0.02, "no points")
+    with browser.page(server.url, width=1280, height=800) as page:
+        page.page.keyboard.press("g")  # before anything stands
+        page.wait_for("flat \u00b7 view", "against the pose", seconds=180)
+        assert photograph(page, "r.dataset.instance") == "3"
+        page.wait_until(lambda: share_of(page.screenshot(), BOX_RGB) > 0.003, "the photograph")
+        zoom = float(photograph(page, "r.querySelector('.rs-zoom').innerText").split()[0])
+        assert zoom > 1  # the object fills a third of a photograph of 160 pixels
+        page.page.mouse.move(640, 300)
+        page.page.mouse.wheel(0, -400)
+        page.wait_until(
+            lambda: (
+                float(photograph(page, "r.querySelector('.rs-zoom').innerText").split()[0])
+                > 2 * zoom
+            ),
+            "a closer look",
+        )
+        page.key("4")
+        page.wait_until(lambda: photograph(page, "r.querySelector('.rs-pane').dataset.layer")
+                        == "depth", "the depth", 180)  # fmt: skip
+        assert "in front of it" in page.text()
+        page.key("s")
+        page.wait_until(lambda: photograph(page, "r.querySelectorAll('.rs-pane').length") == 3,
+                        "three views")  # fmt: skip
+        link = page.page.url
+        assert "photo=" in link
+        page.key("n")
+        page.wait_for("tall \u00b7 view")
+        page.key("g")
+        page.wait_until(lambda: photograph(page, "1") is None, "the scene")
         page.tab("Views")
-        page.press("Stand in this camera")
-        page.wait_for("You stand in the camera of view 0")
-        page.wait_until(lambda: _share(page, TABLE_RGB) > 0.1, "the photograph")
-        assert _share(page, BOX_RGB) > 0.003
-        page.key("Escape")
-        page.wait_for("Click a camera in the scene")
+        page.write("Your name", "ada")
         page.write("Why", "blurred")
         page.press("Leave it out")
         page.wait_for("view 0: ada", "blurred", "Take it in again")
+        page.press("Show its photograph")
+        page.wait_for("tall \u00b7 view 0")
     assert [(e.action, e.view) for e in lines(server)] == [("exclude", 0)]
 
 
-def _share(page: ReviewPage, rgb: tuple[int, int, int]) -> float:
-    return share_of(page.screenshot()[:, 300:590], rgb)
+def test_a_correction_outlives_a_reload_and_the_edit_of_another(
+    browser: ReviewBrowser, server: ReviewServer
+) -> None:
+    session = server.sessions[0]
+    with browser.page(server.url) as page:
+        loaded(page)
+        page.tab("Correct")
+        page.key("l")
+        page.key("l")
+        page.wait_for("moved 10.0 mm", "your correction is not saved")
+        page.reload()
+        page.wait_message("Your correction of flat goes on")
+        page.wait_for("moved 10.0 mm")
+        with browser.page(server.url) as other:
+            other.write("Your name", "bob")
+            other.wait_for("ada corrects 3 flat")
+            page.wait_for("bob looks at 3 flat")
+        placed = session.standing.scene.object(3)
+        aside = se3.from_translation([0.0, 0.02, 0.0]) @ placed.T_world_obj
+        session.decide("move", placed, "bob", pose=aside, how="steps")
+        page.wait_message("bob has changed flat meanwhile. Your copy is kept")
+        page.press("0 tall")
+        page.wait_for("instance 0, object 1")
+        page.press("3 flat")
+        page.wait_message("goes on")
+        page.tab("Correct")
+        page.press("Save the pose")
+        page.wait_message("Recorded: moved 22.4 mm")
+        page.wait_gone("your correction is not saved")
+    assert [e.reviewer for e in lines(server)] == ["bob", "ada"]
 
 
 def test_filters_legends_and_marks(browser: ReviewBrowser, server: ReviewServer) -> None:

@@ -83,30 +83,33 @@ def grasp_set(obj_id: int, instance: int, n: int = 40) -> GraspSet:
     )  # fmt: skip
 
 
-def boxes_session(folder: Path) -> SessionStore:
+def boxes_session(folder: Path, larger: int = 1) -> SessionStore:
     """Return a session whose depth is exact to half a count: a copy of one made once a process."""
-    return SessionStore.open(Path(shutil.copytree(_original(), folder)))
+    return SessionStore.open(Path(shutil.copytree(_original(larger), folder)))
 
 
 @cache
-def _original() -> Path:
+def _original(larger: int) -> Path:
     folder = Path(tempfile.mkdtemp(prefix="boxes_"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    _make(folder / "boxes")
+    _make(folder / "boxes", larger)
     return folder / "boxes"
 
 
-def _make(folder: Path) -> None:
-    session = CaptureSession(
-        name="boxes", intrinsics=INTRINSICS, views=(), depth_unit_m=DEPTH_UNIT_M
-    )
+def _make(folder: Path, larger: int) -> None:
+    K = INTRINSICS
+    camera = CameraIntrinsics(
+        width=larger * K.width, height=larger * K.height, fx=larger * K.fx, fy=larger * K.fy,
+        cx=larger * (K.cx + 0.5) - 0.5, cy=larger * (K.cy + 0.5) - 0.5, distortion=K.distortion,
+    )  # fmt: skip
+    session = CaptureSession(name="boxes", intrinsics=camera, views=(), depth_unit_m=DEPTH_UNIT_M)
     store = SessionStore.create(folder, session)
     table = PlacedMesh(-1, box((1.0, 1.0, 0.02)), se3.from_translation([0.5, 0.0, -0.01]))
     placed = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in SCENE.objects]
     renderer = LabelRenderer([*placed, table])
     rng = np.random.default_rng(1)
     for index, T in enumerate(CAMERAS):
-        labels = renderer.render(INTRINSICS, T)
+        labels = renderer.render(camera, T)
         rgb = np.stack([np.where(labels.ids == 0, 200, 90)] * 3, -1)
         rgb = (rgb + rng.integers(0, 20, rgb.shape)).astype(np.uint8)
         store.add_view(View(index=index, T_world_cam=T), rgb, labels.depth_m)

@@ -29,8 +29,6 @@ LEAST_BINS = 5
 """Numbers that an axis of counts spans at least: one bar alone would be as wide as the plot."""
 WIDE = 0.3
 """Room beside the first and the last bar [bars]."""
-VIOLIN_LEAST = 3
-"""Fewer values make no distribution: they are drawn as points."""
 
 
 def figures(stats: Statistics) -> list[tuple[str, bytes]]:
@@ -83,14 +81,12 @@ def _labels(stats: Statistics) -> bytes:
     levels = sorted(groups)
     for k, mu in enumerate(levels):
         values = groups[mu]
-        if len(values) >= VIOLIN_LEAST and np.ptp(values) > 0:
-            body = right.violinplot([values], [k], widths=0.8, showextrema=False)["bodies"][0]
-            body.set_facecolor(WARN)
+        right.vlines(k, *np.percentile(values, [25, 75]), color=WARN, lw=8)
         right.plot([k], [np.mean(values)], "o", color=INK, ms=4)
         right.text(k, 1.04, f"{len(values)}", ha="center", fontsize=7, color=MUTED)
     right.set_xticks(range(len(levels)), ["none" if np.isinf(v) else f"{v:g}" for v in levels])
     right.set_ylim(-0.02, 1.12)
-    titled(right, f"{name} by the friction that closes (dot: mean, above: grasps)",
+    titled(right, f"{name} by the friction that closes (dot: mean, bar: middle half, above: grasps)",
             "least friction that closes", name)  # fmt: skip
     if not levels:
         right.text(0.5, 0.5, "force closure was not computed", ha="center", color=MUTED, fontsize=9)

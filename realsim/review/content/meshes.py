@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from realsim.arrays import Array, Array32, UInt8, UInt16
 from realsim.errors import DegenerateError
 from realsim.geometry import mesh as mesh_tools
+from realsim.pages.pictures import jpeg_bytes
 from realsim.records import Mesh
 from realsim.review.content.config import SceneConfig
 
@@ -199,8 +200,7 @@ def _texture_jpeg(texture: UInt8, most_texels: int) -> bytes:
     if factor < 1:
         size = tuple(max(1, round(n * factor)) for n in texture.shape[1::-1])
         small = np.asarray(cv2.resize(texture, size, interpolation=cv2.INTER_AREA))
-    bgr = np.ascontiguousarray(small[..., ::-1])
-    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, TEXTURE_QUALITY])[1].tobytes()
+    return jpeg_bytes(small, TEXTURE_QUALITY)
 
 
 def _linear(rgb: NDArray[Any]) -> Array:

@@ -11,8 +11,11 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
+
 from realsim.arrays import UInt8
 from realsim.errors import InputError
+from realsim.pages.pictures import jpeg_bytes
 from realsim.review.content import quick_png
 from realsim.store import SessionStore, atomic
 from realsim.store.manifest import Manifest
@@ -120,12 +123,7 @@ def thumbnail(rgb: UInt8, width_px: int, quality: int) -> bytes:
 
     height = max(1, round(rgb.shape[0] * width_px / rgb.shape[1]))
     small = cv2.resize(rgb, (width_px, height), interpolation=cv2.INTER_AREA)
-    ok, data = cv2.imencode(
-        ".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
-    )
-    if not ok:
-        raise InputError(f"a photograph of shape {rgb.shape} cannot be written as JPEG.")
-    return data.tobytes()
+    return jpeg_bytes(np.asarray(small, np.uint8), quality)
 
 
 def _line(jpeg: bytes, origin: str) -> bytes:

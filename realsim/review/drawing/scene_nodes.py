@@ -65,7 +65,6 @@ class SceneNodes:
         self._frustums: dict[int, viser.CameraFrustumHandle] = {}
         self._grid: viser.GridHandle | None = None
         self._box: viser.LineSegmentsHandle | None = None
-        self._has_box = True
         self._cloud = CloudNodes(api, content.cloud, config)
         self._grasps = GraspNodes(api, config)
         self._on_object: list[OnInstance] = []
@@ -171,14 +170,7 @@ class SceneNodes:
             lines = _box_lines(mesh.low - BOX_MARGIN_M, mesh.high + BOX_MARGIN_M)
             self._box = self._api.add_line_segments(
                 f"{name}/box", lines, HIGHLIGHT_RGB, thickness=2.0, thickness_units="screen",
-                visible=self._has_box,
             )  # fmt: skip
-
-    def show_box(self, visible: bool) -> None:
-        """Show or hide the box about the highlighted object."""
-        self._has_box = visible
-        if self._box is not None:
-            self._box.visible = visible
 
     def ellipsoids(self, shapes: Mapping[int, Ellipsoid | None]) -> None:
         """Draw how sure the positions are, instead of what was drawn before.

@@ -1,6 +1,9 @@
-"""What one browser keeps and says: its address, and the reviewer's name."""
+"""What one browser keeps and says: its address, the reviewer's name, corrections not yet saved."""
 
-from typing import TYPE_CHECKING
+import contextlib
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
 
 from realsim.review.window.place import PLACE_KEY, Place, point_of
 
@@ -9,6 +12,8 @@ if TYPE_CHECKING:
 
 NAME_KEY = "realsim reviewer"
 """Under which the browser keeps the reviewer's name."""
+DRAFTS_KEY = "realsim corrections"
+"""Under which it keeps the corrections that were not saved."""
 NAME_WAIT_S = 60.0
 """How long a browser is waited for that does not tell the name it keeps [s]; nothing else waits."""
 PLACE_WAIT_S = 1.5
@@ -18,6 +23,21 @@ TURNED_WAIT_S = 10.0
 still drawing then."""
 
 
+class Draft(msgspec.Struct, frozen=True, kw_only=True):
+    """A correction that is not saved: it outlives a reload and a lost connection."""
+
+    scene: str
+    """Name of the session."""
+    instance: int
+    obj_id: int
+    """What the object is said to be."""
+    stood: str
+    """`journal.subject_of` the object as it stood when the reviewer saw it last."""
+    how: tuple[str, ...]
+    pose: Annotated[tuple[float, ...], msgspec.Meta(min_length=16, max_length=16)]
+    """T_world_obj, row by row [m]."""
+
+
 class Browser:
     """The storage and the address of one browser."""
 
@@ -25,6 +45,8 @@ class Browser:
         """Take whose browser it is; nothing is asked yet."""
         self._window = window
         self._told = ""
+        self.drafts: dict[tuple[str, int], Draft] = {}
+        """Corrections that are not saved, by session and instance."""
 
     def wait(self) -> None:
         """Wait until the browser has done what was sent before."""
@@ -39,6 +61,29 @@ class Browser:
         """Keep the reviewer's name."""
         self._window.client.local_storage.set_item(NAME_KEY, name.strip())
 
+    def keep_drafts(self, drafts: dict[tuple[str, int], Draft]) -> None:
+        """Keep the corrections that are not saved, if they are others than before."""
+        if drafts != self.drafts:
+            self.drafts = drafts
+            text = msgspec.json.encode(list(drafts.values())).decode()
+            self._window.client.local_storage.set_item(DRAFTS_KEY, text)
+
+    def read_drafts(self) -> None:
+        """Take the corrections that the browser keeps; none where they are not understood."""
+        text = self._asked(DRAFTS_KEY, PLACE_WAIT_S) or "[]"
+        with contextlib.suppress(msgspec.DecodeError):
+            found = msgspec.json.decode(text, type=list[Draft])
+            self.drafts = {(d.scene, d.instance): d for d in found}
+
+    def looks_at(self) -> str:
+        """Return who looks at what here, in words for the others."""
+        window = self._window
+        name = window.reviewer.strip() or "somebody"
+        if not window.is_open or window.selected is None:
+            return f"{name} is here"
+        does = "looks at" if window.correct.moved is None else "corrects"
+        return f"{name} {does} {window.selected} {window.model_of(window.placed).name}"
+
     def go_to_place(self) -> bool:
         """Show what the address names; return whether it names a scene that is here."""
         window = self._window
@@ -49,9 +94,7 @@ class Browser:
         number = names.index(place.scene)
         known = {o.instance for o in window.server.sessions[number].registered.objects}
         window.go_to(number, place.instance if place.instance in known else None)
-        if place.view is not None and place.view in {v.index for v in window.content.views}:
-            window.views.stand_in(place.view)
-        elif place.eye is not None and place.look_at is not None:
+        if place.eye is not None and place.look_at is not None:
             window.views.look_from(place.eye, place.look_at)
         return True
 
@@ -59,7 +102,7 @@ class Browser:
         """Write into the address what is looked at."""
         window, camera = self._window, self._window.client.camera
         place = Place(
-            scene=scene, instance=window.selected, view=window.views.current,
+            scene=scene, instance=window.selected,
             eye=point_of(camera.position), look_at=point_of(camera.look_at),
         )  # fmt: skip
         name = "" if window.selected is None else window.model_of(window.placed).name

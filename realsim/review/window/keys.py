@@ -16,26 +16,8 @@ if TYPE_CHECKING:
     from realsim.review.window.window import Window
 
 Letter = Literal[
-    "H",
-    "N",
-    "P",
-    "Y",
-    "X",
-    "Z",
-    "M",
-    "V",
-    "B",
-    "T",
-    "C",
-    "F",
-    "J",
-    "L",
-    "K",
-    "I",
-    "O",
-    "U",
-    "escape",
-]
+    "H", "N", "P", "Y", "X", "Z", "M", "V", "B", "T", "C", "F", "J", "L", "K", "I", "O", "U"
+]  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +48,7 @@ KEYS = (
     Key("V", "Save the pose", lambda w: w.correct.save()),
     Key("B", "Put the object back", lambda w: w.correct.put_back()),
     Key("T", "Snap by ICP", lambda w: w.correct.snap()),
-    Key("C", "Stand in the chosen camera, or leave it", lambda w: w.views.toggle()),
-    Key("escape", "Leave the camera", lambda w: w.views.leave()),
+    Key("C", "Show the chosen view's photograph", lambda w: w.views.show_chosen()),
     Key("F", "Look at the object", lambda w: w.views.look_at_object()),
     Key("H", "Look at the whole scene", lambda w: w.views.first_look()),
 )

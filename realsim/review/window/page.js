@@ -1,6 +1,20 @@
 // The review's page: the address says what is looked at, so that a link shows a colleague the same.
 // The server reads and writes it as an item of the browser's storage that is none: PLACE.
 (() => {
+  // Keys that come before the scene stands wait for it: only then is somebody there to hear them.
+  const waiting = [], stands = () => document.querySelector("[data-realsim-photograph]");
+  addEventListener("keydown", (event) => {
+    const inText = event.target instanceof Element && event.target.closest("input, textarea");
+    if (stands() || inText || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.stopImmediatePropagation();
+    if (waiting.length < 20) waiting.push({ key: event.key, code: event.code, shiftKey: event.shiftKey });
+  }, true);
+  const heard = setInterval(() => {
+    if (!stands()) return;
+    clearInterval(heard);
+    for (const key of waiting)
+      document.body.dispatchEvent(new KeyboardEvent("keydown", { ...key, bubbles: true, cancelable: true }));
+  }, 100);
   const PLACE = "realsim place", read = Storage.prototype.getItem, write = Storage.prototype.setItem;
   const is = (key) => String(key).endsWith(PLACE);
   // Viser takes its server's address from the page's: at that moment there must be no fragment.
@@ -16,11 +30,19 @@
   };
   Storage.prototype.setItem = function (key, value) {
     if (!is(key)) return write.call(this, key, value);
-    const fields = new URLSearchParams(value), tab = said().get("tab");
-    if (tab) fields.set("tab", tab);
+    const fields = new URLSearchParams(value);
+    for (const own of ["tab", "photo"]) if (said().get(own)) fields.set(own, said().get(own));
     tell(fields);
     const words = [fields.get("object"), fields.get("scene"), "realsim review"];
     document.title = words.filter((word) => word).join(" \u00b7 ");
+  };
+  window.realsimPlace = { // of the photographs
+    photo: () => said().get("photo"),
+    tell: (view) => {
+      const fields = said();
+      if (view === null) fields.delete("photo"); else fields.set("photo", view);
+      tell(fields);
+    },
   };
   addEventListener("hashchange", () => location.reload());
   // The chosen tab is the browser's own.

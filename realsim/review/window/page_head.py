@@ -1,10 +1,17 @@
-"""The review's own title, icon, style and script, put into the page that viser serves."""
+"""What the review adds to the page that viser serves: title, icon, style, scripts, answers."""
 
+import asyncio
+import contextlib
 import re
+from collections.abc import Callable, Generator
 from functools import cache
 from importlib.resources import files
+from typing import Any
 
 TITLE = "realsim review"
+ASKED = "/photograph/"
+"""What the page's script asks for begins so."""
+Ask = Callable[[str], tuple[str, bytes]]
 ICON = (
     "data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'%3E"
     "%3Crect width='32' height='32' rx='7' fill='%23143d59'/%3E"
@@ -28,5 +35,42 @@ def dressed(html: bytes) -> bytes:
 @cache
 def _head() -> str:
     folder = files("realsim.review.window")
-    style, script = (folder.joinpath(f"page.{kind}").read_text("utf-8") for kind in ("css", "js"))
-    return f"\n<style>{style}</style>\n<script>{script}</script>"
+    names = ("page.css", "page.js", "photograph.js")
+    style, *scripts = (folder.joinpath(name).read_text("utf-8") for name in names)
+    return "\n".join([f"\n<style>{style}</style>", *(f"<script>{s}</script>" for s in scripts)])
+
+
+@contextlib.contextmanager
+def answering(ask: Ask) -> Generator[None]:
+    """Answer what the page asks for, of servers that are started inside this block.
+
+    To be entered before `local_pages.guarded`: what its door refuses is not asked.
+
+    Args:
+        ask: path -> media type and content; called in a thread of its own.
+    """
+    from websockets.asyncio import server
+
+    module: Any = server
+    serve = module.serve
+
+    def answered(*args: Any, **kwargs: Any) -> Any:
+        inner = kwargs.pop("process_request")
+
+        async def process_request(connection: Any, request: Any) -> Any:
+            response = await inner(connection, request)
+            if request.path.startswith(ASKED) and getattr(response, "status_code", 0) == 404:
+                kind, response.body = await asyncio.to_thread(ask, request.path)
+                response.status_code, response.reason_phrase = 200, "OK"
+                response.headers.pop("Content-Length", None)
+                response.headers["Content-Type"] = kind
+                response.headers["Content-Length"] = str(len(response.body))
+            return response
+
+        return serve(*args, process_request=process_request, **kwargs)
+
+    module.serve = answered
+    try:
+        yield
+    finally:
+        module.serve = serve

@@ -11,9 +11,12 @@ import viser
 
 from realsim.arrays import Array
 from realsim.errors import InputError
+from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose
+from realsim.review import journal
 from realsim.review.placing import placing
 from realsim.review.window import window_text
+from realsim.review.window.browser import Draft
 from realsim.review.window.moved_copy import MovedCopy
 from realsim.review.window.three_points import PointPlacer
 
@@ -127,13 +130,10 @@ class CorrectPanel:
         with self._window.lock:
             if self._now is None:
                 placed = self._window.placed
-                model = self._window.session.model(placed.obj_id)
-                self._copy.show(model, placed, self._axes(placed.T_world_obj))
-                self._now = Correction(
+                self._show(Correction(
                     start=placed, T_world_obj=placed.T_world_obj, obj_id=placed.obj_id
-                )
-                self.in_camera()
-                self._tell()
+                ))  # fmt: skip
+            assert self._now is not None, "it was shown"
             return self._now
 
     def nudge(self, axis: placing.Axis, sign: int, kind: placing.Kind) -> None:
@@ -189,7 +189,13 @@ class CorrectPanel:
             self._points.begin(self._model().mesh, now.T_world_obj)
 
     def put_back(self) -> None:
-        """Take the copy away; nothing was written."""
+        """Take the copy away and forget it; nothing was written."""
+        if self._now is not None:
+            self._forget(self._now.start.instance)
+        self.set_aside()
+
+    def set_aside(self) -> None:
+        """Take the copy away; it is there again when its object is looked at."""
         with self._window.lock:
             self._end_clicks()
             if self._now is not None:
@@ -262,13 +268,24 @@ class CorrectPanel:
         now = _choice(window.placed.obj_id, window.model_of(window.placed))
         self._object.options = tuple(dict.fromkeys((*names, now)))
         self._object.value = now
+        draft = window.browser.drafts.get(self._key(window.selected))
+        if draft is not None and self._now is None:
+            try:
+                self._resume(draft)
+            except InputError as error:
+                self._forget(draft.instance)
+                window.refuse(f"A correction that this browser kept is left out: {error}")
         self._tell()
 
     def refresh(self) -> None:
-        """Show how the model is marked."""
-        window = self._window
+        """Show how the model is marked, and that somebody else has moved what is corrected here."""
+        window, now = self._window, self._now
         if window.selected is None:
             return
+        if now is not None and journal.subject_of(window.placed) != journal.subject_of(now.start):
+            self._now = replace(now, start=window.placed)
+            self._tell()
+            self._tell_moved()
         mark = window.standing.state.marks().get(window.placed.obj_id)
         own = window_text.symmetry_words(window.model_of(window.placed))
         self._marks.content = f"the model itself: {own}"
@@ -277,6 +294,43 @@ class CorrectPanel:
             self._marks.content = f"marked **{said}** by {window_text.signed(mark)}"
 
     # --- how --------------------------------------------------------------------------------------
+
+    def _key(self, instance: int) -> tuple[str, int]:
+        return self._window.session.name, instance
+
+    def _forget(self, instance: int) -> None:
+        key = self._key(instance)
+        browser = self._window.browser
+        browser.keep_drafts({k: d for k, d in browser.drafts.items() if k != key})
+
+    def _show(self, now: Correction) -> None:
+        """Draw the copy of a correction."""
+        placed = replace(now.start, T_world_obj=now.T_world_obj)
+        model = self._window.session.model(now.obj_id)
+        self._copy.show(model, placed, self._axes(placed.T_world_obj))
+        self._now = now
+        self._tell()
+
+    def _resume(self, draft: Draft) -> None:
+        """Go on with a correction that was not saved."""
+        window, placed = self._window, self._window.placed
+        pose = se3.check_rigid(np.reshape(draft.pose, (4, 4)), "the correction that was kept")
+        self._show(Correction(start=placed, T_world_obj=pose, obj_id=draft.obj_id, how=draft.how))
+        window.views.moved()
+        if journal.subject_of(placed) != draft.stood:
+            self._tell_moved()
+        else:
+            window.say(f"Your correction of {self._model().name} goes on; it is not saved yet.")
+
+    def _tell_moved(self) -> None:
+        """Say that the object stands otherwise than when its correction was begun."""
+        window, instance = self._window, self._window.placed.instance
+        lines = window.standing.state.of(instance)
+        who = lines[-1].reviewer if lines else "somebody"
+        window.refuse(
+            f"{who} has changed {window.model_of(window.placed).name} meanwhile. Your copy is "
+            "kept: Save the pose puts yours in the place of theirs, Put back forgets yours."
+        )
 
     def _model(self) -> ObjectModel:
         assert self._now is not None, "the callers have begun"
@@ -332,13 +386,8 @@ class CorrectPanel:
             # The middles meet: models of one thing may have their origins anywhere.
             T = np.array(now.T_world_obj)
             T[:3, 3] += T[:3, :3] @ (placing.middle_of(before.mesh) - placing.middle_of(after.mesh))
-            self._now = replace(now, obj_id=obj_id)
-            self._copy.show(after, replace(now.start, T_world_obj=T), self._axes(T))
+            self._show(replace(now, obj_id=obj_id, T_world_obj=T))
             self._put(T, "swap")
-
-    def in_camera(self) -> None:
-        """Before a photograph the outline says where the object is; the copy would hide it."""
-        self._copy.see(self._window.views.current is None)
 
     def _asked(self, text: str, with_model: bool) -> None:
         self._copy.see(with_model)
@@ -363,7 +412,7 @@ class CorrectPanel:
     def _end_clicks(self) -> None:
         self._points.end()
         self._clicks.visible = False
-        self.in_camera()
+        self._copy.see(True)
 
     def _words(self, now: Correction) -> str:
         far = placing.moved(now.start.T_world_obj, now.T_world_obj, self._model().mesh)
@@ -373,6 +422,14 @@ class CorrectPanel:
         return words
 
     def _tell(self) -> None:
+        now, kept = self._now, dict(self._window.browser.drafts)
+        if now is not None and now.how:
+            kept[self._key(now.start.instance)] = Draft(
+                scene=self._window.session.name, instance=now.start.instance, obj_id=now.obj_id,
+                stood=journal.subject_of(now.start), how=now.how,
+                pose=tuple(now.T_world_obj.ravel().tolist()),
+            )  # fmt: skip
+        self._window.browser.keep_drafts(kept)
         if self._points.is_on:
             return
         if self._now is None:

@@ -137,11 +137,6 @@ class GraspsPanel:
         if self._show.value:
             self.draw()
 
-    def stood_in(self, view: int | None) -> None:
-        """The reviewer stands in another camera, or in none."""
-        if self._seen.value and self._window.is_open:
-            self.draw()
-
     def close(self) -> None:
         """Play no more: the browser is gone."""
         self._is_closed = True

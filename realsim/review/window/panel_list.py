@@ -1,5 +1,6 @@
 """The list of all scenes and objects, worst first."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import viser
@@ -68,11 +69,11 @@ class ListPanel:
         self._step.on_click(window.guarded(lambda _: self._stepped()))
         self._pages.on_click(window.guarded(lambda _: self._turned()))
 
-    def refresh(self) -> None:
-        """Show the list as the journals have it."""
+    def refresh(self, others: Sequence[str]) -> None:
+        """Show the list as the journals have it, and what the other reviewers look at."""
         window, every = self._window, self._window.rows()
         scenes = len(window.server.sessions)
-        self._head.content = window_text.progress_html(*scene_list.counts(every), scenes)
+        self._head.content = window_text.progress_html(*scene_list.counts(every), scenes, others)
         chosen = every
         if self._scene.value in self._numbers:
             number = self._numbers[self._scene.value]
@@ -99,6 +100,8 @@ class ListPanel:
         scene = window.server.sessions[row.session].name
         label = window_text.list_label(row, scene, with_scene=len(self._numbers) > 1)
         is_here = window.is_open and row.key == (window.session.number, window.selected)
+        if (scene, row.instance) in window.browser.drafts:
+            label += "\nyour correction is not saved"
         button.label = f"\u25b6 {label}" if is_here else label
         button.visible = True
         return window_text.row_style(_uuid(button), row, is_here=is_here)

@@ -34,7 +34,6 @@ class ShowPanel:
             window: whose panel it is.
         """
         self._window = window
-        self._is_in_camera = False
         self._has_hidden_cameras = False
         """Whether the cameras are off because a replay began, and not by the reviewer's hand."""
         self._colored: object = None
@@ -70,11 +69,6 @@ class ShowPanel:
         self._color()
         self._draw_ellipsoids()
 
-    def in_camera(self, is_in: bool) -> None:
-        """Clear the view for the photograph, or show everything again."""
-        self._is_in_camera = is_in
-        self._switch()
-
     def hide_cameras(self) -> None:
         """Switch the cameras off, as the reviewer could: an arm is to be seen among them."""
         self._has_hidden_cameras = self._has_hidden_cameras or self._cameras.value
@@ -89,16 +83,14 @@ class ShowPanel:
             self._switch()
 
     def _switch(self) -> None:
-        nodes, free = self._window.nodes, not self._is_in_camera
-        look = LOOKS[self._look.value] if free else "hidden"
+        nodes, look = self._window.nodes, LOOKS[self._look.value]
         if look == "appearance" and self._colors.value == RESIDUAL:
             look = "faded"  # points inside a model are the ones that matter
         with self._window.client.atomic():
             nodes.show_objects(look)
-            nodes.show_box(free)
-            nodes.show_cloud(self._cloud.value and free)
-            nodes.show_cameras(self._cameras.value and free)
-            nodes.show_table(self._table.value and free)
+            nodes.show_cloud(self._cloud.value)
+            nodes.show_cameras(self._cameras.value)
+            nodes.show_table(self._table.value)
 
     def _color(self) -> None:
         """Colour the points, if what their colours depend on has changed; returns at once."""

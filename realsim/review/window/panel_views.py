@@ -1,5 +1,8 @@
-"""The panel of the views: stand in a camera before the real photograph, leave views out."""
+"""The views: their photographs over the scene, and which the next registration leaves out."""
 
+import html
+import json
+import zlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,16 +13,85 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.review.window import window_text
-from realsim.review.window.camera_stand import StandIn
+from realsim.review.window.camera_stand import Standpoint
 
 if TYPE_CHECKING:
     from realsim.review.window.window import Window
 
 NONE = "-"
+OPEN = """<div data-realsim-photograph data-window="{client}" data-state="{state}"
+data-instance="{instance}" data-name="{name}" data-turn="{turn}" data-view="{view}">
+<button data-realsim-open class="realsim-open">Photographs at full size (G)</button></div>"""
+
+
+class PhotographLink:
+    """What the page's photographs are told and ask for: they are a script's, not viser's."""
+
+    def __init__(self, window: "Window") -> None:
+        """Tell nothing yet.
+
+        Args:
+            window: whose photographs.
+        """
+        self._window = window
+        self._html = window.client.gui.add_html("")
+        self._turn, self._view = 0, -1
+
+    def open(self, view: int) -> None:
+        """Show the photograph of a view over the scene."""
+        self._turn, self._view = self._turn + 1, view
+        self.tell()
+
+    def tell(self) -> None:
+        """Say which object is looked at, and that things stand otherwise."""
+        window = self._window
+        if not window.is_open:
+            return
+        stands = [(o.instance, o.obj_id, o.verdict, o.T_world_obj.tobytes())
+                  for o in window.shown_objects()]  # fmt: skip
+        chosen = window.selected is not None
+        state = repr((window.session.number, window.selected, stands))
+        content = OPEN.format(
+            client=window.client.client_id,
+            state=f"{zlib.crc32(state.encode()):08x}",
+            instance=window.selected if chosen else "",
+            name=html.escape(window.model_of(window.placed).name if chosen else ""),
+            turn=self._turn,
+            view=self._view,
+        )
+        if content != self._html.content:
+            self._html.content = content
+
+    def answer(self, what: str, numbers: list[float]) -> tuple[str, bytes]:
+        """Return media type and content of what the script asks for.
+
+        Args:
+            what: strip, outlines, spot, thumb, or one of `photograph.KINDS`.
+            numbers: the view, and the pixel of a spot.
+
+        Raises:
+            InputError: no scene is open, or there is no such view or image.
+            LookupError: it asks for something else.
+        """
+        from realsim.review.placing.photograph import KINDS
+
+        window = self._window
+        found, objects = window.session.photographs(), window.shown_objects()
+        view = int(numbers[0]) if numbers else 0
+        if what == "thumb":
+            return "image/jpeg", window.content.thumbnails[view]
+        if what in KINDS:
+            return "image/jpeg", found.picture(view, what, objects)
+        answers = {
+            "strip": lambda: found.strip(window.selected, objects),
+            "outlines": lambda: found.outlines(view, objects),
+            "spot": lambda: found.spot(view, (numbers[1], numbers[2]), objects),
+        }
+        return "application/json", json.dumps(answers[what]()).encode()
 
 
 class ViewsPanel:
-    """Chooses a camera to stand in, and which views the next registration leaves out."""
+    """Chooses a view to look at, and which views the next registration leaves out."""
 
     def __init__(self, window: "Window") -> None:
         """Build it in the container that is open.
@@ -28,37 +100,24 @@ class ViewsPanel:
             window: whose panel it is.
         """
         self._window = window
-        self._stand = StandIn(window, self._told)
+        self._stand = Standpoint(window)
         gui = window.client.gui
-        self._text = gui.add_markdown(
-            "Click a camera in the scene, or choose one: you stand in it, before its photograph, "
-            "with the outlines of the models over it."
+        gui.add_markdown(
+            "Click a camera in the scene, or choose one: its photograph opens over the scene, with "
+            "the outlines of the models. In it, 1 to 4 are photograph, render, difference and "
+            "depth, space blinks, S shows three views, the arrows walk through all views."
         )
         self._view: viser.GuiDropdownHandle[str] = gui.add_dropdown("View", [NONE])
-        step = gui.add_button_group("Camera", ("\u25c0 before", "next \u25b6"))
-        enter = gui.add_button("Stand in this camera", icon=viser.Icon.CAMERA, hint="Key C.")
-        self._leave = gui.add_button(
-            "Leave the camera", icon=viser.Icon.DOOR_EXIT, color=(134, 142, 150), disabled=True,
-            hint="Key Escape.",
-        )  # fmt: skip
+        enter = gui.add_button("Show its photograph", icon=viser.Icon.CAMERA, hint="Key C.")
         with gui.add_folder("Leave this view out"):
             gui.add_markdown("The next `realsim register --from-review` does without it.")
             self._why = gui.add_text("Why", "")
             self._exclude = gui.add_button("Leave it out", icon=viser.Icon.EYE_OFF)
             self._excluded = gui.add_markdown("")
         self._numbers: dict[str, int] = {}
-        self._view.on_update(window.guarded(lambda _: self._chosen()))
-        step.on_click(window.guarded(lambda _: self._stepped(1 if "next" in step.value else -1)))
-        enter.on_click(window.guarded(lambda _: self.stand_in(self._index())))
-        self._leave.on_click(window.guarded(lambda _: self.leave()))
+        self._view.on_update(window.guarded(lambda _: self._label_exclude()))
+        enter.on_click(window.guarded(lambda _: self.show_chosen()))
         self._exclude.on_click(window.guarded(lambda _: self._toggle()))
-
-    # --- standing in a camera ---------------------------------------------------------------------
-
-    @property
-    def current(self) -> int | None:
-        """The view in whose camera the reviewer stands; None = in none."""
-        return self._stand.view
 
     @property
     def chosen(self) -> int:
@@ -67,29 +126,24 @@ class ViewsPanel:
         Raises:
             InputError: no scene is open.
         """
-        return self._index()
+        if self._view.value not in self._numbers:
+            raise InputError("no scene is open yet.")
+        return self._numbers[self._view.value]
 
-    def stand_in(self, view: int) -> None:
-        """Stand in the camera of a view."""
-        self._stand.enter(view)
+    def show_chosen(self) -> None:
+        """Show the photograph of the chosen view."""
+        self.show_photograph(self.chosen)
+
+    def show_photograph(self, view: int) -> None:
+        """Show the photograph of a view over the scene."""
         label = next((k for k, v in self._numbers.items() if v == view), None)
         if label is not None:
             self._view.value = label
-
-    def toggle(self) -> None:
-        """Stand in the chosen camera, or leave it."""
-        if self._stand.view is None:
-            self.stand_in(self._index())
-        else:
-            self.leave()
-
-    def leave(self) -> None:
-        """Go back to where the reviewer looked from before."""
-        self._stand.leave()
+        self._window.photographs.open(view)
 
     def moved(self) -> None:
         """Draw the outlines anew: an object is being moved."""
-        self._stand.redraw()
+        self._window.photographs.tell()
 
     def eye(self) -> Any:
         """Return T_world_cam (4, 4) of the browser's camera."""
@@ -117,10 +171,6 @@ class ViewsPanel:
         center = se3.transform(window.placed.T_world_obj, mesh.bounds.mean(0)[None])[0]
         self._stand.look_past(center, base)
 
-    def close(self) -> None:
-        """Stop drawing: the browser is gone."""
-        self._stand.close()
-
     # --- the window's events ----------------------------------------------------------------------
 
     def opened(self) -> None:
@@ -141,7 +191,7 @@ class ViewsPanel:
         ]
         self._excluded.content = "\n".join(lines) or "no view is left out"
         self._label_exclude()
-        self._stand.redraw()
+        self.moved()
 
     # --- how --------------------------------------------------------------------------------------
 
@@ -155,37 +205,14 @@ class ViewsPanel:
             if label is not None:
                 self._view.value = label
 
-    def _index(self) -> int:
-        if self._view.value not in self._numbers:
-            raise InputError("no scene is open yet.")
-        return self._numbers[self._view.value]
-
-    def _chosen(self) -> None:
-        self._label_exclude()
-        if self._stand.view is not None:
-            self._stand.enter(self._index())
-
-    def _stepped(self, step: int) -> None:
-        names = list(self._numbers)
-        at = (names.index(self._view.value) + step) % len(names)
-        self._view.value = names[at]
-        self.stand_in(self._numbers[names[at]])
-
     def _label_exclude(self) -> None:
         excluded = self._window.standing.state.excluded_views()
         is_out = self._numbers.get(self._view.value, -1) in excluded
         self._exclude.label = "Take it in again" if is_out else "Leave it out"
 
     def _toggle(self) -> None:
-        window, view = self._window, self._index()
+        window, view = self._window, self.chosen
         is_out = view in window.standing.state.excluded_views()
         entry = window.session.set_view(view, not is_out, window.reviewer, self._why.value)
         self._why.value = ""
         window.decided(entry, f"view {view} is {'taken in again' if is_out else 'left out'}")
-
-    def _told(self, view: int | None, words: str) -> None:
-        self._leave.disabled = view is None
-        self._text.content = words
-        self._window.show.in_camera(view is not None)
-        self._window.correct.in_camera()
-        self._window.grasps.stood_in(view)

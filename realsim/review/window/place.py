@@ -26,8 +26,6 @@ class Place:
     scene: str = ""
     """Name of the session; '' = none was said."""
     instance: int | None = None
-    view: int | None = None
-    """The view in whose camera the reviewer stands."""
     eye: Point | None = None
     """Where the browser's camera stands [m]."""
     look_at: Point | None = None
@@ -38,10 +36,8 @@ class Place:
         said: dict[str, str] = {"scene": self.scene}
         if self.instance is not None:
             said |= {"instance": str(self.instance), "object": name}
-        if self.view is not None:
-            said["view"] = str(self.view)
         for key, point in (("eye", self.eye), ("at", self.look_at)):
-            if point is not None and self.view is None:
+            if point is not None:
                 said[key] = ",".join(f"{v:.4f}" for v in point)
         return urlencode(said)
 
@@ -56,7 +52,7 @@ class Place:
             eye = at = None
         return Place(
             scene=said.get("scene", ""), instance=_number(said.get("instance", "")),
-            view=_number(said.get("view", "")), eye=eye, look_at=at,
+            eye=eye, look_at=at,
         )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, Protocol
 
@@ -33,7 +33,7 @@ from realsim.review.window.panel_grasps import GraspsPanel
 from realsim.review.window.panel_list import ListPanel
 from realsim.review.window.panel_object import ObjectPanel
 from realsim.review.window.panel_show import ShowPanel
-from realsim.review.window.panel_views import ViewsPanel
+from realsim.review.window.panel_views import PhotographLink, ViewsPanel
 
 PANEL_PX, PANEL_HEIGHT_PX, EDGE_PX = 300, 530, 8
 """Width and height of the panel on the right, and how far from the window's edges it floats [px]:
@@ -60,6 +60,10 @@ class Sessions(Protocol):
 
     def tell(self) -> None:
         """Show a decision in all windows at once."""
+        ...
+
+    def others(self, window: "Window") -> Sequence[str]:
+        """Return what the other reviewers look at, in words."""
         ...
 
 
@@ -91,7 +95,7 @@ class Window:
         """Instance of the object that is looked at."""
         self._opened: Opened | None = None
         self._busy = threading.Lock()
-        self._browser = Browser(self)
+        self.browser = Browser(self)
         self._seen: object = None
         self._standing: Standing | None = None
         self._is_closed = False
@@ -101,6 +105,7 @@ class Window:
         gui.main_panel.float(x=-EDGE_PX, y=EDGE_PX, width=PANEL_PX, height=PANEL_HEIGHT_PX)
         self._name = gui.add_text("Your name", reviewer, hint="Decisions are signed with it.")
         self._message = gui.add_html("")
+        self.photographs = PhotographLink(self)
         self.list = ListPanel(self)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Object"):
@@ -113,7 +118,7 @@ class Window:
             self.grasps = GraspsPanel(self)
         with tabs.add_tab("Show"):
             self.show = ShowPanel(self)
-        self._name.on_update(self.guarded(lambda _: self._browser.keep_name(self.reviewer)))
+        self._name.on_update(self.guarded(lambda _: self.browser.keep_name(self.reviewer)))
         self._up = np.array([0.0, 0.0, 1.0])
         """What is up in the browser's scene, in world."""
         client.camera.on_update(lambda _: self._looked())
@@ -122,10 +127,10 @@ class Window:
 
     def start(self) -> None:
         """Open what the address names, else the worst object that nobody judged."""
-        if not self._browser.go_to_place():
+        self.browser.read_drafts()
+        if not self.browser.go_to_place():
             self._go_to_worst()
-        kept = "" if self.reviewer else self._browser.name()
-        if kept and not self.reviewer:
+        if kept := "" if self.reviewer else self.browser.name():
             self._name.value = kept
 
     def _go_to_worst(self) -> None:
@@ -139,7 +144,6 @@ class Window:
     def close(self) -> None:
         """Forget the browser: it is gone."""
         self._is_closed = True
-        self.views.close()
         self.grasps.close()
 
     # --- what is looked at ------------------------------------------------------------------------
@@ -196,6 +200,15 @@ class Window:
             raise InputError("no object is selected; click one in the scene or in the list.")
         return self.standing.scene.object(self.selected)
 
+    def shown_objects(self) -> tuple[ObjectPose, ...]:
+        """Return the objects that can be drawn, as they stand here, the moved copy among them."""
+        objects = list(self.standing.scene.objects)
+        moved = self.correct.moved
+        if moved is not None:
+            now = [moved if o.instance == moved.instance else o for o in objects]
+            objects = [replace(o, reasons=()) for o in now]
+        return self.session.with_models(objects)
+
     def model_of(self, placed: ObjectPose) -> ObjectModel:
         """Return an object's model, symmetric as it was marked; a stand-in where it is missing."""
         return self.session.shown_model(placed)
@@ -225,7 +238,7 @@ class Window:
         """Look at an object of this scene."""
         with self.lock:
             if instance != self.selected:
-                self.correct.put_back()
+                self.correct.set_aside()
                 self.selected = instance
                 if self._opened is not None:
                     self._opened.nodes.highlight(instance)
@@ -251,15 +264,14 @@ class Window:
             content = session.content(progress)
             with self.lock:
                 if self._opened is not None:
-                    self.views.leave()
-                    self.correct.put_back()
+                    self.correct.set_aside()
                     self.grasps.closed()
                     self._opened.nodes.clear()
                 nodes = SceneNodes(self.client.scene, content, session.config)
                 with self.client.atomic():
                     nodes.build()
                 nodes.on_object(self._guarded_call(self.select))
-                nodes.on_camera(self._guarded_call(self.views.stand_in))
+                nodes.on_camera(self._guarded_call(self.views.show_photograph))
                 nodes.on_grasp(self._guarded_call(self.grasps.clicked))
                 models = {o.instance: o.obj_id for o in content.scene.objects}
                 self._opened = Opened(session, content, nodes, models)
@@ -270,7 +282,7 @@ class Window:
             # the camera is sent when the browser has answered that it has turned the scene.
             self.client.flush()
             if not np.allclose(content.look.up, self._up):
-                self._browser.wait()
+                self.browser.wait()
                 self._up = content.look.up
             with self.lock:
                 self.views.first_look()
@@ -282,14 +294,15 @@ class Window:
         if self._is_closed:
             return
         with self.lock:
-            seen = tuple(id(s.standing) for s in self.server.sessions)
+            others = tuple(self.server.others(self))
+            seen = (*(id(s.standing) for s in self.server.sessions), others)
             if seen == self._seen and not force:
                 return
             self._seen = seen
             if self._opened is not None:
                 self._standing = self._opened.session.standing
             with self.client.atomic():
-                self.list.refresh()
+                self.list.refresh(others)
                 if self._opened is not None:
                     self._place_all()
                     for panel in (self.object, self.correct, self.views, self.grasps, self.show):
@@ -320,7 +333,7 @@ class Window:
             return
         camera = self.client.camera
         self._opened.nodes.clear_sight(camera.position, camera.look_at)
-        self._browser.tell_place(self._opened.session.name)
+        self.browser.tell_place(self._opened.session.name)
 
     def _place_all(self) -> None:
         """Put every object where the reviewers left it, in the colour of its verdict."""

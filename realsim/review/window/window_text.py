@@ -211,15 +211,16 @@ def list_label(row: ObjectRow, scene: str, *, with_scene: bool) -> str:
     return "\n".join(one_line(" \u00b7 ".join(parts)) for parts in (what, said))
 
 
-def progress_html(judged: int, total: int, scenes: int) -> str:
-    """Return how far the review has come, in words and as a bar."""
+def progress_html(judged: int, total: int, scenes: int, others: Sequence[str] = ()) -> str:
+    """Return how far the review has come, in words and as a bar, and what others look at."""
     more = f" in {scenes} scenes" if scenes > 1 else ""
     share = 100.0 * judged / max(total, 1)
+    people = "".join(f"<div>\u25cf {html.escape(one_line(who))}</div>" for who in others)
     return (
         f'<div style="margin:2px 10px"><b>{judged} of {total}</b> objects judged{more}'
         '<div style="height:5px;margin-top:4px;background:#dee2e6;border-radius:3px">'
         f'<div style="height:5px;width:{share:.1f}%;background:#1864ab;border-radius:3px"></div>'
-        "</div></div>"
+        f"</div>{people}</div>"
     )
 
 
