@@ -133,6 +133,33 @@ def _plotly_when_called() -> None:
     sys.modules.setdefault(name, module)
 
 
+def offer(extra: str) -> str:
+    """Return the commands that install an extra."""
+    pip = f"`pip install 'realsim[{extra}]'`"
+    return f"Install it with: `uv sync --inexact --extra {extra}`, or {pip}"
+
+
+def import_extra(module: str, extra: str, use: str, instead: str = "") -> Any:
+    """Return a module that an extra brings.
+
+    Args:
+        module: as it is imported.
+        extra: name of the extra.
+        use: what needs it; the subject of the message.
+        instead: what works without it, as a sentence.
+
+    Raises:
+        MissingLibraryError: it cannot be imported; the message says what to type.
+    """
+    try:
+        return import_module(module)
+    except (ImportError, OSError) as error:
+        raise MissingLibraryError(
+            f"{use} needs {module.split('.', maxsplit=1)[0]}, which cannot be imported ({error}). "
+            f"{offer(extra)}. {instead}".rstrip()
+        ) from error
+
+
 def import_open3d() -> Any:
     """Return the module `open3d`; the only way realsim imports it.
 

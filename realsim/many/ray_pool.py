@@ -35,6 +35,7 @@ from pathlib import Path
 from typing import Any
 
 from realsim.errors import InputError
+from realsim.interop import offer
 from realsim.many.carried import Incoming, packed
 from realsim.many.pool import (
     LOCAL_CLUSTER,
@@ -98,9 +99,9 @@ def _require_ray() -> None:
         is_there = False
     if not is_there:
         raise InputError(
-            "Ray is not installed; it runs work on more machines than one. Install it with `uv "
-            "sync --extra cluster` or `pip install 'realsim[cluster]'`, or leave out --address: "
-            "the cores of this machine are used without it."
+            "Ray is not installed; it runs work on more machines than one. "
+            f"{offer('cluster')}, or leave out --address: the cores of this machine are used "
+            "without it."
         )
 
 

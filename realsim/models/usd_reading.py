@@ -6,7 +6,6 @@ texture or a plain colour; without one, `displayColor`. Surfaces of subdivision 
 cage.
 """
 
-import importlib
 import signal
 import subprocess
 import sys
@@ -18,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from realsim.arrays import Array
-from realsim.errors import InputError, MissingLibraryError
-from realsim.interop import quiet_output
+from realsim.errors import InputError
+from realsim.interop import import_extra, quiet_output
 from realsim.models.mesh_atlas import FileContent, Piece, placed
 from realsim.models.mesh_loading import escape_error
 from realsim.models.mesh_usd_materials import (
@@ -125,17 +124,11 @@ class _Pxr:
     """Pixar's modules, imported when a USD file is read."""
 
     def __init__(self) -> None:
-        try:
-            modules = {
-                name: importlib.import_module(f"pxr.{name}")
-                for name in ("Usd", "UsdGeom", "UsdShade", "Sdf", "Ar")
-            }
-        except ImportError as error:
-            raise MissingLibraryError(
-                f"reading USD needs Pixar's library, which cannot be imported ({error}). Install "
-                "the extra: `pip install 'realsim[usd]'` (or `uv sync --extra usd`), or export "
-                "the mesh as GLB."
-            ) from error
+        instead = "A mesh in a GLB is read without it."
+        modules = {
+            name: import_extra(f"pxr.{name}", "usd", "reading USD", instead)
+            for name in ("Usd", "UsdGeom", "UsdShade", "Sdf", "Ar")
+        }
         self.Usd: Any = modules["Usd"]
         self.UsdGeom: Any = modules["UsdGeom"]
         self.UsdShade: Any = modules["UsdShade"]

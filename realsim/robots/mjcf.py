@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 
 from realsim.arrays import Array
-from realsim.errors import InputError, MissingLibraryError
+from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.interop import import_extra
 from realsim.robots.robot_files import RobotFolder
 from realsim.robots.urdf import UrdfChain, UrdfShape, onto_z
 
@@ -25,15 +26,11 @@ def read_mjcf_chain(folder: RobotFolder, file: str, base: str, flange: str) -> U
         InputError: MuJoCo refuses the file, no such bodies, or a joint that is no hinge.
         MissingLibraryError: MuJoCo is not installed.
     """
-    try:
-        import mujoco
-    except ImportError as error:
-        raise MissingLibraryError(
-            f"{folder.path} is described by an MJCF, which MuJoCo reads; it is not installed: "
-            "pip install 'realsim[mujoco]'. A URDF needs no more than realsim."
-        ) from error
+    module = import_extra(
+        "mujoco", "mujoco", f"{folder.path}, which is described by an MJCF,",
+        "A URDF is read without it.",
+    )  # fmt: skip
     path = folder.file(file, "the MJCF")
-    module: Any = mujoco
     try:
         model = module.MjModel.from_xml_path(str(path))
     except ValueError as error:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from realsim.arrays import Array, Mask
 from realsim.errors import MissingLibraryError
-from realsim.interop import import_pinocchio
+from realsim.interop import import_pinocchio, offer
 from realsim.robots.arm import UR5, arm_of
 from realsim.robots.coal_geometry import coal_shape
 from realsim.robots.shapes import Mount, WorkCell
@@ -41,8 +41,8 @@ def robots_folder() -> Path:
         wheel = distribution("example-robot-data")
     except PackageNotFoundError:
         raise MissingLibraryError(
-            "the UR5's meshes come with the package example-robot-data, which is not installed: "
-            "pip install 'realsim[looks]'."
+            "the UR5's meshes come with the package example-robot-data, which is not installed. "
+            f"{offer('looks')}."
         ) from None
     folder = Path(str(wheel.locate_file("cmeel.prefix/share/example-robot-data/robots")))
     if not (folder / URDF).is_file():

@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module, metadata
+from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,8 +24,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from realsim.arrays import Array
-from realsim.errors import InputError, MissingLibraryError, RealsimError
+from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
+from realsim.interop import import_extra
 from realsim.robots.kinematics import DhChain
 from realsim.robots.limits import JointLimits
 from realsim_capture_plans.devices.franka_messages import lost, named, off_goal, stopped, trouble
@@ -90,13 +91,7 @@ class FrankaArm:
             InputError: it is another robot, or the installed franky is not for its software.
             ArmStoppedError: it cannot be reached; the message says what to do.
         """
-        try:
-            self._franky: Any = import_module("franky")
-        except (ImportError, OSError) as error:
-            raise MissingLibraryError(
-                f"franky, which drives a Franka arm, cannot be imported: {error}. Install it with "
-                "`pip install realsim[franka]`, or `uv sync --extra franka`."
-            ) from error
+        self._franky = import_extra("franky", "franka", "a Franka arm")
         self._host, self._chain, self._who = host, chain, f"{chain.name} at {host}"
         self._config = FrankaConfig() if config is None else config
         # franky's robot: whatever else keeps it keeps the connection.

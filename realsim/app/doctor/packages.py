@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass
 
-REINSTALL = "`uv sync`, or `pip install realsim` once more"
+from realsim.interop import offer
+
+REINSTALL = "`uv sync --inexact`, or `pip install realsim` once more"
 """How a required package is got."""
 
 
@@ -24,7 +26,7 @@ class Package:
         """The command that gets it."""
         if not self.extra:
             return REINSTALL
-        return f"`pip install 'realsim[{self.extra}]'`, or `uv sync --inexact --extra {self.extra}`"
+        return offer(self.extra)
 
 
 _REQUIRED = (

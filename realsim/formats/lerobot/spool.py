@@ -31,6 +31,7 @@ from realsim.formats.lerobot.episodes import (
     depth_of_codes,
 )
 from realsim.formats.lerobot.tables import PictureStats, Stats
+from realsim.interop import import_extra
 from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
 
 ENCODER = "libx264"
@@ -53,16 +54,10 @@ def import_av() -> Any:
     """Return PyAV.
 
     Raises:
-        InputError: it is not installed.
+        MissingLibraryError: it, or pyarrow, is not installed.
     """
-    try:
-        import av
-    except ImportError:
-        raise InputError(
-            "PyAV is not installed; it writes the videos of LeRobot data sets. Install it with "
-            "`uv sync --extra lerobot` or `pip install 'realsim[lerobot]'`."
-        ) from None
-    return av
+    import_extra("pyarrow", "lerobot", "a LeRobot data set")
+    return import_extra("av", "lerobot", "a LeRobot data set")
 
 
 class VideoFile:

@@ -1,15 +1,14 @@
 """Pixar's library, which comes with an extra."""
 
-import importlib
 from typing import Any
 
 import numpy as np
 
-from realsim.errors import MissingLibraryError
 from realsim.formats.robot_scenes.mesh_obj import PLAIN_RGB, Look, collision_parts, look_of
 from realsim.formats.robot_scenes.placed_scene import RigidBody, principal_inertia
 from realsim.geometry import se3
 from realsim.images.png import encode_png
+from realsim.interop import import_extra
 from realsim.records import Mesh
 
 MODULES = ("Gf", "Sdf", "Usd", "UsdGeom", "UsdPhysics", "UsdSemantics", "UsdShade", "Vt")
@@ -24,14 +23,10 @@ class Pixar:
         Raises:
             MissingLibraryError: the extra is not installed.
         """
-        try:
-            found = {name: importlib.import_module(f"pxr.{name}") for name in MODULES}
-        except ImportError as error:
-            raise MissingLibraryError(
-                f"writing USD needs Pixar's library, which cannot be imported ({error}). Install "
-                "the extra: `pip install 'realsim[usd]'` (or `uv sync --extra usd`), or write URDF "
-                "or MJCF."
-            ) from error
+        instead = "URDF and MJCF are written without it."
+        found = {
+            name: import_extra(f"pxr.{name}", "usd", "writing USD", instead) for name in MODULES
+        }
         self.Gf: Any = found["Gf"]
         self.Sdf: Any = found["Sdf"]
         self.Usd: Any = found["Usd"]

@@ -78,7 +78,7 @@ def import_kiss(module: str) -> Any:
     except ImportError as error:
         raise MissingLibraryError(
             f"kiss_icp cannot be imported: {error}. Camera motion from depth needs it; install it "
-            "with `uv sync` or `pip install kiss-icp`."
+            "with `uv sync --inexact` or `pip install kiss-icp`."
         ) from error
 
 

@@ -6,10 +6,14 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from realsim.errors import InputError
+from realsim.interop import import_extra
 from realsim.rendering.photoreal.llvm_probe import LEAST_LLVM, find_llvm
 
 Wanted = Literal["auto", "llvm", "scalar"]
 LLVM, SCALAR = "llvm_ad_rgb", "scalar_rgb"
+MITSUBA = (
+    "mitsuba", "photo", "the photoreal renderer", "The embedded renderer needs no extra.",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -43,7 +47,8 @@ def load_mitsuba(wanted: Wanted = "auto") -> MitsubaVariant:
             `llvm` = LLVM or an error; `scalar` = scalar.
 
     Raises:
-        InputError: Mitsuba is not installed, or `llvm` is wanted and no library works.
+        InputError: `llvm` is wanted and no library works.
+        MissingLibraryError: Mitsuba is not installed.
     """
     why_not = "" if wanted == "scalar" else _prepare_llvm()
     if why_not and wanted == "llvm":
@@ -51,7 +56,7 @@ def load_mitsuba(wanted: Wanted = "auto") -> MitsubaVariant:
             f"photoreal pictures: the variant 'llvm' was asked for, and {why_not} The variant "
             "'scalar' (or 'auto') works without LLVM and takes several times as long."
         )
-    mitsuba = _import_mitsuba()
+    mitsuba = import_extra(*MITSUBA)
     name = SCALAR if wanted == "scalar" or why_not else LLVM
     mitsuba.set_variant(name)
     notes = (
@@ -60,19 +65,6 @@ def load_mitsuba(wanted: Wanted = "auto") -> MitsubaVariant:
         else ()
     )
     return MitsubaVariant(module=mitsuba, name=name, notes=notes)
-
-
-def _import_mitsuba() -> Any:
-    """Return the module, or say which extra brings it."""
-    try:
-        import mitsuba
-    except ImportError as error:
-        raise InputError(
-            f"photoreal pictures need Mitsuba, which cannot be loaded here ({error}). Install the "
-            "extra: `pip install 'realsim[photo]'` (or `uv sync --extra photo`), or use the "
-            "embedded renderer, which needs no extra."
-        ) from error
-    return mitsuba
 
 
 def _prepare_llvm() -> str:
@@ -105,4 +97,4 @@ def _import_drjit_metadata() -> None:
     from importlib.util import find_spec
 
     if find_spec("mitsuba") is None or find_spec("drjit") is None:
-        _import_mitsuba()
+        import_extra(*MITSUBA)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 from realsim.errors import InputError
+from realsim.interop import offer
 from realsim_sim_bridge.slip.world import Engine, Replay
 
 # --- PyBullet's settings for the slip test -------------------------------------------------------
@@ -88,9 +89,8 @@ def make_engine(settings: BulletSettings | MujocoSettings) -> Engine:
         import mujoco  # noqa: F401  # pyright: ignore[reportUnusedImport]
     except ImportError:
         raise InputError(
-            "MuJoCo is not installed; it is the Robot School's second engine. Install it with "
-            "`uv sync --extra mujoco` or `pip install 'realsim[mujoco]'`, or use the engine "
-            "pybullet."
+            "MuJoCo is not installed; it is the Robot School's second engine. "
+            f"{offer('mujoco')}, or use the engine pybullet."
         ) from None
     from realsim_sim_bridge.slip.mujoco_world import MujocoEngine
 

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from realsim import images
 from realsim.arrays import UInt8, UInt16
 from realsim.errors import InputError
+from realsim.interop import offer
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_camera import DepthCamera
 from realsim.rendering.depth_sensors.profiles import profile
@@ -107,9 +108,8 @@ def require_renderer(config: SyntheticConfig) -> None:
     """
     if config.renderer == "photoreal" and find_spec("mitsuba") is None:
         raise InputError(
-            "the photoreal renderer needs Mitsuba, which is not installed. Install the extra: "
-            "`pip install 'realsim[photo]'` (or `uv sync --extra photo`), or use the embedded "
-            "renderer, which needs no extra (--renderer embedded)."
+            f"the photoreal renderer needs Mitsuba, which is not installed. {offer('photo')}, or "
+            "use the embedded renderer, which needs no extra (--renderer embedded)."
         )
 
 

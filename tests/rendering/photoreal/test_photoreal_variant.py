@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from llvm_library import NEEDS_LLVM
-from realsim.errors import InputError
+from realsim.errors import InputError, MissingLibraryError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Environment
@@ -156,7 +156,7 @@ def test_without_llvm_the_scalar_variant_renders_and_says_so(
 
 def test_without_mitsuba_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    with pytest.raises(InputError, match=r"realsim\[photo\]"):
+    with pytest.raises(MissingLibraryError, match=r"realsim\[photo\]"):
         PhotorealRenderer([], SKY, PhotorealConfig(variant="scalar", samples=1))
 
 
