@@ -3,7 +3,6 @@
 grasps/000002_obj000007.npz .json   every set, exact and readable
 grasps/trajectories/                what the arm did
 grasps/grasps.h5                    everything in one file
-grasps/grasps.parquet trajectories.parquet
 models/                             the meshes, where the scene came from another program
 reports/school.html school.json     the page, and its counts for programs
 """
@@ -113,12 +112,10 @@ def _together(
 
 
 def write_tables(folder: Path, grasps: SceneGrasps) -> None:
-    """Write grasps.h5 and grasps.parquet, which other programs read."""
+    """Write grasps.h5, which other programs read."""
     from realsim.formats.grasps.hdf5 import write_grasps_hdf5
-    from realsim.formats.grasps.parquet import write_grasps_parquet
 
     write_grasps_hdf5(folder / HDF5, grasps)
-    write_grasps_parquet(folder / GRASPS, grasps)
 
 
 # --- reading it back ----------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 OUT/grasp_label/NNN_labels.npz            labels that were computed, in GraspNet's layout
 OUT/SPLIT/SCENE/grasps_analytic/*.npz     the sets, as in grasps/; closure_friction = the label
-OUT/SPLIT/SCENE/grasps_analytic/grasps.h5, grasps.parquet
+OUT/SPLIT/SCENE/grasps_analytic/grasps.h5
 """
 
 from collections.abc import Mapping, Sequence
@@ -115,7 +115,6 @@ def labels_file(model: ObjectModel, job: AnalyticJob) -> Path:
 def _write(folder: Path, sets: Sequence[GraspSet], names: Mapping[int, str], key: str) -> None:
     """Write the sets and their tables; the note, which says that they are whole, comes last."""
     from realsim.formats.grasps.hdf5 import write_grasps_hdf5
-    from realsim.formats.grasps.parquet import write_grasps_parquet
     from realsim.formats.grasps.scene_grasps import SceneGrasps
     from realsim.store import save_grasps
 
@@ -128,7 +127,6 @@ def _write(folder: Path, sets: Sequence[GraspSet], names: Mapping[int, str], key
     if sets:
         together = SceneGrasps(sets=tuple(sets), names=dict(names))
         write_grasps_hdf5(folder / "grasps.h5", together)
-        write_grasps_parquet(folder, together)
     atomic.write_json(folder / NOTE, {"key": key})
 
 
