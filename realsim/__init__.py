@@ -8,6 +8,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from realsim.app.verbs import (
+        Result,
+        annotate,
+        calibrate,
+        demo,
+        export,
+        open,
+        plan,
+        register,
+        render,
+        review,
+        scan,
+        school,
+    )
     from realsim.errors import InputError, RealsimError
     from realsim.records import (
         CameraIntrinsics,
@@ -34,10 +48,22 @@ __all__ = [
     "ObjectModel",
     "ObjectPose",
     "RealsimError",
+    "Result",
     "Scene",
     "SupportPlane",
     "TagBoard",
     "View",
+    "annotate",
+    "calibrate",
+    "demo",
+    "export",
+    "open",
+    "plan",
+    "register",
+    "render",
+    "review",
+    "scan",
+    "school",
 ]
 
 
@@ -46,4 +72,6 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'realsim' has no attribute '{name}'")
     where = "realsim.errors" if name.endswith("Error") else "realsim.records"
+    if name.islower() or name == "Result":
+        where = "realsim.app.verbs"
     return getattr(import_module(where), name)

@@ -169,23 +169,27 @@ def _run() -> None:
             told if told.endswith(".") else f"{told}; the same command goes on from here.", err=True
         )
         sys.exit(TERMINATED if isinstance(reason, Terminated) else 130)
-    except RealsimError as error:
-        click.echo(f"error: {error}", err=True)
-        sys.exit(2)
-    except ImportError as error:
-        if "cannot open shared object file" not in str(error):
-            raise  # a bug: its place is wanted
-        from realsim.interop import missing_library
-
-        click.echo(f"error: {missing_library(error.name or 'a library', error)}", err=True)
-        sys.exit(2)
     except BrokenPipeError:
         raise
-    except OSError as error:
-        where = f" ({error.filename})" if error.filename else ""
-        click.echo(
-            f"error: the system refused a file operation: {error.strerror or error}{where}. "
-            "Check that the path exists, that it may be written, and that the disk is not full.",
-            err=True,
-        )
+    except (RealsimError, ImportError, OSError) as error:
+        if (text := refusal(error)) is None:
+            raise  # a bug: its place is wanted
+        click.echo(f"error: {text}", err=True)
         sys.exit(2)
+
+
+def refusal(error: Exception) -> str | None:
+    """Return what is said of an error that the user can mend; None = it is a bug."""
+    if isinstance(error, ImportError):
+        if "cannot open shared object file" not in str(error):
+            return None
+        from realsim.interop import missing_library
+
+        return str(missing_library(error.name or "a library", error))
+    if isinstance(error, OSError):
+        where = f" ({error.filename})" if error.filename else ""
+        return (
+            f"the system refused a file operation: {error.strerror or error}{where}. "
+            "Check that the path exists, that it may be written, and that the disk is not full."
+        )
+    return str(error)

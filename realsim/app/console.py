@@ -9,14 +9,18 @@ import sys
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import click
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
 Tick = Callable[[int, int], None]
 """Called with (done, total)."""
+Progress = Callable[[str, int, int], None]
+"""Called with (what is done, done, total)."""
 SECONDS_BETWEEN_LINES = 10.0
 """Least time between two lines of progress in a log [s]: one can see that it goes on, no more."""
 PIPED_WIDTH = 120
@@ -32,6 +36,22 @@ class StageTime:
     """User and system time of this process and of its ended children [s]."""
     wall_s: float
     """Time on the clock [s]."""
+
+
+@dataclass(eq=False, kw_only=True)
+class Told:
+    """What a command tells a caller in Python: the object (`obj`) of click's context."""
+
+    tables: list[tuple[str, Sequence[str], list[list[str]]]] = field(default_factory=list[Any])
+    """Title, header and rows of every table."""
+    notes: list[str] = field(default_factory=list[str])
+    """What the user must not miss."""
+    document: Any = None
+    """The whole result, as `--json` has it."""
+    passed: bool = True
+    """Whether no check failed: the command's exit code is 0."""
+    progress: Progress | None = None
+    """Called as a stage goes on; None = as on the command line."""
 
 
 def cpu_seconds() -> float:
@@ -58,6 +78,8 @@ class Console:
         self._err = _rich(stderr=True)
         self._last_line = time.monotonic()
         self._doing = ""
+        context = click.get_current_context(silent=True)
+        self._told = None if context is None else context.find_object(Told)
 
     @contextmanager
     def stage(self, name: str, note: str = "") -> Generator[Tick]:
@@ -71,7 +93,10 @@ class Console:
         cpu, wall = cpu_seconds(), time.perf_counter()
         label = f"{name}: {note}" if note else name
         self._doing = ""
-        if self.quiet:
+        progress = None if self._told is None else self._told.progress
+        if progress is not None:
+            yield lambda done, total: progress(label, done, total)
+        elif self.quiet:
             yield _no_tick
         elif sys.stderr.isatty() and not self._err.is_dumb_terminal:
             with self._bar(label) as tick:
@@ -144,13 +169,15 @@ class Console:
 
     def say(self, text: str) -> None:
         """Print one line of result."""
-        if not (self.as_json and self.quiet):
+        if not (self.quiet and (self.as_json or self._told is not None)):
             self._out.print(text, soft_wrap=True, markup=False)
 
     def warn(self, text: str) -> None:
         """Print one line that the user must not miss."""
         from rich.markup import escape
 
+        if self._told is not None:
+            self._told.notes.append(text)
         self._err.print(f"[yellow]note:[/yellow] {escape(text)}", soft_wrap=True)
 
     def result(self, document: object) -> None:
@@ -159,6 +186,8 @@ class Console:
         Args:
             document: a mapping or a record (see `json_values`).
         """
+        if self._told is not None:
+            self._told.document = document
         if self.as_json:
             from realsim.app.json_values import json_document
 
@@ -175,7 +204,9 @@ class Console:
         if self.as_json:
             return
         cells = [[str(cell) for cell in row] for row in rows]
-        if _least_width(header, cells) > self._out.width:
+        if self._told is not None:
+            self._told.tables.append((title, header, cells))
+        elif _least_width(header, cells) > self._out.width:
             self._blocks(title, header, cells)
         else:
             self._grid(title, header, cells)

@@ -1,5 +1,7 @@
 """The web review: look at a registered session in the browser and judge every object."""
 
+import sys
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from realsim.review.corrections import reviewed_scene
@@ -19,3 +21,16 @@ def __getattr__(name: str) -> Any:
 
         return getattr(server, name)
     raise AttributeError(f"module 'realsim.review' has no attribute '{name}'")
+
+
+class ReviewPackage(ModuleType):
+    """The package, which is the verb `rs.review(...)` as well: Python gives both one name."""
+
+    def __call__(self, *sessions: Any, **options: Any) -> Any:
+        """Do what `realsim.app.verbs.review` does."""
+        from realsim import __getattr__ as promised
+
+        return promised("review")(*sessions, **options)
+
+
+sys.modules[__name__].__class__ = ReviewPackage

@@ -1,0 +1,147 @@
+"""The verbs of `import realsim as rs` do what the commands do, to the last bit."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+
+import realsim as rs
+from realsim.app.cli import commands
+from realsim.app.command import walk
+from realsim.app.verbs import run
+from shared_sessions import copy_of
+
+RUN = "from realsim.app.cli import main; main()"
+IMPORT = """
+import sys, time
+before = time.process_time()
+import realsim
+print(time.process_time() - before, "numpy" in sys.modules, "click" in sys.modules)
+"""
+VERBS = ("annotate", "calibrate", "export", "open", "plan", "register", "render", "review", "scan",
+         "school")  # fmt: skip
+
+
+def typed(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", RUN, *words], cwd=folder, capture_output=True, text=True
+    )
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of every file; of the record of a run without its time and its folder."""
+    found = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_file()}
+    return {name: p.read_bytes() for name, p in found.items() if not name.startswith("stages/")}
+
+
+def test_import_is_cheap_and_loads_nothing() -> None:
+    said = subprocess.run(
+        [sys.executable, "-c", IMPORT], capture_output=True, text=True, check=True
+    )
+    cpu_s, *loaded = said.stdout.split()
+    assert float(cpu_s) <= 0.05 and loaded == ["False", "False"]
+
+
+def test_every_promised_name_is_there() -> None:
+    assert set(VERBS) <= set(rs.__all__)
+    assert all(callable(getattr(rs, name)) for name in rs.__all__)
+    from realsim.review import replay  # the package of that name, which is the verb as well
+
+    assert callable(rs.review) and callable(replay)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        rs.nothing  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_named_arguments_are_options_of_the_commands() -> None:
+    import inspect
+
+    found = walk(commands)
+    several = {"open": ("import",), "scan": ("scan", "import"), "school": ("school", "run")}
+    for verb in VERBS:
+        known = {p.name for p in found[several.get(verb, (verb,))].params}
+        known |= {o.lstrip("-").replace("-", "_") for p in found[several.get(verb, (verb,))].params
+                  if isinstance(p, click.Option) for o in p.opts}  # fmt: skip
+        given = inspect.signature(getattr(rs, verb)).parameters.values()
+        named = {p.name for p in given if p.kind is p.KEYWORD_ONLY} - {"progress"}
+        assert named - known <= ({"session"} if verb == "scan" else set()), verb
+
+
+def test_a_plan_is_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    by_command, by_verb = tmp_path / "command", tmp_path / "verb"
+    for folder in (by_command, by_verb):
+        folder.mkdir()
+    monkeypatch.chdir(by_verb)
+    steps: list[tuple[str, int, int]] = []
+    made = rs.plan("plan.json", views=4, progress=lambda *step: steps.append(step))
+    done = typed("plan", "--views", "4", "--out", "plan.json", folder=by_command)
+    assert done.returncode == 0 and files(by_command) == files(by_verb) and made.passed
+    assert len(made.value) == 4 and steps[-1][1] == steps[-1][2]
+    document = json.loads(
+        typed("plan", "--views", "4", "--json", "--overwrite", folder=by_command).stdout
+    )
+    assert made.document["metrics"] == document["metrics"]
+    title, header, rows = made.tables[0]
+    assert (
+        title in done.stdout and rows[0][0] == "views of the plan" and len(header) == len(rows[0])
+    )
+    assert all(note in done.stderr.replace("\n", "") for note in made.notes)
+    assert [p.suffix for p in made.pictures] == [".png"] * len(made.pictures) and made.pictures
+
+
+def test_labels_are_the_commands(tmp_path: Path, registered_session: Path) -> None:
+    by_command, by_verb = (copy_of(registered_session, tmp_path / n) for n in ("a", "b"))
+    session = rs.open(by_verb)
+    assert session.value.views and "views with a camera pose" in session._repr_html_()
+    made = rs.annotate(session, maps="none", quiet=True)
+    done = typed("annotate", str(by_command), "--maps", "none", "--quiet", folder=tmp_path)
+    assert done.returncode == 0 and made.passed and Path(made) == by_verb
+    labels = files(by_verb)
+    assert labels == files(by_command) and "reports/annotated.png" in labels
+    figure = made.plot()
+    assert len(figure.axes) == 1 and figure.axes[0].images[0].get_array().shape[2] == 3
+    record = json.loads((by_verb / "stages/annotate.json").read_text())
+    assert record["run"]["command"] == ["annotate", "--maps", "none", "--quiet", str(by_verb)]
+
+
+def test_errors_say_what_the_command_prints(tmp_path: Path) -> None:
+    def told(verb: str, *places: str, **options: object) -> str:
+        with pytest.raises(rs.InputError) as refused:
+            getattr(rs, verb)(*places, **options)
+        return str(refused.value)
+
+    nowhere = str(tmp_path / "nowhere")
+    printed = typed("register", nowhere, folder=tmp_path).stderr
+    assert printed == f"error: {told('register', nowhere)}\n"
+    printed = typed("plan", "--views", "0", folder=tmp_path).stderr
+    assert printed.endswith(f"Error: {told('plan', views=0)}\n")
+    (tmp_path / "mine.html").write_text("mine")
+    assert "is no page that this command wrote" in told(
+        "review", nowhere, static=tmp_path / "mine.html"
+    )
+    assert "register has no option 'object_'; it has " in told("register", nowhere, object_="mug")
+    assert "kind are for an import" in told("open", nowhere, kind="bop")
+
+
+def test_a_failed_check_is_a_result(tmp_path: Path) -> None:
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models/models_info.json").write_text("{}")
+    (tmp_path / "models/obj_000007.ply").write_text("left over")
+    told = run("scan check", (tmp_path / "models",), {})
+    assert not told.passed and not told.document["sound"]
+
+
+def test_what_a_result_shows_is_escaped() -> None:
+    from realsim.app.verbs import Result
+
+    made = Result(
+        verb="scan", folder=Path("<b>"), value=[], pictures=[], notes=["a < b"],
+        tables=[("models & more", ["<name>"], [["<script>"]])],
+    )  # fmt: skip
+    shown = made._repr_html_()
+    assert "&lt;script&gt;" in shown and "a &lt; b" in shown and "<script>" not in shown
+    assert repr(made) == "<scan <b>: done>"
+    with pytest.raises(rs.InputError, match="has no pictures"):
+        made.plot()
