@@ -14,19 +14,12 @@ import numpy as np
 
 from realsim.app.annotate.current import annotate_session
 from realsim.app.calibrate.session import calibrate_session
-from realsim.app.calibrate.show import show_hand_eye
 from realsim.app.console import Console, StageTime
 from realsim.app.register.run import register_session
 from realsim.app.school.run import school_session
-from realsim.app.school.tables import show_school
-from realsim.app.show import show_scene
-from realsim.app.stages import (
-    BOARD_VIEWS,
-    save_starts,
-    session_models,
-)
+from realsim.app.stages import BOARD_VIEWS, save_starts
 from realsim.errors import InputError
-from realsim.records import CaptureSession, GraspSet, HandEye, Scene
+from realsim.records import CaptureSession, HandEye, Scene
 from realsim.robots.arm import find_arm
 from realsim.store import SessionStore
 from realsim.store.lock import only_run_in
@@ -38,6 +31,8 @@ if TYPE_CHECKING:
 
 BOARD_VIEW_SHARE = 24
 """Most board views of a demo; a smaller demo takes as many as scene views, 10 at least."""
+QUICK: dict[str, Any] = {"views": 8, "objects": 2, "grasps_per_object": 12}
+"""What `--quick` captures and tries."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -62,11 +57,7 @@ class DemoConfig:
 class DemoResult:
     """What the demo made and how far it is from the truth."""
 
-    folder: Path
     store: SessionStore
-    hand_eye: HandEye
-    scene: Scene
-    grasps: list[GraspSet]
     errors: "LoopErrors"
     report: Path
     times: list[StageTime]
@@ -86,8 +77,8 @@ def run_demo(config: DemoConfig, out: Path, console: Console) -> DemoResult:
     _claim(out, config)
     # One BLAS thread: on small matrices the spinning of more costs more than the work.
     with only_run_in(out), threadpool_limits(limits=1):
-        store, hand_eye, scene = capture_and_register(config, out, console)
-        grasps = school_session(
+        store, _, _ = capture_and_register(config, out, console)
+        school_session(
             store, console, grasps_per_object=config.grasps_per_object, seed=config.seed,
             workers=config.workers,
         )  # fmt: skip
@@ -95,10 +86,7 @@ def run_demo(config: DemoConfig, out: Path, console: Console) -> DemoResult:
         with console.stage("report"):
             errors = loop_errors(store, out / "truth")
             report = write_report(store, errors, times=console.times)
-    return DemoResult(
-        folder=out, store=store, hand_eye=hand_eye, scene=scene, grasps=grasps, errors=errors,
-        report=report, times=console.times,
-    )  # fmt: skip
+    return DemoResult(store=store, errors=errors, report=report, times=console.times)
 
 
 def capture_and_register(
@@ -225,24 +213,15 @@ def demo_document(result: DemoResult) -> dict[str, object]:
     }
 
 
-def show_demo(result: DemoResult, console: Console) -> None:
-    """Print the tables, the errors against the truth, the pictures, and what to do next."""
-    show_hand_eye(result.hand_eye, console)
-    show_scene(result.store, result.scene, console)
-    show_school(result.grasps, session_models(result.store), console)
-    console.table(
-        "Errors against the truth of the simulated lab",
-        ["figure", "measured", "goal"],
-        result.errors.rows(),
-    )
-    total = sum(t.cpu_s for t in result.times), sum(t.wall_s for t in result.times)
-    rows = [[t.name, f"{t.cpu_s:.1f}", f"{t.wall_s:.1f}"] for t in result.times]
-    console.table(
-        "Time", ["stage", "CPU [s]", "clock [s]"],
-        [*rows, ["all", f"{total[0]:.1f}", f"{total[1]:.1f}"]],
-    )  # fmt: skip
-    pictures = sorted((result.store.folder / "reports").glob("*.png"))
-    console.say(f"report    {result.report}")
-    for picture in pictures[:8]:
-        console.say(f"picture   {picture}")
-    console.say(f"review    realsim review {result.store.folder}")
+def show_demo(result: DemoResult, console: Console, site: Path | None = None) -> None:
+    """Print what it took, the errors against the truth, and three things to do next."""
+    times = [(t.name, t.cpu_s, t.wall_s) for t in result.times]
+    times.append(("all", sum(t.cpu_s for t in result.times), sum(t.wall_s for t in result.times)))
+    rows = [[name, f"{cpu:.1f}", f"{wall:.1f}"] for name, cpu, wall in times]
+    console.table("Time", ["stage", "CPU [s]", "clock [s]"], rows)
+    title = "Errors against the truth of the simulated lab"
+    console.table(title, ["figure", "measured", "goal"], result.errors.rows())
+    console.say("What to do next")
+    console.say(f"  1. Open {site or result.report} in a browser.")
+    console.say(f"  2. Judge the poses:  realsim review {result.store.folder}")
+    console.say("  3. Take your own images, recording or data set:  realsim import SOURCE session")
