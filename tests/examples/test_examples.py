@@ -1,7 +1,10 @@
 """Examples stay short and run as they stand: the quick ones here, .ci/run runs all of them."""
 
+import ast
+import json
 import runpy
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,3 +23,24 @@ def test_example_runs(
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(path), run_name="__main__")
     assert capsys.readouterr().out.strip()
+
+
+@pytest.mark.slow
+def test_the_cells_of_the_notebook_run_in_order_and_draw(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    cells = json.loads((EXAMPLES[0].parent / "tour.ipynb").read_text())["cells"]
+    texts = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    names: dict[str, Any] = {}
+    verbs: list[str] = []
+    for text in texts:
+        *lines, last = ast.parse(text).body
+        assert isinstance(last, ast.Expr)
+        target = ast.Name("shown", ast.Store())
+        tree = ast.Module([*lines, ast.Assign([target], last.value)], [])
+        exec(compile(ast.fix_missing_locations(tree), "cell", "exec"), names)  # noqa: S102 - the book
+        shown = names["shown"]
+        assert shown.passed and f"<b>{shown.verb} " in shown._repr_html_()
+        verbs.append(shown.verb)
+    assert len(set(verbs)) == 11 and (tmp_path / "scene.html").is_file()
