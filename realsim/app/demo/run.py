@@ -19,7 +19,7 @@ from realsim.app.register.run import register_session
 from realsim.app.school.run import school_session
 from realsim.app.stages import BOARD_VIEWS, save_starts
 from realsim.errors import InputError
-from realsim.records import CaptureSession, HandEye, Scene
+from realsim.records import CaptureSession, GraspSet, HandEye, Scene
 from realsim.robots.arm import find_arm
 from realsim.store import SessionStore
 from realsim.store.lock import only_run_in
@@ -58,6 +58,7 @@ class DemoResult:
     """What the demo made and how far it is from the truth."""
 
     store: SessionStore
+    grasps: list[GraspSet]
     errors: "LoopErrors"
     report: Path
     times: list[StageTime]
@@ -78,7 +79,7 @@ def run_demo(config: DemoConfig, out: Path, console: Console) -> DemoResult:
     # One BLAS thread: on small matrices the spinning of more costs more than the work.
     with only_run_in(out), threadpool_limits(limits=1):
         store, _, _ = capture_and_register(config, out, console)
-        school_session(
+        grasps = school_session(
             store, console, grasps_per_object=config.grasps_per_object, seed=config.seed,
             workers=config.workers,
         )  # fmt: skip
@@ -86,7 +87,7 @@ def run_demo(config: DemoConfig, out: Path, console: Console) -> DemoResult:
         with console.stage("report"):
             errors = loop_errors(store, out / "truth")
             report = write_report(store, errors, times=console.times)
-    return DemoResult(store=store, errors=errors, report=report, times=console.times)
+    return DemoResult(store=store, grasps=grasps, errors=errors, report=report, times=console.times)
 
 
 def capture_and_register(
