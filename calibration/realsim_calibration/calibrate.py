@@ -177,8 +177,8 @@ def require_given_camera(
         f"the given camera has a focal length of {np.sqrt(given.fx * given.fy):.1f} px, and the "
         f"images alone show {np.sqrt(own.fx * own.fy):.1f} +- {sd * own.fx:.1f} px: it is "
         f"{100 * off:+.1f} % off, so that the board seems too {'far' if off > 0 else 'near'}. Is "
-        "it the camera, the resolution and the focus of these images? Leave --camera out to have "
-        "the lens calibrated from these views."
+        "it the camera, the resolution and the focus of these images? Leave --intrinsics out "
+        "to have the lens calibrated from these views."
     )
 
 

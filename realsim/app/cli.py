@@ -16,39 +16,9 @@ import click
 
 from realsim import __version__
 from realsim.app.command import COMMAND_KEY, Group
+from realsim.app.front import COMMANDS, help_text
 from realsim.errors import RealsimError
 
-COMMANDS = {
-    "demo": "realsim.app.demo.cli:demo_command",
-    "robots": "realsim.app.robots.cli:ROBOTS",
-    "plan": "realsim.app.plan.cli:plan_command",
-    "plan-show": "realsim.app.plan.cli:plan_show_command",
-    "plan-convert": "realsim.app.plan.cli:plan_convert_command",
-    "board": "realsim.app.board.cli:board_command",
-    "capture": "realsim.app.capture.cli:capture_command",
-    "import": "realsim.app.importing.cli:import_command",
-    "check": "realsim.app.check.cli:check_command",
-    "calibrate": "realsim.app.calibrate.cli:calibrate_command",
-    "scan": "realsim.app.scan.cli:SCAN",
-    "register": "realsim.app.register.cli:register_command",
-    "school": "realsim.app.school.cli:SCHOOL",
-    "annotate": "realsim.app.annotate.cli:annotate_command",
-    "review": "realsim.app.review.cli:review_command",
-    "report": "realsim.app.report.cli:report_command",
-    "render": "realsim.app.render.cli:render_command",
-    "generate": "realsim.app.generate.cli:generate_command",
-    "pipeline": "realsim.app.pipeline.cli:pipeline_command",
-    "depth-fit": "realsim.app.depth_fit.cli:depth_fit",
-    "upgrade": "realsim.app.upgrade.cli:upgrade_command",
-    "demonstrations": "realsim.app.demonstrations.cli:demonstrations_command",
-    "export": "realsim.app.export.cli:export_command",
-    "stats": "realsim.app.stats.cli:stats_command",
-    "reproduce": "realsim.app.reproduce.cli:reproduce_command",
-    "doctor": "realsim.app.doctor.cli:doctor_command",
-    "config": "realsim.app.config.cli:CONFIG",
-    "completion": "realsim.app.completion:completion_command",
-}
-"""Where each command is defined, in the order of the work."""
 BROKEN_PIPE = 141
 """Exit code where the reader of the output has gone, as in `| head` (128 + SIGPIPE)."""
 TERMINATED = 143
@@ -69,6 +39,10 @@ class Realsim(Group):
         ctx.meta[QUIET_KEY] = "--quiet" in args
         ctx.meta[COMMAND_KEY] = tuple(args)
         return super().parse_args(ctx, args)
+
+    def get_help(self, ctx: click.Context) -> str:
+        """Return the help, commands by group."""
+        return help_text().rstrip()
 
     def make_context(self, *given: Any, **more: Any) -> click.Context:
         """Read the line; `--help` writes already here."""
@@ -95,28 +69,15 @@ QUIET_KEY = "realsim.quiet"
 
 
 @click.group(
-    "realsim",
-    cls=Realsim,
-    late=COMMANDS,
+    "realsim", cls=Realsim, late=COMMANDS,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    examples=("realsim demo", "realsim doctor", "realsim register --help"),
-)
-@click.option(
-    "--config", "config_file", type=click.Path(path_type=Path), default=None, metavar="FILE",
-    help="Settings (TOML).  [REALSIM_CONFIG, realsim.toml, ~/.config/realsim/config.toml]",
 )  # fmt: skip
-@click.option(NO_COLOUR, is_flag=True, help="No colours; NO_COLOR=1 does the same.")
+@click.option("--config", "config_file", type=click.Path(path_type=Path), default=None)
+@click.option(NO_COLOUR, is_flag=True)
 @click.version_option(__version__, prog_name="realsim")
 @click.pass_context
 def commands(ctx: click.Context, config_file: Path | None, no_color: bool) -> None:
-    """Turn robot captures into grasping data that one can trust.
-
-    Start with `realsim demo`: the whole loop in a simulated lab, no hardware needed. Every command
-    goes on where it stopped when it is run again.
-
-    Exit codes: 0 done, 1 done but a check failed, 2 something given cannot be used, 130
-    interrupted.
-    """
+    """Turn robot captures into grasping data that you can trust."""
     from realsim.app.config.applied import apply_config
 
     apply_config(ctx, config_file, quiet=bool(ctx.meta.get(QUIET_KEY)))

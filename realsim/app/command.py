@@ -1,11 +1,14 @@
 """What all commands have in common: late loading, examples, settings from the environment."""
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
 import click
 from click.core import ParameterSource
+
+from realsim.app.meanings import OLD_NAMES
 
 LONGEST_SENTENCE = 200
 """Characters of a command's first sentence in the list of commands: it is wrapped, not cut."""
@@ -25,6 +28,13 @@ class Command(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Read the arguments; a value that a variable gave is refused with the variable's name."""
+        renamed = take_old_variables(self, _path(ctx))
+        end = args.index("--") if "--" in args else len(args)
+        for k, word in enumerate(args[:end]):
+            old, equals, value = word.removeprefix("--").partition("=")
+            if word.startswith("--") and old in renamed:
+                args = [*args[:k], f"--{renamed[old]}{equals}{value}", *args[k + 1 :]]
+                say_renamed(f"--{old}", f"--{renamed[old]}")
         try:
             return super().parse_args(ctx, args)
         except click.BadParameter as error:
@@ -51,6 +61,7 @@ class Group(click.Group):
         *,
         late: Mapping[str, str] | None = None,
         examples: Sequence[str] = (),
+        by_default: str | None = None,
         **attrs: Any,
     ) -> None:
         """Take click's arguments, and the commands that are loaded late.
@@ -59,11 +70,23 @@ class Group(click.Group):
             name: of the group.
             late: `module:attribute` of a command by its name, in the order of the help.
             examples: lines of the help.
+            by_default: the command that needs no name: `realsim school SESSION` runs `run`.
             attrs: click's.
         """
         super().__init__(name, **attrs)
         self.late = dict(late or {})
-        self.examples = tuple(examples)
+        self.examples, self.by_default = tuple(examples), by_default
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Put the default command before arguments that begin with none and ask for no help."""
+        known = (*self.commands, *ctx.help_option_names)
+        if self.by_default and (
+            args[0] not in known
+            if args
+            else not any(p.required for p in self.commands[self.by_default].params)
+        ):
+            args = [self.by_default, *args]
+        return super().parse_args(ctx, args)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all commands, in the order in which they are used."""
@@ -119,9 +142,31 @@ def write_examples(examples: Sequence[str], formatter: click.HelpFormatter) -> N
             formatter.write("".join(f"  {line}\n" for line in examples))
 
 
-def variable(path: Sequence[str], option: click.Option) -> str:
+def old_names(command: click.Command, path: Sequence[str]) -> dict[str, str]:
+    """Return the names that a command's options had before: old -> new, without dashes."""
+    arm = {"robot": "arm"} if any(p.name == "arm" for p in command.params) else {}
+    return arm | OLD_NAMES.get(" ".join(path), {})
+
+
+def take_old_variables(command: click.Command, path: Sequence[str]) -> dict[str, str]:
+    """Give variables of old names their new ones, with a note; return the options' old names."""
+    renamed = old_names(command, path)
+    for old, new in renamed.items():
+        before, now = variable(path, old), variable(path, new)
+        if before in os.environ and now not in os.environ:
+            os.environ[now] = os.environ.pop(before)
+            say_renamed(before, now)
+    return renamed
+
+
+def say_renamed(old: str, new: str) -> None:
+    """Say that a name is used which will go."""
+    click.echo(f"note: {old} is now called {new}; the next release knows only that.", err=True)
+
+
+def variable(path: Sequence[str], option: click.Option | str) -> str:
     """Return the name of the environment variable of a command's option."""
-    words = [ENVIRONMENT, *path, spelling(option)]
+    words = [ENVIRONMENT, *path, option if isinstance(option, str) else spelling(option)]
     return "_".join(words).replace("-", "_").upper()
 
 
@@ -144,6 +189,8 @@ def typed(option: click.Option, value: Any) -> list[Any]:
     word = max(option.opts, key=len)
     if option.is_flag:
         return [word] if value else list(option.secondary_opts[:1])
+    if isinstance(value, list | tuple) and not option.multiple and option.nargs == 1:
+        value = ",".join(map(str, value))  # pyright: ignore[reportUnknownArgumentType]
     each = value if option.multiple else (value,)
     return [w for one in each for w in (word, *(one if option.nargs > 1 else (one,)))]
 

@@ -1,136 +1,173 @@
-"""The options that many commands have, spelled and explained alike."""
+"""How a command declares itself: its options by name, out of `realsim.app.meanings`.
 
-from collections.abc import Callable
+    @command("annotate", "realsim annotate demo/session")
+    @SESSIONS
+    @options(maps="instance,depth", workers=Has(1, "; frames at a time"), address="")
+    @rare(no_depth_check=False)
+    def annotate_command(console: Console, sessions: tuple[Path, ...], maps: str, ...) -> None:
+
+A value is the option's default. `--json` and `--quiet` come with `command`, as does the `Console`.
+"""
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import wraps
-from pathlib import Path
 from typing import Any
 
 import click
 
-from realsim.app.command import Decorator
+from realsim.app.command import Command, Decorator, spelling
+from realsim.app.meanings import FLAG, MEANINGS
+from realsim.app.option_values import FOLDER
 from realsim.app.outputs import OutputFile
 
-FOLDER = click.Path(path_type=Path)
-"""A file or folder as a pathlib.Path; whoever opens it says what is wrong with it."""
+ALL = "realsim.help_all"
+"""In the context: whether the help shows rare options, too."""
+SESSIONS = click.argument("sessions", type=FOLDER, nargs=-1, required=True, metavar="SESSION...")
+SOURCE = click.argument("source", type=FOLDER)
 
-QUIET = click.option("--quiet", is_flag=True, help="No progress; only the result and trouble.")
-JSON = click.option("--json", "as_json", is_flag=True, help="The result as JSON on stdout.")
+
+Where = Any
+"""The `realsim.many.PoolConfig` of --workers and --address; its module is heavy."""
 
 
-def json_file(what: str, key: str, *keys: str, top: bool = False) -> Decorator:
-    """Return the option that writes the JSON into a file as well; `keys` tell its own files.
+@dataclass(frozen=True, slots=True)
+class Has:
+    """What one command has of its own for an option."""
+
+    default: Any = None
+    note: str = ""
+    """Continues the meaning in the help; in [brackets] what the default is."""
+    kind: click.ParamType[Any] | None = None
+    """The type, where a command accepts less: a range, a choice, a guarded output."""
+    required: bool = False
+
+
+class Option(click.Option):
+    """An option whose meaning is that of its name; a rare one is left out of the short help."""
+
+    def __init__(self, words: Sequence[str], *, meaning: str, is_rare: bool, **attrs: Any) -> None:
+        """Take click's arguments, the meaning, and whether the option is rare."""
+        super().__init__(words, **attrs)
+        self.meaning, self.is_rare = meaning, is_rare
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Return name and help, None for a rare option unless all are asked for."""
+        return None if self.is_rare and not ctx.meta.get(ALL) else super().get_help_record(ctx)
+
+
+def _declared(key: str, given: Any, is_rare: bool) -> Decorator:
+    name = key.replace("_", "-")
+    means, has = MEANINGS[name], given if isinstance(given, Has) else Has(given)
+    note, bracket, default = has.note.partition("[")
+    told = f"{means.says}{note.rstrip()}.  {bracket}{default}"
+    is_shown = has.default is not None and has.default not in ("", ()) and means.kind is not FLAG
+    return click.option(
+        f"--{name}", means.name or key, cls=Option, meaning=means.says, is_rare=is_rare,
+        type=has.kind or means.kind, is_flag=means.kind is FLAG, default=has.default,
+        show_default=is_shown, required=has.required, help=told.rstrip(), metavar=means.metavar,
+        multiple=not means.many, nargs=means.many or 1,
+    )  # fmt: skip
+
+
+def options(is_rare: bool = False, /, **given: Any) -> Decorator:
+    """Return the decorator that adds options by name; a value is a default, or a `Has`."""
+
+    def decorated(work: Callable[..., Any]) -> Callable[..., Any]:
+        for key, value in reversed(given.items()):
+            work = _declared(key, value, is_rare)(work)
+        return work
+
+    return decorated
+
+
+def rare(**given: Any) -> Decorator:
+    """Return the decorator that adds options which only `--help-all` shows."""
+    return options(True, **given)
+
+
+def command(name: str, *examples: str, group: click.Group | None = None) -> Decorator:
+    """Return the decorator that makes a command of a function.
+
+    The function gets a `Console` before its options, and one `where` for --workers and --address.
+    Where it returns False a check has failed: exit code 1. It returns nothing else.
 
     Args:
-        what: the help.
+        name: as it is typed.
+        examples: lines that begin with `realsim`; the tests run them.
+        group: that it belongs to; None = it is loaded by its place in `realsim.app.cli`.
+    """
+
+    def decorated(work: Callable[..., Any]) -> click.Command:
+        @wraps(work)
+        def run(as_json: bool, quiet: bool, **given: Any) -> Any:
+            from realsim.app.console import Console
+
+            if "address" in given:
+                from realsim.many import PoolConfig
+
+                pool = PoolConfig(workers=given.pop("workers"), address=given.pop("address"))
+                given["where"] = pool
+            passed = work(Console(quiet=quiet, as_json=as_json), **given)
+            if passed is not None and not passed:
+                sys.exit(1)
+
+        made = click.command(name, cls=Command, examples=examples)(run)
+        options(quiet=False, json=False)(made)
+        if any(isinstance(p, Option) and p.is_rare for p in made.params):
+            made.params.append(HELP_ALL)
+        if group is not None:
+            group.add_command(made)
+        return made
+
+    return decorated
+
+
+def _show_all(ctx: click.Context, option: click.Parameter, asked: bool) -> None:
+    if asked and not ctx.resilient_parsing:
+        ctx.meta[ALL] = True
+        click.echo(ctx.get_help(), color=ctx.color)
+        ctx.exit()
+
+
+HELP_ALL = click.Option(
+    ["--help-all"], is_flag=True, is_eager=True, expose_value=False, callback=_show_all,
+    help="Show this message with the rare options, and exit.",
+)  # fmt: skip
+
+
+def many(workers: Any = 2, note: str = "") -> Decorator:
+    """Return the two options for where work is done, which the command gets as one, `where`."""
+    return options(workers=Has(workers, note), address="")
+
+
+def json_file(key: str, *keys: str, top: bool = False) -> Has:
+    """Return what --json-file has of its own; `keys` tell the command's own files.
+
+    Args:
         key: of the document.
         keys: more of them.
         top: they count at the document's top alone, where another command's holds this one inside.
     """
     marks = [f'\n "{name}"' if top else f'"{name}"' for name in (key, *keys)]
-    own = OutputFile({".json": marks}, "document")
-    return click.option("--json-file", type=own, default=None, metavar="FILE", help=what)
+    return Has(kind=OutputFile({".json": marks}, "document"))
 
 
-def overwrite(what: str) -> Decorator:
-    """Return the option that allows to replace what is there."""
-    return click.option("--overwrite", is_flag=True, help=what)
+def two_meanings(commands: Mapping[tuple[str, ...], click.Command]) -> dict[str, list[str]]:
+    """Return the options whose name means more than one thing, with all that each means.
 
+    The meaning is what the help says before a command's own note, with the kind of value: a switch,
+    a number, a path, one or several.
 
-def workers(default: int | None = 2, help: str = "Processes.") -> Decorator:
-    """Return the option for how many processes work at a time."""
-    return click.option(
-        "--workers", default=default, show_default=True, type=click.IntRange(1, 256), help=help
-    )
-
-
-def many(default: int | None = 2, help: str = "Processes.") -> Decorator:
-    """Return the two options for where work is done, which the command gets as one, `where`."""
-
-    def decorated(command: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(command)
-        def with_pool(*args: Any, workers: int | None, address: str, **kwargs: Any) -> Any:
-            from realsim.many import PoolConfig
-
-            return command(*args, where=PoolConfig(workers=workers, address=address), **kwargs)
-
-        address = click.option(
-            "--address", default="", metavar="RAY", help="HOST:PORT of a Ray cluster, or local."
+    Args:
+        commands: by their path, as `realsim.app.command.walk` gives them.
+    """
+    found: dict[str, set[str]] = {}
+    for option in (p for c in commands.values() for p in c.params if isinstance(p, click.Option)):
+        says = option.meaning if isinstance(option, Option) else option.help or ""
+        kind = f"{option.type.name} x {0 if option.multiple else option.nargs}"
+        found.setdefault(spelling(option), set()).add(
+            f"{says} ({'switch' if option.is_flag else kind})"
         )
-        return workers(default, help)(address(with_pool))
-
-    return decorated
-
-
-def seed(what: str = "Of everything random: the same seed, the same result.") -> Decorator:
-    """Return the option that chooses the random numbers."""
-    return click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help=what)
-
-
-class Name(click.ParamType[str]):
-    """What is found by name; whether there is such a thing is seen when it is looked for."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the text."""
-        return str(value)
-
-
-class ArmName(Name):
-    """An arm that is found by name, or the folder of one: see `realsim.robots`."""
-
-    name = "arm"
-
-    def shell_complete(
-        self, ctx: click.Context, param: click.Parameter, incomplete: str
-    ) -> list[Any]:
-        """Return the names that begin so, or let the shell find a folder."""
-        from click.shell_completion import CompletionItem
-
-        from realsim.robots.robot_files import names_of
-
-        found = [CompletionItem(n) for n in names_of("arm") if n.startswith(incomplete.lower())]
-        return found or [CompletionItem(incomplete, type="dir")]
-
-
-def arm(what: str, default: str | None = None) -> Decorator:
-    """Return the option that names the arm; its older name `--robot` still works."""
-
-    def older(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
-        if value is not None:
-            ctx.default_map = {**(ctx.default_map or {}), "arm": value}
-
-    new = click.option(
-        "--arm", type=ArmName(), default=default, show_default=True, metavar="NAME", help=what
-    )
-    old = click.option("--robot", hidden=True, is_eager=True, expose_value=False, callback=older)
-    return lambda command: new(old(command))
-
-
-class PlanName(Name):
-    """A plan file, or one that comes with realsim: `shipped:NAME`."""
-
-    name = "plan"
-
-    def shell_complete(
-        self, ctx: click.Context, param: click.Parameter, incomplete: str
-    ) -> list[Any]:
-        """Return shipped plans and JSON files that begin so, or let the shell find files."""
-        from click.shell_completion import CompletionItem
-
-        names = [f"shipped:{name}" for name in shipped_names()]
-        if not any(name.startswith(incomplete) for name in names):
-            return [CompletionItem(incomplete, type="file")]
-        names += sorted(p.name for p in Path().glob("*.json"))
-        return [CompletionItem(name) for name in names if name.startswith(incomplete)]
-
-
-def shipped_names() -> list[str]:
-    """Return the names of the plans that come with realsim, without loading their package."""
-    from importlib.util import find_spec
-
-    spec = find_spec("realsim_capture_plans")
-    places = spec.submodule_search_locations if spec is not None else None
-    return sorted(
-        file.stem
-        for place in places or ()
-        for file in (Path(place) / "plan_files" / "shipped").glob("*.json")
-    )
+    return {name: sorted(meanings) for name, meanings in found.items() if len(meanings) > 1}

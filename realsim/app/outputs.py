@@ -29,9 +29,9 @@ SESSION_NAMES = (*SESSION_FILES, SESSION_PLAN, *SESSION_FOLDERS)
 BOARD_FOLDER = "calibration"
 """The one of them in which a session of its own lies, which is captured or imported."""
 INPUTS = frozenset((
-    "base_pose board_poses calibration camera campaign compare config_file dataset depth_model "
-    "hdri hdris images library limits masks meshes models mount obstacles poses result session "
-    "sessions source sources start supports textures token_file trials truth"
+    "arm_calibration base_pose board_poses calibration campaign compare config_file dataset "
+    "depth_model hdri hdris images intrinsics library limits masks meshes models mount obstacles "
+    "poses result session sessions source sources start supports textures token_file trials truth"
 ).split())  # fmt: skip
 """Parameters that name what is read, or a session or library that is worked on: no outputs."""
 

@@ -99,7 +99,7 @@ def test_bad_input_is_named_and_nothing_is_written(
 
 
 def test_unknown_scene_is_named(pristine: Path, tmp_path: Path) -> None:
-    code, text = upgrade(pristine, tmp_path / "out", "--scenes", "9")
+    code, text = upgrade(pristine, tmp_path / "out", "--only-scenes", "9")
     assert code == 2 and "scene 9" in text and "1" in text
     assert not (tmp_path / "out").exists()
 

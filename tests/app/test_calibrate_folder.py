@@ -60,8 +60,8 @@ def test_a_camera_of_another_size_is_named_before_the_poses(lab):
     rows = np.hstack([hands[:, :3, 3], se3.log_so3(hands[:, :3, :3])])
     np.savetxt(lab / "poses.txt", rows)
     with pytest.raises(InputError, match=r"for images of 320x240 px, and these are 640x480") as e:
-        read(lab, camera=lab / "camera.json")
-    assert "s = 2," in str(e.value) and "leave --camera out" in str(e.value)
+        read(lab, intrinsics=lab / "camera.json")
+    assert "s = 2," in str(e.value) and "leave --intrinsics out" in str(e.value)
     assert len(read(lab).views) == 10
 
 

@@ -56,7 +56,7 @@ def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @lru_cache(maxsize=1)
 def scene_session(plans: Path) -> Path:
     out = plans / "session"
-    words = ("--plan", plans / "plan.json", "--simulated", "--views", "0")
+    words = ("--plan", plans / "plan.json", "--simulated", "--only-views", "0")
     done = realsim("capture", out, *words)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "contact sheet" in done.stdout
@@ -89,7 +89,7 @@ def test_a_session_has_plan_devices_log_and_sheet(plans: Path) -> None:
          "--arm panda is a Panda with 7 joints, and the plan was made for a UR5e with 6"),
         (["--plan", "board_plan.json", "--simulated"], "--board does not say which"),
         (["--plan", "plan.json", "--simulated", "--speed", "2"], "at most 1"),
-        (["--plan", "plan.json", "--simulated", "--views", "0-1,9-11"], "[9, 10, 11]"),
+        (["--plan", "plan.json", "--simulated", "--only-views", "0-1,9-11"], "[9, 10, 11]"),
         (["--plan", "plan.json", "--simulated", "--retake", "1-x"], "such as 1-3,7"),
     ],
 )  # fmt: skip

@@ -64,7 +64,7 @@ def test_1_is_done_but_a_check_failed(tmp_path: Path) -> None:
         (["register", "s", "--view", "3"], "Did you mean"),
         (["demo", "--views", "3"], "4<=x<=1024"),
         (["export", "s", "--to", "bob", "--out", "o"], "bop"),
-        ([], "Commands:"),
+        ([], "Prepare:"),
     ],
 )
 def test_2_is_bad_input(

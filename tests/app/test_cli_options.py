@@ -1,11 +1,17 @@
 """The laws of the command line: every option is explained, and the same thing is spelled alike."""
 
 import re
+from pathlib import Path
 
 import click
+import pytest
 
-from realsim.app.cli import COMMANDS, commands
-from realsim.app.command import settable, spelling, variable, walk
+from realsim.app.cli import commands
+from realsim.app.command import context_of, settable, spelling, variable, walk
+from realsim.app.front import COMMANDS, GROUPS, help_text
+from realsim.app.meanings import MEANINGS, OLD_NAMES
+from realsim.app.options import two_meanings
+from typed_commands import realsim
 
 EVERY = walk(commands)
 OPTIONS = [(path, option) for path, command in EVERY.items() for option in settable(command)]
@@ -69,13 +75,60 @@ def test_each_variable_is_of_one_option() -> None:
 
 def test_every_command_is_listed_with_a_whole_sentence() -> None:
     ctx = click.Context(commands, info_name="realsim")
-    text = " ".join(commands.get_help(ctx).split())
+    lines = commands.get_help(ctx).splitlines()
+    for title, group in GROUPS.items():
+        at = lines.index(f"{title}:")
+        assert [f"  {name:15} {does}." for name, does in group.items()] == lines[
+            at + 1 : at + 1 + len(group)
+        ]
     for name in COMMANDS:
         command = commands.get_command(ctx, name)
         assert command is not None and command.name == name
-        sentence = command.get_short_help_str(200)
-        assert not sentence.endswith("..."), name
-        assert f"{name} {sentence}" in text
+        assert not command.get_short_help_str(200).endswith("..."), name
+    assert help_text() == commands.get_help(ctx) + "\n"
+
+
+def test_no_option_has_two_meanings() -> None:
+    assert two_meanings(EVERY) == {}
+    other = click.Command("other", params=[click.Option(["--views"], help="Other views.")])
+    assert set(two_meanings({**EVERY, ("other",): other})) == {"views"}
+    taken = {spelling(o) for _, o in OPTIONS}
+    assert MEANINGS.keys() - taken == set(), "no command takes these"
+
+
+def test_rare_options_are_shown_by_help_all_alone() -> None:
+    short = realsim("import", "--help").stdout
+    every = realsim("import", "--help-all").stdout
+    shown = [o for path, o in OPTIONS if path == ("import",) and o.opts[0] in short]
+    assert len(shown) <= 12 and "--help-all" in short and "--ee-frame" not in short
+    assert all(o.opts[0] in every for path, o in OPTIONS if path == ("import",))
+
+
+def test_old_names_work_with_a_note(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path, names in OLD_NAMES.items():
+        command = EVERY[tuple(path.split())]
+        known = {spelling(o) for o in settable(command)}
+        assert set(names.values()) <= known and not known & names.keys(), path
+    command = EVERY["capture",]
+    ctx = command.make_context(
+        "capture", [str(tmp_path / "out"), "--plan=p", "--views=1-3", "--camera", "7"],
+        parent=context_of(commands, ()),
+    )  # fmt: skip
+    assert ctx.params["views"] == (1, 2, 3) and ctx.params["camera"] == "7"
+    said = capsys.readouterr().err
+    assert "--views is now called --only-views" in said and "--camera-serial" in said
+    monkeypatch.setenv("REALSIM_CAPTURE_CAMERA", "8")
+    monkeypatch.setenv("REALSIM_CAPTURE_CAMERA_SERIAL", "")
+    monkeypatch.delenv("REALSIM_CAPTURE_CAMERA_SERIAL")  # unset again at the end
+    ctx = command.make_context(
+        "capture", [str(tmp_path / "out"), "--plan=p"], parent=context_of(commands, ())
+    )
+    assert ctx.params["camera"] == "8"
+    (tmp_path / "s.toml").write_text('[render]\ncamera = "d435"\n')
+    done = realsim("--config", tmp_path / "s.toml", "config", "show", "render")
+    assert "camera is now called sensor" in done.stderr and "d435" in done.stdout
 
 
 def test_the_help_fits_a_terminal_of_80_columns() -> None:

@@ -14,6 +14,7 @@ from realsim.app.command import default_of, settable, spelling, walk
 from realsim.app.config.files import find_config, read_config
 from realsim.app.config.settings import settings_of
 from realsim.app.config.template import template, toml_value
+from realsim.app.option_values import Numbers
 from realsim.app.outputs import OutputFile
 from realsim.errors import InputError
 from typed_commands import realsim
@@ -92,22 +93,22 @@ def test_the_command_line_wins_over_variables_over_the_file_over_the_default(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     written("[register]\nviews = 64\n[school.run]\nforce = 20\n", "realsim.toml")
-    assert in_force("register", "views") == ("64", "realsim.toml, line 2")
+    assert in_force("register", "views") == (64, "realsim.toml, line 2")
     assert in_force("school run", "force") == (20.0, "realsim.toml, line 4")
     assert in_force("register", "method") == ("joint", "default")
     monkeypatch.setenv("REALSIM_REGISTER_VIEWS", "32")
-    assert in_force("register", "views") == ("32", "REALSIM_REGISTER_VIEWS")
-    assert views_of_a_run() == "32"
-    assert views_of_a_run("--views", "16") == "16"
+    assert in_force("register", "views") == (32, "REALSIM_REGISTER_VIEWS")
+    assert views_of_a_run() == 32
+    assert views_of_a_run("--views", "16") == 16
     monkeypatch.delenv("REALSIM_REGISTER_VIEWS")
-    assert views_of_a_run() == "64"
+    assert views_of_a_run() == 64
     Path("realsim.toml").unlink()
     assert views_of_a_run() == "all"
 
 
-def views_of_a_run(*more: str) -> str:
+def views_of_a_run(*more: str) -> int | str:
     """Return what `realsim register` would get as --views."""
-    seen: list[str] = []
+    seen: list[int | str] = []
     command = commands.get_command(click.Context(commands), "register")
     assert command is not None
     kept, command.callback = command.callback, lambda **options: seen.append(options["views"])
@@ -157,6 +158,8 @@ def another_value(option: click.Option) -> Any:
         value = kind.max if kind.max is not None and kind.max < 0.75 else 0.75
     elif kind is click.INT:
         value = 11
+    elif isinstance(kind, Numbers):
+        value = "2-4,9"
     elif kind is click.FLOAT:
         value = 0.125
     elif isinstance(kind, OutputFile):
@@ -177,14 +180,14 @@ def test_the_first_file_that_is_there_is_read(monkeypatch: pytest.MonkeyPatch) -
 
     assert views() == "all"
     written("[register]\nviews = 1\n", "home/realsim/config.toml")
-    assert views() == "1"
+    assert views() == 1
     written("[register]\nviews = 2\n", "realsim.toml")
-    assert views() == "2"
+    assert views() == 2
     written("[register]\nviews = 3\n", "variable.toml")
     monkeypatch.setenv("REALSIM_CONFIG", "variable.toml")
-    assert views() == "3"
+    assert views() == 3
     written("[register]\nviews = 4\n", "named.toml")
-    assert views("--config", "named.toml") == "4"
+    assert views("--config", "named.toml") == 4
     monkeypatch.setenv("REALSIM_CONFIG", "")
     assert views() == "all"
     assert find_config(None) is None

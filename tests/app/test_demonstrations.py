@@ -156,7 +156,7 @@ def test_requests_that_cannot_be_are_refused(school, tmp_path):
     assert "--view 3" in refused(school, *out, "--view", "3")
     assert "no hand-eye calibration" in refused(school, *out, "--hand-eye")
     assert "inside" in refused(school, "--out", school / "demos")
-    assert "weighs" in refused(school, *out, "--mass", "cube=0.5", "--limit", "1")
+    assert "weighs" in refused(school, *out, "--weighed", "cube=0.5", "--limit", "1")
 
 
 @pytest.mark.slow

@@ -65,7 +65,7 @@ def test_a_folder_gives_a_sensor_that_is_what_it_was(walls: Path, tmp_path: Path
 @pytest.mark.slow
 def test_the_stereo_camera_is_fitted_to_the_same_folder(walls: Path, tmp_path: Path) -> None:
     out = tmp_path / "stereo.json"
-    result = fit(walls, "--simulator", "stereo", "--out", out, "--quiet", "--views", "0-1")
+    result = fit(walls, "--simulator", "stereo", "--out", out, "--quiet", "--only-views", "0-1")
     assert result.exit_code == 0, result.output
     config = StereoConfig.load(out)
     frames = json.loads(out.read_text())["fit"]["frames"]
@@ -79,13 +79,13 @@ def test_the_stereo_camera_is_fitted_to_the_same_folder(walls: Path, tmp_path: P
 def test_the_wrong_unit_is_named(walls: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.json"
     for unit in ("1", "nan"):
-        said = refusal(walls, "--unit", unit, "--out", out)
+        said = refusal(walls, "--depth-unit", unit, "--out", out)
         assert "0.001 where the counts are millimetres" in said
     # Tenths of a millimetre taken for centimetres: a wall 26 m away.
-    assert "millimetres" in refusal(walls, "--unit", "0.01", "--out", out, "--quiet")
+    assert "millimetres" in refusal(walls, "--depth-unit", "0.01", "--out", out, "--quiet")
     # Tenths taken for millimetres: a wall at 2.6 m, where a D405 measures nothing.
-    said = refusal(walls, "--unit", "0.001", "--out", out, "--quiet")
-    assert "measures from 0.1 to 1.5 m" in said and "--unit" in said
+    said = refusal(walls, "--depth-unit", "0.001", "--out", out, "--quiet")
+    assert "measures from 0.1 to 1.5 m" in said and "--depth-unit" in said
     assert not out.exists()
 
 
@@ -102,10 +102,10 @@ def test_frames_without_a_plane_are_named(tmp_path: Path) -> None:
 def test_folders_that_hold_nothing_to_fit_are_named(walls: Path, tmp_path: Path) -> None:
     assert "no folder" in refusal(tmp_path / "nowhere")
     assert "holds no PNG" in refusal(tmp_path)
-    assert "names none" in refusal(walls, "--views", "40-50")
+    assert "names none" in refusal(walls, "--only-views", "40-50")
     assert "is a folder" in refusal(walls, "--out", tmp_path)
     (tmp_path / "a.png").write_bytes(png_bytes(depth_counts(wall(0.3, 0.1), UNIT)))
-    assert "--camera FILE" in refusal(tmp_path)
+    assert "--intrinsics FILE" in refusal(tmp_path)
     np.save(tmp_path / "a.npy", wall(0.3, 0.1))
     assert "uint16" in refusal(tmp_path, "--quiet")
     (tmp_path / "a.npy").write_bytes(b"\x93NUMPY")

@@ -166,7 +166,7 @@ def test_what_cannot_be_is_refused_and_leaves_nothing(bop, tmp_path):
         "export", bop, "--to", "colmap", "--out", out, "--table-is-world"
     )
     assert "lies inside the source" in refused("export", bop, "--to", "bop", "--out", bop / "again")
-    assert "it has 3" in refused("export", bop, "--to", "bop", "--out", out, "--scenes", "4")
+    assert "it has 3" in refused("export", bop, "--to", "bop", "--out", out, "--only-scenes", "4")
     assert "not there" in refused("export", tmp_path / "no", "--to", "bop", "--out", out)
     (tmp_path / "empty").mkdir()
     assert "accepted are" in refused("export", tmp_path / "empty", "--to", "bop", "--out", out)

@@ -16,13 +16,13 @@ COMMANDS = walk(commands)
 QUICK = (
     "realsim board charuco:5x7,square=33mm,marker=20mm,dict=APRILTAG_36h11 --paper A3",
     "realsim check dataset",
-    "realsim import frames imported --camera camera.json --depth-unit 0.001 --no-poses",
+    "realsim import frames imported --intrinsics camera.json --depth-unit 0.001 --no-poses",
     "realsim plan-convert shipped:ur5_d405_hemisphere_256 hemisphere.script",
 )
 """The other commands' examples are of the kinds that the tests of those commands type."""
 LONG = (
-    "realsim depth-fit demo/session --views 0-3 --out table.json --json",
-    "realsim export dataset --to nerfstudio --out as_nerfstudio --scenes 1",
+    "realsim depth-fit demo/session --only-views 0-3 --out table.json --json",
+    "realsim export dataset --to nerfstudio --out as_nerfstudio --only-scenes 1",
     "realsim generate near --scenes 1 --views 2 --objects 2 --size 320x240 --range d405",
     "realsim report demo/session --json --fail-on 'registration.accepted<5'",
     "realsim review demo/session --static scene.html",

@@ -218,7 +218,7 @@ def test_the_camera_is_found_named_or_asked_for(tmp_path):
     other = tmp_path / "other.txt"
     other.write_text("700 0 320\n0 700 240\n0 0 1\n")
     with pytest.raises(InputError, match="another image size"):
-        open_source(replace(request, camera=other), QUIET)
+        open_source(replace(request, intrinsics=other), QUIET)
 
 
 # --- what it is -------------------------------------------------------------------------------

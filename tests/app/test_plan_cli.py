@@ -93,7 +93,7 @@ def test_a_plan_is_made_and_written(realsim: Callable[..., Done]) -> None:
         (["--keep-out", "300,300,120"], "--keep-out"),
         (["--radius", "0.4,0.3"], "in this order"),
         (["--elevation", "20,95"], "90"),
-        (["--board", "--elevation", "20,80"], "--elevation"),
+        (["--board-views", "--elevation", "20,80"], "--elevation"),
         (["--mount", "nowhere.toml"], "nowhere.toml"),
         (["--center", "1.3,0.5,0.05", "--views", "24"], "24 views were asked for"),
     ],
@@ -145,10 +145,10 @@ def test_a_plan_goes_out_and_comes_back(realsim: Callable[..., Done]) -> None:
     assert "def realsim_plan():" in Path("p.script").read_text()
     Ts = table_frame(plan) @ read_camera_poses("folder")
     assert np.abs(Ts - plan.Ts_base_cam).max() < 1e-12
-    done = realsim("plan-convert", "p.csv", "back.json", "--robot", "UR5", "--center", "0.4,0.1,0")
+    done = realsim("plan-convert", "p.csv", "back.json", "--arm", "UR5", "--center", "0.4,0.1,0")
     assert done.code == 0, done.err
     assert np.array_equal(load_plan("back.json").joints, plan.joints)
-    done = realsim("plan-convert", "p.csv", "b.json", "--robot", "UR5e", "--center", "0.4,0.1,0")
+    done = realsim("plan-convert", "p.csv", "b.json", "--arm", "UR5e", "--center", "0.4,0.1,0")
     assert done.code == 2 and "of this robot" in done.err and not Path("b.json").exists()
 
 
@@ -156,11 +156,11 @@ def test_a_plan_goes_out_and_comes_back(realsim: Callable[..., Done]) -> None:
     ("args", "says"),
     [
         (["p.json", "p.xyz"], ".script"),
-        (["p.json", "q.csv", "--robot", "UR5e"], "the plan is for a UR5"),
-        (["bare.csv", "q.json", "--robot", "UR5"], "--joints-unit"),
-        (["bare.csv", "q.json", "--robot", "UR5", "--joints-unit", "deg"], "look like radians"),
-        (["degrees.csv", "q.json", "--robot", "UR5"], "look like degrees"),
-        (["other.json", "q.json", "--robot", "UR5"], "path of another robot"),
+        (["p.json", "q.csv", "--arm", "UR5e"], "the plan is for a UR5"),
+        (["bare.csv", "q.json", "--arm", "UR5"], "--joints-unit"),
+        (["bare.csv", "q.json", "--arm", "UR5", "--joints-unit", "deg"], "look like radians"),
+        (["degrees.csv", "q.json", "--arm", "UR5"], "look like degrees"),
+        (["other.json", "q.json", "--arm", "UR5"], "path of another robot"),
     ],
 )
 def test_what_cannot_be_converted_is_one_paragraph(

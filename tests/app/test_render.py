@@ -131,7 +131,7 @@ def test_views_of_other_options_go_into_another_folder(tmp_path):
     hdri.touch()
     others = (
         {}, {"views": "8"}, {"views": "16"}, {"views": "8", "size": "64x48"},
-        {"views": "8", "radius": "0.4-0.7"}, {"camera": "d435"}, {"seed": 3}, {"hdri": hdri},
+        {"views": "8", "radius": "0.4-0.7"}, {"sensor": "d435"}, {"seed": 3}, {"hdri": hdri},
         {"materials": ("table=painted wood",)}, {"depth": "clean"},
     )  # fmt: skip
     folders = [RenderRequest(**o).folder(tmp_path) for o in others]
@@ -146,7 +146,7 @@ def test_views_of_other_options_go_into_another_folder(tmp_path):
     [
         ({"views": "some"}, "--views"), ({"radius": "0.4-0.5"}, "--radius"),
         ({"views": "3", "radius": "400-700"}, "--radius"), ({"views": "3", "size": "64"}, "--size"),
-        ({"camera": "d999"}, "--camera"), ({"depth_model": "none.json"}, "none.json"),
+        ({"sensor": "d999"}, "--sensor"), ({"depth_model": "none.json"}, "none.json"),
         ({"depth_model": "fit.json", "depth": "stereo"}, "--depth-model"),
     ],
 )  # fmt: skip

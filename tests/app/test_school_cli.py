@@ -5,14 +5,14 @@ import os
 import shutil
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from click.testing import Result
 
+from grasp_files import read_acronym
 from realsim.app.school.files import stored_grasps
-from realsim.formats.grasps.acronym import read_acronym
 from realsim.formats.grasps.hdf5 import read_grasps_hdf5
-from realsim.formats.grasps.parquet import read_grasps_parquet
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import ObjectPose, Scene
@@ -34,7 +34,7 @@ def test_a_run_needs_no_name_and_writes_everything(tried: tuple[Path, Result]) -
     sets = load_grasps(store)
     assert [s.instance for s in sets] == [0, 1] and all(len(s) == GRASPS for s in sets)
     assert any(s.good.any() for s in sets)
-    for name in ("grasps/grasps.h5", "grasps/grasps.parquet", "reports/school.html",
+    for name in ("grasps/grasps.h5", "reports/school.html",
                  "reports/school.json", "reports/school_sheet.png"):  # fmt: skip
         assert store.has(name), name
     assert store.verify() == []
@@ -52,7 +52,6 @@ def test_all_files_hold_the_same_grasps(tried: tuple[Path, Result]) -> None:
     sets = load_grasps(folder)
     for found in (
         read_grasps_hdf5(folder / "grasps/grasps.h5"),
-        read_grasps_parquet(folder / "grasps"),
         stored_grasps(folder)[0],
     ):
         assert found.T_world_table == pytest.approx(T_WORLD_TABLE)
@@ -132,7 +131,7 @@ def test_a_weighed_object_has_its_mass_and_the_others_the_density(
     pristine: Path, tmp_path: Path
 ) -> None:
     folder = Path(shutil.copytree(pristine, tmp_path / "s"))
-    options = ("--mass", "cube=0.31", "--density", "500")
+    options = ("--weighed", "cube=0.31", "--density", "500")
     assert run(folder, *QUICK, "--grasps", "2", *options).exit_code in (0, 1)
     cube, wedge = load_grasps(folder)
     assert cube.parameters["mass_kg"] == pytest.approx(0.31)
@@ -156,12 +155,14 @@ def test_grasps_are_exported(tried: tuple[Path, Result], tmp_path: Path) -> None
         assert result.exit_code == 0, result.output
         for line in result.output.split():
             assert Path(line).stat().st_size > 100
-    found = read_acronym(tmp_path / "acronym/000000_obj000002.h5")
+    _, held, scale = read_acronym(tmp_path / "acronym/000000_obj000002.h5")
     s = load_grasps(tried[0])[0]
     tested = ~np.isnan(s.slip_m[:, 0])
-    assert np.array_equal(found.object_in_gripper, np.isfinite(s.slip_m).all(axis=1)[tested])
-    assert (tmp_path / "acronym" / found.obj.file).is_file() and found.obj.scale == 1e-3
-    assert found.obj.mass_kg == pytest.approx(_mass("cube"), rel=1e-3)
+    assert np.array_equal(held, np.isfinite(s.slip_m).all(axis=1)[tested])
+    with h5py.File(tmp_path / "acronym/000000_obj000002.h5") as file:
+        assert (tmp_path / "acronym" / file["object/file"][()].decode()).is_file()
+        assert file["object/mass"][()] == pytest.approx(_mass("cube"), rel=1e-3)
+    assert scale == 1e-3
 
 
 def test_the_summary_counts_every_session_once(tried: tuple[Path, Result], tmp_path: Path) -> None:

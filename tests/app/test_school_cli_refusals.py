@@ -52,7 +52,7 @@ def test_trials_of_another_layout_are_refused(tmp_path: Path) -> None:
 def test_a_mass_of_nothing_or_of_no_object_is_refused(
     pristine: Path, mass: str, words: str
 ) -> None:
-    message = refused(pristine, *QUICK, "--mass", mass)
+    message = refused(pristine, *QUICK, "--weighed", mass)
     assert words in message and mass in message
 
 

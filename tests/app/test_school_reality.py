@@ -28,7 +28,7 @@ def trials(tmp_path: Path) -> Path:
 
 def test_trials_are_judged_and_a_calibration_is_fitted_on_them(trials: Path) -> None:
     out, fit = trials.parent / "out", trials.parent / "fit.json"
-    masses = ("--mass", "wooden_box=0.1", "--mass", "chips_can=0.1")
+    masses = ("--weighed", "wooden_box=0.1", "--weighed", "chips_can=0.1")
     words = ("--draws", 2, *masses, "--cache", trials.parent / "cache")
     found = run("reality", trials, *words, "--out", out, "--fit", fit, "--json")
     assert found.exit_code == 0, found.output
@@ -42,13 +42,13 @@ def test_trials_are_judged_and_a_calibration_is_fitted_on_them(trials: Path) -> 
     # Bad grasps held in 1 of 4 and good ones in 3 of 4: what the curve must say of 0 and 1.
     np.testing.assert_allclose(told.p_hold(np.array([0.0, 1.0])), [0.25, 0.75], atol=0.02)
     # It serves the next run and the school, which refuse what is no calibration.
-    again = run("reality", trials, *words, "--calibration", fit, "--json")
+    again = run("reality", trials, *words, "--p-hold-calibration", fit, "--json")
     assert again.exit_code == 0 and '"in_sample": true' in again.output
     config = config_of(SchoolRequest(calibration=fit), scene())
     assert config.calibration == told
     with pytest.raises(InputError, match=r"reality\.json"):
         config_of(SchoolRequest(calibration=out / "reality.json"), scene())
-    assert "one of them" in refused("reality", trials, "--fit", fit, "--calibration", fit)
+    assert "one of them" in refused("reality", trials, "--fit", fit, "--p-hold-calibration", fit)
 
 
 def test_trials_of_a_known_object_that_all_ended_alike_are_told(tmp_path: Path) -> None:
@@ -63,8 +63,8 @@ def test_trials_of_a_known_object_that_all_ended_alike_are_told(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--mass", "wooden=0.1"), "'wooden', which no trial is of; there are chips_can"),
-        (("--mass", "wooden_box=-1"), "no weighed object"),
+        (("--weighed", "wooden=0.1"), "'wooden', which no trial is of; there are chips_can"),
+        (("--weighed", "wooden_box=-1"), "no weighed object"),
         (("--draws", "1"), "2 draws or more"),
         (("--cell-error", "8", "3", "-10", "3"), "--cell-error has -10 for yaw"),
         (("--cell-error", "1e9", "3", "10", "3"), "0 to 180 is accepted"),

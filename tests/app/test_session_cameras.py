@@ -144,10 +144,11 @@ def test_bop_has_a_suffix_for_every_camera_and_is_read_back(exported: Path) -> N
 
 
 def test_one_camera_is_chosen_by_its_name(registered: Path, tmp_path: Path) -> None:
-    result = call("export", registered, "--to", "bop", "--camera", "left", "--out", tmp_path / "o")
+    words = ("export", registered, "--to", "bop", "--camera-name")
+    result = call(*words, "left", "--out", tmp_path / "o")
     assert result.exit_code == 0, result.output
     assert [ref.camera for ref in find_scenes(tmp_path / "o")] == [""]
-    wrong = call("export", registered, "--to", "bop", "--camera", "top", "--out", tmp_path / "p")
+    wrong = call(*words, "top", "--out", tmp_path / "p")
     assert "'top'" in str(wrong.exception) and "wrist, left" in str(wrong.exception)
 
 

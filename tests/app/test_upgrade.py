@@ -139,13 +139,13 @@ def test_other_images_are_not_mixed_into_an_upgrade(upgraded, tmp_path) -> None:
     shutil.copytree(out, again)
     other = dataset / "test/000002/rgb/000003.png"
     (copy / "test/000001/rgb/000003.png").write_bytes(other.read_bytes())
-    assert "upgrade of other images" in failed_with(copy, again, "--scenes", "1")
+    assert "upgrade of other images" in failed_with(copy, again, "--only-scenes", "1")
 
 
 @pytest.mark.slow
 def test_a_camera_that_no_scene_of_a_bop_data_set_names_is_refused(upgraded) -> None:
     with pytest.raises(
-        InputError, match=r"no BOP scene of the camera 'kinect'.*Leave --camera out"
+        InputError, match=r"no BOP scene of the camera 'kinect'.*Leave --camera-name out"
     ):
         scenes_of(upgraded[0], UpgradeConfig(camera="kinect"))
 

@@ -331,7 +331,7 @@ def other_size(rig: Rig) -> Rig:
         (mixed_boards, ("boards 'table' and 'held' are exchanged",)),
         (same_boards, ("carry the same markers", "another first id")),
         (lone_camera, ("camera 'right' sees a board in 1 of 1 images", "right.yaml")),
-        (other_size, ("camera 'right'", "640x480", "1280x960", "--camera")),
+        (other_size, ("camera 'right'", "640x480", "1280x960", "--intrinsics")),
     ],
 )
 def test_bad_input_is_named_with_what_to_do(

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from click.testing import CliRunner, Result
 
-from realsim.app.school.cli import SCHOOL
+from realsim.app.school.cli import school_command
 from realsim.errors import InputError
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
@@ -22,7 +22,7 @@ T_WORLD_TABLE = se3.from_rt(se3.exp_so3(np.array([0.0, 0.0, 0.4])), [0.3, 0.1, 0
 
 def run(*args: object) -> Result:
     """Run the group in this process."""
-    return CliRunner().invoke(SCHOOL, [str(a) for a in args])
+    return CliRunner().invoke(school_command, [str(a) for a in args])
 
 
 def refused(*args: object) -> str:

@@ -124,14 +124,14 @@ def _lenses(
             raise InputError(
                 f"camera '{camera.name}' sees a board in {views} of "
                 f"{len({s.instant for s in rig.of_camera(c)})} images: its place can be found from "
-                "that, its lens cannot. Give its intrinsics (--camera FOLDER with a file "
+                "that, its lens cannot. Give its intrinsics (--intrinsics FOLDER with a file "
                 f"{camera.name}.yaml or .json), or add views of a tilted board."
             )
         if given is None and report is None:
             raise DegenerateError(
                 f"camera '{camera.name}': {said} A board that stands still before a fixed camera "
-                "shows one view only: then its intrinsics must be given (--camera FOLDER with a "
-                f"file {camera.name}.yaml or .json)."
+                "shows one view only: then its intrinsics must be given (--intrinsics FOLDER with "
+                f"a file {camera.name}.yaml or .json)."
             )
         found.append(None if report is None else report.intrinsics)
         joint = config.hand_eye.joint

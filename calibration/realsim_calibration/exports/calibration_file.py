@@ -48,7 +48,8 @@ PLAIN = (
     "arm as it moves here"
 )
 NOMINAL = (
-    "do NOT use: no camera was known, and this one only gives px a meaning; --camera FILE states it"
+    "do NOT use: no camera was known, and this one only gives px a meaning; --intrinsics FILE "
+    "states it"
 )
 CONVENTIONS = {
     "transforms": "T_a_b maps points of b into a; matrices row by row; metres",

@@ -1,37 +1,20 @@
 """`realsim annotate`: masks, maps, poses, visibility and grasps on every frame of a session."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-import click
-
-from realsim.app.command import Command
-from realsim.app.options import FOLDER, JSON, QUIET, many
-
-if TYPE_CHECKING:
-    from realsim.many import PoolConfig
+from realsim.app.console import Console
+from realsim.app.options import SESSIONS, Where, command, many, options, rare
 
 
-@click.command(
-    "annotate", cls=Command,
-    examples=("realsim annotate demo/session", "realsim annotate demo/session --maps all --json"),
-)  # fmt: skip
-@click.argument("sessions", type=FOLDER, nargs=-1, required=True, metavar="SESSION...")
-@click.option("--maps", default="instance,depth", show_default=True,
-              metavar="all|none|LIST",
-              help="Maps of each frame: instance, depth, coordinates, normals.")  # fmt: skip
-@many(1, "Frames at a time; of several sessions, sessions.")
-@click.option("--no-depth-check", is_flag=True,
-              help="Do not look for unknown things in the measured depth.")  # fmt: skip
-@JSON
-@QUIET
+@command(
+    "annotate", "realsim annotate demo/session", "realsim annotate demo/session --maps all --json"
+)
+@SESSIONS
+@options(maps="instance,depth")
+@many(1, "; of several sessions, sessions at a time")
+@rare(no_depth_check=False)
 def annotate_command(
-    sessions: tuple[Path, ...],
-    maps: str,
-    where: "PoolConfig",
-    no_depth_check: bool,
-    as_json: bool,
-    quiet: bool,
+    console: Console, sessions: tuple[Path, ...], maps: str, where: Where, no_depth_check: bool
 ) -> None:
     """Write masks, maps, poses, visibility and grasps for every frame of each SESSION.
 
@@ -43,12 +26,9 @@ def annotate_command(
     beside it is a contact sheet of them.
     """
     from realsim.app.annotate.run import run_annotate
-    from realsim.app.console import Console
     from realsim.app.many_sessions import one_session
 
     session = one_session(sessions, where)
-    console = Console(quiet=quiet, as_json=as_json)
-    summary = run_annotate(
-        session, console, maps=maps, workers=where, check_depth=not no_depth_check
+    console.result(
+        run_annotate(session, console, maps=maps, workers=where, check_depth=not no_depth_check)
     )
-    console.result(summary)

@@ -1,36 +1,26 @@
-"""`realsim board`: its options."""
+"""`realsim board`: printed calibration targets."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from realsim.app.command import Command
-from realsim.app.options import JSON, QUIET, overwrite
+from realsim.app.console import Console
+from realsim.app.options import Has, command, options
 from realsim.app.outputs import OutputFolder
 
 
-@click.command(
+@command(
     "board",
-    cls=Command,
-    examples=(
-        "realsim board aprilgrid:6x4,tag=30mm,gap=10mm --out boards",
-        "realsim board charuco:5x7,square=33mm,marker=20mm,dict=APRILTAG_36h11 --paper A3",
-    ),
+    "realsim board aprilgrid:6x4,tag=30mm,gap=10mm --out boards",
+    "realsim board charuco:5x7,square=33mm,marker=20mm,dict=APRILTAG_36h11 --paper A3",
 )
 @click.argument("what", metavar="TARGET")
-@click.option(
-    "--out", type=OutputFolder(), default=Path("boards"), show_default=True, help="Folder."
-)
-@click.option("--paper", default="A4", show_default=True, help="A5 to A0, letter, 300x400mm, auto.")
-@click.option("--preview", is_flag=True, help="A PNG beside the PDF.")
-@click.option("--cut-marks", is_flag=True, help="Where to cut the sheet.")
-@overwrite("Replace a sheet of the same name.")
-@JSON
-@QUIET
-def board_command(
-    what: str, out: Path, paper: str, preview: bool, cut_marks: bool, overwrite: bool,
-    as_json: bool, quiet: bool,
-) -> None:  # fmt: skip
+@options(
+    out=Has(Path("boards"), kind=OutputFolder()), paper="A4", preview=False, cut_marks=False,
+    overwrite=False,
+)  # fmt: skip
+def board_command(console: Console, what: str, out: Path, paper: str, **options: Any) -> None:
     """Print a calibration target: a PDF at exact scale with a ruler, and its target file.
 
     TARGET is one line, or a target file:
@@ -42,11 +32,9 @@ def board_command(
       circles:9x9,pitch=18mm,large-origin
       tag:7,size=80mm                           one AprilTag
     """  # noqa: D301 - click's own mark for lines that stay as they are
-    from realsim.app.console import Console
     from realsim_calibration.sheets import make_board
 
-    console = Console(quiet=quiet, as_json=as_json)
-    files = make_board(what, out, paper, preview=preview, cut_marks=cut_marks, overwrite=overwrite)
+    files = make_board(what, out, paper, **options)
     for path in files:
         console.say(str(path))
     console.result({"target": what, "paper": paper, "files": list(files)})

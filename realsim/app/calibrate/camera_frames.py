@@ -88,13 +88,13 @@ def with_intrinsics(cameras: tuple[RigCamera, ...], folder: Path | None) -> tupl
         return cameras
     if not folder.is_dir():
         raise InputError(
-            f"--camera {folder}: with --cameras a folder is expected that holds a file of every "
-            f"camera whose intrinsics are known, such as {cameras[0].name}.yaml."
+            f"--intrinsics {folder}: with --cameras a folder is expected that holds a file of "
+            f"every camera whose intrinsics are known, such as {cameras[0].name}.yaml."
         )
     files = {p.stem: p for p in sorted(folder.iterdir()) if p.is_file()}
     if not any(c.name in files for c in cameras):
         names = ", ".join(f"{c.name}.yaml" for c in cameras)
-        raise InputError(f"--camera {folder} holds none of {names} (or .json).")
+        raise InputError(f"--intrinsics {folder} holds none of {names} (or .json).")
     return tuple(
         replace(c, intrinsics0=read_camera(files[c.name])) if c.name in files else c
         for c in cameras

@@ -86,7 +86,7 @@ def run_cameras(source: Path, console: Console, options: dict[str, Any]) -> bool
     poses = pose_file_of(source, options["poses"], [c.name for c in cameras])
     raw = None if poses is None else read_pose_file(poses, key=options["key"] or None)
     frames = frames_of(source, cameras, raw)
-    cameras = with_intrinsics(cameras, options["camera"])
+    cameras = with_intrinsics(cameras, options["intrinsics"])
     sightings = _sightings(frames, cameras, boards, out, console)
     rig = Rig(
         cameras=cameras, boards=boards, sightings=sightings,
@@ -131,7 +131,7 @@ def _run_session(
     known = tuple(
         replace(c, intrinsics0=lenses[c.name]) if c.name in lenses else c for c in cameras
     )
-    known = with_intrinsics(known, options["camera"])
+    known = with_intrinsics(known, options["intrinsics"])
     rig = Rig(
         cameras=known, boards=boards,
         sightings=_sightings(frames, known, boards, folder, console),

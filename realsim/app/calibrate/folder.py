@@ -77,7 +77,7 @@ class FolderRequest:
     """How the pose file is to be read; empty = what the file states, or what the images prove."""
     key: str = ""
     """Which entry of the pose file holds the poses."""
-    camera: Path | None = None
+    intrinsics: Path | None = None
     """File with known intrinsics."""
     mode: Literal["eye_in_hand", "eye_to_hand"] = "eye_in_hand"
     arm: str = ""
@@ -147,8 +147,8 @@ def read_views(request: FolderRequest, console: Console) -> FolderViews:
     require_target(folder, detections, target)
     require_views(folder, detections, CalibrationConfig().hand_eye.motion.min_views)
     warn_of_pictures(folder, detections, target, console)
-    camera = _camera_of(request.camera)
-    require_one_size(folder.labels, detections, camera, request.camera)
+    camera = _camera_of(request.intrinsics)
+    require_one_size(folder.labels, detections, camera, request.intrinsics)
     reading = reading or _stated_or_proven(folder, detections, target, camera, request, console)
     Ts, joints = folder.Ts_base_ee(reading), folder.joints
     views = [
@@ -340,7 +340,7 @@ def _of_pairs(
 ) -> tuple[Calibration, list[Path]]:  # fmt: skip
     """Return the calibration of (hand poses, board poses, joints, labels, clock)."""
     Ts, boards, joints, labels, clock = pairs
-    camera = _camera_of(request.camera)
+    camera = _camera_of(request.intrinsics)
     arm = known_arm(request.arm, list(Ts), [] if joints is None else list(joints), console)
     with console.stage("calibrate", f"{len(Ts)} pose pairs"):
         report = calibrate_from_poses(
@@ -350,8 +350,8 @@ def _of_pairs(
     if camera is None:
         console.warn(
             "there are no images: figures in px are those of a nominal camera (f = 900 px) that "
-            "looks at the measured poses, and no lens is exported. --camera FILE exports the lens "
-            "by which the target was measured."
+            "looks at the measured poses, and no lens is exported. --intrinsics FILE exports the "
+            "lens by which the target was measured."
         )
     result = Calibration(hand_eye=replace(report, clock=clock), lens=None)
     return result, write_calibration(result, request, (), console)

@@ -238,7 +238,7 @@ def require_one_size(
         else "their shapes differ: a crop or another mode of the sensor"
     )
     raise InputError(
-        f"--camera {file} is for images of {camera.width}x{camera.height} px, and these are "
-        f"{w}x{h}. Give the intrinsics of this size ({scale}), or leave --camera out: the lens is "
-        "then calibrated from these images."
+        f"--intrinsics {file} is for images of {camera.width}x{camera.height} px, and these are "
+        f"{w}x{h}. Give the intrinsics of this size ({scale}), or leave --intrinsics out: the lens "
+        "is then calibrated from these images."
     )

@@ -29,12 +29,12 @@ def run_live(request: FolderRequest, console: Console) -> bool:
     from realsim_calibration.lens.camera_files import read_camera
     from realsim_calibration.planning.live_calibration import watch_folder
 
-    if request.camera is None or not request.reading:
+    if request.intrinsics is None or not request.reading:
         raise InputError(
-            "--live needs --camera (factory intrinsics: two views cannot tell a lens) and "
+            "--live needs --intrinsics (factory intrinsics: two views cannot tell a lens) and "
             "--reading (such as rotvec,m: one pose cannot prove how it is to be read)."
         )
-    target, camera = target_of(request.board), read_camera(request.camera)
+    target, camera = target_of(request.board), read_camera(request.intrinsics)
     reading = reading_from_text(request.reading)
 
     def read_view(index: int, image: Path, pose: Path) -> BoardView:

@@ -160,7 +160,7 @@ def _run_session(source: Path, console: Console, arm: str, clock: str) -> bool:
 
 def _refuse_folder_options(options: dict[str, Any]) -> None:
     """Raise if an option was given that a session answers itself."""
-    mine = ("board", "poses", "reading", "key", "board_poses", "camera", "eye_to_hand")
+    mine = ("board", "poses", "reading", "key", "board_poses", "intrinsics", "eye_to_hand")
     given = [f"--{name.replace('_', '-')}" for name in mine if options.get(name)]
     if options.get("out", OUT) != OUT:
         raise InputError(
@@ -193,7 +193,7 @@ def _request(source: Path, options: dict[str, Any]) -> Any:
         board_poses=inside(options["board_poses"]),
         reading=options["reading"],
         key=options["key"],
-        camera=inside(options["camera"]),
+        intrinsics=inside(options["intrinsics"]),
         mode="eye_to_hand" if options["eye_to_hand"] else "eye_in_hand",
         arm=options["arm"] or "",
         clock=options["clock_offset"],

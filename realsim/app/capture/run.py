@@ -225,7 +225,7 @@ def _target(request: CaptureRequest, plan: CapturePlan) -> Target | None:
     if plan.kind == "hemisphere":
         raise InputError(
             f"{request.plan} goes round a scene of objects; --board belongs to a plan of board "
-            "views (`realsim plan --board`). Leave --board out, or give that plan."
+            "views (`realsim plan --board-views`). Leave --board out, or give that plan."
         )
     return target_of(request.board)
 

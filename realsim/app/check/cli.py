@@ -1,29 +1,23 @@
 """`realsim check`: its options."""
 
-import sys
 from pathlib import Path
 
 import click
 
-from realsim.app.command import Command
-from realsim.app.options import FOLDER, JSON, QUIET
+from realsim.app.console import Console
+from realsim.app.option_values import FOLDER
+from realsim.app.options import command, options
 
 
-@click.command(
+@command(
     "check",
-    cls=Command,
-    examples=(
-        "realsim check demo/session",
-        "realsim check demo/session --decode --json",
-        "realsim check dataset",
-    ),
+    "realsim check demo/session",
+    "realsim check demo/session --decode --json",
+    "realsim check dataset",
 )
 @click.argument("session", type=FOLDER)
-@click.option("--repair", is_flag=True, help="Move what is damaged to SESSION/damaged.")
-@click.option("--decode", is_flag=True, help="Decode every image, too (slow).")
-@JSON
-@QUIET
-def check_command(session: Path, repair: bool, decode: bool, as_json: bool, quiet: bool) -> None:
+@options(repair=False, decode=False)
+def check_command(console: Console, session: Path, repair: bool, decode: bool) -> bool:
     """Verify every checksum of SESSION and say what is missing or damaged.
 
     Sessions inside it (calibration/capture) are checked, too. Nothing is changed without --repair,
@@ -36,8 +30,5 @@ def check_command(session: Path, repair: bool, decode: bool, as_json: bool, quie
     Exit codes: 0 sound, 1 damaged or contradictory, 2 none of these.
     """
     from realsim.app.check.session import run_check
-    from realsim.app.console import Console
 
-    console = Console(quiet=quiet, as_json=as_json)
-    if not run_check(session, console, repair=repair, decode=decode):
-        sys.exit(1)
+    return run_check(session, console, repair=repair, decode=decode)

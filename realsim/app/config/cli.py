@@ -6,10 +6,11 @@ from typing import Any
 import click
 
 from realsim.app.command import Command, Group, walk
-from realsim.app.options import JSON, QUIET
+from realsim.app.console import Console
+from realsim.app.options import command, options
 from realsim.errors import InputError
 
-CONFIG = Group(
+config_command = Group(
     "config",
     examples=("realsim config show register", "realsim config template"),
     help="""Settings from a file: every option of every command.
@@ -26,17 +27,18 @@ CONFIG = Group(
 )
 
 
-@CONFIG.command(
-    "show", cls=Command,
-    examples=("realsim config show", "realsim config show school run", "realsim config show --all"),
-)  # fmt: skip
-@click.argument("command", nargs=-1, metavar="[COMMAND]")
-@click.option("--all", "show_all", is_flag=True, help="Options that have their default, too.")
-@JSON
-@QUIET
+@command(
+    "show",
+    "realsim config show",
+    "realsim config show school run",
+    "realsim config show --all",
+    group=config_command,
+)
+@click.argument("path", nargs=-1, metavar="[COMMAND]")
+@options(all=False)
 @click.pass_context
 def show_command(
-    ctx: click.Context, command: tuple[str, ...], show_all: bool, as_json: bool, quiet: bool
+    ctx: click.Context, console: Console, path: tuple[str, ...], show_all: bool
 ) -> None:
     """Show what is in force, and where each value came from.
 
@@ -44,20 +46,18 @@ def show_command(
     """
     from realsim.app.config.applied import config_file
     from realsim.app.config.in_force import DEFAULT, in_force, strange_variables
-    from realsim.app.console import Console
 
-    console = Console(quiet=quiet, as_json=as_json)
     file = config_file(ctx)
     root = ctx.find_root()
     assert isinstance(root.command, Group)
     every = walk(root.command)
-    chosen = {path: c for path, c in every.items() if path[: len(command)] == command}
+    chosen = {name: c for name, c in every.items() if name[: len(path)] == path}
     if not chosen:
-        known = ", ".join(" ".join(path) for path in every)
-        raise InputError(f"there is no command '{' '.join(command)}'; there are: {known}.")
+        known = ", ".join(" ".join(name) for name in every)
+        raise InputError(f"there is no command '{' '.join(path)}'; there are: {known}.")
     settings: Mapping[str, Any] = root.default_map or {}
     rows = in_force(chosen, settings, file)
-    shown = [r for r in rows if command or show_all or r.origin != DEFAULT]
+    shown = [r for r in rows if path or show_all or r.origin != DEFAULT]
     console.say(f"file: {'none' if file is None else file.path}")
     if shown:
         table = [[f"{r.command} --{r.option}", _text(r.value), r.origin] for r in shown]
@@ -77,7 +77,7 @@ def _text(value: Any) -> str:
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-@CONFIG.command(
+@config_command.command(
     "template", cls=Command,
     examples=("realsim config template", "realsim config template > realsim.toml"),
 )  # fmt: skip

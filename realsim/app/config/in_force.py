@@ -9,7 +9,14 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from realsim.app.command import ENVIRONMENT, default_of, settable, spelling, variable
+from realsim.app.command import (
+    ENVIRONMENT,
+    default_of,
+    settable,
+    spelling,
+    take_old_variables,
+    variable,
+)  # fmt: skip
 from realsim.app.config.files import ConfigFile
 from realsim.errors import InputError
 
@@ -44,6 +51,8 @@ def in_force(
     Raises:
         InputError: a variable's value cannot be used.
     """
+    for path, command in commands.items():
+        take_old_variables(command, path)
     return [
         _one(path, option, _of(settings, path), file)
         for path, command in commands.items()

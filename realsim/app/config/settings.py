@@ -7,8 +7,17 @@ from typing import Any, cast
 
 import click
 
-from realsim.app.command import Group, context_of, default_of, settable, spelling
+from realsim.app.command import (
+    Group,
+    context_of,
+    default_of,
+    old_names,
+    say_renamed,
+    settable,
+    spelling,
+)  # fmt: skip
 from realsim.app.config.files import ConfigFile
+from realsim.app.option_values import Amount
 from realsim.errors import InputError
 
 Settings = dict[str, Any]
@@ -66,9 +75,13 @@ def _of_command(
     command: click.Command, path: tuple[str, ...], table: Mapping[str, Any], file: ConfigFile
 ) -> Settings:
     options = {spelling(option): option for option in settable(command)}
+    renamed = old_names(command, path)
     found: Settings = {}
     for key, value in table.items():
         name = key.replace("_", "-")
+        if name in renamed:
+            say_renamed(f"{file.place(path, key)}: {key}", renamed[name])
+            name = renamed[name]
         option = options.get(name)
         where = f"{file.place(path, key)}: [{'.'.join(path)}]"
         if option is None:
@@ -140,7 +153,8 @@ def kind_of(option: click.Option) -> str:
     if isinstance(kind, click.Path):
         return "a path in quotes"
     if isinstance(kind, click.IntRange) or kind is click.INT:
-        return "a whole number"
+        words = kind.words if isinstance(kind, Amount) else ()
+        return " or ".join(("a whole number", *(f"{w} in quotes" for w in words)))
     if isinstance(kind, click.FloatRange) or kind is click.FLOAT:
         return "a number"
     return "a text in quotes"

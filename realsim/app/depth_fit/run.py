@@ -47,12 +47,13 @@ class DepthFrames:
 class DepthFitRequest:
     """The options of `realsim depth-fit`."""
 
-    profile_name: str = "d405"
+    sensor: str = "d405"
     simulator: Literal["disparity", "stereo"] = "disparity"
     out: Path | None = None
-    views: str = ""
-    camera: Path | None = None
-    unit_m: float | None = None
+    views: tuple[int, ...] = ()
+    intrinsics: Path | None = None
+    depth_unit: float | None = None
+    """Metres per count of a folder's images; None = the sensor's."""
     baseline_m: float | None = None
 
 
@@ -70,16 +71,11 @@ def run_depth_fit(source: Path, request: DepthFitRequest, console: Any) -> None:
     simulator = request.simulator
     out = OUT[simulator] if request.out is None else request.out
     require_free_file(out, "--out", SENSOR_MARKS, "sensor", (".png",))
-    kind = profile(request.profile_name)
+    kind = profile(request.sensor)
     if request.baseline_m is not None:
         kind = replace(kind, baseline_m=request.baseline_m)
-    unit_m = kind.depth_unit_m if request.unit_m is None else request.unit_m
-    if not 1e-7 <= unit_m <= 0.02:
-        raise InputError(
-            f"--unit {unit_m:g} m a count is refused; 1e-7 to 0.02 is accepted (0.001 where the "
-            "counts are millimetres)."
-        )
-    frames = read_frames(source, request.views, request.camera, unit_m, kind.name)
+    unit_m = kind.depth_unit_m if request.depth_unit is None else request.depth_unit
+    frames = read_frames(source, request.views, request.intrinsics, unit_m, kind.name)
     if frames.is_nominal:
         console.say(
             f"no camera is given: the nominal focal length of a {kind.name}, "
@@ -132,7 +128,7 @@ def _show_stereo(fit: "FittedStereo", kind: DepthProfile, console: Any) -> None:
 
 
 def read_frames(
-    source: Path, views: str, camera: Path | None, unit_m: float, kind: str
+    source: Path, views: tuple[int, ...], camera: Path | None, unit_m: float, kind: str
 ) -> DepthFrames:
     """Return the depth images of a session or of a folder, by a kind of camera.
 
@@ -150,19 +146,15 @@ def read_frames(
     return _of_folder(source, views, camera, unit_m, kind)
 
 
-def _of_session(source: Path, views: str) -> DepthFrames:
-    from realsim.app.option_values import numbers_of
+def _of_session(source: Path, wanted: tuple[int, ...]) -> DepthFrames:
     from realsim.store import SessionStore
 
     with SessionStore.open(source) as store:
-        wanted = numbers_of(views)
         indices = [
             i for i in sorted(store.completed) if store.has_depth(i) and (not wanted or i in wanted)
         ]
         if not indices:
-            raise InputError(
-                f"{source} has no views with depth{' among ' + views if views else ''}."
-            )
+            raise InputError(f"{source} has no views with depth{' among them' if wanted else ''}.")
         indices = _spread(indices, bool(wanted))
         return DepthFrames(
             depths_m=tuple(store.depth_m(i) for i in indices),
@@ -173,10 +165,9 @@ def _of_session(source: Path, views: str) -> DepthFrames:
 
 
 def _of_folder(
-    source: Path, views: str, camera: Path | None, unit_m: float, kind: str
+    source: Path, wanted: tuple[int, ...], camera: Path | None, unit_m: float, kind: str
 ) -> DepthFrames:
     from realsim.app.importing.folder import camera_of_file
-    from realsim.app.option_values import numbers_of
 
     place = source / "depth" if (source / "depth").is_dir() else source
     # Arrays are depth; beside them PNGs are the colour.
@@ -185,11 +176,10 @@ def _of_folder(
         raise InputError(
             f"{place} holds no PNG and no NPY; 16-bit depth images of a plane are looked for."
         )
-    wanted = numbers_of(views)
     if wanted:
         paths = [p for k, p in enumerate(paths) if k in wanted]
         if not paths:
-            raise InputError(f"--views {views} names none of the images of {place} (from 0 on).")
+            raise InputError(f"--only-views names none of the images of {place} (from 0 on).")
     paths = _spread(paths, bool(wanted))
     depths = tuple(_depth_of(p, unit_m) for p in paths)
     height, width = depths[0].shape
@@ -205,7 +195,7 @@ def _of_folder(
         )  # fmt: skip
     else:
         raise InputError(
-            f"the camera of {source} is not known: give --camera FILE, or put a camera.json "
+            f"the camera of {source} is not known: give --intrinsics FILE, or put a camera.json "
             "beside the images."
         )
     for path, depth in zip(paths, depths, strict=True):

@@ -1,35 +1,30 @@
 """`realsim doctor`: its options."""
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from realsim.app.command import Command
-from realsim.app.options import FOLDER, JSON, QUIET
+from realsim.app.console import Console
+from realsim.app.option_values import FOLDER
+from realsim.app.options import command, options
 
 if TYPE_CHECKING:
     from realsim.app.doctor.finding import Finding
 
 
-@click.command(
+@command(
     "doctor",
-    cls=Command,
-    examples=(
-        "realsim doctor",
-        "realsim doctor demo/session --json",
-        "realsim doctor --robot-host 192.168.1.10",
-    ),
+    "realsim doctor",
+    "realsim doctor demo/session --json",
+    "realsim doctor --robot-host 192.168.1.10",
 )
 @click.argument("session", type=FOLDER, required=False)
-@click.option("--robot-host", default="", help="IP address of the arm's controller, to be asked.")
-@JSON
-@QUIET
+@options(robot_host="")
 @click.pass_context
 def doctor_command(
-    ctx: click.Context, session: Path | None, robot_host: str, as_json: bool, quiet: bool
-) -> None:
+    ctx: click.Context, console: Console, session: Path | None, robot_host: str
+) -> bool:
     """Say what of this machine is fit for realsim, what is missing, and how to get it.
 
     Versions and libraries, memory, the disk of SESSION, settings, cameras, the robot. Nothing is
@@ -37,12 +32,9 @@ def doctor_command(
 
     Exit codes: 0 nothing is wrong, 1 there is a problem.
     """
-    from realsim.app.console import Console
     from realsim.app.doctor.run import examine, show
 
-    console = Console(quiet=quiet, as_json=as_json)
-    if not show(examine(session, robot_host, console, _settings(ctx)), console):
-        sys.exit(1)
+    return show(examine(session, robot_host, console, _settings(ctx)), console)
 
 
 def _settings(ctx: click.Context) -> "list[Finding]":

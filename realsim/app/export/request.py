@@ -70,7 +70,7 @@ class ExportRequest:
         if self.undistort and self.keep_distortion:
             raise InputError("--undistort and --keep-distortion contradict each other.")
         if self.points < 0:
-            raise InputError(f"--points {self.points} cannot be; 0 or more is accepted.")
+            raise InputError(f"--colmap-points {self.points} cannot be; 0 or more is accepted.")
 
     def asked(self) -> dict[str, Any]:
         """Return the request as plain JSON values: what an interrupted export is recognised by."""

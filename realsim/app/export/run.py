@@ -38,7 +38,8 @@ ALWAYS = ("sources", "target", "scenes", "name", "licence", "models_licence", "a
 """Options of every format."""
 STATED = ("name", "licence", "models_licence", "attribution")
 """Options that the card tells elsewhere."""
-OPTION_NAMES = {"models_licence": "models-licence", "masks": "no-masks"}
+OPTION_NAMES = {"masks": "no-masks", "camera": "camera-name", "scenes": "only-scenes",
+                "points": "colmap-points", "name": "title"}  # fmt: skip
 HOLD_OBJECTS = ("dataset", "scene")
 """Kinds of formats that have a place for objects and their poses."""
 LABELS = {"annotated": "computed by realsim", "imported": "as imported, unchecked", "none": "none"}

@@ -46,7 +46,7 @@ class FolderRequest:
     """What `realsim import` was told of a folder."""
 
     choice: FolderChoice
-    camera: Path | None = None
+    intrinsics: Path | None = None
     """File with the intrinsics; looked for in the folder where None."""
     poses: Path | None = None
     """File or folder of poses; looked for in the folder where None."""
@@ -79,8 +79,8 @@ def open_image_folder(root: Path, request: FolderRequest) -> tuple[FolderSource,
         states.append(info.states)
         notes.append(f"camera poses from {info.path.name}, in metres, camera to world.")
     camera: CameraIntrinsics | None
-    if request.camera is not None:
-        camera = camera_of_file(request.camera, size)
+    if request.intrinsics is not None:
+        camera = camera_of_file(request.intrinsics, size)
     elif info is not None:
         camera = CameraIntrinsics.from_K(info.K, *size)
         notes.append(f"camera from {info.path.name}; it has no distortion.")
@@ -102,7 +102,7 @@ def open_image_folder(root: Path, request: FolderRequest) -> tuple[FolderSource,
 
 
 def camera_of_file(path: Path, size: tuple[int, int] | None) -> CameraIntrinsics:
-    """Return the camera in a file, of any format that `realsim calibrate --camera` reads.
+    """Return the camera in a file, of any format that `realsim calibrate --intrinsics` reads.
 
     A text file of nine numbers is a camera matrix; it, or a file that names no image size, holds
     for images of `size` if its principal point lies near their centre.
@@ -179,7 +179,7 @@ def _camera_in(
     if not found and failed:
         raise InputError(
             f"the camera of the images ({size[0]}x{size[1]} px) is not known: {' '.join(failed)} "
-            "Give --camera FILE."
+            "Give --intrinsics FILE."
         )
     if not found:
         return None, []
@@ -187,7 +187,7 @@ def _camera_in(
     if any(not _equal(first, camera) for _, camera in found[1:]):
         raise InputError(
             f"{listing.root} holds several cameras: {', '.join(p.name for p, _ in found)}. Say "
-            f"which is the colour camera's: --camera {found[0][0]}."
+            f"which is the colour camera's: --intrinsics {found[0][0]}."
         )
     return first, [f"camera from {found[0][0].name}."]
 
@@ -201,7 +201,7 @@ def _stated_unit(listing: ImageFolder, request: FolderRequest) -> tuple[float | 
     if request.choice.depth_unit_m is not None or not listing.depth:
         return None, []
     files = [p for p in camera_files(listing) if p.suffix.lower() == ".json"]
-    for path in [request.camera] if request.camera is not None else files:
+    for path in [request.intrinsics] if request.intrinsics is not None else files:
         try:
             values: Any = json.loads(path.read_text())
             scale = float(values["depth_scale"])

@@ -45,7 +45,7 @@ ONLY_FOR: dict[str, tuple[str, ...]] = {
     "depth_unit": ("folder", "bag", "colmap", "nerfstudio"),
     "depths": ("folder", "colmap"),
     "images": ("folder", "colmap", "nerfstudio"),
-    "camera": ("folder", "bag"),
+    "intrinsics": ("folder", "bag"),
     "no_depth": ("folder", "bag", "bop", "graspnet", "colmap", "nerfstudio"),
     "arm": ("folder", "bag"),
     "scene": ("bop", "graspnet"),
@@ -62,7 +62,7 @@ BAG_OPTIONS = {
     "joints": "--joints-topic ",
     "camera_info": "--camera-info-topic ",
     "depth_camera_info": "--depth-camera-info-topic ",
-    "intrinsics": "--camera ",
+    "intrinsics": "--intrinsics ",
     "depth_unit_m": "--depth-unit ",
     "without_depth": "--no-depth ",
     "joint_names": "--arm ",
@@ -83,7 +83,7 @@ class ImportRequest:
 
     source: Path
     kind: str = "auto"
-    camera: Path | None = None
+    intrinsics: Path | None = None
     """File with the intrinsics."""
     depth_unit: float | None = None
     """Metres per count of the depth."""
@@ -326,7 +326,7 @@ def folder_request(request: ImportRequest) -> FolderRequest:
             depth_unit_m=request.depth_unit,
             depth_coding=request.depth_coding,
         ),
-        camera=request.camera,
+        intrinsics=request.intrinsics,
         poses=request.poses,
         use_poses=not request.no_poses,
         reading=request.reading,
@@ -405,7 +405,7 @@ def _open_colmap(request: ImportRequest, console: Console) -> FrameSource:
 def _open_bag(request: ImportRequest, console: Console) -> FrameSource:
     from realsim.formats.bags import BagChoice, open_bag
 
-    camera = None if request.camera is None else camera_of_file(request.camera, None)
+    camera = None if request.intrinsics is None else camera_of_file(request.intrinsics, None)
     choice = BagChoice(
         colour=request.colour_topic,
         depth=request.depth_topic,

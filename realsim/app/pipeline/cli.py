@@ -1,38 +1,28 @@
 """`realsim pipeline`: its options."""
 
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
-from realsim.app.command import Command, Group
-from realsim.app.options import FOLDER, JSON, QUIET, many
+from realsim.app.command import Group
+from realsim.app.console import Console
+from realsim.app.option_values import FOLDER
+from realsim.app.options import Has, Where, command, many, options
 
-if TYPE_CHECKING:
-    from realsim.many import PoolConfig
 
-
-@click.command(
+@command(
     "pipeline",
-    cls=Command,
-    examples=(
-        "realsim pipeline campaign.toml --workers 2",
-        "realsim pipeline campaign.toml --json",
-    ),
+    "realsim pipeline campaign.toml --workers 2",
+    "realsim pipeline campaign.toml --json",
 )
 @click.argument("campaign", type=FOLDER)
-@many(help="Scenes at a time.")
-@click.option("--plan", "only_plan", is_flag=True, help="Print what would run, and run nothing.")
-@click.option("--without-failed", is_flag=True,
-              help="Export what is done, although scenes failed.")  # fmt: skip
-@JSON
-@QUIET
+@many(note="; scenes at a time")
+@options(list=Has(False, ": print what would run"), without_failed=False)
 @click.pass_context
 def pipeline_command(
-    ctx: click.Context, campaign: Path, where: "PoolConfig", only_plan: bool, without_failed: bool,
-    as_json: bool, quiet: bool,
-) -> None:  # fmt: skip
+    ctx: click.Context, console: Console, campaign: Path, where: Where, list_only: bool,
+    without_failed: bool,
+) -> bool:  # fmt: skip
     """Run a campaign: the scenes and stages that the file CAMPAIGN names.
 
     \b
@@ -54,19 +44,16 @@ def pipeline_command(
 
     Exit codes: 0 done, 1 a scene or a stage failed, 2 bad input, 130 interrupted.
     """  # noqa: D301 - click's own mark for lines that stay as they are
-    from realsim.app.console import Console
     from realsim.app.pipeline.campaign import read_campaign
     from realsim.app.pipeline.run import run_pipeline, show_pipeline, show_plan
 
     root = ctx.find_root().command
     assert isinstance(root, Group)
-    console = Console(quiet=quiet, as_json=as_json)
     asked = read_campaign(campaign, root)
-    if only_plan:
+    if list_only:
         show_plan(asked, console)
-        return
+        return True
     result = run_pipeline(asked, where, console, without_failed=without_failed)
     show_pipeline(asked, result, console)
     console.result(result.told)
-    if result.failed:
-        sys.exit(1)
+    return not result.failed

@@ -25,7 +25,7 @@ class Place:
 
     arm: str | None = None
     """Name or folder of the arm; None = what a path's own poses prove."""
-    calibration: Path | None = None
+    arm_calibration: Path | None = None
     """The controller's calibration.conf, or the YAML of ROS's ur_calibration."""
     mount: Path | None = None
     """Mount file; None is a D405 on the usual bracket."""
@@ -43,16 +43,16 @@ class Place:
         from realsim.robots.controller_file import read_controller_calibration
 
         if self.arm is None:
-            if self.calibration is not None:
+            if self.arm_calibration is not None:
                 raise InputError(
-                    f"--calibration {self.calibration} needs --arm: the file does not name its "
-                    "model."
+                    f"--arm-calibration {self.arm_calibration} needs --arm: the file does not name "
+                    "its model."
                 )
             return None
         nominal = find_arm(self.arm).chain
-        if self.calibration is None:
+        if self.arm_calibration is None:
             return nominal
-        return read_controller_calibration(self.calibration, nominal)
+        return read_controller_calibration(self.arm_calibration, nominal)
 
     def camera_mount(self) -> Mount:
         """Return the mount of the file, or the usual one."""

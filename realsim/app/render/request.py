@@ -32,12 +32,12 @@ CAMERA_STREAM = 7
 class RenderRequest:
     """What the user asked for; empty = decided from the session."""
 
-    views: str = "real"
+    views: int | str = "real"
     """'real' or a number of new ones."""
     out: Path | None = None
     renderer: str = "embedded"
     depth: str = "disparity"
-    camera: str = ""
+    sensor: str | None = None
     """Name of a depth profile."""
     depth_model: Path | None = None
     """File of `realsim depth-fit`."""
@@ -67,9 +67,9 @@ class RenderRequest:
                     )
         radius_of(self.radius)
         size_of(self.size)
-        if self.camera and self.camera not in PROFILES:
+        if self.sensor and self.sensor not in PROFILES:
             raise InputError(
-                f"--camera '{self.camera}' is not known; the depth cameras are: "
+                f"--sensor '{self.sensor}' is not known; the depth cameras are: "
                 f"{', '.join(sorted(PROFILES))}."
             )
         depth_model_of(self.depth_model, self.depth)
@@ -87,7 +87,7 @@ class RenderRequest:
         """
         if self.views == "real":
             return None
-        if self.views.isdecimal() and 1 <= int(self.views) <= LARGEST_VIEWS:
+        if str(self.views).isdecimal() and 1 <= int(self.views) <= LARGEST_VIEWS:
             return int(self.views)
         raise InputError(
             f"--views '{self.views}' is neither 'real' nor a number of new views from 1 to "
@@ -103,7 +103,7 @@ class RenderRequest:
             return self.out
         name = "real" if self.new_views is None else f"new{self.new_views}"
         chosen = [
-            self.camera,
+            self.sensor,
             self.depth_model.stem if self.depth_model else "",
             f"{self.radius}m" if self.radius else "",
             self.size,
@@ -119,7 +119,7 @@ class RenderRequest:
         unit_m = store.session.depth_unit_m if self.new_views is None else None
         return SyntheticConfig(
             renderer=self.renderer, depth=self.depth,  # pyright: ignore[reportArgumentType]
-            profile=self.camera or camera_of(store), depth_unit_m=unit_m,
+            profile=self.sensor or camera_of(store), depth_unit_m=unit_m,
             depth_model=depth_model_of(self.depth_model, self.depth),
         )  # fmt: skip
 

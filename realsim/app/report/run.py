@@ -35,11 +35,9 @@ class ReportRequest:
     limits: Path | None = None
     fail_on: tuple[str, ...] = ()
     fail_if_worse: bool = False
-    as_json: bool = False
-    quiet: bool = False
 
 
-def run_report(request: ReportRequest) -> bool:
+def run_report(request: ReportRequest, console: Console) -> bool:
     """Write a report, or compare several; return whether nothing failed.
 
     Raises:
@@ -50,10 +48,10 @@ def run_report(request: ReportRequest) -> bool:
     if len(request.sources) == 1:
         if request.fail_if_worse:
             raise InputError("--fail-if-worse compares: give two sessions or more.")
-        return _one(request, limits)
+        return _one(request, limits, console)
     if request.truth is not None:
         raise InputError("--truth belongs to one session; leave it out of a comparison.")
-    return _several(request, limits)
+    return _several(request, limits, console)
 
 
 MADE_FROM = (
@@ -63,7 +61,7 @@ MADE_FROM = (
 """Files of a session that its report is made of."""
 
 
-def _one(request: ReportRequest, limits: Sequence[Limit]) -> bool:
+def _one(request: ReportRequest, limits: Sequence[Limit], console: Console) -> bool:
     """Report one session."""
     from realsim.app.stages import note, open_session
     from realsim.app.truth import loop_errors
@@ -72,7 +70,6 @@ def _one(request: ReportRequest, limits: Sequence[Limit]) -> bool:
         raise InputError(_not_alone(request.sources[0]))
     store = open_session(request.sources[0])
     errors = None if request.truth is None else loop_errors(store, request.truth)
-    console = Console(quiet=request.quiet, as_json=request.as_json)
     if request.out is None:
         report = report_of(store, errors, "kept")
         path = write_report_of(store, report)
@@ -86,7 +83,7 @@ def _one(request: ReportRequest, limits: Sequence[Limit]) -> bool:
     failed += [f"limit: {text}" for text in broken(limits, report.figures)]
     document = report.document(page) | {"failed": failed}
     console.result(document)
-    if not (request.as_json or request.quiet):
+    if not (console.as_json or console.quiet):
         _say_one(console, document)
         console.say(f"report    {path}")
     _tell(console, failed)
@@ -113,9 +110,8 @@ def _say_one(console: Console, document: dict[str, Any]) -> None:
         console.say(f"missing   {command}")
 
 
-def _several(request: ReportRequest, limits: Sequence[Limit]) -> bool:
+def _several(request: ReportRequest, limits: Sequence[Limit], console: Console) -> bool:
     """Compare several sessions."""
-    console = Console(quiet=request.quiet, as_json=request.as_json)
     with console.stage("report", f"{len(request.sources)} sessions"):
         comparison = comparison_of(sources_of(request.sources))
     failed = [
@@ -130,7 +126,7 @@ def _several(request: ReportRequest, limits: Sequence[Limit]) -> bool:
     if request.out is not None:
         _written(request.out, comparison_page(comparison))
     console.result(as_json(comparison) | {"failed": failed})
-    if not (request.as_json or request.quiet):
+    if not (console.as_json or console.quiet):
         _say_several(console, comparison)
         if request.out is not None:
             console.say(f"page      {request.out}")

@@ -1,25 +1,25 @@
-"""`realsim reproduce`: make a result again from its record, and compare."""
+"""`realsim reproduce`: its options."""
 
-import sys
+from dataclasses import asdict
+from math import isfinite
 from pathlib import Path
 
 import click
 
-from realsim.app.command import Command
-from realsim.app.options import FOLDER, JSON, QUIET, workers
+from realsim.app.console import Console
+from realsim.app.option_values import FOLDER
+from realsim.app.options import command, options
 
 
-@click.command(
-    "reproduce", cls=Command,
-    examples=("realsim reproduce demo/session annotate",
-              "realsim reproduce demo/session register --json"),
-)  # fmt: skip
+@command(
+    "reproduce",
+    "realsim reproduce demo/session annotate",
+    "realsim reproduce demo/session register --json",
+)
 @click.argument("result", type=FOLDER)
 @click.argument("stage", default="", metavar="[STAGE]")
-@workers()
-@JSON
-@QUIET
-def reproduce_command(result: Path, stage: str, workers: int, as_json: bool, quiet: bool) -> None:
+@options(workers=2)
+def reproduce_command(console: Console, result: Path, stage: str, workers: int) -> bool:
     """Make RESULT again from its record and compare, file by file and value by value.
 
     RESULT is a session with a STAGE (register, school, annotate), or the folder of an export. What
@@ -29,13 +29,8 @@ def reproduce_command(result: Path, stage: str, workers: int, as_json: bool, qui
 
     Exit codes: 0 equal, 1 something differs, 2 it cannot be made again.
     """
-    from dataclasses import asdict
-    from math import isfinite
-
-    from realsim.app.console import Console
     from realsim.app.reproduce.run import reproduce
 
-    console = Console(quiet=quiet, as_json=as_json)
     found = reproduce(result, stage, console, workers)
     for d in found.differing:
         size = f" (by at most {d.greatest:.3g})" if isfinite(d.greatest) else ""
@@ -51,5 +46,4 @@ def reproduce_command(result: Path, stage: str, workers: int, as_json: bool, qui
         "stage": found.stage, "equal": found.equal, "files": found.files, "differing": rows,
         "other_versions": list(found.other_versions),
     })  # fmt: skip
-    if not found.equal:
-        sys.exit(1)
+    return found.equal

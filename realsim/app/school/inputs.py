@@ -258,7 +258,7 @@ def named_mass(text: str) -> tuple[str, float]:
         mass = math.nan
     if not mark or not name or not (math.isfinite(mass) and 0 < mass <= 100):
         raise InputError(
-            f"--mass '{text}' is no weighed object; NAME=KG with a mass above 0 and up to 100 "
+            f"--weighed '{text}' is no weighed object; NAME=KG with a mass above 0 and up to 100 "
             "kg is one, such as mug=0.31."
         )
     return name, mass
@@ -305,10 +305,10 @@ def masses_of(texts: Sequence[str], models: Mapping[int, ObjectModel]) -> dict[i
         if len(named) != 1:
             what = "names several objects" if named else "is of no object of this scene"
             raise InputError(
-                f"--mass '{text}' {what}; there are: {names_of(list(models.values()))}."
+                f"--weighed '{text}' {what}; there are: {names_of(list(models.values()))}."
             )
         if named[0] in masses:
-            raise InputError(f"--mass names the object '{name}' twice; give it once.")
+            raise InputError(f"--weighed names the object '{name}' twice; give it once.")
         masses[named[0]] = mass
     return masses
 

@@ -50,7 +50,9 @@ def judge(
 
     given = options["calibration"]
     if fit is not None and given is not None:
-        raise InputError("--fit makes a calibration and --calibration takes one; give one of them.")
+        raise InputError(
+            "--fit makes a calibration and --p-hold-calibration takes one; give one of them."
+        )
     objects = read_graspa(folder, _masses(options))
     names = {obj.name for obj in objects}
     config = _config(options)
@@ -82,7 +84,7 @@ def _masses(options: dict[str, Any]) -> dict[str, float]:
     """Return the masses given on the command line, by object [kg]; check the cache's folder."""
     masses = [named_mass(text) for text in options["masses"]]
     if len(dict(masses)) < len(masses):
-        raise InputError("--mass names an object twice; give it once.")
+        raise InputError("--weighed names an object twice; give it once.")
     if options["cache"] is not None and not options["cache"].is_dir() and options["cache"].exists():
         raise InputError(f"--cache {options['cache']} is a file; a folder is expected.")
     return dict(masses)

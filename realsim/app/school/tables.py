@@ -274,7 +274,7 @@ def doubts(sets: Sequence[GraspSet], models: Names) -> list[str]:
         if s.parameters.get("watertight") is False:
             words.append(
                 f"{named(s, models)}: its mesh is not closed, so its mass is a guess: weigh it "
-                "(`--mass`) or repair it (`realsim scan import`)"
+                "(`--weighed`) or repair it (`realsim scan import`)"
             )
     return words
 

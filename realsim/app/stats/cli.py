@@ -1,16 +1,13 @@
-"""`realsim stats` on the command line."""
+"""`realsim stats`: its options."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
-from realsim.app.command import Command
-from realsim.app.options import FOLDER, JSON, QUIET, json_file, many
+from realsim.app.console import Console
+from realsim.app.option_values import FOLDER
+from realsim.app.options import Has, Where, command, json_file, many, options
 from realsim.app.outputs import OutputFolder
-
-if TYPE_CHECKING:
-    from realsim.many import PoolConfig
 
 KEYS = ("statistics", "landscape")
 OUT = OutputFolder(
@@ -19,21 +16,18 @@ OUT = OutputFolder(
 )
 
 
-@click.command(
-    "stats", cls=Command,
-    examples=("realsim stats demo/session --out statistics", "realsim stats demo/session --json"),
-)  # fmt: skip
+@command(
+    "stats", "realsim stats demo/session --out statistics", "realsim stats demo/session --json"
+)
 @click.argument("sources", type=FOLDER, nargs=-1, required=True, metavar="SOURCE...")
-@click.option("--out", type=OUT, default=None, help="Folder for CSV, JSON and an HTML page.")
-@json_file("File for the JSON alone.", *KEYS)
-@click.option("--compare", type=FOLDER, default=None, metavar="OLD",
-              help="Say what differs from an older release instead.")  # fmt: skip
-@many(1, "Sessions at a time.")
-@JSON
-@QUIET
+@options(
+    out=Has(None, ": a folder for CSV, JSON and a page", OUT), json_file=json_file(*KEYS),
+    compare=None,
+)  # fmt: skip
+@many(1, "; sessions at a time")
 def stats_command(
-    sources: tuple[Path, ...], out: Path | None, json_file: Path | None, compare: Path | None,
-    where: "PoolConfig", as_json: bool, quiet: bool,
+    console: Console, sources: tuple[Path, ...], out: Path | None, json_file: Path | None,
+    compare: Path | None, where: Where,
 ) -> None:  # fmt: skip
     """Count what sessions hold, row by row as in the paper: scenes, frames, grasps, scores.
 
@@ -42,15 +36,13 @@ def stats_command(
     With --compare, SOURCE and OLD are two releases of one data set, BOP or GraspNet data sets too:
     scenes, frames, objects, poses that moved and by how much, grasps that came, went or changed.
     """
-    from realsim.app.console import Console
     from realsim.app.stats.run import run_stats
 
-    if compare is not None:
+    if compare is None:
+        run_stats(sources, out, json_file, console, where)
+    elif out is not None or json_file is not None:
+        raise click.UsageError("--compare shows or prints (--json): no --out, no --json-file.")
+    else:
         from realsim.app.stats.compare import compare_releases
 
-        if out is not None or json_file is not None:
-            raise click.UsageError("--compare shows or prints (--json): no --out, no --json-file.")
-        console = Console(quiet=quiet, as_json=as_json)
         console.result(compare_releases(sources, compare, console))
-        return
-    run_stats(sources, out, json_file, Console(quiet=quiet, as_json=as_json), where)

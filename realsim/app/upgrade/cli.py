@@ -1,56 +1,36 @@
-"""`realsim upgrade`: the command line."""
+"""`realsim upgrade`: its options."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import click
 
-from realsim.app.command import Command
-from realsim.app.option_values import numbers_of
-from realsim.app.options import FOLDER, JSON, QUIET, many
+from realsim.app.console import Console
+from realsim.app.meanings import one_of
+from realsim.app.option_values import FOLDER
+from realsim.app.options import Has, command, many, options, rare
 from realsim.app.outputs import GOES_ON
 
 
-@click.command(
+@command(
     "upgrade",
-    cls=Command,
-    examples=(
-        "realsim upgrade dataset --out upgraded --scenes 1 --grasps 4",
-        "realsim upgrade dataset --out upgraded_gt --views 1 --grasps 2 --workers 1 --json",
-    ),
+    "realsim upgrade dataset --out upgraded --only-scenes 1 --grasps 4",
+    "realsim upgrade dataset --out upgraded_gt --views 1 --grasps 2 --workers 1 --json",
 )
 @click.argument("dataset", type=FOLDER)
-@click.option(
-    "--out",
-    type=GOES_ON,
-    required=True,
-    help="Folder for the upgraded BOP dataset.",
-)
-@click.option("--kind", default="auto", show_default=True,
-              type=click.Choice(["auto", "bop", "graspnet"]), help="What DATASET is.")  # fmt: skip
-@click.option("--camera", default="", metavar="NAME",
-              help="kinect or realsense, of GraspNet; a camera of BOP.  [all]")  # fmt: skip
-@click.option(
-    "--start",
-    default="gt",
-    show_default=True,
-    help="Start poses: 'gt' (the annotations) or a folder under keyframe_poses/.",
-)
-@click.option("--scenes", default="", help="Scene numbers, such as 1-3,7; all by default.")
-@click.option("--views", type=click.IntRange(1), default=None,
-              help="At most so many images of each scene, spread evenly.  [all]")  # fmt: skip
-@click.option("--models", type=FOLDER, default=None, help="Models folder, if not DATASET/models.")
-@click.option("--grasps", default=60, show_default=True, type=click.IntRange(1, 2000),
-              help="Candidates to try on each object, at most.")  # fmt: skip
-@click.option("--analytic", default=0, show_default=True, type=click.IntRange(0, 2000),
-              help="Analytic grasps to try on each object beside these.")  # fmt: skip
-@many(None, "Scenes at a time, or processes of the only one.  [one a core]")
-@JSON
-@QUIET
+@options(
+    out=Has(kind=GOES_ON, note=": a folder", required=True), only_scenes="",
+    views=Has(None, " of each scene at most, spread evenly  [all]"), grasps=60,
+    models=Has(None, "  [DATASET/models]"),
+)  # fmt: skip
+@many(None, "; scenes at a time, or of the only one  [one a core]")
+@rare(
+    kind=Has("auto", kind=one_of("auto bop graspnet")), camera_name=Has("", "  [all]"), start="gt",
+    analytic=0,
+)  # fmt: skip
 def upgrade_command(
-    dataset: Path, out: Path, scenes: str, as_json: bool, quiet: bool, **options: Any
-) -> None:
+    console: Console, dataset: Path, out: Path, grasps: int, camera_name: str, **options: Any
+) -> bool:
     """Refine the poses of a BOP or GraspNet data set, try grasps, write it out with labels.
 
     DATASET is a BOP root, a split or one scene; or a GraspNet root, a scene, one camera of it
@@ -62,16 +42,11 @@ def upgrade_command(
 
     Exit codes: 0 done, 1 a scene was left out, 2 bad input.
     """
-    from realsim.app.console import Console
     from realsim.app.upgrade.dataset import UpgradeConfig
     from realsim.app.upgrade.run import run_upgrade, show_upgrade
 
-    config = UpgradeConfig(
-        scenes=numbers_of(scenes), grasps_per_object=options.pop("grasps"), **options
-    )
-    console = Console(quiet=quiet, as_json=as_json)
+    config = UpgradeConfig(camera=camera_name, grasps_per_object=grasps, **options)
     result = run_upgrade(config, dataset, out, console)
     show_upgrade(result, console)
     console.result(result)
-    if result.failed:
-        sys.exit(1)
+    return not result.failed

@@ -132,7 +132,7 @@ def _bop(dataset: Path, config: UpgradeConfig) -> list[SceneRef]:
             raise InputError(
                 f"'{dataset}' holds no BOP scene of the camera '{config.camera}'"
                 + (f"; it has {', '.join(there)}." if there else ": its scenes name no camera. ")
-                + ("" if there else "Leave --camera out.")
+                + ("" if there else "Leave --camera-name out.")
             )
     return [
         SceneRef(

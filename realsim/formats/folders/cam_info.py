@@ -77,7 +77,7 @@ def read_cam_info(path: Path) -> CamInfo:
             T = se3.check_rigid(_matrix(values, 4, name), name)
             states.append(FrameState(name=pose[1], where=name, T_world_cam=T))
     if K is None:
-        raise InputError(f"{path} has no '{COLOUR_TITLE}'; give the camera with --camera.")
+        raise InputError(f"{path} has no '{COLOUR_TITLE}'; give the camera with --intrinsics.")
     far = [s for s in states if s.T_world_cam is not None and _distance(s) > FARTHEST_M]
     if far:
         raise UnitError(

@@ -203,9 +203,9 @@ def _checked_camera(listing: ImageFolder, camera: CameraIntrinsics | None) -> Ca
     if camera is None:
         raise InputError(
             f"{listing.root}: the camera of the images ({width}x{height} px) is not known, and "
-            "without it nothing can be measured in them. Give --camera FILE: OpenCV YAML or XML, "
-            "ROS camera_info YAML, JSON with fx fy cx cy width height, a BOP camera.json, COLMAP's "
-            "cameras.txt, or a text file with the 3x3 matrix."
+            "without it nothing can be measured in them. Give --intrinsics FILE: OpenCV YAML or "
+            "XML, ROS camera_info YAML, JSON with fx fy cx cy width height, a BOP camera.json, "
+            "COLMAP's cameras.txt, or a text file with the 3x3 matrix."
         )
     if (camera.width, camera.height) != (width, height):
         raise InputError(

@@ -180,8 +180,8 @@ def _require_in_reach(distance_m: float, kind: DepthProfile, unit_m: float, name
         return
     raise InputError(
         f"{name}: the plane is at {distance_m:.3g} m, read with {unit_m:g} m per count; a "
-        f"{kind.name} measures from {kind.min_z_m:g} to {kind.max_z_m:g} m. Check --unit (0.001 "
-        "for millimetres, 0.0001 for a D405's tenths) and --profile."
+        f"{kind.name} measures from {kind.min_z_m:g} to {kind.max_z_m:g} m. Check --depth-unit "
+        "(0.001 for millimetres, 0.0001 for a D405's tenths) and --sensor."
     )
 
 

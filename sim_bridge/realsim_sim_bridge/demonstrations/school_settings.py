@@ -159,8 +159,8 @@ def tried_body(
     if not same:
         raise InputError(
             f"{named} weighs {matter.mass_kg:.4g} kg by its model and {mass:.4g} kg when its "
-            "grasps were tried: the mesh, its density or a weighed mass (--mass) is another one. "
-            "Give what the school was given, or run it again."
+            "grasps were tried: the mesh, its density or a weighed mass (--weighed) is another "
+            "one. Give what the school was given, or run it again."
         )
     parts = solid.parts if solid else convex_parts(mesh, config.convex, cache)
     return SlipBody.of(parts, matter)

@@ -185,7 +185,7 @@ def _trial_of(
         matter = physical_properties(obj.mesh, density=DEFAULT_DENSITY, parts=parts)
         told = (
             f"{obj.name} was not weighed: {DEFAULT_DENSITY:g} kg/m^3 make {matter.mass_kg:.3f} kg; "
-            f"weigh it and give --mass {obj.name}=KG."
+            f"weigh it and give --weighed {obj.name}=KG."
         )
         if told not in notes:
             notes.append(told)

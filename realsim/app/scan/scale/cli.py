@@ -1,14 +1,12 @@
 """`realsim scan scale`: its options."""
 
-import sys
-from pathlib import Path
 from typing import Any
 
 import click
 
-from realsim.app.command import Command
-from realsim.app.option_values import numbers_of, point_of
-from realsim.app.options import FOLDER, JSON, QUIET, json_file, overwrite
+from realsim.app.console import Console
+from realsim.app.option_values import FOLDER, point_of
+from realsim.app.options import Has, command, json_file, options, rare
 from realsim.app.outputs import OutputFolder
 
 RESULT = OutputFolder(
@@ -16,38 +14,26 @@ RESULT = OutputFolder(
      "candidates.png", "overlays.png"),
     own=("scale.json", ('"smallest_box_mm"', '"versions"')),
 )  # fmt: skip
-UP = click.Choice(["x", "y", "z", "-x", "-y", "-z"])
 
 
-@click.command(
+@command(
     "scale",
-    cls=Command,
-    examples=(
-        "realsim scan scale tube.ply captured --at 0.50,-0.03",
-        "realsim scan scale generated.obj --measured longest=120.4mm+-0.3mm --out scaled",
-    ),
+    "realsim scan scale tube.ply captured --at 0.50,-0.03",
+    "realsim scan scale generated.obj --measured longest=120.4mm+-0.3mm --out scaled",
 )
 @click.argument("mesh")
 @click.argument("session", type=FOLDER, required=False)
-@click.option("--library", type=FOLDER, default=None, help="Put the scaled model there.  [nowhere]")
-@click.option("--name", default="", help="Name of the result.  [that of the mesh]")
-@click.option("--up", type=UP, default=None, help="The file's axis that points up.")
-@click.option("--start", type=FOLDER, default=None, help="JSON with scale and T_world_obj.")
-@click.option("--size", default="", help="Rough longest side, such as 90mm.")
-@click.option("--at", default="", help="Where the object stands: x,y in world [m].")
-@click.option("--measured", multiple=True, help="A length by caliper: longest=120.4mm+-0.3mm.")
-@click.option("--between", multiple=True, help="Two points and a length: 'x,y,z x,y,z=95mm'.")
-@click.option("--views", default="", help="Only these views, such as 1-24.")
-@click.option("--out", type=RESULT, default=None, help="Folder.  [SESSION/scans/NAME]")
-@json_file("scale.json once more.", "scale", "sigma", "verdict")
-@click.option("--id", "obj_id", type=int, default=None, help="BOP id in the library.")
-@click.option("--density", type=float, default=None, help="For the library [kg/m^3].  [1000]")
-@click.option("--mass", type=float, default=None, help="As weighed [kg], instead of a density.")
-@overwrite("Do it again, and replace what is there.")
-@click.option("--accept-doubtful", is_flag=True, help="Into the library whatever the verdict.")
-@JSON
-@QUIET
-def scale(mesh: str, session: Path | None, as_json: bool, quiet: bool, **options: Any) -> None:
+@options(
+    at="", rough_size="", measured=(), between=(), only_views="",
+    library=Has(None, ", to put the scaled model there  [nowhere]"),
+    name=Has("", "  [that of the mesh]"), up=None, out=Has(None, "  [SESSION/scans/NAME]", RESULT),
+    mass=None, overwrite=False,
+)  # fmt: skip
+@rare(
+    start_file=None, json_file=json_file("scale", "sigma", "verdict"), id=None,
+    density=Has(None, "  [1000]"), accept_doubtful=False,
+)  # fmt: skip
+def scale(console: Console, **options: Any) -> bool:
     """Find the metric scale of MESH in the depth images of SESSION.
 
     \b
@@ -64,41 +50,17 @@ def scale(mesh: str, session: Path | None, as_json: bool, quiet: bool, **options
     Writes scale.json, scale.html, pictures and model.ply (mm) into SESSION/scans/NAME. Exit
     codes: 0 accepted, 1 doubtful, rejected or unchecked, 2 bad input.
     """  # noqa: D301 - click's own mark for lines that stay as they are
-    from realsim.app.console import Console
-    from realsim.app.scan.scale.run import run_scale
-
-    request = request_of(mesh, session, options)
-    if not run_scale(request, Console(quiet=quiet, as_json=as_json)):
-        sys.exit(1)
-
-
-def request_of(mesh: str, session: Path | None, options: dict[str, Any]) -> Any:
-    """Return the request of the options as they were typed.
-
-    Raises:
-        InputError: a length, a start file or a point cannot be read.
-    """
     from realsim.app.scan.scale.inputs import ScaleRequest
+    from realsim.app.scan.scale.run import run_scale
     from realsim.scanning.scale.files import load_start
     from realsim.scanning.scale.measured import parse_length, parse_measurement
 
-    lengths = [*options["measured"], *(f"between {text}" for text in options["between"])]
-    return ScaleRequest(
-        mesh=mesh,
-        session=session,
-        library=options["library"],
-        name=options["name"],
-        up=options["up"],
-        start=None if options["start"] is None else load_start(options["start"]),
-        size_m=parse_length(options["size"]) if options["size"] else None,
-        at=point_of(options["at"]),
+    start, size = options.pop("start"), options.pop("size")
+    lengths = [*options.pop("measured"), *(f"between {t}" for t in options.pop("between"))]
+    request = ScaleRequest(
+        start=None if start is None else load_start(start),
+        size_m=parse_length(size) if size else None, at=point_of(options.pop("at")),
         measured=tuple(parse_measurement(text) for text in lengths),
-        views=numbers_of(options["views"]),
-        out=options["out"],
-        overwrite=options["overwrite"],
-        accept_doubtful=options["accept_doubtful"],
-        json=options["json_file"],
-        obj_id=options["obj_id"],
-        density=options["density"],
-        mass=options["mass"],
-    )
+        json=options.pop("json_file"), **options,
+    )  # fmt: skip
+    return run_scale(request, console)

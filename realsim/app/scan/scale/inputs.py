@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 LEAST_VIEWS = 3
 """Fewer views see too little of an object's sides: scale and distance cannot be told apart."""
 MOST_VIEWS = 48
-"""At most so many enter the fit, spread evenly, unless --views names them: more cost memory and
-time, while a constant hand-eye error limits the result."""
+"""At most so many enter the fit, spread evenly, unless --only-views names them: more cost memory
+and time, while a constant hand-eye error limits the result."""
 LIBRARY = Path("models")
 """Where names are looked up when no library is named."""
 
@@ -236,7 +236,7 @@ def usable_views(store: SessionStore, wanted: Sequence[int]) -> list[View]:
         raise InputError(
             f"{where} has {len(posed)} of {len(asked)} views with depth and a camera pose "
             f"({_ranges([v.index for v in posed])}); at least {LEAST_VIEWS} from different sides "
-            "are needed. Capture more, calibrate the others, or widen --views."
+            "are needed. Capture more, calibrate the others, or widen --only-views."
         )
     if wanted or len(posed) <= MOST_VIEWS:
         return posed

@@ -199,8 +199,10 @@ def _by_measurement(request: ScaleRequest, console: Console) -> bool:
             f"'{request.mesh}' needs something that knows metres: a SESSION with depth images, or "
             "a measured length such as --measured longest=120.4mm."
         )
-    for option, value in (("--start", request.start), ("--at", request.at),
-                          ("--views", request.views), ("--size", request.size_m)):  # fmt: skip
+    for option, value in (
+        ("--start-file", request.start), ("--at", request.at), ("--only-views", request.views),
+        ("--rough-size", request.size_m),
+    ):  # fmt: skip
         if value:
             raise InputError(f"{option} speaks of a session; give SESSION, or leave it away.")
     named = read_mesh(request)

@@ -22,7 +22,7 @@ class SfmRequest:
     """Where to write; None: SESSION/scans/sfm, or IMAGES/sfm."""
     poses: str | None = None
     """'unknown', 'known', 'refined'; None: 'refined' where the session has poses."""
-    camera: Path | None = None
+    intrinsics: Path | None = None
     """File with the intrinsics of a plain folder."""
     masks: Path | None = None
     """Folder of masks, one for each photograph."""
@@ -75,16 +75,16 @@ def sfm_inputs(request: SfmRequest) -> SfmInputs:
     paths = tuple(photographs_in(request.images))
     if request.poses in ("known", "refined"):
         raise InputError(
-            f"--poses {request.poses} needs the robot's camera poses, and '{request.images}' is a "
-            "plain folder. `realsim import` makes a session of images and poses; or leave --poses "
-            "out."
+            f"--use-poses {request.poses} needs the robot's camera poses, and '{request.images}' "
+            "is a plain folder. `realsim import` makes a session of images and poses; or leave "
+            "--use-poses out."
         )
     intrinsics = None
-    if request.camera is not None:
+    if request.intrinsics is not None:
         from realsim.app.importing.folder import camera_of_file
         from realsim.images import image_size
 
-        intrinsics = camera_of_file(request.camera, image_size(paths[0]))
+        intrinsics = camera_of_file(request.intrinsics, image_size(paths[0]))
     return SfmInputs(
         paths=paths, intrinsics=intrinsics, Ts_world_cam=(None,) * len(paths), poses="unknown",
         store=None, notes=("a folder of photographs: no robot poses, so no metric scale.",),
@@ -97,8 +97,8 @@ def _session_inputs(request: SfmRequest) -> SfmInputs:
     from realsim.store.session_store import rgb_path
 
     store = open_session(request.images)
-    if request.camera is not None:
-        raise InputError("a session has its own camera; --camera is for a folder of photographs.")
+    if request.intrinsics is not None:
+        raise InputError("a session has its own camera; --intrinsics is for photographs.")
     views = store.session.views
     posed = sum(v.T_world_cam is not None for v in views)
     poses: Poses = "refined" if posed == len(views) else "unknown"
@@ -108,8 +108,8 @@ def _session_inputs(request: SfmRequest) -> SfmInputs:
     if not posed and poses != "unknown":
         raise InputError(
             f"session '{request.images}' is not calibrated: none of its {len(views)} views has a "
-            "camera pose. `realsim calibrate SESSION` finds them; --poses unknown maps without, "
-            "and without a metric scale."
+            "camera pose. `realsim calibrate SESSION` finds them; --use-poses unknown maps "
+            "without, and without a metric scale."
         )
     if not posed:
         notes.append(
