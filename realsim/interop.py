@@ -13,12 +13,12 @@ rotation first). Every other one is converted here, each by a function with a kn
 """
 
 import ctypes
+import importlib
 import os
 import signal
 import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -123,7 +123,7 @@ def _plotly_when_called() -> None:
         def call(*arguments: Any, **options: Any) -> Any:
             if sys.modules.get(name) is module:
                 del sys.modules[name]
-            return getattr(import_module(name), function)(*arguments, **options)
+            return getattr(importlib.import_module(name), function)(*arguments, **options)
 
         return call
 
@@ -152,7 +152,7 @@ def import_extra(module: str, extra: str, use: str, instead: str = "") -> Any:
         MissingLibraryError: it cannot be imported; the message says what to type.
     """
     try:
-        return import_module(module)
+        return importlib.import_module(module)
     except (ImportError, OSError) as error:
         raise MissingLibraryError(
             f"{use} needs {module.split('.', maxsplit=1)[0]}, which cannot be imported ({error}). "
