@@ -13,61 +13,6 @@ EXTENTS = {"brick": (0.06, 0.04, 0.1), "slab": (0.12, 0.05, 0.02)}
 # --- grasps ---------------------------------------------------------------------------------------
 
 
-def _set(n: int = 20) -> Any:
-    from tried_grasps import tried_set
-
-    return tried_set(np.random.default_rng(3), n)
-
-
-def make_acronym(folder: Path) -> None:
-    """Write grasps as ACRONYM's HDF5."""
-    from realsim.formats.grasps.acronym import AcronymObject, write_acronym
-
-    obj = AcronymObject(
-        file="meshes/mug.obj", scale=0.001, density=150.0, friction=1.0, mass_kg=0.013,
-        volume_m3=8.7e-5, center_of_mass=np.array([0.0, -0.002, 0.09]), inertia=np.eye(3) * 2e-5,
-    )  # fmt: skip
-    write_acronym(folder / "a.h5", _set(), obj)
-
-
-def read_acronym_file(folder: Path) -> Any:
-    """Read it."""
-    from realsim.formats.grasps.acronym import read_acronym
-
-    found = read_acronym(folder / "a.h5")
-    return [found, found.as_set(1)]
-
-
-def make_graspgen(folder: Path) -> None:
-    """Write grasps as GraspGen's JSON."""
-    from realsim.formats.grasps.graspgen import write_graspgen
-
-    write_graspgen(folder / "a.json", _set(), file="mug.obj", scale=0.5)
-
-
-def read_graspgen_file(folder: Path) -> Any:
-    """Read it."""
-    from realsim.formats.grasps.graspgen import read_graspgen
-
-    found = read_graspgen(folder / "a.json")
-    return [found, found.as_set(1)]
-
-
-def make_isaac(folder: Path) -> None:
-    """Write grasps as Isaac's YAML."""
-    from realsim.formats.grasps.isaac_grasp import write_isaac_grasp
-
-    write_isaac_grasp(folder / "a.yaml", _set(8), object_frame="mug")
-
-
-def read_isaac(folder: Path) -> Any:
-    """Read it."""
-    from realsim.formats.grasps.isaac_grasp import read_isaac_grasp
-
-    found = read_isaac_grasp(folder / "a.yaml")
-    return [found, found.as_set(1)]
-
-
 def make_grasps_h5(folder: Path) -> None:
     """Write a scene's grasps as realsim's HDF5."""
     from realsim.formats.grasps.hdf5 import write_grasps_hdf5
@@ -83,27 +28,10 @@ def read_grasps_h5(folder: Path) -> Any:
     return read_grasps_hdf5(folder / "g.h5")
 
 
-def make_parquet(folder: Path) -> None:
-    """Write a scene's grasps as Parquet."""
-    from realsim.formats.grasps.parquet import write_grasps_parquet
-    from tried_grasps import tried_scene
-
-    write_grasps_parquet(folder, tried_scene(4))
-
-
-def read_parquet(folder: Path) -> Any:
-    """Read it."""
-    from realsim.formats.grasps.parquet import read_grasps_parquet
-
-    return read_grasps_parquet(folder)
-
-
 def make_group(folder: Path) -> None:
-    """Write grasps and rectangles as GraspNet's npy."""
+    """Write grasps as GraspNet's npy."""
     from realsim.formats.graspnet.grasp_group import GraspGroup, write_grasp_group
-    from realsim.formats.graspnet.rect import rect_grasps, write_rect
     from realsim.geometry import se3
-    from realsim.records import CameraIntrinsics
 
     rng = np.random.default_rng(0)
     n = 12
@@ -115,22 +43,18 @@ def make_group(folder: Path) -> None:
         heights_m=np.full(n, 0.02), depths_m=np.full(n, 0.02), obj_ids=rng.integers(1, 89, n),
     )  # fmt: skip
     write_grasp_group(folder / "group.npy", group)
-    camera = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
-    write_rect(folder / "rect.npy", rect_grasps(group, camera))
 
 
 def read_group(folder: Path) -> Any:
-    """Read both."""
+    """Read it."""
     from realsim.formats.graspnet.grasp_group import read_grasp_group
-    from realsim.formats.graspnet.rect import read_rect
 
-    return [read_grasp_group(folder / "group.npy"), read_rect(folder / "rect.npy")]
+    return read_grasp_group(folder / "group.npy")
 
 
 def make_grasp_labels(folder: Path) -> None:
-    """Write GraspNet's labels of an object, and their collisions in a scene."""
+    """Write GraspNet's labels of an object."""
     from realsim.formats.graspnet import gripper_frame
-    from realsim.formats.graspnet.collision_labels import write_collision_labels
     from realsim.formats.graspnet.grasp_labels import GraspLabels, write_grasp_labels
 
     rng = np.random.default_rng(0)
@@ -145,17 +69,13 @@ def make_grasp_labels(folder: Path) -> None:
         collision=rng.random(60) < 0.4,
     )  # fmt: skip
     write_grasp_labels(folder / "000_labels.npz", labels)
-    write_collision_labels(folder / "collision_labels.npz", [(labels, rng.random(60) < 0.5)])
 
 
 def read_grasp_label_files(folder: Path) -> Any:
-    """Read both."""
-    from realsim.formats.graspnet.collision_labels import collision_points, read_collision_labels
+    """Read them."""
     from realsim.formats.graspnet.grasp_labels import read_grasp_labels
 
-    labels = read_grasp_labels(folder / "000_labels.npz", with_collision=True)
-    path = folder / "collision_labels.npz"
-    return [labels, collision_points(path), read_collision_labels(path, 0, labels)]
+    return read_grasp_labels(folder / "000_labels.npz", with_collision=True)
 
 
 def make_graspit(folder: Path) -> None:
@@ -191,10 +111,9 @@ def make_graspit(folder: Path) -> None:
 
 def read_graspit(folder: Path) -> Any:
     """Read scene and grasps."""
-    from realsim.formats.graspit.scene import read_graspit_grasps, read_graspit_scene
+    from realsim.formats.graspit.scene import read_graspit_scene
 
-    found = read_graspit_scene(folder)
-    return [found, read_graspit_grasps(found)]
+    return read_graspit_scene(folder)
 
 
 # --- recordings and folders -----------------------------------------------------------------------
@@ -380,11 +299,7 @@ def _archive(ending: str) -> Sample:
 
 
 FILES = (
-    Sample("acronym", make_acronym, read_acronym_file),
-    Sample("graspgen", make_graspgen, read_graspgen_file),
-    Sample("isaac_grasp", make_isaac, read_isaac),
     Sample("grasps h5", make_grasps_h5, read_grasps_h5),
-    Sample("grasps parquet", make_parquet, read_parquet),
     Sample("grasp group", make_group, read_group),
     Sample("grasp labels", make_grasp_labels, read_grasp_label_files),
     Sample("graspit", make_graspit, read_graspit),

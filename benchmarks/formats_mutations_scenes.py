@@ -71,7 +71,9 @@ def labelled_session(folder: Path, views: int = 3) -> Any:
         annotations[index] = [(o.obj_id, se3.invert(T) @ o.T_world_obj) for o in poses]
         infos[index] = [labels.gt_info_entry(a, v, depth) for a, v in masks]
         coco[index] = [(o.obj_id, v) for o, (_, v) in zip(poses, masks, strict=True)]
-        labels.write_masks(store, index, masks)
+        for k, pair in enumerate(masks):
+            for mask, visible in zip(pair, (False, True), strict=True):
+                store.write_image(labels.mask_path(index, k, visible=visible), mask)
     labels.write_scene_gt(store, annotations)
     labels.write_scene_gt_info(store, infos)
     labels.write_scene_gt_coco(store, coco, {o.obj_id: models[o.obj_id].name for o in poses})

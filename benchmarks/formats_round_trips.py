@@ -19,6 +19,7 @@ from realsim.arrays import Array
 
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
 
+from grasp_files import Acronym, GraspGen, IsaacGrasp
 from labelled_scenes import labelled_scene
 from realsim import images
 from realsim.formats.bop.opening import open_labelled_bop
@@ -28,9 +29,6 @@ from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspnet.annotations import object_fields, pose_of, read_objects
 from realsim.formats.graspnet.grasp_group import grasp_group, read_grasp_group, write_grasp_group
 from realsim.formats.graspnet.meta import read_meta
-from realsim.formats.grasps.acronym import AcronymObject, read_acronym, write_acronym
-from realsim.formats.grasps.graspgen import read_graspgen, write_graspgen
-from realsim.formats.grasps.isaac_grasp import read_isaac_grasp, write_isaac_grasp
 from realsim.formats.grasps.scene_grasps import executed, labelled
 from realsim.geometry import se3
 from realsim.records import GraspSet
@@ -210,6 +208,11 @@ def _worst(first: Array, second: Array) -> tuple[float, float]:
     return float(mm.max()), float(np.degrees(angle.max()))
 
 
+def _there(way: Any, home: Path, grasps: GraspSet) -> Array:
+    """Return grasps that were written, as another program reads them."""
+    return way.read(way.write(home / "grasps", grasps))
+
+
 def _grasps(found: Found, home: Path, seed: int) -> None:
     """Note the worst grasp of each format, written and read."""
     grasps = tried_set(np.random.default_rng(seed), GRASPS)
@@ -217,12 +220,9 @@ def _grasps(found: Found, home: Path, seed: int) -> None:
     T = np.eye(4)
     scored = grasps.Ts_obj_grasp[~np.isnan(grasps.labels)]
     ways: dict[str, tuple[Array, Callable[[GraspSet], Array]]] = {
-        "acronym": (kept, lambda s: read_acronym(
-            write_acronym(home / "a.h5", s, AcronymObject(file="a.obj"))).Ts_obj_grasp),
-        "graspgen": (kept, lambda s: read_graspgen(
-            write_graspgen(home / "g.json", s, file="a.obj")).Ts_obj_grasp),
-        "isaac": (grasps.Ts_obj_grasp[labelled(grasps)], lambda s: read_isaac_grasp(
-            write_isaac_grasp(home / "i.yaml", s, object_frame="a")).Ts_obj_grasp),
+        "acronym": (kept, lambda s: _there(Acronym(), home, s)),
+        "graspgen": (kept, lambda s: _there(GraspGen(), home, s)),
+        "isaac": (grasps.Ts_obj_grasp[labelled(grasps)], lambda s: _there(IsaacGrasp(), home, s)),
         "graspgroup": (scored, lambda s: read_grasp_group(
             write_grasp_group(home / "g.npy", grasp_group([s], {s.instance: T}))).Ts_a_grasp),
     }  # fmt: skip

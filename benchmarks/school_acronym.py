@@ -5,6 +5,7 @@ simulation that agrees with it more is not a better one
 (docs/decisions/0018-what-the-labels-mean.md). The data is found through REALSIM_DATA.
 """
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,10 @@ from figures import Found
 from school_cases import in_processes, slip_config
 
 from realsim.arrays import Mask
-from realsim.formats.grasps.acronym import read_acronym
+
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
+
+from grasp_files import read_acronym
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 from realsim.models.convex import ConvexConfig, convex_parts
@@ -55,15 +59,14 @@ def acronym(seed: int, keep: Path, quick: bool) -> Found:
     folder = found.real_data("acronym", "school/acronym_mug")
     if folder is None:
         return found
-    given = read_acronym(next(folder.glob("Mug_*.h5")))
+    Ts_obj_grasp, label, scale = read_acronym(next(folder.glob("Mug_*.h5")))
     rng = np.random.default_rng([seed, 4])
-    label = given.object_in_gripper
     each = EACH_QUICK if quick else EACH
     rows = np.concatenate(
         [rng.permutation(np.flatnonzero(label == value))[:each] for value in (True, False)]
     )
-    body, words = _body(folder, given.obj.scale, keep)
-    Ts = given.Ts_obj_grasp[rows]
+    body, words = _body(folder, scale, keep)
+    Ts = Ts_obj_grasp[rows]
     # The mug stands as its mesh was drawn; what the table frame's place is does not matter.
     standing = se3.from_rt(Ts[:, :3, :3], np.zeros(3))
     trial = ready_trial(body, Ts, standing, find_hand().max_opening_m)

@@ -28,7 +28,6 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.formats.depth_agreement import DepthOf, disagreement_mm, near_pairs, sampled_views
-from realsim.formats.labelled_scene import LabelledFrame
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.interop import T_CAM_GL
@@ -144,7 +143,7 @@ def objects_evidence(
     Args:
         Ts_world_cam: (N, 4, 4) camera poses as stated [m].
         things: of each thing its (view, T_cam_obj) pairs, the view as a place in `Ts_world_cam`
-            and the pose (4, 4) [m]; see `things_of`. Labels that were made out of the camera poses
+            and the pose (4, 4) [m]. Labels that were made out of the camera poses
             (one pose, brought into all views) agree by construction under the reading they were
             made with, which is the question.
     """
@@ -176,31 +175,6 @@ def _spread_of(Ts_world_obj: Array) -> tuple[float, float]:
         1e3 * float(np.percentile(off, SPREAD_PERCENTILE)),
         float(np.rad2deg(np.percentile(angles, SPREAD_PERCENTILE))),
     )
-
-
-def things_of(frames: Iterable[LabelledFrame]) -> tuple[Array, list[list[tuple[int, Array]]]]:
-    """Return the camera poses (N, 4, 4) and the things of labelled frames, for `objects_evidence`.
-
-    Frames without a camera pose are left out. A thing is an instance; where the source has no
-    instances it is an object that no frame shows twice, since two alike could be confused.
-    """
-    Ts: list[Array] = []
-    found: dict[tuple[str, int], list[tuple[int, Array]]] = {}
-    doubled: set[tuple[str, int]] = set()
-    for frame in frames:
-        if frame.T_world_cam is None:
-            continue
-        here: set[tuple[str, int]] = set()
-        for o in frame.objects:
-            by_id = ("object", o.obj_id)
-            key = by_id if o.instance is None else ("instance", o.instance)
-            if key in here:
-                doubled.add(key)
-            here.add(key)
-            found.setdefault(key, []).append((len(Ts), o.T_cam_obj))
-        Ts.append(frame.T_world_cam)
-    poses = np.stack(Ts) if Ts else np.zeros((0, 4, 4))
-    return poses, [rows for key, rows in found.items() if key not in doubled]
 
 
 # --- by depth ---------------------------------------------------------------------------------

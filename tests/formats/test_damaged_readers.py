@@ -2,50 +2,29 @@
 
 from pathlib import Path
 
-import h5py
-import numpy as np
 import pytest
 
 from realsim.errors import InputError
 from realsim.formats.bags import open_bag
-from realsim.formats.grasps.acronym import AcronymObject, read_acronym, write_acronym
+from realsim.formats.grasps.hdf5 import read_grasps_hdf5, write_grasps_hdf5
 from realsim.geometry import mesh_files
 from realsim.geometry.mesh_files import load_mesh
 from realsim.models import mesh_loading
 from realsim.models.reading import read_scan
-from tried_grasps import tried_set
+from tried_grasps import tried_scene
 from written_bags import recorded
 from written_meshes import as_trimesh, textured_box
 
 
-def a_set():
-    return tried_set(np.random.default_rng(3), 8)
-
-
-@pytest.mark.parametrize("name", ["volume", "friction", "mass", "density", "com", "inertia"])
-def test_acronyms_object_has_finite_numbers(tmp_path: Path, name: str) -> None:
-    obj = AcronymObject(
-        file="mug.obj", density=150.0, friction=1.0, mass_kg=0.1, volume_m3=1e-4,
-        center_of_mass=np.zeros(3), inertia=np.eye(3),
-    )  # fmt: skip
-    path = write_acronym(tmp_path / "a.h5", a_set(), obj)
-    assert read_acronym(path).obj.friction == 1.0
-    with h5py.File(path, "r+") as file:
-        file[f"object/{name}"][...] = np.nan
-    with pytest.raises(InputError, match=f"'{name}' holds a number that is not finite"):
-        read_acronym(path)
-
-
 def test_a_heap_in_which_the_library_would_go_round_for_ever_is_refused(tmp_path: Path) -> None:
-    obj = AcronymObject(file="mug.obj")
-    path = write_acronym(tmp_path / "a.h5", a_set(), obj)
-    assert read_acronym(path).obj.file == "mug.obj"
+    path = write_grasps_hdf5(tmp_path / "a.h5", tried_scene(4))
+    assert read_grasps_hdf5(path).name == "Tisch 1"
     raw = path.read_bytes()
     at = raw.index(b"GCOL\x01\0\0\0") + 16
     for zeros in (16, 40):
         path.write_bytes(raw[:at] + bytes(zeros) + raw[at + zeros :])
         with pytest.raises(InputError, match="heap of texts"):
-            read_acronym(path)
+            read_grasps_hdf5(path)
 
 
 # --- recordings -----------------------------------------------------------------------------------

@@ -11,9 +11,7 @@ from realsim.formats.evidence import (
     require_direction,
     require_scale,
     scale_evidence,
-    things_of,
 )
-from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.rendering.rays import PlacedMesh, RayScene, rotated
@@ -92,24 +90,6 @@ def test_a_camera_that_hardly_moves_decides_nothing():
     depths = depths_of(Ts)
     by_depth = depth_evidence(readings(Ts)["inverted"], lambda k: (depths[k], INTRINSICS))
     assert not by_depth.decisive and not by_depth.contradicts
-
-
-def test_two_alike_are_not_confused():
-    """Nothing can be said of an object that a frame shows twice without instances."""
-    T = np.eye(4)
-
-    def frame(index, *objects):
-        rows = tuple(LabelledObject(obj_id=o, instance=i, T_cam_obj=T) for o, i in objects)
-        return LabelledFrame(
-            index=index, intrinsics=INTRINSICS, depth_unit_m=None, objects=rows, T_world_cam=T
-        )
-
-    frames = [
-        frame(0, (1, None), (1, None), (2, None), (3, 7)),
-        frame(4, (1, None), (2, None), (3, 7)),
-    ]
-    Ts, things = things_of(frames)
-    assert Ts.shape == (2, 4, 4) and [[k for k, _ in t] for t in things] == [[0, 1], [0, 1]]
 
 
 def test_depth_agrees_only_under_the_right_reading(scanned):

@@ -1,133 +1,23 @@
-"""Every format of grasps gives back what was written, moves with the object, and means one hand.
-
-`raw` reads a file without realsim: the hand's pose as any other program finds it there.
-"""
+"""Every format of grasps gives back what was written, moves with the object, and means one hand."""
 
 import json
 from dataclasses import asdict, replace
 
-import h5py
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
+from grasp_files import FORMATS, MOUNT, TIP
 from realsim.errors import InputError
-from realsim.formats.graspit.grasps import read_grasp_file
-from realsim.formats.graspnet.grasp_group import grasp_group, read_grasp_group, write_grasp_group
-from realsim.formats.grasps.acronym import AcronymObject, read_acronym, write_acronym
-from realsim.formats.grasps.graspgen import read_graspgen, write_graspgen
-from realsim.formats.grasps.isaac_grasp import read_isaac_grasp, write_isaac_grasp
+from realsim.formats.graspnet.grasp_group import grasp_group
+from realsim.formats.grasps.acronym import AcronymObject, write_acronym
+from realsim.formats.grasps.graspgen import write_graspgen
+from realsim.formats.grasps.hand_frames import grasp_poses
+from realsim.formats.grasps.isaac_grasp import write_isaac_grasp
 from realsim.formats.grasps.scene_grasps import SceneGrasps, executed, labelled
 from realsim.geometry import se3
 from realsim.robots.hand import find_hand
 from tried_grasps import tried_set
-
-MOUNT, TIP = 0.1034, 0.1122
-"""Tool centre point and fingertips before the hand's mounting face [m] (franka_description)."""
-
-
-def from_rt(R, t):
-    out = np.tile(np.eye(4), (len(R), 1, 1))
-    out[:, :3, :3], out[:, :3, 3] = R, t
-    return out
-
-
-class Acronym:
-    rounding = 1e-15
-    approach, closing = 2, 0
-    tip = (0, 0, TIP)
-
-    def write(self, path, s):
-        return write_acronym(path, s, AcronymObject(file="a.obj"))
-
-    def read(self, path):
-        return read_acronym(path).Ts_obj_grasp
-
-    def raw(self, path):
-        with h5py.File(path) as file:
-            return file["grasps/transforms"][()]
-
-
-class GraspGen:
-    rounding = 1e-15
-    approach, closing = 2, 0
-    tip = (0, 0, TIP)
-
-    def write(self, path, s):
-        return write_graspgen(path, s, file="a.obj")
-
-    def read(self, path):
-        return read_graspgen(path).Ts_obj_grasp
-
-    def raw(self, path):
-        return np.array(json.loads(path.read_text())["grasps"]["transforms"])
-
-
-class IsaacGrasp:
-    rounding = 1e-14
-    approach, closing = 2, 1
-    tip = (0, 0, TIP)
-
-    def write(self, path, s):
-        return write_isaac_grasp(path, s, object_frame="a")
-
-    def read(self, path):
-        return read_isaac_grasp(path).Ts_obj_grasp
-
-    def raw(self, path):
-        rows = YAML(typ="safe").load(path)["grasps"].values()
-        w = np.array([r["orientation"]["w"] for r in rows])
-        x, y, z = np.array([r["orientation"]["xyz"] for r in rows]).T
-        R = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        return from_rt(R.transpose(2, 0, 1), np.array([r["position"] for r in rows]))
-
-
-class GraspGroupNpy:
-    rounding = 1e-6
-    approach, closing = 0, 1
-    tip = (0.02 + TIP - MOUNT, 0, 0)  # GraspNet's own fingers end at x = depth = 0.02
-
-    def write(self, path, s):
-        return write_grasp_group(path, grasp_group([s], {s.instance: np.eye(4)}))
-
-    def read(self, path):
-        return read_grasp_group(path).Ts_a_grasp
-
-    def raw(self, path):
-        rows = np.load(path).astype(float)
-        return from_rt(rows[:, 4:13].reshape(-1, 3, 3), rows[:, 13:16])
-
-
-class GraspitHdf5:
-    """Written here as the paper's authors write it: each grasp beside its half turn."""
-
-    rounding = 0.0
-    approach, closing = 2, 1
-    tip = (0, 0, TIP - MOUNT)
-
-    def write(self, path, s):
-        Ts = s.Ts_obj_grasp[executed(s)]
-        with h5py.File(path, "w") as file:
-            file["a"] = np.stack([Ts, Ts @ np.diag([-1.0, -1.0, 1.0, 1.0])], axis=1)
-        return path
-
-    def read(self, path):
-        return read_grasp_file(path)["a"][:, 0]
-
-    def raw(self, path):
-        with h5py.File(path) as file:
-            return file["a"][:, 0]
-
-
-FORMATS = [
-    Acronym, GraspGen, IsaacGrasp, GraspGroupNpy, GraspitHdf5,
-]  # fmt: skip
 
 
 @pytest.fixture(params=FORMATS, ids=[f.__name__ for f in FORMATS])
@@ -206,8 +96,7 @@ def test_another_hand_s_frame_and_joint_are_its_description_s(tmp_path):
         "grasps"]["transforms"])  # fmt: skip
     grasps = s.Ts_obj_grasp[tried]
     np.testing.assert_allclose(T[:, :3, 3], grasps[:, :3, 3] - 0.155046 * grasps[:, :3, 2])
-    found = read_graspgen(tmp_path / "a.json").Ts_obj_grasp
-    np.testing.assert_allclose(found, grasps, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(grasp_poses(T, "acronym", hand), grasps, rtol=0, atol=1e-15)
 
     data = YAML(typ="safe").load(write_isaac_grasp(tmp_path / "a.yaml", s, object_frame="a"))
     assert data["gripper_frame_link"] == "robotiq_2f85"

@@ -151,16 +151,6 @@ def gt_info_entry(
     }
 
 
-def write_masks(
-    store: SessionStore, index: int, masks: Sequence[tuple[ArrayLike, ArrayLike]]
-) -> None:
-    """Write (whole, visible) masks (H, W) of the objects of an image, in their order."""
-    for k, (mask, mask_visib) in enumerate(masks):
-        for image, visible in ((mask, False), (mask_visib, True)):
-            path = mask_path(index, k, visible=visible)
-            store.write_image(path, np.asarray(image, dtype=np.bool_))
-
-
 def write_scene_gt(
     store: SessionStore, annotations: Mapping[int, Sequence[tuple[int, ArrayLike]]]
 ) -> None:

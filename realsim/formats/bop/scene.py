@@ -8,7 +8,7 @@ models in `models`, the estimates that come with YCB-V in `keyframes`; `labelled
 everything in them and a camera per image.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,6 @@ from realsim.arrays import Array, Array32, UInt8
 from realsim.errors import InputError
 from realsim.formats.bop.keyframes import read_keyframe_poses
 from realsim.formats.bop.layout import SceneLayout, cameras_of, scene_number
-from realsim.formats.bop.models import require_meshes
 from realsim.formats.bop.rows import read_cameras, read_ground_truth
 from realsim.records import CaptureSession, View, bop_units
 from realsim.store.session_store import CAMERA_FILE
@@ -29,7 +28,6 @@ __all__ = [
     "BopAnnotation",
     "BopScene",
     "BopSceneRef",
-    "check_models",
     "find_scenes",
     "read_keyframe_poses",
     "read_scene",
@@ -207,16 +205,6 @@ def read_scene(ref: BopSceneRef, image_ids: Sequence[int] | None = None) -> BopS
         color_files=color,
         depth_files={i: deep[i] for i in cameras if i in deep},
     )
-
-
-def check_models(scene: BopScene, obj_ids: Collection[int]) -> None:
-    """Raise if an annotated object has no model among these ids.
-
-    Raises:
-        InputError: names the ids that are missing and those that are there.
-    """
-    used = {a.obj_id for rows in scene.ground_truth.values() for a in rows}
-    require_meshes(used, obj_ids, f"the models given for scene {scene.ref.scene_id}")
 
 
 def _read_session(

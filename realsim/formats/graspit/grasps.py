@@ -1,6 +1,5 @@
 """Where the closing line of a grasp meets the outside of a mesh."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +12,7 @@ from realsim.formats.hdf5_checked import opened
 from realsim.geometry import se3
 from realsim.geometry.mesh import tensor_mesh
 from realsim.interop import import_open3d
-from realsim.records import Mesh, ObjectModel, Scene, SupportPlane
+from realsim.records import Mesh
 
 Axis = Literal["x", "y", "z"]
 OUTSIDE_M = 0.3
@@ -54,10 +53,6 @@ MOST_GRASPS = 1_000_000
 """Most grasps of one object."""
 SAMPLED_GRASPS = 40
 """Grasps of an object whose contacts are looked at: enough for a median."""
-ON_SURFACE_M = 0.005
-"""Grasps whose middle misses the contacts' middle by more (median) are not of these objects."""
-HAND_M = 0.1
-"""The palm stands about so far behind the fingertips."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -70,56 +65,6 @@ class WorldGrasps:
     """(N, 2, 4, 4) [m]."""
     widths_m: Array
     """(N,) distance of the outer contacts along the closing axis [m]; NaN = it meets no surface."""
-
-
-def object_grasps(
-    path: Path,
-    scene: Scene,
-    models: Mapping[int, ObjectModel],
-    names: Mapping[int, str] | None = None,
-) -> list[WorldGrasps]:
-    """Return the grasps of a scene's objects, in the objects' frames.
-
-    Args:
-        path: grasps.hdf5.
-        scene: the objects' poses.
-        models: by object id.
-        names: of the objects in the file, by instance; None = those of their models.
-
-    Raises:
-        InputError: damaged, of other objects, or in another frame than its authors' code writes:
-            y does not close on the surface, or z points out of the table.
-    """
-    by_name = read_grasp_file(path)
-    sets: list[WorldGrasps] = []
-    for o in scene.objects:
-        model = models[o.obj_id]
-        name = model.name if names is None else names[o.instance]
-        Ts_world = by_name.get(name)
-        if Ts_world is None:
-            continue
-        where = f"{path.name}, '{name}'"
-        half_turn = se3.invert(Ts_world[:, 0]) @ Ts_world[:, 1]
-        if np.abs(half_turn - np.diag([-1.0, -1.0, 1.0, 1.0])).max(initial=0.0) > 1e-4:
-            raise InputError(
-                f"{where}: the second pose of a grasp is not its half turn about z; pairs of a "
-                "grasp and its flip about the approach axis are expected."
-            )
-        Ts_obj = se3.invert(o.T_world_obj) @ Ts_world
-        reach = contact_distances(model.mesh, Ts_obj[:, 0], "y")
-        _require_our_frame(model.mesh, Ts_obj[:, 0], where)
-        _require_from_above(Ts_world[:, 0], scene.plane, where)
-        sets.append(
-            WorldGrasps(
-                obj_id=o.obj_id, instance=o.instance, Ts_obj_grasp=Ts_obj, widths_m=reach.sum(1)
-            )
-        )
-    if not sets:
-        raise InputError(
-            f"{path} has grasps of {', '.join(by_name) or 'nothing'}, and the scene "
-            f"has {', '.join(m.name for m in models.values())}: none of them is common."
-        )
-    return sets
 
 
 def read_grasp_file(path: Path) -> dict[str, Array]:
@@ -152,34 +97,3 @@ def _require_sizes(path: Path, names: list[str]) -> None:
                     f"{path}: '{name}' has the shape {shape}; (N, 2, 4, 4) is expected, at most "
                     f"{MOST_GRASPS} grasps."
                 )
-
-
-def _require_our_frame(mesh: Mesh, Ts_obj_grasp: Array, where: str) -> None:
-    """Raise unless the grasps close along y, midway between two contacts."""
-    some = Ts_obj_grasp[:: max(1, len(Ts_obj_grasp) // SAMPLED_GRASPS)]
-    if len(some) == 0:
-        return
-    off = float(np.median(midway_error(mesh, some, "y")))
-    if off > ON_SURFACE_M:
-        others = ", ".join(
-            f"{1e3 * float(np.median(midway_error(mesh, some, a))):.1f} mm along {a}"
-            for a in ("x", "z")
-        )
-        raise InputError(
-            f"{where}: the grasps' origins are {1e3 * off:.1f} mm (median) off the middle of their "
-            f"contacts along y ({others}); at most {1e3 * ON_SURFACE_M:g} mm is accepted. Are they "
-            "of another scene, or is y not the closing axis?"
-        )
-
-
-def _require_from_above(Ts_world_grasp: Array, plane: SupportPlane | None, where: str) -> None:
-    """Raise if more hands would stand in the table than behind the opposite approach."""
-    if plane is None or len(Ts_world_grasp) == 0:
-        return
-    z, at = Ts_world_grasp[:, 2, 2], Ts_world_grasp[:, 2, 3] - plane.T_world_table[2, 3]
-    inside, opposite = np.mean(at - HAND_M * z < 0), np.mean(at + HAND_M * z < 0)
-    if inside > opposite and inside > 0.1:
-        raise InputError(
-            f"{where}: in {100 * inside:.0f} % of the grasps the palm would stand below the table; "
-            "z is not the approach direction of these grasps."
-        )

@@ -22,9 +22,7 @@ from realsim.errors import InputError
 from realsim.formats.graspit.grasps import (
     GRASP_FILE,
     SAMPLED_GRASPS,
-    WorldGrasps,
     midway_error,
-    object_grasps,
     read_grasp_file,
 )
 from realsim.geometry import se3
@@ -156,17 +154,6 @@ def read_graspit_scene(
         names={k: e.name for k, e in enumerate(entries)},
         notes=tuple(notes),
     )
-
-
-def read_graspit_grasps(found: GraspitScene) -> list[WorldGrasps]:
-    """Return the grasps of the scene's objects; see `object_grasps`.
-
-    Raises:
-        InputError: there is no file, or as `object_grasps`.
-    """
-    if found.grasp_file is None:
-        raise InputError(f"scene '{found.scene.name}' has no {GRASP_FILE} beside it.")
-    return object_grasps(found.grasp_file, found.scene, found.models, found.names)
 
 
 # --- the file -----------------------------------------------------------------------------------

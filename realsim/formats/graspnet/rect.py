@@ -10,25 +10,16 @@ where their palm's face is seen (graspnetAPI: to_rect_grasp_group, get_batch_key
 
 import io
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from realsim.arrays import Array, Int64
-from realsim.errors import InputError
 from realsim.formats.graspnet.grasp_group import GraspGroup
 from realsim.formats.graspnet.gripper_frame import BASE_M, HEIGHT_M, graspnet_poses
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.records.checked_arrays import frozen
-from realsim.store import atomic
-from realsim.untrusted.arrays import read_npy
 
-COLUMNS = 7
-MOST_BYTES = 100e6
-"""Largest file that is read [bytes]."""
-MOST_PX = 1e5
-"""Points farther outside an image are damage."""
 ALONG_AXIS = 0.99
 """Least cosine of approach and camera axis of a grasp that has a rectangle (8 deg)."""
 
@@ -109,38 +100,3 @@ def rect_bytes(grasps: RectGrasps) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, np.concatenate(columns, axis=1).astype(np.float32), allow_pickle=False)
     return buffer.getvalue()
-
-
-def write_rect(path: Path | str, grasps: RectGrasps) -> Path:
-    """Write rectangles, whole or not at all."""
-    path = Path(path)
-    atomic.write_bytes(path, rect_bytes(grasps))
-    return path
-
-
-def read_rect(path: Path | str) -> RectGrasps:
-    """Return the rectangles of a file.
-
-    Raises:
-        InputError: it is none, or holds what no rectangle has.
-    """
-    path = Path(path)
-    rows = read_npy(path, most_bytes=MOST_BYTES)
-    if rows.ndim != 2 or rows.shape[1] != COLUMNS or rows.dtype.kind != "f":
-        raise InputError(
-            f"{path} has the shape {rows.shape} of {rows.dtype}; rectangles are (N, {COLUMNS}) "
-            "numbers: centre x y, open x y, height, score, object id."
-        )
-    rows = rows.astype(np.float64)
-    ids = rows[:, 6]
-    if not np.all(np.abs(rows) <= MOST_PX) or np.any(rows[:, 4] < 0):  # NaN is not
-        raise InputError(f"{path}: a number is not finite, beyond {MOST_PX:g} px, or a height < 0.")
-    if np.any((ids != np.round(ids)) | (ids < -1)):
-        raise InputError(f"{path}: the last column must be object ids from 0, or -1 for not known.")
-    return RectGrasps(
-        centers_px=rows[:, 0:2],
-        open_px=rows[:, 2:4],
-        heights_px=rows[:, 4],
-        scores=rows[:, 5],
-        obj_ids=ids.astype(np.int64) + 1,
-    )

@@ -23,13 +23,11 @@ from typing import Any
 import numpy as np
 
 from realsim.arrays import Array
-from realsim.errors import InputError
 from realsim.formats.grasps.hdf5 import COLUMNS, FORMAT, FORMAT_VERSION, FRAMES, SAMPLES
 from realsim.formats.grasps.scene_grasps import SceneGrasps, parameters_json
-from realsim.formats.parquet_checked import CheckedTable
+from realsim.interop import import_extra
 from realsim.records import STAGES, GraspSet
 from realsim.records.grasps import MEASURES
-from realsim.records.trajectories import GraspTrajectories
 from realsim.store import atomic
 
 GRASPS_FILE = "grasps.parquet"
@@ -47,7 +45,11 @@ def write_grasps_parquet(folder: Path | str, scene: SceneGrasps) -> Path:
     """Write the grasps of a scene and return the table of grasps.
 
     Each table is whole or not there; the same grasps give the same bytes.
+
+    Raises:
+        MissingLibraryError: pyarrow is not installed.
     """
+    import_extra("pyarrow", "parquet", "a Parquet table")
     folder = Path(folder)
     attempts = _attempts_bytes(scene) if scene.trajectories else None
     if attempts is not None:
@@ -56,55 +58,6 @@ def write_grasps_parquet(folder: Path | str, scene: SceneGrasps) -> Path:
     if attempts is None:
         (folder / TRAJECTORIES_FILE).unlink(missing_ok=True)  # of an earlier run
     return folder / GRASPS_FILE
-
-
-def read_grasps_parquet(folder: Path | str) -> SceneGrasps:
-    """Return the grasps of a folder of `write_grasps_parquet`.
-
-    Raises:
-        InputError: a table is missing, damaged, of a newer format or of another run, or holds
-            numbers that no grasp has.
-    """
-    table = CheckedTable(Path(folder) / GRASPS_FILE)
-    try:
-        return _scene_of(table, Path(folder))
-    except InputError as error:
-        if str(folder) in str(error):
-            raise
-        raise table.wrong(str(error)) from error  # of a record, which knows no file
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise table.wrong(f"the metadata '{HEAD.decode()}' lacks something ({error!r}).") from error
-
-
-def _scene_of(table: CheckedTable, folder: Path) -> SceneGrasps:
-    """Return what the table and its metadata say."""
-    head = table.head(HEAD)
-    if head.get("format") != FORMAT or head.get("format_version") != FORMAT_VERSION:
-        raise table.wrong(
-            f"the format is {head.get('format')!r}, version {head.get('format_version')!r}; "
-            f"'{FORMAT}', version {FORMAT_VERSION} is read."
-        )
-    sets: list[GraspSet] = []
-    poses: dict[int, Array] = {}
-    first = 0
-    for entry in head["sets"]:
-        count = int(entry["grasps"])
-        s = _set_of(table, entry, slice(first, first + count))
-        sets.append(s)
-        first += count
-        if entry["T_world_obj"] is not None:
-            poses[s.instance] = np.array(entry["T_world_obj"], dtype=np.float64)
-    if first != table.rows:
-        raise table.wrong(f"{table.rows} rows for {first} grasps of its sets; the file is damaged.")
-    T, attempts = head["T_world_table"], head["trajectories"]
-    return SceneGrasps(
-        sets=tuple(sets),
-        name=str(head["scene"]),
-        names={int(key): str(name) for key, name in head["names"].items()},
-        Ts_world_obj=poses,
-        T_world_table=None if T is None else np.array(T, dtype=np.float64),
-        trajectories={} if attempts is None else _read_attempts(folder, dict(attempts)),
-    )
 
 
 # --- the table of grasps ----------------------------------------------------------------------
@@ -228,38 +181,6 @@ def _bytes_of(table: Any) -> bytes:
     return buffer.getvalue()
 
 
-def _set_of(table: CheckedTable, entry: Any, rows: slice) -> GraspSet:
-    """Return one set from its rows and its entry in the metadata."""
-    n = rows.stop - rows.start
-    for name in ("instance", "obj_id"):
-        if np.any(table.integers(name, rows) != entry[name]):
-            raise table.wrong(
-                f"rows {rows.start} to {rows.stop} are not all of {name} {entry[name]}."
-            )
-    if not np.array_equal(table.integers("grasp", rows), np.arange(n)):
-        raise table.wrong(f"the grasps of instance {entry['instance']} are not in their order.")
-
-    def values(name: str, by_stage: bool) -> Array:
-        found = [table.numbers(c, rows) for c, _ in _stage_columns(name, by_stage)]
-        return np.stack(found, axis=1) if by_stage else found[0]
-
-    unknown = [name for name in entry["measures"] if name not in MEASURES]
-    if unknown:
-        raise table.wrong(f"'{unknown[0]}' is no measure; there are: {', '.join(MEASURES)}.")
-    return GraspSet(
-        obj_id=int(entry["obj_id"]),
-        instance=int(entry["instance"]),
-        Ts_obj_grasp=table.lists("T_obj_grasp", 16, rows).reshape(n, 4, 4),
-        reachable=table.booleans("reachable", rows),
-        failures=table.texts("failure", rows),
-        measures={name: values(name, MEASURES[name].by_stage) for name in entry["measures"]},
-        parameters=dict(entry["parameters"]),
-        **{
-            field: values(name, field.startswith("slip")) for name, (field, _, _) in COLUMNS.items()
-        },
-    )
-
-
 # --- the table of attempts --------------------------------------------------------------------
 
 
@@ -293,32 +214,3 @@ def _attempts_bytes(scene: SceneGrasps) -> bytes:
             columns[name] = pa.ListArray.from_arrays(starts, flat)
         tables.append(pa.Table.from_arrays([columns[n] for n in types], schema=schema))
     return _bytes_of(pa.concat_tables(tables))
-
-
-def _read_attempts(folder: Path, head: dict[str, Any]) -> dict[int, GraspTrajectories]:
-    """Return the attempts by instance; they must be the very ones the grasps were written with."""
-    path = folder / TRAJECTORIES_FILE
-    if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != head.get("sha256"):
-        raise InputError(
-            f"{path} is missing, or not the table that {GRASPS_FILE} was written with. Write both "
-            "again from the session."
-        )
-    table = CheckedTable(path)
-    instances = table.integers("instance", slice(0, table.rows))
-    found: dict[int, GraspTrajectories] = {}
-    for key, joints in head["joints"].items():
-        at = np.flatnonzero(instances == int(key))
-        rows = slice(int(at[0]), int(at[-1]) + 1) if len(at) else slice(0, 0)
-        if rows.stop - rows.start != len(at):
-            raise table.wrong(f"the attempts of instance {key} do not stand together.")
-        starts, time_s = table.ragged("time_s", rows)
-        flat = table.inner("joints_rad", rows, int(joints))
-        found[int(key)] = GraspTrajectories(
-            rows=table.integers("grasp", rows),
-            starts=starts,
-            time_s=time_s,
-            joints_rad=flat,
-            opening_m=table.ragged("opening_m", rows)[1],
-            phase=table.ragged("phase", rows)[1].astype(np.int64),
-        )
-    return found
