@@ -42,6 +42,7 @@ from realsim.records import (
 )
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.review import ReviewServer
+from realsim.review.content.config import SceneConfig
 from realsim.store import SessionStore, save_scene
 
 SCENES, QUICK_SCENES, MODELS, VIEWS = 7, 2, 6, 8
@@ -52,6 +53,8 @@ CAMERA = CameraIntrinsics(
     distortion=np.array([-0.05, 0.05, 0.0, 0.0, 0.0]),
 )  # fmt: skip
 LONGEST_S = 300.0
+FEW = SceneConfig(coarse_points=4_000, shown_points=4_000, most_points=20_000)
+"""So little that a processor draws the scene; the photographs are as they are."""
 CAPTION = "(document.querySelector('.rs-caption') || {innerText: ''}).innerText"
 CIRCLES = "document.querySelector('.rs-pane').dataset.missing"
 FIGURES = {
@@ -139,7 +142,7 @@ def people(arguments: Namespace) -> Found:
         names = [f"table_{k}" for k in range(QUICK_SCENES if arguments.quick else SCENES)]
         truth = {n: seeded(Path(scratch) / n, known, rng) for n in names}
         server = ReviewServer([SessionStore.open(Path(scratch) / n) for n in names], port=0,
-                              reviewer="script")  # fmt: skip
+                              reviewer="script", config=FEW)  # fmt: skip
         server.start()
         try:
             with chromium_page(server.url) as (page, errors):

@@ -3,22 +3,22 @@
 import numpy as np
 import pytest
 
-from realsim.arrays import Array
+from realsim.arrays import Array, Array32
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh_shape import sample_surface
 from realsim.geometry.parts import part
-from realsim.review.placing.depth_residuals import (
-    CloudResiduals,
-    noise_of,
-    residual_rgb,
-    residuals,
-)
+from realsim.records import Mesh
+from realsim.review.placing.depth_residuals import CloudResiduals, noise_of, residual_rgb
 
 WEDGE = part("wedge").mesh
 FLANGE = part("flange").mesh
 T_WEDGE = se3.from_translation([0.5, 0.1, 0.0]) @ se3.exp(np.array([0.1, -0.3, 0.5, 0, 0, 0]))
 T_FLANGE = se3.from_translation([0.65, 0.1, 0.0])
+
+
+def residuals(points: Array, Ts: Array, meshes: list[Mesh]) -> Array32:
+    return CloudResiduals(points).against(Ts, meshes)
 
 
 def surface(offset_m: float = 0.0, seed: int = 0) -> Array:

@@ -25,7 +25,7 @@ from tests.support.review_browser import SMALL
 from tests.support.reviewed_boxes import boxes_session
 
 SOCKET = Subprotocol(f"{viser.__name__}-v{viser.__version__}")
-RED, ORANGE = "#c92a2a", "#d9480f"
+RED, ORANGE = "realsim-message alarm", "realsim-message refused"
 CAMERA = {
     "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, 1], "fov": 1.0,
     "near": 0.01, "far": 100.0, "image_height": 480, "image_width": 640, "look_at": [0, 0, 0],

@@ -145,20 +145,6 @@ class CloudResiduals:
         return _Near(T_world_obj.copy(), index, distance)
 
 
-def residuals(
-    points: ArrayLike, T_world_objs: ArrayLike, meshes: Sequence[Mesh], *, within_m: float = 0.01
-) -> Array32:
-    """Return the signed distance (N,) [m] of points to the nearest model; see `CloudResiduals`.
-
-    Args:
-        points: (N, 3) in world [m].
-        T_world_objs: (K, 4, 4) where the objects stand.
-        meshes: K of them.
-        within_m: points farther from every model than this are NaN [m].
-    """
-    return CloudResiduals(points, within_m=within_m).against(T_world_objs, meshes)
-
-
 def noise_of(residuals_m: ArrayLike) -> float:
     """Return the standard deviation of the depth's noise [m], within `NOISE_M`.
 
@@ -210,7 +196,7 @@ def legend(full_m: float = FULL_M, within_m: float = 0.01, noise_m: float = NOIS
 
     Args:
         full_m: as of `residual_rgb` [m].
-        within_m: as of `residuals` [m].
+        within_m: as of `CloudResiduals` [m].
         noise_m: as of `residual_rgb` [m].
     """
     edge = SIGMAS * noise_m

@@ -1,7 +1,6 @@
-"""The words of the static page: what people wrote comes from people, so everything is escaped."""
+"""The words of the static page."""
 
-import html
-from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -33,74 +32,25 @@ def counts_words(content: SceneContent, scene: Scene, state: ReviewState) -> str
     return "; ".join(w for w in words if w) + "."
 
 
-def caption_html(caption: str) -> str:
-    """Return the caption's paragraph; '' = none."""
-    if not caption.strip():
-        return ""
-    return f'<p class="caption">{html.escape(caption.strip())}</p>'
-
-
-def object_items(content: SceneContent, scene: Scene, state: ReviewState) -> str:
-    """Return the list's items, worst first."""
+def object_rows(content: SceneContent, scene: Scene, state: ReviewState) -> list[dict[str, Any]]:
+    """Return what the list says of the objects, worst first."""
     corrected = corrected_scene(content.scene, state)
     sets = {g.instance: g for g in content.grasp_sets}
-    return "\n".join(
-        _item(
-            placed,
-            corrected.object(placed.instance),
-            content.models[placed.obj_id],
-            sets.get(placed.instance),
-            state,
-        )
-        for placed in worst_first(scene.objects)
-    )
-
-
-def photo_items(urls: Mapping[int, str], excluded: Mapping[int, Entry]) -> str:
-    """Return the section of the photographs; a click on one goes to its camera."""
-    if not urls:
-        return ""
-    buttons: list[str] = []
-    for view, url in urls.items():
-        out = view in excluded
-        named = f"view {view}" + (", left out" if out else "")
-        style = ' class="left-out"' if out else ""
-        buttons.append(
-            f'<button type="button" data-view="{view}"{style} title="{named}">'
-            f'<img src="{url}" alt="{named}" loading="lazy"><span>{view}</span></button>'
-        )
-    return (
-        f"<details><summary>Photographs ({len(urls)})</summary>\n"
-        f'<div class="photos">\n{chr(10).join(buttons)}\n</div></details>'
-    )
-
-
-# --- one object ---------------------------------------------------------------------------------
-
-
-def _item(
-    placed: ObjectPose,
-    corrected: ObjectPose,
-    model: ObjectModel,
-    grasps: GraspSet | None,
-    state: ReviewState,
-) -> str:
-    color = "#{:02x}{:02x}{:02x}".format(*VERDICT_RGB[placed.verdict])
-    decision = decision_on(corrected, state)
-    head = (
-        f'<span class="dot" style="background:{color}"></span>'
-        f'<span class="name">{_said(model.name)}</span>'
-        f'<span class="verdict">{html.escape(placed.verdict)}</span>'
-    )
-    lines = [f"<p>{_said(line)}</p>" for line in _judged(corrected, decision)]
-    lines += [f"<p>{_said(reason)}</p>" for reason in corrected.reasons]
-    lines.append(_table(placed, corrected, model, grasps))
-    lines += [_quote(e) for e in state.comments(placed.instance)]
-    return (
-        f'<li class="object" data-instance="{placed.instance}">'
-        f'<button type="button" aria-expanded="false">{head}</button>'
-        f'<div class="detail">{"".join(lines)}</div></li>'
-    )
+    rows: list[dict[str, Any]] = []
+    for placed in worst_first(scene.objects):
+        model, was = content.models[placed.obj_id], corrected.object(placed.instance)
+        lines = [*_judged(was, decision_on(was, state)), *was.reasons]
+        quotes = [
+            (_said(e.comment), _said(f"{e.reviewer}, {e.time[:10]}"))
+            for e in state.comments(placed.instance)
+        ]
+        rows.append({
+            "instance": placed.instance, "name": _said(model.name), "verdict": placed.verdict,
+            "color": "#{:02x}{:02x}{:02x}".format(*VERDICT_RGB[placed.verdict]),
+            "lines": [_said(line) for line in lines], "quotes": quotes,
+            "rows": _table(placed, was, model, sets.get(placed.instance)),
+        })  # fmt: skip
+    return rows
 
 
 def _judged(corrected: ObjectPose, decision: Entry | None) -> list[str]:
@@ -116,7 +66,7 @@ def _judged(corrected: ObjectPose, decision: Entry | None) -> list[str]:
 
 def _table(
     placed: ObjectPose, corrected: ObjectPose, model: ObjectModel, grasps: GraspSet | None
-) -> str:
+) -> list[tuple[str, str]]:
     rows = [("instance", str(placed.instance)), ("object id", str(placed.obj_id))]
     rows += sigma_rows(corrected, model)
     agree = corrected.checks.get("agree")
@@ -124,8 +74,7 @@ def _table(
         rows.append(("pixels that agree with the depth", f"{100 * agree:.1f} %"))
     if grasps is not None and len(grasps):
         rows.append(("grasps, good of all", f"{int(grasps.good.sum())} of {len(grasps)}"))
-    cells = (f"<tr><td>{html.escape(a)}</td><td>{html.escape(b)}</td></tr>" for a, b in rows)
-    return f"<table>{''.join(cells)}</table>"
+    return rows
 
 
 def sigma_rows(placed: ObjectPose, model: ObjectModel) -> list[tuple[str, str]]:
@@ -141,13 +90,8 @@ def sigma_rows(placed: ObjectPose, model: ObjectModel) -> list[tuple[str, str]]:
     return rows
 
 
-def _quote(entry: Entry) -> str:
-    cite = f"{entry.reviewer}, {entry.time[:10]}"
-    return f"<blockquote>{_said(entry.comment)}<cite>{_said(cite)}</cite></blockquote>"
-
-
 def _said(text: str) -> str:
-    return html.escape(one_line(text).strip())
+    return one_line(text).strip()
 
 
 def _counted(count: int, thing: str) -> str:

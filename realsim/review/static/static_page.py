@@ -15,16 +15,17 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from realsim import __version__
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.bop.models import model_file
 from realsim.geometry import se3
+from realsim.pages.page import template
 from realsim.records import ObjectModel, ObjectPose, Scene
 from realsim.records.grasps import label_words
 from realsim.review.content.content import SceneContent
@@ -38,7 +39,7 @@ from realsim.review.static.page_nodes import (
     label_class,
     viewer_html,
 )
-from realsim.review.static.page_text import caption_html, counts_words, object_items, photo_items
+from realsim.review.static.page_text import counts_words, object_rows
 
 Progress = Callable[[int, int], None]
 POLICY = (
@@ -198,44 +199,21 @@ def _page(
     words: PageWords,
 ) -> bytes:
     """Return the page's bytes."""
-    here = files("realsim.review.static")
-    has_grasps = any(len(g) for g in content.grasp_sets)
-    fields = {
-        "policy": html.escape(POLICY),
-        "version": html.escape(__version__),
-        "title": html.escape(title.strip()),
-        "about": html.escape(counts_words(content, scene, state)),
-        "caption": caption_html(words.caption),
-        "objects": object_items(content, scene, state),
-        "photos": photo_items(
-            {v.index: _data_url(content.thumbnails[v.index]) for v in _cameras(content, size)},
-            state.excluded_views(),
-        ),
-        "grasp_switches": GRASP_SWITCHES if has_grasps else "",
-        "grasp_slider": _grasp_slider(content) if has_grasps else "",
-        "footer": _footer(content, size, words),
-        "viewer": html.escape(viewer_html(content, scene, size), quote=True),
-        "data": _json(_data(content, scene, size)),
-        "script": (here / "static_page.js").read_text(encoding="utf-8"),
-    }
-    template = (here / "static_page.html").read_text(encoding="utf-8")
-    return Template(template).substitute(fields).encode()
-
-
-GRASP_SWITCHES = """<label><input type="checkbox" data-show="grasps" checked> Grasps</label>
-<label><input type="checkbox" id="own" checked> of the chosen only</label>"""
-GRASP_SLIDER = Template(
-    f"""<div class="row"><label for="least">Least $label</label>
-<input type="range" id="least" min="0" max="{len(LABEL_EDGES) - 1}" step="1" value="{LEAST_CLASS}">
-<span class="soft" id="least-word"></span></div>
-<div class="soft">Grasps: red 0, yellow 0.5, green 1 by $label; grey not known$pale.</div>"""
-)
-
-
-def _grasp_slider(content: SceneContent) -> str:
-    """Return the slider of the grasps, with what their colours say."""
-    pale = "; pale: p_hold of few draws" * any(g.unsure.any() for g in content.grasp_sets)
-    return GRASP_SLIDER.substitute(label=label_words(content.grasp_sets), pale=pale)
+    script = files("realsim.review.static").joinpath("static_page.js").read_text("utf-8")
+    sets = content.grasp_sets
+    text = template("static_page.html", package="realsim.review.static").render(
+        policy=Markup(html.escape(POLICY)), version=__version__, title=title.strip(),
+        caption=words.caption.strip(), about=counts_words(content, scene, state),
+        objects=object_rows(content, scene, state),
+        photos=[(v.index, _data_url(content.thumbnails[v.index])) for v in _cameras(content, size)],
+        left_out=state.excluded_views(), footer=_footer(content, size, words),
+        label=label_words(sets) if any(len(g) for g in sets) else "",
+        pale="; pale: p_hold of few draws" * any(g.unsure.any() for g in sets),
+        least_class=LEAST_CLASS, last_class=len(LABEL_EDGES) - 1,
+        viewer=Markup(html.escape(viewer_html(content, scene, size), quote=True)),
+        data=Markup(_json(_data(content, scene, size))), script=Markup(script),
+    )  # fmt: skip
+    return text.encode()
 
 
 def _cameras(content: SceneContent, size: StaticSize) -> list[Any]:
@@ -301,21 +279,20 @@ def _json(data: dict[str, Any]) -> str:
     return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def _data_url(jpeg: bytes) -> str:
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")
+def _data_url(jpeg: bytes) -> Markup:
+    return Markup("data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii"))
 
 
-def _footer(content: SceneContent, size: StaticSize, words: PageWords) -> str:
+def _footer(content: SceneContent, size: StaticSize, words: PageWords) -> list[str]:
     made, licence = words.made or datetime.now(UTC), words.licence.strip()
     found = _summary(content, size, Path(), 0)
-    lines = [
+    return [
         f"Drawn: {found.points:,} of {found.points_in_all:,} points, {found.cameras} of "
         f"{found.cameras_in_all} cameras, {found.grasps} of {found.grasps_in_all} grasps.",
         f"{made.astimezone(UTC):%Y-%m-%d %H:%M} UTC",
         *([f"Data: {licence}"] if licence else []),
         MADE_WITH.format(version=__version__),
     ]
-    return "\n".join(f"<span>{html.escape(line)}</span>" for line in lines)
 
 
 def _summary(content: SceneContent, size: StaticSize, path: Path, count: int) -> StaticSummary:

@@ -16,6 +16,7 @@ from realsim.review.drawing.grasp_drawing import (
 )
 from realsim.review.replay.grasp_replay import GraspMotion, ReplayPlayer
 from realsim.review.replay.grasp_words import grasp_words
+from realsim.review.window import window_text
 
 if TYPE_CHECKING:
     from realsim.review.window.window import Window
@@ -189,13 +190,6 @@ def legend_html(sets: Sequence[GraspSet]) -> str:
     """Return the legend of the grasps' colours: what they say, and that pale ones are not sure."""
     scores = (0.0, 0.25, 0.5, 0.75, 1.0, float("nan"))
     words = ("0", "0.25", "0.5", "0.75", "1", "unknown")
-    cells = "".join(
-        f'<div style="flex:1;background:rgb({r},{g},{b});text-align:center;padding:3px 0">'
-        f"{word}</div>"
-        for (r, g, b), word in zip(score_rgb(scores).tolist(), words, strict=True)
-    )
+    cells = zip(words, score_rgb(scores).tolist(), strict=True)
     pale = "; pale: few draws" * any(s.unsure.any() for s in sets)
-    return (
-        f'<div style="margin:4px 12px;font-size:12px"><span>{label_words(sets)}{pale}</span>'
-        f'<div style="display:flex;color:#000">{cells}</div></div>'
-    )
+    return window_text.legend_html(cells, label_words(sets) + pale)

@@ -8,6 +8,7 @@ from realsim.review.drawing.scene_nodes import Look
 from realsim.review.placing import depth_residuals
 from realsim.review.placing.ellipsoid import ellipsoid_of
 from realsim.review.reviewed_session import Standing
+from realsim.review.window import window_text
 from realsim.review.window.latest import LatestOnly
 
 if TYPE_CHECKING:
@@ -114,7 +115,10 @@ class ShowPanel:
                 r = window.session.residuals_m(wanted.scene.objects)
                 noise_m = depth_residuals.noise_of(r)
                 colors = depth_residuals.residual_rgb(r, noise_m=noise_m)
-                self._legend.content = _legend_html(noise_m)
+                said = depth_residuals.legend(noise_m=noise_m)
+                marks = [f"{mm:+.2g}" for mm in said.values_mm]
+                cells = zip(marks, said.rgb.tolist(), strict=True)
+                self._legend.content = window_text.legend_html(cells, f"mm. {said.words}")
             if self._colored is wanted:
                 window.nodes.set_cloud_colors(colors)
 
@@ -132,24 +136,3 @@ class ShowPanel:
         if unknown:
             text += f" Not known of instance {', '.join(unknown)}."
         self._said.content = text
-
-
-def _legend_html(noise_m: float) -> str:
-    """Return the legend of the residuals at a noise of the depth [m]."""
-    legend = depth_residuals.legend(noise_m=noise_m)
-    cells = "".join(
-        f'<div style="flex:1;background:rgb({r},{g},{b});color:{_ink(r, g, b)};'
-        f'text-align:center;padding:3px 0">{value:+.2g}</div>'
-        for value, (r, g, b) in zip(legend.values_mm, legend.rgb.tolist(), strict=True)
-    )
-    return (
-        '<div style="margin:4px 12px;font-size:12px;line-height:1.3">'
-        f'<div style="display:flex;margin-bottom:4px">{cells}'
-        '<div style="padding:3px 6px">mm</div></div>'
-        f"{legend.words}</div>"
-    )
-
-
-def _ink(r: int, g: int, b: int) -> str:
-    """Return the colour of letters that can be read on this one."""
-    return "#000" if 0.3 * r + 0.6 * g + 0.1 * b > 140 else "#fff"

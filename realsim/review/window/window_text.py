@@ -5,7 +5,7 @@ neither look like a button nor bring a script along.
 """
 
 import html
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -217,11 +217,23 @@ def progress_html(judged: int, total: int, scenes: int, others: Sequence[str] = 
     share = 100.0 * judged / max(total, 1)
     people = "".join(f"<div>\u25cf {html.escape(one_line(who))}</div>" for who in others)
     return (
-        f'<div style="margin:2px 10px"><b>{judged} of {total}</b> objects judged{more}'
-        '<div style="height:5px;margin-top:4px;background:#dee2e6;border-radius:3px">'
-        f'<div style="height:5px;width:{share:.1f}%;background:#1864ab;border-radius:3px"></div>'
-        f"</div>{people}</div>"
+        f'<div class="realsim-progress"><b>{judged} of {total}</b> objects judged{more}'
+        f'<div><div style="width:{share:.1f}%"></div></div>{people}</div>'
     )
+
+
+def legend_html(cells: Iterable[tuple[str, Sequence[int]]], words: str) -> str:
+    """Return a row of cells (text, RGB) and what they mean."""
+    row = "".join(
+        f'<i style="background:rgb({r},{g},{b});color:{_ink(r, g, b)}">{html.escape(text)}</i>'
+        for text, (r, g, b) in cells
+    )
+    return f'<div class="realsim-legend"><div>{row}</div>{html.escape(words)}</div>'
+
+
+def _ink(r: int, g: int, b: int) -> str:
+    """Return the colour of letters that can be read on this one."""
+    return "#000" if 0.3 * r + 0.6 * g + 0.1 * b > 140 else "#fff"
 
 
 def row_style(uuid: str, row: ObjectRow, *, is_here: bool) -> str:
@@ -239,13 +251,7 @@ def row_style(uuid: str, row: ObjectRow, *, is_here: bool) -> str:
 
 def message_html(text: str, kind: str) -> str:
     """Return the line that answers the last thing done: kind is ok, refused or alarm."""
-    colors = {"ok": ("#ebfbee", "#2b8a3e"), "refused": ("#fff4e6", "#d9480f")}
-    back, edge = colors.get(kind, ("#fff5f5", ALARM))
-    style = (
-        f"background:{back};border-left:3px solid {edge};padding:6px 9px;margin:4px 10px;"
-        "font-size:13px;line-height:1.35;border-radius:3px;color:#212529;overflow-wrap:anywhere"
-    )
-    return f'<div class="realsim-message" style="{style}">{html.escape(one_line(text))}</div>'
+    return f'<div class="realsim-message {kind}">{html.escape(one_line(text))}</div>'
 
 
 def symmetry_words(model: ObjectModel) -> str:
