@@ -11,25 +11,19 @@ WORKDIR /src
 # Their versions are the constraints of pyproject.toml.
 COPY pyproject.toml ./
 RUN --mount=type=cache,target=/root/.cache/uv \
-    uv sync --no-dev --no-install-project
+    uv sync --no-install-project
 COPY README.md LICENSE ./
 COPY realsim realsim
 COPY calibration calibration
 COPY capture_plans capture_plans
 COPY sim_bridge sim_bridge
 RUN --mount=type=cache,target=/root/.cache/uv \
-    uv sync --no-dev --no-editable
+    uv sync --no-editable
 
 FROM python:3.11-slim-bookworm
 LABEL org.opencontainers.image.title="realsim" \
       org.opencontainers.image.description="Real-to-sim-and-back calibration and registration for robot-grasping data" \
       org.opencontainers.image.licenses="Apache-2.0"
-# Open3D is linked against libEGL and libGL, Pinocchio against libgomp. Debian's stable release keeps one
-# version and mends it: a pinned one would vanish from the mirrors with the next repair.
-# hadolint ignore=DL3008
-RUN apt-get update \
-    && apt-get install -y --no-install-recommends libegl1 libgl1 libgomp1 \
-    && rm -rf /var/lib/apt/lists/* /var/cache/apt/archives/*.deb /var/log/apt/* /var/log/dpkg.log
 # Everybody may write to the caches and to /data: with --user, files in a mounted folder belong to
 # whoever runs the container.
 RUN groupadd --gid 10001 realsim \

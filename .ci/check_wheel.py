@@ -19,8 +19,8 @@ for generic in ("calibration", "capture_plans", "sim_bridge", "tests"):
     assert importlib.util.find_spec(generic) is None, generic
 from importlib.resources import files
 assert (files("realsim.pages") / "page.html").is_file()
-from realsim.interop import import_open3d, import_pyrealsense2
-import_open3d(); import_pyrealsense2()
+from realsim.interop import import_open3d, import_pinocchio, import_pyrealsense2
+import_open3d(); import_pinocchio(); import_pyrealsense2()
 from realsim_capture_plans.plan_files.plan_json import shipped_plan
 assert len(shipped_plan("ur5_d405_hemisphere_256")) == 256
 print("isolated install works")

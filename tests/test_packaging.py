@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from documented_commands import documented
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("realsim", "realsim_calibration", "realsim_capture_plans", "realsim_sim_bridge")
 
@@ -31,6 +33,18 @@ def test_importing_realsim_loads_numpy_and_nothing_heavier() -> None:
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
 
 
+def test_running_installs_no_tests_and_tests_install_every_extra() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert project["tool"]["uv"]["default-groups"] == []
+    extras = ",".join(project["project"]["optional-dependencies"])
+    assert f"realsim[{extras}]" in project["dependency-groups"]["test"]
+
+
+def test_ci_types_the_command_that_the_readme_gives_for_the_tests() -> None:
+    command = documented("README.md", "pytest")
+    assert f"\n{command} -q\n" in (ROOT / ".ci/run").read_text()
+
+
 # --- the container ------------------------------------------------------------------------------
 
 
@@ -42,7 +56,7 @@ def dockerfile() -> list[str]:
 
 def test_the_dockerfile_has_nothing_to_complain_about() -> None:
     hadolint = shutil.which("hadolint", path=Path(sys.executable).parent)
-    assert hadolint is not None, "uv sync installs it with the group dev"
+    assert hadolint is not None, "the group test installs it"
     done = subprocess.run(
         [hadolint, "--no-color", str(ROOT / "Dockerfile")], capture_output=True, text=True
     )

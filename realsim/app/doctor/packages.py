@@ -61,7 +61,6 @@ _REQUIRED = (
     ("ur-rtde", "rtde_control", "the UR robot"),
     ("toppra", "toppra", "time along the arm's path"),
     ("h5py", "h5py", "HDF5 files"),
-    ("pyarrow", "pyarrow", "Parquet files"),
     ("isal", "isal", "fast compression of images"),
 )
 _EXTRAS = (
@@ -69,6 +68,8 @@ _EXTRAS = (
     ("usd", "usd-core", "pxr.Usd", "USD files, scenes for Isaac Sim"),
     ("franka", "franky-control", "franky", "captures with a Franka arm"),
     ("lerobot", "av", "av", "demonstrations with videos"),
+    ("lerobot", "pyarrow", "pyarrow", "tables of demonstrations"),
+    ("parquet", "pyarrow", "pyarrow", "grasps as Parquet tables"),
     ("mujoco", "mujoco", "mujoco", "the Robot School's second engine"),
     ("cluster", "ray", "ray", "the Robot School on several machines"),
     ("photo", "mitsuba", "mitsuba", "photoreal pictures"),

@@ -49,7 +49,7 @@ def _platform() -> list[Finding]:
         Finding(group=group, name="realsim", kind="ok", found=__version__),
         Finding(
             group=group, name="Python", kind="ok" if fits else "problem", found=python,
-            todo="" if fits else "Python 3.11 has every package: `uv python install 3.11`",
+            todo="" if fits else "install Python 3.11: PyBullet has no wheel for a later one",
         ),
         Finding(
             group=group, name="system", kind="ok" if known else "note", found=machine,
