@@ -193,10 +193,17 @@
     draw();
   };
 
+  // Viser draws no scene that is out of the window: without a graphics card that is most of the work.
+  const hideScene = (isHidden) => {
+    const canvas = document.querySelector("canvas"), scene = canvas && canvas.closest('[style*="z-index: 0"]');
+    if (scene) scene.style.transform = isHidden ? "translateX(-300vw)" : "";
+  };
+
   // --- what a person does ---------------------------------------------------------------------
   const open = () => {
     if (root || !shown()) return;
     root = make("div", "rs-photograph", document.body);
+    hideScene(true);
     make("div", "rs-panes", root);
     const bar = make("div", "rs-bar", root);
     make("b", "rs-caption", bar);
@@ -243,7 +250,7 @@
     seen = { state: "", instance: "" }; strip = null; panes = []; zoom = 0;
     renew();
   };
-  const close = () => { if (root) root.remove(); root = null; panes = []; window.realsimPlace.tell(null); };
+  const close = () => { hideScene(false); if (root) root.remove(); root = null; panes = []; window.realsimPlace.tell(null); };
   const fit = () => { zoom = strip ? fitted() : 1; middle = strip ? [strip.width / 2, strip.height / 2] : middle; if (strip) place(); };
   const three = () => { isThree = !isThree; draw(); };
   const blink = () => { layer = layer === "photo" ? "render" : "photo"; draw(); };
