@@ -17,6 +17,7 @@ import os
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
+import json
 import tempfile
 import time
 from argparse import Namespace
@@ -26,6 +27,7 @@ from typing import Any
 
 import numpy as np
 from figures import Figure, Found, Goal, run
+from labels_scene import scene as labels_scene
 from review_page import chromium_page
 
 from realsim.formats.bop.models import save_models
@@ -84,25 +86,15 @@ def models(rng: np.random.Generator) -> dict[int, ObjectModel]:
 
 def seeded(folder: Path, known: dict[int, ObjectModel], rng: np.random.Generator) -> dict[str, Any]:
     """Write a scene whose labels have defects; return which instances, and where one is missing."""
-    true = [
-        ObjectPose(
-            obj_id=int(rng.integers(1, MODELS + 1)), instance=k, verdict="accepted",
-            checks={"agree": 0.97},
-            T_world_obj=se3.from_rt(
-                se3.exp_so3([0, 0, rng.uniform(0, 6.28)]),
-                [0.11 * (k % 3 - 1), 0.11 * (k // 3 - 1), 0],
-            ),
-        )
-        for k in range(9)
-    ]  # fmt: skip
+    turns = rng.uniform(0, 6.28, 9)
+    Ts = [se3.from_rt(se3.exp_so3([0, 0, a]), [0.11 * (k % 3 - 1), 0.11 * (k // 3 - 1), 0])
+          for k, a in enumerate(turns)]  # fmt: skip
+    true = [ObjectPose(obj_id=int(i), instance=k, verdict="accepted", T_world_obj=Ts[k])
+            for k, i in enumerate(rng.integers(1, MODELS + 1, 9))]  # fmt: skip
     session = CaptureSession(name=folder.name, intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
     store = SessionStore.create(folder, session)
-    import trimesh
-
-    slab: Any = trimesh.creation.box([1.6, 1.6, 0.02])
-    table = Mesh(vertices=np.asarray(slab.vertices), faces=np.asarray(slab.faces, np.int32))
     placed = [PlacedMesh(o.instance, known[o.obj_id].mesh, o.T_world_obj) for o in true]
-    renderer = LabelRenderer([PlacedMesh(-1, table, se3.from_translation([0, 0, -0.01])), *placed])
+    renderer = LabelRenderer([labels_scene()[0], *placed])
     colors = rng.integers(60, 220, (len(true) + 1, 3))
     for index in range(VIEWS):
         a = 2 * np.pi * index / VIEWS
@@ -120,12 +112,9 @@ def seeded(folder: Path, known: dict[int, ObjectModel], rng: np.random.Generator
         spin = se3.from_rt(se3.exp_so3([0, 0, np.radians(deg)]), [0, 0, 0])
         return replace(true[k], T_world_obj=se3.from_translation(by) @ true[k].T_world_obj @ spin)
 
-    wrong = {
-        place: moved(place, [0.02, -0.015, 0], 60), turn: moved(turn, [0, 0, 0], 180),
-        swap: replace(true[swap], obj_id=true[swap].obj_id % MODELS + 1),
-    }  # fmt: skip
-    for k in small:
-        a = rng.uniform(0, 6.28)
+    wrong = {place: moved(place, [0.02, -0.015, 0], 60), turn: moved(turn, [0, 0, 0], 180),
+             swap: replace(true[swap], obj_id=true[swap].obj_id % MODELS + 1)}  # fmt: skip
+    for k, a in zip(small, turns, strict=False):
         wrong[k] = moved(k, [0.003 * np.cos(a), 0.003 * np.sin(a), 0])
     said = tuple(wrong.get(o.instance, o) for o in true if o.instance != missing)
     save_scene(store, Scene(name=folder.name, objects=said,
@@ -154,10 +143,9 @@ def people(arguments: Namespace) -> Found:
     hits, alarms, right = 0, 0, 0
     for name, t in truth.items():
         rejected = {e.instance for e in said[name] if e.action == "reject"}
-        judged = {e.instance for e in said[name]}
-        hits += len(rejected & t["wrong"])
         alarms += len(rejected - t["wrong"])
-        right += len(judged - t["wrong"])
+        right += len({e.instance for e in said[name]} - t["wrong"])
+        hits += len(rejected & t["wrong"])
         hits += any(_circled(views[name], v, spots, t["at"]) for v, spots in circles[name])
     total = 6 * len(names)
     over = f"{total} defects in {len(names)} scenes of 8 drawn objects"
@@ -171,8 +159,6 @@ def people(arguments: Namespace) -> Found:
 
 def _review(page: Any, names: list[str]) -> tuple[int, float, dict[str, list[Any]]]:
     """Judge every object by what the photographs show; return keys, seconds, circles."""
-    import json
-
     circles: dict[str, list[Any]] = {n: [] for n in names}
     start, keys, before = time.perf_counter(), 1, ""
     page.keyboard.press("g")

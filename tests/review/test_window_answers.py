@@ -159,7 +159,7 @@ def test_a_failure_whose_refresh_fails_too_does_not_raise(
 def test_a_journal_that_vanishes_is_told_in_red_until_it_is_back(page: Page) -> None:
     window, server = page.window, page.server
     window.attempt(lambda: window.object.decide("reject"))
-    page.wait_message("Recorded", "#2b8a3e")
+    page.wait_message("Recorded", "realsim-message ok")
     path = server.sessions[0].journal_path
     path.rename(path.with_name("aside"))
     page.wait_message("the journal that was read is gone", RED)
@@ -167,7 +167,7 @@ def test_a_journal_that_vanishes_is_told_in_red_until_it_is_back(page: Page) -> 
     assert not path.exists() and RED in page.message
     assert [e.action for e in server.decisions()] == ["reject"]
     path.with_name("aside").rename(path)
-    page.wait_message("can be read again", "#2b8a3e")
+    page.wait_message("can be read again", "realsim-message ok")
 
 
 def test_a_page_with_a_swap_to_a_missing_model_stays_usable(page: Page) -> None:
