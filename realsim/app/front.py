@@ -103,6 +103,16 @@ def main() -> None:
         except BrokenPipeError:
             os._exit(141)  # as `realsim.app.cli`, where the reader of the output has gone
         return
-    from realsim.app.cli import main as run
+    try:
+        from realsim.app.cli import main as run
 
-    run()
+        run()
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("realsim"):
+            raise  # a bug: its place is wanted
+        print(
+            f"error: {error.name} is not installed. Install what realsim needs with `uv sync "
+            "--inexact`, or `pip install realsim`; `realsim doctor` says what else is missing.",
+            file=sys.stderr,
+        )
+        sys.exit(2)

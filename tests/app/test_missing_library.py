@@ -4,6 +4,7 @@ import sys
 
 import pytest
 
+from realsim.app import front
 from realsim.app.cli import main
 from realsim.app.config import applied
 
@@ -25,3 +26,23 @@ def test_a_missing_shared_library_ends_with_what_to_install(
     said = capsys.readouterr().err
     assert "pinocchio" in said and "libstdc++6" in said and "apt-get install" in said
     assert "realsim doctor" in said
+
+
+@pytest.mark.parametrize(("module", "mended"), [("numba", True), ("realsim.nowhere", False)])
+def test_a_missing_package_ends_with_what_to_install_and_a_bug_with_its_place(
+    module: str,
+    mended: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def missing(*_: object, **__: object) -> None:
+        raise ModuleNotFoundError(f"No module named '{module}'", name=module)
+
+    monkeypatch.setattr(applied, "apply_config", missing)
+    monkeypatch.setattr(sys, "argv", ["realsim", "config", "show"])
+    with pytest.raises(SystemExit if mended else ModuleNotFoundError) as stop:
+        front.main()
+    if mended:
+        assert getattr(stop.value, "code", None) == 2
+        said = capsys.readouterr().err
+        assert "numba is not installed" in said and "uv sync" in said and "realsim doctor" in said

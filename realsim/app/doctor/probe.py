@@ -1,6 +1,6 @@
 """Runs one probe after the other in a process of its own, and writes a line of JSON for each.
 
-    python -m realsim.app.doctor.probe import:numpy library:libEGL.so.1 numba-cache realsense
+    python -m realsim.app.doctor.probe import:numpy library:libusb-1.0.so.0 numba-cache realsense
 
 A library that crashes takes this process along and nothing else; `isolation` starts another one.
 """
