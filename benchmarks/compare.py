@@ -113,11 +113,9 @@ def page_of(documents: dict[str, Document]) -> str:
         seeds = ", ".join(map(str, document.get("seeds") or [document.get("seed")]))
         kind = "quick" if document.get("quick") else "full"
         lines += [f"## {name}", "", f"{kind}, seeds {seeds}, {machine.get('cores', '?')} cores", ""]
-        noise = {k: f" +- {v:.2g}" for k, v in document.get("noise", {}).items()}
-        said = {
-            key: "not measured" if value is None else f"{value:.4g}{noise.get(key, '')}"
-            for key, value in document["figures"].items()
-        }
+        figures, noise = document["figures"].items(), document.get("noise", {}).items()
+        said = {k: "not measured" if v is None else f"{v:.4g}" for k, v in figures}
+        said |= {k: f"{said[k]} +- {v:.2g}" for k, v in noise}
         asked = [key for key in said if "inf" not in goals.get(key, "inf")]
         lines += ["figure | measured | goal", "---|---|---"]
         lines += [f"{key} | {said[key]} | {goals[key]}" for key in asked]
