@@ -5,7 +5,6 @@ import dataclasses
 import h5py
 import numpy as np
 import pytest
-from pxr import Usd
 
 import placed_scenes
 from realsim.errors import InputError
@@ -111,15 +110,6 @@ def test_a_table_that_leans_in_world_becomes_level(tmp_path):
     for o, p in zip(scene.objects, found.scene.objects, strict=True):
         assert np.allclose(p.T_world_obj, T @ o.T_world_obj, atol=1e-12)
     held_grasps(found, grasps())
-
-
-def test_meshes_go_as_usd_too_where_it_is_asked_for(tmp_path):
-    scene = placed_scenes.placed_scene()
-    told = write(scene, grasps(), tmp_path / "s", with_usd=True)
-    assert "file_path: assets/bracket.usd" in (tmp_path / "s/scene.yaml").read_text()
-    stage = Usd.Stage.Open(str(tmp_path / "s/assets/bracket.usd"))
-    assert stage.GetDefaultPrim().GetName() == "bracket" and not told.notes
-    same(read_graspit_scene(tmp_path / "s"), scene, grasps())
 
 
 def test_the_same_scene_gives_the_same_bytes_and_several_go_into_one_export(tmp_path):

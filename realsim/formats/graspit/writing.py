@@ -1,8 +1,7 @@
 """Scenes of GraspIT written: scene.yaml, assets/*.stl, grasps.hdf5, as their authors lay them out.
 
 Quaternions are w x y z, as the authors' own scene proves. Grasps stand in world, each beside its
-half turn about the approach axis. Meshes are STL in metres, and USD too where it is asked for:
-the authors' simulation loads those.
+half turn about the approach axis. Meshes are STL in metres.
 """
 
 import io
@@ -46,8 +45,6 @@ class GraspitConfig:
 
     under: str = ""
     """Folder in the export that the scene gets; '' = the export's own. One export, many scenes."""
-    with_usd: bool = False
-    """Whether the meshes are written as USD too (extra `usd`); file_path names those then."""
 
 
 def paired_grasps(grasps: GraspSet) -> WorldGrasps:
@@ -81,7 +78,6 @@ def write_graspit(
 
     Raises:
         InputError: grasps of an object that is not in the scene.
-        MissingLibraryError: USD is asked for and its extra is not installed.
         StorageError: the disk is full, or refuses.
     """
     config = config or GraspitConfig()
@@ -90,12 +86,14 @@ def write_graspit(
     names = unique_names({o.instance: o.name for o in scene.objects})
     files = scene.body_names()
     for obj_id, name in files.items():
-        _write_mesh(scene, obj_id, f"{at}{ASSETS}/{name}", name, folder, config)
+        piece = f"{at}{ASSETS}/{name}"
+        if not folder.has(piece):
+            folder.write_piece(piece, {f"{piece}.stl": stl_bytes(scene.bodies[obj_id].model.mesh)})
         if progress is not None:
             progress()
     bare = [n for i, n in files.items() if scene.bodies[i].model.mesh.texture is not None]
     bare += [n for i, n in files.items() if scene.bodies[i].model.mesh.colors is not None]
-    if bare and not config.with_usd:
+    if bare:
         notes.append(f"STL has no colours; those of {', '.join(bare)} are not written.")
     rows = _rows(scene, names, files, config)
     last = {f"{at}{SCENE_FILE}": yaml_text(rows).encode("utf-8")}
@@ -124,30 +122,6 @@ def _upright(scene: PlacedScene) -> tuple[PlacedScene, list[str]]:
     return seen_from(scene, scene.table.T_world_table), [said]
 
 
-def _write_mesh(
-    scene: PlacedScene,
-    obj_id: int,
-    piece: str,
-    name: str,
-    folder: ExportFolder,
-    config: GraspitConfig,
-) -> None:
-    if folder.has(piece):
-        return
-    body = scene.bodies[obj_id]
-    files = {f"{piece}.stl": stl_bytes(body.model.mesh)}
-    if config.with_usd:
-        from realsim.formats.robot_scenes.usd_body import Pixar, body_stage, texture_png
-        from realsim.formats.robot_scenes.usd_scene import layer_bytes
-
-        stage = body_stage(Pixar(), body, name, f"./{name}.png")
-        files[f"{piece}.usd"] = layer_bytes(stage.GetRootLayer(), "usdc")
-        texture = texture_png(body)
-        if texture is not None:
-            files[f"{piece}.png"] = texture
-    folder.write_piece(piece, files)
-
-
 # --- scene.yaml ---------------------------------------------------------------------------------
 
 
@@ -159,10 +133,9 @@ def _rows(
 ) -> dict[str, Any]:
     """Return the values of scene.yaml, in the order of the authors' file."""
     rows: dict[str, Any] = {"grasp_path": f"{config.under.strip('/')}/{GRASP_FILE}".lstrip("/")}
-    suffix = "usd" if config.with_usd else "stl"
     for k, o in enumerate(scene.objects):
         rows[f"object{k + 1}"] = {
-            "file_path": f"{ASSETS}/{files[o.obj_id]}.{suffix}",
+            "file_path": f"{ASSETS}/{files[o.obj_id]}.stl",
             "name": names[o.instance],
             "orientation": se3.quaternion_wxyz(o.T_world_obj[:3, :3]).tolist(),
             "position": o.T_world_obj[:3, 3].tolist(),

@@ -69,8 +69,6 @@ class UrdfConfig:
 
     under: str = ""
     """Folder in the export that the scene gets; '' = the export's own. One export, many scenes."""
-    with_world: bool = True
-    """Whether world.urdf is written beside the single files."""
 
 
 def write_urdf_scene(
@@ -113,8 +111,7 @@ def write_urdf_scene(
     files = {f"{at}{SCENE_FILE}": atomic.json_bytes(scene_json(scene, names))}
     files[f"{at}{SCRIPT}"] = Path(__file__).with_name(SCRIPT).read_bytes()
     files[f"{at}{TABLE_NAME}.urdf"] = _robot(TABLE_NAME, [table_link(scene.table)])
-    if config.with_world:
-        files[f"{at}{WORLD_FILE}"] = _world(scene, names)
+    files[f"{at}{WORLD_FILE}"] = _world(scene, names)
     folder.write_piece(f"{at}{SCENE_FILE}", files)
     counts = {"bodies": len(names), "collision shapes": shapes, "cameras": len(scene.cameras)}
     return told(scene, folder.folder / config.under, counts)

@@ -5,13 +5,11 @@ writes poses down (`recorded_worlds`). What comes out is compared with what is s
 that ends otherwise says so.
 """
 
-from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
-from types import TracebackType
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from realsim.arrays import Array, Mask
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet
@@ -22,12 +20,10 @@ from realsim_sim_bridge.slip.score import score_stages
 from realsim_sim_bridge.slip.slip_test import NOT_SIMULATED, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import (
-    Closing,
     Engine,
     Grips,
     HandWorld,
     Motion,
-    PairStates,
     SlipBody,
     SlipPhysics,
 )
@@ -73,7 +69,7 @@ class RecordedEngine(Engine):
         geometry: Hand,
         stand: Stand | None = None,
     ) -> HandWorld:
-        """Return the engine's world, watched.
+        """Return the engine's world, whose plays are written down.
 
         The slip test's first world goes through the stages; a later one plays its latest stage
         again, at true speed.
@@ -81,75 +77,22 @@ class RecordedEngine(Engine):
         self._worlds += 1
         again = self._worlds > 1
         world = self._engine.world(body, grips, physics, geometry, stand)
-        return _RecordedWorld(world, self.stages, 1 if again else self.replay.speed, again)
+        close, play = world.close, world.play
 
+        def noted(motion: Motion, speed: int) -> Motion:
+            fingers = world.states().fingers_m[0]
+            self.stages.append(StageRecord(motion=motion, fingers_m=fingers, speed=speed))
+            return motion
 
-@dataclass(eq=False)
-class _RecordedWorld(HandWorld):
-    """A `HandWorld` whose plays are written down."""
+        def played(wrenches: Array, sample: int, lost_m: float) -> Motion:
+            motion = play(wrenches, sample, lost_m)
+            if again:
+                self.stages.pop()
+            return noted(motion, 1 if again else self.replay.speed)
 
-    inner: HandWorld
-    stages: list[StageRecord]
-    speed: int
-    again: bool
-    _stack: ExitStack = field(default_factory=ExitStack)
-
-    def __post_init__(self) -> None:
-        """Take over the time step."""
-        self.dt = self.inner.dt
-
-    @property
-    def alive(self) -> Mask:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The inner world's."""
-        return self.inner.alive
-
-    def __enter__(self) -> "_RecordedWorld":
-        """Enter the inner world."""
-        self._stack.enter_context(self.inner)
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Leave it."""
-        self._stack.__exit__(kind, error, trace)
-
-    def close(self, closing: Closing) -> Motion:
-        """Close the hands and write it down."""
-        motion = self.inner.close(closing)
-        self._note(motion, 1)
-        return motion
-
-    def play(self, wrenches: Array, sample: int, lost_m: float) -> Motion:
-        """Play a stage and write it down, in place of what was played too fast."""
-        motion = self.inner.play(wrenches, sample, lost_m)
-        if self.again:
-            self.stages.pop()
-        self._note(motion, self.speed)
-        return motion
-
-    def _note(self, motion: Motion, speed: int) -> None:
-        fingers = self.inner.states().fingers_m[0]
-        self.stages.append(StageRecord(motion=motion, fingers_m=fingers, speed=speed))
-
-    def states(self) -> PairStates:
-        """Return the inner world's states."""
-        return self.inner.states()
-
-    def put(self, states: PairStates) -> None:
-        """Put the pairs of the inner world there."""
-        self.inner.put(states)
-
-    def remove(self, rows: Mask) -> None:
-        """Take pairs out of the inner world."""
-        self.inner.remove(rows)
-
-    def settings(self) -> dict[str, float]:
-        """Return the inner world's settings."""
-        return self.inner.settings()
+        world.close = lambda closing: noted(close(closing), 1)
+        world.play = played
+        return world
 
 
 SAME = 1e-9

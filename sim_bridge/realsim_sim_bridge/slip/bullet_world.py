@@ -1,6 +1,5 @@
 """PyBullet as an engine of the slip test: K grasps, one after the other in one pair."""
 
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -82,12 +81,7 @@ class BulletWorld(HandWorld):
         self._speeds = np.zeros((n, 2))
         self.alive: Mask = np.ones(n, dtype=np.bool_)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Nothing is held here: the engine keeps its pair for the next world."""
 
     def close(self, closing: Closing) -> Motion:

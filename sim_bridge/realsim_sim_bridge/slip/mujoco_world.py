@@ -8,7 +8,6 @@ import copy
 import hashlib
 from collections import OrderedDict
 from dataclasses import fields
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -133,12 +132,7 @@ class MujocoWorld(HandWorld):
         self._open = self.alive.copy()
         """Hands that have not been closed or put anywhere yet."""
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Free the engine's memory."""
         self._rollout.close()
         self._memory.clear()

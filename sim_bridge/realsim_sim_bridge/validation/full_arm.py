@@ -8,7 +8,6 @@ in common is the hand's motion alone.
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -196,12 +195,7 @@ class _ArmWorld:
     def __enter__(self) -> "_ArmWorld":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._engine.disconnect()
 
     def close_fingers(self, speed: float) -> None:

@@ -11,7 +11,6 @@ each. `docs/decisions/0048-an-independent-contact-model.md`.
 """
 
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -197,12 +196,7 @@ class ReferenceWorld(HandWorld):
         self._bristles_box = np.zeros((n, len(self._surface.points), len(self._boxes), 3))
         self._entered = np.full(self._bristles_box.shape[:3], -1)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Hold nothing that has to be freed."""
 
     @property
