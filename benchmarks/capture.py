@@ -1,4 +1,4 @@
-"""Benchmark of capture: speed, kills and full disks, import.
+"""Benchmark of capture: speed, import; kills and full disks are in `reliability.py`.
 
     uv run python benchmarks/capture.py [--quick] [--json FILE] [--part NAME]
 
@@ -6,8 +6,6 @@ Figures (keys of the JSON's "figures"):
   speed   capture_ms_per_view   CPU of a 1280x720 view beyond rendering, checks and files included;
           of which capture_checks_ms_per_view is all but storing; capture_wall_ms_per_view,
           capture_mb_per_view and what else `capture_speed` says
-  kills   kills, kills_with_loss   SIGKILLs at random moments, and those that lost a sealed view;
-          enospc_runs, enospc_with_loss   the same on a full disk (root)
   import  import_mb_per_s   of a 500 MB bag per CPU second, PNG writing included
           import_peak_mb    greatest memory of the importing process; both the worst container's,
           and KIND_cpu_s ... of each
@@ -27,7 +25,6 @@ ROW = {
     "with_joints": "", "bag_mb": "MB", "mb_per_s": "MB/s",
 }  # fmt: skip
 """What is measured of the import of each container."""
-NONE = Goal(low=0, high=0)
 FIGURES = {
     "capture_ms_per_view": Figure(unit="ms", goal=Goal(high=40)),
     **{
@@ -37,20 +34,12 @@ FIGURES = {
             "mb_per_view": "MB", "frames_retaken": "", "views_noted": "",
         }.items()
     },
-    "kills": Figure(unit=""),
-    "kills_with_loss": Figure(unit="", goal=NONE),
-    "views_in_flight_lost_max": Figure(unit="", goal=Goal(high=1)),
-    "sessions_completed": Figure(unit=""),
-    "capture_s": Figure(unit="s"),
-    "enospc_runs": Figure(unit=""),
-    "enospc_with_loss": Figure(unit="", goal=NONE),
     "import_mb_per_s": Figure(unit="MB/s", goal=Goal(low=100)),
     "import_peak_mb": Figure(unit="MB", goal=Goal(high=500)),
     **{f"{kind}_{key}": Figure(unit=unit) for kind in KINDS for key, unit in ROW.items()},
 }  # fmt: skip
 PARTS = {
     "speed": "capture_speed:speed",
-    "kills": "capture_kills:kills",
     "import": "capture_import:imports",
 }
 

@@ -1,4 +1,4 @@
-"""Benchmark of formats: speed of writing and opening, memory, damaged files, round trips.
+"""Benchmark of formats: speed of writing and opening, memory, round trips.
 
     uv run python benchmarks/formats.py [--quick] [--json FILE] [--seed N] [--part NAME]
                                         [--frames N]
@@ -12,8 +12,6 @@ Parts and the figures they give (keys of the JSON's "figures"):
   headers  bop_headers_s, graspnet_headers_s    opening a scene and asking for all frames: 1000 of
                                 BOP, 256 of GraspNet, 15 objects each
            bop_list_s           `realsim import --list` of the BOP data set
-  damage   mutated_files, and how many of them end in mutated_tracebacks, mutated_nan,
-           mutated_hangs (> 5 s), mutated_memory (> 1 GB), mutated_crashes
   export   export_peak_mb, graspnet_export_peak_mb    memory of 100,000 frames beyond the imports
            resume_s, graspnet_resume_s    going on with an export that is all there
   trips    bop_round_trip_diff, graspnet_round_trip_diff    numbers and images that differ after
@@ -21,7 +19,7 @@ Parts and the figures they give (keys of the JSON's "figures"):
            bop_graspnet_mm, bop_graspnet_deg    BOP -> GraspNet -> BOP by the XML, the worst
            FORMAT_mm, FORMAT_deg    grasps written and read: acronym, graspgen, isaac, graspgroup
 
-Real frames are measured too where REALSIM_DATA is.
+Real frames are measured too where REALSIM_DATA is. Damaged files are in `reliability.py`.
 """
 
 import os
@@ -30,7 +28,6 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
 import argparse
-from collections import Counter
 from collections.abc import Callable
 from importlib import import_module
 
@@ -46,12 +43,6 @@ FIGURES = {
     "bop_headers_s": Figure(unit="s", goal=Goal(high=2.0)),
     "bop_list_s": Figure(unit="s"),
     "graspnet_headers_s": Figure(unit="s"),
-    "mutated_files": Figure(unit=""),
-    "mutated_tracebacks": Figure(unit="", goal=Goal(high=0.0)),
-    "mutated_nan": Figure(unit="", goal=Goal(high=0.0)),
-    "mutated_hangs": Figure(unit="", goal=Goal(high=0.0)),
-    "mutated_memory": Figure(unit="", goal=Goal(high=0.0)),
-    "mutated_crashes": Figure(unit="", goal=Goal(high=0.0)),
     "export_peak_mb": Figure(unit="MB", goal=Goal(high=1000.0)),
     "resume_s": Figure(unit="s"),
     "graspnet_export_peak_mb": Figure(unit="MB", goal=Goal(high=1000.0)),
@@ -73,33 +64,6 @@ FIGURES = {
     "graspgroup_deg": Figure(unit="deg"),
 }
 """All keys, in the table's order. In every run they are in the JSON."""
-COUNT, QUICK_COUNT = 10_000, 300
-WORKERS = 2
-CLASSES = {
-    "mutated_tracebacks": "traceback", "mutated_nan": "nan", "mutated_hangs": "hang",
-    "mutated_memory": "memory", "mutated_crashes": "crash",
-}  # fmt: skip
-
-
-def damage(seed: int, quick: bool) -> Found:
-    """Return how many mutated files there were, and how many ended otherwise than they may."""
-    from formats_mutations import run_mutations
-
-    result = run_mutations(QUICK_COUNT if quick else COUNT, seed, WORKERS)
-    found = Found()
-    sums = Counter[str]()
-    for row in result.counts.values():
-        sums.update(row)
-    found.add(
-        "mutated_files", result.total(),
-        f"{len(result.counts)} formats; {sums['read']} read, {sums['refused']} refused",
-    )  # fmt: skip
-    for key, name in CLASSES.items():
-        found.add(key, sums[name])
-    found.cases["mutations"] = result.counts
-    found.cases["offenders"] = [o._asdict() for o in result.offenders]
-    found.notes += [f"{o.kind}: formats_mutations.py '{o.name}:{o.seed}'" for o in result.offenders]
-    return found
 
 
 def part(module: str, function: str) -> Callable[[argparse.Namespace], Found]:
@@ -124,7 +88,6 @@ PARTS = {
     "headers": part("formats_headers", "header_cost"),
     "export": part("formats_export", "export_memory"),
     "trips": part("formats_round_trips", "round_trips"),
-    "damage": lambda given: damage(given.seed, given.quick),
 }
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
 """Small valid files of our own, and what reads all of each: for the mutations."""
 
+import argparse
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from figures import Found
 from formats_mutations_scenes import Sample
 
 
@@ -103,3 +105,47 @@ OWN = (
     Sample("plan", make_plan, read_plan),
     Sample("kept files", make_kept, read_kept),
 )
+
+
+# --- the command line -----------------------------------------------------------------------------
+
+TYPED, QUICK_TYPED = 5_000, 200
+WRONG = (
+    "", "-1", "nan", "inf", "1e999", "0x10", "\udcff", "a" * 5000, "../../no", "no/such", "-", "--",
+    "--no", "1-", ",", "[", "{}", "x=y", "1,2", "\u202e", "10**9", "99999999999999999999",
+)  # fmt: skip
+"""What no option wants, or few do."""
+
+
+def typed(given: argparse.Namespace) -> Found:
+    """Type commands whose first argument is not there, with foreign values: all are refused."""
+    from click.testing import CliRunner
+
+    from realsim.app.cli import commands
+    from realsim.app.command import walk
+    from realsim.errors import RealsimError
+
+    rng, found = np.random.default_rng(given.seed), Found()
+    count, wrong = QUICK_TYPED if given.quick else TYPED, 0
+    every = [(p, c) for p, c in walk(commands).items() if needs_a_source(c)]
+    with CliRunner().isolated_filesystem():
+        for _ in range(count):
+            path, command = every[int(rng.integers(len(every)))]
+            here = ["--workers", "1"] if any(p.name == "workers" for p in command.params) else []
+            words = [*path, "no/such/source", *here]
+            for option in rng.choice(np.array(command.params, object), int(rng.integers(5))):
+                words += [*option.opts[:1], WRONG[int(rng.integers(len(WRONG)))]]
+            done = CliRunner().invoke(commands, words)
+            if not isinstance(done.exception, RealsimError | OSError | SystemExit):
+                wrong += 1
+                found.notes.append(f"realsim {words}: {done.exception!r}"[:300])
+    found.figures |= {"fuzz_inputs": count, "fuzz_tracebacks": wrong}
+    return found
+
+
+def needs_a_source(command: Any) -> bool:
+    """Return whether a command's first argument has to be there, so that it cannot begin."""
+    import click
+
+    first = next((p for p in command.params if isinstance(p, click.Argument)), None)
+    return first is not None and first.required and type(first.type) is click.Path

@@ -113,13 +113,16 @@ def _compile(folder: Path) -> None:
 
 
 @contextmanager
-def serving(folder: Path, settings: tuple[str, str, str]) -> Generator[Server]:
-    """Run the server on a session in a process of its own."""
+def serving(
+    folder: Path, settings: tuple[str, str, str], log: IO[bytes] | None = None
+) -> Generator[Server]:
+    """Run the server on a session in a process of its own; None = it complains on the terminal."""
     _compile(folder)
     command = [sys.executable, str(SERVER), str(folder), *settings]
     with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=_environment()
-    ) as process:
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True,
+        env=_environment(),
+    ) as process:  # fmt: skip
         try:
             yield Server(process)
         finally:
