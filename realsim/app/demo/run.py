@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 BOARD_VIEW_SHARE = 24
 """Most board views of a demo; a smaller demo takes as many as scene views, 10 at least."""
-QUICK: dict[str, Any] = {"views": 8, "objects": 2, "grasps_per_object": 12}
+QUICK: dict[str, Any] = {"views": 8, "objects": 2, "grasps_per_object": 12, "width": 640}
 """What `--quick` captures and tries."""
 
 
@@ -49,6 +49,8 @@ class DemoConfig:
     """Seed of everything random: scene, noise, sampling."""
     grasps_per_object: int = 60
     """Grasp candidates tried on each object, at most."""
+    width: int = 1280
+    """Width of the images, which are 16:9 [px]."""
     workers: int = 2
     """Processes in the Robot School."""
 
@@ -101,7 +103,11 @@ def capture_and_register(
     """
     from realsim_capture_plans.lab import LabConfig, SimulatedLab
 
-    lab = SimulatedLab(LabConfig(seed=config.seed, arm=config.arm, n_objects=config.objects))
+    setup = LabConfig(
+        seed=config.seed, arm=config.arm, n_objects=config.objects, width=config.width,
+        height=config.width * 9 // 16,
+    )  # fmt: skip
+    lab = SimulatedLab(setup)
     store = _capture_all(lab, config, out, console)
     joints = {v.index: v.joints for v in store.session.views if v.joints is not None}
     lab.write_truth(out / "truth", joints)
@@ -118,7 +124,8 @@ def _claim(out: Path, config: DemoConfig) -> None:
     if out.exists() and not out.is_dir():
         raise InputError(f"'{out}' is a file; give --out a folder that may be made or filled.")
     if note.is_file():
-        found = {"arm": DemoConfig.arm} | json.loads(note.read_text())
+        older = {"arm": "ur5", "width": 1280}  # what folders of before do not name
+        found = older | json.loads(note.read_text())
         if found != wanted:
             told = ", ".join(f"{k}={v}" for k, v in found.items())
             raise InputError(
