@@ -9,12 +9,7 @@ import numpy as np
 from realsim.app.annotate.current import annotate_session
 from realsim.app.annotate.page import HEADER, object_row, write_page
 from realsim.app.console import Console
-from realsim.app.stages import (
-    judged_scene,
-    open_session,
-    registered_views,
-    session_models,
-)
+from realsim.app.stages import judged_scene, open_session, registered_views, session_models
 from realsim.arrays import Image
 from realsim.many import Workers
 from realsim.store import SessionStore

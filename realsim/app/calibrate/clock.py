@@ -14,12 +14,7 @@ from realsim.app.console import Console
 from realsim.arrays import Array, Mask
 from realsim.errors import DegenerateError, InputError
 from realsim.records import CameraIntrinsics, Target
-from realsim_calibration import (
-    BoardView,
-    ClockOffset,
-    estimate_board_pose,
-    estimate_clock_offset,
-)
+from realsim_calibration import BoardView, ClockOffset, estimate_board_pose, estimate_clock_offset
 from realsim_calibration.clock.streams import checked_stream, interpolated
 from realsim_calibration.inputs import PoseReading, RawPoses
 from realsim_calibration.results import Clock, Mode

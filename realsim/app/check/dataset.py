@@ -13,13 +13,7 @@ import numpy as np
 
 from realsim import images
 from realsim.app.check.agreement import AgreementConfig, SceneAgreement
-from realsim.app.check.tally import (
-    DepthDifference,
-    MaskOverlap,
-    Tally,
-    agreement_of,
-    stray_depth,
-)
+from realsim.app.check.tally import DepthDifference, MaskOverlap, Tally, agreement_of, stray_depth
 from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig, open_scene, scenes_of
 from realsim.arrays import Array32, Mask
 from realsim.errors import InputError, RealsimError
@@ -210,11 +204,7 @@ def _outline(mask: Mask) -> int:
 
 
 def _depth_difference(
-    image: int,
-    depth_m: Array32,
-    labels: Labels,
-    seen: Mask,
-    config: AgreementConfig,
+    image: int, depth_m: Array32, labels: Labels, seen: Mask, config: AgreementConfig
 ) -> list[DepthDifference]:
     """Return how the measured depth of visible pixels differs from the rendered one."""
     measured = seen & (depth_m > 0)

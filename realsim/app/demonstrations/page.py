@@ -60,8 +60,7 @@ def shown_episodes(notes: Sequence[Mapping[str, Any]]) -> list[int]:
     """Return the episodes that are shown: some that succeeded, some that failed in other ways."""
     good = [k for k, n in enumerate(notes) if n["success"]]
     bad = sorted(
-        (k for k, n in enumerate(notes) if not n["success"]),
-        key=lambda k: (_earlier(notes, k), k),
+        (k for k, n in enumerate(notes) if not n["success"]), key=lambda k: (_earlier(notes, k), k)
     )
     return [*good[:SHOWN], *bad[:SHOWN]]
 

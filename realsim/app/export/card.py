@@ -92,8 +92,7 @@ def card_bytes(card: DatasetCard) -> bytes:
     parts.append(_section("Made with", _made_with(card)))
     parts.append(
         _section(
-            "Checksums",
-            "`sha256sum -c SHA256SUMS` compares every file with what was written.\n",
+            "Checksums", "`sha256sum -c SHA256SUMS` compares every file with what was written.\n"
         )
     )
     return "\n".join(parts).encode("utf-8")

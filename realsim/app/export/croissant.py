@@ -64,9 +64,7 @@ def croissant_bytes(card: DatasetCard, sums: Mapping[str, tuple[int, str]]) -> b
     return (json.dumps(document, indent=2, ensure_ascii=False) + "\n").encode("utf-8")
 
 
-def _distribution(
-    sums: Mapping[str, tuple[int, str]],
-) -> tuple[list[dict[str, Any]], list[str]]:
+def _distribution(sums: Mapping[str, tuple[int, str]]) -> tuple[list[dict[str, Any]], list[str]]:
     """Return files and sets of files, and the sets that are colour images."""
     kinds: dict[tuple[str, str], list[str]] = {}
     for name in sums:

@@ -115,9 +115,7 @@ def _request(**options: Any) -> "GenerateRequest":
             sizes=range_of("--object-sizes", options["object_sizes"], "0.02-0.2"),
             tables=options["tables"],
             pool=PoolConfig(
-                keep_size=options["keep_size"],
-                unit=options["unit"],
-                hull_only=options["hull_only"],
+                keep_size=options["keep_size"], unit=options["unit"], hull_only=options["hull_only"]
             ),
         ),
         views=ViewConfig(

@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -42,33 +42,67 @@ other programs (0.001): below this it is not BOP's, and is not taken."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class FolderRequest:
-    """What `realsim import` was told of a folder."""
+class ImportRequest:
+    """What `realsim import` was asked for."""
 
-    choice: FolderChoice
+    source: Path
+    kind: str = "auto"
     intrinsics: Path | None = None
-    """File with the intrinsics; looked for in the folder where None."""
+    """File with the intrinsics."""
+    depth_unit: float | None = None
+    """Metres per count of the depth."""
+    depth_coding: str = "auto"
+    no_depth: bool = False
+    images: str = ""
+    """Folder of the colour images, in the source."""
+    depths: str = ""
+    """Folder of the depth images, in the source."""
     poses: Path | None = None
-    """File or folder of poses; looked for in the folder where None."""
-    use_poses: bool = True
-    """Whether poses are looked for at all."""
+    no_poses: bool = False
     reading: str = ""
-    """How the poses are read, as in `realsim calibrate --reading`."""
     key: str = ""
-    """Which entry of the pose file holds them."""
-    arm: str | None = None
-    """Name or folder of the arm that the joints must be of."""
     poses_of: str = "tool"
-    """"tool" (flange in base) or "camera" (camera in world)."""
+    colour_topic: str | None = None
+    depth_topic: str | None = None
+    arm: str | None = None
+    """Name or folder of the arm; None = a UR's joints in a recording, any in a folder."""
+    joints_topic: str | None = None
+    camera_info_topic: str | None = None
+    depth_camera_info_topic: str | None = None
+    joint_prefix: str | None = None
+    base_frame: str | None = None
+    ee_frame: str | None = None
+    world_frame: str | None = None
+    clock: Literal["header", "receive"] = "header"
+    max_pair_gap: float | None = None
+    """Greatest time between colour and its depth [s]."""
+    only_still: bool = False
+    scene: int | None = None
+    camera_name: str = ""
+    """Camera of a data set with several cameras: kinect, cam1 ..."""
+    models: Path | None = None
+    """Folder of the models, when it is not in the data set."""
+    no_labels: bool = False
+    """Leave poses, masks and models of a data set where they are."""
+    camera_id: int | None = None
+    scale: float | None = None
+    """Metres per unit of a COLMAP model or of a transforms.json."""
+
+    def folder_choice(self) -> FolderChoice:
+        """Return what is asked of a folder's images."""
+        return FolderChoice(
+            colour=self.images, depth=self.depths, use_depth=not self.no_depth,
+            depth_unit_m=self.depth_unit, depth_coding=self.depth_coding,
+        )  # fmt: skip
 
 
-def open_image_folder(root: Path, request: FolderRequest) -> tuple[FolderSource, list[str]]:
+def open_image_folder(request: ImportRequest) -> tuple[FolderSource, list[str]]:
     """Return a folder as a frame source, and what was decided on the way.
 
     Raises:
         InputError: as `open_folder`, or the camera or the poses cannot be read.
     """
-    choice = request.choice
+    root, choice = request.source, request.folder_choice()
     listing = list_folder(root, colour=choice.colour, depth=choice.depth)
     size = require_one_size(listing.colour, "colour images")
     notes: list[str] = []
@@ -196,9 +230,9 @@ def _equal(a: CameraIntrinsics, b: CameraIntrinsics) -> bool:
     return bool(np.array_equal(a.K, b.K) and np.array_equal(a.distortion, b.distortion))
 
 
-def _stated_unit(listing: ImageFolder, request: FolderRequest) -> tuple[float | None, list[str]]:
+def _stated_unit(listing: ImageFolder, request: ImportRequest) -> tuple[float | None, list[str]]:
     """Return the depth unit [m] that a BOP camera.json beside the images states."""
-    if request.choice.depth_unit_m is not None or not listing.depth:
+    if request.depth_unit is not None or not listing.depth:
         return None, []
     files = [p for p in camera_files(listing) if p.suffix.lower() == ".json"]
     for path in [request.intrinsics] if request.intrinsics is not None else files:
@@ -217,7 +251,7 @@ def _stated_unit(listing: ImageFolder, request: FolderRequest) -> tuple[float | 
 
 
 def _poses(
-    listing: ImageFolder, request: FolderRequest, *, has_states: bool
+    listing: ImageFolder, request: ImportRequest, *, has_states: bool
 ) -> tuple[list[FrameState], list[str]]:
     """Return the poses that were given or found, and what was decided.
 
@@ -226,7 +260,7 @@ def _poses(
     """
     from realsim_calibration.inputs import listed_readings, read_pose_file, reading_from_text
 
-    if request.poses is None and (not request.use_poses or has_states):
+    if request.poses is None and (request.no_poses or has_states):
         return [], []
     raw = None
     if request.poses is not None:
@@ -276,9 +310,9 @@ def _poses(
     return states, [*notes, *raw.notes]
 
 
-def describe_folder(root: Path, request: FolderRequest) -> list[tuple[str, str]]:
+def describe_folder(request: ImportRequest) -> list[tuple[str, str]]:
     """Return what a folder holds, for --list, without importing it."""
-    choice = request.choice
+    root, choice = request.source, request.folder_choice()
     listing = list_folder(root, colour=choice.colour, depth=choice.depth)
     rows: list[tuple[str, str]] = []
     for what, files in (("colour", listing.colour), ("depth", listing.depth)):

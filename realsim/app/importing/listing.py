@@ -6,12 +6,7 @@ from pathlib import Path
 from realsim.app.console import Console
 from realsim.app.importing.archive import is_archive
 from realsim.app.importing.folder import describe_folder
-from realsim.app.importing.source import (
-    ImportRequest,
-    folder_request,
-    kind_of,
-    require_fitting,
-)
+from realsim.app.importing.source import ImportRequest, kind_of, require_fitting
 from realsim.errors import InputError
 
 
@@ -39,7 +34,7 @@ def list_source(request: ImportRequest, console: Console) -> None:
         _show(request, kind, ("topic", "type", "messages"), rows, console)
         return
     if kind == "folder":
-        rows = describe_folder(request.source, folder_request(request))
+        rows = describe_folder(request)
         for what, text in rows:
             console.say(f"{what}: {text}")
         console.result({"source": request.source, "kind": kind, "holds": dict(rows)})

@@ -4,13 +4,12 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from realsim.app.console import Console
-from realsim.app.importing.folder import FolderRequest, camera_of_file, open_image_folder
+from realsim.app.importing.folder import ImportRequest, camera_of_file, open_image_folder
 from realsim.app.importing.session import ImportSummary, import_session
 from realsim.errors import InputError
-from realsim.formats.folders import FolderChoice
 from realsim.formats.folders.listing import ENDINGS, shown
 from realsim.formats.frame_source import FrameSource
 from realsim.store.header import SESSION_FILE
@@ -57,72 +56,14 @@ ONLY_FOR: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 """Options that say something of some kinds only; with another they are refused, not ignored."""
 BAG_OPTIONS = {
-    "colour": "--colour-topic ",
-    "depth": "--depth-topic ",
-    "joints": "--joints-topic ",
-    "camera_info": "--camera-info-topic ",
-    "depth_camera_info": "--depth-camera-info-topic ",
-    "intrinsics": "--intrinsics ",
-    "depth_unit_m": "--depth-unit ",
-    "without_depth": "--no-depth ",
-    "joint_names": "--arm ",
-    "joint_prefix": "--joint-prefix ",
-    "base_frame": "--base-frame ",
-    "ee_frame": "--ee-frame ",
-    "world_frame": "--world-frame ",
-    "clock": "--clock ",
-    "max_pair_gap_s": "--max-pair-gap ",
-    "only_still": "--only-still ",
-}
-"""What the fields of BagChoice are called on the command line."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ImportRequest:
-    """What `realsim import` was asked for."""
-
-    source: Path
-    kind: str = "auto"
-    intrinsics: Path | None = None
-    """File with the intrinsics."""
-    depth_unit: float | None = None
-    """Metres per count of the depth."""
-    depth_coding: str = "auto"
-    no_depth: bool = False
-    images: str = ""
-    """Folder of the colour images, in the source."""
-    depths: str = ""
-    """Folder of the depth images, in the source."""
-    poses: Path | None = None
-    no_poses: bool = False
-    reading: str = ""
-    key: str = ""
-    poses_of: str = "tool"
-    colour_topic: str | None = None
-    depth_topic: str | None = None
-    arm: str | None = None
-    """Name or folder of the arm; None = a UR's joints in a recording, any in a folder."""
-    joints_topic: str | None = None
-    camera_info_topic: str | None = None
-    depth_camera_info_topic: str | None = None
-    joint_prefix: str | None = None
-    base_frame: str | None = None
-    ee_frame: str | None = None
-    world_frame: str | None = None
-    clock: Literal["header", "receive"] = "header"
-    max_pair_gap: float | None = None
-    """Greatest time between colour and its depth [s]."""
-    only_still: bool = False
-    scene: int | None = None
-    camera_name: str = ""
-    """Camera of a data set with several cameras: kinect, cam1 ..."""
-    models: Path | None = None
-    """Folder of the models, when it is not in the data set."""
-    no_labels: bool = False
-    """Leave poses, masks and models of a data set where they are."""
-    camera_id: int | None = None
-    scale: float | None = None
-    """Metres per unit of a COLMAP model or of a transforms.json."""
+    **{what: f"{what}_topic"
+       for what in ("colour", "depth", "joints", "camera_info", "depth_camera_info")},
+    **{name: name for name in ("intrinsics", "joint_prefix", "base_frame", "ee_frame",
+                               "world_frame", "clock", "only_still")},
+    "depth_unit_m": "depth_unit", "without_depth": "no_depth", "joint_names": "arm",
+    "max_pair_gap_s": "max_pair_gap",
+}  # fmt: skip
+"""What the fields of BagChoice are called in the request, and on the command line."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -316,28 +257,8 @@ def open_source(request: ImportRequest, console: Console) -> FrameSource:
     return openers[kind](request, console)
 
 
-def folder_request(request: ImportRequest) -> FolderRequest:
-    """Return what is asked of a folder of images."""
-    return FolderRequest(
-        choice=FolderChoice(
-            colour=request.images,
-            depth=request.depths,
-            use_depth=not request.no_depth,
-            depth_unit_m=request.depth_unit,
-            depth_coding=request.depth_coding,
-        ),
-        intrinsics=request.intrinsics,
-        poses=request.poses,
-        use_poses=not request.no_poses,
-        reading=request.reading,
-        key=request.key,
-        poses_of=request.poses_of,
-        arm=request.arm,
-    )
-
-
 def _open_folder(request: ImportRequest, console: Console) -> FrameSource:
-    source, notes = open_image_folder(request.source, folder_request(request))
+    source, notes = open_image_folder(request)
     for note in notes:
         console.say(note)
     return source
@@ -381,52 +302,36 @@ def _open_graspnet(request: ImportRequest, _: Console) -> FrameSource:
 def _open_nerfstudio(request: ImportRequest, _: Console) -> FrameSource:
     from realsim.formats.nerfstudio.source import open_nerfstudio
 
-    return open_nerfstudio(
-        request.source, images_folder=request.images or None, camera_id=request.camera_id,
-        metres_per_unit=request.scale, depth_unit_m=request.depth_unit,
-        use_depth=not request.no_depth,
-    )  # fmt: skip
+    return open_nerfstudio(request.source, **_project(request))
 
 
 def _open_colmap(request: ImportRequest, console: Console) -> FrameSource:
     from realsim.formats.colmap.source import open_colmap
 
-    return open_colmap(
-        request.source,
-        images_folder=request.images or None,
-        camera_id=request.camera_id,
-        metres_per_unit=request.scale,
-        depth_folder=request.depths or None,
-        depth_unit_m=request.depth_unit,
-        use_depth=not request.no_depth,
-    )
+    return open_colmap(request.source, depth_folder=request.depths or None, **_project(request))
+
+
+def _project(request: ImportRequest) -> dict[str, Any]:
+    """Return what is asked of a COLMAP or nerfstudio project."""
+    return {
+        "images_folder": request.images or None, "camera_id": request.camera_id,
+        "metres_per_unit": request.scale, "depth_unit_m": request.depth_unit,
+        "use_depth": not request.no_depth,
+    }  # fmt: skip
 
 
 def _open_bag(request: ImportRequest, console: Console) -> FrameSource:
     from realsim.formats.bags import BagChoice, open_bag
 
     camera = None if request.intrinsics is None else camera_of_file(request.intrinsics, None)
-    choice = BagChoice(
-        colour=request.colour_topic,
-        depth=request.depth_topic,
-        joints=request.joints_topic,
-        camera_info=request.camera_info_topic,
-        depth_camera_info=request.depth_camera_info_topic,
-        joint_prefix=request.joint_prefix,
-        base_frame=request.base_frame,
-        ee_frame=request.ee_frame,
-        world_frame=request.world_frame,
-        clock=request.clock,
-        max_pair_gap_s=request.max_pair_gap,
-        only_still=request.only_still,
-        without_depth=request.no_depth,
-        intrinsics=camera,
-        depth_unit_m=request.depth_unit,
-    )
+    given = {field: getattr(request, option) for field, option in BAG_OPTIONS.items()}
+    given |= {"intrinsics": camera}
+    del given["joint_names"]
     if request.arm is not None:
         from realsim.robots.arm import find_arm
 
-        choice = replace(choice, joint_names=find_arm(request.arm).joint_names)
+        given["joint_names"] = find_arm(request.arm).joint_names
+    choice = BagChoice(**given)
     try:
         return open_bag(request.source, choice)
     except InputError as error:
@@ -437,7 +342,10 @@ def option_names(message: str) -> str:
     """Return a message in which the fields of BagChoice are called as on the command line."""
     names = "|".join(sorted(BAG_OPTIONS, key=len, reverse=True))
     message = re.sub(r"\bwithout_depth\b(?!=)", "--no-depth", message)
-    said = re.sub(rf"(?<![\w-])({names})=(True\b)?", lambda m: BAG_OPTIONS[m[1]], message)
+    said = re.sub(
+        rf"(?<![\w-])({names})=(True\b)?",
+        lambda m: f"--{BAG_OPTIONS[m[1]].replace('_', '-')} ", message,
+    )  # fmt: skip
     return re.sub(r" +([),.;]| )", r"\1", said)
 
 

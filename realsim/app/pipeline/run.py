@@ -296,8 +296,7 @@ def _lost(outcome: Outcome) -> Ended:
 def _command(step: Step, words: Sequence[str], workers: int) -> Command:
     share = ["--workers", str(workers)] if step.has_workers else []
     return Command(
-        stage=step.stage,
-        words=(*step.command, *words, *step.options, *share, "--quiet", "--json"),
+        stage=step.stage, words=(*step.command, *words, *step.options, *share, "--quiet", "--json")
     )
 
 

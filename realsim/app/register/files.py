@@ -229,10 +229,7 @@ def write_result(
         pictures: path -> bytes of pictures and page.
     """
     before = cameras_now(store)
-    value = {
-        "before": _poses_to_json(before),
-        "files": documents(result, store, models),
-    }
+    value = {"before": _poses_to_json(before), "files": documents(result, store, models)}
     store.remove(STAGE_FILE)  # from here on the old result is not known to be whole
     store.write_bytes(NEXT_FILE, atomic.json_bytes(value, indent=None))
     finish_interrupted(store)

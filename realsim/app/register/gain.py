@@ -100,10 +100,7 @@ def gain_picture(
         pictures.append(draw_outlines(ground, alone, {instance: color}, 2))
     name = models[result.scene.object(instance).obj_id].name
     px = usable[index, instance]
-    captions = [
-        f"view {index}, {name}: camera as claimed",
-        f"refined: {px:.2f} px away from it",
-    ]
+    captions = [f"view {index}, {name}: camera as claimed", f"refined: {px:.2f} px away from it"]
     return contact_sheet(pictures, 2, captions)
 
 

@@ -16,10 +16,7 @@ from realsim.app.options import Has, command, options, rare
 
 scan_command = Group(
     "scan",
-    late={
-        "scale": "realsim.app.scan.scale.cli:scale",
-        "sfm": "realsim.app.scan.sfm.cli:sfm",
-    },
+    late={"scale": "realsim.app.scan.scale.cli:scale", "sfm": "realsim.app.scan.sfm.cli:sfm"},
     examples=("realsim scan import mug.stl --unit mm", "realsim scan list"),
     help="""Object models: meshes and scans into a library, at metric scale.
 

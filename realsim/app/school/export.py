@@ -9,12 +9,7 @@ import numpy as np
 
 from realsim.app.console import Console
 from realsim.app.school.files import MODELS, stored_grasps
-from realsim.app.school.tables import (
-    SUMMARY_HEADER,
-    agreement_line,
-    p_hold_line,
-    setting_lines,
-)
+from realsim.app.school.tables import SUMMARY_HEADER, agreement_line, p_hold_line, setting_lines
 from realsim.errors import InputError
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.records import GraspSet

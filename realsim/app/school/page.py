@@ -105,10 +105,7 @@ CAPTIONS: dict[str, tuple[str, str]] = {
 
 
 def page_bytes(
-    name: str,
-    sets: Sequence[GraspSet],
-    models: Names,
-    pictures: Mapping[str, bytes],
+    name: str, sets: Sequence[GraspSet], models: Names, pictures: Mapping[str, bytes]
 ) -> bytes:
     """Return the page.
 

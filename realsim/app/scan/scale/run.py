@@ -34,11 +34,7 @@ from realsim.app.scan.scale.show import CALIPER, model_lines, show_fit, show_mea
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Mesh, Verdict, View
-from realsim.scanning.scale.files import (
-    ScaleRecord,
-    installed_versions,
-    json_lines,
-)
+from realsim.scanning.scale.files import ScaleRecord, installed_versions, json_lines
 from realsim.scanning.scale.measured import smallest_box
 from realsim.scanning.scale.result import ScaleFit
 from realsim.store import SessionStore
