@@ -30,10 +30,8 @@ def write_site(store: SessionStore, errors: LoopErrors, folder: Path, console: C
             shutil.copyfile(store.path(f"reports/{name}"), folder / name)
         review(store.folder, static=folder / "scene.html", quiet=True)
         counts = run("stats", (store.folder,), {"out": folder, "quiet": True}).document
-        page = Page(
-            title=store.session.name,
-            about="A capture session of the simulated lab, from plan to labels.",
-        )
+        title = "A capture session, from plan to grasp labels"
+        page = Page(title=title, about=f"Made by realsim in a {store.session.name}.")
         drawn = store.path("registration/pictures/overlay.jpg").read_bytes()
         figures = [(value, name) for name, value, goal in errors.rows() if goal]
         figures.append((f"{counts['school']['candidates']:,}", "grasps tried by physics"))
