@@ -9,19 +9,16 @@ disjoint halves of the four sets; the command on the whole sets), crb and covera
 truth), faults, corners. --quick takes few trials.
 """
 
-import os
-
-for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
-
 import argparse
 import multiprocessing
+import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+import blas_threads  # noqa: F401
 import numpy as np
 from calibration_faults import faults_named_share, layouts_that_are_read
 from calibration_halves import Command, Halves, halves_apart, run_command

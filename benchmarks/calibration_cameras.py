@@ -25,17 +25,14 @@ What was chosen was chosen on labs 1000 to 1009; labs 0 to 9 were seen once befo
 was jackknifed in every case. Nothing was chosen on any other lab.
 """
 
-import os
-
-for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
-
 import argparse
 import multiprocessing
+import os
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 
+import blas_threads  # noqa: F401
 import numpy as np
 from calibration_cameras_lab import HELD, NAMES, TABLE, UR3, Lab
 from figures import Figure, Found, Goal, run

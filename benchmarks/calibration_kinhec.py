@@ -16,17 +16,13 @@ robot_error, 40 of pnp, tier full; all of outliers and temporal of tier small); 
 have global seed 7000 + --seed and were not looked at.
 """
 
-import os
-
-for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
-
 import argparse
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from typing import Any
 
+import blas_threads  # noqa: F401
 import numpy as np
 from figures import Figure, Found, Goal, run
 

@@ -11,11 +11,7 @@ Figures (keys of the JSON's "figures"):
           and KIND_cpu_s ... of each
 """
 
-import os
-
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
-
+import blas_threads  # noqa: F401
 from figures import Figure, Goal, run
 
 KINDS = ("ros1", "sqlite3", "mcap")

@@ -22,15 +22,11 @@ Parts and the figures they give (keys of the JSON's "figures"):
 Real frames are measured too where REALSIM_DATA is. Damaged files are in `reliability.py`.
 """
 
-import os
-
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
-
 import argparse
 from collections.abc import Callable
 from importlib import import_module
 
+import blas_threads  # noqa: F401
 from figures import Figure, Found, Goal, run
 from formats_round_trips import BOUND_MM
 

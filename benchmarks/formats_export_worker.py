@@ -7,17 +7,13 @@ Prints JSON: level_mb (resident after the imports and after a first export of tw
 nothing is closed), and frames. Linux only: the peak is VmHWM, reset through clear_refs.
 """
 
-import os
-
-for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-
 import json
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+import blas_threads  # noqa: F401
 from formats_scene import LongScene, long_scene
 
 from realsim.formats.bop.root_files import write_bop_models, write_bop_root

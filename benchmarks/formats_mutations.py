@@ -11,8 +11,8 @@ waiting), 'memory' (1 GB more than the whole sample) and 'crash' (of the process
 
 import os
 
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
+import blas_threads  # noqa: F401
+
 os.environ.setdefault("MALLOC_ARENA_MAX", "2")  # an arena a thread would count as memory
 
 import sys

@@ -21,15 +21,11 @@ Parts and the figures they give (keys of the JSON's "figures"):
   generate  generate_frames_per_cpu_h   10 scenes x 256 views with all labels
 """
 
-import os
-
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
-
 import argparse
 from collections.abc import Callable
 from importlib import import_module
 
+import blas_threads  # noqa: F401
 from figures import Figure, Found, Goal, run
 
 PACKAGES = (

@@ -8,15 +8,11 @@ top-down view) on the same data; box_slip_mm and box_slip_deg, the greatest slip
 all four stages, and default_world_score, the same box's score in a bare PyBullet world.
 """
 
-import os
-
-for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-
 import argparse
 import tempfile
 from pathlib import Path
 
+import blas_threads  # noqa: F401
 import numpy as np
 from figures import Figure, Found, Goal, run
 

@@ -17,14 +17,10 @@ Figures (keys of the JSON's "figures"), the worst of the seeds:
 The meshes are those of the example-robot-data wheel; without it the last three keys are left out.
 """
 
-import os
-
-for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-
 import argparse
 import time
 
+import blas_threads  # noqa: F401
 import numpy as np
 from figures import Figure, Found, Goal, run
 

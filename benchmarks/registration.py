@@ -38,14 +38,10 @@ Shares are 0 to 1. Eight scenes from the seed on; seeds from 100 are those of th
 use lower ones while developing.
 """
 
-import os
-
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
-
 import argparse
 from pathlib import Path
 
+import blas_threads  # noqa: F401
 import numpy as np
 from figures import Figure, Found, run
 from registration_figures import GOALS, Row, figures_of, per_part

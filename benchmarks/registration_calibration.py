@@ -13,16 +13,13 @@ distorted by 0.8 %, as scans are.
 
 import argparse
 import json
-import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
-
+import blas_threads  # noqa: F401
 import numpy as np
 from registration_calibration_fit import DISTORTED, fitted, printed, tested
 from scale_shapes import SHAPES

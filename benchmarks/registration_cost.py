@@ -6,11 +6,6 @@ memory is that of a fresh process.
     uv run python benchmarks/registration_cost.py FOLDER
 """
 
-import os
-
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
-
 import json
 import resource
 import subprocess
@@ -23,6 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import blas_threads  # noqa: F401
 import numpy as np
 from registration_cases import SceneKey, library, make_scene
 from registration_figures import Done

@@ -28,11 +28,6 @@ published figures; everything was tuned on seeds 1 to 20. Parts and their figure
   d405        d405_noise_ratio, d405_holes_ratio: see `depth_d405.py`
 """
 
-import os
-
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
-
 import argparse
 import tempfile
 import time
@@ -42,6 +37,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
+import blas_threads  # noqa: F401
 import numpy as np
 from figures import Figure, Found, Goal, run
 from outside_lab import Lab, LabScene, make_scene

@@ -30,13 +30,9 @@ Parts and the figures they give (keys of the JSON's "figures"):
            console_errors      what the browser calls an error, on both pages
 """
 
-import os
-
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
-
 import atexit
 
+import blas_threads  # noqa: F401
 from figures import Figure, Goal, run
 from review_opening import clean_up
 

@@ -12,11 +12,6 @@ Figures: defects_found_share, false_alarms_share (of the right objects), seconds
 keys_per_defect, console_errors.
 """
 
-import os
-
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
-
 import json
 import tempfile
 import time
@@ -25,6 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import blas_threads  # noqa: F401
 import numpy as np
 from figures import Figure, Found, Goal, run
 from labels_scene import scene as labels_scene

@@ -23,17 +23,13 @@ Parts and the figures they give (keys of the JSON's "figures"):
                                         the whole loop with a Panda
 """
 
-import os
-
-for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-
 import argparse
 import sys
 import tempfile
 import time
 from pathlib import Path
 
+import blas_threads  # noqa: F401
 import numpy as np
 from figures import Figure, Found, Goal, run
 from school_cases import KEEP, cut_shapes

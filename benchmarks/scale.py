@@ -21,11 +21,6 @@ is in unknown units (factor 0.3 to 3) and other axes. Figures (keys of the JSON'
 Shares are 0 to 1. What raises counts as an error of 1000 % and is named.
 """
 
-import os
-
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
-
 import argparse
 import multiprocessing
 import sys
@@ -36,6 +31,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 
+import blas_threads  # noqa: F401
 from figures import Found, run
 from scale_cases import FULL_WIDTH, Case, make_case
 from scale_figures import FIGURES, KINDS, Kind, Row, figures_of, told

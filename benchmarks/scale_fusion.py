@@ -14,11 +14,6 @@ same frames: Open3D's own VoxelBlockGrid at the robot's poses (open3d_*), Poisso
 joined cloud (poisson_*).
 """
 
-import os
-
-for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-
 import argparse
 import resource
 import time
@@ -26,6 +21,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import blas_threads  # noqa: F401
 import numpy as np
 from figures import Figure, Found, Goal, run
 

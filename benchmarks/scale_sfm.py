@@ -19,17 +19,13 @@ sfm_table_mm            median height of the sheet's points over the true table,
 sfm_cpu_s               CPU seconds of one free reconstruction of all views, median
 """
 
-import os
-
-for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-
 import argparse
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import blas_threads  # noqa: F401
 import numpy as np
 from figures import Figure, Found, Goal, run
 

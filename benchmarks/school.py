@@ -34,16 +34,12 @@ those of the published figures, use lower ones while developing. Parts and the f
 Shares are 0 to 1. Convex parts are cut once and kept in the folder --keep.
 """
 
-import os
-
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
-
 import argparse
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
+import blas_threads  # noqa: F401
 from figures import Figure, Found, Goal, run
 from school_cases import KEEP, PAPER_GRASPS_PER_S, cut_shapes
 

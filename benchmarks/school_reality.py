@@ -33,16 +33,12 @@ AUC of alternatives on them, over all and within objects: nominal score with clo
 limit analysis on draws 0.67 and 0.69, the same if the table stops the hand 0.63 and 0.69.
 """
 
-import os
-
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
-
 import argparse
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import blas_threads  # noqa: F401
 import numpy as np
 from figures import Figure, Found, Goal, run
 from school_cases import KEEP, PROCESSES, spent
