@@ -95,7 +95,7 @@ def frames(given: argparse.Namespace) -> Found:
                             break
         said = log.read_text(errors="replace")
     wrong = said.count("Traceback (most recent call last)")
-    figures = {"fuzz_inputs": sent, "fuzz_tracebacks": wrong, "fuzz_hangs": hangs}
+    figures: dict[str, float] = {"fuzz_inputs": sent, "fuzz_tracebacks": wrong, "fuzz_hangs": hangs}
     return Found(figures=figures, notes=[said[-3000:]] if wrong else [])
 
 

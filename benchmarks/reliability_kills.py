@@ -101,7 +101,7 @@ def _be_the_command(work: Path, words: str, room: int) -> None:
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)
     finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         (work.parent / "modules").write_text("\n".join(n for n in sys.modules if n not in before))
         os._exit(code)
 
