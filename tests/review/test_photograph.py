@@ -1,14 +1,18 @@
 """The photographs as an instrument: what each says of the poses, to the pixel."""
 
 import io
+import threading
+import urllib.request
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import viser
 from PIL import Image
 
+from realsim import local_pages
 from realsim.arrays import Rgb
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
@@ -17,6 +21,7 @@ from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.review.content.config import SceneConfig
 from realsim.review.content.content import SceneContent
 from realsim.review.placing.photograph import Photographs
+from realsim.review.window import page_head
 from tests.support.reviewed_boxes import CAMERAS, MODELS, SCENE, boxes_session
 
 TALL, FLAT = SCENE.objects
@@ -139,3 +144,26 @@ def test_a_view_without_depth_says_nothing_and_one_that_is_not_there_is_refused(
     assert rows[9]["against"] is None and rows[0]["against"] is not None
     with pytest.raises(InputError, match="view 77"):
         blind.outlines(77, [TALL])
+
+
+def test_a_slow_answer_is_asked_again_and_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page_head, "SOON_S", 0.2)
+    asked: list[str] = []
+    gate = threading.Event()
+
+    def ask(path: str) -> tuple[str, bytes]:
+        asked.append(path)
+        gate.wait(30)
+        return "image/jpeg", path.encode()
+
+    with page_head.answering(ask), local_pages.guarded(local_pages.Door()):
+        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        url = f"http://127.0.0.1:{server.get_port()}/photograph/0/x/photo/3"
+        assert urllib.request.urlopen(url).read() == b'{"wait": true}'
+        gate.set()
+        answer = urllib.request.urlopen(url)
+        assert answer.read() == b"/photograph/0/x/photo/3" and asked == ["/photograph/0/x/photo/3"]
+        assert answer.headers["Content-Type"] == "image/jpeg"
+    finally:
+        server.stop()

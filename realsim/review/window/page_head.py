@@ -11,6 +11,9 @@ from typing import Any
 TITLE = "realsim review"
 ASKED = "/photograph/"
 """What the page's script asks for begins so."""
+SOON_S, MOST_PENDING = 4.0, 32
+"""A request lasts at most 10 s: what takes longer than this is said to be asked for again [s]; and
+how many answers wait to be fetched."""
 Ask = Callable[[str], tuple[str, bytes]]
 ICON = (
     "data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'%3E"
@@ -53,6 +56,18 @@ def answering(ask: Ask) -> Generator[None]:
 
     module: Any = server
     serve = module.serve
+    pending: dict[str, asyncio.Future[tuple[str, bytes]]] = {}
+
+    async def found(path: str) -> tuple[str, bytes]:
+        task = pending.get(path)
+        if task is None:
+            task = pending[path] = asyncio.ensure_future(asyncio.to_thread(ask, path))
+            if len(pending) > MOST_PENDING:
+                del pending[next(iter(pending))]
+        if not (await asyncio.wait([task], timeout=SOON_S))[0]:
+            return "application/json", b'{"wait": true}'
+        pending.pop(path, None)
+        return task.result()
 
     def answered(*args: Any, **kwargs: Any) -> Any:
         inner = kwargs.pop("process_request")
@@ -60,7 +75,7 @@ def answering(ask: Ask) -> Generator[None]:
         async def process_request(connection: Any, request: Any) -> Any:
             response = await inner(connection, request)
             if request.path.startswith(ASKED) and getattr(response, "status_code", 0) == 404:
-                kind, response.body = await asyncio.to_thread(ask, request.path)
+                kind, response.body = await found(request.path)
                 response.status_code, response.reason_phrase = 200, "OK"
                 response.headers.pop("Content-Length", None)
                 response.headers["Content-Type"] = kind

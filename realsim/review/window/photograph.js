@@ -30,6 +30,7 @@
           return URL.createObjectURL(await response.blob());
         if (response.ok) {
           const said = await response.json();
+          if (said.wait) { --k; continue; }
           if (said.error) { tell(said.error, true); throw new Refused(said.error); }
           return said;
         }
