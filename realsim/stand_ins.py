@@ -74,9 +74,13 @@ def load(content: bytes) -> None:
 def undefined(path: Path) -> set[bytes]:
     """Return the names that a library asks others for."""
     data = np.memmap(path, mode="r")
-    (at,), (size, count) = struct.unpack("<Q", data[40:48]), struct.unpack("<HH", data[58:62])
+    (at,), (size, count) = (
+        struct.unpack("<Q", bytes(data[40:48])),
+        struct.unpack("<HH", bytes(data[58:62])),
+    )
     sections = [
-        struct.unpack("<IIQQQQIIQQ", data[at + size * k : at + size * k + 64]) for k in range(count)
+        struct.unpack("<IIQQQQIIQQ", bytes(data[n : n + 64]))
+        for n in range(at, at + size * count, size)
     ]
     symbols = next(s for s in sections if s[1] == DYNSYM)
     table = data[symbols[4] : symbols[4] + symbols[5]].view(SYMBOL)
