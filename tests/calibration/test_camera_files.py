@@ -151,8 +151,8 @@ BAD = {
     "deep": ("{" + '"a":{' * 3000, "the camera file"),
     "tag": ("!!python/object/apply:os.getcwd []\n", "has the tag"),
     "entities": ("<!DOCTYPE x [<!ENTITY a 'b'>]><opencv_storage/>", "entities"),
-    "many cameras": ("# Camera list\n1 PINHOLE 9 9 1 1 4 4\n2 PINHOLE 9 9 1 1 4 4\n", "2 cameras"),
-    "colmap fisheye": ("# Camera list\n1 OPENCV_FISHEYE 640 480 1 1 1 1 0 0 0 0\n", "not supported"),
+    "cameras": ("# Camera list\n1 PINHOLE 9 9 1 1 4 4\n2 PINHOLE 9 9 1 1 4 4\n", "2 cameras"),
+    "colmap fisheye": ("# Camera list\n1 OPENCV_FISHEYE 64 48 1 1 1 1 0 0 0 0\n", "not supported"),
 }  # fmt: skip
 
 

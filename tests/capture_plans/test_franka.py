@@ -122,7 +122,7 @@ def test_what_cannot_be_driven_is_refused_before_anything_moves(
 @pytest.mark.parametrize(
     ("what", "stop", "said"),
     [
-        ("reflex joint_reflex", "protective stop", r"reflex \(joint_reflex\).*free what it touched"),
+        ("reflex joint_reflex", "protective stop", r"reflex \(joint_reflex\).*what it touched"),
         *(
             pytest.param(*row, marks=pytest.mark.slow)
             for row in (

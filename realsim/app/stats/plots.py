@@ -86,7 +86,7 @@ def _labels(stats: Statistics) -> bytes:
         right.text(k, 1.04, f"{len(values)}", ha="center", fontsize=7, color=MUTED)
     right.set_xticks(range(len(levels)), ["none" if np.isinf(v) else f"{v:g}" for v in levels])
     right.set_ylim(-0.02, 1.12)
-    titled(right, f"{name} by the friction that closes (dot: mean, bar: middle half, above: grasps)",
+    titled(right, f"{name} by the friction that closes (dot mean, bar middle half, above grasps)",
             "least friction that closes", name)  # fmt: skip
     if not levels:
         right.text(0.5, 0.5, "force closure was not computed", ha="center", color=MUTED, fontsize=9)
