@@ -26,12 +26,7 @@ from realsim_calibration import (
     TargetDetection,
     calibrate_hand_eye_report,
 )
-from realsim_calibration.fit.joint_solve import (
-    JointProblem,
-    JointState,
-    Setup,
-    ViewCorners,
-)
+from realsim_calibration.fit.joint_solve import JointProblem, JointState, Setup, ViewCorners
 from realsim_calibration.fit.linear_model import LinearModel
 from realsim_calibration.fit.robust_fit import solve
 from realsim_calibration.fit.view_system import camera_vector

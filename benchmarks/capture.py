@@ -34,10 +34,7 @@ FIGURES = {
     "import_peak_mb": Figure(unit="MB", goal=Goal(high=500)),
     **{f"{kind}_{key}": Figure(unit=unit) for kind in KINDS for key, unit in ROW.items()},
 }  # fmt: skip
-PARTS = {
-    "speed": "capture_speed:speed",
-    "import": "capture_import:imports",
-}
+PARTS = {"speed": "capture_speed:speed", "import": "capture_import:imports"}
 
 if __name__ == "__main__":
     packages = ("realsim", "numpy", "opencv-python-headless", "rosbags", "isal")

@@ -16,13 +16,7 @@ import numpy as np
 from realsim.arrays import Array, Image, Int64
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics
-from realsim.records.targets import (
-    CharucoBoard,
-    Chessboard,
-    CircleGrid,
-    TagBoard,
-    Target,
-)
+from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim_calibration.detect.find import find_target
 from realsim_calibration.detect.markers import FAMILY_DICTIONARY, predefined_dictionary
 from realsim_calibration.sheets import target_image

@@ -25,14 +25,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from formats_mutations_files import FILES
 from formats_mutations_scenes import SCENES, Sample
-from formats_mutations_worker import (
-    BATCH,
-    Job,
-    Outcome,
-    outcomes,
-    read_mutation,
-    sample_files,
-)
+from formats_mutations_worker import BATCH, Job, Outcome, outcomes, read_mutation, sample_files
 from reliability_own import OWN
 
 SAMPLES = {sample.name: sample for sample in (*SCENES, *FILES, *OWN)}

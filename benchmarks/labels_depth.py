@@ -20,12 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from figures import DATA, Found
-from labels_losses import (
-    FittedLosses,
-    KnownView,
-    LossFitConfig,
-    fit_losses,
-)
+from labels_losses import FittedLosses, KnownView, LossFitConfig, fit_losses
 from registration_real import ycbv_frame
 
 from realsim.arrays import Array32, Mask

@@ -252,13 +252,7 @@ def _zones(view: KnownView, config: LossFitConfig) -> list[Mask]:
     left_of, right_of = _nearby(objects, config.rim_px)
     from_left, from_right = _nearby(far | (view.exact_m == 0), config.rim_px)
     inside = objects & ~from_left & ~from_right
-    return [
-        inside,
-        objects & from_right,
-        objects & from_left,
-        far & right_of,
-        far & left_of,
-    ]
+    return [inside, objects & from_right, objects & from_left, far & right_of, far & left_of]
 
 
 def _nearby(mask: Mask, reach_px: int) -> tuple[Mask, Mask]:

@@ -121,9 +121,7 @@ SHAPES: dict[str, tuple[Callable[[], trimesh.Trimesh], bool, str]] = {
 """The lab's objects; the last four are flat."""
 
 
-def _symmetries(
-    kind: str,
-) -> tuple[Array, tuple[tuple[Triple, Triple], ...]]:
+def _symmetries(kind: str) -> tuple[Array, tuple[tuple[Triple, Triple], ...]]:
     """Return what a library would declare: discrete transforms (S, 4, 4), and axes with a point."""
 
     def turned(axis: str, *degrees: float) -> list[Array]:

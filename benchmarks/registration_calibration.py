@@ -40,12 +40,7 @@ from realsim.registration.evidence import (
     measure_noise,
     without_table,
 )
-from realsim.registration.judging.held_out import (
-    HeldOutConfig,
-    half_fit,
-    held_out,
-    owned_points,
-)
+from realsim.registration.judging.held_out import HeldOutConfig, half_fit, held_out, owned_points
 from realsim.registration.judging.ownership import make_claims, owners
 from realsim.registration.judging.surface_residuals import (
     ResidualConfig,

@@ -226,8 +226,7 @@ class SchoolCase:
         models = {i: replace(m, density=density) for i, m in self.models.items()}
         solids = {
             i: replace(
-                s,
-                matter=physical_properties(models[i].mesh, density=density, parts=s.parts),
+                s, matter=physical_properties(models[i].mesh, density=density, parts=s.parts)
             )
             for i, s in self.solids.items()
         }
@@ -247,9 +246,7 @@ def school_case(seed: int, keep: Path, quick: bool) -> SchoolCase:
         config = replace(config, disc_m=config.disc_m + WIDER_M)
     return SchoolCase(
         scene=Scene(
-            name=f"seed {seed}",
-            objects=put.objects,
-            plane=SupportPlane(T_world_table=np.eye(4)),
+            name=f"seed {seed}", objects=put.objects, plane=SupportPlane(T_world_table=np.eye(4))
         ),
         models={i: m for i, (m, _) in known.items()},
         solids={i: s for i, (_, s) in known.items()},

@@ -131,8 +131,7 @@ def demo_scene() -> tuple[Scene, dict[int, ObjectModel]]:
 def demo_config(given: argparse.Namespace, engine: str) -> SchoolConfig:
     """Return the school's config, coarser with --quick."""
     config = SchoolConfig(
-        seed=given.seed,
-        max_candidates=CANDIDATES_QUICK if given.quick else CANDIDATES,
+        seed=given.seed, max_candidates=CANDIDATES_QUICK if given.quick else CANDIDATES
     )
     config = replace(config, slip=replace(config.slip, engine=settings_of(engine)))
     return replace(config, convex=COARSE) if given.quick else config
@@ -168,12 +167,7 @@ def demo(given: argparse.Namespace) -> Found:
     config = demo_config(given, "mujoco")
     cache = KEEP / "demo" / ("quick" if given.quick else "full")
     sets = run_school(
-        scene,
-        models,
-        config,
-        workers=1 if given.quick else PROCESSES,
-        cache=cache,
-        restart=True,
+        scene, models, config, workers=1 if given.quick else PROCESSES, cache=cache, restart=True
     )
     found = Found()
     tried = sum(int(executed(s).sum()) for s in sets)

@@ -243,8 +243,7 @@ def test_a_board_that_is_said_to_be_elsewhere_is_named(
     out = str(photos.parent / "refused")  # the points found are noted there
     said = refusal(
         CliRunner().invoke(
-            commands,
-            ["calibrate", str(source), "--cameras", cameras, *board, "--out", out],
+            commands, ["calibrate", str(source), "--cameras", cameras, *board, "--out", out]
         )
     )
     assert "contradict the robot" in said and words in said

@@ -13,11 +13,7 @@ from realsim.app import cli
 from realsim.app.check.agreement import AgreementConfig, ObjectAgreement, SceneAgreement
 from realsim.app.check.checksums import check_checksums, checksum_list
 from realsim.app.check.dataset import checked_scenes
-from realsim.app.check.tally import (
-    MaskOverlap,
-    Tally,
-    agreement_of,
-)
+from realsim.app.check.tally import MaskOverlap, Tally, agreement_of
 from realsim.errors import InputError
 from tests.support.bop_scenes import edit, write_boxes
 

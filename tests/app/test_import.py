@@ -12,12 +12,7 @@ import pytest
 
 from realsim.app.console import Console
 from realsim.app.importing.session import import_session
-from realsim.app.importing.source import (
-    ImportRequest,
-    kinds_of,
-    open_source,
-    run_import,
-)
+from realsim.app.importing.source import ImportRequest, kinds_of, open_source, run_import
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.records import CaptureSession

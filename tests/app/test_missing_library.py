@@ -30,10 +30,7 @@ def test_a_missing_shared_library_ends_with_what_to_install(
 
 @pytest.mark.parametrize(("module", "mended"), [("numba", True), ("realsim.nowhere", False)])
 def test_a_missing_package_ends_with_what_to_install_and_a_bug_with_its_place(
-    module: str,
-    mended: bool,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    module: str, mended: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def missing(*_: object, **__: object) -> None:
         raise ModuleNotFoundError(f"No module named '{module}'", name=module)

@@ -10,9 +10,7 @@ from PIL import Image
 from realsim.app.register.gain import camera_shifts_px, gain_picture, zoomed_camera
 from realsim.app.register.map import place_covariance_mm2
 from realsim.app.register.page import page_bytes
-from realsim.app.register.pictures import (
-    draw_pictures,
-)
+from realsim.app.register.pictures import draw_pictures
 from realsim.app.register.results import CameraChange, Registered
 from realsim.app.register.run import pixel_sigma
 from realsim.geometry import camera, se3

@@ -60,9 +60,7 @@ def test_views_that_were_left_out_get_no_labels_and_are_named(store: SessionStor
     assert shown == {f"overlay_{k:06d}.png" for k in (0, 1, 3)}
 
 
-def test_an_interrupted_registration_is_finished_by_whoever_comes_next(
-    store: SessionStore,
-) -> None:
+def test_an_interrupted_registration_is_finished_by_whoever_comes_next(store: SessionStore) -> None:
     result = registered_by_hand(store, left_out=1)
     before = {str(k): T.tolist() for k, T in cameras_now(store).items()}
     files = documents(result, store, MODELS)

@@ -20,13 +20,7 @@ from realsim.geometry import camera
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.photo import PhotoRenderer
 from realsim.store import SessionStore, save_scene
-from synthetic_scenes import (
-    INTRINSICS,
-    MODELS,
-    captured_session,
-    rejected,
-    two_boxes,
-)
+from synthetic_scenes import INTRINSICS, MODELS, captured_session, rejected, two_boxes
 
 QUIET = Console(quiet=True)
 

@@ -42,8 +42,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
             moved = first.T_world_obj.copy()
             moved[0, 3] += SHIFT_M
             scene = replace(
-                result.scene,
-                objects=(replace(first, T_world_obj=moved), *result.scene.objects[1:]),
+                result.scene, objects=(replace(first, T_world_obj=moved), *result.scene.objects[1:])
             )
             result = replace(result, scene=scene)
         write_result(store, result, models_of(), {})

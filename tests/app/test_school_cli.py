@@ -50,10 +50,7 @@ def test_a_run_needs_no_name_and_writes_everything(tried: tuple[Path, Result]) -
 def test_all_files_hold_the_same_grasps(tried: tuple[Path, Result]) -> None:
     folder, _ = tried
     sets = load_grasps(folder)
-    for found in (
-        read_grasps_hdf5(folder / "grasps/grasps.h5"),
-        stored_grasps(folder)[0],
-    ):
+    for found in (read_grasps_hdf5(folder / "grasps/grasps.h5"), stored_grasps(folder)[0]):
         assert found.T_world_table == pytest.approx(T_WORLD_TABLE)
         for s, other in zip(sets, found.sets, strict=True):
             assert np.array_equal(s.Ts_obj_grasp, other.Ts_obj_grasp)

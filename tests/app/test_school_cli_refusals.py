@@ -43,11 +43,7 @@ def test_trials_of_another_layout_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("mass", "words"),
-    [
-        ("mug=0.3", "no object of this scene"),
-        ("cube=heavy", "NAME=KG"),
-        ("cube=0", "NAME=KG"),
-    ],
+    [("mug=0.3", "no object of this scene"), ("cube=heavy", "NAME=KG"), ("cube=0", "NAME=KG")],
 )
 def test_a_mass_of_nothing_or_of_no_object_is_refused(
     pristine: Path, mass: str, words: str

@@ -18,13 +18,7 @@ from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import GraspSet
 from realsim.store import load_grasps
-from upgradable_datasets import (
-    NAMES,
-    bop_dataset,
-    content_and_times,
-    graspnet_dataset,
-    standing,
-)
+from upgradable_datasets import NAMES, bop_dataset, content_and_times, graspnet_dataset, standing
 
 QUIET = Console(quiet=True)
 

@@ -143,9 +143,7 @@ def test_excluded_views_are_not_looked_at(store: SessionStore) -> None:
         Snapper(store, SCENE, MODELS, excluded_views=range(8)).snap(0, TRUTH[0].obj_id, np.eye(4))
 
 
-def test_the_bias_is_the_calibration_s_followed_by_the_registration_s(
-    tmp_path: Path,
-) -> None:
+def test_the_bias_is_the_calibration_s_followed_by_the_registration_s(tmp_path: Path) -> None:
     store = table_session(tmp_path / "s", views=1)
     assert depth_bias_of(store).is_none
     first, then = (

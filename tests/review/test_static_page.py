@@ -17,11 +17,7 @@ from realsim.geometry import se3
 from realsim.review import journal
 from realsim.review.content.config import SceneConfig
 from realsim.review.content.content import SceneContent
-from realsim.review.static.page_nodes import (
-    LABEL_EDGES,
-    drawn_grasps,
-    label_class,
-)
+from realsim.review.static.page_nodes import LABEL_EDGES, drawn_grasps, label_class
 from realsim.review.static.static_page import PageWords, StaticSummary, write_static
 from realsim.store import save_grasps, save_scene
 from registered_sessions import registered_by_hand, table_session
