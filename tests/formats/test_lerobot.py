@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from realsim.errors import InputError
+from realsim.errors import InputError, MissingLibraryError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.lerobot import episodes as layout
 from realsim.formats.lerobot import spool
@@ -247,7 +247,7 @@ def test_what_does_not_fit_is_refused(tmp_path, source, words):
 def test_a_missing_pyav_is_said_before_anything_is_written(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     source = Source()
-    with pytest.raises(InputError, match=r"realsim\[lerobot\]"):
+    with pytest.raises(MissingLibraryError, match=r"realsim\[lerobot\]"):
         write(tmp_path / "set", source)
     assert source.asked == []
 
