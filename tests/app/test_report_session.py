@@ -98,6 +98,14 @@ def test_the_report_of_the_same_session_is_the_same_bytes(
     assert (again.parent / "report.json").read_bytes() == document
 
 
+def test_a_report_does_not_count_the_record_of_the_one_before(store: SessionStore) -> None:
+    read = []
+    for _ in range(2):
+        CliRunner().invoke(report_command, [str(store.folder)], catch_exceptions=False)
+        read.append((store.folder / "reports" / "report.json").read_bytes())
+    assert (store.folder / "stages" / "report.json").is_file() and read[0] == read[1]
+
+
 def test_the_page_is_whole_needs_no_network_and_names_no_folder(
     registered: SessionStore, page: Path
 ) -> None:

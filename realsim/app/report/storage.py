@@ -12,7 +12,7 @@ from realsim.store import SessionStore
 from realsim.store.check_report import CheckReport
 from realsim.store.session_check import check_session, read_lists
 
-OWN = "reports/"
+OWN = ("reports/", "stages/report.")
 """A report says nothing of its own files: it would differ from the next one."""
 SHOWN = 30
 LONGEST = 120
