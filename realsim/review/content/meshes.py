@@ -199,7 +199,7 @@ def _texture_jpeg(texture: UInt8, most_texels: int) -> bytes:
     small = texture
     if factor < 1:
         size = tuple(max(1, round(n * factor)) for n in texture.shape[1::-1])
-        small = np.asarray(cv2.resize(texture, size, interpolation=cv2.INTER_AREA))
+        small = np.asarray(cv2.resize(texture, size, interpolation=cv2.INTER_AREA), np.uint8)
     return jpeg_bytes(small, TEXTURE_QUALITY)
 
 
