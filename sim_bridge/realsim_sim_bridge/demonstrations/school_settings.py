@@ -72,10 +72,9 @@ def _value(hint: Any, value: Any, name: str) -> Any:
     """Return a field's value in its own type."""
     if get_origin(hint) in (Union, types.UnionType):
         return _one_of(get_args(hint), value, name)
-    if hint is Hand:
-        return hand_of_json(value, name)
     if is_dataclass(hint) and isinstance(hint, type):
-        return _read(hint, value)
+        kind: Any = hint
+        return hand_of_json(value, name) if kind is Hand else _read(hint, value)
     if get_origin(hint) is Literal:
         if value not in get_args(hint):
             raise TypeError(f"{name} is {value!r}")
