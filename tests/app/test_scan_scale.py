@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from realsim.app.console import Console
-from realsim.app.scan.scale.cli import request_of, scale
+from realsim.app.scan.scale.cli import scale
 from realsim.app.scan.scale.files import Place, write_result
 from realsim.app.scan.scale.inputs import (
     NamedMesh,
@@ -76,16 +77,6 @@ def record_of(known, fit, inputs) -> ScaleRecord:
     return ScaleRecord(fit=fit, inputs=inputs, versions=installed_versions())
 
 
-def typed(**changes):
-    """The options as click gives them."""
-    return {
-        "library": None, "name": "", "up": None, "start": None, "size": "", "at": "",
-        "measured": (), "between": (), "views": "", "out": None, "json_file": None,
-        "overwrite": False, "accept_doubtful": False, "obj_id": None, "density": None,
-        "mass": None,
-    } | changes  # fmt: skip
-
-
 # --- what is refused --------------------------------------------------------------------------
 
 
@@ -122,16 +113,16 @@ def test_a_mesh_without_anything_that_knows_metres_is_refused():
 @pytest.mark.parametrize(
     ("options", "error", "said"),
     [
-        ({"size": "90"}, UnitError, "no unit"),
-        ({"between": ("0,0,0=95mm",)}, InputError, "two different"),
-        ({"at": "0.4"}, InputError, "x,y in metres"),
-        ({"at": "400,-50"}, InputError, "millimetres"),
-        ({"start": Path("none.json")}, InputError, "does not exist"),
+        (("--rough-size", "90"), UnitError, "no unit"),
+        (("--between", "0,0,0=95mm"), InputError, "two different"),
+        (("--at", "0.4"), InputError, "x,y in metres"),
+        (("--at", "400,-50"), InputError, "millimetres"),
+        (("--start-file", "none.json"), InputError, "does not exist"),
     ],
 )
 def test_what_cannot_be_read_is_named(options, error, said):
     with pytest.raises(error, match=said):
-        request_of("mug.ply", None, typed(**options))
+        CliRunner().invoke(scale, ["mug.ply", *options], catch_exceptions=False)
 
 
 # --- a mesh of the library --------------------------------------------------------------------

@@ -198,7 +198,7 @@ def test_good_and_bad_grasps_of_a_box_are_told_apart(tmp_path):
                                         ("blocked", "missed", "skewed", "overloaded"))  # fmt: skip
     np.testing.assert_allclose(told, (4 + found.columns["score"]) / 5)
     (note,) = found.notes
-    assert "wooden_box was not weighed: 1000 kg/m^3 make 0.096 kg" in note and "--mass" in note
+    assert "wooden_box was not weighed: 1000 kg/m^3 make 0.096 kg" in note and "--weighed" in note
 
     flipped = [replace(objects[0], held=~objects[0].held)]
     config = RealityConfig(hold=HoldConfig(draws=2))
