@@ -296,7 +296,8 @@ class Window:
             return
         with self.lock:
             others = tuple(self.server.others(self))
-            seen = (*(id(s.standing) for s in self.server.sessions), others)
+            drafts = tuple(self.browser.drafts)
+            seen = (*(id(s.standing) for s in self.server.sessions), others, drafts)
             if seen == self._seen and not force:
                 return
             self._seen = seen
