@@ -250,6 +250,7 @@ def test_a_correction_outlives_a_reload_and_the_edit_of_another(
         page.wait_message("Your correction of flat goes on")
         page.wait_for("moved 10.0 mm")
         with browser.page(server.url) as other:
+            other.wait_for("objects judged", "computed:")
             other.write("Your name", "bob")
             other.wait_for("ada corrects 3 flat")
             page.wait_for("bob looks at 3 flat")
@@ -258,7 +259,7 @@ def test_a_correction_outlives_a_reload_and_the_edit_of_another(
         session.decide("move", placed, "bob", pose=aside, how="steps")
         page.wait_message("bob has changed flat meanwhile. Your copy is kept")
         page.press("0 tall")
-        page.wait_for("instance 0, object 1")
+        page.wait_for("\u25b6 0 tall")
         page.press("3 flat")
         page.wait_message("goes on")
         page.tab("Correct")
