@@ -25,7 +25,7 @@ from realsim.local_pages import Door
 from realsim.review import journal, scene_list
 from realsim.review.content.config import SceneConfig
 from realsim.review.journal import Entry
-from realsim.review.replay.grasp_replay import Motions
+from realsim.review.replaying.grasp_replay import Motions
 from realsim.review.reviewed_session import ReviewedSession
 from realsim.review.window import page_head
 from realsim.review.window.window import Window

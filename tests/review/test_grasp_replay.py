@@ -12,7 +12,7 @@ from realsim import InputError, Mesh
 from realsim.geometry import se3
 from realsim.records import STAGES
 from realsim.records.trajectories import PHASES
-from realsim.review.replay.grasp_replay import (
+from realsim.review.replaying.grasp_replay import (
     GraspMotion,
     HandApproach,
     Motions,
@@ -20,7 +20,7 @@ from realsim.review.replay.grasp_replay import (
     ReplayPlayer,
     hand_approach,
 )
-from realsim.review.replay.grasp_words import (
+from realsim.review.replaying.grasp_words import (
     LOST,
     NOT_TRIED,
     escaped,

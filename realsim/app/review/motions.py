@@ -23,7 +23,7 @@ from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet, Mesh, ObjectModel
 from realsim.records.trajectories import PHASES, GraspTrajectories
-from realsim.review.replay.grasp_replay import GraspMotion, HandApproach, hand_approach
+from realsim.review.replaying.grasp_replay import GraspMotion, HandApproach, hand_approach
 from realsim.robots.hand import FRANKA, find_hand
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.reach_config import base_on_table, grasping_arm
@@ -43,7 +43,7 @@ CLOSE = PHASES.index("close")
 
 
 class SessionMotions:
-    """`realsim.review.replay.grasp_replay.Motions` of a school's results."""
+    """`realsim.review.replaying.grasp_replay.Motions` of a school's results."""
 
     def __init__(
         self,

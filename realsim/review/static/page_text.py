@@ -11,7 +11,7 @@ from realsim.review.content.views import VERDICT_ORDER, worst_first
 from realsim.review.corrections import corrected_scene, decision_on
 from realsim.review.journal import Entry, ReviewState
 from realsim.review.placing.ellipsoid import rotation_sigmas_deg
-from realsim.review.replay.grasp_words import one_line
+from realsim.review.replaying.grasp_words import one_line
 
 NOT_KNOWN = "not known"
 DECISION_WORDS = {"accept": "accepted", "reject": "rejected"}

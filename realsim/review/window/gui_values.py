@@ -12,7 +12,7 @@ import viser
 
 from realsim.errors import InputError
 from realsim.local_pages import refuse_uploads
-from realsim.review.replay.grasp_words import one_line
+from realsim.review.replaying.grasp_words import one_line
 
 MOST_TEXT = 20_000
 """Characters of a text field: more than a comment may have, so that it can still be shortened."""

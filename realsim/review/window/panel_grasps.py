@@ -14,8 +14,8 @@ from realsim.review.drawing.grasp_drawing import (
     failure_choices,
     visible_grasps,
 )
-from realsim.review.replay.grasp_replay import GraspMotion, ReplayPlayer
-from realsim.review.replay.grasp_words import grasp_words
+from realsim.review.replaying.grasp_replay import GraspMotion, ReplayPlayer
+from realsim.review.replaying.grasp_words import grasp_words
 from realsim.review.window import window_text
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from realsim.review.content.content import SceneContent
 from realsim.review.drawing.scene_nodes import SceneNodes
 from realsim.review.journal import Entry
 from realsim.review.refusals import SessionGone, disk_words
-from realsim.review.replay.grasp_replay import Motions
+from realsim.review.replaying.grasp_replay import Motions
 from realsim.review.reviewed_session import ReviewedSession, Standing
 from realsim.review.window import window_text
 from realsim.review.window.browser import Browser

@@ -15,7 +15,7 @@ from realsim.records import ObjectModel, ObjectPose
 from realsim.rendering.overlay import VERDICT_RGB
 from realsim.review.journal import Entry
 from realsim.review.placing.ellipsoid import rotation_sigmas_deg
-from realsim.review.replay.grasp_words import escaped, one_line
+from realsim.review.replaying.grasp_words import escaped, one_line
 from realsim.review.scene_list import ObjectRow
 
 ALARM = "#c92a2a"

@@ -22,8 +22,8 @@ from realsim.errors import InputError
 from realsim.records import Mesh
 from realsim.records.checked_arrays import frozen
 from realsim.records.trajectories import PHASES
-from realsim.review.replay.grasp_words import escaped
-from realsim.review.replay.replay_nodes import ReplayNodes
+from realsim.review.replaying.grasp_words import escaped
+from realsim.review.replaying.replay_nodes import ReplayNodes
 from realsim.robots.hand import Hand, find_hand
 
 SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x")
