@@ -1,10 +1,4 @@
-"""The way in: `realsim --help` is answered from the table here, all else by `realsim.app.cli`.
-
-The table needs no library, so that the help comes at once.
-"""
-
-import os
-import sys
+"""The table of commands: the help of `realsim` is answered from it, before any library loads."""
 
 GROUPS = {
     "Prepare": {
@@ -93,26 +87,3 @@ def help_text() -> str:
         lines = [f"  {name:15} {does}.\n" for name, does in group.items()]
         parts.append(f"\n{title}:\n{''.join(lines)}")
     return "".join([*parts, OPTIONS])
-
-
-def main() -> None:
-    """Run the command line."""
-    if sys.argv[1:] in (["--help"], ["-h"]):
-        try:
-            print(help_text(), end="", flush=True)
-        except BrokenPipeError:
-            os._exit(141)  # as `realsim.app.cli`, where the reader of the output has gone
-        return
-    try:
-        from realsim.app.cli import main as run
-
-        run()
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.startswith("realsim"):
-            raise  # a bug: its place is wanted
-        print(
-            f"error: {error.name} is not installed. Install what realsim needs with `uv sync "
-            "--inexact`, or `pip install realsim`; `realsim doctor` says what else is missing.",
-            file=sys.stderr,
-        )
-        sys.exit(2)

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from realsim.app import front
+from realsim import app
 from realsim.app.cli import main
 from realsim.app.config import applied
 
@@ -38,7 +38,7 @@ def test_a_missing_package_ends_with_what_to_install_and_a_bug_with_its_place(
     monkeypatch.setattr(applied, "apply_config", missing)
     monkeypatch.setattr(sys, "argv", ["realsim", "config", "show"])
     with pytest.raises(SystemExit if mended else ModuleNotFoundError) as stop:
-        front.main()
+        app.main()
     if mended:
         assert getattr(stop.value, "code", None) == 2
         said = capsys.readouterr().err
