@@ -43,7 +43,6 @@ class Page:
         self.send(CAMERA)
         self.wait(lambda: bool(server.windows) and server.windows[0].selected is not None)
         self.window: Window = server.windows[0]
-        self.wait(lambda: not self.window._busy.locked())  # pyright: ignore[reportPrivateUsage]
 
     def send(self, message: dict[str, Any]) -> None:
         self._line.send(msgspec.msgpack.encode(message))

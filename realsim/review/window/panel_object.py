@@ -44,6 +44,10 @@ class ObjectPanel:
             self._rest = gui.add_markdown("")
         with gui.add_folder("Journal of this object"):
             self._history = gui.add_markdown("")
+        self._deciding = (accept, reject, comment)
+        """Not to be pressed before an object is looked at: the list is there first."""
+        for button in self._deciding:
+            button.disabled = True
         accept.on_click(window.guarded(lambda _: self.decide("accept")))
         reject.on_click(window.guarded(lambda _: self.decide("reject")))
         comment.on_click(window.guarded(lambda _: self.decide("comment")))
@@ -75,6 +79,8 @@ class ObjectPanel:
     def refresh(self) -> None:
         """Show the object as the journal has it."""
         window = self._window
+        for button in self._deciding:
+            button.disabled = window.selected is None
         if window.selected is None:
             return
         standing, placed = window.standing, window.placed

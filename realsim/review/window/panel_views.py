@@ -45,7 +45,7 @@ class PhotographLink:
     def tell(self) -> None:
         """Say which object is looked at, and that things stand otherwise."""
         window = self._window
-        if not window.is_open:
+        if not window.stands:
             return
         stands = [(o.instance, o.obj_id, o.verdict, o.T_world_obj.tobytes())
                   for o in window.shown_objects()]  # fmt: skip

@@ -93,6 +93,8 @@ class Window:
         self.lock = threading.RLock()
         self.selected: int | None = None
         """Instance of the object that is looked at."""
+        self.stands = False
+        """Whether a scene is there and an object chosen: keys and buttons wait for it."""
         self._opened: Opened | None = None
         self._busy = threading.Lock()
         self.browser = Browser(self)
@@ -221,21 +223,23 @@ class Window:
         """Show an object, and its scene if another one is shown."""
         session = self.server.sessions[number]
         if self._opened is None or self._opened.session is not session:
-            self._open(session, instance)
-        else:
-            self.select(instance)
+            self._open(session)
+        self.select(instance)
         if instance is not None:
             self.views.look_at_object()
 
     def renew(self, session: ReviewedSession) -> None:
         """Show a session that was registered anew in place of what is shown of it."""
+        instance = self.selected
+        self._open(session)
         known = {o.instance for o in session.registered.objects}
-        self._open(session, self.selected if self.selected in known else None)
+        self.select(instance if instance in known else None)
         self.say(f"{session.name} was registered anew; this is how it stands.")
 
     def select(self, instance: int | None) -> None:
         """Look at an object of this scene."""
         with self.lock:
+            self.stands = True
             if instance != self.selected:
                 self.correct.set_aside()
                 self.selected = instance
@@ -257,8 +261,8 @@ class Window:
             return
         self.go_to(*row.key)
 
-    def _open(self, session: ReviewedSession, instance: int | None) -> None:
-        """Load a session's scene, show it in place of the one before and look at an object."""
+    def _open(self, session: ReviewedSession) -> None:
+        """Load a session's scene and show it in place of the one before."""
         with self.working("Opening the scene", session.name) as progress:
             content = session.content(progress)
             with self.lock:
@@ -277,8 +281,6 @@ class Window:
                 self.selected, self._seen, self._standing = None, None, None
                 for panel in (self.views, self.grasps, self.show):
                     panel.opened()
-                # No list is shown without its selection: a button pressed early would miss it.
-                self.select(instance)
             # A browser maps a camera by the direction that was up before the batch it comes in:
             # the camera is sent when the browser has answered that it has turned the scene.
             self.client.flush()
