@@ -3,6 +3,7 @@
 `scale` and `sfm` live in modules of their own and are loaded when they are asked for.
 """
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,7 @@ def import_command(console: Console, **options: Any) -> None:
 
     code = run_scan_import(ImportRequest(**options), console)
     if code:
-        raise click.exceptions.Exit(code)
+        sys.exit(code)
 
 
 @command("list", "realsim scan list", "realsim scan list demo/session/models", group=scan_command)
