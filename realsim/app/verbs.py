@@ -112,7 +112,7 @@ def open(
             ["views with a camera pose", str(sum(v.T_world_cam is not None for v in views))],
             ["stages done", ", ".join(done) or "none"]]  # fmt: skip
     told.tables.append((store.session.name, ["session", "value"], rows))
-    return _made("open", store.folder, store.session, told, "reports/contact_sheet.png")
+    return _made("open", store.folder, store.session, told, "reports/views.png")
 
 
 def demo(
