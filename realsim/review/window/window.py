@@ -252,9 +252,9 @@ class Window:
     def next_undecided(self, step: Literal[1, -1]) -> None:
         """Go to the next object that waits for a person, or the one before."""
         rows = scene_list.worst_first(self.rows())
-        now = None
-        if self._opened is not None and self.selected is not None:
-            now = (self._opened.session.number, self.selected)
+        now = None if self._opened is None or self.selected is None else (
+            self._opened.session.number, self.selected
+        )  # fmt: skip
         row = scene_list.next_undecided(rows, now, step)
         if row is None:
             self.say("All objects are judged. Thank you.")
@@ -360,7 +360,7 @@ class Window:
 
     def decided(self, entry: Entry, words: str = "") -> None:
         """Say that a line is in the journal, and show it everywhere."""
-        done = words or f"{window_text.ACTION_WORDS.get(entry.action, 'taken back')}"
+        done = words or window_text.ACTION_WORDS.get(entry.action, "taken back")
         self.say(f"Recorded: {done}, signed {entry.reviewer}.")
         self.server.tell()
 
@@ -376,8 +376,7 @@ class Window:
 
     def alarm(self, text: str) -> None:
         """Say in red that decisions may be lost, or that the page itself failed."""
-        content = window_text.message_html(text, "alarm")
-        if self._message.content != content:
+        if (content := window_text.message_html(text, "alarm")) != self._message.content:
             self._message.content = content
 
     def fail(self, error: Exception) -> None:
@@ -448,5 +447,4 @@ class Window:
 
 
 def _tell(note: Any, body: str, done: int, total: int) -> None:
-    share = np.clip(done / max(total, 1), 0.0, 1.0)
-    note.body = f"{body}: {100 * share:.0f} %"
+    note.body = f"{body}: {100 * np.clip(done / max(total, 1), 0.0, 1.0):.0f} %"
