@@ -105,12 +105,12 @@ def png(drawn: Any) -> bytes:
     """Return the figure as PNG; the same figure gives the same bytes."""
     buffer = io.BytesIO()
     engine = drawn.get_layout_engine()
-    if engine is not None:  # once: savefig would draw all of it in vain before
-        engine.execute(drawn)
-        drawn.set_layout_engine(None)
     with warnings.catch_warnings():
         # A name in a script that the font has not got is drawn as boxes; the tables spell it.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        if engine is not None:  # once: savefig would draw all of it in vain before
+            engine.execute(drawn)
+            drawn.set_layout_engine(None)
         drawn.savefig(buffer, format="png", facecolor="white", metadata={"Software": None})
     return buffer.getvalue()
 

@@ -120,7 +120,7 @@ def test_tables_and_page_say_the_same(session, tmp_path):
     assert [int(o["candidates"]) for o in objects] == [4, 3]
     assert sum(o["good"] for o in document["objects"]) == document["sessions"][0]["good"] == 3
     page = (out / "statistics.html").read_text()
-    assert page.count('src="data:') == 4
+    assert page.count('src="data:') == 6
     assert all(here in page for here in (table["mean score"], table["objects per scene"]))
 
 

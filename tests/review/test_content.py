@@ -10,9 +10,9 @@ import pytest
 from realsim import CameraIntrinsics, GraspSet, InputError, View
 from realsim.geometry import camera, depth, se3
 from realsim.rendering import overlay
-from realsim.review.content import content
 from realsim.review.content.config import GripperDrawing, SceneConfig
 from realsim.review.content.content import SceneContent
+from realsim.review.content.views import Region, region_of, strided, worst_first
 from realsim.review.drawing import grasp_drawing
 from realsim.review.drawing.grasp_drawing import GraspFilter, passing
 from realsim.review.window.panel_grasps import legend_html
@@ -32,7 +32,7 @@ def shown(store: SessionStore) -> SceneContent:
     return SceneContent.load(store, CONFIG)
 
 
-def measured(store: SessionStore, region: content.Region) -> np.ndarray:
+def measured(store: SessionStore, region: Region) -> np.ndarray:
     """All measured points in world, in double."""
     parts = []
     for view in store.session.views:
@@ -86,12 +86,12 @@ def test_pieces_are_the_cloud_in_order_and_no_message_is_large(
 
 
 def test_worst_comes_first() -> None:
-    assert [o.instance for o in content.worst_first(SCENE.objects)] == [3, 0]
+    assert [o.instance for o in worst_first(SCENE.objects)] == [3, 0]
 
 
 def test_without_objects_the_region_is_where_the_cameras_look() -> None:
     views = [View(index=i, T_world_cam=T) for i, T in enumerate(CAMERAS)]
-    region = content.region_of([], views, 0.2)
+    region = region_of([], views, 0.2)
     np.testing.assert_allclose(region.center, [0.5, 0.0, 0.03], atol=1e-9)
 
 
@@ -101,7 +101,7 @@ def test_a_strided_camera_sees_the_same_points() -> None:
         distortion=np.array([-0.05, 0.06, 3e-4, 5e-4, -0.02]),
     )  # fmt: skip
     for stride in (1, 2, 3, 7):
-        small = content.strided(lens, stride)
+        small = strided(lens, stride)
         rays = camera.ray_table(lens)[::stride, ::stride]
         np.testing.assert_allclose(camera.ray_table(small), rays, atol=1e-6)
 
@@ -165,7 +165,13 @@ def test_too_many_grasps_are_thinned_evenly_over_scores_and_objects() -> None:
     assert len(found[0]) == 40 and len(found[3]) == 10
     scores = sets[0].scores[found[0]]
     assert np.nanmin(scores) < 0.05 and np.nanmax(scores) > 0.95
-    assert grasp_drawing.failure_choices(sets)[:2] == ("close", "lift")
+    choices = grasp_drawing.failure_choices(sets)
+    words = ["any failure", "none: it held", "close", "lift", "oscillate", "pendulum"]
+    assert list(choices.values())[:6] == words
+    counts = {k: sum(len(passing(g, GraspFilter(failure=w))) for g in sets)
+              for k, w in choices.items()}  # fmt: skip
+    assert all(name.endswith(f"({n})") and n > 0 for name, n in counts.items())
+    assert sum(list(counts.values())[:2]) == 500
 
 
 @pytest.mark.parametrize("wrong", [{"stage": 5}, {"stage": -1}, {"min_label": 1.5}])

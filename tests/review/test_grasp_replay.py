@@ -24,11 +24,12 @@ from realsim.review.replaying.grasp_words import (
     LOST,
     NOT_TRIED,
     escaped,
-    failure_words,
     grasp_words,
     slip_table,
     slip_words,
+    why_words,
 )
+from reviewed_boxes import grasp_set
 from tried_grasps import tried_set
 
 WIDTH_M = 0.03
@@ -238,20 +239,41 @@ def test_the_words_of_every_grasp_say_stage_by_stage_what_is_stored() -> None:
                 assert cell == (LOST if np.isinf(slip) else NOT_TRIED)
         text = grasp_words(grasps, row, "mug")
         assert f"Grasp {row}" in text and "mug" in text
-        assert escaped(grasps.failures[row]) in text
+        assert escaped(grasps.failures[row]) in text and why_words(grasps, row) in text
         assert ("does not reach" in text) is not bool(grasps.reachable[row])
         assert "nan" not in text and "inf" not in text.replace("instance", "")
 
 
-def test_a_failure_names_the_stage_where_it_stopped() -> None:
-    grasps = tried_set(np.random.default_rng(0), 4)
-    words = ("lift: the object slipped", "the approach leaves the limits", "", "close: lost")
-    grasps = replace(grasps, failures=words, scores=np.array([0.2, np.nan, 1.0, 0.0]))
-    assert failure_words(grasps, 0).startswith("stopped at lift")
-    assert failure_words(grasps, 1) == words[1]
-    assert failure_words(grasps, 2) == ""
+def test_one_sentence_says_why_a_grasp_failed() -> None:
+    grasps = grasp_set(1, 0, 7)
+    failures = (
+        "lift: the object slipped 7.5 mm", "collides with the table", "too few *pads*", "",
+        "close: the fingers did not both touch the object", "", "",
+    )  # fmt: skip
+    nan = np.full(7, np.nan)
+    measures = {
+        "p_hold": np.array([*nan[:5], 0.4, 0.9]),
+        "share_missed": np.array([*nan[:5], 0.1, 0.0]),
+        "share_overloaded": np.array([*nan[:5], 0.5, 0.1]),
+    }
+    grasps = replace(
+        grasps, failures=failures, measures=measures, base_scores=np.ones(7),
+        scores=np.array([0.2, 0, np.nan, 1, 0, 1, 1]), reachable=np.arange(7) != 1,
+    )  # fmt: skip
+    assert [why_words(grasps, row) for row in range(7)] == [
+        "It failed during the lift: the object slipped 7.5 mm.",
+        "The arm does not reach it: collides with the table.",
+        "It was not tried: too few \\*pads\\*.",
+        "It held in all four stages.",
+        "It failed while the fingers closed: the fingers did not both touch the object.",
+        "It held as planned, but fails in 60 % of the draws, most often because the load is too "
+        "large.",
+        "It held in all four stages.",
+    ]
+    unknown = replace(grasps, failures=("",) * 7, base_scores=np.zeros(7))
+    assert why_words(unknown, 4) == "It failed: no reason is stored."
     with pytest.raises(IndexError):
-        grasp_words(grasps, 4)
+        grasp_words(grasps, 7)
 
 
 def test_names_of_people_are_neither_html_nor_markdown() -> None:

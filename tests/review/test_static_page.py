@@ -294,9 +294,9 @@ def test_the_slider_leaves_out_worse_grasps(page: Any) -> None:
             value,
         )
 
-    assert becomes(page, "/grasps/0/1", False) and becomes(page, "/grasps/0/2", True)
-    put(0)
     assert becomes(page, "/grasps/0/-1", True) and becomes(page, "/grasps/0/0", True)
+    put(2)
+    assert becomes(page, "/grasps/0/1", False) and becomes(page, "/grasps/0/2", True)
     put(3)
     assert becomes(page, "/grasps/0/2", False) and becomes(page, "/grasps/0/3", True)
     assert "0.75" in page.inner_text("#least-word")

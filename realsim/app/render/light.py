@@ -19,7 +19,7 @@ from realsim.records import CameraIntrinsics, View
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.labels import LabelRenderer, Labels
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
-from realsim.review.content.content import spread, strided
+from realsim.review.content.views import spread, strided
 from realsim.store import SessionStore
 from realsim_sim_bridge.synthetic.scene import SyntheticScene
 

@@ -129,7 +129,7 @@ def page_of(
     for section in report.sections:
         page.parts += section.page.parts
     if times:
-        page.section("Cost of the run")
+        page.section("Cost of the run", folded=f"{sum(t.wall_s for t in times):.0f} s")
         rows = [[t.name, f"{t.cpu_s:.1f}", f"{t.wall_s:.1f}"] for t in times]
         page.table(["stage", "CPU [s]", "clock [s]"], rows)
     return page

@@ -28,7 +28,7 @@ VERDICTS = {
     "bad": ("Do not use it yet", "bad"),
     "look": ("Look first", "warn"),
     "unfinished": ("Not finished", "off"),
-    "sound": ("Nothing speaks against it", "good"),
+    "sound": ("All checks passed", "good"),
 }
 
 
@@ -148,7 +148,8 @@ def _leading(report: Report) -> list[tuple[str, str]]:
         if name not in figures or len(found) == 3:
             continue
         f = figures[name]
-        value = f"{f.shown} {f.meaning.unit}".strip()
+        told = f.shown if f.sigma else f"{float(f'{f.value:.3g}'):g}"
+        value = f"{told} {f.meaning.unit}".strip()
         if name == "registration.accepted":
             value = f"{f.value:.0f} of {figures['registration.objects'].value:.0f}"
         found.append((value, f.meaning.text))
@@ -197,10 +198,8 @@ def _why(report: Report) -> str:
     missing = [s.title.lower() for s in report.missing if s.key in NEEDED]
     if missing:
         told.append(f"missing: {', '.join(missing)}")
-    if not told:
-        return "Every check that was made is passed."
     text = "; ".join(told)
-    return f"{text[0].upper()}{text[1:]}."
+    return f"{text[0].upper()}{text[1:]}." if text else ""
 
 
 def truth_section(

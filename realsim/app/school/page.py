@@ -142,6 +142,6 @@ def page_bytes(
     page.table(REASON_HEADER, reason_rows(sets))
     page.section("What the filters took", "Candidates before the arm and physics had their say.")
     page.table(FILTER_HEADER, filter_rows(sets, models))
-    page.section("Summary", "Row by row as in the paper's table of statistics.")
+    page.section("Summary", "As in the paper's table: by its limits, but for 'nominal' rows.")
     page.table(SUMMARY_HEADER, summarise(sets).to_rows())
     return page.encode()

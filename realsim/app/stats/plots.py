@@ -1,6 +1,7 @@
 """The pictures of the statistics: what became of grasps, how visible and certain objects are."""
 
 from collections import Counter
+from typing import Any
 
 import numpy as np
 
@@ -13,13 +14,16 @@ from realsim.pages.plots import (
     MUTED,
     VERDICT_COLORS,
     WARN,
-    columns,
+    WIDE_PX,
+    WIDTH_PX,
+    axes,
     legend,
     png,
     share_bars,
     titled,
     whole_numbers,
 )
+from realsim.records import GraspSet
 from realsim_sim_bridge.school.measure_statistics import label_chart
 from realsim_sim_bridge.school.summary import GOOD as GOOD_OUTCOMES
 from realsim_sim_bridge.school.summary import OUTCOME_NAMES, PAPER_CANDIDATES, PAPER_OUTCOMES
@@ -27,25 +31,35 @@ from realsim_sim_bridge.school.summary import OUTCOME_NAMES, PAPER_CANDIDATES, P
 BINS = 20
 LEAST_BINS = 5
 """Numbers that an axis of counts spans at least: one bar alone would be as wide as the plot."""
+THIRD_PX = WIDE_PX // 3 - 18
+"""Width of a picture of which three stand side by side [px]."""
 WIDE = 0.3
 """Room beside the first and the last bar [bars]."""
 
 
-def figures(stats: Statistics) -> list[tuple[str, bytes]]:
-    """Return (caption, picture) of everything that there are figures for."""
-    drawn: list[tuple[str, bytes]] = []
+Drawn = tuple[bytes, str]
+"""A picture and its caption."""
+
+
+def figures(stats: Statistics) -> list[tuple[str, int, list[Drawn]]]:
+    """Return (title, width of a picture [px], pictures) of everything that there are figures for.
+
+    Pictures stand side by side where the page is wide enough, and one below the other on a phone.
+    """
+    drawn: list[tuple[str, int, list[Drawn]]] = []
     if stats.school.judged:
-        drawn.append(("What became of the candidates, beside the paper's", _outcomes(stats)))
-        drawn.append(("p_hold or score, and force closure against it", _labels(stats)))
+        both = [_outcomes(stats), _labels(stats)]
+        drawn.append(("What became of the candidates, beside the paper's", WIDTH_PX, both))
+        drawn.append(("Force closure against p_hold or score", WIDTH_PX, [_closure(stats)]))
     if len(stats.visibility) or stats.objects:
-        drawn.append(("How visible and how certain the objects are", _trust(stats)))
-    if stats.objects:
-        drawn.append(("Objects, frames and verdicts of the scenes", _scenes(stats)))
+        drawn.append(("How visible and how certain the objects are", THIRD_PX, _trust(stats)))
+    if stats.objects and len(stats.sessions) > 1:  # of one, the table says it
+        drawn.append(("Objects, frames and verdicts of the scenes", THIRD_PX, _scenes(stats)))
     return drawn
 
 
-def _outcomes(stats: Statistics) -> bytes:
-    figure, (ax,) = columns(1)
+def _outcomes(stats: Statistics) -> Drawn:
+    figure, ax = axes()
     school = stats.school.by_paper or stats.school
     names = [n for n in OUTCOME_NAMES if school.outcomes[n] or n in PAPER_OUTCOMES]
     rows = np.arange(len(names))
@@ -61,15 +75,26 @@ def _outcomes(stats: Statistics) -> bytes:
                     color=MUTED)  # fmt: skip
     ax.set_yticks(rows, [OUTCOME_NAMES[n] for n in names])
     ax.invert_yaxis()
+    ax.margins(x=0.12)
     titled(ax, f"{school.judged:,} candidates, score_paper", "share [%]", "")
-    return png(figure)
+    return png(figure), "Coloured: here. Grey: in the paper."
 
 
-def _labels(stats: Statistics) -> bytes:
-    figure, (left, right) = columns(2)
-    sets = [s for session in stats.sessions for s in session.sets]
-    counts, title, name = label_chart(sets)
-    share_bars(left, counts, title, name, "grasps")
+def _labels(stats: Statistics) -> Drawn:
+    figure, ax = axes()
+    counts, title, name = label_chart(_sets(stats))
+    share_bars(ax, counts, title, name, "grasps")
+    return png(figure), "Red: below 0.5."
+
+
+def _sets(stats: Statistics) -> list[GraspSet]:
+    return [s for session in stats.sessions for s in session.sets]
+
+
+def _closure(stats: Statistics) -> Drawn:
+    figure, right = axes()
+    sets = _sets(stats)
+    name = label_chart(sets)[2]
     groups: dict[float, list[float]] = {}
     for s in sets:
         friction = s.measures.get("closure_friction")
@@ -86,15 +111,20 @@ def _labels(stats: Statistics) -> bytes:
         right.text(k, 1.04, f"{len(values)}", ha="center", fontsize=7, color=MUTED)
     right.set_xticks(range(len(levels)), ["none" if np.isinf(v) else f"{v:g}" for v in levels])
     right.set_ylim(-0.02, 1.12)
-    titled(right, f"{name} by the friction that closes (dot mean, bar middle half, above grasps)",
-            "least friction that closes", name)  # fmt: skip
+    titled(right, f"{name} by the friction that closes", "least friction that closes", name)
     if not levels:
         right.text(0.5, 0.5, "force closure was not computed", ha="center", color=MUTED, fontsize=9)
-    return png(figure)
+    return png(figure), "Dot: mean. Bar: middle half. Grey: number of grasps."
 
 
-def _trust(stats: Statistics) -> bytes:
-    figure, (left, middle, right) = columns(3)
+def _thirds() -> tuple[list[Any], list[Any]]:
+    """Return three figures, and the axes of each."""
+    drawn = [axes(width_px=THIRD_PX) for _ in range(3)]
+    return [figure for figure, _ in drawn], [ax for _, ax in drawn]
+
+
+def _trust(stats: Statistics) -> list[Drawn]:
+    drawn, (left, middle, right) = _thirds()
     seen = stats.visibility
     left.hist(seen, np.linspace(0, 1, BINS + 1).tolist(), color=GOOD, rwidth=0.9)
     titled(left, f"Visible share, {len(seen):,} objects in frames", "visible share", "number")
@@ -113,11 +143,11 @@ def _trust(stats: Statistics) -> bytes:
             ax.text(0.5, 0.5, "not known", ha="center", transform=ax.transAxes, color=MUTED)
         titled(ax, "Uncertainty of the poses, 1 sigma", f"[{unit}]", "objects")
         whole_numbers(ax.yaxis)
-    return png(figure)
+    return [(png(figure), "") for figure in drawn]
 
 
-def _scenes(stats: Statistics) -> bytes:
-    figure, (left, middle, right) = columns(3)
+def _scenes(stats: Statistics) -> list[Drawn]:
+    drawn, (left, middle, right) = _thirds()
     counts = np.array([len(s.objects) for s in stats.sessions])
     edges = np.arange(counts.min(), counts.max() + 2) - 0.5
     left.hist(counts, edges.tolist(), color=GOOD, rwidth=0.9)
@@ -142,4 +172,4 @@ def _scenes(stats: Statistics) -> bytes:
               color=[VERDICT_COLORS[v] for v in VERDICTS])  # fmt: skip
     titled(right, "Verdicts", "", "objects")
     whole_numbers(left.xaxis, left.yaxis, middle.yaxis, right.yaxis)
-    return png(figure)
+    return [(png(figure), "") for figure in drawn]

@@ -30,6 +30,10 @@ from realsim.pages import Page
 from realsim.store import atomic
 
 HEADER = ("property", "here", "in the paper")
+PAPER_TEXT = (
+    "Rows that begin with 'nominal', and the tables of sessions and objects below, use the nominal "
+    "score. The other rows on grasps use the paper's limits, score_paper."
+)
 TABLES = ("statistics.csv", "sessions.csv", "objects.csv")
 PAGE, DOCUMENT = "statistics.html", "statistics.json"
 
@@ -181,20 +185,25 @@ def _write_page(path: Path, stats: Statistics, notes: list[str]) -> None:
     )
     for note in notes:
         page.text(note, "note")
-    for title, picture in figures(stats):
+    for title, width_px, pictures in figures(stats):
         page.section(title)
-        page.picture(picture, "")
-    page.section("Statistics, row by row as in the paper")
+        page.pictures(pictures, width_px=width_px, kind="plots")
+    page.section("Statistics, row by row as in the paper", PAPER_TEXT)
     page.table(HEADER, all_rows(stats))
     page.section("Beside other data sets", landscape.LANDSCAPE_TEXT)
     page.table(landscape.LANDSCAPE_HEADER, [*landscape.LANDSCAPE, landscape.landscape_row(stats)])
     page.section("Grasps beside those of other data sets", landscape.GRASPS_TEXT)
     page.table(landscape.GRASPS_HEADER, [*landscape.GRASPS, landscape.grasps_row(stats)])
     page.section("Sessions")
-    page.table(SESSION_HEADER, _shown(session_table(stats)))
+    page.table(_words(SESSION_HEADER), _shown(session_table(stats)))
     page.section("Objects")
-    page.table(OBJECT_HEADER, _shown(object_table(stats)))
+    page.table(_words(OBJECT_HEADER), _shown(object_table(stats)))
     atomic.write_bytes(path, page.encode())
+
+
+def _words(header: Sequence[str]) -> list[str]:
+    """Return names of columns that break into lines."""
+    return [name.replace("_", " ") for name in header]
 
 
 def _shown(rows: Sequence[Sequence[Cell]]) -> list[list[str]]:

@@ -25,15 +25,8 @@ from realsim.review.content.views import (
     placed_views,
     region_of,
     spread,
-    strided,
-    worst_first,
 )
 from realsim.store import SessionStore, load_grasps, load_scene
-
-__all__ = [
-    "FirstLook", "LeveledCloud", "Region", "SceneConfig", "SceneContent", "first_look",
-    "placed_views", "region_of", "spread", "strided", "worst_first",
-]  # fmt: skip
 
 Progress = Callable[[int, int], None]
 

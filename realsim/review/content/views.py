@@ -9,10 +9,9 @@ from numpy.typing import ArrayLike
 from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, ObjectPose, View
+from realsim.review.scene_list import VERDICT_ORDER
 from realsim.store import SessionStore
 
-VERDICT_ORDER = ("rejected", "doubtful", "unchecked", "accepted")
-"""Worst first."""
 LOOK_NEARER = 0.8
 """Distance of the first look, as a share of the cameras' own."""
 LOOK_DOWN_RAD = 0.6

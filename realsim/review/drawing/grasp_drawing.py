@@ -29,6 +29,9 @@ HIDDEN_M = 0.01
 """A contact is seen if no measured surface is nearer to the camera by this much [m]: noise and
 the error of a pose are less, the thickness of an object is more."""
 
+FAILED, HELD = "any failure", "none: it held"
+"""What `GraspFilter.failure` asks for beside words of the failures themselves."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class GraspFilter:
@@ -45,7 +48,8 @@ class GraspFilter:
     instance: int | None = None
     """Only those of this object; None = of all."""
     failure: str = ""
-    """Only those whose failure says this, such as 'lift' or 'collides'; '' = all."""
+    """Only those whose failure says this, such as 'lift' or 'collides'; '' = all. `FAILED` = those
+    that failed anywhere, `HELD` = those of which no failure is told."""
     show: bool = True
     """Whether any are drawn."""
 
@@ -72,9 +76,7 @@ def passing(grasps: GraspSet, chosen: GraspFilter) -> Rows:
         rows = [r for r in chosen.visible.get(grasps.instance, ()) if 0 <= r < len(grasps)]
         seen[rows] = True
         keep &= seen
-    if chosen.failure:
-        word = chosen.failure.casefold()
-        keep &= np.array([word in f.casefold() for f in grasps.failures], np.bool_)
+    keep &= _says(grasps, chosen.failure)
     return np.flatnonzero(keep)
 
 
@@ -94,11 +96,19 @@ def chosen_grasps(
     return [(g, rows) for g, rows in found if len(rows)]
 
 
-def failure_choices(sets: Sequence[GraspSet]) -> tuple[str, ...]:
-    """Return the words to filter failures by, those that some grasp's failure says."""
-    words = (*STAGES, "collides", "inverse kinematics", "joint limits")
-    failures = {f.casefold() for g in sets for f in g.failures if f}
-    return tuple(w for w in words if any(w in f for f in failures))
+def _says(grasps: GraspSet, failure: str) -> Mask:
+    """Return (N,) which grasps failed by what `GraspFilter.failure` asks for."""
+    if failure in (FAILED, HELD):
+        return np.array([bool(f) == (failure == FAILED) for f in grasps.failures], np.bool_)
+    word = failure.casefold()
+    return np.array([word in f.casefold() for f in grasps.failures], np.bool_)
+
+
+def failure_choices(sets: Sequence[GraspSet]) -> dict[str, str]:
+    """Return what failures can be filtered by, with its count -> `GraspFilter.failure`."""
+    words = (FAILED, HELD, *STAGES, "collides", "inverse kinematics", "joint limits", "not tested")
+    counts = {w: sum(int(_says(g, w).sum()) for g in sets) for w in words}
+    return {f"{w} ({n})": w for w, n in counts.items() if n}
 
 
 def visible_grasps(

@@ -23,7 +23,7 @@ class GraspNodes:
         """Draw nothing yet."""
         self._api, self._config = api, config
         self._node: viser.BatchedMeshHandle | None = None
-        self._drawn: list[tuple[int, int]] = []
+        self.drawn: list[tuple[int, int]] = []
         """Instance and row of every gripper, in the order of the batch."""
         self._on_click: list[Callable[[int, int], None]] = []
 
@@ -39,14 +39,14 @@ class GraspNodes:
         widths = np.concatenate([g.widths_m[rows] for g, rows in found])
         rgb = np.concatenate([grasp_rgb(g, rows) for g, rows in found])
         vertices, faces = gripper_mesh(self._config.gripper)
-        self._drawn = [(g.instance, int(row)) for g, rows in found for row in rows]
+        self.drawn = [(g.instance, int(row)) for g, rows in found for row in rows]
         # Off: of two dozen triangles nothing can be left out.
         self._node = self._api.add_batched_meshes_simple(
             NAME, vertices, faces, wxyzs, positions, batched_scales=gripper_scales(widths),
             batched_colors=linear_rgb(rgb), lod="off", flat_shading=True,
             side="double", cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
-        drawn = self._drawn
+        drawn = self.drawn
 
         def clicked(event: Any) -> None:
             index = event.instance_index
@@ -55,7 +55,7 @@ class GraspNodes:
                     callback(*drawn[index])
 
         self._node.on_click(clicked)
-        return len(self._drawn)
+        return len(self.drawn)
 
     def on_click(self, callback: Callable[[int, int], None]) -> None:
         """Call back with instance and row of a grasp that is clicked."""
@@ -66,4 +66,4 @@ class GraspNodes:
         if self._node is not None:
             self._node.remove()
             self._node = None
-        self._drawn = []
+        self.drawn = []

@@ -6,7 +6,7 @@ switched by one message. What is rarely looked at is sent when it is first asked
 """
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, get_args
 
 import numpy as np
@@ -15,7 +15,7 @@ import viser
 from realsim.arrays import Array, Array32, UInt8
 from realsim.errors import InputError
 from realsim.interop import viser_wxyz_position
-from realsim.records import ObjectModel
+from realsim.records import ObjectModel, View
 from realsim.rendering.overlay import VERDICT_RGB
 from realsim.review.content.config import SceneConfig
 from realsim.review.content.content import SceneContent
@@ -77,7 +77,8 @@ class SceneNodes:
         with self._lock:
             self._api.set_up_direction(self._content.look.up)
             if self._content.scene.plane is not None:
-                self._add_table(self._content.scene.plane.T_world_table)
+                T_world_table = self._content.scene.plane.T_world_table
+                self._grid = add_table(self._api, T_world_table, self._config)
             for placed in self._content.scene.objects:
                 self._add_object(placed.instance, placed.T_world_obj)
             self._cloud.build()
@@ -167,7 +168,7 @@ class SceneNodes:
                 return
             name = self._root(instance).name
             mesh = self._content.meshes[self._models[instance]]
-            lines = _box_lines(mesh.low - BOX_MARGIN_M, mesh.high + BOX_MARGIN_M)
+            lines = box_edges(mesh.low, mesh.high)
             self._box = self._api.add_line_segments(
                 f"{name}/box", lines, HIGHLIGHT_RGB, thickness=2.0, thickness_units="screen",
             )  # fmt: skip
@@ -304,32 +305,12 @@ class SceneNodes:
 
     def _add_cameras(self) -> None:
         """Add a frustum with its photograph per shown view."""
-        i = self._content.intrinsics
-        fov = 2 * float(np.arctan2(i.height / 2, i.fy))
         self._cameras = self._api.add_frame("/cameras", show_axes=False)
         for view in self._content.shown_views:
-            wxyz, position = viser_wxyz_position(np.asarray(view.T_world_cam))
-            handle = self._api.add_camera_frustum(
-                f"/cameras/{view.index:06d}", fov, i.width / i.height,
-                scale=self._config.frustum_m, thickness=FRUSTUM_LINE_M, color=FRUSTUM_RGB,
-                format="jpeg", wxyz=wxyz, position=position, cast_shadow=False,
-                receive_shadow=False,
-            )  # fmt: skip
-            jpeg = self._content.thumbnails.get(view.index)
-            if jpeg is not None:
-                # The JPEG itself: `image` would be encoded again for every browser.
-                handle._image_data = jpeg  # pyright: ignore[reportPrivateUsage]
+            name = f"/cameras/{view.index:06d}"
+            handle = add_frustum(self._api, name, view, self._content, self._config)
             handle.on_click(lambda _, index=view.index: self._tell(self._on_camera, index))
             self._frustums[view.index] = handle
-
-    def _add_table(self, T_world_table: Array) -> None:
-        """Add the support plane as a grid of 5 cm, and 25 cm in bold."""
-        wxyz, position = viser_wxyz_position(T_world_table)
-        self._grid = self._api.add_grid(
-            "/table", self._config.grid_m, self._config.grid_m, cell_size=0.05, section_size=0.25,
-            cell_color=(205, 205, 205), section_color=(150, 150, 150),
-            plane_color=(235, 235, 235), plane_opacity=0.35, wxyz=wxyz, position=position,
-        )  # fmt: skip
 
     # --- grasps -------------------------------------------------------------------------------
 
@@ -361,6 +342,11 @@ class SceneNodes:
         """Call back with the number of the view whose frustum is clicked."""
         self._on_camera.append(callback)
 
+    @property
+    def drawn_grasps(self) -> Sequence[tuple[int, int]]:
+        """Instance and row of every grasp that is drawn."""
+        return self._grasps.drawn
+
     def on_grasp(self, callback: OnGrasp) -> None:
         """Call back with instance and row of a grasp that is clicked."""
         self._grasps.on_click(callback)
@@ -370,8 +356,37 @@ class SceneNodes:
             callback(number)
 
 
-def _box_lines(low: Array, high: Array) -> Array32:
-    """Return the edges (12, 2, 3) of a box of these corners (3,)."""
+def add_frustum(
+    api: viser.SceneApi, name: str, view: View, content: SceneContent, config: SceneConfig
+) -> viser.CameraFrustumHandle:
+    """Add the camera of a view with its photograph, if it has one."""
+    i = content.intrinsics
+    wxyz, position = viser_wxyz_position(np.asarray(view.T_world_cam))
+    handle = api.add_camera_frustum(
+        name, 2 * float(np.arctan2(i.height / 2, i.fy)), i.width / i.height,
+        scale=config.frustum_m, thickness=FRUSTUM_LINE_M, color=FRUSTUM_RGB, format="jpeg",
+        wxyz=wxyz, position=position, cast_shadow=False, receive_shadow=False,
+    )  # fmt: skip
+    jpeg = content.thumbnails.get(view.index)
+    if jpeg is not None:
+        # The JPEG itself: `image` would be encoded again for every browser.
+        handle._image_data = jpeg  # pyright: ignore[reportPrivateUsage]
+    return handle
+
+
+def add_table(api: viser.SceneApi, T_world_table: Array, config: SceneConfig) -> viser.GridHandle:
+    """Add the support plane as a grid of 5 cm, and 25 cm in bold."""
+    wxyz, position = viser_wxyz_position(T_world_table)
+    return api.add_grid(
+        "/table", config.grid_m, config.grid_m, cell_size=0.05, section_size=0.25,
+        cell_color=(205, 205, 205), section_color=(150, 150, 150),
+        plane_color=(235, 235, 235), plane_opacity=0.35, wxyz=wxyz, position=position,
+    )  # fmt: skip
+
+
+def box_edges(low: Array, high: Array) -> Array32:
+    """Return the edges (12, 2, 3) of a box that stands off these corners (3,) [m]."""
+    low, high = low - BOX_MARGIN_M, high + BOX_MARGIN_M
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     edges = [(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1]
     return (low + corners[np.array(edges)] * (high - low)).astype(np.float32)

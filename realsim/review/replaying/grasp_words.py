@@ -9,14 +9,22 @@ import re
 import numpy as np
 
 from realsim.records import STAGES, GraspSet
+from realsim.records.grasps import LABEL_MEASURES
 
 SHARE_WORDS = {
     "share_blocked": "fingers touch while open",
     "share_missed": "a pad meets nothing",
-    "share_skewed": "pads outside the friction cone",
-    "share_overloaded": "too large a load",
+    "share_skewed": "the pads meet it outside the friction cone",
+    "share_overloaded": "the load is too large",
 }
 """Why draws of p_hold failed."""
+STAGE_WORDS = dict(
+    zip(STAGES, ("while the fingers closed", "during the lift", "while it was shaken",
+                 "while it was swung"), strict=True)
+)  # fmt: skip
+"""When a grasp failed, by the stage that its failure names."""
+HOLDS_FROM = 0.5
+"""Least p_hold of a grasp of which no failure is told."""
 MEASURE_WORDS = {
     "score_paper": "score by the paper's limits",
     "margin": "share of the tried frictions and forces that hold",
@@ -50,13 +58,12 @@ def grasp_words(grasps: GraspSet, row: int, name: str = "") -> str:
     lines = [
         f"**Grasp {row}** of {len(grasps)}, {of}",
         "",
+        why_words(grasps, row),
+        "",
         *_p_hold(grasps, row),
         _score(grasps, row),
+        f"- {_reach(grasps, row)}",
     ]
-    why = failure_words(grasps, row)
-    if why:
-        lines.append(f"- {why}")
-    lines.append(f"- {_reach(grasps, row)}")
     lines.append(f"- distance of the contacts {1e3 * grasps.widths_m[row]:.1f} mm")
     lines += ["", *slip_table(grasps, row)]
     measured = measure_lines(grasps, row)
@@ -105,14 +112,24 @@ def measure_lines(grasps: GraspSet, row: int) -> list[str]:
     return lines
 
 
-def failure_words(grasps: GraspSet, row: int) -> str:
-    """Return why a grasp stopped where it stopped; '' = it passed all four stages."""
-    why = grasps.failures[row]
-    if why:
-        return f"stopped at {escaped(why)}" if why.split(":")[0] in STAGES else escaped(why)
+def why_words(grasps: GraspSet, row: int) -> str:
+    """Return in one sentence why a grasp failed, or that it held."""
+    stage, _, told = grasps.failures[row].partition(":")
+    why = escaped(told.strip() if stage in STAGE_WORDS else grasps.failures[row]).rstrip(".")
+    if stage in STAGE_WORDS:
+        return f"It failed {STAGE_WORDS[stage]}: {why}."
+    if not grasps.reachable[row]:
+        return f"The arm does not reach it: {why}." if why else "The arm does not reach it."
     if np.isnan(grasps.scores[row]):
-        return "not tried"
-    return ""
+        return f"It was not tried: {why}." if why else "It was not tried."
+    if why or not grasps.base_scores[row] >= 1.0:
+        return f"It failed: {why or 'no reason is stored'}."
+    p_hold = _value(grasps, row, "p_hold")
+    if not p_hold < HOLDS_FROM:
+        return "It held in all four stages."
+    share, words = max((np.nan_to_num(_value(grasps, row, n)), w) for n, w in SHARE_WORDS.items())
+    often = f", most often because {words}" if share > 0 else ""
+    return f"It held as planned, but fails in {100 - 100 * p_hold:.0f} % of the draws{often}."
 
 
 def escaped(text: str) -> str:
@@ -133,20 +150,21 @@ def one_line(text: str) -> str:
 
 def _p_hold(grasps: GraspSet, row: int) -> list[str]:
     """Return p_hold with its error, and why draws failed; nothing where it is not known."""
-
-    def value(name: str) -> float:
-        return float(grasps.measures[name][row]) if name in grasps.measures else np.nan
-
-    if np.isnan(value("p_hold")):
+    p_hold, error, draws = (_value(grasps, row, n) for n in LABEL_MEASURES[:3])
+    if np.isnan(p_hold):
         return []
-    told = f"- p_hold **{value('p_hold'):.2f}**"
-    if np.isfinite(value("p_hold_error")):
-        told += f" ± {value('p_hold_error'):.2f}"
-    if np.isfinite(value("p_hold_draws")):
-        told += f" of {value('p_hold_draws'):.0f} draws"
+    told = f"- p_hold **{p_hold:.2f}**"
+    told += f" ± {error:.2f}" if np.isfinite(error) else ""
+    told += f" of {draws:.0f} draws" if np.isfinite(draws) else ""
     told += ": few, take it as a guess" if grasps.unsure[row] else ""
-    shares = [f"{words} {100 * value(n):.0f} %" for n, words in SHARE_WORDS.items() if value(n) > 0]
+    each = ((100 * _value(grasps, row, n), words) for n, words in SHARE_WORDS.items())
+    shares = [f"{words} {share:.0f} %" for share, words in each if share > 0]
     return [told, *([f"- draws that fail: {', '.join(shares)}"] if shares else [])]
+
+
+def _value(grasps: GraspSet, row: int, name: str) -> float:
+    """Return a measure of a grasp; NaN = not measured."""
+    return float(grasps.measures[name][row]) if name in grasps.measures else np.nan
 
 
 def _score(grasps: GraspSet, row: int) -> str:

@@ -21,17 +21,14 @@ from realsim.review.content.content import SceneContent
 from realsim.review.content.meshes import glb_of, within_budget
 from realsim.review.content.views import spread
 from realsim.review.drawing.grasp_drawing import gripper_mesh, gripper_scales, linear_rgb
+from realsim.review.drawing.scene_nodes import add_frustum, add_table, box_edges
 
 LABEL_EDGES = (0.0, 0.25, 0.5, 0.75)
 """Lower ends of the classes of p_hold or score that the page can show or hide."""
 BOX_LINE_M = 0.0015
 """Thickness of the box about the chosen object [m]."""
-BOX_GROWN = 0.05
-"""By which share of its size the box stands off the object."""
 POINT_SHARE = 0.5
 """Size of a drawn point over the voxels: gaps let the models be seen behind their points."""
-FRUSTUM_RGB = (70, 96, 140)
-FRUSTUM_LINE_M = 0.0008
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -100,52 +97,11 @@ def _build(api: Any, content: SceneContent, scene: Scene, size: StaticSize) -> N
             precision="float32",
         )
     if scene.plane is not None:
-        _add_table(api, scene.plane.T_world_table, config.grid_m)
-    _add_cameras(api, content, size, config)
+        add_table(api, scene.plane.T_world_table, config)
+    for view in spread(content.shown_views, size.cameras):
+        add_frustum(api, f"/cameras/{view.index}", view, content, config)
     _add_objects(api, content, scene, size)
     _add_grasps(api, content, scene, size, config)
-
-
-def _add_table(api: Any, T_world_table: Array, grid_m: float) -> None:
-    wxyz, position = viser_wxyz_position(T_world_table)
-    api.add_grid(
-        "/table",
-        grid_m,
-        grid_m,
-        cell_size=0.05,
-        section_size=0.25,
-        cell_color=(205, 205, 205),
-        section_color=(150, 150, 150),
-        plane_color=(235, 235, 235),
-        plane_opacity=0.35,
-        wxyz=wxyz,
-        position=position,
-    )
-
-
-def _add_cameras(api: Any, content: SceneContent, size: StaticSize, config: SceneConfig) -> None:
-    import cv2
-
-    k = content.intrinsics
-    fov = 2.0 * float(np.arctan2(k.height / 2.0, k.fy))
-    for view in spread(content.shown_views, size.cameras):
-        assert view.T_world_cam is not None, "only views with a pose are shown"
-        wxyz, position = viser_wxyz_position(view.T_world_cam)
-        jpeg = np.frombuffer(content.thumbnails[view.index], dtype=np.uint8)
-        api.add_camera_frustum(
-            f"/cameras/{view.index}",
-            fov,
-            k.width / k.height,
-            scale=config.frustum_m,
-            thickness=FRUSTUM_LINE_M,
-            color=FRUSTUM_RGB,
-            image=np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_COLOR_RGB), dtype=np.uint8),
-            format="jpeg",
-            jpeg_quality=80,
-            wxyz=wxyz,
-            position=position,
-            cast_shadow=False,
-        )
 
 
 def _add_objects(api: Any, content: SceneContent, scene: Scene, size: StaticSize) -> None:
@@ -168,22 +124,13 @@ def _add_objects(api: Any, content: SceneContent, scene: Scene, size: StaticSize
         )
         api.add_line_segments(
             f"/boxes/{placed.instance}",
-            box_edges(*meshes[placed.obj_id].bounds).astype(np.float32),
+            box_edges(*meshes[placed.obj_id].bounds),
             VERDICT_RGB[placed.verdict],
             thickness=BOX_LINE_M,
             wxyz=wxyz,
             position=position,
             visible=False,
         )
-
-
-def box_edges(low: Array, high: Array) -> Array:
-    """Return the edges (12, 2, 3) of a box that stands off these corners (3,) and (3,) [m]."""
-    pad = BOX_GROWN * float(np.linalg.norm(high - low)) / 2.0
-    axes = np.stack([low - pad, high + pad], axis=1)
-    corners = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    pairs = [(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit]
-    return corners[np.array(pairs)]
 
 
 def _add_grasps(

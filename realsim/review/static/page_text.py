@@ -7,11 +7,12 @@ import numpy as np
 from realsim.records import GraspSet, ObjectModel, ObjectPose, Scene
 from realsim.rendering.overlay import VERDICT_RGB
 from realsim.review.content.content import SceneContent
-from realsim.review.content.views import VERDICT_ORDER, worst_first
+from realsim.review.content.views import worst_first
 from realsim.review.corrections import corrected_scene, decision_on
 from realsim.review.journal import Entry, ReviewState
 from realsim.review.placing.ellipsoid import rotation_sigmas_deg
 from realsim.review.replaying.grasp_words import one_line
+from realsim.review.scene_list import VERDICT_ORDER
 
 NOT_KNOWN = "not known"
 DECISION_WORDS = {"accept": "accepted", "reject": "rejected"}

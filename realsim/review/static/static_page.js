@@ -4,7 +4,7 @@
 const data = JSON.parse(document.getElementById("data").textContent);
 const frame = document.getElementById("viewer");
 const shown = { objects: true, cloud: true, cameras: false, table: true, grasps: true };
-let chosen = null, least = data.least, ownOnly = false, viewer = null;
+let chosen = null, least = 0, ownOnly = false, viewer = null;
 
 function send(...messages) {
   if (viewer === null) return;
@@ -122,14 +122,26 @@ function clicked(message) {
   else if (kind === "objects" && chosen !== Number(number)) choose(Number(number));
 }
 
+// What tells of the browser's graphics stands below, not before the scene.
+const BELOW = '.mantine-Notifications-root[data-position^="top"] { inset: auto auto 12px 12px !important; }';
+
 function begin() {
-  const inside = frame.contentWindow;
+  const inside = frame.contentWindow, test = document.createElement("canvas");
+  if (!test.getContext("webgl2") && !test.getContext("webgl")) {
+    document.getElementById("wait").textContent = "This browser cannot draw in three dimensions (WebGL is "
+      + "off), so the scene is not shown; the list and the photographs are. Switch on hardware "
+      + "acceleration in its settings, or use another browser.";
+    return;
+  }
   const names = inside.__viserSceneTree ? Object.keys(inside.__viserSceneTree.getState()) : [];
   const found = inside.__viserMutable;
   const ready = found && found.cameraControl && data.nodes.every((n) => names.includes(n));
   if (!ready) { setTimeout(begin, 50); return; }
   viewer = found;
   viewer.sendMessage = clicked;
+  const style = inside.document.createElement("style");
+  style.textContent = BELOW;
+  inside.document.head.append(style);
   const bindings = [{ button: "left", modifier: null }];
   const clickable = [...data.objects.map((o) => `/objects/${o.instance}`),
     ...data.cameras.map((c) => `/cameras/${c.view}`)];

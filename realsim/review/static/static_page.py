@@ -52,9 +52,6 @@ its decoder from the page itself, for which it needs `eval` and addresses of the
 data."""
 TRIES = 6
 """How often the scene is halved to fit; 64 times smaller is no scene."""
-LEAST_CLASS = 2
-"""The class of labels from which grasps are shown at first: half of the stages passed, or p_hold
-0.5."""
 ASIDE_M = 0.25
 """How far before a camera the point is that one looks at from it [m]."""
 MADE_WITH = (
@@ -209,7 +206,7 @@ def _page(
         left_out=state.excluded_views(), footer=_footer(content, size, words),
         label=label_words(sets) if any(len(g) for g in sets) else "",
         pale="; pale: p_hold of few draws" * any(g.unsure.any() for g in sets),
-        least_class=LEAST_CLASS, last_class=len(LABEL_EDGES) - 1,
+        last_class=len(LABEL_EDGES) - 1,
         viewer=Markup(html.escape(viewer_html(content, scene, size), quote=True)),
         data=Markup(_json(_data(content, scene, size))), script=Markup(script),
     )  # fmt: skip
@@ -248,7 +245,6 @@ def _data(content: SceneContent, scene: Scene, size: StaticSize) -> dict[str, An
         "cameras": cameras,
         "grasps": grasps,
         "edges": LABEL_EDGES,
-        "least": LEAST_CLASS,
         "cloud": len(content.cloud) > 0,
         "table": scene.plane is not None,
         "nodes": [f"/objects/{o.instance}" for o in scene.objects]

@@ -31,8 +31,6 @@ STAGES = {
 """What a grasp has passed at least."""
 THIS, EVERY = "this object", "all objects"
 ANY = "any, or none"
-DRAWN_FROM = 0.5
-"""Least p_hold or score of the grasps drawn at first; all of them hide the objects."""
 
 
 class GraspsPanel:
@@ -50,13 +48,20 @@ class GraspsPanel:
         self._show = gui.add_checkbox("Show grasps", False)
         self._of = gui.add_dropdown("Of", (THIS, EVERY))
         self._stage = gui.add_dropdown("Passed", tuple(STAGES))
-        self._least = gui.add_slider("Least score", 0.0, 1.0, 0.05, DRAWN_FROM)
+        self._least = gui.add_slider("Least score", 0.0, 1.0, 0.05, 0.0)
         self._reachable = gui.add_checkbox("The arm reaches it", False)
         self._seen = gui.add_checkbox(
             "The chosen view sees it", False, hint="The view that is chosen under Views."
         )
         self._failure: viser.GuiDropdownHandle[str] = gui.add_dropdown("Failed by", [ANY])
+        self._reasons = {ANY: ""}
         self._drawn = gui.add_markdown("")
+        self._step = gui.add_button_group(
+            "Grasp", ("\u25c0 Prev", "Next \u25b6"), hint="Through those that are drawn."
+        )
+        self._step.on_click(window.guarded(lambda _: self._stepped()))
+        self._at: tuple[int, int] | None = None
+        """Instance and row of the grasp that is looked at."""
         self._legend = gui.add_html("")
         self._words = gui.add_markdown("")
         self._player = ReplayPlayer(
@@ -97,6 +102,7 @@ class GraspsPanel:
         window = self._window
         if instance != window.selected:
             window.select(instance)
+        self._at = instance, row
         grasps = window.content.grasps_of(instance)
         if grasps is None:
             raise InputError(f"instance {instance} has no grasps.")
@@ -115,7 +121,8 @@ class GraspsPanel:
     def opened(self) -> None:
         """Offer the filters of another scene."""
         sets = self._window.content.grasp_sets
-        self._failure.options = (ANY, *failure_choices(sets))
+        self._reasons = {ANY: ""} | failure_choices(sets)
+        self._failure.options = tuple(self._reasons)
         self._least.label = f"Least {label_words(sets)}"
         self._legend.content = legend_html(sets)
         self._words.content = ""
@@ -150,21 +157,28 @@ class GraspsPanel:
         if self._window.is_open and not self._is_closed:
             self._window.show.bring_back_cameras()
 
+    def _stepped(self) -> None:
+        """Go to the next drawn grasp, or the one before, round the list."""
+        drawn = self._window.nodes.drawn_grasps
+        if not self._show.value or not drawn:
+            raise InputError("no grasps are drawn; tick Show grasps or set other filters.")
+        step = 1 if "Next" in self._step.value else -1
+        at = drawn.index(self._at) if self._at in drawn else min(-step, 0)
+        self.clicked(*drawn[(at + step) % len(drawn)])
+
     def _filtered(self) -> None:
         """Whoever sets a filter wants to see what passes it."""
         self._show.value = True
         self.draw()
 
     def _filter(self, sets: tuple[GraspSet, ...]) -> GraspFilter:
-        failure = "" if self._failure.value == ANY else self._failure.value
         return GraspFilter(
             stage=STAGES[self._stage.value],
-            # Whoever asks for failures does not mean the good ones.
-            min_label=0.0 if failure else float(self._least.value),
+            min_label=float(self._least.value),
             reachable_only=self._reachable.value,
             visible=self._rows(sets),
             instance=self._window.selected if self._of.value == THIS else None,
-            failure=failure,
+            failure=self._reasons.get(self._failure.value, ""),
             show=self._show.value,
         )
 
