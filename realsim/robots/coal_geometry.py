@@ -12,6 +12,9 @@ from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Shape
 
 Pair = tuple[int, int]
+DIGITS = 7
+"""Decimals of a distance [m]. coal stops within 1e-6 m, and its last digits hang on where in memory
+a body lies: with them, the same plan made twice in a process has two hashes."""
 
 
 def pinocchio_model(chain: DhChain) -> tuple[Any, Array]:
@@ -129,7 +132,7 @@ class PairDistances:
         for row, q in zip(rows, np.ascontiguousarray(joints), strict=True):
             self._distances(self.model, self.data, self.geometry, self.work, q)
             row[:] = [result.min_distance for result in self._results]
-        return rows
+        return np.round(rows, DIGITS)
 
     def collider(self, margin_m: float) -> "Collider":
         """Return the same pairs as a yes-or-no question with a margin [m]."""
