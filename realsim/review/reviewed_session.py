@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from realsim.review.placing.photograph import Photographs
     from realsim.review.placing.snapping import Snapper
 
+WATCHED = (scene_list.SCENE_FILE, "session.json", "grasps")
+"""What is shown anew when it changes on disk: poses, cameras, grasps."""
 Progress = Callable[[int, int], None]
 """Called with (done, total)."""
 
@@ -39,8 +41,6 @@ class Standing:
     state: ReviewState
     scene: Scene
     """Objects where the reviewers left them, with their verdicts."""
-    damaged: tuple[int, ...]
-    """Numbers of journal lines that are not whole."""
 
 
 class ReviewedSession:
@@ -68,7 +68,7 @@ class ReviewedSession:
         self.number = number
         self.config = config or SceneConfig()
         """How much is shown."""
-        self._scene_stamp = _stamp(store.path(scene_list.SCENE_FILE))
+        self._read = self._seen = self._stamps()
         self.registered: Scene = load_scene(store)
         self.names = _names(store)
         missing = sorted({o.obj_id for o in self.registered.objects} - set(self.names))
@@ -80,6 +80,7 @@ class ReviewedSession:
         self._lock = threading.RLock()
         self._stamp: tuple[int, int] | None = None
         self._standing: Standing | None = None
+        self._rows: tuple[Standing, list[scene_list.ObjectRow]] | None = None
         self._known: dict[str, Entry] = {} if before is None else dict(before._known)
         """Every line that was read or written, by id, whatever became of the file."""
         self._loading = threading.Lock()
@@ -99,10 +100,16 @@ class ReviewedSession:
         """Where the decisions stand."""
         return self.store.path(JOURNAL_FILE)
 
-    @property
-    def is_stale(self) -> bool:
-        """Whether the session was registered anew since it was read."""
-        return _stamp(self.store.path(scene_list.SCENE_FILE)) != self._scene_stamp
+    def has_changed(self) -> bool:
+        """Return whether poses, cameras or grasps were written anew since they were read.
+
+        Only what is the same as at the last call counts: a stage at work is waited for.
+        """
+        was, self._seen = self._seen, self._stamps()
+        return was == self._seen != self._read
+
+    def _stamps(self) -> list[tuple[int, int]]:
+        return [_stamp(self.store.path(name)) for name in WATCHED]
 
     @property
     def has_pending(self) -> bool:
@@ -131,7 +138,7 @@ class ReviewedSession:
             self._check_whole(state)
             scene = corrections.reviewed_scene(self.registered, state)
             self._stamp = stamp
-            self._standing = Standing(state=state, scene=scene, damaged=found.damaged)
+            self._standing = Standing(state=state, scene=scene)
             self._known |= {e.id: e for e in state.entries}
             return self._standing
 
@@ -144,7 +151,7 @@ class ReviewedSession:
             with self._lock:
                 state = journal.replay(tuple(self._known.values()))
                 scene = corrections.reviewed_scene(self.registered, state)
-                return Standing(state=state, scene=scene, damaged=())
+                return Standing(state=state, scene=scene)
 
     def trouble(self) -> str:
         """Return what keeps the journal from being read; '' = nothing."""
@@ -157,10 +164,9 @@ class ReviewedSession:
 
     def entries_seen(self) -> list[Entry]:
         """Return all lines that were read or written, also those whose file is gone since."""
+        _ = self.latest
         with self._lock:
-            return list(
-                {e.id: e for e in (*self.latest.state.entries, *self._known.values())}.values()
-            )
+            return list(self._known.values())
 
     def _check_whole(self, state: ReviewState) -> None:
         """Raise if a journal lacks a line that was read from it before: none is ever removed."""
@@ -185,16 +191,18 @@ class ReviewedSession:
             )
 
     def rows(self, standing: Standing | None = None) -> list[scene_list.ObjectRow]:
-        """Return the objects as the list shows them.
+        """Return the objects as the list shows them; made once for what stands.
 
         Args:
             standing: what the journal adds up to; None = as it is on disk now.
         """
         standing = standing or self.standing
+        if self._rows is not None and self._rows[0] is standing:
+            return self._rows[1]
         corrected = corrections.corrected_scene(self.registered, standing.state)
         rows: list[scene_list.ObjectRow] = []
-        for placed, computed in zip(standing.scene.objects, corrected.objects, strict=True):
-            registered = self.registered.object(placed.instance)
+        all_of = (self.registered.objects, standing.scene.objects, corrected.objects)
+        for registered, placed, computed in zip(*all_of, strict=True):
             rows.append(
                 scene_list.ObjectRow(
                     session=self.number,
@@ -207,6 +215,7 @@ class ReviewedSession:
                     is_changed=journal.subject_of(registered) != journal.subject_of(placed),
                 )
             )
+        self._rows = standing, rows
         return rows
 
     # --- decisions --------------------------------------------------------------------------------

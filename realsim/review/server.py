@@ -242,7 +242,7 @@ class ReviewServer:
                     window.follow(troubles.get(number))
 
     def _renew(self) -> dict[int, Exception]:
-        """Read sessions again that were registered anew, and show them so.
+        """Read sessions again that have changed on disk, and show them so.
 
         Returns:
             Number of a session -> why it cannot be read.
@@ -251,7 +251,7 @@ class ReviewServer:
         for number, session in enumerate(self._sessions):
             try:
                 session.check_folder()
-                if not session.is_stale:
+                if not session.has_changed():
                     _ = session.standing  # Read also while no window is open, to be remembered.
                     continue
                 store = SessionStore.open(session.store.folder)

@@ -179,11 +179,11 @@ def test_the_journal_is_read_again_only_when_it_changed(session: ReviewedSession
 
 
 def test_a_session_that_is_registered_anew_is_noticed(session: ReviewedSession) -> None:
-    assert not session.is_stale and not session.has_pending
+    assert not session.has_changed() and not session.has_pending
     session.decide("reject", seen(session, 3), "ada")
-    assert session.has_pending and not session.is_stale
+    assert session.has_pending and not session.has_changed()
     save_scene(session.store, SCENE)
-    assert session.is_stale
+    assert [session.has_changed() for _ in range(2)] == [False, True]
 
 
 # --- what keeps a line out ----------------------------------------------------------------------

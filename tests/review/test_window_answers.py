@@ -1,11 +1,15 @@
 """What the review page answers when something is amiss; asked by a program, without a browser."""
 
 import errno
+import json
 import os
 import re
+import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +21,17 @@ from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 from websockets.typing import Subprotocol
 
-from realsim import InputError
+from realsim import InputError, ObjectModel, ObjectPose, Scene
+from realsim.formats.bop.models import save_models
+from realsim.geometry import se3
 from realsim.review import ReviewServer
 from realsim.review.window.gui_values import check_update
+from realsim.review.window.place import Place
 from realsim.review.window.window import Window
+from realsim.store import SessionStore, save_grasps, save_scene
+from realsim.store.session_store import rgb_path
 from tests.support.review_browser import SMALL
-from tests.support.reviewed_boxes import boxes_session
+from tests.support.reviewed_boxes import MODELS, SCENE, boxes_session, grasp_set
 
 SOCKET = Subprotocol(f"{viser.__name__}-v{viser.__version__}")
 RED, ORANGE = "realsim-message alarm", "realsim-message refused"
@@ -70,19 +79,22 @@ class Page:
         assert color in self.message
 
 
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[ReviewServer]:
-    review = ReviewServer(boxes_session(tmp_path / "boxes"), port=0, reviewer="ada", config=SMALL)
-    review.start()
-    yield review
-    review.stop()
-
-
-@pytest.fixture
-def page(server: ReviewServer) -> Iterator[Page]:
+@contextmanager
+def opened(store: SessionStore) -> Generator[Page]:
+    server = ReviewServer(store, port=0, reviewer="ada", config=SMALL)
+    server.start()
     address = server.url.replace("http", "ws")
-    with connect(address, subprotocols=[SOCKET], max_size=None, ping_interval=None) as line:
-        yield Page(server, line)
+    try:
+        with connect(address, subprotocols=[SOCKET], max_size=None, ping_interval=None) as line:
+            yield Page(server, line)
+    finally:
+        server.stop()
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[Page]:
+    with opened(boxes_session(tmp_path / "boxes")) as page:
+        yield page
 
 
 def test_a_choice_that_is_not_offered_is_refused_and_never_held(
@@ -202,3 +214,76 @@ def test_keys_change_and_save_nothing_while_a_snap_is_computed(page: Page) -> No
     assert not session.standing.state.entries
     window.correct.enable(True)
     assert window.attempt(lambda: window.correct.nudge("x", -1, "move"))
+
+
+# --- scenes that lack something, or hold much ---------------------------------------------------
+
+
+@pytest.mark.parametrize("lost", ["rgb", "depth"])
+def test_a_scene_without_images_is_drawn_and_told(tmp_path: Path, lost: str) -> None:
+    folder = boxes_session(tmp_path / "boxes").folder
+    shutil.rmtree(folder / lost)
+    with opened(SessionStore.open(folder)) as page:
+        page.wait_message("No view of this scene has a photograph", ORANGE)
+        window = page.window
+        assert window.client.scene.get_handle_by_name("/objects/3/appearance") is not None
+        assert np.isfinite(window.content.look.position).all()
+        assert "No view" in answered(page, "strip")["error"]
+        assert not window.attempt(window.views.show_chosen) and "no view to choose" in page.message
+        assert not window.attempt(window.correct.snap) and "nothing can be snapped" in page.message
+        assert window.attempt(lambda: (window.correct.put_back(), window.object.decide("accept")))
+
+
+def answered(page: Page, what: str) -> Any:
+    path = f"/photograph/{page.window.client.client_id}/-/{what}"
+    kind, data = page.server._asked(path)  # pyright: ignore[reportPrivateUsage]
+    assert kind == "application/json"
+    return json.loads(data)
+
+
+def test_two_thousand_objects_without_texture_and_with_names_of_other_scripts(
+    tmp_path: Path,
+) -> None:
+    store = boxes_session(tmp_path / "\u573a\u666f")
+    names = {1: "\u7ea2\u8272\u676f\u5b50", 7: "\u0645\u0635\u0628\u0627\u062d", 9: "a" * 300}
+    plain = {k: ObjectModel(obj_id=k, name=n, mesh=replace(MODELS[k].mesh, colors=None))
+             for k, n in names.items()}  # fmt: skip
+    save_models(store.folder / "models", plain)
+    placed = [
+        ObjectPose(obj_id=(1, 7, 9)[k % 3], instance=k, verdict="doubtful",
+                   T_world_obj=se3.from_translation([0.1 * (k % 45), 0.1 * (k // 45), 0.02]))
+        for k in range(2000)
+    ]  # fmt: skip
+    save_scene(store, Scene(name="many", objects=tuple(placed)))
+    with opened(SessionStore.open(store.folder)) as page:
+        window: Any = page.window
+        assert "page 1 of 125" in window.list._remarks.content
+        assert window.attempt(lambda: window.select(1999)) and names[7] not in page.message
+        start = time.thread_time()
+        assert window.attempt(lambda: window.select(1000))
+        assert time.thread_time() - start < 0.3
+        window._name.value = "\u0645\u062d\u0645\u062f"
+        assert window.attempt(lambda: window.object.decide("reject"))
+        page.wait_message(f"{names[7]} rejected, signed \u0645\u062d\u0645\u062f", "ok")
+        page.wait(lambda: "1 of 2000" in re.sub("<.*?>", "", window.list._head.content))
+        window.list._which.value = "judged"
+        window.refresh(force=True)
+        assert window.list._buttons[0].label.splitlines()[0] == f"\u25b6 1000 {names[7]}"
+        place = Place.of(Place(scene=store.folder.name, instance=1000).text(names[7]))
+        assert (place.scene, place.instance) == ("\u573a\u666f", 1000)
+
+
+def test_a_session_that_changes_on_disk_is_shown_as_it_stands(page: Page) -> None:
+    window, store = page.window, page.server.sessions[0].store
+    for index in range(4):
+        store.path(rgb_path(index)).unlink()
+    assert "000001.png" in answered(page, "photo/1")["error"]
+    aside = replace(SCENE.objects[0], T_world_obj=se3.from_translation([0.2, 0.1, 0.06]))
+    save_scene(store, replace(SCENE, objects=(aside, SCENE.objects[1])))
+    save_grasps(store, grasp_set(1, 0, 7))
+    page.wait_message("has changed on disk", "ok")
+    page.wait(lambda: [len(s) for s in window.content.grasp_sets] == [7, 40])
+    np.testing.assert_allclose(window.standing.scene.object(0).T_world_obj, aside.T_world_obj)
+    (store.folder / "models/obj_000001.ply").unlink()
+    save_scene(store, SCENE)
+    page.wait_message("obj_000001.ply|no model of", ORANGE)

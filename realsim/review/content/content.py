@@ -22,7 +22,6 @@ from realsim.review.content.views import (
     FirstLook,
     Region,
     first_look,
-    placed_views,
     region_of,
     spread,
 )
@@ -70,11 +69,16 @@ class SceneContent:
             progress: called with how many photographs are ready, of how many.
 
         Raises:
-            InputError: the session is not registered, no camera pose is known, a model of the
-                scene's objects is missing, or an image is damaged.
+            InputError: the session is not registered, it has neither objects nor views with a
+                camera pose, a model of its objects is missing, or an image is damaged.
         """
         scene = load_scene(store)
-        views = tuple(placed_views(store))
+        views = tuple(v for v in store.session.views if v.T_world_cam is not None)
+        if not views and not scene.objects:
+            raise InputError(
+                f"session '{store.session.name}' has no object and no view with a camera pose; "
+                "calibrate and register it first."
+            )
         models = SessionModels(store.folder / "models", {o.obj_id for o in scene.objects})
         region = region_of(scene.objects, views, config.margin_m)
         # World is a camera where a data set has no robot: up is the table's normal, not z.

@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from realsim.arrays import Array, Mask
-from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, ObjectPose, View
 from realsim.review.scene_list import VERDICT_ORDER
-from realsim.store import SessionStore
 
 LOOK_NEARER = 0.8
 """Distance of the first look, as a share of the cameras' own."""
+LOOK_RADII = 2.5
+"""Distance taken for the cameras' own where there are none [radii of the region]."""
 LOOK_DOWN_RAD = 0.6
 """Angle under which the first look sees the table [rad]."""
 
@@ -46,20 +46,6 @@ def strided(intrinsics: CameraIntrinsics, stride: int) -> CameraIntrinsics:
         cy=intrinsics.cy / stride,
         distortion=intrinsics.distortion,
     )
-
-
-def placed_views(store: SessionStore) -> list[View]:
-    """Return the views whose camera is known.
-
-    Raises:
-        InputError: none is.
-    """
-    views = [v for v in store.session.views if v.T_world_cam is not None]
-    if not views:
-        raise InputError(
-            f"no view of session '{store.session.name}' has a camera pose; calibrate first."
-        )
-    return views
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -113,20 +99,21 @@ def first_look(region: Region, views: Sequence[View], up: Array) -> FirstLook:
     """Return where a new browser's camera stands and what it looks at.
 
     It stands where the cameras stand, on the side of the first one, but nearer, so that no frustum
-    is in the way.
+    is in the way. Without views it is the region's size that says how far.
 
     Args:
         region: what to look at.
         views: views with a camera pose.
         up: (3,) unit vector out of the table, in world.
     """
-    Ts = np.array([v.T_world_cam for v in views])
-    offset = Ts[0, :3, 3] - region.center
+    eyes = np.array([v.T_world_cam for v in views]).reshape(-1, 4, 4)[:, :3, 3] - region.center
+    offset = eyes[0] if views else np.zeros(3)
     horizontal = offset - up * (up @ offset)
     length = float(np.linalg.norm(horizontal))
     side = horizontal / length if length > 1e-6 else np.linalg.svd(up[None])[2][1]
-    distance = LOOK_NEARER * float(np.median(np.linalg.norm(Ts[:, :3, 3] - region.center, axis=1)))
+    distance = LOOK_RADII * region.radius_m
+    if views:
+        distance = float(np.median(np.linalg.norm(eyes, axis=1)))
     direction = np.cos(LOOK_DOWN_RAD) * side + np.sin(LOOK_DOWN_RAD) * up
-    return FirstLook(
-        position=region.center + distance * direction, look_at=region.center.copy(), up=up
-    )
+    position = region.center + LOOK_NEARER * distance * direction
+    return FirstLook(position=position, look_at=region.center.copy(), up=up)

@@ -119,6 +119,8 @@ class SceneNodes:
         self._root(instance)
         obj_id = model if isinstance(model, int) else model.obj_id
         _ = self._content.meshes[obj_id]
+        if self._models[instance] == obj_id:
+            return
         with self._lock:
             self._models[instance] = obj_id
             for nodes in (self._appearance, self._judged):
@@ -285,7 +287,7 @@ class SceneNodes:
         cone about it.
         """
         views = self._content.shown_views
-        offset = np.array([v.T_world_cam for v in views])[:, :3, 3] - eye
+        offset = np.array([v.T_world_cam for v in views]).reshape(-1, 4, 4)[:, :3, 3] - eye
         line = np.asarray(look_at) - eye
         length = float(np.linalg.norm(line))
         along = offset @ line / max(length, 1e-9)

@@ -19,8 +19,8 @@ LOOK_RADII, LOOK_M = 3.0, 0.1
 """Distance from which it is looked at: radii of its ball, and metres."""
 BESIDE_RAD, BESIDE_DOWN_RAD = -0.7, 0.5
 """An arm at work is looked at from the far side of the object, and so much round and down."""
-BEHIND_CAMERAS = 1.25
-"""Distance of that look over the cameras' own: hand, object and forearm are seen."""
+BEHIND_FIRST = 1.5
+"""Distance of that look over the first look's: hand, object and forearm are seen."""
 
 
 class Standpoint:
@@ -79,6 +79,5 @@ class Standpoint:
         away = away / max(float(np.linalg.norm(away)), 1e-9)
         side = se3.exp_so3(BESIDE_RAD * up) @ away
         direction = np.cos(BESIDE_DOWN_RAD) * side + np.sin(BESIDE_DOWN_RAD) * up
-        eyes = np.array([v.T_world_cam for v in content.views])[:, :3, 3]
-        distance = BEHIND_CAMERAS * float(np.median(np.linalg.norm(eyes - center, axis=1)))
+        distance = BEHIND_FIRST * float(np.linalg.norm(content.look.position - center))
         self.look_from(center + distance * direction, center)

@@ -70,12 +70,14 @@ class PhotographLink:
             numbers: the view, and the pixel of a spot.
 
         Raises:
-            InputError: no scene is open, or there is no such view or image.
+            InputError: no scene is open, it has no photographs, or there is no such view or image.
             LookupError: it asks for something else.
         """
         from realsim.review.placing.photograph import KINDS
 
         window = self._window
+        if not window.content.views:
+            raise InputError(window_text.NO_PHOTOGRAPHS)
         found, objects = window.session.photographs(), window.shown_objects()
         view = int(numbers[0]) if numbers else 0
         if what == "thumb":
@@ -127,7 +129,7 @@ class ViewsPanel:
             InputError: no scene is open.
         """
         if self._view.value not in self._numbers:
-            raise InputError("no scene is open yet.")
+            raise InputError("there is no view to choose: none has a photograph and a camera pose.")
         return self._numbers[self._view.value]
 
     def show_chosen(self) -> None:
@@ -200,7 +202,7 @@ class ViewsPanel:
         names = {f"view {v}" + (" (left out)" if v in excluded else ""): v for v in views}
         if names != self._numbers:
             self._numbers = names
-            self._view.options = tuple(names)
+            self._view.options = tuple(names) or (NONE,)
             label = next((k for k, v in names.items() if v == here), None)
             if label is not None:
                 self._view.value = label

@@ -35,7 +35,7 @@ class Place:
         """Return the fragment; `name` is the object's, for the window's title."""
         said: dict[str, str] = {"scene": self.scene}
         if self.instance is not None:
-            said |= {"instance": str(self.instance), "object": name}
+            said |= {"instance": str(self.instance), "object": name[:80]}
         for key, point in (("eye", self.eye), ("at", self.look_at)):
             if point is not None:
                 said[key] = ",".join(f"{v:.4f}" for v in point)

@@ -7,10 +7,10 @@ another's way. What they share is the journal on the disk, and what was read of 
 import contextlib
 import logging
 import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import viser
@@ -22,7 +22,6 @@ from realsim.review.content.content import SceneContent
 from realsim.review.drawing.scene_nodes import SceneNodes
 from realsim.review.journal import Entry
 from realsim.review.refusals import SessionGone, disk_words
-from realsim.review.replaying.grasp_replay import Motions
 from realsim.review.reviewed_session import ReviewedSession, Standing
 from realsim.review.window import window_text
 from realsim.review.window.browser import Browser
@@ -35,36 +34,13 @@ from realsim.review.window.panel_object import ObjectPanel
 from realsim.review.window.panel_show import ShowPanel
 from realsim.review.window.panel_views import PhotographLink, ViewsPanel
 
+if TYPE_CHECKING:
+    from realsim.review.server import ReviewServer
+
 PANEL_PX, PANEL_HEIGHT_PX, EDGE_PX = 300, 530, 8
 """Width and height of the panel on the right, and how far from the window's edges it floats [px]:
 with the list it leaves three quarters of 1280x800 to the scene."""
 log = logging.getLogger(__name__)
-
-
-class Sessions(Protocol):
-    """What a window needs of the server: all sessions, and whom to tell."""
-
-    @property
-    def sessions(self) -> Sequence[ReviewedSession]:
-        """All sessions under review; their `number` is their place here."""
-        ...
-
-    @property
-    def remarks(self) -> Sequence[str]:
-        """What the reviewer should know of the sessions, such as which cannot be opened."""
-        ...
-
-    def motions_of(self, session: ReviewedSession) -> Motions | None:
-        """Return where the motions of a session's grasps come from; None = there are none."""
-        ...
-
-    def tell(self) -> None:
-        """Show a decision in all windows at once."""
-        ...
-
-    def others(self, window: "Window") -> Sequence[str]:
-        """Return what the other reviewers look at, in words."""
-        ...
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -74,14 +50,16 @@ class Opened:
     session: ReviewedSession
     content: SceneContent
     nodes: SceneNodes
-    models: dict[int, int]
-    """instance -> obj_id as it is drawn."""
+    stands: dict[int, ObjectPose]
+    """instance -> object as it is drawn."""
 
 
 class Window:
     """What one connected browser shows; the methods may be called from any thread."""
 
-    def __init__(self, client: viser.ClientHandle, server: Sessions, reviewer: str = "") -> None:
+    def __init__(
+        self, client: viser.ClientHandle, server: "ReviewServer", reviewer: str = ""
+    ) -> None:
         """Build the panels; `start` opens the first scene.
 
         Args:
@@ -229,12 +207,12 @@ class Window:
             self.views.look_at_object()
 
     def renew(self, session: ReviewedSession) -> None:
-        """Show a session that was registered anew in place of what is shown of it."""
+        """Show a session that has changed on disk in place of what is shown of it."""
         instance = self.selected
         self._open(session)
         known = {o.instance for o in session.registered.objects}
         self.select(instance if instance in known else None)
-        self.say(f"{session.name} was registered anew; this is how it stands.")
+        self.say(f"{session.name} has changed on disk; this is how it stands now.")
 
     def select(self, instance: int | None) -> None:
         """Look at an object of this scene."""
@@ -276,8 +254,7 @@ class Window:
                 nodes.on_object(self._guarded_call(self.select))
                 nodes.on_camera(self._guarded_call(self.views.show_photograph))
                 nodes.on_grasp(self._guarded_call(self.grasps.clicked))
-                models = {o.instance: o.obj_id for o in content.scene.objects}
-                self._opened = Opened(session, content, nodes, models)
+                self._opened = Opened(session, content, nodes, {})
                 self.selected, self._seen, self._standing = None, None, None
                 for panel in (self.views, self.grasps, self.show):
                     panel.opened()
@@ -289,6 +266,8 @@ class Window:
                 self._up = content.look.up
             with self.lock:
                 self.views.first_look()
+            if not content.views:
+                self.refuse(window_text.NO_PHOTOGRAPHS)
 
     # --- what changed -----------------------------------------------------------------------------
 
@@ -343,12 +322,13 @@ class Window:
         """Put every object where the reviewers left it, in the colour of its verdict."""
         opened, session = self.opened, self.session
         for placed in self.standing.scene.objects:
+            if opened.stands.get(placed.instance) is placed:
+                continue
+            opened.stands[placed.instance] = placed
             drawn = placed.obj_id
             if not session.has_model(drawn):
                 drawn = session.registered.object(placed.instance).obj_id
-            if opened.models[placed.instance] != drawn:
-                opened.nodes.swap(placed.instance, drawn)
-                opened.models[placed.instance] = drawn
+            opened.nodes.swap(placed.instance, drawn)
             opened.nodes.place(placed.instance, placed.T_world_obj)
             opened.nodes.color_verdict(placed.instance, placed.verdict)
 
