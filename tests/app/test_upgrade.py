@@ -180,8 +180,10 @@ def test_two_things_of_one_model_stay_two_in_every_order() -> None:
 # --- what becomes of an annotation ------------------------------------------------------------
 
 
-def judged(off_m: float, found_off_m: float, hidden: bool = False) -> list[Outcome]:
-    """Return what becomes of annotations and new poses that are off along the camera's x."""
+def judged(
+    off_m: float, found_off_m: float, hidden: bool = False, far_m: float = 0.0
+) -> list[Outcome]:
+    """Return what becomes of annotations and new poses, off along x (and z) of the camera."""
     placed, (T,) = standing(0.5), cameras(1)
     things = [*placed]
     if hidden:  # a board between the camera and the parts
@@ -191,8 +193,8 @@ def judged(off_m: float, found_off_m: float, hidden: bool = False) -> list[Outco
     depth_m = labels.depth_m.astype(np.float32)
     picture = Picture(intrinsics=CAMERA, depth_m=depth_m, T_world_cam=T, rgb=grey_of(labels))
 
-    def at(off: float) -> list[ObjectPose]:
-        step = T @ se3.from_translation([off, 0, 0]) @ se3.invert(T)
+    def at(off: float, far: float = 0.0) -> list[ObjectPose]:
+        step = T @ se3.from_translation([off, 0, far]) @ se3.invert(T)
         return [
             ObjectPose(obj_id=part(n).obj_id, instance=p.instance, verdict="accepted",
                        T_world_obj=step @ p.T_world_obj)
@@ -200,8 +202,8 @@ def judged(off_m: float, found_off_m: float, hidden: bool = False) -> list[Outco
         ]  # fmt: skip
 
     table = SupportPlane(T_world_table=np.eye(4))
-    return decide([picture], {part(n).obj_id: part(n) for n in NAMES}, at(off_m), at(found_off_m),
-                  table)  # fmt: skip
+    return decide([picture], {part(n).obj_id: part(n) for n in NAMES}, at(off_m),
+                  at(found_off_m, far_m), table)  # fmt: skip
 
 
 @pytest.mark.parametrize("off_m", [-0.02, -0.004, 0.002, 0.008])
@@ -217,6 +219,13 @@ def test_a_wrong_annotation_is_replaced_by_the_right_pose(off_m: float) -> None:
         off = se3.transform(outcome.T_world_obj, right.mesh.vertices)
         off -= se3.transform(right.T_world_obj, right.mesh.vertices)
         assert np.linalg.norm(off, axis=1).max() < 0.001
+
+
+def test_one_view_takes_no_distance_from_depth_that_may_be_off_as_a_whole() -> None:
+    for outcome, right in zip(judged(0.008, 0.0, far_m=0.003), standing(0.5), strict=True):
+        assert outcome.kind == "improved" and "distance" in outcome.words, outcome.words
+        step = outcome.T_world_obj[:3, 3] - right.T_world_obj[:3, 3]
+        assert np.linalg.norm(step) < 0.001
 
 
 def test_a_hidden_thing_keeps_its_annotation_and_says_how_little_is_seen() -> None:

@@ -6,11 +6,13 @@ outlines. The photograph is no part of the fit; where a pose was shifted onto it
 other squares of it. All other things stand meanwhile where they are believed to be.
 
 A thing of which little is seen keeps its annotation. A pose that moved far is a proposal of a
-search, not a refinement: it must win clearly.
+search, not a refinement: it must win clearly. From one view, a new pose keeps the annotation's
+distance where the two differ by no more than the camera's whole depth may be off by: no evidence of
+that view tells which of them is right.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -64,6 +66,9 @@ class OutcomeConfig:
     """Sectors of an outline, each one piece."""
     cap_px: float = 3.0
     """An edge further away, or none, counts as this [px]."""
+    ray_share: float = 0.01
+    """Share of its distance by which one view's depth may be off as a whole: data sheets of depth
+    cameras state 1 to 2 %."""
     least_pieces: int = 8
     """Fewer pieces decide nothing."""
     views: int = 6
@@ -116,6 +121,17 @@ class Outcome:
                 "visible": _plain(e.visible), "proposed_mm": _plain(1e3 * e.moved_m),
             }  # fmt: skip
         return out
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Proposal:
+    """A pose that might take an annotation's place."""
+
+    T_world_obj: Array
+    on_photo: bool = False
+    """Whether it was shifted onto the photograph."""
+    keeps_distance: bool = False
+    """Whether it is as far from the camera as the annotation."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -284,15 +300,21 @@ def decide(
     of = {a.instance: models[a.obj_id] for a in annotations}
     referee = Referee(pictures, of, plane, config)
     new = {r.instance: r for r in registered if r.instance in of}
-    proposals = {i: [r.T_world_obj] for i, r in new.items()}
+    now = {a.instance: a.T_world_obj for a in annotations}
+    proposals = {i: [_Proposal(r.T_world_obj)] for i, r in new.items()}
     if len(pictures) == 1:
         # Several views were brought together by their depth; one can be laid onto its photograph.
         moved = shifted(
             pictures[0], [of[i].mesh for i in new], [r.T_world_obj for r in new.values()],
             config.photo,
         )  # fmt: skip
-        proposals = {i: [T, *proposals[i]] for i, T in zip(new, moved, strict=True)}
-    now = {a.instance: a.T_world_obj for a in annotations}
+        proposals = {
+            i: [
+                _at_the_distance_of(now[i], p, of[i], pictures[0], config)
+                for p in (_Proposal(T, on_photo=True), *proposals[i])
+            ]
+            for i, T in zip(new, moved, strict=True)
+        }
     outcomes: dict[int, Outcome] = {}
     for _ in range(2):  # the second time with the others where they now are
         for a in annotations:
@@ -303,10 +325,24 @@ def decide(
     return [outcomes[a.instance] for a in annotations]
 
 
+def _at_the_distance_of(
+    T_old: Array, p: _Proposal, model: ObjectModel, picture: Picture, config: OutcomeConfig
+) -> _Proposal:
+    """Return a proposal, moved along its ray to the annotation's distance if that is near."""
+    middle = model.mesh.bounds.mean(0)[None]
+    T_cam_world = se3.invert(picture.T_world_cam)
+    new, old = (se3.transform(T_cam_world @ T, middle)[0] for T in (p.T_world_obj, T_old))
+    share = old[2] / new[2] - 1.0
+    if abs(share) > config.ray_share:
+        return p
+    step = se3.from_translation(picture.T_world_cam[:3, :3] @ (share * new))
+    return replace(p, T_world_obj=step @ p.T_world_obj, keeps_distance=True)
+
+
 def _decided(
     given: ObjectPose,
     found: ObjectPose | None,
-    proposals: Sequence[Array],
+    proposals: Sequence[_Proposal],
     referee: Referee,
     others: Mapping[int, Array],
 ) -> Outcome:
@@ -317,12 +353,13 @@ def _decided(
         return Outcome(instance=given.instance, kind="kept", words=words, T_world_obj=T,
                        evidence=None)  # fmt: skip
     first: tuple[Evidence, Kind, str] | None = None
-    for proposed in proposals:
-        e = referee.evidence(given.instance, T, proposed, others, proposed is not found.T_world_obj)
+    for p in proposals:
+        e = referee.evidence(given.instance, T, p.T_world_obj, others, p.on_photo)
         kind, words = _judged(e, found, referee.config)
         if kind == "improved":
-            return Outcome(instance=given.instance, kind=kind, words=words, T_world_obj=proposed,
-                           evidence=e)  # fmt: skip
+            words += "; its distance is the annotation's" if p.keeps_distance else ""
+            return Outcome(instance=given.instance, kind=kind, words=words,
+                           T_world_obj=p.T_world_obj, evidence=e)  # fmt: skip
         first = first or (e, kind, words)
     assert first is not None
     e, kind, words = first
