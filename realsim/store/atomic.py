@@ -110,9 +110,11 @@ def write_bytes(
         os.replace(unnamed, path)
         if flush:
             _sync_folder(path.parent)
-    except BaseException:
+    except BaseException as error:
         if not announced:
             unnamed.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:  # a full disk names no file
+            error.filename = str(path)
         raise
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from realsim.errors import RealsimError
 from realsim.records import CameraIntrinsics, CaptureSession, View
-from realsim.store import SessionStore, StorageError
+from realsim.store import SessionStore, StorageError, atomic
 from realsim.store.session_check import check_session
 
 CAMERA = CameraIntrinsics(width=60, height=40, fx=60, fy=60, cx=29.5, cy=19.5)
@@ -137,3 +137,10 @@ def test_a_line_that_does_not_fit_leaves_no_half_line(
     assert store.verify() == [] and check_session(tmp_path).sound
     listed = {p for p in ("rgb/000100.png",) if p in (tmp_path / "manifest.jsonl").read_text()}
     assert bool(listed) == (name == "manifest.jsonl")
+
+
+def test_the_file_that_found_no_room_is_named(disk: Path) -> None:
+    with pytest.raises(OSError) as told:
+        atomic.write_bytes(disk / "new/page.html", b"0" * (DISK_PAGES + 1) * PAGE)
+    assert told.value.filename == str(disk / "new/page.html")
+    assert not list((disk / "new").iterdir())
