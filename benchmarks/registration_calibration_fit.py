@@ -76,7 +76,8 @@ def printed(sets: Mapping[Kind, Coefficients]) -> str:
         lines += ["        weights={"]
         lines += [f'            "{n}": {v:.3f},' for n, v in c.weights.items()]
         lines += ["        },", "        usual={"]
-        lines += [f'            "{n}": {v:.3f},' for n, v in c.usual.items()]
+        lines += [f'            "{n}": {v:.3f},' for n, v in c.usual.items()
+                  if n not in verdict.NEEDED and abs(v) >= 5e-4]  # fmt: skip
         lines += ["        },", "    ),"]
     return "\n".join([*lines, "}"])
 
