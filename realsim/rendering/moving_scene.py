@@ -32,6 +32,7 @@ from realsim.rendering.embedded.room_light import (
     encoded,
     lit_colors,
     room_surfaces,
+    room_view,
     sample_room,
     tones,
 )
@@ -96,13 +97,8 @@ class MovingScene:
         self._every = tuple(range(len(placed)))
         self._caster = PixelCaster(placed)
         self._surfaces = room_surfaces(placed, light.gamma)
-        self._R_sun_world = se3.look_at(light.sun_direction, [0.0, 0.0, 0.0])[:3, :3].T * [
-            [1.0], [-1.0], [-1.0]
-        ]  # fmt: skip
-        gloss = (light.specular, light.shininess, 0.0)
-        self._light = np.array(
-            [light.ground, light.sky, light.sun, light.horizon, light.zenith, light.floor, gloss]
-        )
+        self._R_sun_world = light.R_sun_world()
+        self._light = light.rows()
         poses = [p.T_world_obj for p in placed]
         self._first = Moment(np.array(poses), tuple(map(self._in_the_sun, self._every, poses)))
 
@@ -198,15 +194,7 @@ class MovingScene:
 
     def _view(self, moment: Moment, T_world_cam: Array) -> RoomView:
         """Return a camera as the kernels take it."""
-        Ts_obj_cam = se3.invert(moment.Ts_world_obj) @ T_world_cam
-        return RoomView(
-            eyes=np.ascontiguousarray(Ts_obj_cam[:, :3, 3]),
-            Rs_obj_cam=np.ascontiguousarray(Ts_obj_cam[:, :3, :3]),
-            R_world_cam=np.ascontiguousarray(T_world_cam[:3, :3]),
-            Ts_sun_obj=se3.from_rt(self._R_sun_world, np.zeros(3)) @ moment.Ts_world_obj,
-            R_sun_world=self._R_sun_world,
-            light=self._light,
-        )
+        return room_view(self._light, self._R_sun_world, moment.Ts_world_obj, T_world_cam)
 
     def _enter(
         self, numbers: Sequence[int], moment: Moment, seen_by: tuple[CameraIntrinsics, Array],

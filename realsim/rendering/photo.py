@@ -10,20 +10,31 @@ is sRGB (see `environment_view`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from realsim.arrays import Array, Array32, Int32, Mask, UInt8
+from realsim.arrays import Array, Array32, Int32, UInt8
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment
 from realsim.rendering.casting.pixel_caster import FirstHits, PixelCaster
 from realsim.rendering.developing import developed
+from realsim.rendering.embedded.edge_samples import world_rays
 from realsim.rendering.embedded.environment_view import EnvironmentRenderer, LightSampling
-from realsim.rendering.embedded.materials import Surface, check_projection
+from realsim.rendering.embedded.materials import check_projection
+from realsim.rendering.embedded.room_light import (
+    RoomView,
+    busy_among,
+    empty_samples,
+    lit_colors,
+    room_surfaces,
+    room_view,
+    sample_room,
+    tones,
+)
 from realsim.rendering.rays import PlacedMesh, RayScene, rotated
 
 __all__ = ["Environment", "LightSampling", "Lighting", "Photo", "PhotoRenderer", "PlacedMesh"]
@@ -31,8 +42,6 @@ __all__ = ["Environment", "LightSampling", "Lighting", "Photo", "PhotoRenderer",
 Color = tuple[float, float, float]
 BLOCK_RAYS = 1 << 17
 """Rays shaded at a time: the working arrays stay near the processor's cache."""
-SHADOW_LIFT_M = 1e-4
-"""Shadow rays start this far off the surface, or rounding would shade it by itself."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -84,6 +93,17 @@ class Lighting:
         if not np.linalg.norm(self.sun_direction) > 0:
             raise InputError("lighting: the sun has no direction; (0, 0, 1) is overhead.")
 
+    def rows(self) -> Array:
+        """Return the light (7, 3) as the kernels take it, see `room_light.GROUND`."""
+        gloss = (self.specular, self.shininess, 0.0)
+        lights = (self.ground, self.sky, self.sun, self.horizon, self.zenith, self.floor, gloss)
+        return np.array(lights)
+
+    def R_sun_world(self) -> Array:
+        """Return the rotation (3, 3) from world to the sun's frame, whose z is towards the sun."""
+        T = se3.look_at(self.sun_direction, [0.0, 0.0, 0.0])
+        return T[:3, :3].T * [[1.0], [-1.0], [-1.0]]
+
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Photo:
@@ -95,19 +115,6 @@ class Photo:
     """(H, W) exact depth along z at the pixel centres [m]; 0 = nothing."""
     geometry: Int32
     """(H, W) number of the placed mesh seen at the pixel centres; -1 = nothing."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Frame:
-    """One view's rays and how they change from pixel to pixel."""
-
-    eye: Array
-    directions: Array32 = field()
-    """(N, 3) through the pixel centres, in world, z = 1 in camera axes."""
-    along_u: Array32 = field()
-    """(N, 3) change of the direction per pixel along u."""
-    along_v: Array32 = field()
-    """(N, 3) change of the direction per pixel along v."""
 
 
 class PhotoRenderer:
@@ -143,9 +150,7 @@ class PhotoRenderer:
             return
         self._scene = RayScene(self.placed)
         self._caster = PixelCaster(self.placed)
-        self._surfaces = [Surface(p, self.lighting.gamma) for p in self.placed]
-        sun = np.array(self.lighting.sun_direction)
-        self._sun: Array32 = (sun / np.linalg.norm(sun)).astype(np.float32)
+        self._surfaces = room_surfaces(self.placed, self.lighting.gamma)
 
     def render(
         self,
@@ -182,138 +187,47 @@ class PhotoRenderer:
         if self._under_sky is not None:
             color, hits = self._under_sky.radiance(intrinsics, T)
         else:
-            color, hits = self._in_the_room(intrinsics, T), self._caster.cast(intrinsics, T)
+            color, hits = self._in_the_room(intrinsics, T)
         if self.lighting.psf_px > 0:
             color = np.asarray(cv2.GaussianBlur(color, (0, 0), self.lighting.psf_px), np.float32)
         return color, hits
 
-    def _in_the_room(self, intrinsics: CameraIntrinsics, T: Array) -> Array32:
-        """Return linear light (H, W, 3) under the `Lighting`, before the lens."""
-        height, width = intrinsics.height, intrinsics.width
-        frame, known = _frame(intrinsics, T)
-        pixel_rad = 1.0 / float(np.sqrt(intrinsics.fx * intrinsics.fy))
-        seen, _, geometry = self._shade(frame.eye, frame.directions, pixel_rad)
-
-        color = np.zeros((height * width, 3), np.float32)
-        hit = np.full(height * width, -1, np.int32)
-        color[known], hit[known] = seen, geometry
-        color = color.reshape(height, width, 3)
-        if self.lighting.samples > 1:
-            busy = self._busy(color, hit.reshape(height, width)).ravel()
-            rows = np.flatnonzero(busy[known])
-            color.reshape(-1, 3)[known[rows]] = self._supersampled(frame, rows, pixel_rad)
-        return color
-
-    def _busy(self, color: Array32, geometry: Int32) -> Mask:
-        """Return (H, W) where the neighbourhood has contrast or the edge of a mesh."""
-        import cv2
-
-        kernel = np.ones((3, 3), np.uint8)
-        encoded = np.clip(color.mean(-1), 0.0, 1.0) ** np.float32(1.0 / self.lighting.gamma)
-        span = cv2.dilate(encoded, kernel) - cv2.erode(encoded, kernel)
-        mesh = geometry.astype(np.float32)
-        edge = cv2.dilate(mesh, kernel) != cv2.erode(mesh, kernel)
-        return (np.asarray(span) > self.lighting.contrast) | np.asarray(edge)
-
-    def _supersampled(self, frame: _Frame, rows: NDArray[np.intp], pixel_rad: float) -> Array32:
-        """Return the mean colours (M, 3) of the squares around the pixels `rows` (M,)."""
-        n = self.lighting.samples
-        offsets = ((np.arange(n) + 0.5) / n - 0.5).astype(np.float32)
-        du, dv = (a.ravel() for a in np.meshgrid(offsets, offsets))
-        step = max(1, BLOCK_RAYS // (n * n))
-        out = np.empty((len(rows), 3), np.float32)
-        for first in range(0, len(rows), step):
-            of = rows[first : first + step]
-            directions = np.repeat(frame.directions[of][:, None], n * n, axis=1)
-            directions += du[:, None] * frame.along_u[of][:, None]
-            directions += dv[:, None] * frame.along_v[of][:, None]
-            color, _, _ = self._shade(frame.eye, directions.reshape(-1, 3), pixel_rad / n)
-            out[first : first + step] = color.reshape(len(of), n * n, 3).mean(1)
-        return out
-
-    def _shade(
-        self, eye: Array, directions: Array32, pixel_rad: float
-    ) -> tuple[Array32, Array32, Int32]:
-        """Return linear colours (N, 3), t (N,) and placed meshes (N,) seen along rays."""
-        n = len(directions)
-        color = np.empty((n, 3), np.float32)
-        t = np.empty(n, np.float32)
-        geometry = np.empty(n, np.int32)
-        for first in range(0, n, BLOCK_RAYS):
-            block = slice(first, first + BLOCK_RAYS)
-            color[block], t[block], geometry[block] = self._shade_block(
-                eye, directions[block], pixel_rad
-            )
-        return color, t, geometry
-
-    def _shade_block(
-        self, eye: Array, directions: Array32, pixel_rad: float
-    ) -> tuple[Array32, Array32, Int32]:
-        """Return what `_shade` does, for one block of rays."""
-        hits = self._scene.cast(eye, directions)
-        distance = np.sqrt(np.einsum("ij,ij->i", directions, directions))
-        view = directions / distance[:, None]
-        color = np.empty((len(view), 3), np.float32)
-        for g in np.flatnonzero(np.bincount(hits.geometry + 1)) - 1:
-            rows = np.flatnonzero(hits.geometry == g)
-            if g < 0:
-                color[rows] = self._background(view[rows])
-                continue
-            surface, toward = self._surfaces[g], -view[rows]
-            face, uv = hits.face[rows], hits.uv[rows]
-            weights = np.stack([1.0 - uv[:, 0] - uv[:, 1], uv[:, 0], uv[:, 1]], -1)
-            flat = hits.normal[rows]
-            # An open surface is lit from the side it is seen from.
-            flat = flat * np.sign(np.einsum("ij,ij->i", flat, toward))[:, None]
-            normal = surface.normal(face, weights)
-            normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-            normal = normal * np.sign(np.einsum("ij,ij->i", normal, flat))[:, None]
-            at = eye + directions[rows].astype(np.float64) * hits.t[rows, None]
-            paint = surface.reflectance(face, weights, hits.t[rows] * np.float32(pixel_rad))
-            color[rows] = self._lit(at, flat, normal, toward, paint, surface.is_glossy)
-        return color, hits.t, hits.geometry
+    def _in_the_room(self, intrinsics: CameraIntrinsics, T: Array) -> tuple[Array32, FirstHits]:
+        """Return linear light (H, W, 3) under the `Lighting`, before the lens, and the hits."""
+        light, n, i = self.lighting, self.lighting.samples, intrinsics
+        hits, table = self._caster.cast(i, T), camera.ray_table(i)
+        geometry, every = hits.geometry.ravel(), np.arange(i.height * i.width)
+        # Far from the world's origin float32 would lose digits.
+        to_center = se3.from_translation(-self._scene.center)
+        Ts_center_obj = to_center @ np.array([p.T_world_obj for p in self.placed]).reshape(-1, 4, 4)
+        view = room_view(light.rows(), light.R_sun_world(), Ts_center_obj, to_center @ T)
+        pixel_rad = 1.0 / float(np.sqrt(i.fx * i.fy))
+        color = self._lit(view, table.reshape(-1, 3), (geometry, hits.face.ravel()), pixel_rad)
+        if n > 1:
+            tone = np.empty(len(every), np.float32)
+            tones(color, light.gamma, every, tone)
+            busy = busy_among(tone, geometry, every, table.shape[:2], light.contrast)
+            rows = every[busy & np.isfinite(table[..., 0].ravel())]
+            offsets = ((np.arange(n) + 0.5) / n - 0.5).astype(np.float32)
+            offsets = np.stack(np.meshgrid(offsets, offsets), -1).reshape(-1, 2)
+            for of in np.array_split(rows, 1 + len(rows) * n * n // BLOCK_RAYS):
+                parts, _, _ = world_rays(table, (np.eye(3), i.fx, i.fy), of, offsets, 1.0)
+                seen = self._scene.cast(T[:3, 3], rotated(parts, T[:3, :3]))
+                fine = self._lit(view, parts, (seen.geometry, seen.face), pixel_rad / n)
+                color[of] = fine.reshape(len(of), n * n, 3).mean(1)
+        return color.reshape(*table.shape[:2], 3), hits
 
     def _lit(
-        self,
-        at: Array,
-        flat: Array32,
-        normal: Array32,
-        toward: Array32,
-        paint: Array32,
-        gloss: bool,
+        self, view: RoomView, rays: Array32, hits: tuple[Int32, Int32], pixel_rad: float
     ) -> Array32:
-        """Return the light (N, 3) that points `at` send towards the eye.
-
-        Lambert under hemispheric ambient light and a sun with one shadow ray, plus the highlight.
-        """
-        light = self.lighting
-        up = 0.5 + 0.5 * normal[:, 2:3]
-        ground, sky = np.array(light.ground, np.float32), np.array(light.sky, np.float32)
-        facing = normal @ self._sun
-        lit = np.flatnonzero((facing > 0) & (flat @ self._sun > 0))
-        start = at[lit] + SHADOW_LIFT_M * flat[lit]
-        free = ~self._scene.occluded(start, np.broadcast_to(self._sun, (len(lit), 3)))
-        lit = lit[free]
-        sun = np.array(light.sun, np.float32)
-        out = np.asarray(ground + up * (sky - ground), np.float32)
-        out[lit] += facing[lit, None] * sun
-        out *= paint
-        if gloss and light.specular > 0:
-            half = toward[lit] + self._sun
-            half /= np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-12)
-            shine = np.maximum(np.einsum("ij,ij->i", half, normal[lit]), 0) ** light.shininess
-            out[lit] += (light.specular * shine)[:, None] * sun
-        return out
-
-    def _background(self, view: Array32) -> Array32:
-        """Return the soft room (N, 3) behind everything, by the elevation of the ray."""
-        light = self.lighting
-        horizon = np.array(light.horizon, np.float32)
-        up = np.sqrt(np.clip(view[:, 2:3], 0, 1))
-        down = np.sqrt(np.clip(-view[:, 2:3], 0, 1))
-        color = horizon + up * (np.array(light.zenith, np.float32) - horizon)
-        color = color + down * (np.array(light.floor, np.float32) - horizon)
-        return np.asarray(color, np.float32)
+        """Return the light (N, 3) that rays see: with one shadow ray each; see `sample_room`."""
+        out, every = empty_samples(len(rays)), np.arange(len(rays))
+        sample_room(self._surfaces, view, rays, hits, every, pixel_rad, out)
+        lit = np.isfinite(out.toward_sun[:, 0])
+        start = rotated(out.toward_sun[lit], view.R_sun_world.T) + self._scene.center
+        sun = np.broadcast_to(view.R_sun_world[2].astype(np.float32), start.shape)
+        lit[lit] = ~self._scene.occluded(start, sun)
+        return lit_colors(out, lit)
 
     def _expose(self, color: Array32, rng: np.random.Generator | None) -> UInt8:
         """Return the encoded picture: shot and read noise, saturation, gamma."""
@@ -326,24 +240,3 @@ class PhotoRenderer:
         if light.gamma != 1.0:
             value = value ** np.float32(1.0 / light.gamma)
         return np.round(255.0 * value).astype(np.uint8)
-
-
-def _frame(intrinsics: CameraIntrinsics, T_world_cam: Array) -> tuple[_Frame, NDArray[np.intp]]:
-    """Return the rays of the pixels whose ray exists, and those pixels' flat indices (N,)."""
-    table = camera.ray_table(intrinsics)
-    slopes: list[Array32] = []
-    for axis, f in ((1, intrinsics.fx), (0, intrinsics.fy)):
-        if table.shape[axis] > 1:
-            slope = np.gradient(table, axis=axis).astype(np.float32)
-        else:
-            slope = np.full_like(table, np.nan)
-        # At the rim of the invertible region a neighbour is missing: the paraxial slope will do.
-        fallback = np.zeros(3, np.float32)
-        fallback[1 - axis] = 1.0 / f
-        slopes.append(np.where(np.isfinite(slope), slope, fallback))
-    known = np.flatnonzero(np.isfinite(table[..., 0].ravel()))
-    R = T_world_cam[:3, :3]
-    directions, along_u, along_v = (
-        rotated(a.reshape(-1, 3)[known], R) for a in (table, slopes[0], slopes[1])
-    )
-    return _Frame(T_world_cam[:3, 3], directions, along_u, along_v), known

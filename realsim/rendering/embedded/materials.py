@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from realsim.arrays import Array, Array32, Int32, UInt8
+from realsim.arrays import Array, Array32, UInt8
 from realsim.errors import InputError
 from realsim.geometry.colors import srgb_decoded, srgb_encoded
 from realsim.records import Mesh
@@ -17,8 +17,6 @@ from realsim.rendering.rays import BACKGROUND, PlacedMesh
 
 CREASE_COS = float(np.cos(np.radians(30.0)))
 """Faces that meet at a sharper angle keep their edge instead of being shaded as one surface."""
-REMAP_COLUMNS = 4096
-"""Look-ups are laid out in rows of this length, because OpenCV's images end at 32767 columns."""
 PLAIN_COLORS = (
     (196, 84, 60), (72, 118, 168), (214, 172, 84), (96, 146, 104), (150, 106, 160),
     (206, 130, 96), (84, 148, 152), (182, 186, 172), (142, 112, 84), (168, 64, 92),
@@ -35,7 +33,7 @@ TABLE_ROUGHNESS = 0.62
 
 
 class MipTexture:
-    """A texture and its successive halvings, looked up by area."""
+    """A texture and its successive halvings, each the mean of the one before."""
 
     def __init__(self, image: UInt8, gamma: float, wrap: bool) -> None:
         """Build the halvings.
@@ -56,44 +54,6 @@ class MipTexture:
             size = (max(1, width // 2), max(1, height // 2))
             level = np.asarray(cv2.resize(level, size, interpolation=cv2.INTER_AREA), np.uint16)
             self.levels.append(level)
-
-    def sample(self, uv: Array32, footprint: Array32) -> Array32:
-        """Return the mean reflectance (N, 3) about uv (N, 2) over a footprint (N,) in texels."""
-        level = np.log2(np.maximum(footprint, 1.0))
-        level = np.minimum(level, np.float32(len(self.levels) - 1))
-        low = level.astype(np.int32)
-        rest = (level - low)[:, None]
-        out = np.empty((len(uv), 3), np.float32)
-        for k in np.unique(low):
-            of_level = np.flatnonzero(low == k)
-            color = self._bilinear(int(k), uv[of_level])
-            mix = rest[of_level]
-            if k + 1 < len(self.levels) and bool(np.any(mix > 0)):
-                color += mix * (self._bilinear(int(k) + 1, uv[of_level]) - color)
-            out[of_level] = color
-        return out
-
-    def _bilinear(self, k: int, uv: Array32) -> Array32:
-        """Return the reflectance (N, 3) of one halving, interpolated between texel centres."""
-        import cv2
-
-        image = self.levels[k]
-        height, width = image.shape[:2]
-        n = len(uv)
-        columns = min(n, REMAP_COLUMNS)
-        rows = -(-n // columns)
-        x = np.zeros(rows * columns, np.float32)
-        y = np.zeros(rows * columns, np.float32)
-        u, v = uv[:, 0], 1.0 - uv[:, 1]
-        if self.wrap:
-            u, v = u - np.floor(u), v - np.floor(v)
-        x[:n], y[:n] = u * width - 0.5, v * height - 0.5
-        border = cv2.BORDER_WRAP if self.wrap else cv2.BORDER_REPLICATE
-        color = cv2.remap(
-            image, x.reshape(rows, columns), y.reshape(rows, columns), cv2.INTER_LINEAR,
-            borderMode=border,
-        )  # fmt: skip
-        return np.asarray(color, np.float32).reshape(-1, 3)[:n] * np.float32(1 / 65535)
 
 
 def corner_normals(mesh: Mesh) -> Array32:
@@ -169,10 +129,7 @@ class Surface:
         Of a material only the base colour counts: how glossy a surface is, the `Lighting` says.
         """
         mesh, material = placed.mesh, placed.material
-        R = placed.T_world_obj[:3, :3].astype(np.float32)
-        local = corner_normals(mesh)
-        self.local_normals = local
-        self.normals: Array32 = local @ R.T
+        self.local_normals = corner_normals(mesh)
         self.is_glossy = placed.instance != BACKGROUND
         corners = mesh.vertices[mesh.faces]
         self._colors: Array32 | None = None
@@ -214,19 +171,6 @@ class Surface:
         if self._colors is not None:
             return self._colors
         return np.concatenate([self._uv, np.zeros_like(self._uv[..., :1])], axis=-1)
-
-    def normal(self, face: Int32, weights: Array32) -> Array32:
-        """Return shading normals (N, 3), not normalised, at barycentric weights (N, 3)."""
-        return np.einsum("nij,ni->nj", self.normals[face], weights)
-
-    def reflectance(self, face: Int32, weights: Array32, footprint_m: Array32) -> Array32:
-        """Return the linear reflectance (N, 3), averaged over a footprint (N,) [m]."""
-        if self.texture is None:
-            assert self._colors is not None
-            return np.einsum("nij,ni->nj", self._colors[face], weights)
-        uv = np.einsum("nij,ni->nj", self._uv[face], weights)
-        color = self.texture.sample(uv, footprint_m * self.texels_per_m[face])
-        return color * self.tint
 
 
 def check_projection(number: int, placed: PlacedMesh) -> None:

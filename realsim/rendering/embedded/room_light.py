@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from realsim.arrays import Array, Array32, Int32, Int64, Mask, UInt8
 from realsim.compiled import njit
+from realsim.geometry import se3
 from realsim.rendering.embedded.face_geometry import edges_of, plane_met
 from realsim.rendering.embedded.materials import Surface
 from realsim.rendering.rays import PlacedMesh
@@ -113,6 +114,24 @@ def room_surfaces(placed: Sequence[PlacedMesh], gamma: float) -> RoomSurfaces:
         wraps=np.array([bool(t and t.wrap) for t in texture]),
         tint=np.array([s.tint for s in surfaces], np.float32),
         glossy=np.array([s.is_glossy for s in surfaces]),
+    )
+
+
+def room_view(
+    light: Array, R_sun_world: Array, Ts_world_obj: Array, T_world_cam: Array
+) -> RoomView:
+    """Return a camera at T_world_cam (4, 4) among meshes at Ts_world_obj (G, 4, 4) [m].
+
+    `light` and `R_sun_world` are those of `RoomView`.
+    """
+    Ts_obj_cam = se3.invert(Ts_world_obj) @ T_world_cam
+    return RoomView(
+        eyes=np.ascontiguousarray(Ts_obj_cam[:, :3, 3]),
+        Rs_obj_cam=np.ascontiguousarray(Ts_obj_cam[:, :3, :3]),
+        R_world_cam=np.ascontiguousarray(T_world_cam[:3, :3]),
+        Ts_sun_obj=se3.from_rt(R_sun_world, np.zeros(3)) @ Ts_world_obj,
+        R_sun_world=R_sun_world,
+        light=light,
     )
 
 
