@@ -68,7 +68,7 @@ class CorrectPanel:
         self._now: Correction | None = None
         self._is_busy = False
         self._copy = MovedCopy(window, self._dragged)
-        self._points = PointPlacer(window, self._by_points, self._asked)
+        self.points = PointPlacer(window, self._by_points, self._asked)
         gui = window.client.gui
         self._text = gui.add_markdown("Choose an object first.")
         self._begin = gui.add_button(
@@ -186,7 +186,7 @@ class CorrectPanel:
         with self._window.lock:
             now = self.begin()
             self._clicks.visible = True
-            self._points.begin(self._model().mesh, now.T_world_obj)
+            self.points.begin(self._model().mesh, now.T_world_obj)
 
     def put_back(self) -> None:
         """Take the copy away and forget it; nothing was written."""
@@ -402,15 +402,15 @@ class CorrectPanel:
 
     def _click_answer(self, word: str) -> None:
         if word == "Last click back":
-            self._points.back()
+            self.points.back()
         elif word == "Shift by one":
-            self._points.shift()
+            self.points.shift()
         else:
             self._end_clicks()
             self._tell()
 
     def _end_clicks(self) -> None:
-        self._points.end()
+        self.points.end()
         self._clicks.visible = False
         self._copy.see(True)
 
@@ -430,7 +430,7 @@ class CorrectPanel:
                 pose=tuple(now.T_world_obj.ravel().tolist()),
             )  # fmt: skip
         self._window.browser.keep_drafts(kept)
-        if self._points.is_on:
+        if self.points.is_on:
             return
         if self._now is None:
             self._text.content = "The object stands as it is in the journal."

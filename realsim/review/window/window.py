@@ -399,7 +399,8 @@ class Window:
 
     def _guarded_call(self, action: Callable[..., object]) -> Callable[..., None]:
         def callback(*given: Any) -> None:
-            if not self._is_closed:
+            # A click that places an object by points chooses nothing.
+            if not (self._is_closed or self.correct.points.is_on):
                 self.attempt(lambda: action(*given))
 
         return callback
