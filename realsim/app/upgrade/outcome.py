@@ -6,9 +6,12 @@ outlines. The photograph is no part of the fit; where a pose was shifted onto it
 other squares of it. All other things stand meanwhile where they are believed to be.
 
 A thing of which little is seen keeps its annotation. A pose that moved far is a proposal of a
-search, not a refinement: it must win clearly. From one view, a new pose keeps the annotation's
-distance where the two differ by no more than the camera's whole depth may be off by: no evidence of
-that view tells which of them is right.
+search, not a refinement: it must win clearly.
+
+No evidence of one view tells whether its whole depth is off. So of the way z along the ray from the
+annotation to the new pose only the share a^2 / (a^2 + d^2) is taken, d being the 1-sigma of that
+depth, and a^2 = s^2 / 2 + max(z^2 - d^2, 0) the annotation's own error, as seen from the way s that
+it is off in all other directions and from z (empirical Bayes).
 """
 
 from collections.abc import Mapping, Sequence
@@ -66,9 +69,9 @@ class OutcomeConfig:
     """Sectors of an outline, each one piece."""
     cap_px: float = 3.0
     """An edge further away, or none, counts as this [px]."""
-    ray_share: float = 0.01
-    """Share of its distance by which one view's depth may be off as a whole: data sheets of depth
-    cameras state 1 to 2 %."""
+    ray_share: float = 0.005
+    """1-sigma of one view's whole depth, as a share of the distance: data sheets of depth cameras
+    state limits of 1 to 2 %."""
     least_pieces: int = 8
     """Fewer pieces decide nothing."""
     views: int = 6
@@ -130,8 +133,8 @@ class _Proposal:
     T_world_obj: Array
     on_photo: bool = False
     """Whether it was shifted onto the photograph."""
-    keeps_distance: bool = False
-    """Whether it is as far from the camera as the annotation."""
+    words: str = ""
+    """What was not taken of it."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -310,7 +313,7 @@ def decide(
         )  # fmt: skip
         proposals = {
             i: [
-                _at_the_distance_of(now[i], p, of[i], pictures[0], config)
+                _along_its_ray(now[i], p, of[i], pictures[0], config)
                 for p in (_Proposal(T, on_photo=True), *proposals[i])
             ]
             for i, T in zip(new, moved, strict=True)
@@ -325,18 +328,24 @@ def decide(
     return [outcomes[a.instance] for a in annotations]
 
 
-def _at_the_distance_of(
+def _along_its_ray(
     T_old: Array, p: _Proposal, model: ObjectModel, picture: Picture, config: OutcomeConfig
 ) -> _Proposal:
-    """Return a proposal, moved along its ray to the annotation's distance if that is near."""
+    """Return a proposal as far along its ray as one view's depth can tell."""
     middle = model.mesh.bounds.mean(0)[None]
     T_cam_world = se3.invert(picture.T_world_cam)
     new, old = (se3.transform(T_cam_world @ T, middle)[0] for T in (p.T_world_obj, T_old))
-    share = old[2] / new[2] - 1.0
-    if abs(share) > config.ray_share:
-        return p
-    step = se3.from_translation(picture.T_world_cam[:3, :3] @ (share * new))
-    return replace(p, T_world_obj=step @ p.T_world_obj, keeps_distance=True)
+
+    def slid(share: float) -> Array:
+        step = picture.T_world_cam[:3, :3] @ (share * (old[2] / new[2] - 1.0) * new)
+        return se3.from_translation(step) @ p.T_world_obj
+
+    way, sigma = float(new[2] - old[2]), config.ray_share * float(new[2])
+    aside = mssd_symmetric(T_old, slid(1.0), model)
+    own = aside**2 / 2 + max(way**2 - sigma**2, 0.0)
+    taken = own / (own + sigma**2)
+    words = f"; {1e3 * taken * way:.1f} of {1e3 * way:.1f} mm along the ray were taken"
+    return replace(p, T_world_obj=slid(1.0 - taken), words=words)
 
 
 def _decided(
@@ -357,8 +366,7 @@ def _decided(
         e = referee.evidence(given.instance, T, p.T_world_obj, others, p.on_photo)
         kind, words = _judged(e, found, referee.config)
         if kind == "improved":
-            words += "; its distance is the annotation's" if p.keeps_distance else ""
-            return Outcome(instance=given.instance, kind=kind, words=words,
+            return Outcome(instance=given.instance, kind=kind, words=words + p.words,
                            T_world_obj=p.T_world_obj, evidence=e)  # fmt: skip
         first = first or (e, kind, words)
     assert first is not None
