@@ -41,7 +41,9 @@ def pages(registered_session: Path, tmp_path_factory: pytest.TempPathFactory) ->
 def test_tables_scroll_inside_the_page_and_every_check_is_in_one(pages: dict[str, Path]) -> None:
     for page in pages.values():
         text = page.read_text("utf-8")
-        assert text.count("<table>") == len(re.findall(r'<div class="scroll[^>]*><table>', text)) > 0
+        assert (
+            text.count("<table>") == len(re.findall(r'<div class="scroll[^>]*><table>', text)) > 0
+        )
     rows = re.findall(r"<tr><td[^>]*>(?:<span>)?(.*?)</", pages["report"].read_text("utf-8"))
     assert {"agree", "probability"} <= set(rows)
 

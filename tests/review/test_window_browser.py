@@ -13,8 +13,10 @@ from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.review import ReviewServer
 from realsim.review.journal import Entry
+from realsim.review.static.static_page import write_static
 from realsim.store import SessionStore, load_scene, save_scene
 from tests.support.review_browser import (
+    CHROMIUM,
     SMALL,
     ReviewBrowser,
     ReviewPage,
@@ -293,3 +295,69 @@ def test_filters_legends_and_marks(browser: ReviewBrowser, server: ReviewServer)
         page.wait_message("it is spare")
         page.wait_until(lambda: any("0 spare" in b for b in page.buttons()), "the other name")
     assert [e.action for e in lines(server)] == ["symmetric", "swap"]
+
+
+def test_the_mouse_chooses_objects_frustums_grasps_and_three_points(
+    browser: ReviewBrowser, server: ReviewServer
+) -> None:
+    scene = server.sessions[0].registered
+    with browser.page(server.url, width=1280, height=800) as page:
+        loaded(page)
+        window: Any = server.windows[0]
+        page.wait_until(lambda: _scene_share(page) > 0.02, "the scene")
+        camera = window.client.camera
+        window.views.first_look()
+        page.page.wait_for_timeout(1500)
+        page.click_at(camera, [0.46, 0.0, 0.12], "\u25b6 0 tall")
+        T_cam = max((v.T_world_cam for v in window.content.views),
+                    key=lambda T: np.linalg.norm(T[:3, 3] - camera.position))  # fmt: skip
+        page.click_at(camera, T_cam[:3, 3] + 0.025 * T_cam[:3, 2], "tall \u00b7 view")
+        page.key("g")
+        page.wait_until(lambda: in_photograph(page, ".rs-bar") is None, "the scene")
+        page.tab("Grasps")
+        page.tick("Show grasps")
+        page.wait_for("40 of 80 grasps drawn")
+        grasps = window.content.grasps_of(0)
+        widest = int(np.argmax(grasps.widths_m))
+        T_grasp = scene.object(0).T_world_obj @ grasps.Ts_obj_grasp[widest]
+        finger = [[0.0, 0.52 * grasps.widths_m[widest], -0.5 * SMALL.gripper.finger_m]]
+        page.click_at(camera, se3.transform(T_grasp, np.array(finger)), "of 40, tall (instance 0)")
+        page.press("Next")
+        page.wait_for("The arm does not reach it")
+        page.tick("Show grasps")
+        page.press("3 flat")
+        page.wait_for("\u25b6 3 flat")
+        page.tab("Correct")
+        page.key("l")
+        page.key("l")
+        page.wait_for("moved 10.0 mm")
+        page.press("Place by three points")
+        cloud = window.content.cloud.points
+        middle = scene.object(3).T_world_obj[:3, 3] + [0, 0, 0.015]
+        top = cloud[(np.abs(cloud - middle) < [0.035, 0.025, 0.002]).all(1)]
+        said = ("second point on the blue", "third point on the blue", "placed by 3 points")
+        for k, corner in enumerate(([-0.03, -0.02], [0.03, -0.02], [0.0, 0.02])):
+            point = top[np.argmin(np.linalg.norm((top - middle)[:, :2] - corner, axis=1))]
+            page.click_at(camera, point + np.array([0.01, 0, 0]), f"(pair {k + 1})")
+            page.click_at(camera, point, said[k])
+        page.press("Save the pose")
+        page.wait_message("Recorded")
+    (line,) = lines(server)
+    assert line.how == "steps+points" and line.pose is not None
+    assert np.linalg.norm(line.pose[:3, 3] - scene.object(3).T_world_obj[:3, 3]) < 0.003
+
+
+def test_a_browser_without_webgl_says_so(
+    browser: ReviewBrowser, server: ReviewServer, tmp_path: Path
+) -> None:
+    session, path = server.sessions[0], tmp_path / "scene.html"
+    write_static(session.content(), session.standing.state, path, title="Scene")
+    args = ["--no-sandbox", "--disable-gpu", "--disable-webgl", "--disable-3d-apis"]
+    bare = browser.browser.browser_type.launch(executable_path=CHROMIUM, args=args)
+    try:
+        page = bare.new_page()
+        for address, note in ((server.url, ".realsim-no-webgl"), (path.as_uri(), "#wait")):
+            page.goto(address)
+            page.get_by_text("cannot draw in three dimensions").and_(page.locator(note)).wait_for()
+    finally:
+        bare.close()

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from realsim.arrays import Rgb
+from realsim.geometry import se3
 from realsim.review.content.config import SceneConfig
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -122,6 +124,29 @@ class ReviewPage:
             lambda: self.page.evaluate(f"name => {find}.ariaSelected === 'true'", name),
             f"the tab '{name}'",
         )
+
+    def click_at(self, camera: Any, point: ArrayLike, until: str) -> None:
+        """Click with the mouse where a point (3,) of the scene is drawn [m], until a text is shown.
+
+        Args:
+            camera: the browser's, as the server knows it.
+            point: in world.
+            until: what the click brings about; the scene may be drawn late.
+        """
+        T = se3.from_rt(se3.from_quaternion_wxyz(camera.wxyz), camera.position)
+        x, y, z = se3.transform(se3.invert(T), np.reshape(point, (1, 3)))[0]
+        size = self.page.viewport_size
+        f = 0.5 * size["height"] / np.tan(0.5 * camera.fov)
+        at = size["width"] / 2 + f * x / z, size["height"] / 2 + f * y / z
+        for _ in range(10):
+            self.page.mouse.move(at[0] + 3, at[1])
+            self.page.mouse.move(*at)
+            self.page.wait_for_timeout(500)
+            self.page.mouse.click(*at, delay=50)
+            self.page.wait_for_timeout(3000)
+            if until in self.text():
+                return
+        self.wait_for(until)
 
     def key(self, key: str) -> None:
         """Press a key, no text being written."""

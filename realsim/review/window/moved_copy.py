@@ -76,10 +76,17 @@ class MovedCopy:
             self._mesh.wxyz, self._mesh.position = viser_wxyz_position(self._T_gizmo_obj)
             self._gizmo.wxyz, self._gizmo.position = viser_wxyz_position(T_world_gizmo)
 
-    def see(self, is_seen: bool) -> None:
-        """Show the copy, or not while a click among the measured points is waited for."""
+    def see(self, is_seen: bool, is_dragged: bool) -> None:
+        """Show the copy, or not while a click among the measured points is waited for.
+
+        Args:
+            is_seen: whether it is shown.
+            is_dragged: whether its gizmo is there; it would catch clicks.
+        """
         if self._gizmo is not None:
             self._mesh.visible = is_seen
+            for part in ("disable_axes", "disable_sliders", "disable_rotations"):
+                setattr(self._gizmo, part, not is_dragged)
 
     def hide(self) -> None:
         """Take copy and gizmo away; the object is seen again."""

@@ -390,7 +390,7 @@ class CorrectPanel:
             self._put(T, "swap")
 
     def _asked(self, text: str, with_model: bool) -> None:
-        self._copy.see(with_model)
+        self._copy.see(with_model, False)
         self._text.content = text
 
     def _by_points(self, fit: placing.PointFit) -> None:
@@ -412,7 +412,7 @@ class CorrectPanel:
     def _end_clicks(self) -> None:
         self.points.end()
         self._clicks.visible = False
-        self._copy.see(True)
+        self._copy.see(True, True)
 
     def _words(self, now: Correction) -> str:
         far = placing.moved(now.start.T_world_obj, now.T_world_obj, self._model().mesh)
