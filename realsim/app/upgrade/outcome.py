@@ -5,13 +5,13 @@ by a paired t-test: over blocks of the pixels that either pose claims, and over 
 outlines. The photograph is no part of the fit; where a pose was shifted onto it, that was done on
 other squares of it. All other things stand meanwhile where they are believed to be.
 
-A thing of which little is seen keeps its annotation. A pose that moved far is a proposal of a
-search, not a refinement: it must win clearly.
+A thing of which little is seen keeps its annotation; a pose that moved far must win clearly.
 
-No evidence of one view tells whether its whole depth is off. So of the way z along the ray from the
-annotation to the new pose only the share a^2 / (a^2 + d^2) is taken, d being the 1-sigma of that
-depth, and a^2 = s^2 / 2 + max(z^2 - d^2, 0) the annotation's own error, as seen from the way s that
-it is off in all other directions and from z (empirical Bayes).
+A new pose is no more than an estimate with a covariance C, and so is the annotation: its own error,
+a in all directions, is told from the twist x between the two by x' (C + a^2 I)^-1 x = 6. What is
+proposed is the mean of both by their weights (empirical Bayes): where the new pose is unsure, such
+as a can's turn about its axis, the annotation stands. No evidence of one view tells whether its
+whole depth is off; that is in C, too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,10 +19,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from scipy.optimize import brentq
 
 from realsim.arrays import Array, Array32, Mask
 from realsim.geometry import camera, se3
-from realsim.geometry.metrics import mssd_symmetric
+from realsim.geometry.metrics import aligned_pose, mssd_symmetric
 from realsim.records import ObjectModel, ObjectPose, SupportPlane
 from realsim.registration.compare import CompareConfig, Comparer, make_comparer
 from realsim.registration.evidence import DepthFrame, EvidenceConfig, measure_noise
@@ -134,7 +135,7 @@ class _Proposal:
     on_photo: bool = False
     """Whether it was shifted onto the photograph."""
     words: str = ""
-    """What was not taken of it."""
+    """How much was taken of it."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -312,12 +313,12 @@ def decide(
             config.photo,
         )  # fmt: skip
         proposals = {
-            i: [
-                _along_its_ray(now[i], p, of[i], pictures[0], config)
-                for p in (_Proposal(T, on_photo=True), *proposals[i])
-            ]
-            for i, T in zip(new, moved, strict=True)
+            i: [_Proposal(T, on_photo=True), *proposals[i]] for i, T in zip(new, moved, strict=True)
         }
+    proposals = {
+        i: [_fused(now[i], p, new[i], of[i], pictures, config) for p in given]
+        for i, given in proposals.items()
+    }
     outcomes: dict[int, Outcome] = {}
     for _ in range(2):  # the second time with the others where they now are
         for a in annotations:
@@ -328,24 +329,38 @@ def decide(
     return [outcomes[a.instance] for a in annotations]
 
 
-def _along_its_ray(
-    T_old: Array, p: _Proposal, model: ObjectModel, picture: Picture, config: OutcomeConfig
+def _fused(
+    T_old: Array,
+    p: _Proposal,
+    found: ObjectPose,
+    model: ObjectModel,
+    pictures: Sequence[Picture],
+    config: OutcomeConfig,
 ) -> _Proposal:
-    """Return a proposal as far along its ray as one view's depth can tell."""
-    middle = model.mesh.bounds.mean(0)[None]
-    T_cam_world = se3.invert(picture.T_world_cam)
-    new, old = (se3.transform(T_cam_world @ T, middle)[0] for T in (p.T_world_obj, T_old))
+    """Return a proposal together with the annotation, each as far as it is sure."""
+    if found.covariance is None:
+        return p
+    # About the box's centre, turns times its radius: all six in metres of the surface.
+    M = se3.from_translation(model.mesh.bounds.mean(0))
+    radius = float(np.linalg.norm(np.ptp(model.mesh.bounds, axis=0))) / 2
+    units = np.repeat([radius, 1.0], 3)
+    new, old = p.T_world_obj @ M, aligned_pose(p.T_world_obj, T_old, model) @ M
+    to_centre = units[:, None] * se3.adjoint(se3.invert(M))
+    C = to_centre @ found.covariance @ to_centre.T
+    if len(pictures) == 1:
+        ray = new[:3, :3].T @ (new[:3, 3] - pictures[0].T_world_cam[:3, 3])
+        C[3:, 3:] += config.ray_share**2 * np.outer(ray, ray)
+    variances, axes = np.linalg.eigh(C)
+    x = axes.T @ (units * se3.log(se3.invert(new) @ old))
 
-    def slid(share: float) -> Array:
-        step = picture.T_world_cam[:3, :3] @ (share * (old[2] / new[2] - 1.0) * new)
-        return se3.from_translation(step) @ p.T_world_obj
+    def surplus(own: float) -> float:
+        return float(np.sum(x**2 / (variances + own))) - len(x)
 
-    way, sigma = float(new[2] - old[2]), config.ray_share * float(new[2])
-    aside = mssd_symmetric(T_old, slid(1.0), model)
-    own = aside**2 / 2 + max(way**2 - sigma**2, 0.0)
-    taken = own / (own + sigma**2)
-    words = f"; {1e3 * taken * way:.1f} of {1e3 * way:.1f} mm along the ray were taken"
-    return replace(p, T_world_obj=slid(1.0 - taken), words=words)
+    own = brentq(surplus, 0.0, float(x @ x)) if surplus(0.0) > 0 else 0.0
+    back = axes @ (variances / (variances + own) * x)
+    T = new @ se3.exp(back / units) @ se3.invert(M)
+    taken, whole = (1e3 * mssd_symmetric(T_old, X, model) for X in (T, p.T_world_obj))
+    return replace(p, T_world_obj=T, words=f"; {taken:.1f} of {whole:.1f} mm were taken")
 
 
 def _decided(
