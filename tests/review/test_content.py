@@ -12,12 +12,12 @@ from realsim.geometry import camera, depth, se3
 from realsim.rendering import overlay
 from realsim.review.content.config import GripperDrawing, SceneConfig
 from realsim.review.content.content import SceneContent
-from realsim.review.content.views import Region, region_of, strided, worst_first
+from realsim.review.content.views import Region, region_of, strided
 from realsim.review.drawing import grasp_drawing
 from realsim.review.drawing.grasp_drawing import GraspFilter, passing
 from realsim.review.window.panel_grasps import legend_html
 from realsim.store import SessionStore
-from tests.support.reviewed_boxes import CAMERAS, SCENE, boxes_session, grasp_set
+from tests.support.reviewed_boxes import CAMERAS, boxes_session, grasp_set
 
 CONFIG = SceneConfig(voxel_m=0.004, coarse_points=200, piece_points=700, thumbnail_px=40)
 
@@ -83,10 +83,6 @@ def test_pieces_are_the_cloud_in_order_and_no_message_is_large(
 
 
 # --- the scene --------------------------------------------------------------------------------
-
-
-def test_worst_comes_first() -> None:
-    assert [o.instance for o in worst_first(SCENE.objects)] == [3, 0]
 
 
 def test_without_objects_the_region_is_where_the_cameras_look() -> None:

@@ -13,9 +13,9 @@ from realsim.review import journal, scene_list
 from realsim.review.refusals import SessionGone
 from realsim.review.reviewed_session import ReviewedSession
 from realsim.review.scene_list import ObjectRow
-from realsim.store import SessionStore, save_scene
+from realsim.store import SessionStore
 from tests.support.review_browser import SMALL
-from tests.support.reviewed_boxes import SCENE, boxes_session
+from tests.support.reviewed_boxes import boxes_session
 
 TALL, FLAT, SPARE = 1, 7, 9
 
@@ -176,14 +176,6 @@ def test_the_journal_is_read_again_only_when_it_changed(session: ReviewedSession
     )
     assert session.standing is not first
     assert session.standing.state.entries[-1].reviewer == "somebody else"
-
-
-def test_a_session_that_is_registered_anew_is_noticed(session: ReviewedSession) -> None:
-    assert not session.has_changed() and not session.has_pending
-    session.decide("reject", seen(session, 3), "ada")
-    assert session.has_pending and not session.has_changed()
-    save_scene(session.store, SCENE)
-    assert [session.has_changed() for _ in range(2)] == [False, True]
 
 
 # --- what keeps a line out ----------------------------------------------------------------------

@@ -245,27 +245,6 @@ def test_grasps_are_one_node_at_their_poses_and_a_click_tells_the_row(
     assert "/grasps" not in states(server)
 
 
-def test_clicks_on_objects_and_cameras_tell_which(
-    server: viser.ViserServer, nodes: SceneNodes
-) -> None:
-    told: list[tuple[str, int]] = []
-    done = threading.Semaphore(0)
-
-    def hear(kind: str, number: int) -> None:
-        told.append((kind, number))
-        done.release()
-
-    nodes.on_object(lambda i: hear("object", i))
-    nodes.on_camera(lambda i: hear("camera", i))
-    client = Client(server)
-    client.receive()
-    owner = client.of("GlbMessage")[0]["owner"]
-    for name in ("/objects/3/appearance", "/cameras/000002", "/objects/0/appearance"):
-        client.click(name, owner)
-        assert done.acquire(timeout=10)
-    assert told == [("object", 3), ("camera", 2), ("object", 0)]
-
-
 def test_highlight_and_ellipsoids_come_and_go(server: viser.ViserServer, nodes: SceneNodes) -> None:
     before = states(server)
     nodes.highlight(3)

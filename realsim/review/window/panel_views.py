@@ -55,7 +55,9 @@ class PhotographLink:
             client=window.client.client_id,
             state=f"{zlib.crc32(state.encode()):08x}",
             instance=window.selected if chosen else "",
-            name=html.escape(window.model_of(window.placed).name if chosen else ""),
+            name=html.escape(f"{window.selected} {window.model_of(window.placed).name}")
+            if chosen
+            else "",
             turn=self._turn,
             view=self._view,
         )
