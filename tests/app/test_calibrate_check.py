@@ -9,6 +9,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from realsim.app.cli import commands
+from realsim.app.console import Console
+from realsim.app.demo.run import DemoConfig, capture_and_register
 from realsim.app.register.files import write_result
 from realsim.arrays import Array
 from realsim.errors import InputError
@@ -73,9 +75,10 @@ def test_what_cannot_be_checked_is_bad_input(pristine: Path, tmp_path: Path) -> 
         assert isinstance(done.exception, InputError) and words in str(done.exception)
 
 
-def test_the_calibration_that_lies_there_now_is_checked(demo_session: Path, tmp_path: Path) -> None:
+def test_the_calibration_that_lies_there_now_is_checked(tmp_path: Path) -> None:
     """A hand-eye that was changed after the registration is the one that does not hold."""
-    store = SessionStore.open(copy_of(demo_session, tmp_path / "s"))
+    config = DemoConfig(views=6, objects=2, width=640)
+    store, _, _ = capture_and_register(config, tmp_path, Console(quiet=True))
     assert check(store.folder, "--tolerance", "2").exit_code == 0
     hand_eye = load_hand_eye(store)
     aside = hand_eye.T_ee_cam @ se3.from_translation([0.005, 0.0, 0.0])
