@@ -11,7 +11,7 @@ Tests that only read use the folder as it is. A test that writes takes a copy:
   registered (registered_sessions.table_session).
 - `registered_session`: the same with a registration that is the truth.
 - `demo_session`: a whole `realsim demo` of six views, two objects, eight grasps each: captured,
-  calibrated, registered, schooled, annotated, reported. It costs about 40 CPU s: for slow tests.
+  calibrated, registered, schooled, annotated, reported. It costs about 50 CPU s: for slow tests.
 """
 
 import os
@@ -71,7 +71,7 @@ def demo_session(run_folder: Path) -> Path:
         from realsim.app.console import Console
         from realsim.app.demo.run import DemoConfig, run_demo
 
-        config = DemoConfig(views=6, objects=2, grasps_per_object=8, workers=1)
+        config = DemoConfig(views=6, objects=2, grasps_per_object=8, width=640, workers=1)
         run_demo(config, folder, Console(quiet=True))
 
     return once(run_folder, "demo", make) / "session"

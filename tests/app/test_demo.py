@@ -18,7 +18,8 @@ from realsim.app.demo.site import PAGES, write_site
 from realsim.app.truth import LoopErrors, loop_errors
 from realsim.store import SessionStore
 
-SMALL = ["--views", "6", "--objects", "2", "--grasps", "8", "--quiet"]
+SMALL = ["--quick", "--views", "6", "--objects", "2", "--grasps", "8", "--quiet"]
+"""The demo of `demo_session`; `--quick` makes its pictures small."""
 
 
 def start_demo(out: Path) -> subprocess.Popen[str]:
