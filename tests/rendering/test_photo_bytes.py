@@ -77,6 +77,11 @@ def test_the_look_without_an_environment_stays() -> None:
     assert np.abs(np.diff(rgb, axis=1)).mean() == pytest.approx(GOLDEN_STEP, abs=0.1)
 
 
+def test_where_nothing_stands_the_room_is_seen() -> None:
+    photo = PhotoRenderer([]).render(VIEW, T_WORLD_CAM)
+    assert np.all(photo.geometry == -1) and photo.rgb.min() > 30
+
+
 @pytest.mark.slow
 def test_the_bytes_do_not_depend_on_the_number_of_threads() -> None:
     threads = "3"

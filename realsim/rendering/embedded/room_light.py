@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from realsim.arrays import Array, Array32, Int32, Int64, Mask, UInt8
 from realsim.compiled import njit
 from realsim.geometry import se3
+from realsim.records import Mesh
 from realsim.rendering.embedded.face_geometry import edges_of, plane_met
 from realsim.rendering.embedded.materials import Surface
 from realsim.rendering.rays import PlacedMesh
@@ -86,6 +87,9 @@ class RoomSamples(NamedTuple):
 
 def room_surfaces(placed: Sequence[PlacedMesh], gamma: float) -> RoomSurfaces:
     """Return the surfaces of placed meshes; where they stand does not matter."""
+    # Where nothing is placed, a surface that no ray meets gives the arrays their shapes.
+    unseen = Mesh(vertices=np.eye(3), faces=np.array([[0, 1, 2]]))
+    placed = placed or [PlacedMesh(0, unseen, np.eye(4))]
     surfaces = [Surface(p, gamma) for p in placed]
     n, first = len(placed), 0
     layout = np.zeros((n, MOST_HALVINGS, 3), np.int64)
