@@ -19,12 +19,7 @@ from realsim_calibration.lens.fit import IntrinsicsConfig
 from realsim_calibration.lens.intrinsics import calibrate_intrinsics
 from realsim_calibration.lens.report import IntrinsicsReport
 from realsim_calibration.results import HandEyeReport
-from realsim_calibration.views import (
-    BoardView,
-    TargetDetection,
-    detection_of,
-    measured_poses,
-)
+from realsim_calibration.views import BoardView, TargetDetection, detection_of, measured_poses
 
 CAMERA_SIGMAS = 4.0
 """A given focal length this many sigma of the images' own away is another one."""

@@ -13,13 +13,7 @@ from realsim_calibration.fit.robust_fit import Solution, solve
 from realsim_calibration.fit.view_system import SHARED, camera_record
 from realsim_calibration.plain import choose_plain
 from realsim_calibration.results import BoardShape, HandEyeReport, Stretch, ViewReport
-from realsim_calibration.screening import (
-    Candidate,
-    HandEyeConfig,
-    Screened,
-    joints_of,
-    screen,
-)
+from realsim_calibration.screening import Candidate, HandEyeConfig, Screened, joints_of, screen
 from realsim_calibration.views import BoardView
 
 

@@ -18,12 +18,7 @@ SYMMETRY_STEP_RAD = 0.002
 be up to 3 mm off."""
 IOU_VIEWS = 24
 """Masks are compared with the true ones in at most so many views, evenly spread."""
-GOALS = {
-    "handeye_mm": 0.5,
-    "handeye_deg": 0.1,
-    "object_mssd_mm": 1.0,
-    "mask_iou": 0.95,
-}
+GOALS = {"handeye_mm": 0.5, "handeye_deg": 0.1, "object_mssd_mm": 1.0, "mask_iou": 0.95}
 """What the default demo (24 views) must reach."""
 
 

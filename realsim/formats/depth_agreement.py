@@ -86,9 +86,7 @@ def near_pairs(Ts_world_cam: Array, views: Mapping[int, DepthView]) -> list[tupl
 
 
 def disagreement_mm(
-    Ts_world_cam: Array,
-    views: Mapping[int, DepthView],
-    pairs: Sequence[tuple[int, int]],
+    Ts_world_cam: Array, views: Mapping[int, DepthView], pairs: Sequence[tuple[int, int]]
 ) -> float:
     """Return by how much the depth of pairs of views differs: the median over the pairs [mm].
 

@@ -349,11 +349,7 @@ def require_scale(evidence: ScaleEvidence, where: str, *, stated: float = 1.0) -
 
 
 def poses_checked_by_depth(
-    Ts_world_cam: Array,
-    depth_of: DepthOf,
-    where: str,
-    metres_per_unit: float | None,
-    remedy: str,
+    Ts_world_cam: Array, depth_of: DepthOf, where: str, metres_per_unit: float | None, remedy: str
 ) -> list[str]:
     """Return notes on what depth says of camera poses: their direction, axes and unit.
 

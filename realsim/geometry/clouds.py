@@ -65,10 +65,7 @@ def voxel_mean(
 
 
 def fit_plane_ransac(
-    points: ArrayLike,
-    rng: np.random.Generator,
-    tolerance_m: float,
-    iterations: int = 300,
+    points: ArrayLike, rng: np.random.Generator, tolerance_m: float, iterations: int = 300
 ) -> tuple[Array, float, Mask]:
     """Return the plane n.p = offset with the most points within `tolerance_m`.
 

@@ -178,10 +178,7 @@ def _quiet(name: str) -> Generator[None]:
 
 
 def _missing_looks(
-    path: Path,
-    beside: Any,
-    colors: UInt8 | None,
-    texture: UInt8 | None,
+    path: Path, beside: Any, colors: UInt8 | None, texture: UInt8 | None
 ) -> list[str]:
     """Return in words what is missing of a mesh's look, and what stands for it."""
     if texture is not None:

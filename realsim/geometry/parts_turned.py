@@ -66,11 +66,7 @@ def bottle() -> PartShape:
     top = [[0.0125, 0.064], [0.0155, 0.0645], [0.0155, 0.0775], [0.014, 0.079], [0.0, 0.079]]
     profile = np.concatenate([[[0.0, -0.079]], foot, shoulder, top])
     green, label = (44, 112, 74), (238, 222, 170)
-    return _turned(
-        profile,
-        (-0.05, 0.012, 0.0642),
-        (green, label, green, (224, 224, 220)),
-    )
+    return _turned(profile, (-0.05, 0.012, 0.0642), (green, label, green, (224, 224, 220)))
 
 
 def bowl() -> PartShape:
@@ -137,9 +133,7 @@ def elbow() -> PartShape:
     middle = np.array([0.0, 0.0, (z.min() + z.max()) / 2])
     copper, dark = (186, 104, 72), (140, 72, 50)
     return PartShape(
-        pieces=[pieces - middle],
-        bands=[(-0.019, dark), (np.inf, copper)],
-        symmetries=cyclic(2),
+        pieces=[pieces - middle], bands=[(-0.019, dark), (np.inf, copper)], symmetries=cyclic(2)
     )
 
 

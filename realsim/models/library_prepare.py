@@ -163,10 +163,7 @@ def _prepared(
     parts, trouble = _parts(repair.mesh, config)
     step("properties")
     properties = physical_properties(
-        repair.mesh,
-        density=matter.density,
-        mass_kg=matter.mass_kg,
-        parts=parts,
+        repair.mesh, density=matter.density, mass_kg=matter.mass_kg, parts=parts
     )
     reasons = (*_reasons(repair, parts, config, scale), *trouble)
     made = ModelProperties(

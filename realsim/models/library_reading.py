@@ -15,12 +15,7 @@ from realsim.models import library_files as files
 from realsim.models.convex import parts_from_collision_obj
 from realsim.models.library_commit import finish_interrupted
 from realsim.models.library_files import read_info, read_properties, sha256
-from realsim.models.library_records import (
-    KnownSolid,
-    LibraryModel,
-    ModelProperties,
-    UnscaledModel,
-)
+from realsim.models.library_records import KnownSolid, LibraryModel, ModelProperties, UnscaledModel
 from realsim.models.model_records import ConvexParts
 
 

@@ -186,12 +186,7 @@ def _improper(positions: Array, faces: Int32) -> dict[str, Mask]:
             folded, repeated = back_to_back, repeated & ~back_to_back
         else:
             two_sided = back_to_back
-    return {
-        "collapsed": collapsed,
-        "repeated": repeated,
-        "folded": folded,
-        "two_sided": two_sided,
-    }
+    return {"collapsed": collapsed, "repeated": repeated, "folded": folded, "two_sided": two_sided}
 
 
 def _merged_rims(

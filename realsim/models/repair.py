@@ -42,11 +42,7 @@ class Fillers:
 
 
 def find_fillers(
-    topo: Topology,
-    faces: Int32,
-    turned: Mask,
-    largest: Array,
-    unevenness: float,
+    topo: Topology, faces: Int32, turned: Mask, largest: Array, unevenness: float
 ) -> Fillers:
     """Return fans that close the holes up to a size.
 

@@ -61,10 +61,7 @@ class AlignmentFinding:
 
 
 def check_alignment(
-    rgb: UInt8,
-    depth_m: Array32,
-    intrinsics: CameraIntrinsics,
-    config: AlignmentConfig,
+    rgb: UInt8, depth_m: Array32, intrinsics: CameraIntrinsics, config: AlignmentConfig
 ) -> AlignmentFinding:
     """Return how the depth image lies on the colour image.
 

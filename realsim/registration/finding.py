@@ -23,13 +23,7 @@ from realsim.registration.many_views import ManyViews
 from realsim.registration.odometry.cross_check import KinematicsCheck
 from realsim.registration.reports import search_report
 from realsim.registration.search.find import find_objects
-from realsim.registration.search.flat_search import (
-    FlatPose,
-    cover,
-    is_free,
-    seek_flat,
-    table_map,
-)
+from realsim.registration.search.flat_search import FlatPose, cover, is_free, seek_flat, table_map
 from realsim.registration.search.records import NotPlaced, Placed, Region, SearchResult, Wanted
 
 Progress = Callable[[int, int], None]

@@ -288,10 +288,7 @@ def save_hints(store: SessionStore, hints: Sequence[Hint], source: str) -> None:
 
 
 def wanted_objects(
-    hints: Sequence[Hint],
-    models: Mapping[int, ObjectModel],
-    scene: HintScene,
-    config: HintConfig,
+    hints: Sequence[Hint], models: Mapping[int, ObjectModel], scene: HintScene, config: HintConfig
 ) -> list[Wanted]:
     """Return what is wanted: each hint's object with its region and, of a rough pose, the pose.
 

@@ -147,9 +147,7 @@ def register_many(
     seen = [
         [
             replace(
-                p,
-                T_cam_obj=p.T_cam_obj @ S,
-                covariance=_turn_covariance(p.covariance, S) + more,
+                p, T_cam_obj=p.T_cam_obj @ S, covariance=_turn_covariance(p.covariance, S) + more
             )
             for p in of[: len(frames)]
         ]

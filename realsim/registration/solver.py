@@ -296,11 +296,7 @@ class _Sums(NamedTuple):
 
 
 def _linearised(
-    body: Body,
-    cloud: tuple[Array, Array, Array],
-    T: Array,
-    stage: Stage,
-    config: SolverConfig,
+    body: Body, cloud: tuple[Array, Array, Array], T: Array, stage: Stage, config: SolverConfig
 ) -> tuple[_Sums, Array, Array]:
     """Return the sums at pose T, and the upper normal matrix (6, 6) and right side (6,)."""
     H, b = np.zeros((6, 6)), np.zeros(6)

@@ -112,10 +112,7 @@ def dashed(lines: Sequence[Array], length_m: float = DASH_M) -> list[Array]:
 
 
 def draw_outlines(
-    rgb: Image,
-    ids: Int32,
-    colors: Mapping[int, Color] | None = None,
-    thickness: int = 2,
+    rgb: Image, ids: Int32, colors: Mapping[int, Color] | None = None, thickness: int = 2
 ) -> Image:
     """Return the picture with every instance's mask outlined.
 

@@ -240,10 +240,7 @@ def _cosines(began: Array, ended: Array) -> tuple[Array, Array]:
     ends, turn = np.stack([np.cos(began), np.cos(ended)]), 2.0 * np.pi
     passes_0 = np.ceil(began / turn) * turn <= ended
     passes_pi = np.ceil((began - np.pi) / turn) * turn + np.pi <= ended
-    return (
-        np.where(passes_pi, -1.0, ends.min(axis=0)),
-        np.where(passes_0, 1.0, ends.max(axis=0)),
-    )
+    return (np.where(passes_pi, -1.0, ends.min(axis=0)), np.where(passes_0, 1.0, ends.max(axis=0)))
 
 
 def along_approach(Ts_a_b: Array, distances_m: Array | float) -> Array:

@@ -78,11 +78,7 @@ def _make_folder(folder: Path) -> None:
 
 
 def write_bytes(
-    path: Path | str,
-    data: bytes,
-    *,
-    announce: Callable[[], None] | None = None,
-    flush: bool = True,
+    path: Path | str, data: bytes, *, announce: Callable[[], None] | None = None, flush: bool = True
 ) -> None:
     """Write the file whole or not at all; folders are made as needed.
 

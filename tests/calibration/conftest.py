@@ -10,14 +10,7 @@ import pytest
 from realsim.arrays import Array
 from realsim.geometry import camera, se3
 from realsim.geometry.dh import DhArm
-from realsim.records import (
-    ArmErrorMap,
-    CameraIntrinsics,
-    Check,
-    RobotErrorMap,
-    TagBoard,
-    Target,
-)
+from realsim.records import ArmErrorMap, CameraIntrinsics, Check, RobotErrorMap, TagBoard, Target
 from realsim_calibration.hand_eye import HandEyeConfig, calibrate_hand_eye_report
 from realsim_calibration.results import BoardShape, HandEyeReport, Mode, ViewReport
 from realsim_calibration.views import BoardView, TargetDetection

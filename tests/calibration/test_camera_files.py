@@ -172,10 +172,7 @@ def test_large_binary_and_missing_files_are_refused(tmp_path):
     (tmp_path / "large").write_bytes(b" " * 5_000_000)
     with pytest.raises(InputError, match=r"5\.0 MB"):
         read_camera(tmp_path / "large")
-    for head, kind in (
-        (b"\x89PNG\xff\xfe\x00", "a picture"),
-        (b"abc\x00\xff", "a binary file"),
-    ):
+    for head, kind in ((b"\x89PNG\xff\xfe\x00", "a picture"), (b"abc\x00\xff", "a binary file")):
         (tmp_path / "some.file").write_bytes(head)
         with pytest.raises(InputError, match=f"is {kind}, no camera file.*Accepted are text files"):
             read_camera(tmp_path / "some.file")

@@ -6,21 +6,10 @@ import pytest
 from realsim.geometry import camera, se3
 from realsim.records import ArmErrorMap, CameraIntrinsics, RobotErrorMap
 from realsim.robots.arm import find_arm
-from realsim_calibration.fit.joint_solve import (
-    FLAT,
-    JointConfig,
-    JointProblem,
-    Setup,
-    ViewCorners,
-)
+from realsim_calibration.fit.joint_solve import FLAT, JointConfig, JointProblem, Setup, ViewCorners
 from realsim_calibration.fit.linear_model import LinearModel
 from realsim_calibration.fit.noise_scale import NoiseConfig, largest_ratio, whiteness
-from realsim_calibration.fit.robot_error import (
-    RobotErrorConfig,
-    arm_basis,
-    map_basis,
-    map_record,
-)
+from realsim_calibration.fit.robot_error import RobotErrorConfig, arm_basis, map_basis, map_record
 from realsim_calibration.fit.view_system import (
     camera_from_board,
     camera_vector,

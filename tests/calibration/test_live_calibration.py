@@ -30,12 +30,8 @@ from realsim_calibration.planning.live_calibration import (
     WatchConfig,
     watch_folder,
 )
-from realsim_calibration.planning.next_view import (
-    board_geometry,
-)
-from realsim_calibration.planning.view_proposals import (
-    ViewLimits,
-)
+from realsim_calibration.planning.next_view import board_geometry
+from realsim_calibration.planning.view_proposals import ViewLimits
 from realsim_calibration.results import HandEyeReport
 from realsim_calibration.views import BoardView, TargetDetection
 

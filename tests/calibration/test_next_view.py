@@ -6,16 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hand_views import (
-    BOARD,
-    Array,
-    board_at,
-    hand_at,
-    measured,
-    random_hands,
-    report_of,
-    solved,
-)
+from hand_views import BOARD, Array, board_at, hand_at, measured, random_hands, report_of, solved
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import Chessboard
@@ -27,11 +18,7 @@ from realsim_calibration.planning.next_view import (
     predicted_boards,
     rank_next_views,
 )
-from realsim_calibration.planning.view_proposals import (
-    ViewLimits,
-    describe_move,
-    propose_views,
-)
+from realsim_calibration.planning.view_proposals import ViewLimits, describe_move, propose_views
 from realsim_calibration.results import HandEyeReport
 
 

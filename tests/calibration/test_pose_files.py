@@ -13,12 +13,7 @@ from hypothesis import strategies as st
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_calibration.inputs import (
-    ROTATIONS,
-    PoseReading,
-    read_pose_file,
-    reading_from_text,
-)
+from realsim_calibration.inputs import ROTATIONS, PoseReading, read_pose_file, reading_from_text
 
 
 @contextmanager

@@ -13,9 +13,7 @@ from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import ArmErrorMap, CameraIntrinsics, HandEye
 from realsim_calibration.report import style
-from realsim_calibration.report.model_plots import (
-    lens_field,
-)
+from realsim_calibration.report.model_plots import lens_field
 from realsim_calibration.report.scene_3d import frustum
 from realsim_calibration.report.summary import (
     camera_in_board,
@@ -24,9 +22,7 @@ from realsim_calibration.report.summary import (
     rest_of_map,
     viewpoint,
 )
-from realsim_calibration.report.view_plots import (
-    plot_views,
-)
+from realsim_calibration.report.view_plots import plot_views
 from realsim_calibration.results import HandEyeReport, Mode
 
 Maker = Callable[..., HandEyeReport]

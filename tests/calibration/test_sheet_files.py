@@ -11,13 +11,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.records import CharucoBoard
-from realsim_calibration.sheets import (
-    SheetConfig,
-    largest_fit,
-    make_board,
-    paper_size,
-    write_sheet,
-)
+from realsim_calibration.sheets import SheetConfig, largest_fit, make_board, paper_size, write_sheet
 from realsim_calibration.targets.target_text import parse_target
 
 pdfium = pytest.importorskip("pypdfium2", reason="rasterising a PDF needs pypdfium2")

@@ -12,10 +12,7 @@ from hypothesis import strategies as st
 from realsim.errors import InputError
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim.untrusted.own_json import to_json
-from realsim_calibration.targets.marker_sets import (
-    dictionary_names,
-    dictionary_size,
-)
+from realsim_calibration.targets.marker_sets import dictionary_names, dictionary_size
 from realsim_calibration.targets.target_file import (
     LARGEST_BYTES,
     read_target,

@@ -12,12 +12,7 @@ from realsim.app.calibrate.show import warn_of_far_views
 from realsim.app.console import Console
 from realsim.geometry import se3
 from realsim.records import TagBoard, View
-from realsim_calibration import (
-    BoardView,
-    HandEyeConfig,
-    HandEyeReport,
-    calibrate_hand_eye_report,
-)
+from realsim_calibration import BoardView, HandEyeConfig, HandEyeReport, calibrate_hand_eye_report
 from realsim_calibration.checks import CheckConfig, hand_eye_checks
 from realsim_calibration.exports import (
     FrameNames,

@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 
 from realsim.robots.arm import UR5, find_arm
-from realsim_capture_plans.capturing.checks import (
-    CheckConfig,
-    sharpness,
-)
+from realsim_capture_plans.capturing.checks import CheckConfig, sharpness
 from realsim_capture_plans.capturing.look import SettleConfig, until_still
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError
 from realsim_capture_plans.lab.devices import SimulatedArm

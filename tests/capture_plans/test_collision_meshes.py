@@ -8,11 +8,7 @@ from realsim.geometry import se3
 from realsim.robots.arm import UR5, arm_of
 from realsim.robots.shapes import Box, Mount, Shape, WorkCell
 from realsim_capture_plans.collision.mount import d405_mount, plain_bracket
-from realsim_capture_plans.collision.ur5_meshes import (
-    MeshModel,
-    compare_with_meshes,
-    robots_folder,
-)
+from realsim_capture_plans.collision.ur5_meshes import MeshModel, compare_with_meshes, robots_folder
 
 try:
     robots_folder()

@@ -18,11 +18,7 @@ from realsim_capture_plans.planning.moves import detour
 from realsim_capture_plans.planning.ordering import move_seconds
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 from realsim_capture_plans.planning.view_quality import hole_deg
-from realsim_capture_plans.planning.viewpoints import (
-    golden_cap,
-    hemisphere_poses,
-    reachable,
-)
+from realsim_capture_plans.planning.viewpoints import golden_cap, hemisphere_poses, reachable
 
 CENTER = np.array([0.375, 0.0, 0.05])
 BOARD = np.array([0.375, 0.0, 0.0])

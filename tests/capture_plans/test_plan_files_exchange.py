@@ -22,18 +22,10 @@ from realsim_capture_plans.plan_files.exported import (
     export_urscript,
     table_frame,
 )
-from realsim_capture_plans.plan_files.imported import (
-    colliding_legs,
-    import_plan,
-)
+from realsim_capture_plans.plan_files.imported import colliding_legs, import_plan
 from realsim_capture_plans.plan_files.joint_paths import read_path
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
-from realsim_capture_plans.planning.record import (
-    CapturePlan,
-    PlanConfig,
-    plan_content,
-    plan_of,
-)
+from realsim_capture_plans.planning.record import CapturePlan, PlanConfig, plan_content, plan_of
 
 HOME = np.array([0.1, -1.6, 1.7, -1.7, -1.5, 0.3])
 CENTER = np.array([0.37, 0.02, 0.05])

@@ -14,10 +14,7 @@ from realsim.robots.arm import UR5
 from realsim.robots.shapes import Box, Mount, WorkCell
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.planning import view_quality
-from realsim_capture_plans.planning.metrics import (
-    METRIC_MEANINGS,
-    plan_metrics,
-)
+from realsim_capture_plans.planning.metrics import METRIC_MEANINGS, plan_metrics
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 from realsim_capture_plans.planning.tour_time import TourTime
 from realsim_capture_plans.planning.view_quality import D405, hole_deg

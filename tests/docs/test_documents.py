@@ -52,8 +52,7 @@ def test_commands_are_found_in_code_only() -> None:
 
 
 @pytest.mark.parametrize(
-    "line",
-    ["realsim fly", "realsim demo --hihg 3", "realsim demo --views many", "realsim check"],
+    "line", ["realsim fly", "realsim demo --hihg 3", "realsim demo --views many", "realsim check"]
 )
 def test_what_click_would_refuse_is_refused(line: str) -> None:
     with pytest.raises(click.UsageError):

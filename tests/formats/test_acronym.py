@@ -11,11 +11,7 @@ from hypothesis import strategies as st
 
 from grasp_files import read_acronym
 from realsim.formats.grasps.acronym import AcronymObject, write_acronym
-from realsim.formats.grasps.hand_frames import (
-    HAND_FRAMES,
-    grasp_poses,
-    hand_poses,
-)
+from realsim.formats.grasps.hand_frames import HAND_FRAMES, grasp_poses, hand_poses
 from realsim.formats.grasps.hdf5 import COLUMNS
 from realsim.formats.grasps.scene_grasps import executed, held
 from realsim.geometry import se3

@@ -41,10 +41,7 @@ def edited_metadata(tmp_path: Path, old: str, new: str) -> Path:
 
 @pytest.mark.parametrize(
     ("old", "new"),
-    [
-        ("message_count: ", "message_count: x"),
-        ("name: /camera", "name: [/camera] #"),
-    ],
+    [("message_count: ", "message_count: x"), ("name: /camera", "name: [/camera] #")],
 )
 def test_a_damaged_table_of_contents_is_refused(tmp_path: Path, old: str, new: str) -> None:
     with pytest.raises(InputError, match="recording"):

@@ -11,11 +11,7 @@ from realsim.errors import InputError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspit.grasps import WorldGrasps, read_grasp_file
 from realsim.formats.graspit.scene import read_graspit_scene
-from realsim.formats.graspit.writing import (
-    GraspitConfig,
-    paired_grasps,
-    write_graspit,
-)
+from realsim.formats.graspit.writing import GraspitConfig, paired_grasps, write_graspit
 from realsim.geometry import se3
 from realsim.records import GraspSet
 

@@ -17,11 +17,7 @@ from realsim.formats.graspnet.grasp_group import (
     read_grasp_group,
     write_grasp_group,
 )
-from realsim.formats.graspnet.grasp_labels import (
-    GraspLabels,
-    read_grasp_labels,
-    write_grasp_labels,
-)
+from realsim.formats.graspnet.grasp_labels import GraspLabels, read_grasp_labels, write_grasp_labels
 from realsim.formats.graspnet.rect import rect_bytes, rect_grasps
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics

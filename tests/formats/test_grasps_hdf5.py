@@ -72,11 +72,7 @@ def test_what_no_grasp_has_is_not_written(field, value, words):
 
 
 @pytest.mark.parametrize(
-    "changed",
-    [
-        {"failures": ("nul\0", *[""] * 5)},
-        {"parameters": {"x": float("nan")}},
-    ],
+    "changed", [{"failures": ("nul\0", *[""] * 5)}, {"parameters": {"x": float("nan")}}]
 )
 def test_what_a_file_cannot_give_back_is_not_written(changed):
     s = tried_set(np.random.default_rng(0), 6)

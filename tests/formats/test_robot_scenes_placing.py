@@ -8,12 +8,7 @@ import pytest
 import placed_scenes
 from realsim.errors import InputError
 from realsim.formats.robot_scenes.mesh_obj import look_of
-from realsim.formats.robot_scenes.placed_scene import (
-    RigidBody,
-    file_name,
-    seen_from,
-    unique_names,
-)
+from realsim.formats.robot_scenes.placed_scene import RigidBody, file_name, seen_from, unique_names
 from realsim.formats.robot_scenes.placing import PlacingConfig, place_scene
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties

@@ -7,11 +7,7 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.clouds import fit_plane_ransac, plane_frame, voxel_mean
-from realsim.geometry.depth import (
-    depth_noise_per_m,
-    edge_mask,
-    points_from_depth,
-)
+from realsim.geometry.depth import depth_noise_per_m, edge_mask, points_from_depth
 from realsim.records import CameraIntrinsics
 
 CAMERA = CameraIntrinsics(

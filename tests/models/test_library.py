@@ -18,12 +18,7 @@ from realsim.models.library import ModelLibrary
 from realsim.models.library_check import check_library
 from realsim.models.library_complete import complete
 from realsim.models.library_files import read_properties
-from realsim.models.library_prepare import (
-    Matter,
-    PrepareConfig,
-    PreparedModel,
-    prepare_mesh,
-)
+from realsim.models.library_prepare import Matter, PrepareConfig, PreparedModel, prepare_mesh
 from realsim.records import Mesh
 from realsim.store.lock import only_run_in
 from realsim.untrusted.own_json import to_json

@@ -13,13 +13,7 @@ from realsim.models.mesh_atlas import Piece, one_mesh, transformed_uv
 from realsim.models.reading import METRES, ROTATIONS, read_scan
 from realsim.models.simplify import colors_at, deviation
 from realsim.records import Mesh
-from written_meshes import (
-    as_trimesh,
-    colorful_texture,
-    textured_box,
-    write_textured_obj,
-    write_usd,
-)
+from written_meshes import as_trimesh, colorful_texture, textured_box, write_textured_obj, write_usd
 
 Y_UP = np.array(ROTATIONS["y"], dtype=float)
 

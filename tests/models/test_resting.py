@@ -7,11 +7,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 from realsim.geometry.parts import part
-from realsim.models.resting import (
-    Resting,
-    RestingConfig,
-    resting_orientations,
-)
+from realsim.models.resting import Resting, RestingConfig, resting_orientations
 from realsim.records import Mesh
 from realsim.scanning.simulated import distorted
 

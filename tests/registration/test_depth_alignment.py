@@ -11,11 +11,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
-from realsim.registration.depth_alignment import (
-    AlignmentConfig,
-    check_alignment,
-    pooled_alignment,
-)
+from realsim.registration.depth_alignment import AlignmentConfig, check_alignment, pooled_alignment
 from realsim.registration.simulated import seen_instances
 from table_scenes import small_scene
 

@@ -6,10 +6,7 @@ import numpy as np
 
 from realsim.geometry import se3
 from realsim.registration.evidence import DepthNoise
-from realsim.registration.find_table import (
-    TableSearchConfig,
-    find_table,
-)
+from realsim.registration.find_table import TableSearchConfig, find_table
 from realsim.registration.views import SampleConfig, ViewPoints, sample_views
 from table_scenes import small_scene
 

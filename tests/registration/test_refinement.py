@@ -18,12 +18,7 @@ from realsim.registration.intake import Intake, take_in
 from realsim.registration.refinement.config import CameraPrior, PointConfig, RefineConfig
 from realsim.registration.refinement.equations import BIAS, HAND_EYE
 from realsim.registration.refinement.refine import Refined, refine
-from realsim.registration.simulated import (
-    TableLabConfig,
-    TableScene,
-    scatter_objects,
-    table_scene,
-)
+from realsim.registration.simulated import TableLabConfig, TableScene, scatter_objects, table_scene
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from table_scenes import SMALL_LAB, part_models, small_scene
 

@@ -12,9 +12,7 @@ from realsim.registration.blind import CovarianceConfig
 from realsim.registration.register import DepthFrame, RegistrationConfig, register_scene
 
 CONFIG = RegistrationConfig(
-    field_cells=64,
-    with_single_view=False,
-    covariance=CovarianceConfig(correlation_area_px=1.0),
+    field_cells=64, with_single_view=False, covariance=CovarianceConfig(correlation_area_px=1.0)
 )
 
 

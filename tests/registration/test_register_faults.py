@@ -17,11 +17,7 @@ from realsim.registration.evidence import DepthFrame
 from realsim.registration.register import Registration, RegistrationConfig, register_scene
 from realsim.registration.search.records import Wanted
 from realsim.registration.simulated import TableScene
-from table_faults import (
-    foreign,
-    without_any_depth,
-    without_depth_on,
-)
+from table_faults import foreign, without_any_depth, without_depth_on
 from table_scenes import named_scene, part_models
 
 CONFIG = RegistrationConfig(field_cells=64, with_single_view=False)

@@ -9,12 +9,7 @@ from realsim.records import ObjectPose
 from realsim.registration.body import make_body
 from realsim.registration.evidence import Cloud
 from realsim.registration.search.candidates import Candidate, Sought
-from realsim.registration.search.peel import (
-    PeelConfig,
-    clusters,
-    explained_points,
-    suspects,
-)
+from realsim.registration.search.peel import PeelConfig, clusters, explained_points, suspects
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import Render, Score
 

@@ -10,10 +10,7 @@ from realsim.registration.compare import CompareConfig, make_comparer
 from realsim.registration.evidence import EvidenceConfig, average_cloud, gather, without_table
 from realsim.registration.solver import SolverConfig, solve_pose
 from realsim.registration.table_planes import PlaneConfig, find_support_plane
-from realsim.registration.verify import (
-    VerifyConfig,
-    verify_objects,
-)
+from realsim.registration.verify import VerifyConfig, verify_objects
 
 
 @pytest.fixture(scope="module")

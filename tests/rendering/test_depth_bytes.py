@@ -29,10 +29,7 @@ def tilted_with_a_box() -> np.ndarray:
 @pytest.mark.parametrize(
     ("model", "digest"),
     [
-        (
-            DepthSensorModel(),
-            "5bec6a4e236b7a7add9dbfb135c129b3dc60615450d969a4f64c8b4e723e228b",
-        ),
+        (DepthSensorModel(), "5bec6a4e236b7a7add9dbfb135c129b3dc60615450d969a4f64c8b4e723e228b"),
         (
             DepthSensorModel.noiseless(1 / 32),
             "4ff30763909fd153c564044751807868ba807c5d51c9676c1e85810bccf320f5",

@@ -11,12 +11,7 @@ from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
 from realsim.robots.arm import ArmFile, find_arm, known_chains
 from realsim.robots.check_arm import check_arm
-from realsim.robots.compiled_chain import (
-    chain_numbers,
-    follow_lines,
-    frames_into,
-    jacobian_into,
-)
+from realsim.robots.compiled_chain import chain_numbers, follow_lines, frames_into, jacobian_into
 from realsim.robots.dh_of_chain import dh_of_chain
 from realsim.robots.robot_files import VARIABLE, names_of, robot_file
 

@@ -20,14 +20,7 @@ from realsim.scanning.scale.equations import (
 )
 from realsim.scanning.scale.outlines import COLUMNS, Rims, add_outline
 from realsim.scanning.scale.shape import ScanShape
-from realsim.scanning.scale.state import (
-    OBJECT,
-    PATCHES,
-    RIM,
-    SIZE,
-    ScaleState,
-    moved_state,
-)
+from realsim.scanning.scale.state import OBJECT, PATCHES, RIM, SIZE, ScaleState, moved_state
 from scanned_objects import evidence_of, shape_of
 
 STEP = 1e-6

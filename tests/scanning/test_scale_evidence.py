@@ -11,14 +11,7 @@ from realsim.geometry.camera import project
 from realsim.geometry.distance_field import DistanceField
 from realsim.scanning.scale.evidence import ScanView
 from realsim.scanning.scale.outlines import outline
-from scanned_objects import (
-    Scanned,
-    evidence_of,
-    gathered,
-    scanned,
-    shape_of,
-    true_state,
-)
+from scanned_objects import Scanned, evidence_of, gathered, scanned, shape_of, true_state
 
 
 def outline_px(name: str, lab: str) -> list[tuple[ScanView, Array, Array]]:

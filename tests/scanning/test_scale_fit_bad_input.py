@@ -83,10 +83,7 @@ def test_a_mug_given_for_a_block_is_not_accepted():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("real", "given"),
-    [("l_bracket", "t_profile"), ("bunny", "duck")],
-)
+@pytest.mark.parametrize(("real", "given"), [("l_bracket", "t_profile"), ("bunny", "duck")])
 def test_no_mesh_of_another_object_is_accepted(real: str, given: str):
     assert another(real, given).verdict != "accepted"
 

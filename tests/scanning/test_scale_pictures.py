@@ -8,22 +8,9 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.records import Mesh
-from realsim.scanning.scale.picture_overlays import (
-    Photograph,
-    overlays_png,
-)
-from realsim.scanning.scale.pictures import (
-    candidates_png,
-    residuals_png,
-    views_png,
-)
-from realsim.scanning.shading import (
-    UNSEEN,
-    ShadingConfig,
-    diverging,
-    shaded_views,
-    value_paint,
-)
+from realsim.scanning.scale.picture_overlays import Photograph, overlays_png
+from realsim.scanning.scale.pictures import candidates_png, residuals_png, views_png
+from realsim.scanning.shading import UNSEEN, ShadingConfig, diverging, shaded_views, value_paint
 from scale_fits import fit_of, known_scan
 
 SMALL = ShadingConfig(size_px=120)

@@ -14,15 +14,7 @@ from realsim.records import Mesh, SupportPlane
 from realsim.registration.evidence import DepthFrame, EvidenceConfig, measure_noise
 from realsim.scanning.scale.config import TableConfig
 from realsim.scanning.scale.table import Footprint, find_object, find_table
-from scanned_objects import (
-    LAB,
-    Scanned,
-    block,
-    joined,
-    real_mesh,
-    scanned_mesh,
-    shifted,
-)
+from scanned_objects import LAB, Scanned, block, joined, real_mesh, scanned_mesh, shifted
 
 CONFIG = TableConfig()
 SMALL = replace(LAB, views=6, width=320, height=180, focal_px=162.0)

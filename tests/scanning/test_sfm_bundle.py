@@ -6,11 +6,7 @@ import pytest
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics
-from realsim.scanning.sfm.bundle import (
-    adjust,
-    point_covariances,
-    reprojection_errors,
-)
+from realsim.scanning.sfm.bundle import adjust, point_covariances, reprojection_errors
 from realsim.scanning.sfm.config import MappingConfig, RobotNoise, TrustConfig
 from realsim.scanning.sfm.judging import depth_scale
 from realsim.scanning.sfm.result import Geometry

@@ -10,13 +10,7 @@ from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import Mesh
 from realsim.rendering.depth_sensors.model import DepthSensorModel
-from realsim.scanning.simulated import (
-    T_EE_CAM,
-    ScanLabConfig,
-    ScanViews,
-    scan_views,
-    standing,
-)
+from realsim.scanning.simulated import T_EE_CAM, ScanLabConfig, ScanViews, scan_views, standing
 
 HALF_M = np.array([0.03, 0.02, 0.05])
 SMALL = ScanLabConfig(width=64, height=36, focal_px=32.4, sensor=DepthSensorModel.noiseless())

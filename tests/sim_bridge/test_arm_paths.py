@@ -13,11 +13,7 @@ from realsim_sim_bridge.arm.arm_space import FREE, ArmSpace, ArmSpaceConfig
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.joint_path import PlannerConfig, connect
 from realsim_sim_bridge.arm.obstacles import obstacles_of
-from realsim_sim_bridge.arm.timing import (
-    TimingConfig,
-    straight_times,
-    timed_path,
-)
+from realsim_sim_bridge.arm.timing import TimingConfig, straight_times, timed_path
 
 PANDA = GraspingArm(find_arm("panda"), find_hand())
 READY = PANDA.arm.home

@@ -7,11 +7,7 @@ from hypothesis import strategies as st
 
 from held_boxes import held_box, held_from_above
 from realsim.robots.hand import find_hand
-from realsim_sim_bridge.school.cross_check import (
-    agreement,
-    cross_check,
-    wilson_interval,
-)
+from realsim_sim_bridge.school.cross_check import agreement, cross_check, wilson_interval
 from realsim_sim_bridge.slip.engines import make_engine, settings_of
 from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test

@@ -11,15 +11,8 @@ from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.grasping.antipodal import CandidateConfig, RaySurface
-from realsim_sim_bridge.grasping.candidates import (
-    IN_OBJECT,
-    HandPoses,
-    Stand,
-)
-from realsim_sim_bridge.grasping.surroundings import (
-    hands_free,
-    surface_tree,
-)
+from realsim_sim_bridge.grasping.candidates import IN_OBJECT, HandPoses, Stand
+from realsim_sim_bridge.grasping.surroundings import hands_free, surface_tree
 
 HAND = find_hand()
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))

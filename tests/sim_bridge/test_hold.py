@@ -15,9 +15,7 @@ from realsim.records import STAGES, Mesh
 from realsim.records.grasps import MEASURES
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.grasping.surroundings import first_triangle_inside
-from realsim_sim_bridge.hold.calibration import (
-    p_hold_columns,
-)
+from realsim_sim_bridge.hold.calibration import p_hold_columns
 from realsim_sim_bridge.hold.draws import (
     PALM_M,
     GraspedObject,

@@ -18,9 +18,7 @@ from realsim_sim_bridge.hold.calibration import (
     left_out,
     shipped,
 )
-from realsim_sim_bridge.hold.draws import (
-    HoldConfig,
-)
+from realsim_sim_bridge.hold.draws import HoldConfig
 from realsim_sim_bridge.hold.reality import (
     Judged,
     RealityConfig,

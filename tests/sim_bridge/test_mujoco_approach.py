@@ -6,11 +6,7 @@ import numpy as np
 
 from realsim.geometry import se3
 from realsim.robots.hand import find_hand
-from realsim_sim_bridge.slip.mujoco_approach import (
-    CLEARANCE_M,
-    advanced_fingers,
-    surface_triangles,
-)
+from realsim_sim_bridge.slip.mujoco_approach import CLEARANCE_M, advanced_fingers, surface_triangles
 
 HAND = find_hand()
 

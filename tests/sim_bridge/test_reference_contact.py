@@ -27,9 +27,7 @@ EDGE = with_hand(SlipConfig.of(HAND), 20.0, 0.5)
 def closed(body, physics=EDGE.physics, settings=None):
     """Return a world of one hand that has closed on a body, with its origin between the pads."""
     grips = Grips(
-        Ts_table_grasp=np.eye(4)[None],
-        Ts_obj_grasp=np.eye(4)[None],
-        openings_m=np.array([0.06]),
+        Ts_table_grasp=np.eye(4)[None], Ts_obj_grasp=np.eye(4)[None], openings_m=np.array([0.06])
     )
     world = ReferenceEngine(settings).world(body, grips, physics, HAND)
     world.close(Closing())

@@ -12,12 +12,7 @@ from realsim.models.model_records import ConvexParts
 from realsim.models.properties import physical_properties
 from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, Support, known_solids
-from realsim_sim_bridge.scenes.stable_state import (
-    HEADERS,
-    StandConfig,
-    stable_state,
-    stand_rows,
-)
+from realsim_sim_bridge.scenes.stable_state import HEADERS, StandConfig, stable_state, stand_rows
 from realsim_sim_bridge.scenes.stand_picture import stand_picture
 from realsim_sim_bridge.scenes.table_world import TableWorld, WorldConfig
 

@@ -75,9 +75,7 @@ def registered():
 
 def placed_scene(**config):
     view = SceneCamera(
-        name="view_0",
-        intrinsics=CAMERA,
-        T_world_cam=se3.look_at([0.5, -0.5, 1.2], [0.5, 0.1, 0.7]),
+        name="view_0", intrinsics=CAMERA, T_world_cam=se3.look_at([0.5, -0.5, 1.2], [0.5, 0.1, 0.7])
     )
     config = PlacingConfig(friction=FRICTION, **config)
     return place_scene(*registered(), config, cameras=[view])

@@ -22,13 +22,7 @@ from realsim.scanning.scale.result import ScaleFit, Similarity
 from realsim.scanning.scale.shape import ScanShape, make_shape
 from realsim.scanning.scale.state import ScaleState, first_state
 from realsim.scanning.scale.table import find_object, find_table
-from realsim.scanning.simulated import (
-    ScanLabConfig,
-    ScanViews,
-    distorted,
-    scan_views,
-    standing,
-)
+from realsim.scanning.simulated import ScanLabConfig, ScanViews, distorted, scan_views, standing
 
 UNIT_M = 0.1
 """Metres per unit of the scans made here: the scale that a fit should find."""

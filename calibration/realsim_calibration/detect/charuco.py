@@ -14,11 +14,7 @@ from realsim_calibration.detect.homography import (
     seen_from_front,
 )
 from realsim_calibration.detect.images import gray_image, size_of
-from realsim_calibration.detect.markers import (
-    TWO_BOARDS,
-    decode_markers,
-    several_boards,
-)
+from realsim_calibration.detect.markers import TWO_BOARDS, decode_markers, several_boards
 from realsim_calibration.detect.saddles import OUTSIDE, SaddleConfig, Saddles, refine_saddles
 from realsim_calibration.views import TargetDetection
 
@@ -191,12 +187,7 @@ def _agreeing(ids: Int64, quads: Array, known: Array, usable: Mask, limit: float
 
 
 def _remedy(
-    ids: Int64,
-    quads: Array,
-    board: CharucoBoard,
-    usable: Mask,
-    limit: float,
-    least: int,
+    ids: Int64, quads: Array, board: CharucoBoard, usable: Mask, limit: float, least: int
 ) -> str:
     """Return how they do lie, where a usual mistake explains it."""
     turned = replace(board, rows=board.columns, columns=board.rows)

@@ -9,12 +9,7 @@ from realsim.records import CameraIntrinsics
 from realsim.records.targets import Chessboard
 from realsim_calibration.detect.edges import bilinear
 from realsim_calibration.detect.images import gray_image, size_of
-from realsim_calibration.detect.saddles import (
-    SaddleConfig,
-    Saddles,
-    grid_arms,
-    refine_saddles,
-)
+from realsim_calibration.detect.saddles import SaddleConfig, Saddles, grid_arms, refine_saddles
 from realsim_calibration.views import TargetDetection
 
 MIN_PART = (3, 3)

@@ -99,10 +99,7 @@ def _dots_told(reason: str) -> int:
 
 
 def _of_one_shade(
-    gray: UInt8,
-    grid: CircleGrid,
-    config: CirclesConfig,
-    intrinsics: CameraIntrinsics | None,
+    gray: UInt8, grid: CircleGrid, config: CirclesConfig, intrinsics: CameraIntrinsics | None
 ) -> tuple[TargetDetection | None, str]:
     """Return the grid of dark dots, or why there is none."""
     middles, axes = find_blobs(gray, config.dots)
@@ -242,11 +239,7 @@ def _measured(
         uv = middles - outline_bias(to_image, board[good], _radii(H, dots, grid)[good])
     return (
         TargetDetection(
-            point_ids=ids,
-            uv=uv,
-            sd_px=dots.sd_px[good],
-            image_size=size_of(gray),
-            rejected=faults,
+            point_ids=ids, uv=uv, sd_px=dots.sd_px[good], image_size=size_of(gray), rejected=faults
         ),
         "",
     )

@@ -393,13 +393,7 @@ def _linearised(
     nx, ny, ux, uy = normal[..., 0], normal[..., 1], u[..., 0], u[..., 1]
     outline = np.stack([nx, ny, nx * ux, nx * uy + ny * ux, ny * uy], -1)
     J = np.concatenate(
-        [
-            -bell[..., None] * outline,
-            (-bell * z)[..., None],
-            -inside[..., None],
-            frame,
-        ],
-        -1,
+        [-bell[..., None] * outline, (-bell * z)[..., None], -inside[..., None], frame], -1
     )
     model = (frame * plane[:, None]).sum(-1) - dark[:, None] * inside
     return J, model

@@ -127,11 +127,7 @@ def unimodular(*, mirrored: bool = False) -> list[Int64]:
 
 
 def lay_pattern(
-    lattice: dict[Node, int],
-    pattern: Int64,
-    beyond: list[Int64],
-    *,
-    mirrored: bool = False,
+    lattice: dict[Node, int], pattern: Int64, beyond: list[Int64], *, mirrored: bool = False
 ) -> list[Laid]:
     """Return the ways to lay a pattern (n, 2) over a lattice that cover most of its nodes.
 

@@ -209,11 +209,7 @@ def _feet(
 
 
 def _turned(
-    toward: Array,
-    met: Array,
-    normal: Array,
-    length: Array,
-    intrinsics: CameraIntrinsics | None,
+    toward: Array, met: Array, normal: Array, length: Array, intrinsics: CameraIntrinsics | None
 ) -> Array:
     """Return the arms' directions (n, 4, 2) along the fitted lines."""
     tangent = np.stack([normal[..., 1], -normal[..., 0]], -1)

@@ -99,11 +99,7 @@ def _remedy(ids: Int64, corners: Array, board: TagBoard, limit: float, least: in
 
 
 def read_missing_tags(
-    gray: UInt8,
-    board: TagBoard,
-    seen: tuple[Int64, Array],
-    missing: Int64,
-    code: tuple[int, int],
+    gray: UInt8, board: TagBoard, seen: tuple[Int64, Array], missing: Int64, code: tuple[int, int]
 ) -> tuple[Int64, Array]:
     """Return ids (n,) and rough corners (n, 4, 2) of tags that are where the board has them.
 

@@ -15,14 +15,7 @@ from realsim.records.checked_arrays import rigid
 from realsim.store import atomic
 from realsim.untrusted.own_json import OwnFile, Real, from_json, read_object, to_json
 from realsim_calibration.exports.frames import FrameNames, parent_frame, quaternion_xyzw
-from realsim_calibration.results import (
-    BoardShape,
-    Clock,
-    HandEyeReport,
-    Mode,
-    Stretch,
-    ViewReport,
-)
+from realsim_calibration.results import BoardShape, Clock, HandEyeReport, Mode, Stretch, ViewReport
 
 Record = TypeVar("Record")
 SCHEMA = "realsim.calibration"

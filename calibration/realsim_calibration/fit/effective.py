@@ -69,10 +69,7 @@ def plain_fits(
     shared = {name: (fit.step, fit.step + fit.away) for name, fit in steps.items()}
     if basis is not None:
         P = projection(model, basis)
-        shared["effective"] = (
-            _folded(P, mapped.step),
-            _folded(P, mapped.step + mapped.away),
-        )
+        shared["effective"] = (_folded(P, mapped.step), _folded(P, mapped.step + mapped.away))
     return [
         PlainFit(
             name=name, state=model.state.moved(step),

@@ -25,12 +25,7 @@ from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim_calibration.fit.robot_error import ErrorBasis
-from realsim_calibration.fit.view_system import (
-    SHARED,
-    all_equations,
-    all_rows,
-    camera_vector,
-)
+from realsim_calibration.fit.view_system import SHARED, all_equations, all_rows, camera_vector
 
 MOST_DAMPING = 1e6
 """A step that is still no gain with this much of the curvature added is none: the fit has ended."""

@@ -18,13 +18,7 @@ from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim.records import ArmErrorMap, RobotErrorMap
 from realsim_calibration.fit.board_pose import refine_board_pose
-from realsim_calibration.fit.effective import (
-    PlainFit,
-    Stretch,
-    plain_fits,
-    projection,
-    stretch,
-)
+from realsim_calibration.fit.effective import PlainFit, Stretch, plain_fits, projection, stretch
 from realsim_calibration.fit.joint_solve import JointProblem, JointState, Setup, smooth_errors
 from realsim_calibration.fit.linear_model import LinearFit, LinearModel
 from realsim_calibration.fit.noise_scale import (

@@ -33,10 +33,7 @@ class Pairing:
 
 
 def pair(
-    images: Sequence[str],
-    labels: Sequence[str | None],
-    stems: Sequence[str],
-    where: Sequence[str],
+    images: Sequence[str], labels: Sequence[str | None], stems: Sequence[str], where: Sequence[str]
 ) -> Pairing:
     """Return which pose belongs to which image.
 

@@ -118,9 +118,7 @@ class State:
     def moved(self, step: Array) -> "State":
         """Return the state after a step (16,) of the globals."""
         return replace(
-            self,
-            camera=self.camera + step[:CAMERA_TERMS],
-            board=self.board + step[CAMERA_TERMS:],
+            self, camera=self.camera + step[:CAMERA_TERMS], board=self.board + step[CAMERA_TERMS:]
         )
 
     def only_views(self, keep: Mask) -> "State":

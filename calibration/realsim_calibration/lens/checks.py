@@ -42,10 +42,7 @@ class CheckLimits:
 
 
 def intrinsics_checks(
-    report: IntrinsicsReport,
-    prior: Prior,
-    start: CameraIntrinsics | None,
-    limits: CheckLimits,
+    report: IntrinsicsReport, prior: Prior, start: CameraIntrinsics | None, limits: CheckLimits
 ) -> tuple[Check, ...]:
     """Return every check of a camera calibration, good ones too."""
     checks = [

@@ -94,12 +94,7 @@ def measure_coverage(
 
 
 def _advice(
-    counts: Int64,
-    share: float,
-    reach: float,
-    tilt: Array,
-    spread: float,
-    config: CoverageConfig,
+    counts: Int64, share: float, reach: float, tilt: Array, spread: float, config: CoverageConfig
 ) -> str:
     parts: list[str] = []
     seen = counts > 0

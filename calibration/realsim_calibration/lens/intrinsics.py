@@ -43,10 +43,7 @@ from realsim_calibration.lens.fit import (
     robust_sigma,
     settle,
 )
-from realsim_calibration.lens.models import (
-    MODELS,
-    lens_prior,
-)
+from realsim_calibration.lens.models import MODELS, lens_prior
 from realsim_calibration.lens.observations import Corners, find_outliers, gather
 from realsim_calibration.lens.report import IntrinsicsReport, LensView
 from realsim_calibration.lens.start import choose_twins, start_state, view_errors
@@ -156,10 +153,7 @@ def _first_fit(
 
 
 def _clean(
-    corners: Corners,
-    fit: LensFit,
-    start: CameraIntrinsics | None,
-    config: IntrinsicsConfig,
+    corners: Corners, fit: LensFit, start: CameraIntrinsics | None, config: IntrinsicsConfig
 ) -> tuple[Corners, LensFit]:
     """Return corners and fit without outlier corners and views, which are named."""
     for _ in range(config.outliers.rounds):
@@ -236,11 +230,7 @@ def _choose_model(
 
 
 def _report(
-    corners: Corners,
-    target: Target,
-    chosen: Candidate,
-    wider: Candidate,
-    config: IntrinsicsConfig,
+    corners: Corners, target: Target, chosen: Candidate, wider: Candidate, config: IntrinsicsConfig
 ) -> IntrinsicsReport:
     """Return the report; the table, the start and the checks are left out."""
     obs, fit, cov = corners.obs, chosen.fit, chosen.covariance

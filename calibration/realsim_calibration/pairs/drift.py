@@ -74,10 +74,7 @@ class Drift:
 
 
 def estimate_drift(
-    claimed: ArrayLike,
-    refined: ArrayLike,
-    distance_m: float,
-    config: DriftConfig | None = None,
+    claimed: ArrayLike, refined: ArrayLike, distance_m: float, config: DriftConfig | None = None
 ) -> Drift:
     """Return how far the camera moved in the hand.
 

@@ -158,10 +158,7 @@ def rank_next_views(
 
 
 def choose_next_views(
-    report: HandEyeReport,
-    Ts_planned: ArrayLike,
-    count: int,
-    config: NextViewConfig | None = None,
+    report: HandEyeReport, Ts_planned: ArrayLike, count: int, config: NextViewConfig | None = None
 ) -> tuple[NextView, ...]:
     """Return at most `count` planned poses chosen greedily, each given the ones before it.
 

@@ -14,12 +14,7 @@ from realsim.store import atomic
 from realsim_calibration.depth.bias import DepthBiasReport
 from realsim_calibration.lens.models import TERM_NAMES
 from realsim_calibration.lens.report import IntrinsicsReport, LensView
-from realsim_calibration.report import (
-    model_plots,
-    scene_3d,
-    style,
-    view_plots,
-)
+from realsim_calibration.report import model_plots, scene_3d, style, view_plots
 from realsim_calibration.report.summary import (
     NOT_KNOWN,
     PLACES_HEADER,

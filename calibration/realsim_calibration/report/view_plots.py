@@ -104,8 +104,7 @@ def plot_worst_views(
         ax.plot(view.uv[:, 0], view.uv[:, 1], ".", ms=2, color=style.INK)
         ax.set_title(style.view_label(view.label, view.index), fontsize=8.5)
         ax.set_xlabel(
-            f"unseen {amount(view.unseen_px, 2, 'px')}; arrows {factor:g} times{note}",
-            fontsize=8,
+            f"unseen {amount(view.unseen_px, 2, 'px')}; arrows {factor:g} times{note}", fontsize=8
         )
         ax.set_ylabel("")
     return figure

@@ -245,11 +245,7 @@ def _automatic(target: Target, artwork: Artwork, config: SheetConfig) -> tuple[s
 
 
 def _does_not_fit(
-    target: Target,
-    artwork: Artwork,
-    name: str,
-    size: tuple[float, float],
-    config: SheetConfig,
+    target: Target, artwork: Artwork, name: str, size: tuple[float, float], config: SheetConfig
 ) -> str:
     """Return the message: what is too large, what would fit, and the commands for it."""
     x0, y0, x1, y1 = (1000 * v for v in artwork.bounds_m)

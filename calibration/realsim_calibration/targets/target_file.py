@@ -14,14 +14,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from realsim.errors import InputError, UnitError
-from realsim.records import (
-    TAG_CELLS,
-    CharucoBoard,
-    Chessboard,
-    CircleGrid,
-    TagBoard,
-    Target,
-)
+from realsim.records import TAG_CELLS, CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim.untrusted.json_text import read_json
 from realsim.untrusted.yaml_text import read_yaml
 from realsim_calibration.targets.marker_sets import check_markers, dictionary_name

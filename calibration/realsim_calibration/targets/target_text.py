@@ -18,14 +18,7 @@ from decimal import Decimal
 from typing import cast
 
 from realsim.errors import InputError, UnitError
-from realsim.records import (
-    TAG_CELLS,
-    CharucoBoard,
-    Chessboard,
-    CircleGrid,
-    TagBoard,
-    Target,
-)
+from realsim.records import TAG_CELLS, CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim.records.targets import TagFamily
 from realsim_calibration.targets.marker_sets import check_markers, dictionary_name
 

@@ -164,11 +164,7 @@ def _plain(text: str) -> str:
 
 
 def _fill_cell(
-    cell: UInt8,
-    k: int,
-    image: Image | None,
-    entry: Mapping[str, Any],
-    config: SheetConfig,
+    cell: UInt8, k: int, image: Image | None, entry: Mapping[str, Any], config: SheetConfig
 ) -> None:
     """Draw one view into its cell (h, w, 3)."""
     h, w = cell.shape[:2]
@@ -197,11 +193,7 @@ def _first_words(note: str) -> str:
 
 
 def _label(
-    image: UInt8,
-    text: str,
-    at: tuple[int, int],
-    colour: tuple[int, int, int],
-    scale: float,
+    image: UInt8, text: str, at: tuple[int, int], colour: tuple[int, int, int], scale: float
 ) -> None:
     """Write on a dark strip: legible on every picture."""
     import cv2
@@ -213,11 +205,7 @@ def _label(
 
 
 def _write(
-    image: UInt8,
-    text: str,
-    at: tuple[int, int],
-    colour: tuple[int, int, int],
-    scale: float,
+    image: UInt8, text: str, at: tuple[int, int], colour: tuple[int, int, int], scale: float
 ) -> int:
     """Write ASCII text at its lower left corner (x, y); return its width [px]."""
     import cv2

@@ -17,10 +17,7 @@ from realsim.errors import InputError
 from realsim.robots.arm import RobotArm, arm_of
 from realsim.robots.coal_geometry import Body, Geometry
 from realsim.robots.kinematics import DhChain
-from realsim.robots.link_shapes import (
-    finite_box,
-    link_placements,
-)
+from realsim.robots.link_shapes import finite_box, link_placements
 from realsim.robots.shapes import Mount, WorkCell
 from realsim_capture_plans.collision.mount import camera_shape
 from realsim_capture_plans.collision.pairs import choose_pairs

@@ -18,11 +18,7 @@ from realsim_capture_plans.devices.interfaces import ArmStoppedError
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 """Fixed in the controller and in ur_rtde."""
-PORTS = {
-    RTDE_PORT: "readings (RTDE)",
-    SCRIPT_PORT: "programs",
-    DASHBOARD_PORT: "dashboard",
-}
+PORTS = {RTDE_PORT: "readings (RTDE)", SCRIPT_PORT: "programs", DASHBOARD_PORT: "dashboard"}
 DEADLINE_SLACK_S = 1.0
 """Waited beyond a request's own deadline for the process to say so [s]."""
 CLOSE_S = 3.0

@@ -71,9 +71,7 @@ class SimulatedArm:
     def state(self) -> ArmState:
         """Return where the arm believes it is."""
         return ArmState(
-            joints=self._joints,
-            T_base_ee=self._chain.forward(self._joints),
-            time_s=self._time_s,
+            joints=self._joints, T_base_ee=self._chain.forward(self._joints), time_s=self._time_s
         )
 
 

@@ -46,12 +46,7 @@ class PlanReplay:
     """One plan's replay; it runs in threads of its own until `stop`."""
 
     def __init__(
-        self,
-        plan: CapturePlan,
-        *,
-        host: str = "127.0.0.1",
-        port: int = 8080,
-        looks: bool = True,
+        self, plan: CapturePlan, *, host: str = "127.0.0.1", port: int = 8080, looks: bool = True
     ) -> None:
         """Listen, and build scene and panel; returns when both are there.
 
@@ -193,11 +188,7 @@ def near_parts(model: CollisionModel, joints: Array) -> set[str]:
 
 
 def serve_replay(
-    plan: CapturePlan,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    *,
-    looks: bool = True,
+    plan: CapturePlan, host: str = "127.0.0.1", port: int = 8080, *, looks: bool = True
 ) -> PlanReplay:
     """Return the running replay of a plan; `url` is where to look, `stop` ends it.
 

@@ -46,10 +46,7 @@ def isolated(
 
 
 def _one_process(
-    names: Sequence[str],
-    found: dict[str, Outcome],
-    timeout_s: float,
-    told: Callable[[], None],
+    names: Sequence[str], found: dict[str, Outcome], timeout_s: float, told: Callable[[], None]
 ) -> str:
     """Add the outcomes up to and with the first probe that took its process along; return it."""
     command = [sys.executable, "-m", "realsim.app.doctor.probe", *names]

@@ -27,25 +27,17 @@ CATALOGUE: dict[str, Meaning] = {
     "report.bad": _is("", "lower", "things that speak against using the session"),
     "report.warnings": _is("", "lower", "things to look at before it is used"),
     "calibration.sigma_mm": _is(
-        "mm",
-        "lower",
-        "1 sigma of the camera's place in the hand, worst axis",
+        "mm", "lower", "1 sigma of the camera's place in the hand, worst axis"
     ),
     "calibration.sigma_deg": _is("deg", "lower", "1 sigma of its rotation, worst axis"),
     "calibration.held_out_px": _is(
-        "px",
-        "lower",
-        "RMS reprojection of board views the fit has not seen",
+        "px", "lower", "RMS reprojection of board views the fit has not seen"
     ),
     "calibration.view_rms_px": _is(
-        "px",
-        "lower",
-        "median over the board views of their RMS reprojection",
+        "px", "lower", "median over the board views of their RMS reprojection"
     ),
     "calibration.mismatch_deg": _is(
-        "deg",
-        "lower",
-        "how far hand and camera turn differently: reading and pairing of the poses",
+        "deg", "lower", "how far hand and camera turn differently: reading and pairing of the poses"
     ),
     "calibration.views_used": _is("", "higher", "board views used"),
     "calibration.views_rejected": _is("", "lower", "board views left out"),
@@ -62,9 +54,7 @@ CATALOGUE: dict[str, Meaning] = {
     "plan.hole_deg": _is("deg", "lower", "radius of the largest gap between viewing directions"),
     "plan.clearance_mm": _is("mm", "higher", "least clearance of the planned moves"),
     "plan.in_view_min": _is(
-        "",
-        "higher",
-        "least share of the scene's points that a planned view sees",
+        "", "higher", "least share of the scene's points that a planned view sees"
     ),
     "capture.views": _is("", "higher", "views captured"),
     "capture.views_missing": _is("", "lower", "views planned and not captured"),
@@ -80,19 +70,13 @@ CATALOGUE: dict[str, Meaning] = {
     "registration.rejected": _is("", "lower", "objects rejected"),
     "registration.not_placed": _is("", "lower", "objects looked for and not placed"),
     "registration.probability_min": _is(
-        "",
-        "higher",
-        "least probability that an object is right within 3 mm",
+        "", "higher", "least probability that an object is right within 3 mm"
     ),
     "registration.agree_min": _is(
-        "",
-        "higher",
-        "least share of an object's visible pixels whose depth fits its pose",
+        "", "higher", "least share of an object's visible pixels whose depth fits its pose"
     ),
     "registration.sigma_mm_max": _is(
-        "mm",
-        "lower",
-        "largest 1 sigma of an object's position, worst axis",
+        "mm", "lower", "largest 1 sigma of an object's position, worst axis"
     ),
     "registration.sigma_deg_max": _is(
         "deg",
@@ -102,25 +86,17 @@ CATALOGUE: dict[str, Meaning] = {
     "registration.views_used": _is("", "higher", "views the objects were registered in"),
     "registration.views_left_out": _is("", "lower", "views that took no part"),
     "registration.view_sigma_px": _is(
-        "px",
-        "lower",
-        "median over the views of 1 sigma of their median object",
+        "px", "lower", "median over the views of 1 sigma of their median object"
     ),
     "registration.camera_shift_mm": _is(
-        "mm",
-        "none",
-        "median shift of the cameras by the refinement",
+        "mm", "none", "median shift of the cameras by the refinement"
     ),
     "registration.camera_turn_deg": _is(
-        "deg",
-        "none",
-        "median turn of the cameras by the refinement",
+        "deg", "none", "median turn of the cameras by the refinement"
     ),
     "registration.hand_eye_shift_mm": _is("mm", "none", "shift of all cameras together (hand-eye)"),
     "registration.plane_rms_mm": _is(
-        "mm",
-        "lower",
-        "RMS distance of the table's points from its plane",
+        "mm", "lower", "RMS distance of the table's points from its plane"
     ),
     "review.decided": _is("", "higher", "objects a person has accepted or rejected as they stand"),
     "review.open": _is("", "lower", "objects not accepted that nobody has decided on"),
@@ -131,36 +107,26 @@ CATALOGUE: dict[str, Meaning] = {
     "school.reachable_share": _is("", "higher", "share of the tried grasps that the arm gets to"),
     "school.close_share": _is("", "higher", "share of the tried grasps that close on the object"),
     "school.pendulum_share": _is(
-        "",
-        "higher",
-        "share of the tried grasps that pass all four stages",
+        "", "higher", "share of the tried grasps that pass all four stages"
     ),
     "school.good_share": _is("", "higher", "share of the tried grasps with a score of 0.5 or more"),
     "school.mean_score": _is("", "higher", "mean score of the tried grasps"),
     "school.mean_p_hold": _is("", "higher", "mean p_hold of the grasps that the arm reaches"),
     "school.p_hold_entropy_bits": _is("bit", "none", "entropy of p_hold over ten equal bins"),
     "school.slip_mm": _is(
-        "mm",
-        "lower",
-        "median of the largest slip of the grasps that kept their object",
+        "mm", "lower", "median of the largest slip of the grasps that kept their object"
     ),
     "school.objects_without_grasp": _is("", "lower", "objects without a good grasp"),
     "labels.frames": _is("", "higher", "frames with labels"),
     "labels.frames_flagged": _is(
-        "",
-        "lower",
-        "frames where depth contradicts a pose or the scene's occlusion",
+        "", "lower", "frames where depth contradicts a pose or the scene's occlusion"
     ),
     "labels.visibility_mean": _is("", "none", "mean visible share of an object in a frame"),
     "labels.depth_agree": _is(
-        "",
-        "higher",
-        "median share of a mask's measured pixels whose depth fits the label",
+        "", "higher", "median share of a mask's measured pixels whose depth fits the label"
     ),
     "labels.hidden_by_unknown": _is(
-        "",
-        "lower",
-        "share of object pixels hidden by what is not in the scene",
+        "", "lower", "share of object pixels hidden by what is not in the scene"
     ),
     "files.listed": _is("", "none", "files with a checksum"),
     "files.megabytes": _is("MB", "none", "their size"),

@@ -11,11 +11,7 @@ MARK = ("Made with realsim", "The viewer in this file is Viser")
 PAGE = OutputFile({".html": MARK, ".htm": MARK}, "page")
 
 
-@command(
-    "review",
-    "realsim review demo/session",
-    "realsim review demo/session --static scene.html",
-)
+@command("review", "realsim review demo/session", "realsim review demo/session --static scene.html")
 @SESSIONS
 @options(port=8080, reviewer="", static=Has(kind=PAGE), no_browser=False)
 @rare(host="127.0.0.1", token_file=None)

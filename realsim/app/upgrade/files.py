@@ -82,11 +82,7 @@ def labels_of(ref: SceneRef) -> tuple[str, ...]:
 
 
 def keep_imported(
-    store: SessionStore,
-    ref: SceneRef,
-    at: SceneRef,
-    labels: Sequence[str],
-    digests: dict[int, str],
+    store: SessionStore, ref: SceneRef, at: SceneRef, labels: Sequence[str], digests: dict[int, str]
 ) -> None:
     """Copy the data set's annotations beside the new ones, and say where they came from.
 

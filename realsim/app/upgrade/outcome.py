@@ -176,12 +176,7 @@ class Referee:
         self._depths: dict[tuple[int, int, bytes], Array32] = {}
 
     def evidence(
-        self,
-        instance: int,
-        T_old: Array,
-        T_new: Array,
-        others: Mapping[int, Array],
-        held_out: bool,
+        self, instance: int, T_old: Array, T_new: Array, others: Mapping[int, Array], held_out: bool
     ) -> Evidence:
         """Return what speaks for a new pose, the other things standing at their poses.
 

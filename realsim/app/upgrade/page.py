@@ -47,10 +47,7 @@ BEFORE_RGB = (245, 60, 200)
 
 
 def write_page(
-    out: Path,
-    records: Sequence[Record],
-    failed: Mapping[str, str],
-    analytic: Record | None,
+    out: Path, records: Sequence[Record], failed: Mapping[str, str], analytic: Record | None
 ) -> None:
     """Write OUT/upgrade.html."""
     summary = summary_of(records)

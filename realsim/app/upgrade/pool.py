@@ -10,16 +10,7 @@ from typing import Protocol
 
 from realsim.app.console import Console
 from realsim.app.upgrade.scene import Record, SceneJob, read_source, upgrade_scene
-from realsim.many import (
-    Outcome,
-    Sent,
-    Task,
-    Worked,
-    Workers,
-    at_most,
-    open_pool,
-    run_many,
-)
+from realsim.many import Outcome, Sent, Task, Worked, Workers, at_most, open_pool, run_many
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

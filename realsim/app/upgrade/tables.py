@@ -111,10 +111,7 @@ def summary_line(summary: Mapping[str, Any]) -> str:
 
 
 def write_tables(
-    out: Path,
-    records: Sequence[Record],
-    failed: Mapping[str, str],
-    analytic: Record | None,
+    out: Path, records: Sequence[Record], failed: Mapping[str, str], analytic: Record | None
 ) -> None:
     """Write upgrade.json and upgrade.csv."""
     document = {

@@ -209,11 +209,7 @@ def _joined(
                 f"{len(lost)} of {len(times.stamp_ns)} images of {times.topic.name} have no "
                 f"{other} within {gap * 1e3:.1f} ms and were left out: at {first}{more} s."
             )
-    return (
-        StoredImages.of(colour, pairs[:, 0]),
-        StoredImages.of(depth, pairs[:, 1]),
-        left_out,
-    )
+    return (StoredImages.of(colour, pairs[:, 0]), StoredImages.of(depth, pairs[:, 1]), left_out)
 
 
 def _pair_gap_s(recording: Recording, colour: ImageTimes, depth: ImageTimes) -> float:

@@ -23,10 +23,7 @@ def image_entry(index: int, file_name: str, width: int, height: int) -> Json:
 
 
 def annotation_entry(
-    index: int,
-    obj_id: int,
-    masks: tuple[Mask | None, Mask | None],
-    visible_fraction: float | None,
+    index: int, obj_id: int, masks: tuple[Mask | None, Mask | None], visible_fraction: float | None
 ) -> Json | None:
     """Return an object's annotation without its id; None = no visible pixel, or no visible mask.
 

@@ -88,10 +88,7 @@ def _matrix_mm(S: Array) -> list[float]:
 
 
 def load_models(
-    folder: Path | str,
-    obj_ids: Collection[int] | None = None,
-    *,
-    notes: list[str] | None = None,
+    folder: Path | str, obj_ids: Collection[int] | None = None, *, notes: list[str] | None = None
 ) -> dict[int, ObjectModel]:
     """Return the models of a BOP models folder, in metres.
 

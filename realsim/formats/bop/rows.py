@@ -139,11 +139,7 @@ def read_ground_truth(path: Path, *, least_id: int = 1) -> GroundTruth:
         ]
         Ts = np.stack(one_by_one)
     return GroundTruth(
-        file=path,
-        rows=rows,
-        start=start,
-        obj_ids=np.array(obj_ids, dtype=np.int64),
-        Ts_cam_obj=Ts,
+        file=path, rows=rows, start=start, obj_ids=np.array(obj_ids, dtype=np.int64), Ts_cam_obj=Ts
     )
 
 

@@ -19,12 +19,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.formats.graspit.grasps import (
-    GRASP_FILE,
-    SAMPLED_GRASPS,
-    midway_error,
-    read_grasp_file,
-)
+from realsim.formats.graspit.grasps import GRASP_FILE, SAMPLED_GRASPS, midway_error, read_grasp_file
 from realsim.geometry import se3
 from realsim.geometry.mesh import load_mesh
 from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane

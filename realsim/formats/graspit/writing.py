@@ -20,12 +20,7 @@ from realsim.formats.graspit.grasps import GRASP_FILE, WorldGrasps
 from realsim.formats.graspit.scene import SCENE_FILE, TABLE
 from realsim.formats.labelled_scene import WrittenScene
 from realsim.formats.robot_scenes.mesh_obj import part_file
-from realsim.formats.robot_scenes.placed_scene import (
-    PlacedScene,
-    TableBox,
-    seen_from,
-    unique_names,
-)
+from realsim.formats.robot_scenes.placed_scene import PlacedScene, TableBox, seen_from, unique_names
 from realsim.geometry import se3
 from realsim.geometry.mesh import face_normals
 from realsim.records import GraspSet, Mesh
@@ -126,10 +121,7 @@ def _upright(scene: PlacedScene) -> tuple[PlacedScene, list[str]]:
 
 
 def _rows(
-    scene: PlacedScene,
-    names: Mapping[int, str],
-    files: Mapping[int, str],
-    config: GraspitConfig,
+    scene: PlacedScene, names: Mapping[int, str], files: Mapping[int, str], config: GraspitConfig
 ) -> dict[str, Any]:
     """Return the values of scene.yaml, in the order of the authors' file."""
     rows: dict[str, Any] = {"grasp_path": f"{config.under.strip('/')}/{GRASP_FILE}".lstrip("/")}

@@ -157,8 +157,7 @@ def opened(path: Path | str) -> Generator[zipfile.ZipFile]:
 
 
 def write_blocks(
-    path: Path | str,
-    arrays: Mapping[str, tuple[tuple[int, ...], Any, Iterator[NDArray[Any]]]],
+    path: Path | str, arrays: Mapping[str, tuple[tuple[int, ...], Any, Iterator[NDArray[Any]]]]
 ) -> Path:
     """Write an npz archive out of blocks of rows, whole or not at all.
 

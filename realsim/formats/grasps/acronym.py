@@ -27,11 +27,7 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.formats.grasps.hand_frames import hand_poses, require_panda
 from realsim.formats.grasps.hdf5 import put_set
-from realsim.formats.grasps.scene_grasps import (
-    check_values,
-    executed,
-    held,
-)
+from realsim.formats.grasps.scene_grasps import check_values, executed, held
 from realsim.records import GraspSet
 from realsim.robots.hand import find_hand
 from realsim.store import atomic

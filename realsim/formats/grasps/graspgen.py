@@ -21,18 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from realsim.formats.grasps.hand_frames import (
-    HandFrame,
-    hand_of_set,
-    hand_poses,
-    known_frame,
-)
-from realsim.formats.grasps.scene_grasps import (
-    check_values,
-    executed,
-    held,
-    measures_json,
-)
+from realsim.formats.grasps.hand_frames import HandFrame, hand_of_set, hand_poses, known_frame
+from realsim.formats.grasps.scene_grasps import check_values, executed, held, measures_json
 from realsim.records import GraspSet
 from realsim.store import atomic
 from realsim.untrusted.own_json import to_json

@@ -35,11 +35,7 @@ from realsim import interop
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.grasps.hand_frames import hand_of_set, hand_poses
-from realsim.formats.grasps.scene_grasps import (
-    check_values,
-    labelled,
-    measures_json,
-)
+from realsim.formats.grasps.scene_grasps import check_values, labelled, measures_json
 from realsim.records import GraspSet
 from realsim.robots.hand import Hand
 from realsim.store import atomic

@@ -94,10 +94,7 @@ def place_scene(
     names = unique_names({o.instance: models[o.obj_id].name for o in scene.objects})
     objects = tuple(
         PlacedObject(
-            instance=o.instance,
-            name=names[o.instance],
-            obj_id=o.obj_id,
-            T_world_obj=o.T_world_obj,
+            instance=o.instance, name=names[o.instance], obj_id=o.obj_id, T_world_obj=o.T_world_obj
         )
         for o in scene.objects
     )

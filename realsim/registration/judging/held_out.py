@@ -179,10 +179,7 @@ def held_out(
 
 
 def _unused_agree(
-    body: Body,
-    owned: OwnedPoints,
-    tests: Sequence[tuple[Array, Int64]],
-    config: HeldOutConfig,
+    body: Body, owned: OwnedPoints, tests: Sequence[tuple[Array, Int64]], config: HeldOutConfig
 ) -> float:
     """Return the share of points that agree, each tested with the pose its view was not used for.
 

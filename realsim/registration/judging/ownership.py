@@ -79,12 +79,7 @@ def make_claims(
         reach_m=reach_m,
         T_table_world=None if plane is None else se3.invert(plane.T_world_table),
         objects=tuple(
-            (
-                b.field.lattice,
-                se3.invert(T),
-                b.model.mesh.bounds,
-                b.center(T),
-            )
+            (b.field.lattice, se3.invert(T), b.model.mesh.bounds, b.center(T))
             for b, T in zip(bodies, poses, strict=True)
         ),
         radii=tuple(b.radius_m + reach_m for b in bodies),

@@ -18,12 +18,7 @@ from realsim.registration.compare import Comparer
 from realsim.registration.evidence import Cloud
 from realsim.registration.search.records import Placed, SearchResult, Wanted
 from realsim.registration.solver import SolverConfig, solve_pose
-from realsim.registration.verify import (
-    OffsetConfig,
-    SinkingConfig,
-    common_offset,
-    common_sinking,
-)
+from realsim.registration.verify import OffsetConfig, SinkingConfig, common_offset, common_sinking
 
 FindingKind = Literal["common shift", "common sinking", "swapped ids", "not in the scene", "unit"]
 

@@ -247,12 +247,7 @@ def _look(
 
 
 def _means_of(
-    patches: Patches,
-    sums: Array,
-    looks: Int32,
-    depths: Array,
-    views: int,
-    config: ResidualConfig,
+    patches: Patches, sums: Array, looks: Int32, depths: Array, views: int, config: ResidualConfig
 ) -> SurfaceResiduals:
     """Return the means of the sums."""
     count, weight, first, _ = sums.T

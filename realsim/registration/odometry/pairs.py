@@ -69,10 +69,7 @@ def without_plane(
 
 
 def view_cloud(
-    view: ViewPoints,
-    plane: SupportPlane | None,
-    config: AboveTableConfig,
-    rng: np.random.Generator,
+    view: ViewPoints, plane: SupportPlane | None, config: AboveTableConfig, rng: np.random.Generator
 ) -> ViewCloud:
     """Return the table and the things of one view.
 

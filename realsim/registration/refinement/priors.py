@@ -13,13 +13,7 @@ from realsim.arrays import Array, Mask
 from realsim.geometry.normal_equations import System, add_prior, covariances
 from realsim.records.depth_bias import DepthBias
 from realsim.registration.refinement.config import RefineConfig
-from realsim.registration.refinement.equations import (
-    BIAS,
-    HAND_EYE,
-    TABLE_AT,
-    State,
-    object_at,
-)
+from realsim.registration.refinement.equations import BIAS, HAND_EYE, TABLE_AT, State, object_at
 from realsim.registration.views import ViewPoints
 
 OF_VIEW, KINDS = 7, (3, 3, 1)
@@ -33,11 +27,7 @@ FIXED = 1e-9
 
 
 def add_priors(
-    system: System,
-    state: State,
-    views: Sequence[ViewPoints],
-    config: RefineConfig,
-    sigmas: Array,
+    system: System, state: State, views: Sequence[ViewPoints], config: RefineConfig, sigmas: Array
 ) -> None:
     """Add what is known of hand-eye, views, bias and table, and hold what nothing says.
 

@@ -33,11 +33,7 @@ from realsim.registration.search.records import Region, Wanted
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import Canvas, ScoreConfig, make_canvas, without_far
 from realsim.registration.search.selection import SelectionConfig
-from realsim.registration.search.templates import (
-    ModelTemplates,
-    TemplateConfig,
-    model_templates,
-)
+from realsim.registration.search.templates import ModelTemplates, TemplateConfig, model_templates
 from realsim.registration.views import ViewPoints, world_cloud
 
 

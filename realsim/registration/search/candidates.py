@@ -19,12 +19,7 @@ from realsim.registration.body import Body
 from realsim.registration.evidence import Cloud, DepthNoise, average_cloud, without_table
 from realsim.registration.search.sameness import Sameness, distinct
 from realsim.registration.search.scoring import Canvas, Render, Score, render, score
-from realsim.registration.solver import (
-    LEAST_POINTS,
-    SolverConfig,
-    Stage,
-    accumulate_points,
-)
+from realsim.registration.solver import LEAST_POINTS, SolverConfig, Stage, accumulate_points
 from realsim.registration.views import ViewPoints, world_cloud
 
 

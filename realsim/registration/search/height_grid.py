@@ -130,11 +130,7 @@ def _table_points(points: Array, T: Array, low: float, high: float) -> Array:
 
 @njit
 def _heights(
-    p: Array,
-    origin: Array,
-    shape: tuple[int, int],
-    cell: float,
-    rule: tuple[float, float, float],
+    p: Array, origin: Array, shape: tuple[int, int], cell: float, rule: tuple[float, float, float]
 ) -> Array32:
     """Return the heights (X, Y) of points (N, 3); NaN where there is none.
 

@@ -43,10 +43,7 @@ def bands_of(planes: Sequence[PlaneView]) -> dict[str, Estimate]:
     """
     flat = [_without_bowl(p) for p in planes]
     upright, lying = ([_halves(r, axis) for r in flat] for axis in (0, 1))
-    return {
-        "column_band_px": _shared(upright),
-        "row_band_px": _shared(lying),
-    }
+    return {"column_band_px": _shared(upright), "row_band_px": _shared(lying)}
 
 
 def _halves(residual: Array, axis: int) -> Array:

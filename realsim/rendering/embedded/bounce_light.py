@@ -134,11 +134,7 @@ def sun_rays(
 
 @njit(error_model="numpy")
 def mirror_rays(
-    points: SurfacePoints,
-    rows: Int64,
-    eye: Array,
-    lift: float,
-    rays: tuple[Array, Array32],
+    points: SurfacePoints, rows: Int64, eye: Array, lift: float, rays: tuple[Array, Array32]
 ) -> None:
     """Fill origins and directions (M, 3) of the reflected rays of the points `rows` (M,).
 

@@ -358,11 +358,7 @@ def _find_facing(face_light: Array32, face: Int32, out: Mask) -> None:
 
 @njit(error_model="numpy")
 def _arrivals(
-    rays: tuple[Array, Array32],
-    hits: tuple[Array32, Array32],
-    rows: Rows,
-    lift: float,
-    out: Array,
+    rays: tuple[Array, Array32], hits: tuple[Array32, Array32], rows: Rows, lift: float, out: Array
 ) -> None:
     """Fill where the rays `rows` (M,) arrive (M, 3), lifted off the face."""
     origins, directions = rays
@@ -375,10 +371,7 @@ def _arrivals(
 
 @njit(error_model="numpy")
 def _fill_mirrored(
-    face_light: Array32,
-    hits: tuple[Int32, Mask, Array32],
-    rows: Rows,
-    out: Array32,
+    face_light: Array32, hits: tuple[Int32, Mask, Array32], rows: Rows, out: Array32
 ) -> None:
     """Fill the rows (M,) of `out` (N, 4) with what faces send back, and 1; the sky stays zero."""
     face, lit, tint = hits

@@ -230,10 +230,7 @@ def _met(
 
 @njit(inline="always", error_model="numpy")
 def _smooth(
-    normals: Array32,
-    f: int,
-    weights: tuple[float, float, float],
-    flat: tuple[float, float, float],
+    normals: Array32, f: int, weights: tuple[float, float, float], flat: tuple[float, float, float]
 ) -> tuple[float, float, float]:
     """Return the unit shading normal at a point of face f, on the side of its normal."""
     a, b, w = weights

@@ -11,12 +11,7 @@ from realsim.geometry import se3
 from realsim.geometry.colors import srgb_decoded
 from realsim.rendering.appearance import LEAST_ROUGHNESS
 from realsim.rendering.embedded.face_geometry import bent_normal, bulge_of, edges_of, plane_met
-from realsim.rendering.embedded.materials import (
-    box_uv,
-    corner_normals,
-    look_of,
-    repeats,
-)
+from realsim.rendering.embedded.materials import box_uv, corner_normals, look_of, repeats
 from realsim.rendering.embedded.texture_atlas import (
     MOST_PROBES,
     TextureArrays,

@@ -11,12 +11,7 @@ from realsim.arrays import Array, Array32, Int32, UInt8
 from realsim.geometry import se3
 from realsim.geometry.colors import srgb_decoded
 from realsim.rendering.appearance import LEAST_ROUGHNESS, Environment, Material
-from realsim.rendering.embedded.materials import (
-    box_uv,
-    corner_normals,
-    look_of,
-    repeats,
-)
+from realsim.rendering.embedded.materials import box_uv, corner_normals, look_of, repeats
 from realsim.rendering.rays import GRID_M, PlacedMesh, rotated
 
 

@@ -202,9 +202,7 @@ def _fitted(radiance: Array32, path: Path, notes: list[str]) -> Array32:
     return np.asarray(out, np.float32)
 
 
-def split_sun(
-    panorama: Array32,
-) -> tuple[Array32, Color, Color, float]:
+def split_sun(panorama: Array32) -> tuple[Array32, Color, Color, float]:
     """Take a small, very bright light above the horizon out of a panorama.
 
     The excess over the sky around it moves from the panorama into the sun, and the sun stands in

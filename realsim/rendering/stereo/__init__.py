@@ -4,10 +4,4 @@ from realsim.rendering.stereo.camera import StereoCamera, StereoDepth
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.fit import FittedStereo, fit_stereo
 
-__all__ = [
-    "FittedStereo",
-    "StereoCamera",
-    "StereoConfig",
-    "StereoDepth",
-    "fit_stereo",
-]
+__all__ = ["FittedStereo", "StereoCamera", "StereoConfig", "StereoDepth", "fit_stereo"]

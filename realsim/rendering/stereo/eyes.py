@@ -109,13 +109,7 @@ def _quantiles() -> Array32:
 
 
 @njit(fastmath=True)
-def _to_bytes(
-    light: Array32,
-    noise: UInt16,
-    normal: Array32,
-    sensor: Array32,
-    out: UInt8,
-) -> None:
+def _to_bytes(light: Array32, noise: UInt16, normal: Array32, sensor: Array32, out: UInt8) -> None:
     """Write bytes from light: value + sqrt(dark + value per_value) noise, clipped and rounded."""
     gain, dark, per_value = sensor
     white, half = np.float32(255.0), np.float32(0.5)

@@ -18,13 +18,7 @@ from realsim.review.content.clouds import LeveledCloud
 from realsim.review.content.config import SceneConfig
 from realsim.review.content.meshes import DisplayMesh, display_mesh
 from realsim.review.content.thumbnails import Thumbnails
-from realsim.review.content.views import (
-    FirstLook,
-    Region,
-    first_look,
-    region_of,
-    spread,
-)
+from realsim.review.content.views import FirstLook, Region, first_look, region_of, spread
 from realsim.store import SessionStore, load_grasps, load_scene
 
 Progress = Callable[[int, int], None]

@@ -9,11 +9,7 @@ from realsim.errors import InputError
 from realsim.records import GraspSet
 from realsim.records.grasps import label_words
 from realsim.rendering.overlay import score_rgb
-from realsim.review.drawing.grasp_drawing import (
-    GraspFilter,
-    failure_choices,
-    visible_grasps,
-)
+from realsim.review.drawing.grasp_drawing import GraspFilter, failure_choices, visible_grasps
 from realsim.review.replaying.grasp_replay import GraspMotion, ReplayPlayer
 from realsim.review.replaying.grasp_words import grasp_words
 from realsim.review.window import window_text
@@ -21,13 +17,7 @@ from realsim.review.window import window_text
 if TYPE_CHECKING:
     from realsim.review.window.window import Window
 
-STAGES = {
-    "any": 0,
-    "closed": 1,
-    "closed and lifted": 2,
-    "and shaken": 3,
-    "and swung: all four": 4,
-}
+STAGES = {"any": 0, "closed": 1, "closed and lifted": 2, "and shaken": 3, "and swung: all four": 4}
 """What a grasp has passed at least."""
 THIS, EVERY = "this object", "all objects"
 ANY = "any, or none"

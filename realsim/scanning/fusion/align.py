@@ -176,10 +176,7 @@ def _corrections(
 
 
 def _wrong(
-    state: PoseState,
-    matched: Array,
-    corrections: tuple[ViewCorrection, ...],
-    config: FusionConfig,
+    state: PoseState, matched: Array, corrections: tuple[ViewCorrection, ...], config: FusionConfig
 ) -> list[tuple[int, str, ViewCorrection]]:
     """Return the views that the others speak against, the worst first, not too many at once."""
     sigma = np.repeat([config.arm_sigma[1], config.arm_sigma[0]], 3)

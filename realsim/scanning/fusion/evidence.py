@@ -128,10 +128,7 @@ def fitted_to_noise(
 
 
 def trusted_depth(
-    depth_m: Array32,
-    intrinsics: CameraIntrinsics,
-    noise: DepthNoise,
-    config: FusionConfig,
+    depth_m: Array32, intrinsics: CameraIntrinsics, noise: DepthNoise, config: FusionConfig
 ) -> Array32:
     """Return the depth (h, w) that is trusted; 0 = none, negative = an edge.
 

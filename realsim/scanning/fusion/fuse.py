@@ -180,12 +180,7 @@ def _sigma(seen: VertexEvidence, pose_sigma_m: float, measured: Mask) -> Array:
     return np.where(measured, np.hypot(noise, pose), np.nan)
 
 
-def _coverage(
-    surface: Surface,
-    down: Mask,
-    measured: Mask,
-    views: Int32,
-) -> Coverage:
+def _coverage(surface: Surface, down: Mask, measured: Mask, views: Int32) -> Coverage:
     """Return the shares of the area that were measured and invented."""
     a, b, c = np.moveaxis(surface.vertices[surface.faces], 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)

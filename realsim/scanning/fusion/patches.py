@@ -154,10 +154,7 @@ def observed_object(
         if len(p):
             matched[number] = np.count_nonzero(near) / len(p)
         rows.append(
-            (
-                *_rows(number, T, view.on_object[near], n[near], r[near]),
-                view.object_sigma[near],
-            )
+            (*_rows(number, T, view.on_object[near], n[near], r[near]), view.object_sigma[near])
         )
     pitch = float(np.median([v.pitch for v in points]))
     return _averaged(rows, max(PATCH_M, PATCH_PX * pitch), STRIDE_PX, PATCH_FLOOR_M), matched

@@ -11,13 +11,7 @@ import numpy as np
 
 from realsim.arrays import Array, Int32, Int64
 from realsim.geometry import se3
-from realsim.geometry.normal_equations import (
-    System,
-    add_prior,
-    inverse,
-    symmetric,
-    without_views,
-)
+from realsim.geometry.normal_equations import System, add_prior, inverse, symmetric, without_views
 from realsim.geometry.seen_surface import seen_distances
 from realsim.registration.refinement.equations import (
     BIAS,

@@ -247,9 +247,7 @@ def _covariance(look: Outlook, sigma: float) -> Array:
 
 
 def _views(
-    evidence: ScanEvidence,
-    fit: tuple[ScaleState, Outlook, Explained],
-    dropped: Sequence[int],
+    evidence: ScanEvidence, fit: tuple[ScaleState, Outlook, Explained], dropped: Sequence[int]
 ) -> tuple[ViewAgreement, ...]:
     """Return how every view agrees, in the order of their numbers."""
     state, look, explained = fit

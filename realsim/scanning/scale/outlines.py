@@ -240,11 +240,7 @@ class Outline:
 
 
 def outline(
-    shape: ScanShape,
-    state: ScaleState,
-    T_world_cam: Array,
-    focal_px: float,
-    wanted: int,
+    shape: ScanShape, state: ScaleState, T_world_cam: Array, focal_px: float, wanted: int
 ) -> Outline:
     """Return points of the model's outline against the background in one view.
 

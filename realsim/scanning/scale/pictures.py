@@ -13,13 +13,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim.scanning.scale.result import ScaleFit
-from realsim.scanning.shading import (
-    DIVERGING,
-    UNSEEN,
-    ShadingConfig,
-    shaded_views,
-    value_paint,
-)
+from realsim.scanning.shading import DIVERGING, UNSEEN, ShadingConfig, shaded_views, value_paint
 
 INK, MUTED, GOOD, WARN, BAD = "#22303c", "#8a99a8", "#1f8a7d", "#b26a00", "#c03f26"
 VERDICT_COLORS = {"accepted": GOOD, "doubtful": WARN, "rejected": BAD, "unchecked": MUTED}

@@ -146,10 +146,7 @@ def mirror_gain(
 
 
 def _fitted(
-    shape: ScanShape,
-    evidence: ScanEvidence,
-    starts: Sequence[Similarity],
-    config: ScaleConfig,
+    shape: ScanShape, evidence: ScanEvidence, starts: Sequence[Similarity], config: ScaleConfig
 ) -> list[Hypothesis]:
     """Return the starts after the coarse fit with their gain, the best ones compared finely."""
     c = config.search

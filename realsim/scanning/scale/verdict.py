@@ -279,10 +279,7 @@ def sigma_log(look: Outlook, config: ScaleConfig) -> float:
 
 
 def limits_of(
-    look: Outlook,
-    evidence: ScanEvidence,
-    state: ScaleState,
-    config: ScaleConfig,
+    look: Outlook, evidence: ScanEvidence, state: ScaleState, config: ScaleConfig
 ) -> tuple[Limit, ...]:
     """Return what limits the scale, worst first."""
     total = float(look.covariance[SIZE, SIZE])

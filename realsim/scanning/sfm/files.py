@@ -69,12 +69,7 @@ def cameras_json(result: SfmResult) -> dict[str, Any]:
         "units": ("m" if result.is_metric else "arbitrary") + "; T_world_cam maps camera to world",
         "camera": to_json(g.intrinsics),
         "views": [
-            {
-                "name": name,
-                "T_world_cam": to_json(T),
-                "reprojection_px": to_json(error),
-                **sigma,
-            }
+            {"name": name, "T_world_cam": to_json(T), "reprojection_px": to_json(error), **sigma}
             for name, T, error, sigma in zip(
                 g.names, g.Ts_world_cam, result.view_reprojection_px.tolist(), sigmas, strict=True
             )
@@ -161,9 +156,6 @@ def _camera_sigmas(result: SfmResult) -> list[dict[str, Any]]:
     for C in result.camera_covariance:
         turn, shift = np.linalg.eigvalsh(C[:3, :3])[-1], np.linalg.eigvalsh(C[3:, 3:])[-1]
         rows.append(
-            {
-                "sigma_deg": float(np.degrees(np.sqrt(turn))),
-                "sigma_mm": float(1e3 * np.sqrt(shift)),
-            }
+            {"sigma_deg": float(np.degrees(np.sqrt(turn))), "sigma_mm": float(1e3 * np.sqrt(shift))}
         )
     return rows

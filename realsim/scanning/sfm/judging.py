@@ -222,9 +222,7 @@ MEDIAN_OF_NORMAL = 1.2533
 
 
 def depth_scale(
-    geometry: Geometry,
-    depth_of: Callable[[str], Array32 | None],
-    config: TrustConfig,
+    geometry: Geometry, depth_of: Callable[[str], Array32 | None], config: TrustConfig
 ) -> DepthScale | None:
     """Compare measured depth with the depth of the sparse points, both along z.
 

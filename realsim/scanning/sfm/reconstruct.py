@@ -71,9 +71,7 @@ def reconstruct(
 
 
 def with_depth(
-    result: SfmResult,
-    depth_of: Callable[[str], Array32 | None],
-    config: SfmConfig,
+    result: SfmResult, depth_of: Callable[[str], Array32 | None], config: SfmConfig
 ) -> SfmResult:
     """Return the result with the depth images' scale beside the robot's, judged anew.
 

@@ -39,10 +39,7 @@ from realsim_sim_bridge.annotation.summary import AnnotationSummary, numbers, su
 
 
 def write_objects(
-    store: SessionStore,
-    scene: Scene,
-    models: Mapping[int, ObjectModel],
-    config: AnnotationConfig,
+    store: SessionStore, scene: Scene, models: Mapping[int, ObjectModel], config: AnnotationConfig
 ) -> None:
     """Write annotations/objects.json, and the surface cloud of every model that is annotated."""
     annotated = sorted({o.obj_id for o in scene.objects if o.verdict != "rejected"})

@@ -31,11 +31,7 @@ from realsim_sim_bridge.annotation.config import MAPS
 from realsim_sim_bridge.annotation.frame_grasps import GraspsInView
 from realsim_sim_bridge.annotation.frame_labels import FrameLabel
 from realsim_sim_bridge.annotation.frame_maps import map_path
-from realsim_sim_bridge.annotation.inputs import (
-    FORMAT_VERSION,
-    FrameInputs,
-    FrameView,
-)
+from realsim_sim_bridge.annotation.inputs import FORMAT_VERSION, FrameInputs, FrameView
 
 OBJECTS_FILE = "annotations/objects.json"
 INFO_KEYS = (

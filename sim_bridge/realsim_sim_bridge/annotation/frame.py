@@ -15,11 +15,7 @@ from realsim.formats.bop.labels import mask_path
 from realsim.images.png import encode_window
 from realsim.rendering.labels import LabelRenderer, Labels
 from realsim_sim_bridge.annotation import files
-from realsim_sim_bridge.annotation.frame_grasps import (
-    GraspsInView,
-    GraspVisibility,
-    grasps_in_view,
-)
+from realsim_sim_bridge.annotation.frame_grasps import GraspsInView, GraspVisibility, grasps_in_view
 from realsim_sim_bridge.annotation.frame_labels import (
     DepthAgreement,
     FrameLabel,

@@ -113,10 +113,7 @@ def silhouette_box(
 
 
 def depth_agreement(
-    visible: Mask,
-    rendered_m: Array32,
-    measured_m: Array32,
-    tolerance_m: float,
+    visible: Mask, rendered_m: Array32, measured_m: Array32, tolerance_m: float
 ) -> DepthAgreement:
     """Return how measured and rendered depth (H, W) [m] agree inside a mask (H, W)."""
     measured, rendered = measured_m[visible], rendered_m[visible]

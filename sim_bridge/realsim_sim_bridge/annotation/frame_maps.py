@@ -159,12 +159,7 @@ def normal_counts(labels: Labels) -> Counts:
 
 @njit
 def _normals(
-    rays: Array32,
-    geometry: Int32,
-    face: Int32,
-    Ts_obj_cam: Array,
-    normals: Array32,
-    starts: Int64,
+    rays: Array32, geometry: Int32, face: Int32, Ts_obj_cam: Array, normals: Array32, starts: Int64
 ) -> Counts:
     """Return the counts (H, W, 3) of the faces' normals towards the eye, 0 0 0 where nothing is."""
     height, width = geometry.shape

@@ -196,10 +196,7 @@ def object_masks(
     rendered = labels.ids[window] == instance
     visible = rendered if region is None else rendered & ~region.over(window)
     return ObjectMasks(
-        window=window,
-        amodal=labels.amodal[instance][window],
-        rendered=rendered,
-        visible=visible,
+        window=window, amodal=labels.amodal[instance][window], rendered=rendered, visible=visible
     )
 
 

@@ -191,12 +191,7 @@ def _fingers(
 
 
 def _object(
-    attempt: Attempt,
-    clock: _Clock,
-    t: Array,
-    planned: Array,
-    times: Array,
-    falling: FallConfig,
+    attempt: Attempt, clock: _Clock, t: Array, planned: Array, times: Array, falling: FallConfig
 ) -> Array:
     """Return where the object is (S, 4, 4), table frame [m]."""
     Ts = np.empty((len(t), 4, 4))

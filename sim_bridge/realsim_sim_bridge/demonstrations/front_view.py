@@ -50,9 +50,7 @@ def view_intrinsics(view_deg: float, size_px: tuple[int, int] = SIZE_PX) -> Came
 
 
 def wrist_camera(
-    T_ee_cam: Array | None = None,
-    size_px: tuple[int, int] = SIZE_PX,
-    hand: Hand | None = None,
+    T_ee_cam: Array | None = None, size_px: tuple[int, int] = SIZE_PX, hand: Hand | None = None
 ) -> DemonstrationCamera:
     """Return a camera in the hand.
 

@@ -60,12 +60,7 @@ class LeRobotDemonstrations:
     """Chosen attempts of a source; a `LeRobotSource`."""
 
     def __init__(
-        self,
-        source: DemonstrationSource,
-        name: str,
-        chosen: Sequence[int],
-        *,
-        depth: bool = False,
+        self, source: DemonstrationSource, name: str, chosen: Sequence[int], *, depth: bool = False
     ) -> None:
         """Choose attempts.
 

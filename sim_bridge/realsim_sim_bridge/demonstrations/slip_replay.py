@@ -19,14 +19,7 @@ from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.slip.score import score_stages
 from realsim_sim_bridge.slip.slip_test import NOT_SIMULATED, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.stand import Stand
-from realsim_sim_bridge.slip.world import (
-    Engine,
-    Grips,
-    HandWorld,
-    Motion,
-    SlipBody,
-    SlipPhysics,
-)
+from realsim_sim_bridge.slip.world import Engine, Grips, HandWorld, Motion, SlipBody, SlipPhysics
 
 # --- An engine of the slip test that writes down where the objects were --------------------------
 # It stands between the slip test and a real engine and passes everything on unchanged, so that a

@@ -136,10 +136,7 @@ class Stand:
         Ts = along_approach(poses.Ts_obj_grasp, -depths)
         openings = np.minimum(poses.widths_m + 2 * margin_m, self._geometry.max_opening_m)
         return HandPoses(
-            Ts_obj_grasp=Ts,
-            widths_m=poses.widths_m,
-            openings_m=openings,
-            contact_depths_m=depths,
+            Ts_obj_grasp=Ts, widths_m=poses.widths_m, openings_m=openings, contact_depths_m=depths
         )
 
     def _outcome(self, poses: HandPoses) -> Int64:

@@ -185,11 +185,7 @@ def _add_edges_loops(
             u[axis] += 1.0
             u /= np.sqrt(np.sum(u * u))
             v = np.array(
-                [
-                    a[1] * u[2] - a[2] * u[1],
-                    a[2] * u[0] - a[0] * u[2],
-                    a[0] * u[1] - a[1] * u[0],
-                ]
+                [a[1] * u[2] - a[2] * u[1], a[2] * u[0] - a[0] * u[2], a[0] * u[1] - a[1] * u[0]]
             )
             for e in range(len(corners)):
                 for i in range(3):

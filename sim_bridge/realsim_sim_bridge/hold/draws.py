@@ -227,10 +227,7 @@ def nominal_factors(
     patches = pad_patches(obj.rays, pads, trial.openings_m, hand, softness_m)
     n = len(trial)
     return safety_factors(
-        patches,
-        loads.about_grasp(_centers(trial, pads)),
-        np.full(n, friction),
-        np.full(n, force_n),
+        patches, loads.about_grasp(_centers(trial, pads)), np.full(n, friction), np.full(n, force_n)
     )
 
 

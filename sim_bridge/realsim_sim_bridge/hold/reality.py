@@ -25,12 +25,7 @@ from realsim_sim_bridge.hold.calibration import (
     left_out,
     shipped,
 )
-from realsim_sim_bridge.hold.draws import (
-    PALM_M,
-    GraspedObject,
-    HoldConfig,
-    chance_columns,
-)
+from realsim_sim_bridge.hold.draws import PALM_M, GraspedObject, HoldConfig, chance_columns
 from realsim_sim_bridge.slip.engines import make_engine
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test

@@ -28,13 +28,7 @@ from realsim_sim_bridge.school.object_task import (
     prepare,
     trial_of,
 )
-from realsim_sim_bridge.school.shards import (
-    Tested,
-    read_tested,
-    run_shard,
-    shards_of,
-    write_tested,
-)
+from realsim_sim_bridge.school.shards import Tested, read_tested, run_shard, shards_of, write_tested
 from realsim_sim_bridge.slip.stand import Stand
 
 Progress = Callable[[int, int], None]

@@ -59,15 +59,7 @@ def read_prepared(path: Path) -> Prepared | None:
     )
 
 
-_ARRAYS = (
-    "Ts_obj_grasp",
-    "widths_m",
-    "scores",
-    "base_scores",
-    "slip_m",
-    "slip_rad",
-    "reachable",
-)
+_ARRAYS = ("Ts_obj_grasp", "widths_m", "scores", "base_scores", "slip_m", "slip_rad", "reachable")
 _TRAJECTORY_ARRAYS = ("rows", "starts", "time_s", "joints_rad", "opening_m", "phase")
 MEASURE, TRAJECTORY = "measure.", "trajectory."
 """Before the names of measures and trajectory arrays in a file."""

@@ -16,12 +16,7 @@ from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.day import Day, Progress, Pupil
 from realsim_sim_bridge.school.kept_sets import SchoolResult
 from realsim_sim_bridge.school.object_task import ObjectTask
-from realsim_sim_bridge.school.run_record import (
-    Restart,
-    folder_of_run,
-    mark_finished,
-    run_record,
-)
+from realsim_sim_bridge.school.run_record import Restart, folder_of_run, mark_finished, run_record
 from realsim_sim_bridge.school.shards import default_shard_grasps
 
 

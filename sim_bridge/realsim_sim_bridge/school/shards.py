@@ -34,11 +34,7 @@ def shard_measures(
     Raises:
         InputError: the second engine is not installed.
     """
-    found = {
-        "force_n": slips.force_n,
-        "duration_s": slips.duration_s,
-        "safety": slips.safety,
-    }
+    found = {"force_n": slips.force_n, "duration_s": slips.duration_s, "safety": slips.safety}
     slip, limits, hand = config.slip, config.score, config.hand
     if config.sweep is not None:
         found |= sweep_margins(trial, slips, slip, limits, hand, engine, config.sweep)

@@ -410,15 +410,10 @@ def _numbers(groups: Sequence[Sequence[GraspSet]]) -> dict[str, Spread]:
     """Return how many candidates, good and bad ones the groups have."""
     good = np.array([sum(int(s.good.sum()) for s in group) for group in groups], dtype=np.float64)
     judged = np.array(
-        [sum(int(np.sum(~np.isnan(s.scores))) for s in group) for group in groups],
-        dtype=np.float64,
+        [sum(int(np.sum(~np.isnan(s.scores))) for s in group) for group in groups], dtype=np.float64
     )
     total = np.array([sum(len(s) for s in group) for group in groups], dtype=np.float64)
-    return {
-        "candidates": _spread(total),
-        "good": _spread(good),
-        "bad": _spread(judged - good),
-    }
+    return {"candidates": _spread(total), "good": _spread(good), "bad": _spread(judged - good)}
 
 
 def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:

@@ -219,11 +219,7 @@ def _set_options(spec: Any, physics: SlipPhysics, settings: "MujocoSettings") ->
 
 
 def _add_finger(
-    spec: Any,
-    finger: int,
-    geometry: Hand,
-    physics: SlipPhysics,
-    settings: "MujocoSettings",
+    spec: Any, finger: int, geometry: Hand, physics: SlipPhysics, settings: "MujocoSettings"
 ) -> None:
     """Add a finger that slides along y; its joint's position is its face's distance from y = 0."""
     mujoco = load_mujoco()

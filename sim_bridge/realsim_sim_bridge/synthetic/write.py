@@ -33,12 +33,7 @@ from realsim_sim_bridge.annotation.config import AnnotationConfig, OccluderConfi
 from realsim_sim_bridge.annotation.summary import AnnotationSummary
 from realsim_sim_bridge.synthetic.claim import claimed_session, with_stored_models
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
-from realsim_sim_bridge.synthetic.frame import (
-    FrameJob,
-    forget_job,
-    frame_of_job,
-    require_renderer,
-)
+from realsim_sim_bridge.synthetic.frame import FrameJob, forget_job, frame_of_job, require_renderer
 from realsim_sim_bridge.synthetic.scene import SyntheticScene, save_surroundings
 
 Progress = Callable[[int, int], None]

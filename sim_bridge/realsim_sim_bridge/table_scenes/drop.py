@@ -205,10 +205,7 @@ def _on_table(points: Array, table: TableModel, config: DropConfig) -> bool:
 
 
 def settle(
-    table: TableModel,
-    solids: dict[int, SlipBody],
-    poses: dict[int, Array],
-    config: DropConfig,
+    table: TableModel, solids: dict[int, SlipBody], poses: dict[int, Array], config: DropConfig
 ) -> tuple[dict[int, Array], dict[int, float], float]:
     """Let a fresh world with the objects at their poses run for `check_s`.
 
@@ -234,10 +231,7 @@ def settle(
 
 
 def _second_settles(
-    table: TableModel,
-    solids: dict[int, SlipBody],
-    poses: dict[int, Array],
-    config: DropConfig,
+    table: TableModel, solids: dict[int, SlipBody], poses: dict[int, Array], config: DropConfig
 ) -> Resting:
     """Settle again until nothing moves; what does not stop moving is taken off."""
     fell: list[int] = []

@@ -269,11 +269,7 @@ class ObjectDraw:
 
 
 def sample_layout(
-    seed: int,
-    scene: int,
-    pool: ObjectPool,
-    config: TableSceneConfig,
-    cache: Path | None = None,
+    seed: int, scene: int, pool: ObjectPool, config: TableSceneConfig, cache: Path | None = None
 ) -> Layout:
     """Return scene `scene` of a seed: drawn, dropped, at rest.
 
@@ -303,12 +299,7 @@ def sample_layout(
 
 
 def _layout(
-    seed: int,
-    scene: int,
-    wanted: int,
-    model: TableModel,
-    objects: ObjectDraw,
-    rest: Resting,
+    seed: int, scene: int, wanted: int, model: TableModel, objects: ObjectDraw, rest: Resting
 ) -> Layout:
     def names(numbers: tuple[int, ...]) -> tuple[str, ...]:
         return tuple(objects.drawn[k].name for k in numbers)

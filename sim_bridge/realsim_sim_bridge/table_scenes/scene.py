@@ -126,11 +126,7 @@ def part_looks(
 
 
 def _part_look(key: str, rng: np.random.Generator, own: OwnLooks) -> Material:
-    from realsim.rendering.procedural.choose import (
-        floor_material,
-        random_material,
-        table_material,
-    )
+    from realsim.rendering.procedural.choose import floor_material, random_material, table_material
 
     def one_of(kinds: tuple[str, ...]) -> Material:
         return random_material(rng, kinds[int(rng.integers(len(kinds)))])

@@ -4,11 +4,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.geometry import se3
-from realsim_sim_bridge.slip.motion import (
-    SlipMotion,
-    lift_acceleration,
-    oscillation_acceleration,
-)
+from realsim_sim_bridge.slip.motion import SlipMotion, lift_acceleration, oscillation_acceleration
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import Slips, run_slip_test
 from realsim_sim_bridge.slip.world import Engine, PadModel

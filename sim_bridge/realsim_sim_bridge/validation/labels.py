@@ -72,9 +72,7 @@ def refined(settings: Settings, steps: int, iterations: int) -> Settings:
     settings = at_true_speed(settings)
     if isinstance(settings, BulletSettings):
         return replace(
-            settings,
-            rate_hz=settings.rate_hz * steps,
-            iterations=settings.iterations * iterations,
+            settings, rate_hz=settings.rate_hz * steps, iterations=settings.iterations * iterations
         )
     # MuJoCo's Newton solver ends at its tolerance; what can be refined is the pass against slip.
     noslip = settings.noslip_iterations * iterations + 10 * (iterations - 1)

@@ -32,13 +32,7 @@ from realsim_sim_bridge.validation.slip_limits import (
     press_checks,
     torque_checks,
 )
-from realsim_sim_bridge.validation.specimens import (
-    DOWN,
-    OPENING_M,
-    SIDE_M,
-    cube_trial,
-    edge_trial,
-)
+from realsim_sim_bridge.validation.specimens import DOWN, OPENING_M, SIDE_M, cube_trial, edge_trial
 
 # --- What the engine says its settings are, whether it repeats itself, and whether pairs are alone
 

@@ -13,12 +13,7 @@ from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.fit_pictures import stereo_fit_picture
 from realsim.rendering.depth_sensors.profiles import profile
-from realsim.rendering.stereo import (
-    FittedStereo,
-    StereoCamera,
-    StereoConfig,
-    fit_stereo,
-)
+from realsim.rendering.stereo import FittedStereo, StereoCamera, StereoConfig, fit_stereo
 
 CAMERA = CameraIntrinsics(width=420, height=280, fx=640, fy=640, cx=209.5, cy=139.5)
 

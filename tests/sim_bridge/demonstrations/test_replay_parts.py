@@ -12,10 +12,7 @@ from realsim.geometry.mesh import mass_properties
 from realsim.records import GraspSet
 from realsim_sim_bridge.demonstrations.falling import FallConfig, fall
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of, tried_body
-from realsim_sim_bridge.demonstrations.slip_replay import (
-    RecordedEngine,
-    replay_grasp,
-)
+from realsim_sim_bridge.demonstrations.slip_replay import RecordedEngine, replay_grasp
 from realsim_sim_bridge.school import run_school_results
 from realsim_sim_bridge.school.object_slips import stand_of
 from realsim_sim_bridge.school.sweep import SweepConfig

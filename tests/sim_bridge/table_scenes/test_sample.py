@@ -11,11 +11,7 @@ from realsim.errors import InputError
 from realsim.geometry.mesh import save_ply
 from realsim.geometry.parts import part
 from realsim_sim_bridge.slip.world import SlipBody
-from realsim_sim_bridge.table_scenes.config import (
-    DropConfig,
-    PoolConfig,
-    TableSceneConfig,
-)
+from realsim_sim_bridge.table_scenes.config import DropConfig, PoolConfig, TableSceneConfig
 from realsim_sim_bridge.table_scenes.drop import settle
 from realsim_sim_bridge.table_scenes.pool import ObjectPool, open_pool
 from realsim_sim_bridge.table_scenes.sample import (
