@@ -109,8 +109,8 @@ def write_bytes(
     except BaseException as error:
         if not announced:
             unnamed.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename is None:  # a full disk names no file
-            error.filename = str(path)
+        if isinstance(error, OSError) and error.errno and error.filename is None:
+            error.filename = str(path)  # a full disk names no file
         raise
 
 
