@@ -44,7 +44,7 @@ class ConvexConfig:
     64 vertices of a capsule lose 8 %."""
     time_limit_s: float = 180.0
     """CPU time for all thresholds together [s]; then the best parts found so far are taken.
-    A flange with seven bores takes 70 on a busy machine: what the parts are must not hang on that."""
+    A flange with seven bores takes 70 on a busy machine, and its parts must not hang on that."""
     seed: int = 0
     """CoACD's own seed."""
 
