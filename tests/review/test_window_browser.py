@@ -358,6 +358,8 @@ def test_a_browser_without_webgl_says_so(
         page = bare.new_page()
         for address, note in ((server.url, ".realsim-no-webgl"), (path.as_uri(), "#wait")):
             page.goto(address)
-            page.get_by_text("cannot draw in three dimensions").and_(page.locator(note)).wait_for()
+            told = page.get_by_text("cannot draw in three dimensions").and_(page.locator(note))
+            told.wait_for()
+            assert told.is_visible()
     finally:
         bare.close()
