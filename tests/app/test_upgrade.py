@@ -233,7 +233,7 @@ def test_one_view_takes_little_distance_from_depth_that_may_be_off_as_a_whole(
     off_m: float, far_m: float, most_m: float
 ) -> None:
     for outcome, right in zip(judged(off_m, 0.0, far_m=far_m), standing(0.5), strict=True):
-        assert outcome.kind == "improved" and "mm were taken" in outcome.words, outcome.words
+        assert outcome.kind == "improved" and "new pose sure of" in outcome.words, outcome.words
         step = outcome.T_world_obj[:3, 3] - right.T_world_obj[:3, 3]
         assert np.linalg.norm(step) < most_m
 

@@ -135,7 +135,7 @@ class _Proposal:
     on_photo: bool = False
     """Whether it was shifted onto the photograph."""
     words: str = ""
-    """How much was taken of it."""
+    """How much of the new pose it is."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -355,7 +355,7 @@ def _fused(
     back = axes @ (variances / (variances + own) * x)
     T = new @ se3.exp(back / units) @ se3.invert(M)
     taken, whole = (1e3 * mssd_symmetric(T_old, X, model) for X in (T, p.T_world_obj))
-    return replace(p, T_world_obj=T, words=f"; {taken:.1f} of {whole:.1f} mm were taken")
+    return replace(p, T_world_obj=T, words=f"; new pose sure of {taken:.1f} of {whole:.1f} mm")
 
 
 def _decided(
@@ -375,8 +375,9 @@ def _decided(
     for p in proposals:
         e = referee.evidence(given.instance, T, p.T_world_obj, others, p.on_photo)
         kind, words = _judged(e, found, referee.config)
+        words += p.words
         if kind == "improved":
-            return Outcome(instance=given.instance, kind=kind, words=words + p.words,
+            return Outcome(instance=given.instance, kind=kind, words=words,
                            T_world_obj=p.T_world_obj, evidence=e)  # fmt: skip
         first = first or (e, kind, words)
     assert first is not None
@@ -420,7 +421,7 @@ def _judged(e: Evidence, found: ObjectPose, config: OutcomeConfig) -> tuple[Kind
 def _why_kept(e: Evidence, config: OutcomeConfig) -> str | None:
     """Return why a new pose is not even considered; None = it is."""
     if e.moved_m < config.same_m:
-        return f"the new pose is the same within {1e3 * config.same_m:g} mm"
+        return f"the new pose, where it is sure, is the same within {1e3 * config.same_m:g} mm"
     least = config.far_visible if e.moved_m > config.far_m else config.least_visible
     if e.visible < least:
         return f"only {100 * e.visible:.0f} % of it is in sight"
