@@ -13,6 +13,7 @@ from realsim.app import cli
 from realsim.formats.bop.models import load_models, save_models
 from realsim.geometry.mesh import save_ply
 from realsim.geometry.parts import part
+from realsim.models.convex_config import ConvexConfig
 from realsim.models.library import ModelLibrary
 from realsim.models.library_prepare import PrepareConfig
 from realsim.models.library_records import ScaleNote
@@ -167,7 +168,8 @@ def test_a_bop_folder_is_completed(run, tmp_path: Path):
     assert code == 2 and "Did you mean" in err
     words = ("wedge", "--mass", 0.1, "--quiet")
     code, out, _ = run("scan", "complete", tmp_path / "bop/models", *words)
-    assert code == 0 and "up to 60 s of CPU time" in out
+    limit = f"up to {ConvexConfig().time_limit_s:g} s of CPU time"
+    assert code == 0 and limit in out
     assert "1/1 wedge: symmetries" in out and "1 of 1 completed" in out
     code, out, _ = run("scan", "show", tmp_path / "bop/models", "wedge")
     assert code == 0 and "100 (weighed)" in out
