@@ -20,9 +20,7 @@ import numpy as np
 from realsim.arrays import Array, Int64, Mask
 from realsim.compiled import njit
 from realsim.errors import DegenerateError
-from realsim.geometry import se3
-from realsim.geometry.camera import projection_jacobian
-from realsim_calibration.fit.view_system import camera_record
+from realsim.geometry import lens_loops, se3
 
 CAMERA_TERMS = 12
 """fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6."""
@@ -201,47 +199,73 @@ class _Normal:
 @njit
 def _accumulate(
     offsets: Int64,
-    derivatives: tuple[Array, Array],
-    rotations: Array,
+    camera: Array,
+    poses: Array,
     board: tuple[Array, Array, float],
-    weighted: tuple[Array, Array],
-    system: tuple[Array, Array],
+    seen: tuple[Array, Array, float],
+    first: int,
+    normal: tuple[Array, Array, Array, Array],
 ) -> None:
-    """Add J^T w J and J^T w r of every corner to its view's H (views, 22, 22) and g (views, 22)."""
-    d_point, d_cam = derivatives
+    """Write every corner's residual; add J^T w J, J^T w r and the robust cost to its view's.
+
+    Corners are weighted by Huber. Of the unknowns the `first` ones are taken as known.
+    """
     points, flat, extent = board
-    residuals, weights = weighted
-    H, g = system
-    J = np.empty(22)
+    measured, precision, huber = seen
+    residuals, H, g, costs = normal
+    J = np.zeros((2, 22))
     for i in range(len(offsets) - 1):
-        R = rotations[i]
+        T = poses[i]
         for n in range(offsets[i], offsets[i + 1]):
-            x, y, z = points[n, 0], points[n, 1], points[n, 2]
-            u, v = flat[n, 0] / extent, flat[n, 1] / extent
-            w = weights[n]
+            px, py, pz = points[n, 0], points[n, 1], points[n, 2]
+            cx = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+            cy = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+            cz = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+            if cz < NEAREST_M:
+                costs[i] = np.inf
+                continue
+            x, y = cx / cz, cy / cz
+            bent_x, bent_y = lens_loops.bent(camera, x, y)
+            xx, xy, yy, radial, den = lens_loops.bent_slopes(camera, x, y)
+            residuals[n, 0] = camera[0] * bent_x + camera[2] - measured[n, 0]
+            residuals[n, 1] = camera[1] * bent_y + camera[3] - measured[n, 1]
+            square = (residuals[n, 0] ** 2 + residuals[n, 1] ** 2) * precision[n]
+            if not np.isfinite(square):
+                costs[i] = np.inf
+                continue
+            far = np.sqrt(max(square, huber * huber))
+            costs[i] += 2 * huber * far - huber * huber if square > huber * huber else square
+            w = precision[n] * huber / far
+            r2, u, v = x * x + y * y, flat[n, 0] / extent, flat[n, 1] / extent
             for k in range(2):
-                a, b, c = d_point[n, k, 0], d_point[n, k, 1], d_point[n, k, 2]
-                gx = a * R[0, 0] + b * R[1, 0] + c * R[2, 0]
-                gy = a * R[0, 1] + b * R[1, 1] + c * R[2, 1]
-                gz = a * R[0, 2] + b * R[1, 2] + c * R[2, 2]
-                for m in range(12):
-                    J[m] = d_cam[n, k, m]
-                J[12] = gy * flat[n, 1]
-                J[13] = gz * extent * u * u
-                J[14] = gz * extent * u * v
-                J[15] = gz * extent * v * v
-                J[16] = y * gz - z * gy
-                J[17] = z * gx - x * gz
-                J[18] = x * gy - y * gx
-                J[19], J[20], J[21] = gx, gy, gz
-                wr = w * residuals[n, k]
-                for p in range(22):
-                    wj = w * J[p]
-                    g[i, p] += wr * J[p]
+                f = camera[k]
+                ideal = f * (x if k == 0 else y) / den
+                a = f * (xx if k == 0 else xy) / cz
+                b = f * (xy if k == 0 else yy) / cz
+                c = -(x * a + y * b)
+                gx = a * T[0, 0] + b * T[1, 0] + c * T[2, 0]
+                gy = a * T[0, 1] + b * T[1, 1] + c * T[2, 1]
+                gz = a * T[0, 2] + b * T[1, 2] + c * T[2, 2]
+                J[k, k], J[k, 2 + k] = bent_x if k == 0 else bent_y, 1.0
+                J[k, 4], J[k, 5], J[k, 8] = ideal * r2, ideal * r2**2, ideal * r2**3
+                J[k, 6] = f * (2 * x * y if k == 0 else r2 + 2 * y * y)
+                J[k, 7] = f * (r2 + 2 * x * x if k == 0 else 2 * x * y)
+                for m in range(3):
+                    J[k, 9 + m] = -ideal * radial * r2 ** (m + 1)
+                J[k, 12] = gy * flat[n, 1]
+                J[k, 13] = gz * extent * u * u
+                J[k, 14] = gz * extent * u * v
+                J[k, 15] = gz * extent * v * v
+                J[k, 16], J[k, 17] = py * gz - pz * gy, pz * gx - px * gz
+                J[k, 18] = px * gy - py * gx
+                J[k, 19], J[k, 20], J[k, 21] = gx, gy, gz
+                for p in range(first, 22):
+                    wj = w * J[k, p]
+                    g[i, p] += wj * residuals[n, k]
                     for q in range(p, 22):
-                        H[i, p, q] += wj * J[q]
-        for p in range(22):
-            for q in range(p):
+                        H[i, p, q] += wj * J[k, q]
+        for p in range(first, 22):
+            for q in range(first, p):
                 H[i, p, q] = H[i, q, p]
 
 
@@ -259,33 +283,23 @@ def points_in_camera(state: State, obs: Observations) -> Array:
     return np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
 
 
-def _normal(state: State, obs: Observations, sigma: float, huber: float) -> _Normal:
-    """Return the normal equations of all views, corners weighted by Huber."""
+def _normal(state: State, obs: Observations, sigma: float, huber: float, first: int = 0) -> _Normal:
+    """Return the normal equations of all views, without the first unknowns if these are known."""
     n = obs.views
-    H, g = np.zeros((n, ROW, ROW)), np.zeros((n, ROW))
-    empty = np.zeros((len(obs.uv), 2))
+    H, g, costs = np.zeros((n, ROW, ROW)), np.zeros((n, ROW)), np.zeros(n)
+    residuals = np.zeros((len(obs.uv), 2))
     if not (np.all(np.isfinite(state.camera)) and state.camera[0] > 0 and state.camera[1] > 0):
-        return _Normal(residuals=empty, H=H, g=g, costs=np.full(n, np.inf))
-    cam = points_in_camera(state, obs)
-    behind = cam[:, 2] < NEAREST_M
-    cam = np.where(behind[:, None], [0.0, 0.0, 1.0], cam)
-    uv, d_point, d_cam = projection_jacobian(camera_record(state.camera, obs.image_size), cam)
-    residuals = uv - obs.uv
-    square = np.sum(residuals**2, -1) * obs.weight / sigma**2
-    far = np.sqrt(np.maximum(square, huber**2))
-    loss = np.where(square > huber**2, 2 * huber * far - huber**2, square)
-    loss[behind | ~np.isfinite(loss)] = np.inf
-    weights = np.where(behind, 0.0, obs.weight / sigma**2 * huber / far)
-    points = shaped_points(obs.flat, state.board, obs.half_extent_m)
+        return _Normal(residuals=residuals, H=H, g=g, costs=np.full(n, np.inf))
     _accumulate(
         obs.offsets,
-        (d_point, d_cam),
-        np.ascontiguousarray(state.poses[:, :3, :3]),
-        (points, obs.flat, obs.half_extent_m),
-        (residuals, weights),
-        (H, g),
+        np.ascontiguousarray(state.camera),
+        np.ascontiguousarray(state.poses),
+        (shaped_points(obs.flat, state.board, obs.half_extent_m), obs.flat, obs.half_extent_m),
+        (obs.uv, obs.weight / sigma**2, huber),
+        first,
+        (residuals, H, g, costs),
     )
-    return _Normal(residuals=residuals, H=H, g=g, costs=obs.per_view(loss))
+    return _Normal(residuals=residuals, H=H, g=g, costs=costs)
 
 
 def _damped(H: Array, damping: Any) -> Array:
@@ -387,13 +401,13 @@ def refine_poses(
     """
     pose = slice(GLOBALS, ROW)
     damping = np.full(obs.views, config.first_damping)
-    normal = _normal(state, obs, sigma_px, config.huber_sigmas)
+    normal = _normal(state, obs, sigma_px, config.huber_sigmas, GLOBALS)
     for _ in range(config.max_iterations):
         block, g = normal.H[:, pose, pose], normal.g[:, pose]
         step = -np.linalg.solve(_damped(block, damping), g[..., None])[..., 0]
         promised = -np.sum(g * step, -1)
         trial = replace(state, poses=state.poses @ se3.exp(step))
-        equations = _normal(trial, obs, sigma_px, config.huber_sigmas)
+        equations = _normal(trial, obs, sigma_px, config.huber_sigmas, GLOBALS)
         better = equations.costs <= normal.costs
         corner = better[obs.view]
         normal = _Normal(

@@ -16,15 +16,8 @@ import numpy as np
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Target
-from realsim_calibration.fit.view_system import camera_vector
-from realsim_calibration.lens.bundle import (
-    CAMERA_TERMS,
-    LensFit,
-    Observations,
-    Prior,
-    adjust,
-    camera_record,
-)
+from realsim_calibration.fit.view_system import camera_record, camera_vector
+from realsim_calibration.lens.bundle import CAMERA_TERMS, LensFit, Observations, Prior, adjust
 from realsim_calibration.lens.checks import intrinsics_checks
 from realsim_calibration.lens.choice import (
     ChoiceConfig,
