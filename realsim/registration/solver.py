@@ -216,6 +216,60 @@ def _accumulate_free_space(
     return violating
 
 
+@njit
+def _step(
+    T: Array, system: tuple[Array, Array], free: Array, damping: float, radius: float, center: Array
+) -> tuple[Array, float]:
+    """Return the pose after a damped step about the box's centre, and how far it moved [m].
+
+    H is given by its upper triangle. In units of the radius every unknown moves the surface by
+    about its own size: the equations are solved in these, by Cholesky's decomposition.
+    """
+    H, b = system
+    scale = np.array([radius, radius, radius, 1.0, 1.0, 1.0])
+    A, x = np.empty((6, 6)), np.zeros(6)
+    for i in range(6):
+        for j in range(i, 6):
+            A[i, j] = A[j, i] = H[i, j] / (scale[i] * scale[j])
+    A = free @ A @ free
+    for i in range(6):
+        A[i, i] += damping
+        for j in range(6):
+            x[i] += free[i, j] * b[j] / scale[j]
+    for j in range(6):
+        for k in range(j):
+            A[j, j] -= A[j, k] * A[j, k]
+        A[j, j] = np.sqrt(A[j, j])
+        for i in range(j + 1, 6):
+            for k in range(j):
+                A[i, j] -= A[i, k] * A[j, k]
+            A[i, j] /= A[j, j]
+        for k in range(j):
+            x[j] -= A[j, k] * x[k]
+        x[j] /= A[j, j]
+    for j in range(5, -1, -1):
+        for i in range(j + 1, 6):
+            x[j] -= A[i, j] * x[i]
+        x[j] /= A[j, j]
+    moved = np.sqrt(np.sum(x[:3] ** 2)) + np.sqrt(np.sum(x[3:] ** 2))
+    w, v = x[:3] / radius, x[3:]
+    theta2 = np.sum(w * w)
+    theta = np.sqrt(theta2)
+    p, q, s = 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0
+    if theta2 >= 1e-10:
+        p, q = np.sin(theta) / theta, (1.0 - np.cos(theta)) / theta2
+        s = (1.0 - p) / theta2
+    W = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+    square = W @ W
+    R = np.eye(3) + p * W + q * square
+    shift = center - R @ center + v + q * (W @ v) + s * (square @ v)
+    turned = np.ascontiguousarray(T[:3, :3])
+    new = T.copy()
+    new[:3, :3] = turned @ R
+    new[:3, 3] += turned @ shift
+    return new, moved
+
+
 def solve_pose(
     body: Body,
     cloud: Cloud,
@@ -242,8 +296,6 @@ def solve_pose(
     typical = float(np.median(1.0 / np.square(sigmas))) if len(sigmas) else 1.0
     data = (np.ascontiguousarray(cloud.points), np.ascontiguousarray(cloud.towards), sigmas)
     radius = body.radius_m
-    scale = np.array([radius, radius, radius, 1.0, 1.0, 1.0])
-    T_center = se3.from_translation(body.center_obj)
     free = np.eye(6) if held is None else np.eye(6) - held @ held.T
     sums, taken = _Sums(np.zeros((6, 6)), 0.0, 0.0, 0.0, 0), 0
     history: list[float] = []
@@ -263,13 +315,9 @@ def solve_pose(
                     body.center_obj,
                     (H, b),
                 )
-            H = H + np.triu(H, 1).T
-            # In scaled units every unknown moves the surface by about its own size.
-            A = free @ (H / np.outer(scale, scale)) @ free
-            A += config.damping**2 * sums.weight * np.eye(6)
-            xi = np.linalg.solve(A, free @ (b / scale)) / scale
-            T = T @ T_center @ se3.exp(xi) @ se3.invert(T_center)
-            if np.linalg.norm(xi[:3]) * radius + np.linalg.norm(xi[3:]) < config.converged_m:
+            damping = config.damping**2 * sums.weight
+            T, moved = _step(T, (H, b), free, damping, radius, body.center_obj)
+            if moved < config.converged_m:
                 break
         rms = np.sqrt(sums.square / sums.weight) if sums.weight > 0 else np.nan
         history.append(float(1e3 * rms))

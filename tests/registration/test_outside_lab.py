@@ -138,7 +138,7 @@ def test_a_sensor_without_faults_measures_the_rays():
 
 @pytest.fixture(scope="module")
 def one_view():
-    ids = [IDS[n] for n in ("mug", "carton", "plate_3", "bottle", "wedge", "hex_bar")]
+    ids = [IDS[n] for n in ("mug", "carton", "plate_3", "bottle")]
     severe = lab.Lab(views=1, bias_px=0.0, highest_deg=50.0, photos=True, **TRUE_CAMERAS)
     scene = lab.make_scene(5, severe, ids=ids)
     (frame,) = scene.frames
@@ -167,9 +167,12 @@ def with_photo(one_view):
     return registered(one_view, one_view.frames[0])
 
 
-def test_a_photograph_takes_the_offset_out_of_the_depth(one_view, with_photo):
-    frame = one_view.frames[0]
-    bare = registered(one_view, replace(frame, read_rgb=None))
+@pytest.fixture(scope="module")
+def bare(one_view):
+    return registered(one_view, replace(one_view.frames[0], read_rgb=None))
+
+
+def test_a_photograph_takes_the_offset_out_of_the_depth(one_view, with_photo, bare):
     assert "photograph" not in bare.report and with_photo.report["photograph"]["taken"]
     assert with_photo.report["refinement"]["depth_offset_per_m"] != 0.0
     left, had = (errors(one_view, r) for r in (with_photo, bare))
@@ -194,11 +197,10 @@ def test_an_accepted_pose_is_right_and_its_covariance_holds_the_error(one_view, 
     assert 0.5 < np.median(squares) < 12.6  # 95 % of chi2 with six degrees of freedom
 
 
-def test_a_photograph_of_something_else_moves_nothing(one_view):
+def test_a_photograph_of_something_else_moves_nothing(one_view, bare):
     frame = one_view.frames[0]
     noise = np.random.default_rng(0).integers(90, 110, (480, 640, 3)).astype(np.uint8)
     found = registered(one_view, replace(frame, read_rgb=partial(np.copy, noise)))
-    bare = registered(one_view, replace(frame, read_rgb=None))
     assert not found.report["photograph"]["taken"]
     for a, b in zip(found.scene.objects, bare.scene.objects, strict=True):
         np.testing.assert_allclose(a.T_world_obj, b.T_world_obj, atol=1e-9)

@@ -31,6 +31,9 @@ PARALLEL = 0.998
 """Cosine from which on two axes are one (3.6 deg)."""
 DAMPING = 1e-6
 """Damping of the least squares: a turn about the axis of a lathe's work moves nothing."""
+REMEMBERED = 64
+"""Models whose near symmetries are kept in memory."""
+_memory: dict[str, Array] = {}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -138,16 +141,21 @@ def near_symmetries(model: ObjectModel, config: NearSymmetryConfig, folder: Path
     Args:
         model: need not declare its symmetries.
         config: settings.
-        folder: where results are kept between runs; None = nowhere.
+        folder: where results are kept between runs; None = in memory.
     """
     if is_ball(model):
         return np.zeros((0, 4, 4))
-    path = None if folder is None else folder / f"near_{content_key(model, config)}.npz"
-    known = None if path is None else _load_motions(path)
+    key = content_key(model, config)
+    path = None if folder is None else folder / f"near_{key}.npz"
+    known = _memory.get(key) if path is None else _load_motions(path)
     if known is None:
         known = _computed(model, config)
+        known.setflags(write=False)
         if path is not None:
             write_arrays(path, {"transforms": known}, {})
+    while len(_memory) >= REMEMBERED:
+        _memory.pop(next(iter(_memory)))
+    _memory[key] = known
     return known
 
 
