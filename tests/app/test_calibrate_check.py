@@ -9,14 +9,13 @@ import pytest
 from click.testing import CliRunner, Result
 
 from realsim.app.cli import commands
-from realsim.app.console import Console
-from realsim.app.demo.run import DemoConfig, capture_and_register
 from realsim.app.register.files import write_result
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.store import SessionStore, load_hand_eye, save_hand_eye
-from registered_sessions import models_of, registered_by_hand, table_session
+from realsim.records import HandEye
+from realsim.store import SessionStore, save_hand_eye
+from registered_sessions import CAMERA, models_of, registered_by_hand, table_session
 from shared_sessions import copy_of
 
 SLIP = np.array([0.004, -0.006, 0.002, 0.003, -0.001, 0.002])
@@ -75,13 +74,22 @@ def test_what_cannot_be_checked_is_bad_input(pristine: Path, tmp_path: Path) -> 
         assert isinstance(done.exception, InputError) and words in str(done.exception)
 
 
-def test_the_calibration_that_lies_there_now_is_checked(tmp_path: Path) -> None:
+def test_the_calibration_that_lies_there_now_is_checked(pristine: Path, tmp_path: Path) -> None:
     """A hand-eye that was changed after the registration is the one that does not hold."""
-    config = DemoConfig(views=6, objects=2, width=640)
-    store, _, _ = capture_and_register(config, tmp_path, Console(quiet=True))
+    source, X = SessionStore.open(pristine), se3.exp(10 * SLIP)
+    store = SessionStore.create(tmp_path / "s", replace(source.session, views=()))
+    for view in source.session.views:
+        assert view.T_world_cam is not None
+        hand = view.T_world_cam @ se3.invert(X)
+        store.add_view(replace(view, T_base_ee=hand), source.rgb(view.index))
+    write_result(store, registered_by_hand(store), models_of(), {})
+    hand_eye = HandEye(
+        T_ee_cam=X, covariance=1e-8 * np.eye(6), T_base_board=np.eye(4), intrinsics=CAMERA,
+        intrinsics_sd=np.zeros(12), view_indices=(0,), view_rms_px=np.zeros(1), held_out_px=0.1,
+    )  # fmt: skip
+    save_hand_eye(store, hand_eye)
     assert check(store.folder, "--tolerance", "2").exit_code == 0
-    hand_eye = load_hand_eye(store)
-    aside = hand_eye.T_ee_cam @ se3.from_translation([0.005, 0.0, 0.0])
+    aside = X @ se3.from_translation([0.005, 0.0, 0.0])
     save_hand_eye(store, replace(hand_eye, T_ee_cam=aside))
     done = check(store.folder, "--tolerance", "2")
     assert done.exit_code == 1 and "another calibration" in done.output

@@ -79,8 +79,10 @@ def test_a_plan_is_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.chdir(by_verb)
     steps: list[tuple[str, int, int]] = []
     made = rs.plan("plan.json", views=4, progress=lambda *step: steps.append(step))
-    done = typed("plan", "--views", "4", "--out", "plan.json", "--json", folder=by_command)
-    assert done.returncode == 0 and files(by_command) == files(by_verb) and made.passed
+    words = ("--views", "4", "--out", "plan.json", "--no-pictures", "--json")
+    done = typed("plan", *words, folder=by_command)
+    assert done.returncode == 0 and made.passed
+    assert (by_command / "plan.json").read_bytes() == (by_verb / "plan.json").read_bytes()
     assert len(made.value) == 4 and steps[-1][1] == steps[-1][2]
     assert json.loads(done.stdout)["metrics"] == made.document["metrics"]
     _, header, rows = made.tables[0]

@@ -20,6 +20,7 @@ import viser
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 from websockets.typing import Subprotocol
+from zstandard import ZstdDecompressor
 
 from realsim import InputError, ObjectModel, ObjectPose, Scene
 from realsim.formats.bop.models import save_models
@@ -47,11 +48,22 @@ class Page:
 
     def __init__(self, server: ReviewServer, line: Connection) -> None:
         self.server, self._line = server, line
-        # Who does not read what comes is not let go for 10 s.
-        threading.Thread(target=lambda: [None for _ in line], daemon=True).start()
+        # Who does not read what comes is not let go for 10 s; who does not say what he keeps is
+        # waited for.
+        threading.Thread(target=self._read, daemon=True).start()
         self.send(CAMERA)
         self.wait(lambda: bool(server.windows) and server.windows[0].selected is not None)
         self.window: Window = server.windows[0]
+
+    def _read(self) -> None:
+        """Say to all that is asked for that it is not kept."""
+        for data in self._line:
+            size = int.from_bytes(data[8:16], "little")
+            told = msgspec.msgpack.decode(ZstdDecompressor().decompress(data[16 : 16 + size]))
+            for asked in told["messages"]:
+                if asked["type"] == "LocalStorageGetItemRequestMessage":
+                    self.send({"type": "LocalStorageGetItemResponseMessage", "value": None,
+                               "error": None, "request_uuid": asked["request_uuid"]})  # fmt: skip
 
     def send(self, message: dict[str, Any]) -> None:
         self._line.send(msgspec.msgpack.encode(message))

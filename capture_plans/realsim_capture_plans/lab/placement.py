@@ -17,6 +17,9 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel
 
+UNMOVED = np.zeros((1, 2))
+"""Shifts of an outline that stays where it is [m]."""
+
 
 class CrowdedError(InputError):
     """The objects do not fit into the disc."""
@@ -88,10 +91,15 @@ def stable_rests(mesh: Mesh, margin_m: float) -> tuple[Array, Array]:
     facets = _merged_facets(equations)
     order = np.argsort(facets, kind="stable")
     starts = np.flatnonzero(np.r_[True, np.diff(facets[order]) > 0])
+    normals = equations[:, :3]
+    feet = center - (normals @ center + equations[:, 3])[:, None] * normals
+    alone = _inside_triangles_by(triangles, feet)
     for members in np.split(order, starts[1:]):
-        normal, offset = equations[members[0], :3], equations[members[0], 3]
-        foot = center - (normal @ center + offset) * normal
-        if _inside_by(triangles[members].reshape(-1, 3), normal, foot) >= margin_m:
+        k, normal = members[0], normals[members[0]]
+        inside = float(alone[k]) if len(members) == 1 else (
+            _inside_by(triangles[members].reshape(-1, 3), normal, feet[k])
+        )  # fmt: skip
+        if inside >= margin_m:
             down.append(normal)
             weights.append(float(angles[members].sum()))
     if not down:
@@ -101,6 +109,21 @@ def stable_rests(mesh: Mesh, margin_m: float) -> tuple[Array, Array]:
         )
     total = np.array(weights)
     return np.array(down), total / total.sum()
+
+
+def _inside_triangles_by(triangles: Array, feet: Array) -> Array:
+    """Return how far (F,) [m] points (F, 3) lie inside triangles (F, 3, 3) of their planes."""
+    least = np.full(len(triangles), np.inf)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        start, edge = triangles[:, i], triangles[:, j] - triangles[:, i]
+        across = triangles[:, k] - start
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.einsum("ij,ij->i", across, edge) / np.einsum("ij,ij->i", edge, edge)
+            inward = across - share[:, None] * edge
+            inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+        inside = np.einsum("ij,ij->i", feet - start, inward)
+        least = np.minimum(least, np.nan_to_num(inside, nan=-np.inf))  # a needle carries nothing
+    return least
 
 
 def _inside_by(points: Array, normal: Array, foot: Array) -> float:
@@ -155,20 +178,30 @@ def footprint(mesh: Mesh, T_table_obj: Array) -> Array:
     return flat[ConvexHull(flat).vertices]
 
 
-def footprint_gap(a: Array, b: Array) -> float:
-    """Return a lower bound of the distance [m] of two convex outlines; negative if they overlap.
+def _outward(outline: Array) -> tuple[Array, Array]:
+    """Return the unit normals (N, 2) of a convex outline's edges and how far out these lie (N,)."""
+    edge = np.roll(outline, -1, axis=0) - outline
+    outward = np.stack([edge[:, 1], -edge[:, 0]], -1)
+    outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-15)
+    return outward, np.einsum("ij,ij->i", outward, outline)
+
+
+def footprint_gap(a: Array, b: Array, shifts: Array = UNMOVED) -> Array:
+    """Return lower bounds (S,) of the distance [m] of two convex outlines; negative: they overlap.
 
     The widest separation along any edge normal of either (separating axis): exact where an edge
     faces a corner, too small by at most 30 % where corner faces corner.
+
+    Args:
+        a: outline (N, 2) [m].
+        b: outline (M, 2) [m].
+        shifts: (S, 2) by which `a` is moved, one after the other [m].
     """
-    gaps: list[float] = []
-    for p, q in ((a, b), (b, a)):
-        edge = np.roll(p, -1, axis=0) - p
-        outward = np.stack([edge[:, 1], -edge[:, 0]], -1)
-        outward /= np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-15)
-        support = np.einsum("ij,ij->i", outward, p)
-        gaps.append(float(((q @ outward.T).min(0) - support).max()))
-    return max(gaps)
+    of_a, far_a = _outward(a)
+    of_b, far_b = _outward(b)
+    from_a = ((b @ of_a.T).min(0) - far_a) - shifts @ of_a.T
+    from_b = ((a @ of_b.T).min(0) - far_b) + shifts @ of_b.T
+    return np.maximum(from_a.max(1), from_b.max(1))
 
 
 def place_objects(
@@ -233,8 +266,10 @@ def _free_spot(
         n = -(-config.tries // rests)
         angles, r = rng.uniform(-np.pi, np.pi, n), room * np.sqrt(rng.uniform(size=n))
         spots = np.stack([r * np.cos(angles), r * np.sin(angles)], -1)
-        for shift in spots[np.argsort(r)] if packed else spots:
-            outline = shape + shift
-            if all(footprint_gap(outline, other) >= config.gap_m for other in outlines):
-                return se3.from_translation([*shift, 0.0]) @ T, outline
+        free = np.ones(n, dtype=bool)
+        for other in outlines:
+            free &= footprint_gap(shape, other, spots) >= config.gap_m
+        if free.any():
+            first = np.where(free, r, np.inf).argmin() if packed else free.argmax()
+            return se3.from_translation([*spots[first], 0.0]) @ T, shape + spots[first]
     return None
