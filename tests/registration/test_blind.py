@@ -11,9 +11,9 @@ from realsim.geometry.metrics import mssd
 from realsim.geometry.parts import part
 from realsim.records import ObjectPose
 from realsim.registration.blind import twist_rad
-from realsim.registration.register import RegistrationConfig, register_scene
+from realsim.registration.register import register_scene
+from table_scenes import QUICK
 
-CONFIG = RegistrationConfig(field_cells=80, with_single_view=False)
 Z = np.array([0.0, 0.0, 1.0])
 ROUND_PARTS = (
     ("cylinder_can", (-0.06, 0.05), 0.3, (0.0, 0.0, 0.0)),
@@ -48,7 +48,7 @@ def case(make_scene):
 
 
 def registered(scene, frames, starts):
-    return register_scene("round", scene.intrinsics, frames, scene.models, starts, CONFIG)
+    return register_scene("round", scene.intrinsics, frames, scene.models, starts, QUICK)
 
 
 def error_mm(scene, instance: int, name: str, T) -> float:

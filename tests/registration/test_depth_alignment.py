@@ -2,7 +2,7 @@
 
 import json
 import os
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -28,7 +28,7 @@ def warped(depth, sx=1.0, sy=1.0, dx=0.0, dy=0.0):
     return cv2.warpAffine(depth, M, (w, h), flags=cv2.INTER_NEAREST)
 
 
-@lru_cache(maxsize=1)
+@cache
 def painted():
     """Camera, and pairs of a colour and a depth image of simulated objects, 640 px wide."""
     scene = small_scene(5, 6, 6)
@@ -45,20 +45,30 @@ def painted():
     return camera, pairs
 
 
-def pooled(camera, pairs, **warp):
-    found = [check_alignment(rgb, warped(d, **warp), camera, CONFIG) for rgb, d in pairs]
+@cache
+def checked(source, n, warp):
+    """The check of one pair of a source, its depth warped; each is made once."""
+    camera, pairs = source()
+    rgb, depth = pairs[n]
+    return check_alignment(rgb, warped(depth, **dict(warp)), camera, CONFIG)
+
+
+def pooled(source, *which, **warp):
+    """The check of the pairs of a source together, or of some of them."""
+    which = which or range(len(source()[1]))
+    found = [checked(source, n, tuple(sorted(warp.items()))) for n in which]
     return pooled_alignment(found, CONFIG)
 
 
 def test_simulated_depth_is_aligned():
-    found = pooled(*painted())
+    found = pooled(painted)
     assert found.kind == "aligned" and found.agreeing == found.views == 4
     assert np.hypot(*found.shift_px) < 2
 
 
 def test_a_shift_is_measured():
     dx, dy = 9, 12
-    still, found = pooled(*painted()), pooled(*painted(), dx=dx, dy=dy)
+    still, found = pooled(painted), pooled(painted, dx=dx, dy=dy)
     assert found.kind == "not_aligned" and found.stretch == (1.0, 1.0)
     moved = np.array(found.shift_px) - still.shift_px
     assert np.allclose(moved, [dx, dy], atol=1.0)
@@ -67,16 +77,15 @@ def test_a_shift_is_measured():
 
 
 def test_a_stretch_is_measured():
-    found = pooled(*painted(), sx=0.85, sy=1.12)
+    found = pooled(painted, sx=0.85, sy=1.12)
     assert found.kind == "not_aligned"
     assert np.allclose(found.stretch, [1 / 0.85, 1 / 1.12], rtol=0.025)
     assert "stretched" in found.words
 
 
 def test_one_view_is_enough_to_name_a_resized_or_moved_depth():
-    camera, pairs = painted()
     for warp in ({}, {"sx": 0.75}, {"sx": 0.85, "sy": 1.12}, {"dx": 9, "dy": 12}):
-        kinds = [pooled(camera, [pair], **warp).kind for pair in pairs[:2]]
+        kinds = [pooled(painted, n, **warp).kind for n in range(2)]
         allowed = {"not_aligned", "unknown"} if warp else {"aligned", "unknown"}
         assert set(kinds) <= allowed
         assert not warp or "not_aligned" in kinds
@@ -107,6 +116,7 @@ def test_senseless_images_are_errors():
 # --- real data --------------------------------------------------------------------------------
 
 
+@cache
 def ycbv():
     pairs = []
     for scene in (50, 51, 54):
@@ -121,8 +131,7 @@ def ycbv():
 @pytest.mark.real
 @pytest.mark.skipif(not SCENES.is_dir(), reason=f"no scenes under {DATA} (set REALSIM_DATA)")
 def test_published_images_are_aligned_and_no_longer_when_shifted():
-    camera, pairs = ycbv()
-    still, found = pooled(camera, pairs), pooled(camera, pairs, dx=-14)
+    still, found = pooled(ycbv), pooled(ycbv, dx=-14)
     assert still.kind == "aligned" and still.agreeing == still.views
     assert found.kind == "not_aligned" and "left" in found.words
     assert abs(found.shift_px[0] - still.shift_px[0] + 14) < 2
@@ -132,10 +141,9 @@ def test_published_images_are_aligned_and_no_longer_when_shifted():
 @pytest.mark.real
 @pytest.mark.skipif(not SCENES.is_dir(), reason=f"no scenes under {DATA} (set REALSIM_DATA)")
 def test_one_real_view_tells_resized_depth_from_aligned():
-    camera, pairs = ycbv()
-    assert all(pooled(camera, [p]).kind == "aligned" for p in pairs)
+    assert all(pooled(ycbv, n).kind == "aligned" for n in range(3))
     for warp in ({"sx": 0.8, "sy": 0.85, "dx": 10}, {"dx": 12, "dy": 6}, {"sx": 1.2, "sy": 1.2}):
-        assert all(pooled(camera, [p], **warp).kind == "not_aligned" for p in pairs)
+        assert all(pooled(ycbv, n, **warp).kind == "not_aligned" for n in range(3))
     # Depth of 1024x768 beside colour of 1920x1080, one taken for the other after a resize.
     named = 0
     for n in (0, 1, 6):
@@ -144,6 +152,8 @@ def test_one_real_view_tells_resized_depth_from_aligned():
         counts = cv2.imread(str(folder / f"{n}.png"), cv2.IMREAD_UNCHANGED)
         depth = cv2.resize(counts, (1920, 1080), interpolation=cv2.INTER_NEAREST) / 1000
         lens = CameraIntrinsics(width=1920, height=1080, fx=1350, fy=1350, cx=959.5, cy=539.5)
-        found = pooled(lens, [(rgb, depth.astype(np.float32))])
+        found = pooled_alignment(
+            [check_alignment(rgb, depth.astype(np.float32), lens, CONFIG)], CONFIG
+        )
         named += found.kind == "not_aligned" and "stretched by 1.00 in x and 1." in found.words
     assert named == 3

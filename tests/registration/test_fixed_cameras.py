@@ -10,11 +10,11 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectPose
 from realsim.records.depth_bias import DepthBias
-from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.fixed_cameras import FixedCamera, FixedFrames, noise_of, still_depth
 from realsim.registration.register import register_scene
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
+from table_scenes import QUICK
 
 CAMERA = CameraIntrinsics(width=400, height=300, fx=310.0, fy=312.0, cx=203.0, cy=147.0)
 """Another camera than the one in the hand."""
@@ -75,14 +75,13 @@ def fixed_camera(scene, eye, seed: int, *, arm: bool = True) -> tuple[FixedFrame
 
 
 @pytest.fixture(scope="module")
-def registered(one_sided, tmp_path_factory):
+def registered(one_sided):
     """Registrations with none to three fixed cameras."""
-    config = RegistrationConfig(field_folder=tmp_path_factory.mktemp("fields"))
     starts = one_sided.starts(np.random.default_rng(2), 4, 4)
     cameras = [fixed_camera(one_sided, eye, seed) for seed, eye in enumerate(EYES)]
     found = [
         register_scene(
-            "one side", one_sided.intrinsics, one_sided.frames, one_sided.models, starts, config,
+            "one side", one_sided.intrinsics, one_sided.frames, one_sided.models, starts, QUICK,
             fixed=[c for c, _ in cameras[:n]],
         )
         for n in (0, 1, 3)
@@ -140,7 +139,7 @@ def test_too_few_views_for_a_joint_fit_leave_fixed_cameras_out_and_say_so(one_si
     frames, _ = fixed_camera(one_sided, EYES[0], 0)
     found = register_scene(
         "two views", one_sided.intrinsics, one_sided.frames[:2], one_sided.models,
-        one_sided.starts(np.random.default_rng(2), 2, 2), fixed=[frames],
+        one_sided.starts(np.random.default_rng(2), 2, 2), QUICK, fixed=[frames],
     )  # fmt: skip
     assert found.fixed_cameras == {}
     said = [f.words for f in found.findings if f.kind == "fixed_cameras"]

@@ -12,7 +12,6 @@ from realsim.geometry import se3
 from realsim.geometry.metrics import aligned_pose, mssd_symmetric
 from realsim.records import ObjectPose, SupportPlane
 from realsim.registration.body import make_body, moved_about_center
-from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import Cloud
 from realsim.registration.few_views import ALIKE, register_few, with_photograph
 from realsim.registration.intake import take_in
@@ -22,15 +21,15 @@ from realsim.registration.register import register_scene
 from realsim.registration.rivals_around import _moved_alike
 from realsim.registration.search.flat_search import explained_at, table_map
 from realsim.registration.solver import SolverConfig, solve_pose
+from table_scenes import QUICK
 
 shapes = load_benchmark("outside_shapes")
 lab = load_benchmark("outside_lab")
-CONFIG = RegistrationConfig(with_single_view=False)
 TRUE_CAMERAS = {"hand_eye_mm": 0.0, "hand_eye_deg": 0.0, "arm_mm": 0.0, "arm_deg": 0.0}
 IDS = {name: i for i, (name, *_) in enumerate(shapes.SHAPES.items(), start=1)}
 OFFSET_PX = 0.1
 """By which the disparity of the one view is too large: 1.5 to 2.5 mm."""
-FLAT_M = CONFIG.around.flat_m
+FLAT_M = QUICK.around.flat_m
 
 
 def off_by(pose: ObjectPose, mm: float, deg: float, rng: np.random.Generator) -> ObjectPose:
@@ -150,7 +149,7 @@ def one_view():
 def registered(scene, frame):
     rng = np.random.default_rng(0)
     starts = [off_by(t, 8, 8, rng) for t in scene.truth]
-    return register_scene("x", scene.intrinsics, [frame], scene.models, starts, CONFIG)
+    return register_scene("x", scene.intrinsics, [frame], scene.models, starts, QUICK)
 
 
 def errors(scene, found):
@@ -197,27 +196,45 @@ def test_an_accepted_pose_is_right_and_its_covariance_holds_the_error(one_view, 
     assert 0.5 < np.median(squares) < 12.6  # 95 % of chi2 with six degrees of freedom
 
 
-def test_a_photograph_of_something_else_moves_nothing(one_view, bare):
-    frame = one_view.frames[0]
+@pytest.fixture(scope="module")
+def something_else(one_view):
     noise = np.random.default_rng(0).integers(90, 110, (480, 640, 3)).astype(np.uint8)
-    found = registered(one_view, replace(frame, read_rgb=partial(np.copy, noise)))
+    return replace(one_view.frames[0], read_rgb=partial(np.copy, noise))
+
+
+@pytest.fixture(scope="module")
+def few(one_view):
+    """What was taken in, the bodies at the truth, and what depth alone makes of them."""
+    intake = take_in(one_view.intrinsics, one_view.frames, QUICK)
+    bodies = [make_body(t, one_view.models[t.obj_id], 64, 200) for t in one_view.truth]
+    return intake, bodies, register_few(intake, bodies, QUICK, None, lambda: None)
+
+
+def test_a_photograph_of_something_else_is_not_taken(something_else, few):
+    intake, bodies, before = few
+    intake = replace(intake, frames=(something_else,))
+    same, after, photo = with_photograph(intake, before, bodies, QUICK)
+    assert not photo.taken and same is intake and after is before
+
+
+@pytest.mark.slow
+def test_a_photograph_of_something_else_moves_nothing(one_view, something_else, bare):
+    found = registered(one_view, something_else)
     assert not found.report["photograph"]["taken"]
     for a, b in zip(found.scene.objects, bare.scene.objects, strict=True):
         np.testing.assert_allclose(a.T_world_obj, b.T_world_obj, atol=1e-9)
 
 
-def test_an_object_that_depth_and_photograph_place_apart_is_told_of(one_view):
+def test_an_object_that_depth_and_photograph_place_apart_is_told_of(one_view, few):
+    intake, bodies, few = few
     (frame,) = one_view.frames
-    intake = take_in(one_view.intrinsics, [frame], CONFIG)
-    bodies = [make_body(t, one_view.models[t.obj_id], 64, 200) for t in one_view.truth]
-    few = register_few(intake, bodies, CONFIG, None, lambda: None)
     names = [b.model.name for b in bodies]
     n = names.index("plate_3")  # of which depth does not know where on the table it lies
     aside = se3.from_translation(0.009 * frame.T_world_cam[:3, 0])
     kept = list(few.kept)
     kept[n] = replace(kept[n], fit=kept[n].fit.at(aside @ one_view.truth[n].T_world_obj))
-    before = with_photograph(intake, few, bodies, CONFIG)[2].agreements
-    after = with_photograph(intake, replace(few, kept=kept), bodies, CONFIG)[2].agreements
+    before = with_photograph(intake, few, bodies, QUICK)[2].agreements
+    after = with_photograph(intake, replace(few, kept=kept), bodies, QUICK)[2].agreements
     assert after[n][0] < 0.5 and "photograph" in after[n][1]
     others = [k for k in range(len(names)) if k != n]
     assert np.median([before[k][0] for k in others]) > ALIKE
@@ -247,7 +264,8 @@ def test_the_turn_of_a_mug_is_doubted_where_its_handle_is_hidden(hidden):
     z = np.where(z < 1.5, z * (1 + 0.002 * np.random.default_rng(0).normal(size=z.shape)), 0.0)
     frame = replace(frame, depth_m=z.astype(np.float32), T_world_cam=T_world_cam)
     start = replace(true, T_world_obj=T @ se3.exp([0, 0, np.radians(8), 0, 0, 0]))
-    found = register_scene("x", scene.intrinsics, [frame], scene.models, [start], CONFIG)
+    fine = replace(QUICK, field_cells=96)
+    found = register_scene("x", scene.intrinsics, [frame], scene.models, [start], fine)
     (mug,) = found.scene.objects
     if hidden:
         assert mug.verdict == "doubtful"
@@ -265,18 +283,18 @@ def test_the_turn_of_a_mug_is_doubted_where_its_handle_is_hidden(hidden):
 def test_a_slid_plate_does_not_explain_the_heights_around_it():
     flat = lab.Lab(views=12, **TRUE_CAMERAS)
     scene = lab.make_scene(3, flat, ids=[IDS["plate_2"], IDS["plate_5"]])
-    intake = take_in(scene.intrinsics, scene.frames, CONFIG)
+    intake = take_in(scene.intrinsics, scene.frames, QUICK)
     plane = SupportPlane(T_world_table=np.eye(4))
     assert intake.plane is not None
-    map_ = table_map(intake.views, intake.plane, intake.noise, np.zeros(3), 12.5, CONFIG.find.flat)
+    map_ = table_map(intake.views, intake.plane, intake.noise, np.zeros(3), 12.5, QUICK.find.flat)
     up = intake.plane.T_world_table @ se3.invert(plane.T_world_table)
     for true in scene.truth:
         name = scene.models[true.obj_id].name
         body = body_of(name, true.T_world_obj)
         there = laid_down(body, (se3.invert(up) @ true.T_world_obj)[None], FLAT_M)[0]
-        right = explained_at(map_, body, up @ there, 0.0, CONFIG.find.flat)
+        right = explained_at(map_, body, up @ there, 0.0, QUICK.find.flat)
         slid = explained_at(
-            map_, body, up @ se3.from_translation([0.012, 0.0, 0.0]) @ there, 0.0, CONFIG.find.flat
+            map_, body, up @ se3.from_translation([0.012, 0.0, 0.0]) @ there, 0.0, QUICK.find.flat
         )
         assert right is not None and slid is not None
         assert right > EXPLAINED > slid, name

@@ -1,6 +1,7 @@
 """Laws and accuracy of the joint registration on synthetic scenes."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,11 +10,10 @@ from realsim.geometry import se3
 from realsim.geometry.metrics import mssd
 from realsim.records import ObjectPose
 from realsim.registration.blind import CovarianceConfig
-from realsim.registration.register import DepthFrame, RegistrationConfig, register_scene
+from realsim.registration.register import DepthFrame, register_scene
+from table_scenes import QUICK
 
-CONFIG = RegistrationConfig(
-    field_cells=64, with_single_view=False, covariance=CovarianceConfig(correlation_area_px=1.0)
-)
+CONFIG = replace(QUICK, covariance=CovarianceConfig(correlation_area_px=1.0))
 
 
 def errors_mm(scene, objects):
@@ -43,8 +43,7 @@ def starts(clutter):
 
 @pytest.fixture(scope="module")
 def result(clutter, starts):
-    config = RegistrationConfig(field_cells=64, covariance=CONFIG.covariance)
-    return run(clutter, starts, config=config)
+    return run(clutter, starts, config=replace(CONFIG, with_single_view=True))
 
 
 def test_rough_start_ends_at_the_truth_and_beats_one_view(clutter, result):

@@ -18,9 +18,8 @@ from realsim.registration.register import Registration, RegistrationConfig, regi
 from realsim.registration.search.records import Wanted
 from realsim.registration.simulated import TableScene
 from table_faults import foreign, without_any_depth, without_depth_on
-from table_scenes import named_scene, part_models
+from table_scenes import QUICK, named_scene, part_models
 
-CONFIG = RegistrationConfig(field_cells=64, with_single_view=False)
 NAMES = ("wedge", "l_bracket", "elbow", "t_profile")
 RIGHT_MM = 1.5
 
@@ -51,7 +50,7 @@ def run(
     wanted: Sequence[ObjectPose] | Sequence[Wanted] | None,
     frames: Sequence[DepthFrame] | None = None,
     models: Mapping[int, ObjectModel] | None = None,
-    config: RegistrationConfig = CONFIG,
+    config: RegistrationConfig = QUICK,
 ) -> Registration:
     frames = scene().frames if frames is None else frames
     result = register_scene(
@@ -196,7 +195,7 @@ def test_one_view_only_is_worse_and_says_so():
 
 
 def test_top_down_needs_starts_and_says_so():
-    config = replace(CONFIG, method="top-down")
+    config = replace(QUICK, method="top-down")
     with pytest.raises(InputError, match="rough poses"):
         run(None, config=config)
     first = starts()[0]
@@ -226,11 +225,11 @@ def test_what_cannot_be_registered_is_refused_by_name():
     with pytest.raises(InputError, match="same instance"):
         run([starts()[0], starts()[0]])
     with pytest.raises(InputError, match="no object models"):
-        register_scene("s", scene().intrinsics, scene().frames, {}, None, CONFIG)
+        register_scene("s", scene().intrinsics, scene().frames, {}, None, QUICK)
     with pytest.raises(InputError, match="object 99, which is not among the models"):
         run([replace(starts()[0], obj_id=99)])
     with pytest.raises(InputError, match="'best'; joint or top-down"):
-        run(starts(), config=replace(CONFIG, method="best"))  # pyright: ignore[reportArgumentType]
+        run(starts(), config=replace(QUICK, method="best"))  # pyright: ignore[reportArgumentType]
     small = replace(scene().frames[0], depth_m=np.zeros((5, 5), np.float32))
     with pytest.raises(InputError, match="shape"):
         run(starts(), [small])

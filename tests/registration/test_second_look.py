@@ -9,19 +9,17 @@ from fault_sessions import load_benchmark
 from realsim.geometry import se3
 from realsim.geometry.metrics import mssd_symmetric
 from realsim.records import Mesh, ObjectPose
-from realsim.registration.config import RegistrationConfig
 from realsim.registration.register import register_scene
-from table_scenes import named_scene
+from table_scenes import QUICK, named_scene
 
-NAMES = ("gear", "box", "mug", "t_profile")
-CONFIG = RegistrationConfig(with_single_view=False)
+NAMES = ("gear", "box", "mug")
 shapes = load_benchmark("outside_shapes")
 lab = load_benchmark("outside_lab")
 
 
 @pytest.fixture(scope="module")
 def scene():
-    return named_scene(3, NAMES, 12)
+    return named_scene(3, NAMES, 9)
 
 
 def registered(scene, frames, models=None, starts=()):
@@ -30,7 +28,7 @@ def registered(scene, frames, models=None, starts=()):
         for t in scene.truth
     ]
     return register_scene(
-        "x", scene.intrinsics, frames, models or scene.models, [*near, *starts], CONFIG
+        "x", scene.intrinsics, frames, models or scene.models, [*near, *starts], QUICK
     )
 
 
@@ -94,7 +92,7 @@ def test_a_plane_on_objects_alone_is_no_table():
         replace(t, T_world_obj=t.T_world_obj @ se3.exp(near * rng.normal(size=6)))
         for t in bare.truth
     ]
-    found = register_scene("x", bare.intrinsics, bare.frames, bare.models, starts, CONFIG)
+    found = register_scene("x", bare.intrinsics, bare.frames, bare.models, starts, QUICK)
     assert found.scene.plane is None
     assert not [f for f in found.findings if "sink" in f.words or "float" in f.words]
     assert len(found.scene.objects) == len(picked)

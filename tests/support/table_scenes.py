@@ -9,6 +9,8 @@ import numpy as np
 
 from realsim.geometry.parts import part, part_names
 from realsim.records import ObjectModel
+from realsim.registration.config import RegistrationConfig
+from realsim.registration.search.bench import FindConfig
 from realsim.registration.simulated import (
     TableLabConfig,
     TableScene,
@@ -19,6 +21,11 @@ from realsim.registration.simulated import (
 
 SMALL_LAB = resized(TableLabConfig(disc_m=0.12, distance_m=(0.25, 0.40), views=12), 320)
 """Images of 320x180 of a few objects close together; the errors are a real lab's."""
+
+QUICK = RegistrationConfig(
+    field_cells=64, find=FindConfig(field_cells=64), with_single_view=False
+)  # fmt: skip
+"""One coarse distance field per model, which all tests of a process share."""
 
 
 @lru_cache(maxsize=1)
