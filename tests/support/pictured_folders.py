@@ -34,5 +34,5 @@ def save_pictures(folder, shots, pattern="{:02d}.png"):
     paths = [folder / pattern.format(k) for k in range(len(shots))]
     for path, shot in zip(paths, shots, strict=True):
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(shot).save(path)
+        Image.fromarray(shot).save(path, compress_level=1)
     return paths
