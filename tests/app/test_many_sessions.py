@@ -35,7 +35,7 @@ def labels(session):
 def test_each_session_is_done_and_the_one_that_fails_is_named(sessions, tmp_path):
     alone = tmp_path / "alone"
     shutil.copytree(sessions[0], alone)
-    assert run("annotate", alone, "--maps", "none", "--quiet").exit_code == 0
+    assert run("annotate", alone, "--maps", "none", "--workers", "1", "--quiet").exit_code == 0
     done = run("annotate", *sessions, "--maps", "none", "--workers", "2", "--json", "--quiet")
     assert done.exit_code == 1, done.output
     document = json.loads(done.stdout)

@@ -13,6 +13,7 @@ from realsim.app.cli import commands
 from realsim.app.command import walk
 from realsim.app.verbs import run
 from shared_sessions import copy_of
+from typed_commands import realsim
 
 RUN = "from realsim.app.cli import main; main()"
 IMPORT = """
@@ -80,7 +81,8 @@ def test_a_plan_is_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     steps: list[tuple[str, int, int]] = []
     made = rs.plan("plan.json", views=4, progress=lambda *step: steps.append(step))
     words = ("--views", "4", "--out", "plan.json", "--no-pictures", "--json")
-    done = typed("plan", *words, folder=by_command)
+    monkeypatch.chdir(by_command)
+    done = realsim("plan", *words)
     assert done.returncode == 0 and made.passed
     assert (by_command / "plan.json").read_bytes() == (by_verb / "plan.json").read_bytes()
     assert len(made.value) == 4 and steps[-1][1] == steps[-1][2]
