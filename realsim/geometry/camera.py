@@ -167,10 +167,12 @@ def undistort(intrinsics: CameraIntrinsics, uv: ArrayLike) -> tuple[Array, Mask]
     target = (uv - [intrinsics.cx, intrinsics.cy]) / [intrinsics.fx, intrinsics.fy]
     if not intrinsics.is_distorted:
         return target, np.ones(target.shape[:-1], dtype=bool)
-    xy = target.copy()
+    xy, goal = target.reshape(-1, 2).copy(), target.reshape(-1, 2)
+    moving = np.arange(len(xy))
     for _ in range(NEWTON_STEPS):
-        error = distort(intrinsics.distortion, xy) - target
-        J = distort_jacobian(intrinsics.distortion, xy)
+        now = xy[moving]
+        error = distort(intrinsics.distortion, now) - goal[moving]
+        J = distort_jacobian(intrinsics.distortion, now)
         det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
         det = np.where(np.abs(det) < 1e-9, 1e-9, det)
         step = np.stack(
@@ -181,9 +183,15 @@ def undistort(intrinsics: CameraIntrinsics, uv: ArrayLike) -> tuple[Array, Mask]
             -1,
         )
         # Half a focal length at most per step keeps a wild pixel from leaping to another branch.
-        xy = xy - np.clip(step / det[..., None], -0.5, 0.5)
+        xy[moving] = after = now - np.clip(step / det[..., None], -0.5, 0.5)
+        changed = after != now
+        moving = moving[changed[:, 0] | changed[:, 1]]  # the others stay for good
+        if not len(moving):
+            break
+    xy = xy.reshape(target.shape)
     error_px = np.abs(distort(intrinsics.distortion, xy) - target).max(-1) * intrinsics.fx
-    det = np.linalg.det(distort_jacobian(intrinsics.distortion, xy))
+    J = distort_jacobian(intrinsics.distortion, xy)
+    det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
     valid = (error_px < 1e-6) & (det > 0)
     # Beyond the turning radius a solution is on a branch that no lens has.
     valid &= np.sum(xy * xy, axis=-1) < turning_radius(intrinsics) ** 2

@@ -101,8 +101,8 @@ def bars(
     return drawn, ax
 
 
-def png(drawn: Any) -> bytes:
-    """Return the figure as PNG; the same figure gives the same bytes."""
+def png(drawn: Any, software: str | None = None) -> bytes:
+    """Return the figure as PNG, which names its maker; the same figure gives the same bytes."""
     buffer = io.BytesIO()
     engine = drawn.get_layout_engine()
     with warnings.catch_warnings():
@@ -111,7 +111,7 @@ def png(drawn: Any) -> bytes:
         if engine is not None:  # once: savefig would draw all of it in vain before
             engine.execute(drawn)
             drawn.set_layout_engine(None)
-        drawn.savefig(buffer, format="png", facecolor="white", metadata={"Software": None})
+        drawn.savefig(buffer, format="png", facecolor="white", metadata={"Software": software})
     return buffer.getvalue()
 
 

@@ -1,6 +1,5 @@
 """What all pictures share: colours, figures without a screen, arrays that are drawn."""
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from realsim.arrays import Array
+from realsim.pages.plots import png
 from realsim.store.atomic import write_bytes
 from realsim_capture_plans.planning import view_quality
 from realsim_capture_plans.planning.metrics import plan_metrics
@@ -29,16 +29,14 @@ def new_figure(width_in: float, height_in: float) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    figure = Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def save_png(figure: Any, path: Path | str) -> Path:
     """Write the figure as a PNG, whole or not at all, and return where."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
-    write_bytes(path, buffer.getvalue())
+    write_bytes(path, png(figure))
     return Path(path)
 
 

@@ -1,6 +1,5 @@
 """The table from above: footprints of the objects, their numbers, and how sure their places are."""
 
-import io
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 from realsim.app.register.results import Registered
 from realsim.arrays import Array
 from realsim.geometry import se3
+from realsim.pages.plots import png
 from realsim.records import ObjectModel, ObjectPose
 from realsim.scanning.scale.pictures import INK, VERDICT_COLORS
 
@@ -51,9 +51,7 @@ def map_png(result: Registered, models: Mapping[int, ObjectModel]) -> bytes:
         color=INK, loc="left",
     )  # fmt: skip
     _legend(figure, result)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    return buffer.getvalue()
+    return png(figure)
 
 
 def footprint_mm(model: ObjectModel, T_map_obj: Array) -> Array:

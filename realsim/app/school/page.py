@@ -1,7 +1,6 @@
 """The page of one school: counts, reasons, margins and pictures in one file that prints well."""
 
 from collections.abc import Mapping, Sequence
-from io import BytesIO
 
 from realsim.app.school.tables import (
     FILTER_HEADER,
@@ -23,6 +22,7 @@ from realsim.app.school.tables import (
 )
 from realsim.geometry import se3
 from realsim.pages import Page
+from realsim.pages.plots import png
 from realsim.records import STAGES, GraspSet, Scene
 
 SHEET, MARGINS = "school_sheet.png", "school_margins.png"
@@ -77,9 +77,7 @@ def margins_png(sets: Sequence[GraspSet], models: Names) -> bytes:
     if not drawn:
         return b""
     axes[0].legend(fontsize=7, frameon=False)
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png")
-    return buffer.getvalue()
+    return png(figure)
 
 
 # --- The page of one school: counts, reasons, margins and pictures in one file that prints well --

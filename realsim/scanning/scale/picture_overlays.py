@@ -9,10 +9,11 @@ import numpy as np
 from realsim.arrays import Array, Array32, Image
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
+from realsim.pages.plots import png
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.overlay import draw_outlines
 from realsim.rendering.rays import PlacedMesh, RayScene, rotated
-from realsim.scanning.scale.pictures import INK, MUTED, diverging_map, new_figure, png_of
+from realsim.scanning.scale.pictures import INK, MUTED, diverging_map, new_figure
 from realsim.scanning.scale.result import ScaleFit, ViewAgreement
 from realsim.scanning.shading import diverging
 
@@ -107,7 +108,7 @@ def overlays_png(
         title, color = _caption(photo.index, agreement.get(photo.index))
         left.set_title(title, fontsize=8, color=color, loc="left")
     _residual_bar(figure, axes, config.range_mm)
-    return png_of(figure)
+    return png(figure)
 
 
 def _caption(index: int, view: ViewAgreement | None) -> tuple[str, str]:

@@ -3,7 +3,6 @@
 Every picture carries the verdict: a scale is not shown without it.
 """
 
-import io
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.pages.plots import png
 from realsim.records import Mesh
 from realsim.scanning.scale.result import ScaleFit
 from realsim.scanning.shading import DIVERGING, UNSEEN, ShadingConfig, shaded_views, value_paint
@@ -66,13 +66,6 @@ def new_figure(width: float, height: float, fit: ScaleFit) -> Any:
     return figure
 
 
-def png_of(figure: Any) -> bytes:
-    """Return the bytes of a figure as PNG; the same figure gives the same bytes."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    return buffer.getvalue()
-
-
 def residuals_png(mesh: Mesh, fit: ScaleFit, config: ShadingConfig | None = None) -> bytes:
     """Return the mesh from four sides, coloured by where the real surface lies.
 
@@ -112,7 +105,7 @@ def residuals_png(mesh: Mesh, fit: ScaleFit, config: ShadingConfig | None = None
         else "no vertex was measured"
     )
     figure.supxlabel(about, fontsize=9, color=INK)
-    return png_of(figure)
+    return png(figure)
 
 
 def _residual_bar(figure: Any, axes: Any, limit: float) -> None:
@@ -161,7 +154,7 @@ def views_png(fit: ScaleFit) -> bytes:
     axes[-1].set_xlabel("view", fontsize=8, color=INK)
     axes[0].set_xlim(-0.7, len(x) - 0.3)
     _view_legend(figure, fit)
-    return png_of(figure)
+    return png(figure)
 
 
 def _view_bars(ax: Any, fit: ScaleFit, name: str) -> None:
@@ -234,7 +227,7 @@ def candidates_png(fit: ScaleFit) -> bytes:
     ax.spines[["top", "right"]].set_visible(False)
     ax.tick_params(labelsize=8, colors=INK)
     ax.legend(fontsize=8, frameon=False, loc="best")
-    return png_of(figure)
+    return png(figure)
 
 
 def _name_rivals(

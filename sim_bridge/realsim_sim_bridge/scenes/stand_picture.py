@@ -1,6 +1,5 @@
 """A picture of what physics did to a scene: outlines before and after, from above and the side."""
 
-import io
 from typing import Any
 
 import numpy as np
@@ -8,6 +7,7 @@ import numpy as np
 from realsim.arrays import Array, Int32
 from realsim.geometry import se3
 from realsim.geometry.mesh import welded_mesh
+from realsim.pages.plots import png
 from realsim.records import Mesh
 from realsim_sim_bridge.scenes.school_scene import SchoolScene
 from realsim_sim_bridge.scenes.stable_state import ObjectStand, Standing, StandReport
@@ -49,11 +49,9 @@ def stand_picture(scene: SchoolScene, report: StandReport) -> bytes:
             ax.axhline(0.0, color="#333333", linewidth=1.2)
         ax.grid(alpha=0.2)
     _legend(figure, report)
-    buffer = io.BytesIO()
     # Without Matplotlib's version and a date the same scene gives the same bytes; by this name the
     # command knows a picture of its own, which it may replace.
-    figure.savefig(buffer, format="png", metadata={"Software": "realsim settle"})
-    return buffer.getvalue()
+    return png(figure, "realsim settle")
 
 
 def _light(mesh: Mesh) -> Mesh:
