@@ -4,6 +4,7 @@ import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -12,8 +13,10 @@ from click.testing import CliRunner
 from realsim import CaptureSession
 from realsim.app.register.files import write_result
 from realsim.app.report.cli import report_command
+from realsim.app.report.section import Section
 from realsim.app.report.session import page_of, report_of, write_report
-from realsim.app.report.summary import Report
+from realsim.app.report.summary import Report, write_summary
+from realsim.pages import Page
 from realsim.review import journal
 from realsim.store import SessionStore, load_scene, save_grasps
 from registered_sessions import CAMERA, models_of, registered_by_hand, table_session
@@ -154,6 +157,23 @@ def test_the_worst_comes_first_and_missing_stages_name_their_command(
     first = text[: text.index("<h2")]
     assert "Look first" in first and "half of it is hidden" in first
     assert "realsim annotate SESSION" in first
+
+
+def test_a_page_never_says_that_all_passed_while_a_stage_is_not_done() -> None:
+    def first_screen(*states: Literal["done", "missing"]) -> str:
+        keys = zip(("labels", "review"), states, strict=True)
+        sections = tuple(
+            Section(key=key, title=key, page=Page(), command=key, state=state)
+            for key, state in keys
+        )
+        page = Page(title="s", about="")
+        write_summary(page, Report(name="s", about="", sections=sections))
+        return page.encode().decode()
+
+    whole, unreviewed = first_screen("done", "done"), first_screen("done", "missing")
+    assert "All checks passed" in whole
+    assert "All checks passed" not in unreviewed and "Not done: review" in unreviewed
+    assert "What was run passed" not in first_screen("missing", "done")
 
 
 def test_what_reviewers_decided_is_told(store: SessionStore) -> None:

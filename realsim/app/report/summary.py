@@ -118,6 +118,8 @@ def write_summary(
     """
     found = [f for f in report.findings if f.severity != "note"]
     title, kind = VERDICTS[report.verdict]
+    if report.verdict == "sound" and report.missing:
+        title = "What was run passed its checks"
     rows: list[list[object]] = [
         [Cell(f.severity, kind=f.severity), textwrap.shorten(f.text, LONGEST, placeholder="…"),
          Cell("more", href=f.section)]
@@ -195,9 +197,8 @@ def _why(report: Report) -> str:
     bad, warn = severities.count("bad"), severities.count("warn")
     told = [f"{bad} {'thing speaks' if bad == 1 else 'things speak'} against it"] * bool(bad)
     told += [f"{warn} {'thing' if warn == 1 else 'things'} to look at"] * bool(warn)
-    missing = [s.title.lower() for s in report.missing if s.key in NEEDED]
-    if missing:
-        told.append(f"missing: {', '.join(missing)}")
+    if report.missing:
+        told.append(f"not done: {', '.join(s.title for s in report.missing)}")
     text = "; ".join(told)
     return f"{text[0].upper()}{text[1:]}." if text else ""
 
