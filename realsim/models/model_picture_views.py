@@ -145,18 +145,20 @@ def draw_layer(ax: Any, layer: Layer, view: View, depth: Array32) -> None:
         _mass_mark(ax, camera.project(view.intrinsics, se3.transform(T_cam_obj, layer.lines[0])))
         return
     pieces: list[Array] = []
-    opacity: list[Array] = []
+    opacity: list[float] = []
     for line in layer.lines:
         points = _subdivided(line)
         seen = se3.transform(T_cam_obj, points)
         uv = camera.project(view.intrinsics, seen)
         behind = _is_behind(uv, seen[:, 2], depth)
-        pieces.append(np.stack([uv[:-1], uv[1:]], axis=1))
-        opacity.append(np.where(behind[:-1] | behind[1:], layer.hidden, 1.0))
+        faint = behind[:-1] | behind[1:]
+        ends = [0, *(np.flatnonzero(np.diff(faint)) + 1), len(faint)]
+        pieces += [uv[a : b + 1] for a, b in pairwise(ends)]
+        opacity += [layer.hidden if faint[a] else 1.0 for a in ends[:-1]]
     if pieces:
         runs = LineCollection(
-            list(np.concatenate(pieces)), colors=layer.color, linewidths=layer.width,
-            alpha=np.concatenate(opacity), capstyle="butt",
+            pieces, colors=layer.color, linewidths=layer.width, alpha=np.array(opacity),
+            capstyle="butt",
         )  # fmt: skip
         ax.add_collection(runs)
     for place, text in layer.labels:

@@ -90,9 +90,10 @@ def test_the_claimed_sigma_of_the_ratio_is_honest():
 # Faults that take as long, and that are told from the others by the same fits, are for slow runs;
 # degrees as radians may be turns of any count, and all of them are searched.
 SEARCHED = {
-    "base_turned", "board_in_mm", "board_size", "camera_inverted", "degrees_as_radians",
-    "duplicated", "euler_as_rotvec", "mispaired", "quaternion_order", "radians_as_degrees",
-    "rotvec_as_euler", "shifted_later", "tool_changed", "wrong_mode",
+    "base_turned", "board_in_mm", "board_moved", "board_size", "camera_inverted",
+    "degrees_as_radians", "duplicated", "euler_as_rotvec", "mispaired", "quaternion_order",
+    "radians_as_degrees", "robot_inverted", "rotvec_as_euler", "shifted_later", "swapped",
+    "tool_changed", "wrong_mode",
 }  # fmt: skip
 REPAIRED = {"euler_order", "robot_inverted", "flipped", "swapped", "robot_in_mm", "frozen"}
 

@@ -60,7 +60,7 @@ def test_a_handful_of_pictures_is_written_and_nothing_else(tmp_path: Path) -> No
 
     pyplot: Any = sys.modules.get("matplotlib.pyplot")
     before = pyplot.get_fignums() if pyplot else []
-    paths = plan_pictures(make(n=8), tmp_path / "pictures")
+    paths = plan_pictures(make(n=3), tmp_path / "pictures")
     names = ["coverage", "arm", "joints", "clearance", "views"]
     assert [p.stem for p in paths] == names
     assert sorted(p.name for p in (tmp_path / "pictures").iterdir()) == sorted(

@@ -66,6 +66,7 @@ class PersonAtThePendant(NoOperator):
         return "go"
 
 
+@pytest.mark.slow
 def test_a_capture_with_a_protective_stop_on_its_way_stores_every_view(tmp_path: Path) -> None:
     lab = SimulatedLab(LabConfig(width=128, height=72, n_objects=1))
     lab.place_board()

@@ -68,7 +68,7 @@ def test_every_grasp_stopped_somewhere_and_fewer_are_left_each_time():
 
 
 def test_the_same_sets_give_the_same_bytes_and_an_object_stands_as_it_is_told_to():
-    s = some_sets(1, 20)
+    s = some_sets(1, 6)
     png = school_sheet(s, {1: model()}, title="Tisch 1")
     again = school_sheet(s, {1: model()}, title="Tisch 1", Ts_up_obj={0: np.eye(4)})
     assert png == again and pixels(png).shape[1] == 1600
@@ -79,7 +79,7 @@ def test_the_same_sets_give_the_same_bytes_and_an_object_stands_as_it_is_told_to
 @pytest.mark.parametrize("measures", [("margin",), tuple(MEASURES)])
 def test_no_two_words_overlap_and_all_are_on_the_sheet(measures):
     name = "a name that is far too long for any panel of a sheet, with a number 000123"
-    sets = [replace(s, instance=100 + s.instance) for s in some_sets(3, 60, measures=measures)]
+    sets = [replace(s, instance=100 + s.instance) for s in some_sets(3, 30, measures=measures)]
     figure = sheet_figure(sets, {1: model(name=name)}, "A title that is also long " * 4, {})
     figure.canvas.draw()
     texts = [t for ax in figure.axes for t in (*ax.texts, ax.title, ax._left_title)]

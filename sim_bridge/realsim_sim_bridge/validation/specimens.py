@@ -118,7 +118,10 @@ def edge_trial(
     Raises:
         InputError: no such grasp was found; the shape is too large for the hand.
     """
+    from scipy.spatial import ConvexHull
+
     body = specimen(shape, mass_kg)
+    hulls = [ConvexHull(part).equations for part in body.parts]
     corners = np.concatenate(body.parts)
     low, high = corners.min(axis=0), corners.max(axis=0)
     z_pad = hand.z_pad(high[1] - low[1])
@@ -136,34 +139,31 @@ def edge_trial(
         tries -= 1
         at = rng.uniform(low, high) * [1.0, 0.0, 1.0]
         turn = se3.exp_so3([0.0, rng.uniform(-np.pi, np.pi), 0.0])
-        tilt = se3.exp_so3(rng.uniform(-0.5, 0.5, 3))
-        shift = rng.normal(size=3)
+        tilt, shift = rng.uniform(-0.5, 0.5, 3), rng.normal(size=3)
         T_obj_grasp = se3.from_rt(turn, at + shift_m * shift / np.linalg.norm(shift))
         T_obj_grasp[:3, 3] -= z_pad * T_obj_grasp[:3, 2]
         in_hand = se3.transform(se3.invert(T_obj_grasp), corners)
         clear = in_hand[:, 2].min() > hand.palm_face_z_m + CLEARANCE_M
-        if clear and _lean_deg(body, at) <= lean_deg:
-            found.append((T_obj_grasp, se3.from_rt(tilt @ DOWN @ turn, np.zeros(3))))
+        if clear and _lean_deg(hulls, at) <= lean_deg:
+            R = se3.exp_so3(tilt) @ DOWN @ turn
+            found.append((T_obj_grasp, se3.from_rt(R, np.zeros(3))))
     return ready_trial(
         body, np.stack([T for T, _ in found]), np.stack([T for _, T in found]), hand.max_opening_m
     )
 
 
-def _lean_deg(body: SlipBody, at: Array) -> float:
+def _lean_deg(hulls: list[Array], at: Array) -> float:
     """Return the greatest angle to y of the two outermost faces that the line along y meets [deg].
 
     Args:
-        body: what it meets.
+        hulls: outward planes (n, 4) of the parts that it may meet.
         at: (3,) a point on the line.
 
     Returns:
         infinity if it does not meet the body.
     """
-    from scipy.spatial import ConvexHull
-
     first, last = (np.inf, 0.0), (-np.inf, 0.0)
-    for part in body.parts:
-        planes = ConvexHull(part).equations
+    for planes in hulls:
         across, beside = planes[:, 1], planes[:, [0, 2]] @ at[[0, 2]] + planes[:, 3]
         if np.any((across == 0.0) & (beside > 0.0)):
             continue
