@@ -164,7 +164,7 @@ def test_a_dry_run_drives_the_robot_without_a_camera(plans: Path, tmp_path: Path
     plan = made_plan("hemisphere", 4)
     save_plan(plan, tmp_path / "four.json")
     words = {"joints": ",".join(map(repr, plan.home.tolist()))}
-    with LoopbackController.start(robot="UR5", speedup=20, **words) as controller:
+    with LoopbackController.start(robot="UR5", speedup=60, **words) as controller:
         command = ("capture", tmp_path / "s", "--plan", tmp_path / "four.json", "--robot-host",
                    controller.host, "--no-input")  # fmt: skip
         done = realsim(*command, "--dry-run", "--views", "0-2")

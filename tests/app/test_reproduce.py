@@ -122,6 +122,7 @@ def test_what_cannot_be_made_again_is_said(copy: Path, tmp_path: Path) -> None:
     assert "from-review" in refused and "realsim register" in refused
 
 
+@pytest.mark.slow
 def test_a_school_and_an_export_are_made_again(tmp_path: Path) -> None:
     session, out = registered(tmp_path / "s"), tmp_path / "out"
     assert realsim("school", session, *QUICK).exit_code == 0

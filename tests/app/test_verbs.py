@@ -98,7 +98,7 @@ def test_labels_are_the_commands(tmp_path: Path, registered_session: Path) -> No
     session = rs.open(by_verb)
     assert session.value.views and "views with a camera pose" in session._repr_html_()
     made = rs.annotate(session, maps="none", quiet=True)
-    done = typed("annotate", str(by_command), "--maps", "none", "--quiet", folder=tmp_path)
+    done = realsim("annotate", by_command, "--maps", "none", "--quiet")
     assert done.returncode == 0 and made.passed and Path(made) == by_verb
     labels = files(by_verb)
     assert labels == files(by_command) and "reports/annotated.png" in labels

@@ -24,13 +24,15 @@ def command(request: pytest.FixtureRequest, root: Path) -> Any:
     return kills.Command(root, kills.LONG[request.param])
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "how", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_a_killed_command_ends_like_one_left_alone(command: Any, how: int) -> None:
     caught, differs = command.ended(how, command.seconds / 2)
     assert caught and differs == []
 
 
-@pytest.mark.parametrize("room", [2_000, 9_000])
+@pytest.mark.parametrize("room", [2_000, pytest.param(9_000, marks=pytest.mark.slow)])
 def test_a_full_disk_is_told_and_the_same_command_goes_on(command: Any, room: int) -> None:
     caught, differs = command.ended(kills.FULL, room)
     assert caught and differs == []
