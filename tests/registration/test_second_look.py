@@ -44,6 +44,7 @@ def plain(scene):
     return registered(scene, scene.frames)
 
 
+@pytest.mark.slow
 def test_a_view_whose_depth_lies_beside_its_image_is_named_and_left_out(scene, plain):
     aside = np.roll(scene.frames[5].depth_m, 9, axis=1)
     frames = [*scene.frames]

@@ -83,6 +83,7 @@ def test_the_result_moves_with_the_world():
     assert 1e3 * np.linalg.norm(gap, axis=1).max() < 0.15
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_the_meshs_unit_and_axes():
     known, unit = scanned("bunny"), 25.4
     rng = np.random.default_rng(7)
