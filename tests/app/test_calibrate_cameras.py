@@ -37,12 +37,10 @@ FIXED = {
 BIAS = DepthBias(offset_per_m=0.02)
 """Bias of a fixed camera's depth."""
 VIEWS, MODULES, TEXTURE, SUPER = 8, 8, 8, 2
-HELD_ON_TABLE = (
-    "wrist=hand,left=fixed", "--held-board", "table", "board 'held' is on the table (give it",
-)  # fmt: skip
-TABLE_IN_HAND = (
-    "left=fixed,right=fixed", "--board", "held", "board 'table' is in the hand (give it",
-)  # fmt: skip
+MISPLACED = (
+    ("wrist=hand,left=fixed", "--held-board", "table", "board 'held' is on the table (give it"),
+    ("left=fixed,right=fixed", "--board", "held", "board 'table' is in the hand (give it"),
+)
 
 
 def sheet_of(board: TagBoard) -> tuple[UInt8, float, int]:
@@ -228,11 +226,9 @@ def test_a_camera_that_sees_no_board_is_named_with_what_it_shows(
 @pytest.mark.parametrize(
     ("cameras", "option", "file", "words", "stated"),
     [
-        (*wrong, stated)
-        if stated == (wrong is HELD_ON_TABLE)
-        else pytest.param(*wrong, stated, marks=pytest.mark.slow)
-        for wrong in (HELD_ON_TABLE, TABLE_IN_HAND)
-        for stated in (True, False)
+        pytest.param(*case, k == by, marks=[pytest.mark.slow] * by)
+        for k, case in enumerate(MISPLACED)
+        for by in (0, 1)
     ],
 )
 def test_a_board_that_is_said_to_be_elsewhere_is_named(

@@ -58,6 +58,7 @@ class Page:
     def _read(self) -> None:
         """Say to all that is asked for that it is not kept."""
         for data in self._line:
+            assert isinstance(data, bytes)
             size = int.from_bytes(data[8:16], "little")
             told = msgspec.msgpack.decode(ZstdDecompressor().decompress(data[16 : 16 + size]))
             for asked in told["messages"]:

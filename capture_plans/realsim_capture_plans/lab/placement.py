@@ -95,12 +95,11 @@ def stable_rests(mesh: Mesh, margin_m: float) -> tuple[Array, Array]:
     feet = center - (normals @ center + equations[:, 3])[:, None] * normals
     alone = _inside_triangles_by(triangles, feet)
     for members in np.split(order, starts[1:]):
-        k, normal = members[0], normals[members[0]]
-        inside = float(alone[k]) if len(members) == 1 else (
-            _inside_by(triangles[members].reshape(-1, 3), normal, feet[k])
-        )  # fmt: skip
+        k, inside = members[0], float(alone[members[0]])
+        if len(members) > 1:
+            inside = _inside_by(triangles[members].reshape(-1, 3), normals[k], feet[k])
         if inside >= margin_m:
-            down.append(normal)
+            down.append(normals[k])
             weights.append(float(angles[members].sum()))
     if not down:
         raise DegenerateError(
