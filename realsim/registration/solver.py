@@ -223,34 +223,15 @@ def _step(
     """Return the pose after a damped step about the box's centre, and how far it moved [m].
 
     H is given by its upper triangle. In units of the radius every unknown moves the surface by
-    about its own size: the equations are solved in these, by Cholesky's decomposition.
+    about its own size: the equations are solved in these.
     """
     H, b = system
     scale = np.array([radius, radius, radius, 1.0, 1.0, 1.0])
-    A, x = np.empty((6, 6)), np.zeros(6)
-    for i in range(6):
-        for j in range(i, 6):
-            A[i, j] = A[j, i] = H[i, j] / (scale[i] * scale[j])
-    A = free @ A @ free
-    for i in range(6):
-        A[i, i] += damping
-        for j in range(6):
-            x[i] += free[i, j] * b[j] / scale[j]
-    for j in range(6):
-        for k in range(j):
-            A[j, j] -= A[j, k] * A[j, k]
-        A[j, j] = np.sqrt(A[j, j])
-        for i in range(j + 1, 6):
-            for k in range(j):
-                A[i, j] -= A[i, k] * A[j, k]
-            A[i, j] /= A[j, j]
-        for k in range(j):
-            x[j] -= A[j, k] * x[k]
-        x[j] /= A[j, j]
-    for j in range(5, -1, -1):
-        for i in range(j + 1, 6):
-            x[j] -= A[i, j] * x[i]
-        x[j] /= A[j, j]
+    full = H + np.triu(H, 1).T
+    A = free @ (full / np.outer(scale, scale)) @ free + damping * np.eye(6)
+    if not np.isfinite(A.sum()):
+        return np.full((4, 4), np.nan), np.inf
+    x = np.linalg.solve(A, free @ (b / scale))
     moved = np.sqrt(np.sum(x[:3] ** 2)) + np.sqrt(np.sum(x[3:] ** 2))
     w, v = x[:3] / radius, x[3:]
     theta2 = np.sum(w * w)

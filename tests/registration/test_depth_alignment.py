@@ -55,9 +55,8 @@ def checked(source, n, warp):
 
 def pooled(source, *which, **warp):
     """The check of the pairs of a source together, or of some of them."""
-    which = which or range(len(source()[1]))
-    found = [checked(source, n, tuple(sorted(warp.items()))) for n in which]
-    return pooled_alignment(found, CONFIG)
+    pairs, warp = which or range(len(source()[1])), tuple(sorted(warp.items()))
+    return pooled_alignment([checked(source, n, warp) for n in pairs], CONFIG)
 
 
 def test_simulated_depth_is_aligned():
@@ -150,10 +149,9 @@ def test_one_real_view_tells_resized_depth_from_aligned():
         folder = DATA / "handeye/rtde_ur5e/Hand-Eye-Data"
         rgb = cv2.imread(str(folder / f"{n}.jpg"))[..., ::-1].copy()
         counts = cv2.imread(str(folder / f"{n}.png"), cv2.IMREAD_UNCHANGED)
-        depth = cv2.resize(counts, (1920, 1080), interpolation=cv2.INTER_NEAREST) / 1000
+        metres = (counts / 1000).astype(np.float32)
+        depth = cv2.resize(metres, (1920, 1080), interpolation=cv2.INTER_NEAREST)
         lens = CameraIntrinsics(width=1920, height=1080, fx=1350, fy=1350, cx=959.5, cy=539.5)
-        found = pooled_alignment(
-            [check_alignment(rgb, depth.astype(np.float32), lens, CONFIG)], CONFIG
-        )
+        found = pooled_alignment([check_alignment(rgb, depth, lens, CONFIG)], CONFIG)
         named += found.kind == "not_aligned" and "stretched by 1.00 in x and 1." in found.words
     assert named == 3

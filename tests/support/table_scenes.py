@@ -22,9 +22,7 @@ from realsim.registration.simulated import (
 SMALL_LAB = resized(TableLabConfig(disc_m=0.12, distance_m=(0.25, 0.40), views=12), 320)
 """Images of 320x180 of a few objects close together; the errors are a real lab's."""
 
-QUICK = RegistrationConfig(
-    field_cells=64, find=FindConfig(field_cells=64), with_single_view=False
-)  # fmt: skip
+QUICK = RegistrationConfig(field_cells=64, find=FindConfig(field_cells=64), with_single_view=False)
 """One coarse distance field per model, which all tests of a process share."""
 
 
