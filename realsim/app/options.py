@@ -65,9 +65,11 @@ def _declared(key: str, given: Any, is_rare: bool) -> Decorator:
     is_shown = has.default is not None and has.default not in ("", ()) and means.kind is not FLAG
     return click.option(
         f"--{name}", means.name or key, cls=Option, meaning=means.says, is_rare=is_rare,
-        type=has.kind or means.kind, is_flag=means.kind is FLAG, default=has.default,
-        show_default=is_shown, required=has.required, help=told.rstrip(), metavar=means.metavar,
+        type=has.kind or means.kind, is_flag=means.kind is FLAG, show_default=is_shown,
+        required=has.required, help=told.rstrip(), metavar=means.metavar,
         multiple=not means.many, nargs=means.many or 1,
+        # To click a default of None is a value that is there: nothing would be required.
+        **{} if has.required else {"default": has.default},
     )  # fmt: skip
 
 

@@ -68,6 +68,9 @@ class SecondLookConfig:
     moved_m: float = 0.0015
     """If all cameras were moved by so much in the median, that is told [m]: an arm is not so
     coarse."""
+    unsure_m: float = 0.003
+    """If by so much, which is what a right pose may be off, no pose is accepted [m]: cameras follow
+    a model of another size, and then everything fits it."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

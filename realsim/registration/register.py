@@ -61,6 +61,7 @@ from realsim.registration.second_look import (
     far_moved,
     is_beside_objects,
     odd_views,
+    unsure,
     views_off,
     without_views,
 )
@@ -381,7 +382,7 @@ def _registration(
     task.tick()
     single, single_report = top_down_poses(task, given, comparer)
     task.tick()
-    objects = tuple(judgement.objects)
+    objects = unsure(judgement.objects, fit.findings)
     scene = Scene(name=task.name, objects=objects, plane=given.plane)
     baseline = Scene(name=f"{task.name} (single view)", objects=tuple(single), plane=given.plane)
     cameras = {f.index: T for f, T in zip(intake.frames, given.cameras, strict=False)}

@@ -12,10 +12,11 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.geometry import se3
-from realsim.records import ObjectModel, SupportPlane
+from realsim.records import ObjectModel, ObjectPose, SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.config import RegistrationConfig, SecondLookConfig
 from realsim.registration.intake import Intake
+from realsim.registration.judge import Defect
 from realsim.registration.many_views import ManyViews
 from realsim.registration.view_agreement import ViewFinding
 from realsim.registration.view_checks import check_views
@@ -118,7 +119,22 @@ def far_moved(moves: Array, config: SecondLookConfig) -> list[ViewFinding]:
     words = (
         f"each camera had to be moved by {1e3 * usual:.1f} mm on its own (median) for the depth of "
         "all views to agree: the depth is scaled or does not lie on the colour image's pixels, the "
-        "camera's lens is another's, or the robot's poses are coarse. Poses fit the depth; look at "
-        "the outlines on the photographs before you use them."
+        "camera's lens is another's, the robot's poses are coarse, or a model is larger or smaller "
+        "than its object (`--no-cameras` registers without moving them and names its size). Poses "
+        "fit the depth; look at the outlines on the photographs before you use them."
     )
-    return [ViewFinding(index=None, kind="cameras_moved", words=words, exclude=False)]
+    kind = "cameras_far" if usual > config.unsure_m else "cameras_moved"
+    return [ViewFinding(index=None, kind=kind, words=words, exclude=False)]
+
+
+def unsure(placed: Sequence[ObjectPose], found: Sequence[Defect]) -> tuple[ObjectPose, ...]:
+    """Return the objects; where the cameras were moved too far for it, none is accepted."""
+    words = "the cameras had to be moved by more than a right pose may be off, until it fitted"
+    if not any(f.kind == "cameras_far" for f in found):
+        return tuple(placed)
+    return tuple(
+        replace(o, verdict="doubtful", reasons=(*o.reasons, words))
+        if o.verdict == "accepted"
+        else o
+        for o in placed
+    )

@@ -206,7 +206,8 @@ def _compare(
 
 Kind = Literal[
     "no_depth", "little_depth", "table_off", "foreign", "partly_foreign", "pose_of_another",
-    "slipped", "all_disagree", "objects_off", "cameras_moved", "odometry", "fixed_cameras",
+    "slipped", "all_disagree", "objects_off", "cameras_moved", "cameras_far", "odometry",
+    "fixed_cameras",
 ]  # fmt: skip
 
 

@@ -82,6 +82,22 @@ def test_a_model_of_the_wrong_size_is_told_so(scene):
     assert any("smaller than its model's" in r for r in of[big].reasons), of[big].reasons
 
 
+def test_cameras_that_follow_a_model_of_the_wrong_size_leave_no_pose_accepted():
+    pair = named_scene(3, ("tube", "knob"), 8)
+    tube, knob = pair.truth
+    models = dict(pair.models)
+    mesh = models[tube.obj_id].mesh
+    middle = mesh.vertices.mean(axis=0)
+    large = Mesh(vertices=(mesh.vertices - middle) * 1.07 + middle, faces=mesh.faces)
+    models[tube.obj_id] = replace(models[tube.obj_id], mesh=large)
+    found = registered(pair, pair.frames, models)
+    by = {o.instance: o for o in found.scene.objects}
+    placed = by[knob.instance].T_world_obj
+    off_mm = 1e3 * mssd_symmetric(knob.T_world_obj, placed, pair.models[knob.obj_id])
+    assert off_mm < 3.0 or {o.verdict for o in by.values()} <= {"doubtful", "rejected"}
+    assert by[tube.instance].verdict != "accepted"
+
+
 @pytest.mark.slow
 def test_a_plane_on_objects_alone_is_no_table():
     ids = {name: i for i, (name, *_) in enumerate(shapes.SHAPES.items(), start=1)}
