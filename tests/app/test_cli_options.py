@@ -54,6 +54,16 @@ def test_every_option_is_explained_and_spelled_in_one_way() -> None:
             assert option.is_flag == is_flag, said
 
 
+def test_what_a_command_needs_is_asked_for(tmp_path: Path) -> None:
+    needy = [(path, c) for path, c in EVERY.items() if any(o.required for o in settable(c))]
+    assert {path[0] for path, _ in needy} >= {"upgrade", "export", "demonstrations", "capture"}
+    for path, c in needy:
+        given = [str(tmp_path) for p in c.params if isinstance(p, click.Argument) and p.required]
+        context = click.Context(c, info_name=" ".join(path))
+        with pytest.raises(click.MissingParameter):
+            c.parse_args(context, given)
+
+
 def test_every_command_that_works_has_json_and_quiet() -> None:
     for path in EVERY.keys() - WITHOUT_RESULT:
         assert {"json", "quiet"} <= {spelling(option) for option in settable(EVERY[path])}, path
