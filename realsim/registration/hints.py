@@ -57,6 +57,8 @@ __all__ = [
 ]  # fmt: skip
 
 STARTS_FILE = "registration/starts.json"
+MOST_INSTANCES = 100
+"""Instances of one object that can be asked for at once."""
 KINDS = ("T_world_obj", "click", "box", "mask")
 KEYS = ("obj_id", "instance", *KINDS, "radius_mm", "turn_deg")
 FARTHEST_M = 10.0
@@ -101,11 +103,10 @@ def parse_object(text: str, models: Mapping[int, ObjectModel]) -> list[Hint]:
         where = Click(view=view, pixel=(x, y))
         if match["w"] is not None:
             where = Box(view=view, xywh=(x, y, float(match["w"]), float(match["h"])))
-    if count < 1 or (count > 1 and where is not None):
-        raise InputError(
-            f"'{text}' asks for {count} instances"
-            + (" at one place; name each with its own place." if count > 1 else "; at least 1.")
-        )
+    if not 1 <= count <= MOST_INSTANCES or (count > 1 and where is not None):
+        room = f"; 1 to {MOST_INSTANCES} can be looked for."
+        room = room if where is None else " at one place; name each with its own place."
+        raise InputError(f"'{text}' asks for {count} instances{room}")
     return [Hint(obj_id=obj_id, instance=k, where=where) for k in range(count)]
 
 

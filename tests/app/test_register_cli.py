@@ -19,7 +19,7 @@ from realsim.errors import InputError
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.parts import part
-from realsim.records import ObjectPose
+from realsim.records import Mesh, ObjectModel, ObjectPose
 from realsim.records.depth_bias import DepthBias
 from realsim.registration.odometry.hand_held import HandHeldConfig, hand_held_poses
 from realsim.store import SessionStore
@@ -120,6 +120,15 @@ def test_nothing_said_names_the_three_ways(session: Path) -> None:
 def test_what_cannot_be_used_is_named(session: Path, options: list[str], words: str) -> None:
     error = run(session, *options).exception
     assert isinstance(error, InputError) and words in str(error)
+
+
+def test_a_flat_model_is_named_and_stays_out_of_the_session(session: Path, tmp_path: Path) -> None:
+    corners = np.array([[0.0, 0, 0], [0.09, 0, 0], [0.09, 0.06, 0], [0, 0.06, 0]])
+    sheet = Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
+    save_models(tmp_path / "lib", {50: ObjectModel(obj_id=50, name="sheet", mesh=sheet)})
+    error = run(session, "--library", tmp_path / "lib", "--object", 50).exception
+    assert isinstance(error, InputError) and "object 50" in str(error) and "flat" in str(error)
+    assert not list(session.glob("models/*000050*"))
 
 
 def test_a_wrong_number_of_views_is_refused(session: Path) -> None:

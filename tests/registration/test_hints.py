@@ -162,7 +162,8 @@ def test_typed_objects_are_understood():
     [
         ("999", "no object '999'"),
         ("5@view3", "does not name"),
-        ("5x0", "at least 1"),
+        ("5x0", "1 to 100"),
+        ("5x99999", "1 to 100"),
         ("5x2@view0:1,2", "one place"),
     ],
 )

@@ -99,9 +99,11 @@ def read_inputs(
     views, left_out = _views(store, request, claimed)
     if wanted is not None:
         _check_distances(wanted, [claimed[k] for k in views])
-        _take(store, request, [w.obj_id for w in wanted])
         ids = {w.obj_id for w in wanted}
         available = {k: m for k, m in available.items() if k in ids}
+    _check_solids(available)
+    if wanted is not None:
+        _take(store, request, [w.obj_id for w in wanted])
     fixed, fixed_out = read_fixed(store, request)
     config = config_of(store, request)
     constants = asdict(replace(config, field_folder=None, bias=DepthBias.none()))
@@ -133,6 +135,20 @@ def _available(store: SessionStore, request: RegisterRequest) -> dict[int, Objec
     if (store.folder / "models").is_dir() or not models:
         models |= session_models(store)
     return models
+
+
+def _check_solids(models: Mapping[int, ObjectModel]) -> None:
+    """Refuse a model without volume by its name, before the session takes it in."""
+    from realsim.geometry.mesh_shape import mass_properties
+
+    for k, model in sorted(models.items()):
+        try:
+            mass_properties(model.mesh, density=1.0)
+        except InputError as error:
+            raise InputError(
+                f"object {k} ('{model.name}') cannot be registered: {error} Leave it out, or give "
+                "it its thickness."
+            ) from error
 
 
 def _take(store: SessionStore, request: RegisterRequest, obj_ids: Sequence[int]) -> None:
