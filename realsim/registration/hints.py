@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from realsim.arrays import Array
-from realsim.errors import InputError, RealsimError, UnitError
+from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.images import read_image
 from realsim.records import CameraIntrinsics, ObjectModel, SupportPlane
@@ -201,8 +201,9 @@ def _where_of(kind: str, row: dict[str, Any], label: str, folder: Path) -> Where
             None if row.get(k) is None else float(_numbers([row[k]], 1, f"{label}, {k}")[0])
             for k in ("radius_mm", "turn_deg")
         )
-        if (radius is not None and radius <= 0) or (turn is not None and turn <= 0):
-            raise InputError(f"{label}: radius_mm and turn_deg are {radius}, {turn}; positive.")
+        for name, value in (("radius_mm", radius), ("turn_deg", turn)):
+            if value is not None and value <= 0:
+                raise InputError(f"{label}: {name} is {value:g}; more than 0 is expected.")
         return RoughPose(
             T_world_obj=T, radius_m=None if radius is None else radius / 1e3, turn_deg=turn
         )
@@ -244,8 +245,6 @@ def _rigid(values: ArrayLike, label: str) -> Array:
         T = se3.check_rigid(np.asarray(values, dtype=np.float64), f"{label}: T_world_obj")
     except (TypeError, ValueError) as error:
         raise InputError(f"{label}: T_world_obj is {values!r}; 4 rows of 4 numbers.") from error
-    except RealsimError as error:
-        raise type(error)(f"{label}: {error}") from error
     if T.shape != (4, 4):
         raise InputError(f"{label}: T_world_obj has shape {T.shape}; (4, 4) is expected.")
     far = float(np.linalg.norm(T[:3, 3]))
