@@ -69,8 +69,11 @@ class SecondLookConfig:
     """If all cameras were moved by so much in the median, that is told [m]: an arm is not so
     coarse."""
     unsure_m: float = 0.003
-    """If by so much, which is what a right pose may be off, no pose is accepted [m]: cameras follow
-    a model of another size, and then everything fits it."""
+    """If by more, which is what a right pose may be off, no pose is accepted [m]: cameras follow a
+    model of another size, and then everything fits it."""
+    explained_sigmas: float = 5.0
+    """So many sigmas per axis of what the arm, or a hand that holds the camera, is said to be off
+    by are no reason to doubt."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

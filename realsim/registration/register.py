@@ -239,7 +239,7 @@ def _fit_many(
         known=found.findings, with_starts=all(T is not None for T in found.claimed),
     )  # fmt: skip
     numbers = [f.index for f in intake.frames]
-    moved = far_moved(camera_moves(many, claimed), rules)
+    moved = far_moved(camera_moves(many, claimed), config)
     return task, found, _Fit(
         poses=poses, frames=many.frames, views=many.hand_views,
         fixed=many.views[len(many.frames):], kept=many.kept, uncertain=uncertain,

@@ -111,10 +111,10 @@ def views_off(
     return [f for f in found if f.kind == "objects_off" and f.index not in known]
 
 
-def far_moved(moves: Array, config: SecondLookConfig) -> list[ViewFinding]:
-    """Return that all cameras were moved far, if they were."""
-    usual = float(np.median(moves))
-    if usual < config.moved_m:
+def far_moved(moves: Array, config: RegistrationConfig) -> list[ViewFinding]:
+    """Return that all cameras were moved far, if they were: 'cameras_far' if no arm explains it."""
+    usual, rules = float(np.median(moves)), config.second_look
+    if usual < rules.moved_m:
         return []
     words = (
         f"each camera had to be moved by {1e3 * usual:.1f} mm on its own (median) for the depth of "
@@ -123,7 +123,8 @@ def far_moved(moves: Array, config: SecondLookConfig) -> list[ViewFinding]:
         "than its object (`--no-cameras` registers without moving them and names its size). Poses "
         "fit the depth; look at the outlines on the photographs before you use them."
     )
-    kind = "cameras_far" if usual > config.unsure_m else "cameras_moved"
+    explained_m = rules.explained_sigmas * (config.arm_sigma_mm or 0.0) / 1e3
+    kind = "cameras_far" if usual > max(rules.unsure_m, explained_m) else "cameras_moved"
     return [ViewFinding(index=None, kind=kind, words=words, exclude=False)]
 
 

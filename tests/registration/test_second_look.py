@@ -10,6 +10,7 @@ from realsim.geometry import se3
 from realsim.geometry.metrics import mssd_symmetric
 from realsim.records import Mesh, ObjectPose
 from realsim.registration.register import register_scene
+from realsim.registration.second_look import far_moved
 from table_scenes import QUICK, named_scene
 
 NAMES = ("gear", "box", "mug")
@@ -96,6 +97,16 @@ def test_cameras_that_follow_a_model_of_the_wrong_size_leave_no_pose_accepted():
     off_mm = 1e3 * mssd_symmetric(knob.T_world_obj, placed, pair.models[knob.obj_id])
     assert off_mm < 3.0 or {o.verdict for o in by.values()} <= {"doubtful", "rejected"}
     assert by[tube.instance].verdict != "accepted"
+
+
+def test_cameras_are_moved_too_far_only_where_no_arm_explains_it():
+    def kinds(moved_mm, arm_mm):
+        config = replace(QUICK, arm_sigma_mm=arm_mm)
+        return [f.kind for f in far_moved(np.full(8, moved_mm / 1e3), config)]
+
+    assert kinds(1.0, None) == []
+    assert kinds(2.0, None) == kinds(8.0, 3.0) == ["cameras_moved"]
+    assert kinds(8.0, None) == kinds(8.0, 0.1) == ["cameras_far"]
 
 
 @pytest.mark.slow
