@@ -217,6 +217,8 @@ def judged(
 def test_a_right_annotation_stays_whatever_is_proposed(off_m: float) -> None:
     for outcome in judged(0.0, off_m):
         assert outcome.kind != "improved" and not outcome.looks_wrong, outcome.words
+        # What was not taken can be shown beside what stays.
+        assert outcome.T_proposed is not None and "T_world_obj_proposed" in outcome.as_json()
 
 
 @pytest.mark.parametrize("off_m", [0.004, -0.008])
@@ -233,7 +235,7 @@ def test_one_view_takes_little_distance_from_depth_that_may_be_off_as_a_whole(
     off_m: float, far_m: float, most_m: float
 ) -> None:
     for outcome, right in zip(judged(off_m, 0.0, far_m=far_m), standing(0.5), strict=True):
-        assert outcome.kind == "improved" and "new pose sure of" in outcome.words, outcome.words
+        assert outcome.kind == "improved" and "mm are sure" in outcome.words, outcome.words
         step = outcome.T_world_obj[:3, 3] - right.T_world_obj[:3, 3]
         assert np.linalg.norm(step) < most_m
 

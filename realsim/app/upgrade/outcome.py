@@ -111,12 +111,16 @@ class Outcome:
     """(4, 4) the pose to go on with."""
     evidence: Evidence | None
     """Evidence of the new pose; None = there is none."""
+    T_proposed: Array | None = None
+    """(4, 4) the pose that was refused or not better; None = there is none."""
     looks_wrong: bool = False
     """Whether the annotation that was kept does not fit what was measured."""
 
     def as_json(self) -> dict[str, Any]:
         """Return plain values for tables."""
         out: dict[str, Any] = {"outcome": self.kind, "why": self.words}
+        if self.T_proposed is not None:
+            out["T_world_obj_proposed"] = self.T_proposed.tolist()
         if (e := self.evidence) is not None:
             out |= {
                 "depth_t": _plain(e.depth_t), "photo_t": _plain(e.photo_t),
@@ -355,7 +359,7 @@ def _fused(
     back = axes @ (variances / (variances + own) * x)
     T = new @ se3.exp(back / units) @ se3.invert(M)
     taken, whole = (1e3 * mssd_symmetric(T_old, X, model) for X in (T, p.T_world_obj))
-    return replace(p, T_world_obj=T, words=f"; new pose sure of {taken:.1f} of {whole:.1f} mm")
+    return replace(p, T_world_obj=T, words=f"; {taken:.1f} of the fit's {whole:.1f} mm are sure")
 
 
 def _decided(
@@ -371,7 +375,7 @@ def _decided(
         words = "it was not found again: its annotation is kept unchecked"
         return Outcome(instance=given.instance, kind="kept", words=words, T_world_obj=T,
                        evidence=None)  # fmt: skip
-    first: tuple[Evidence, Kind, str] | None = None
+    first: tuple[Evidence, Kind, str, Array] | None = None
     for p in proposals:
         e = referee.evidence(given.instance, T, p.T_world_obj, others, p.on_photo)
         kind, words = _judged(e, found, referee.config)
@@ -379,16 +383,16 @@ def _decided(
         if kind == "improved":
             return Outcome(instance=given.instance, kind=kind, words=words,
                            T_world_obj=p.T_world_obj, evidence=e)  # fmt: skip
-        first = first or (e, kind, words)
+        first = first or (e, kind, words, p.T_world_obj)
     assert first is not None
-    e, kind, words = first
+    e, kind, words, T_proposed = first
     wrong = e.visible >= referee.config.least_visible and e.agree[0] < referee.config.wrong_agree
     if wrong:
         words += (
             f"; the annotation itself looks wrong: depth agrees at {100 * e.agree[0]:.0f} % of it"
         )
     return Outcome(instance=given.instance, kind=kind, words=words, T_world_obj=T, evidence=e,
-                   looks_wrong=wrong)  # fmt: skip
+                   T_proposed=T_proposed, looks_wrong=wrong)  # fmt: skip
 
 
 def _judged(e: Evidence, found: ObjectPose, config: OutcomeConfig) -> tuple[Kind, str]:

@@ -31,7 +31,9 @@ PAIRS = 60
 """Objects with pictures, the worst; a page of more is not looked at."""
 FRAMES = 12
 """Whole frames at the top of the page."""
-POSES = ("T_cam_obj_before", "T_cam_obj")
+POSES = ("T_cam_obj_before", "T_cam_obj", "T_cam_obj_proposed")
+RIGHT = {"improved": "improved", "kept": "kept", "rejected": "new pose refused"}
+"""What stands right of the handle, by what became of the annotation."""
 ROWS = 400
 """Objects in the page's table; upgrade.csv has all."""
 CROP_WIDTH_PX = 560
@@ -40,10 +42,13 @@ MARGIN = 0.35
 """Surroundings on each side of the object [share of its size in the picture]."""
 LEAST_SIDE_PX = 96
 """Least side of what is cut out: a small object alone does not show where it stands."""
-THICKNESS_PX = (1, 2)
-"""Thickness of the outlines of the given pose and of the refined one, which is drawn over it."""
+THICKNESS_PX = (1, 2, 1)
+"""Thickness of the outlines of the given pose, of the written one over it, of a proposed one."""
 BEFORE_RGB = (245, 60, 200)
 """Colour of the pose that was given: a colour that no verdict has."""
+PROPOSED_RGB = (255, 255, 255)
+DASH_PX = 7
+"""Length of the dashes of a pose that was not written, and of the gaps."""
 
 
 def write_page(
@@ -63,7 +68,8 @@ def write_page(
         page.section(
             "Frames",
             "Magenta, on both sides of the handle: the poses as the data set has them. Right of "
-            "the handle also those that are written, in the colours of their verdicts.",
+            "the handle also those that are written: green accepted, yellow doubtful, red "
+            "rejected, grey unchecked.",
         )
         page.sliders(frames)
     pairs = [_pair(out, r, o) for r, o in pictured[:PAIRS]]
@@ -71,10 +77,10 @@ def write_page(
         more = "" if len(pairs) == len(pictured) else f" The worst {PAIRS} of {len(pictured)}."
         page.section(
             "Objects one by one",
-            "Magenta and thin, on both sides of the handle: the pose as the data set has it. Right "
-            "of the handle also the pose that is written, in the colour of its verdict: the same "
-            "where the annotation was kept or the new pose rejected. Whole outlines, as "
-            f"if nothing stood in front. Worst first.{more}",
+            "Magenta and thin, on both sides of the handle: the annotation. Right of the handle "
+            "also the pose that is written: green accepted, yellow doubtful, red rejected, grey "
+            "unchecked. Dashed white: a new pose that was not written, because it was refused or "
+            f"not surely better. Whole outlines, as if nothing stood in front. Worst first.{more}",
         )
         page.sliders(pairs)
     shown = ranked[:ROWS]
@@ -83,7 +89,10 @@ def write_page(
         "Objects",
         f"{'Worst first.' if len(ranked) <= ROWS else worst} An annotation is improved only where "
         "the new pose is better on depth and on the photograph; where it is not, it is kept, and "
-        "rejected says that the new pose was refused.",
+        "rejected says that the new pose was refused. The verdict is on the pose that is written. "
+        "Moved: its centre, from the annotation. Depth agrees: share of the visible surface; "
+        "edges: median distance of the outline from the photograph's edges; both also for a new "
+        "pose that was not written.",
     )
     page.table(
         HEADER, [row_of(r, o) for r, o in shown],
@@ -124,7 +133,7 @@ def _frames(out: Path, pictured: Sequence[tuple[Record, Mapping[str, Any]]]) -> 
         before, after = (partial(_frame, out / place, image, objects, k) for k in (1, 2))
         names = ", ".join(str(o["name"]) for o in objects)
         views.append(
-            View(f"{place} image {image}: {names}", {"as given": before, "refined": after})
+            View(f"{place} image {image}: {names}", {"as given": before, "as written": after})
         )
     return views
 
@@ -146,12 +155,17 @@ def _frame(folder: Path, image: int, objects: Sequence[Mapping[str, Any]], poses
 def _pair(out: Path, record: Record, o: Mapping[str, Any]) -> View:
     """Return the two pictures of an object, drawn when the page asks for them."""
     before, after = _pictures(out, str(record["place"]), o)
-    return View(
-        f"{record['place']} image {o['shown']['image']}, {o['name']}: {o['outcome']}; "
-        f"{o['verdict']}, moved by {o['moved_mm']:.1f} mm and {o['moved_deg']:.1f} deg; {o['why']}"
-        + "".join(f"; {r}" for r in o["reasons"] if o["why"] not in r),
-        {"as given": before, "refined": after},
+    moved = f"moved by {o['moved_mm']:.1f} mm and {o['moved_deg']:.1f} deg"
+    became = {
+        "improved": f"annotation improved, {moved}", "kept": "annotation kept",
+        "rejected": "annotation kept, new pose refused",
+    }[o["outcome"]]  # fmt: skip
+    label = (
+        f"{record['place']} image {o['shown']['image']}, {o['name']}: {became}; the written pose "
+        f"is {o['verdict']}; {o['why']}"
     )
+    more = "".join(f"; {r}" for r in o["reasons"] if o["why"] not in r)
+    return View(label + more, {"as given": before, RIGHT[o["outcome"]]: after})
 
 
 def _pictures(
@@ -159,7 +173,7 @@ def _pictures(
 ) -> tuple[Callable[[], Image], Callable[[], Image]]:
     """Return what draws the pose as given and the refined one, in the same window."""
     shown = o["shown"]
-    Ts = [np.array(shown[key]) for key in POSES]
+    Ts = [np.array(shown[key]) for key in POSES if shown.get(key) is not None]
 
     def drawn(k: int) -> Image:
         store, models = _scene(out / place)
@@ -168,8 +182,9 @@ def _pictures(
             FirstSurfaces([PlacedMesh(0, mesh, T)]).look(store.session.intrinsics, np.eye(4))[0]
             for T in Ts
         ]
-        refined = VERDICT_RGB.get(o["verdict"], (255, 255, 255))
-        return _cropped(store.rgb(int(shown["image"])), masks, [BEFORE_RGB, refined][: k + 1])
+        written = VERDICT_RGB.get(o["verdict"], (255, 255, 255))
+        colors = [BEFORE_RGB, written, PROPOSED_RGB] if k else [BEFORE_RGB]
+        return _cropped(store.rgb(int(shown["image"])), masks, colors)
 
     return (lambda: drawn(0)), (lambda: drawn(1))
 
@@ -188,12 +203,12 @@ def _cropped(rgb: Image, masks: Sequence[Int32], colors: Sequence[tuple[int, int
     Args:
         rgb: (H, W, 3).
         masks: (H, W) each, negative beside the object.
-        colors: of the first outlines; those without one are not drawn.
+        colors: of the first outlines; those without one are not drawn. A third one is dashed.
     """
     import cv2
 
     height, width = rgb.shape[:2]
-    rows, columns = np.nonzero(np.logical_or(*(m >= 0 for m in masks)))
+    rows, columns = np.nonzero(np.any([m >= 0 for m in masks], axis=0))
     if len(rows) == 0:  # both outside the picture
         rows, columns = np.array([0, height - 1]), np.array([0, width - 1])
     centre = np.array([columns.min() + columns.max(), rows.min() + rows.max()]) / 2
@@ -203,9 +218,12 @@ def _cropped(rgb: Image, masks: Sequence[Int32], colors: Sequence[tuple[int, int
     window = slice(int(y), int(y) + side), slice(int(x), int(x) + side)
     big = (CROP_WIDTH_PX, CROP_WIDTH_PX)
     picture = np.asarray(cv2.resize(rgb[window], big, interpolation=cv2.INTER_CUBIC), np.uint8)
-    for mask, color, thickness in zip(masks, colors, THICKNESS_PX, strict=False):
+    i, j = np.indices(picture.shape[:2]) // DASH_PX
+    for k, (mask, color) in enumerate(zip(masks, colors, strict=False)):
         # Linear between pixels, or an enlarged outline would be stairs.
         covered = cv2.resize((mask[window] >= 0).astype(np.float32), big)
         ids = np.where(np.asarray(covered) >= 0.5, 0, -1).astype(np.int32)
-        picture = draw_outlines(picture, ids, colors={0: color}, thickness=thickness)
+        drawn = draw_outlines(picture, ids, colors={0: color}, thickness=THICKNESS_PX[k])
+        dash = ((i + j) % 2 == 0) | (k < 2)
+        picture = np.where(dash[..., None], drawn, picture)
     return picture

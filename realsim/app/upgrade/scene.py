@@ -42,7 +42,7 @@ RIGHT_M = 0.003
 UNDECIDED: Record = {
     "outcome": "improved", "why": "no annotation in the images that took part", "depth_t": None,
     "photo_t": None, "agree_annotation": None, "agree_new": None, "edge_px_annotation": None,
-    "edge_px_new": None, "visible": None, "proposed_mm": None,
+    "edge_px_new": None, "visible": None, "proposed_mm": None, "T_world_obj_proposed": None,
 }  # fmt: skip
 """Columns for an object whose annotation lies in no image that took part."""
 
@@ -283,15 +283,16 @@ def _record(
     for o in scene.objects:
         moved_mm, moved_deg = moved_from_start(o, starts, source.models)
         found = sets.get(o.instance)
+        decided: Record = {**UNDECIDED, **became.get(str(o.instance), {})}
+        T_proposed = decided.pop("T_world_obj_proposed")
         objects.append(
             {
                 "instance": o.instance, "obj_id": o.obj_id, "name": source.models[o.obj_id].name,
-                "verdict": o.verdict, "reasons": list(o.reasons),
-                **UNDECIDED, **became.get(str(o.instance), {}),
+                "verdict": o.verdict, "reasons": list(o.reasons), **decided,
                 "agree": _number(o.checks.get("agree")),
                 "probability": _number(o.checks.get("probability")),
                 "moved_mm": round(moved_mm, 3), "moved_deg": round(moved_deg, 3),
-                "grasps": _grasp_counts(found), "shown": _shown(source, store, o),
+                "grasps": _grasp_counts(found), "shown": _shown(source, store, o, T_proposed),
             }
         )  # fmt: skip
     plane = scene.plane
@@ -328,8 +329,10 @@ def _grasp_counts(found: GraspSet | None) -> Record:
     }
 
 
-def _shown(source: SceneSource, store: SessionStore, pose: ObjectPose) -> Record | None:
-    """Return the image that shows an object best, with its pose there before and after.
+def _shown(
+    source: SceneSource, store: SessionStore, pose: ObjectPose, T_proposed: Sequence[Any] | None
+) -> Record | None:
+    """Return the image that shows an object best, with its poses there: before, after, proposed.
 
     None = the images that it was registered in have no annotation of it.
     """
@@ -343,10 +346,11 @@ def _shown(source: SceneSource, store: SessionStore, pose: ObjectPose) -> Record
         return None
     index = best[1]
     before = next(s for s in source.seen[index] if s.instance == pose.instance)
-    T_now = se3.invert(cameras[index]) @ pose.T_world_obj
+    T_cam_world = se3.invert(cameras[index])
+    proposed = None if T_proposed is None else (T_cam_world @ np.array(T_proposed)).tolist()
     return {
         "image": index, "T_cam_obj_before": before.T_cam_obj.tolist(),
-        "T_cam_obj": T_now.tolist(),
+        "T_cam_obj": (T_cam_world @ pose.T_world_obj).tolist(), "T_cam_obj_proposed": proposed,
     }  # fmt: skip
 
 

@@ -28,8 +28,8 @@ COLUMNS = (
 )  # fmt: skip
 PAGE = "upgrade.html"
 HEADER = [
-    "scene, object", "annotation", "verdict", "agrees", "moved [mm]", "turned [deg]",
-    "edges before, new [px]", "good grasps",
+    "scene, object", "annotation", "verdict", "moved [mm]", "turned [deg]",
+    "depth agrees: annotation, new [%]", "edges: annotation, new [px]", "good grasps",
 ]  # fmt: skip
 OUTCOMES = ("rejected", "kept", "improved")
 MOST_ROWS = 60
@@ -57,18 +57,18 @@ def worst_first(
 
 def row_of(record: Record, o: Mapping[str, Any]) -> list[str]:
     """Return an object's row of the table."""
-    agree, grasps = o["agree"], o["grasps"]
+    grasps = o["grasps"]
+    agree = [o["agree_annotation"], o["agree_new"]]
+    edges = [o["edge_px_annotation"], o["edge_px_new"]]
     return [
         f"{record['place']} {o['name']}",
         str(o["outcome"]),
         str(o["verdict"]),
-        "-" if agree is None else f"{agree:.2f}",
         f"{o['moved_mm']:.1f}",
         f"{o['moved_deg']:.1f}",
-        "-"
-        if o["edge_px_new"] is None or o["edge_px_annotation"] is None
-        else f"{o['edge_px_annotation']:.1f}, {o['edge_px_new']:.1f}",
-        f"{grasps['good']} of {grasps['tried']}",
+        ", ".join("-" if a is None else f"{100 * a:.0f}" for a in agree),
+        ", ".join("-" if e is None else f"{e:.1f}" for e in edges),
+        f"{grasps['good']} of {grasps['tried']}" if grasps["tried"] else "none tried",
     ]
 
 

@@ -241,24 +241,25 @@ def _legend(figure: Any, top: float, sets: Sequence[GraspSet]) -> None:
     for label, color in STOPS:
         ax.add_patch(_swatch(at, middle, color))
         at = _written(ax, at + 20, middle, label, INK) + 18
-    # To the right the hands, whose colours run with the label.
-    at = width - 460 if any(s.unsure.any() for s in sets) else width - 320
-    at = _written(ax, at, middle, f"hands by {label_words(sets)}:  0", MUTED) + 8
+    # From the right the hands, whose colours run with the label.
+    few = "   dashed: few draws" if any(s.unsure.any() for s in sets) else ""
+    at = _written(ax, width - 12, middle, f"1{few}", MUTED, "right") - 8
     ramp = score_rgb(np.linspace(0, 1, 64))[None]
-    ax.imshow(ramp, extent=(at, at + 120, middle + 6, middle - 6), aspect="auto")
-    at = _written(ax, at + 128, middle, "1", MUTED)
-    if any(s.unsure.any() for s in sets):
-        _written(ax, at + 14, middle, "dashed: few draws", MUTED)
+    ax.imshow(ramp, extent=(at - 120, at, middle + 6, middle - 6), aspect="auto")
+    _written(ax, at - 128, middle, f"hands by {label_words(sets)}:  0", MUTED, "right")
     ax.set_axis_off()
     ax.axhline(2, color="#d3d8de", linewidth=1)
     ax.set_xlim(0, width)
     ax.set_ylim(LEGEND_PX, 0)
 
 
-def _written(ax: Any, left: float, middle: float, text: str, color: str) -> float:
-    """Write into axes whose unit is a pixel, and return where the text ends."""
-    written = ax.text(left, middle, text, fontsize=10.5, color=color, va="center")
-    return left + float(written.get_window_extent(ax.figure.canvas.get_renderer()).width)
+def _written(
+    ax: Any, at: float, middle: float, text: str, color: str, align: str = "left"
+) -> float:
+    """Write into axes whose unit is a pixel, and return the end of the text away from `at`."""
+    written = ax.text(at, middle, text, fontsize=10.5, color=color, va="center", ha=align)
+    width = float(written.get_window_extent(ax.figure.canvas.get_renderer()).width)
+    return at + width if align == "left" else at - width
 
 
 def _swatch(left: float, middle: float, color: str) -> Any:
