@@ -133,7 +133,7 @@ def test_sources_that_number_their_objects_alike_share_one_count(bop, tmp_path):
 
 
 def test_labels_that_came_along_become_starts_and_are_never_overwritten(bop, tmp_path):
-    done("import", bop, tmp_path / "session", "--quiet")
+    first = done("import", bop, tmp_path / "session", "--quiet")
     store = SessionStore.open(tmp_path / "session")
     starts = store.read_json("registration/starts.json")["starts"]
     scene = open_labelled_bop(bop)
@@ -144,6 +144,8 @@ def test_labels_that_came_along_become_starts_and_are_never_overwritten(bop, tmp
     assert store.verify() == []
     done("import", bop, tmp_path / "session", "--quiet")
     assert (tmp_path / "session/imported/scene_gt.json").read_bytes() == before
+    bare = done("import", bop, tmp_path / "bare", "--no-depth", "--quiet")
+    assert "refines" in first and "refines" not in bare and "register` needs" in bare
 
 
 def test_the_sums_and_counts_on_the_card_are_those_of_the_folder(bop, tmp_path):

@@ -105,7 +105,17 @@ def test_a_frame_that_cannot_be_is_named_and_the_rest_stays(tmp_path, fault, mes
     check_equal(tmp_path / "s", ten()[:5])
 
 
-# --- round trips through other formats --------------------------------------------------------
+def test_depth_that_is_empty_or_not_there_is_told_before_register_asks_for_it(tmp_path, capsys):
+    frames = ten()
+    frames[3] = replace(frames[3], depth_counts=0 * frames[3].depth_counts)
+    import_session(Recording(frames), tmp_path / "a", QUIET)
+    told = capsys.readouterr().err
+    assert "1 of 10 depth images are empty, at least 99 % of" in told and "those of f3." in told
+    assert "register" not in told
+    bare = [replace(f, depth_counts=None) for f in frames]
+    for some in ([frames[3]], bare):
+        import_session(Recording(some), tmp_path / f"b{len(some)}", QUIET)
+        assert "has no depth, and `realsim register` needs it" in capsys.readouterr().err
 
 
 # --- folders: camera and poses ----------------------------------------------------------------

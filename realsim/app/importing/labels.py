@@ -52,8 +52,9 @@ def labels_of(
 
 
 def import_labels(
-    scene: LabelledScene, indices: tuple[int, ...], folder: Path, console: Console
-) -> None:
+    scene: LabelledScene, indices: tuple[int, ...], folder: Path, console: Console, *,
+    can_register: bool,
+) -> None:  # fmt: skip
     """Keep the labels and models of a data set in the session that its images were imported into.
 
     The labels lie in SESSION/imported, untouched by what realsim computes. Where the cameras'
@@ -64,6 +65,7 @@ def import_labels(
         indices: numbers of its images, in the order of the session's views.
         folder: the session.
         console: where progress goes.
+        can_register: whether there is depth to register by.
 
     Raises:
         InputError: a pose, a mask or a model cannot be used.
@@ -86,15 +88,14 @@ def import_labels(
             console.warn(f"{scene.name}: {note}".replace("[", r"\["))
     poses = sum(len(scene.frame(i).objects) for i in indices)
     missing = sorted(ids - set(models))
+    then = f" `realsim register {folder}` refines and judges them." if can_register else ""
     console.say(
         f"labels    {poses} poses in {len(indices)} frames, {len(models)} models: kept in "
-        f"{folder / 'imported'} as they are, not checked."
-        + ("" if missing else f" `realsim register {folder}` refines and judges them.")
+        f"{folder / 'imported'} as they are, not checked." + ("" if missing else then)
     )
     if missing:
         console.warn(
-            f"{what_to_give(missing)} The same import again with it adds them, and then `realsim "
-            f"register {folder}` refines and judges the poses."
+            f"{what_to_give(missing)} The same import again with it adds the models.{then}"
         )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from realsim.app.console import Console, Tick
 from realsim.errors import InputError, UnitError
+from realsim.formats.folders.listing import shown
 from realsim.formats.frame_source import FrameSource, SourceFrame
 from realsim.records import CaptureSession, View
 from realsim.store.lock import only_run_in
@@ -47,6 +48,8 @@ TURN_RAD = 0.1
 """From this turn on a camera in the hand moves noticeably."""
 MIN_FOR_UNIT = 3
 """Fewer camera poses say nothing about the unit."""
+LEAST_FILLED = 0.01
+"""A depth image with a smaller share of measured pixels is as good as none."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -60,6 +63,8 @@ class ImportSummary:
     imported: int
     """Frames that this call wrote; the others were there."""
     with_depth: int
+    empty_depth: tuple[str, ...]
+    """Frames that this call wrote with a depth image in which next to nothing is measured."""
     with_joints: int
     with_tool_pose: int
     with_camera_pose: int
@@ -71,6 +76,11 @@ class ImportSummary:
     """The source's notes."""
     contact_sheet: Path
     """Picture of all frames."""
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether depth was measured in some frame."""
+        return self.with_depth > len(self.empty_depth)
 
 
 def import_session(
@@ -106,13 +116,14 @@ def import_session(
         taken = _thumbnails(source)
         try:
             with console.stage("import", source.name) as tick:
-                _write_frames(source, store, done, tick, taken)
+                empty = _write_frames(source, store, done, tick, taken)
             _warn_of_unit(store, console)
             sheet = folder / write_contact_sheet(store, len(source), source.name, taken)
         finally:
             store.close()
-    summary = _summary(source, store, done, time.perf_counter() - started, sheet)
+    summary = _summary(source, store, done, time.perf_counter() - started, sheet, empty)
     show_import(summary, console)
+    _warn_of_depth(summary, console)
     return summary
 
 
@@ -206,8 +217,12 @@ def _thumbnails(source: FrameSource) -> Thumbnails:
 
 def _write_frames(
     source: FrameSource, store: SessionStore, done: int, tick: Tick, taken: Thumbnails
-) -> None:
-    """Write the frames that are missing; the last one that is there must be the source's own."""
+) -> tuple[str, ...]:
+    """Write the frames that are missing; the last one that is there must be the source's own.
+
+    Returns:
+        Those whose depth is empty.
+    """
     if store.completed != set(range(done)):
         gap = min(set(range(done)) - store.completed)
         raise InputError(
@@ -216,7 +231,7 @@ def _write_frames(
         )
     if done == len(source):
         tick(done, len(source))
-        return
+        return ()
     frames: Iterator[SourceFrame] = source.frames(max(done - 1, 0))
     last_s = -np.inf
     if done:
@@ -228,10 +243,14 @@ def _write_frames(
             )
         last_s = first.time_s
     index = done
+    empty: list[str] = []
     for frame in frames:
         _check(frame, index, last_s, source)
         _add(store, index, frame)
         taken.add(index, frame.rgb)
+        counts = frame.depth_counts
+        if counts is not None and np.count_nonzero(counts) < LEAST_FILLED * counts.size:
+            empty.append(frame.name)
         last_s = frame.time_s
         index += 1
         tick(index, len(source))
@@ -240,6 +259,7 @@ def _write_frames(
             f"'{source.name}' announced {len(source)} frames and gave {index}: it is cut off or "
             f"still being written. The {index} frames stay in {store.folder}."
         )
+    return tuple(empty)
 
 
 def _check(frame: SourceFrame, index: int, last_s: float, source: FrameSource) -> None:
@@ -301,9 +321,26 @@ def _warn_of_unit(store: SessionStore, console: Console) -> None:
         )
 
 
+def _warn_of_depth(summary: ImportSummary, console: Console) -> None:
+    """Say it where depth images are empty, and where there is nothing to register by."""
+    if summary.empty_depth:
+        console.warn(
+            f"{len(summary.empty_depth)} of {summary.with_depth} depth images are empty, at least "
+            f"{100 * (1 - LEAST_FILLED):.0f} % of their pixels are 0: those of "
+            f"{shown(summary.empty_depth)}. Was the depth stream running?"
+        )
+    if not summary.has_depth:
+        console.warn(
+            f"{summary.folder} has no depth, and `realsim register` needs it. Give the source depth"
+            " images on the colour's pixels, and import with --overwrite. Without depth `realsim "
+            f"calibrate` (on photographs of a board) and `realsim scan sfm {summary.folder}` work."
+        )
+
+
 def _summary(
-    source: FrameSource, store: SessionStore, done: int, seconds: float, sheet: Path
-) -> ImportSummary:
+    source: FrameSource, store: SessionStore, done: int, seconds: float, sheet: Path,
+    empty: tuple[str, ...],
+) -> ImportSummary:  # fmt: skip
     views = store.session.views
     times = [v.time_s for v in views]
     return ImportSummary(
@@ -311,6 +348,7 @@ def _summary(
         frames=len(views),
         imported=len(views) - done,
         with_depth=sum(store.has_depth(v.index) for v in views),
+        empty_depth=empty,
         with_joints=sum(v.joints is not None for v in views),
         with_tool_pose=sum(v.T_base_ee is not None for v in views),
         with_camera_pose=sum(v.T_world_cam is not None for v in views),
