@@ -209,7 +209,8 @@ def _object(
         reasons = (
             *reasons,
             f"its surface looks {100 * abs(size):.0f} % {'larger' if size > 0 else 'smaller'} than "
-            "its model's, at least: the model may have the wrong size. Measure it, or run "
+            "its model's, at least: the model, or the depth, may have the wrong scale. Measure "
+            "the object, and whether the depth's unit is right; or run "
             f"`realsim scan scale {body.model.name} SESSION`",
         )
     mine = [f for f in findings if body.start.instance in f.instances and f.kind not in COMMON]

@@ -131,8 +131,9 @@ def _check_each(
     if 2 * len(odd) > n:
         words = (
             f"{len(odd)} of {n} views disagree with the others about what stands on the table "
-            f"(numbers {_listed(held, odd)}): which are right cannot be told. Are the images of "
-            "one session, and was nothing moved meanwhile?"
+            f"(numbers {_listed(held, odd)}): which are right cannot be told. Is the depth's unit "
+            "right (a few percent are enough), and is it aligned to the colour image? Are the "
+            "images of one session, and was nothing moved meanwhile?"
         )
         return [ViewFinding(index=None, kind="all_disagree", words=words, exclude=False)]
     found = [_finding(held, o, odd, (plane, noise), config) for o in odd]

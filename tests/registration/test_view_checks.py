@@ -106,6 +106,7 @@ def test_views_of_another_session_are_named(wrong):
 def test_two_views_that_disagree_are_not_told_apart():
     found = findings([views_of(1)[0], views_of(2)[1]])
     assert kinds(found) == {None: "all_disagree"} and not found[0].exclude
+    assert "depth's unit" in found[0].words and "aligned to the colour" in found[0].words
 
 
 def test_a_slipped_mount_is_named_with_the_view_it_begins_at():
