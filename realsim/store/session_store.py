@@ -135,7 +135,8 @@ class SessionStore:
         known = listed.get(ROBOT_FILE)
         start = 0 if known is None else known.bytes
         # Only what was appended is listed: a file that was changed stays a fault of `verify`.
-        if known is None or entry_of(ROBOT_FILE, data[:start]) == known:
+        sound = known is None or entry_of(ROBOT_FILE, data[:start]) == known
+        if sound:
             new = {int(record_of(line)["index"]) for line in data[start:].decode().splitlines()}
             names = [
                 p for i in self._robot for p in self._files_of(i) if i in new or p not in listed
@@ -148,7 +149,11 @@ class SessionStore:
         self._camera_lines = {v.index: self._camera_line(v) for v in self.session.views}
         cameras, data = self.folder / CAMERA_FILE, self._camera_bytes()
         is_same = cameras.is_file() and cameras.read_bytes() == data
-        if not is_same or self._manifest.entries.get(CAMERA_FILE) != entry_of(CAMERA_FILE, data):
+        is_listed = self._manifest.entries.get(CAMERA_FILE) == entry_of(CAMERA_FILE, data)
+        # A view whose image was deleted keeps its line: no kill does that, and it may come back.
+        kept = (p for i in self._robot for p in self._files_of(i) if p in listed)
+        sound = sound and all((self.folder / p).is_file() for p in kept)
+        if sound and not (is_same and is_listed):
             self._write_cameras()
         self._cameras_written = len(self._camera_lines)
 

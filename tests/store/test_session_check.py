@@ -87,6 +87,9 @@ def test_every_flipped_byte_is_found_and_only_its_view_is_lost(session: Path) ->
 def test_a_lost_image_costs_its_view(session: Path) -> None:
     path = "depth/000002.png"
     (session / path).unlink()
+    before = bytes_of(session)
+    SessionStore.open(session).close()
+    assert bytes_of(session) == before
     report = check_session(session)
     assert report.missing == (path,) and report.damaged_views == (2,) and not report.sound
     repaired = repair_session(session)
