@@ -89,6 +89,8 @@ class Terminated(KeyboardInterrupt):
 
 def _asked_to_end(number: int, frame: object) -> None:
     """End as after Ctrl-C: workers are ended, folders are left whole."""
+    # `timeout` and queues ask twice; the second time must not break into the cleaning up.
+    signal.signal(number, signal.SIG_IGN)
     raise Terminated
 
 

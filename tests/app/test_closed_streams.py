@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -77,3 +78,28 @@ def test_pycolmap_leaves_the_answer_to_sigterm_alone() -> None:
     """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
     assert done.returncode == 143 and b"stack trace" not in done.stderr
+
+
+def test_a_second_sigterm_does_not_break_into_the_ending() -> None:
+    script = """if True:
+        import sys, time
+        from realsim.app import cli
+        from realsim.many import open_pool
+        def work():
+            with open_pool(2) as pool:
+                pool.submit(time.sleep, 0.0).result()
+                print("ready", flush=True)
+                time.sleep(60)
+        if __name__ == "__main__":
+            cli.commands.command("work")(work)
+            sys.argv = ["realsim", "work"]
+            cli.main()
+    """
+    run = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE,
+                           stderr=subprocess.PIPE, text=True)  # fmt: skip
+    assert run.stdout is not None and run.stdout.readline() == "ready\n"
+    while run.poll() is None:
+        run.terminate()
+        time.sleep(0.01)
+    told = run.communicate()[1].strip()
+    assert (run.returncode, told) == (143, "interrupted; the same command goes on from here.")
