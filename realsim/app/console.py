@@ -23,6 +23,8 @@ Progress = Callable[[str, int, int], None]
 """Called with (what is done, done, total)."""
 SECONDS_BETWEEN_LINES = 10.0
 """Least time between two lines of progress in a log [s]: one can see that it goes on, no more."""
+SECONDS_BETWEEN_SAME = 120.0
+"""The same where nothing has changed since [s]."""
 PIPED_WIDTH = 120
 """Columns of output that is piped: it has no width of its own, and 120 keep most rows whole."""
 
@@ -146,13 +148,15 @@ class Console:
 
     def _lines(self, label: str) -> Tick:
         """Return what writes a line of progress into a log, at most every ten seconds."""
-        begun = time.monotonic()
+        begun, told = time.monotonic(), (-1, -1, "")
 
         def tick(done: int, total: int) -> None:
-            at = time.monotonic()
-            if total <= 0 or at - self._last_line < SECONDS_BETWEEN_LINES:
+            nonlocal told
+            at, now = time.monotonic(), (done, total, self._doing)
+            least = SECONDS_BETWEEN_SAME if now == told else SECONDS_BETWEEN_LINES
+            if total <= 0 or at - self._last_line < least:
                 return
-            self._last_line = at
+            self._last_line, told = at, now
             left = f", {duration((at - begun) * (total - done) / done)} left" if done > 0 else ""
             share = f"{100 * done // total} %"
             self._err.print(

@@ -103,6 +103,10 @@ def test_a_log_gets_a_line_at_most_every_ten_seconds(
     assert re.fullmatch(r"first: 16 % \(8 of 50\), \d+ s left", lines[0]) or "left" in lines[0]
     shares = [int(re.findall(r"(\d+) %", line)[0]) for line in lines]
     assert shares[:4] == sorted(shares[:4])
+    with console.stage("long") as tick:
+        for _ in range(300):
+            tick(0, 5)
+    assert len(capsys.readouterr().err.splitlines()) == 3  # nothing moved: every two minutes
 
 
 def test_json_has_stdout_for_itself(capsys: pytest.CaptureFixture[str]) -> None:
