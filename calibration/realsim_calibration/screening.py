@@ -15,6 +15,7 @@ from realsim_calibration.checks import CheckConfig, roll_range_deg
 from realsim_calibration.faults.consequences import (
     SINGLE_VIEWS,
     check_of,
+    drawings_check,
     examine,
     half_turned,
     motion_check_of,
@@ -138,7 +139,10 @@ def screen(
         mismatch_deg=mismatch,
         screw_ratio=ratio,
         roll_range_deg=roll_range_deg(list(used)),
-        checks=tuple(c for c in (conventions, turned, motion) if c is not None),
+        checks=(
+            *(c for c in (conventions, turned, motion) if c is not None),
+            *drawings_check([(v.index, v.detection) for v in views]),
+        ),
     )
 
 

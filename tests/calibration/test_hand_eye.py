@@ -7,6 +7,7 @@ from realsim.errors import DegenerateError, InputError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim_calibration import JointConfig
+from realsim_calibration.detect.drawings import DRAWN
 from realsim_calibration.fit.board_pose import estimate_board_pose
 from realsim_calibration.hand_eye import (
     HandEyeConfig,
@@ -106,11 +107,16 @@ def test_a_swapped_pair_is_dropped_and_named(simulate):
     views = list(sim.views)
     views[3] = replace(views[3], detection=sim.views[17].detection)
     views[17] = replace(views[17], detection=sim.views[3].detection)
+    drawn = (f"{DRAWN} (2.0 % of it): corners below them are off. Use others",)
+    views[5] = replace(views[5], detection=replace(views[5].detection, rejected=drawn))
     h = calibrate(sim, views)
     assert [k for k, _ in h.rejected] == [3, 17]
     assert all("3 with 17" in reason for _, reason in h.rejected)
     e = error_of(h, sim)
     assert np.degrees(np.linalg.norm(e[:3])) < 0.2 and np.linalg.norm(e[3:]) < 1.5e-3
+    checks = {c.name: c for c in h.checks}
+    assert checks["drawings"].verdict == "warn" and checks["drawings"].views == (5,)
+    assert checks["drawings"].sentence.startswith(f"1 of 24 images: {DRAWN}")
 
 
 def test_a_pair_swapped_between_parallel_poses_is_dropped_by_its_pixels(simulate):

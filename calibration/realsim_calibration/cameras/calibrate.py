@@ -33,6 +33,7 @@ from realsim_calibration.cameras.solve import (
 )
 from realsim_calibration.cameras.start import Start, board_poses, find_start
 from realsim_calibration.checks import given_camera_check, hand_eye_checks, roll_range_deg
+from realsim_calibration.faults.consequences import drawings_check
 from realsim_calibration.fit.joint_solve import JointConfig
 from realsim_calibration.fit.view_system import camera_record
 from realsim_calibration.lens.intrinsics import calibrate_intrinsics
@@ -322,6 +323,7 @@ def _camera(
         check for check in hand_eye_checks(report, config.hand_eye.checks)
         if moves or check.name not in {"roll", "robot poses", "joint zeros"}
     ]  # fmt: skip
+    checks += drawings_check([(v.instant, v.detection) for v in mine])
     if camera.intrinsics0 is not None and own is not None:
         given, fitted = (
             float(np.sqrt(i.fx * i.fy)) for i in (camera.intrinsics0, report.intrinsics)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.records import Check, Target
+from realsim_calibration.detect.drawings import DRAWN
 from realsim_calibration.faults.diagnose import diagnose
 from realsim_calibration.faults.diagnosis import Diagnosis, DiagnosisConfig
 from realsim_calibration.faults.frame_fit import MIN_VIEWS
@@ -82,6 +83,20 @@ def check_of(found: Diagnosis | None, indices: Sequence[int]) -> Check:
         unit="deg",
         views=tuple(indices[k] for k in found.views),
     )
+
+
+def drawings_check(found: Sequence[tuple[int, TargetDetection]]) -> tuple[Check, ...]:
+    """Return the check of what is drawn over the target in (view's number, its points)."""
+    why = {k: r for k, seen in found for r in seen.rejected if r.startswith(DRAWN)}
+    if not why:
+        return ()
+    sentence, _, advice = next(iter(why.values())).partition(". ")
+    return (
+        Check(
+            name="drawings", verdict="warn", sentence=f"{len(why)} of {len(found)} images: "
+            f"{sentence}.", advice=f"{advice}.", value=len(why), views=tuple(why),
+        ),
+    )  # fmt: skip
 
 
 def motion_check_of(
