@@ -157,6 +157,15 @@ def test_the_verdict_is_that_of_the_worst_check(
     assert order == sorted(order, key=["bad", "warn", "unknown", "good"].index)
 
 
+def test_verdict_and_table_count_the_checks_of_the_lens(report: HandEyeReport) -> None:
+    good = Check(name="c", verdict="good", sentence="S.")
+    lens = (good, Check(name="border", verdict="warn", sentence="90 px.", views=(0,)))
+    changed = dataclasses.replace(report, checks=(good,))
+    judged = verdict(changed, lens)
+    assert judged.verdict == "warn" and "1 of 3 checks gave a warning" in judged.sentence
+    assert check_rows(changed, lens)[0][:4] == ["warn", "border", "", "90 px."]
+
+
 def test_checks_name_views_by_their_files(report: HandEyeReport) -> None:
     row = next(r for r in check_rows(report) if r[1] == "dropped views")
     assert "view_007.png, view_015.png" in row[3] and row[4].startswith("Look at")

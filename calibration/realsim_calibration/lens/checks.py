@@ -75,7 +75,7 @@ def _views(report: IntrinsicsReport, limits: CheckLimits) -> Check:
     if left_out:
         advice = (advice + " Look at the views that were left out.").strip()
     return Check(
-        name="views", verdict="warn" if few or left_out else "good", sentence=sentence,
+        name="views of the lens", verdict="warn" if few or left_out else "good", sentence=sentence,
         advice=advice, value=float(n), views=tuple(v.index for v in left_out),
     )  # fmt: skip
 

@@ -75,7 +75,7 @@ def write_calibration_report(
         title: heading of the page.
     """
     page = _Page(folder=Path(folder), title=title, about=_about(report))
-    _verdict_section(page, report)
+    _verdict_section(page, report, () if intrinsics_report is None else intrinsics_report.checks)
     _place_section(page, report)
     _residual_section(page, report, images)
     _coverage_section(page, report)
@@ -105,9 +105,9 @@ def _about(report: HandEyeReport) -> str:
     )
 
 
-def _verdict_section(page: _Page, report: HandEyeReport) -> None:
-    """Say in one sentence what to do, then show figures and checks."""
-    judged = verdict(report)
+def _verdict_section(page: _Page, report: HandEyeReport, lens: Sequence[Check]) -> None:
+    """Say in one sentence what to do, then show figures and checks, those of the lens too."""
+    judged = verdict(report, lens)
     page.verdict(VERDICT_KIND[judged.verdict], judged.headline, judged.sentence)
     page.cards([
         (amount(report.held_out_px, 2, "px"), "error of unseen views"),
@@ -118,9 +118,10 @@ def _verdict_section(page: _Page, report: HandEyeReport) -> None:
         (f"± {amount(report.sigma_mm, 2, 'mm')}", "its place for another arm or a drawing"),
         (f"{len(report.used)} / {len(report.views)}", "views used / given"),
     ])  # fmt: skip
-    page.section("Checks", "" if report.checks else "Nothing was checked.")
-    if report.checks:
-        page.checks(["", "check", "value", "what was found", "what to do"], check_rows(report))
+    rows = check_rows(report, lens)
+    page.section("Checks", "" if rows else "Nothing was checked.")
+    if rows:
+        page.checks(["", "check", "value", "what was found", "what to do"], rows)
 
 
 def _place_section(page: _Page, report: HandEyeReport) -> None:
@@ -259,7 +260,6 @@ def _lens_section(
                 for m in intrinsics_report.held_out
             ],
         )
-        _checks_of(page, intrinsics_report.checks, "Checks of the lens alone")
 
 
 def _points(views: Sequence[ViewReport] | Sequence[LensView]) -> Array:
@@ -277,17 +277,6 @@ def _lens_column(i: CameraIntrinsics, covariance: Array) -> list[str]:
     ]
 
 
-def _checks_of(page: _Page, checks: Sequence[Check], title: str) -> None:
-    """Add the checks of another report, worst first."""
-    if not checks:
-        return
-    page.section(title)
-    page.checks(
-        ["", "check", "what was found", "what to do"],
-        [[c.verdict, c.name, c.sentence, c.advice] for c in worst_first(checks)],
-    )
-
-
 def _depth_section(page: _Page, report: DepthBiasReport) -> None:
     """Show the depth camera's bias."""
     page.section("The depth camera's bias")
@@ -296,7 +285,12 @@ def _depth_section(page: _Page, report: DepthBiasReport) -> None:
         "Left: measured minus true depth of every view and the fitted curve. Right: what is left "
         "where each view is corrected by the others.",
     )  # fmt: skip
-    _checks_of(page, report.checks, "Checks of the depth camera")
+    if report.checks:
+        page.section("Checks of the depth camera")
+        page.checks(
+            ["", "check", "what was found", "what to do"],
+            [[c.verdict, c.name, c.sentence, c.advice] for c in worst_first(report.checks)],
+        )
 
 
 def _appendix(page: _Page, report: HandEyeReport) -> None:

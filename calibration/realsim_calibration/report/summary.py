@@ -39,9 +39,9 @@ def worst_first(checks: Sequence[Check]) -> list[Check]:
     return sorted(checks, key=lambda c: WORST_FIRST.index(c.verdict))
 
 
-def verdict(report: HandEyeReport) -> Judgement:
-    """Return the judgement of a calibration from its checks."""
-    checks = worst_first(report.checks)
+def verdict(report: HandEyeReport, lens: Sequence[Check] = ()) -> Judgement:
+    """Return the judgement of a calibration from its checks and those of the lens alone."""
+    checks = worst_first((*report.checks, *lens))
     bad = [c for c in checks if c.verdict == "bad"]
     warn = [c for c in checks if c.verdict == "warn"]
     unknown = [c for c in checks if c.verdict == "unknown"]
@@ -81,13 +81,16 @@ def _words(check: Check) -> str:
     return f"{check.name[:1].upper()}{check.name[1:]}: {check.sentence}"
 
 
-def check_rows(report: HandEyeReport) -> list[list[str]]:
-    """Return (verdict, check, value, what was found, what to do) of every check, worst first."""
+def check_rows(report: HandEyeReport, lens: Sequence[Check] = ()) -> list[list[str]]:
+    """Return (verdict, check, value, what was found, what to do) of every check, worst first.
+
+    Checks of the lens alone name views in their sentences.
+    """
     names = {v.index: v.label for v in report.views}
     rows: list[list[str]] = []
-    for c in worst_first(report.checks):
+    for c in worst_first((*report.checks, *lens)):
         found = c.sentence
-        if c.views:
+        if c.views and c not in lens:
             found += f" Views: {', '.join(names.get(k, str(k)) for k in c.views)}."
         value = f"{c.value:.4g} {c.unit}".strip() if np.isfinite(c.value) else ""
         rows.append([c.verdict, c.name, value, found, c.advice])
