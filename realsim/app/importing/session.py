@@ -8,7 +8,7 @@ import hashlib
 import json
 import shutil
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +30,7 @@ from realsim_capture_plans.capturing.contact_sheet import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
 KEY = "import"
 """Entry of the session's extra under which the source is described."""
@@ -63,8 +63,7 @@ class ImportSummary:
     imported: int
     """Frames that this call wrote; the others were there."""
     with_depth: int
-    empty_depth: tuple[str, ...]
-    """Frames that this call wrote with a depth image in which next to nothing is measured."""
+    """Frames with a depth image; an empty one that this call wrote does not count."""
     with_joints: int
     with_tool_pose: int
     with_camera_pose: int
@@ -76,11 +75,6 @@ class ImportSummary:
     """The source's notes."""
     contact_sheet: Path
     """Picture of all frames."""
-
-    @property
-    def has_depth(self) -> bool:
-        """Whether depth was measured in some frame."""
-        return self.with_depth > len(self.empty_depth)
 
 
 def import_session(
@@ -121,9 +115,10 @@ def import_session(
             sheet = folder / write_contact_sheet(store, len(source), source.name, taken)
         finally:
             store.close()
-    summary = _summary(source, store, done, time.perf_counter() - started, sheet, empty)
+    summary = _summary(source, store, done, time.perf_counter() - started, sheet)
+    summary = replace(summary, with_depth=summary.with_depth - len(empty))
     show_import(summary, console)
-    _warn_of_depth(summary, console)
+    _warn_of_depth(summary, empty, console)
     return summary
 
 
@@ -217,7 +212,7 @@ def _thumbnails(source: FrameSource) -> Thumbnails:
 
 def _write_frames(
     source: FrameSource, store: SessionStore, done: int, tick: Tick, taken: Thumbnails
-) -> tuple[str, ...]:
+) -> list[str]:
     """Write the frames that are missing; the last one that is there must be the source's own.
 
     Returns:
@@ -231,7 +226,7 @@ def _write_frames(
         )
     if done == len(source):
         tick(done, len(source))
-        return ()
+        return []
     frames: Iterator[SourceFrame] = source.frames(max(done - 1, 0))
     last_s = -np.inf
     if done:
@@ -259,7 +254,7 @@ def _write_frames(
             f"'{source.name}' announced {len(source)} frames and gave {index}: it is cut off or "
             f"still being written. The {index} frames stay in {store.folder}."
         )
-    return tuple(empty)
+    return empty
 
 
 def _check(frame: SourceFrame, index: int, last_s: float, source: FrameSource) -> None:
@@ -321,15 +316,14 @@ def _warn_of_unit(store: SessionStore, console: Console) -> None:
         )
 
 
-def _warn_of_depth(summary: ImportSummary, console: Console) -> None:
+def _warn_of_depth(summary: ImportSummary, empty: "Sequence[str]", console: Console) -> None:
     """Say it where depth images are empty, and where there is nothing to register by."""
-    if summary.empty_depth:
+    if empty:
         console.warn(
-            f"{len(summary.empty_depth)} of {summary.with_depth} depth images are empty, at least "
-            f"{100 * (1 - LEAST_FILLED):.0f} % of their pixels are 0: those of "
-            f"{shown(summary.empty_depth)}. Was the depth stream running?"
+            f"depth images that are empty (at least {100 * (1 - LEAST_FILLED):.0f} % of the pixels "
+            f"are 0): {len(empty)}, of {shown(empty)}. Was the depth stream running?"
         )
-    if not summary.has_depth:
+    if not summary.with_depth:
         console.warn(
             f"{summary.folder} has no depth, and `realsim register` needs it. Give the source depth"
             " images on the colour's pixels, and import with --overwrite. Without depth `realsim "
@@ -338,9 +332,8 @@ def _warn_of_depth(summary: ImportSummary, console: Console) -> None:
 
 
 def _summary(
-    source: FrameSource, store: SessionStore, done: int, seconds: float, sheet: Path,
-    empty: tuple[str, ...],
-) -> ImportSummary:  # fmt: skip
+    source: FrameSource, store: SessionStore, done: int, seconds: float, sheet: Path
+) -> ImportSummary:
     views = store.session.views
     times = [v.time_s for v in views]
     return ImportSummary(
@@ -348,7 +341,6 @@ def _summary(
         frames=len(views),
         imported=len(views) - done,
         with_depth=sum(store.has_depth(v.index) for v in views),
-        empty_depth=empty,
         with_joints=sum(v.joints is not None for v in views),
         with_tool_pose=sum(v.T_base_ee is not None for v in views),
         with_camera_pose=sum(v.T_world_cam is not None for v in views),

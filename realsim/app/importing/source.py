@@ -95,7 +95,7 @@ def run_import(
             require_models(*labels, request.models)
         summary = import_session(source, out, console, overwrite=overwrite)
         if labels is not None:
-            import_labels(*labels, out, console, can_register=summary.has_depth)
+            import_labels(*labels, out, console, can_register=summary.with_depth > 0)
     return summary
 
 
