@@ -1,7 +1,5 @@
 """Scenes upgraded by processes or machines: one that breaks or is killed harms no other."""
 
-import sys
-import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -99,55 +97,20 @@ def upgraded(out: Path, job: SceneJob, root: Path, models: Path | None) -> Recor
 
 
 @contextmanager
-def scene_progress(total: int, finished: int, *, quiet: bool) -> Generator[Told]:
-    """Show a bar over scenes with the remaining time and those under way.
+def scene_progress(total: int, console: Console) -> Generator[Told]:
+    """Show how many scenes have ended, with the remaining time and those under way.
 
     Args:
-        total: scenes in all.
-        finished: of them, upgraded by an earlier run.
-        quiet: whether nothing is shown.
+        total: scenes to upgrade; those of an earlier run took no time of this one.
+        console: where it is shown.
     """
-    if not quiet and not sys.stderr.isatty():
-        with Console().stage("upgrade", "scenes") as tick:
-            ended_now = 0
-
-            def note(ended: SceneEnd | None, under_way: Sequence[str]) -> None:
-                nonlocal ended_now
-                ended_now += ended is not None
-                # Those of an earlier run took no time of this one.
-                tick(ended_now, total - finished)
-
-            yield note
-        return
-    from rich.console import Console as RichConsole
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (
-        TextColumn("scenes"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeElapsedColumn(),
-        TextColumn("{task.description}"),
-    )  # fmt: skip
-    start, done = time.monotonic(), 0
-    with Progress(*columns, console=RichConsole(stderr=True), disable=quiet) as bar:
-        task = bar.add_task("", total=total, completed=finished)
+    done = 0
+    with console.stage("upgrade", "scenes") as tick:
 
         def tell(ended: SceneEnd | None, under_way: Sequence[str]) -> None:
             nonlocal done
             done += ended is not None
-            left = remaining_s(time.monotonic() - start, done, total - finished)
-            words = f"{_words(left)} left" if left is not None else ""
-            names = ", ".join(under_way)
-            bar.update(task, completed=finished + done, description=f"{words}  {names}".strip())
+            console.doing(", ".join(under_way))
+            tick(done, total)
 
         yield tell
-
-
-def remaining_s(elapsed_s: float, done: int, of: int) -> float | None:
-    """Return how long the rest takes at the rate of what is done [s]; None = nothing is done."""
-    return None if done == 0 else elapsed_s / done * (of - done)
-
-
-def _words(seconds: float) -> str:
-    """Return a time as a person says it."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -123,7 +123,7 @@ def _many(
         return {}
     failed: dict[str, str] = {}
     jobs = [_job(ref, config, out, 1) for ref in refs]
-    with scene_progress(len(refs) + len(done), len(done), quiet=console.quiet) as tell:
+    with scene_progress(len(refs), console) as tell:
         upgrade_scenes(jobs, config.where, tell, lambda e: _take(e, done, failed, console))
     return failed
 
