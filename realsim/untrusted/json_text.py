@@ -3,8 +3,9 @@
 import json
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from realsim.errors import InputError
 from realsim.untrusted.files import checked_text
@@ -47,10 +48,11 @@ def parsed_json(text: str, where: str) -> Any:
         raise InputError(
             f"{where} holds {containers} arrays and objects; at most {MOST_CONTAINERS} are read."
         )
+    strange: set[str] = set()
     try:
         value = json.loads(
-            text, parse_constant=_no_constant, parse_float=_finite, parse_int=_whole,
-            object_pairs_hook=_each_once,
+            text, parse_constant=lambda name: strange.add(name) or float(name),
+            parse_float=_finite, parse_int=_whole, object_pairs_hook=_each_once,
         )  # fmt: skip
     except RecursionError as error:
         raise _too_deep(where) from error
@@ -60,6 +62,11 @@ def parsed_json(text: str, where: str) -> Any:
             "with the program that made it."
         ) from error
     _require_shallow(value, where)
+    if strange:
+        raise InputError(
+            f"{where} has {min(strange)} at {_strange_place(value):.200}: JSON has no such number, "
+            "and nothing can be computed with it. Write a number, or leave the entry out."
+        )
     if STRANGE_ESCAPE.search(text):
         _require_whole_characters(value, where)
     return value
@@ -78,8 +85,16 @@ def _whole(text: str) -> int:
     return int(text)
 
 
-def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no number in JSON, and nothing can be computed with it")
+def _strange_place(value: Any, place: str = "") -> str:
+    """Return where the first number that is not finite stands, such as starts[1].radius_mm."""
+    if isinstance(value, float):
+        return "" if math.isfinite(value) else place.lstrip(".") or "the top"
+    parts: Iterable[tuple[str, Any]] = ()
+    if type(value) is dict:
+        parts = ((f"{place}.{key}", inner) for key, inner in value.items())
+    elif type(value) is list:
+        parts = ((f"{place}[{k}]", inner) for k, inner in enumerate(value))
+    return next(filter(None, (_strange_place(inner, at) for at, inner in parts)), "")
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

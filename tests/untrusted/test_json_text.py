@@ -32,7 +32,7 @@ def test_the_mark_of_windows_editors_is_no_character(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("[NaN]", "NaN"),
+        ('{"starts": [{"x": 1}, {"T": [[0, NaN]]}]}', "has NaN at starts[1].T[0][1]: "),
         ("[1e999]", "double precision"),
         ("[-" + "9" * 1_000_000 + "]", "1000001 digits"),
         ("[" * 100_000 + "]" * 100_000, "deeper"),
