@@ -21,6 +21,7 @@ and in the session's `registration/starts.json` as rows of "starts", beside a "s
 
 import re
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -170,9 +171,9 @@ def _hint_of(
     """Return what one row of a starts file says."""
     unknown = [k for k in row if k not in KEYS]
     if unknown:
+        close = "".join(f" Did you mean {k}?" for k in get_close_matches(unknown[0], KEYS, n=1))
         raise InputError(
-            f"{label} has the key '{unknown[0]}' = {row[unknown[0]]!r}; there are: "
-            f"{', '.join(KEYS)}."
+            f"{label} has the key '{unknown[0]}'.{close} There are: {', '.join(KEYS)}."
         )
     obj_id, instance = row.get("obj_id"), row.get("instance", n)
     if not isinstance(obj_id, int) or obj_id not in models:

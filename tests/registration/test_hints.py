@@ -227,7 +227,7 @@ SHEARED = (np.eye(4) + np.eye(4, k=1) * 0.3).tolist()
 @pytest.mark.parametrize(
     ("row", "error", "words"),
     [
-        ({"obj_id": 5, "clik": {}}, InputError, "row 1 has the key 'clik'"),
+        ({"obj_id": 5, "clik": {}}, InputError, "row 1 has the key 'clik'. Did you mean click[?]"),
         ({"obj_id": 999}, InputError, "row 1: obj_id is 999"),
         ({"obj_id": 5, "instance": 0}, InputError, "row 1: instance 0 is there twice"),
         ({"obj_id": 5, "T_world_obj": FAR}, UnitError, "row 1.*millimetres"),

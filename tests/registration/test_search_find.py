@@ -99,6 +99,7 @@ def test_one_too_many_is_not_placed_and_says_why(folder: Path):
     assert len(result.placed) + len(result.not_placed) == 2
     for missing in result.not_placed:
         assert "explains" in missing.reason or "looks like" in missing.reason
+        assert "start" not in missing.reason  # it has none
 
 
 def test_bad_questions_are_refused():

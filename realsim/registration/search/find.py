@@ -221,12 +221,12 @@ def _not_placed(search: Search, final: Sequence[Candidate | None], n: int) -> No
     buffer = compose(canvas.table, [k.rendered for k in final if k is not None])
     rest = [search.pool[k] for k in search.choices[n]]
     scores = [score(canvas, c.rendered, buffer).per_cell for c in rest]
+    strange = "" if wanted.T_start is None else ", or its start is of another scene"
     reason = (
         f"nothing {where} looks like it"
         if not rest
         else f"nothing that was measured {where} looks like it, beside what the other objects and "
         f"the table explain (best of {len(rest)} poses: {max(scores):.2f} likelier per pixel, "
-        f"{least:.2f} is needed): it is not there, or the depth does not show it, or its start is "
-        "of another scene"
+        f"{least:.2f} is needed): it is not there, or the depth does not show it{strange}"
     )
     return NotPlaced(obj_id=wanted.obj_id, instance=wanted.instance, reason=reason)
