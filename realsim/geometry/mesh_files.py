@@ -47,14 +47,14 @@ def check_unit(largest_extent: float, unit: Unit, name: str) -> None:
         raise UnitError(
             f"{name} is said to be in mm, but its largest extent is {largest_extent:.4g} mm; in "
             f"metres it would be {largest_extent:.4g} m. At least {SMALLEST_M * 1e3:g} mm is "
-            "accepted. If the file is in metres, load it with unit='m'."
+            "accepted. If it is in metres, `realsim scan import FILE --unit m` makes a model of it."
         )
     if unit == "m" and extent_m > LARGEST_M:
         raise UnitError(
             f"{name} is said to be in m, but its largest extent is {largest_extent:.4g} m; in "
             f"millimetres it would be {largest_extent:.4g} mm = {largest_extent / 1e3:.4g} m. At "
-            f"most {LARGEST_M:g} m is accepted. If the file is in millimetres, load it with "
-            "unit='mm'."
+            f"most {LARGEST_M:g} m is accepted. If it is in millimetres, `realsim scan import FILE "
+            "--unit mm` makes a model of it."
         )
 
 
@@ -88,15 +88,15 @@ def load_mesh(path: Path | str, unit: Unit, notes: list[str] | None = None) -> M
             loaded: Any = trimesh.load_scene(path, process=False, resolver=beside).to_mesh()
     except Exception as error:  # a broken file raises whatever the format's reader trips over
         raise InputError(
-            f"{path} cannot be read as a {path.suffix[1:]} mesh ({type(error).__name__}: {error}). "
-            "Export it again; triangles with vertices are needed."
+            f"{path} cannot be read as a {path.suffix[1:]} mesh: it seems to be cut off or damaged."
+            " Copy or export it again; triangles with vertices are needed."
         ) from error
     vertices = np.asarray(getattr(loaded, "vertices", ()), dtype=np.float64).reshape(-1, 3)
     faces = np.asarray(getattr(loaded, "faces", ()), dtype=np.int32).reshape(-1, 3)
     if len(faces) == 0:
         raise InputError(
             f"{path} has {len(vertices)} vertices and no triangles; a surface mesh is needed, "
-            "not a point cloud."
+            "not a point cloud. Is the file whole?"
         )
     check_unit(float(np.ptp(vertices, axis=0).max()), unit, str(path))
     colors, uv, texture = _appearance(loaded, len(vertices), beside.broken)

@@ -55,8 +55,8 @@ def load_pieces(path: Path) -> FileContent:
         folder.raise_if_refused()
         missing = f" It names {', '.join(folder.missing)}, not found." if folder.missing else ""
         raise InputError(
-            f"{path} cannot be read as a {kind[1:]} mesh ({type(error).__name__}: {error})."
-            f"{missing} Export it again; triangles with vertices are needed."
+            f"{path} cannot be read as a {kind[1:]} mesh: it seems to be cut off or damaged."
+            f"{missing} Copy or export it again; triangles with vertices are needed."
         ) from error
     notes += [
         f"'{name}', named in the file, is not in its folder: colours from it are missing."

@@ -111,7 +111,7 @@ def _content(path: Path) -> FileContent:
     if not content.pieces:
         raise InputError(
             f"{path} has no triangles; a surface mesh is needed, not an empty scene or a cloud of "
-            "points. Mesh the points first, or export the surface."
+            "points. Is the file whole? If so, mesh the points first, or export the surface."
         )
     return content
 

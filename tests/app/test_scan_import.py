@@ -128,7 +128,7 @@ def test_a_scaled_model_is_one_row_with_the_mark_of_its_source(run, meshes: Path
     [
         (["wedge.ply"], "does not state its unit"),
         (["wedge.ply", "--unit", "m"], "as mm"),
-        (["broken.obj", "--unit", "mm"], "broken.obj"),
+        (["broken.obj", "--unit", "mm"], "mesh: it seems to be cut off or damaged. Copy"),
         (["points.ply", "--unit", "mm"], "no triangles"),
         (["flat.ply", "--unit", "mm"], "flat"),
         (["wedge.ply", "--unit", "mm", "--mass", "nan"], "--mass is nan"),

@@ -277,5 +277,7 @@ def test_models_in_the_wrong_unit_are_found_out(tmp_path):
     from realsim.geometry.mesh import save_ply
 
     save_ply(tmp_path / "obj_000001.ply", cube(), "m")
-    with pytest.raises(UnitError, match="unit='m'"):
+    with pytest.raises(UnitError, match="scan import FILE --unit m` makes"):
         bop_models.load_models(tmp_path)
+    with pytest.raises(InputError, match="nowhere does not exist; files obj"):
+        bop_models.load_models(tmp_path / "nowhere")

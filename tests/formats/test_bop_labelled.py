@@ -240,6 +240,8 @@ def test_models_that_are_missing_are_named(tmp_path):
     assert set(given.models()) == {1, 7} and not any("no mesh" in n for n in given.notes)
     with pytest.raises(InputError, match="has no models"):
         open_labelled_bop(tmp_path, models=tmp_path)
+    with pytest.raises(InputError, match="nowhere does not exist; obj"):
+        open_labelled_bop(tmp_path, models=tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("scale", [0.5, 1 / 640])

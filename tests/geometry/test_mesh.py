@@ -265,7 +265,7 @@ def test_what_is_no_mesh_is_an_error_that_names_the_file(tmp_path):
     with pytest.raises(InputError, match=r"\.ply, \.obj"):
         meshes.load_mesh(tmp_path / "mug.dae", "m")
     (tmp_path / "broken.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement")
-    with pytest.raises(InputError, match=r"broken\.ply"):
+    with pytest.raises(InputError, match=r"broken\.ply cannot .* cut off or damaged\. Copy"):
         meshes.load_mesh(tmp_path / "broken.ply", "m")
     header = "ply\nformat ascii 1.0\nelement vertex 1\n"
     header += "property float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n"

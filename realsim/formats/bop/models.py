@@ -105,8 +105,9 @@ def load_models(
     folder = Path(folder)
     files = {int(p.stem[4:]): p for p in folder.glob("obj_*.ply") if p.stem[4:].isdecimal()}
     if not files:
+        found = "has no models" if folder.is_dir() else "does not exist"
         raise InputError(
-            f"{folder} has no models; files obj_000001.ply, obj_000002.ply, ... are expected, as "
+            f"{folder} {found}; files obj_000001.ply, obj_000002.ply, ... are expected, as "
             "in the folder 'models' of a BOP dataset. Of a data set whose models lie elsewhere, "
             "give them with --models FOLDER (to `realsim import`, run again, of a session)."
         )

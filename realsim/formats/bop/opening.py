@@ -221,7 +221,8 @@ def _models(
 ) -> Path | Mapping[int, ObjectModel] | None:
     if isinstance(given, (str, Path)):
         if not model_ids(Path(given)):
-            raise InputError(f"{given} has no models; obj_000001.ply, ... are expected.")
+            found = "has no models" if Path(given).is_dir() else "does not exist"
+            raise InputError(f"{given} {found}; obj_000001.ply, ... are expected.")
         return Path(given)
     if given is not None:
         return given
