@@ -38,6 +38,9 @@ class Command(click.Command):
         try:
             return super().parse_args(ctx, args)
         except click.BadParameter as error:
+            for kind, word in (("integer range", "whole number"), ("float range", "number")):
+                told = error.message.replace(f"a valid {kind}", f"a {word}")
+                error.message = told  # pyright: ignore[reportAttributeAccessIssue]
             option = error.param
             if not isinstance(option, click.Option):
                 raise

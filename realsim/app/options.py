@@ -117,8 +117,8 @@ def command(name: str, *examples: str, group: click.Group | None = None) -> Deco
 
         made = click.command(name, cls=Command, examples=examples)(run)
         options(quiet=False, json=False)(made)
-        if any(isinstance(p, Option) and p.is_rare for p in made.params):
-            made.params.append(HELP_ALL)
+        has_rare = any(isinstance(p, Option) and p.is_rare for p in made.params)
+        made.params.append(_help_all(hidden=not has_rare))
         if group is not None:
             group.add_command(made)
         return made
@@ -133,10 +133,11 @@ def _show_all(ctx: click.Context, option: click.Parameter, asked: bool) -> None:
         ctx.exit()
 
 
-HELP_ALL = click.Option(
-    ["--help-all"], is_flag=True, is_eager=True, expose_value=False, callback=_show_all,
-    help="Show this message with the rare options, and exit.",
-)  # fmt: skip
+def _help_all(*, hidden: bool) -> click.Option:
+    return click.Option(
+        ["--help-all"], is_flag=True, is_eager=True, expose_value=False, callback=_show_all,
+        hidden=hidden, help="Show this message with the rare options, and exit.",
+    )  # fmt: skip
 
 
 def many(workers: Any = 2, note: str = "") -> Decorator:

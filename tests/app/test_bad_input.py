@@ -104,6 +104,13 @@ def test_unknown_scene_is_named(pristine: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_a_session_is_no_data_set(pristine: Path, tmp_path: Path) -> None:
+    shutil.copytree(pristine / SCENE, tmp_path / "demo/session")
+    (tmp_path / "demo/session/session.json").write_text("{}")
+    code, text = upgrade(tmp_path / "demo", tmp_path / "out")
+    assert code == 2 and "is a session of realsim" in text and "SPLIT/000001" in text
+
+
 def test_output_inside_the_dataset_is_refused(pristine: Path) -> None:
     code, text = upgrade(pristine, pristine / "upgraded")
     assert code == 2 and "only read" in text

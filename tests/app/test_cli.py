@@ -63,6 +63,7 @@ def test_1_is_done_but_a_check_failed(tmp_path: Path) -> None:
         (["scan", "lst"], "Did you mean 'list'?"),
         (["register", "s", "--view", "3"], "Did you mean"),
         (["demo", "--views", "3"], "4<=x<=1024"),
+        (["demo", "--views", "abc"], "'abc' is not a whole number"),
         (["export", "s", "--to", "bob", "--out", "o"], "bop"),
         ([], "Prepare:"),
     ],

@@ -112,6 +112,7 @@ def test_rare_options_are_shown_by_help_all_alone() -> None:
     shown = [o for path, o in OPTIONS if path == ("import",) and o.opts[0] in short]
     assert len(shown) <= 12 and "--help-all" in short and "--ee-frame" not in short
     assert all(o.opts[0] in every for path, o in OPTIONS if path == ("import",))
+    assert realsim("demo", "--help-all").stdout == realsim("demo", "--help").stdout
 
 
 def test_old_names_work_with_a_note(

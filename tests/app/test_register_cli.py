@@ -216,7 +216,7 @@ def test_the_depth_bias_is_that_of_the_calibration_unless_it_is_off(session: Pat
     assert config_of(store, RegisterRequest(depth_bias=str(other))).bias.scale == 0.999
     assert isinstance(load_depth_bias(other), DepthBias)
     other.write_text('{"scale": 1.0}')
-    with pytest.raises(InputError, match="no depth bias"):
+    with pytest.raises(InputError, match="no depth bias: its entries are others"):
         load_depth_bias(other)
 
 

@@ -116,6 +116,6 @@ def load_depth_bias(path: Path) -> DepthBias:
         )  # fmt: skip
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"'{path}' is no depth bias ({error!r}). `realsim calibrate` writes one to "
+            f"'{path}' is no depth bias: its entries are others. `realsim calibrate` writes one to "
             f"{BIAS_FILE}; give such a file, or --depth-bias {OFF}."
         ) from error

@@ -12,6 +12,7 @@ from realsim.formats.graspnet.scene import CAMERAS, cameras_of
 from realsim.formats.graspnet.single_frame import is_graspnet_frame, open_graspnet_frame
 from realsim.formats.labelled_scene import LabelledScene
 from realsim.many import Workers
+from realsim.store.header import SESSION_FILE
 
 Kind = Literal["auto", "bop", "graspnet"]
 GT = "gt"
@@ -125,6 +126,14 @@ def _require_places(refs: Sequence[SceneRef]) -> None:
 
 def _bop(dataset: Path, config: UpgradeConfig) -> list[SceneRef]:
     refs = find_scenes(dataset)
+    for r in refs:
+        has_models = (config.models or _root(r) / "models").is_dir()
+        if not has_models and (r.folder / SESSION_FILE).is_file():
+            raise InputError(
+                f"'{dataset}' is no data set: {r.folder} is a session of realsim, whose poses "
+                f"`realsim register {r.folder}` finds. A BOP data set has SPLIT/000001/"
+                "scene_camera.json and models/; `realsim export SESSION --to bop` makes one."
+            )
     if config.camera:
         there = sorted({r.camera for r in refs if r.camera})
         refs = [r for r in refs if r.camera == config.camera]
