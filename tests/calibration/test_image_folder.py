@@ -146,6 +146,10 @@ def test_a_reading_must_be_said_and_must_fit(tmp_path):
         found.Ts_base_ee()
     with pytest.raises(InputError, match="takes 6 numbers"):
         read_image_folder(images, file, reading=reading_from_text("rotvec,m"))
+    named = [",".join(map(repr, r.tolist())) for r in rows(4)]
+    file.write_text("\n".join(["x_m,y_m,z_m,qx,qy,qz,qw", *named]))
+    turned = read_image_folder(images, file, reading=reading_from_text("quat_wxyz,m"))
+    assert "contradicts the file" in turned.warnings[0] and len(turned.Ts_base_ee()) == 4
 
 
 def test_poses_and_depth_beside_the_images(tmp_path):

@@ -208,10 +208,21 @@ def test_units_in_names_extra_columns_and_joints():
     assert np.allclose(found.joints, np.radians(joints), atol=1e-14)
     assert list(found.labels) == names and any("force" in n for n in found.notes)
     check(found, reading, T)
-    with pytest.raises(InputError, match="contradicts the file: length unit is mm, not m"):
+    with pytest.raises(InputError, match=r"length unit is mm, not m.*rename the columns"):
         found.poses(reading_from_text("euler_xyz,deg,m"))
+    moved = found.poses(reading_from_text("euler_xyz,rad,mm"), despite_names=True)
+    assert np.allclose(moved[:, :3, 3], T[:, :3, 3])
     with pytest.raises(InputError, match="not rotation_vector"):
         found.poses(reading_from_text("rotvec,deg,mm"))
+
+
+def test_degrees_under_names_that_state_radians_are_noted():
+    T = random_poses(6, 8)
+    numbers = reading_from_text("rotvec,deg,m").numbers(T)
+    with folder() as place:
+        head = "x_m,y_m,z_m,rx_rad,ry_rad,rz_rad"
+        found = read_pose_file(write_lines(place / "a.csv", numbers, ",", head=head))
+    assert any("beyond two turns" in n and "rotvec,deg" in n for n in found.notes)
 
 
 def test_time_and_index_columns_are_told_from_the_pose():

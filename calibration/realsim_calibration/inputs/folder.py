@@ -54,6 +54,8 @@ class FolderInput:
     def Ts_base_ee(self, reading: PoseReading | None = None) -> Array:
         """Return the poses (n, 4, 4) [m] of a reading, by default of the one that was said.
 
+        A reading that contradicts the names of the file is taken: `warnings` says so.
+
         Raises:
             InputError: no reading was said, or it does not fit the file.
         """
@@ -64,7 +66,7 @@ class FolderInput:
                 f"admit {listed_readings(self.poses.possible)}. Give one of them, or let the "
                 "images decide."
             )
-        return self.poses.poses(chosen)
+        return self.poses.poses(chosen, despite_names=True)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -123,8 +125,10 @@ def read_image_folder(
     if not kept:
         raise InputError(f"{raw.path}: no pose that belongs to an image holds finite numbers.")
     rows = raw.subset([r for _, r in kept])
+    against = ""
     if reading is not None:
-        rows.poses(reading)
+        rows.poses(reading, despite_names=True)
+        against = rows.contradiction(reading)
     chosen = [listing.images[i] for i, _ in kept]
     labels = tuple(names[i] for i, _ in kept)
     same_images = _equal_groups(labels, [content_of(p) for p in chosen])
@@ -147,7 +151,11 @@ def read_image_folder(
         ),
         duplicate_images=same_images,
         duplicate_poses=same_poses,
-        warnings=(*found.warnings, *_warnings(same_images, same_poses, found, len(lost))),
+        warnings=(
+            *([f"{against} It is taken as you say."] if against else []),
+            *found.warnings,
+            *_warnings(same_images, same_poses, found, len(lost)),
+        ),
     )
 
 
@@ -225,18 +233,23 @@ def _warnings(
     if same_images:
         groups = "; ".join(", ".join(g) for g in same_images[:6])
         said.append(
-            f"{len(same_images)} images are there more than once, byte by byte ({groups}): at "
+            f"{_count(len(same_images), 'image')} there more than once, byte by byte ({groups}): at "
             "least one of each has the pose of another. Delete the copies with their poses."
         )
     if same_poses:
         groups = "; ".join(", ".join(g) for g in same_poses[:6])
         said.append(
-            f"{len(same_poses)} poses are there more than once, with the very same numbers "
+            f"{_count(len(same_poses), 'pose')} there more than once, with the very same numbers "
             f"({groups}): a controller never repeats all digits. Was an old pose stored again?"
         )
     left = len(found.unpaired_images), len(found.unpaired_poses)
     if any(left):
-        said.append(f"{left[0]} images have no pose, {left[1]} poses have no image.")
+        said.append(f"Images without a pose: {left[0]}, poses without an image: {left[1]}.")
     if not_measured:
-        said.append(f"{not_measured} images were left out: {NOT_MEASURED}.")
+        said.append(f"Images left out for a pose of NaN or infinite numbers: {not_measured}.")
     return tuple(said)
+
+
+def _count(n: int, what: str) -> str:
+    """Return "1 image is" or "2 images are"."""
+    return f"{n} {what} is" if n == 1 else f"{n} {what}s are"

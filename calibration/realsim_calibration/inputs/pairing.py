@@ -95,7 +95,7 @@ def _by_label(images: Sequence[str], labels: Sequence[str | None], where: Sequen
             f"none of the {len(labels)} names that the poses give is an image: the poses name "
             f"{_shown([x for x in labels if x is not None])}; the images are {_shown(images)}."
         )
-    how = f"by the image names beside the poses ({len(pairs)} of {len(images)} images)"
+    how = f"by the image names beside the poses (images: {len(pairs)} of {len(images)})"
     how += f", {other_ending} of them up to the file's ending" if other_ending else ""
     return _finished(images, pairs, no_image, f"Paired {how}.", "no pose names it")
 

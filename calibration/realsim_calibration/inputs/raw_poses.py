@@ -129,8 +129,14 @@ class RawPoses:
             times=None if self.times is None else self.times[pick],
         )
 
-    def poses(self, reading: PoseReading, *, ranges: ReadingRanges | None = None) -> Array:
-        """Return T_base_ee (n, 4, 4) [m] of this reading.
+    def poses(
+        self,
+        reading: PoseReading,
+        *,
+        ranges: ReadingRanges | None = None,
+        despite_names: bool = False,
+    ) -> Array:
+        """Return T_base_ee (n, 4, 4) [m] of this reading, which a person may say against the names.
 
         Raises:
             InputError: the file says otherwise, or a row cannot be a pose; the rows are named.
@@ -139,11 +145,11 @@ class RawPoses:
         limits = ranges or ReadingRanges()
         if self.said.position_first is not None:
             reading = replace(reading, position_first=self.said.position_first)
-        contradiction = self._contradiction(reading)
-        if contradiction:
+        contradiction = self.contradiction(reading)
+        if contradiction and not despite_names:
             raise InputError(
-                f"{self.path}: the reading '{reading}' contradicts the file: {contradiction} "
-                f"Readings that fit: {listed_readings(self.possible)}."
+                f"{contradiction} Readings that fit: {listed_readings(self.possible)}. If the "
+                "names are wrong, rename the columns."
             )
         try:
             T = reading.apply(self.values, rows=self.where)
@@ -159,7 +165,7 @@ class RawPoses:
             )
         return T
 
-    def _contradiction(self, reading: PoseReading) -> str:
+    def contradiction(self, reading: PoseReading) -> str:
         """Return what the file says against a reading; empty where nothing does."""
         said = self.said
         pairs = (
@@ -169,7 +175,12 @@ class RawPoses:
         wrong = [f"{name} is {a}, not {b}" for a, b, name in pairs if a is not None and a != b]
         if said.rotations is not None and reading.rotation not in said.rotations:
             wrong.append(f"the rotation is not {reading.rotation}")
-        return f"{'; '.join(wrong)} ({' '.join(said.sentences)})" if wrong else ""
+        if not wrong:
+            return ""
+        return (
+            f"{self.path}: the reading '{reading}' contradicts the file: {'; '.join(wrong)} "
+            f"({' '.join(said.sentences)})."
+        )
 
 
 def listed_readings(readings: Sequence[PoseReading], most: int = 10) -> str:
@@ -284,13 +295,19 @@ def _angle_units(
     else:
         size = np.abs(angles).max(axis=1)
     largest = float(size.max())
+    degrees = np.mean(size > 2 * FULL_TURN) >= 0.5
     if np.mean(size > limits.most_deg) > 1 - limits.share:
         return (), f"Not angles: most rows hold numbers beyond {limits.most_deg:g}."
+    if said.angle_unit == "rad" and degrees:
+        return ("rad",), (
+            f"The names state rad, and the largest angle is {largest:.4g}, beyond two turns. If "
+            f"these are degrees, give --reading, such as {replace(reading, angle_unit='deg')}."
+        )
     if said.angle_unit is not None:
         return (said.angle_unit,), ""
     if limits.tiny_rad <= largest <= FULL_TURN * (1 + 1e-3):
         return ("rad",), f"The largest angle is {largest:.4g}, at most a turn: radians."
-    if np.mean(size > 2 * FULL_TURN) >= 0.5:
+    if degrees:
         return ("deg",), f"The largest angle is {largest:.4g}, beyond two turns in rad: degrees."
     return ("rad", "deg"), f"The largest angle is {largest:.4g}: rad or deg is left open."
 
