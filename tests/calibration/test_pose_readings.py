@@ -101,7 +101,7 @@ def test_rows_that_are_no_poses_are_named():
         (lambda r: r.__setitem__((1, slice(0, 3)), -r[1, :3]), NotRigidError, "line 11.*mirrored"),
         (lambda r: r.__setitem__((3, slice(0, 3)), 2 * r[3, :3]), NotRigidError, "line 13.*not a"),
         (lambda r: r.__setitem__((4, 12), 0.2), NotRigidError, "line 14.*last row"),
-        (lambda r: r.__setitem__((4, 3), 650.0), UnitError, "line 14.*millimetres"),
+        (lambda r: r.__setitem__((4, 3), 650.0), UnitError, "line 14.*--reading matrix,mm if"),
     ):
         bad = raw.copy()
         change(bad)

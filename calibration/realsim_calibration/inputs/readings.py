@@ -145,10 +145,14 @@ class PoseReading:
         far = away > reach_m
         if far.any():
             worst = float(away.max())
+            mm, turned = replace(self, length_unit="mm"), replace(self, position_first=False)
+            remedies = [f"--reading {mm} if the lengths are in millimetres"] * (mm != self)
+            if turned != self and values.shape[1] != 16:
+                remedies += [f"--reading {turned} if the rotation stands before the position"]
             raise UnitError(
                 f"read as '{self}' {_listed(names, far)} would lie up to {worst:.4g} m away; at "
-                f"most {reach_m:g} m is accepted. Are the lengths in millimetres, or is the "
-                "rotation stored before the position (rotation_first)?"
+                f"most {reach_m:g} m is accepted. "
+                + (f"Give {', or '.join(remedies)}." if remedies else "Correct the lengths.")
             )
         T = se3.from_rt(R, t)
         return se3.invert(T) if self.inverted else T
@@ -252,7 +256,7 @@ class PoseReading:
                 raise NotRigidError(
                     f"{_listed(names, bad)}: the quaternion does not have length 1 "
                     f"({names[k]}: {r[k].tolist()}, length {length[k]:.4g}). Are these numbers a "
-                    "quaternion, and does the position stand where it is said to (rotation_first)?"
+                    "quaternion? If it stands before the position, add ,rotation_first to --reading"
                 )
             wxyz = r if self.rotation.endswith("wxyz") else np.roll(r, 1, axis=-1)
             return se3.from_quaternion_wxyz(wxyz), t
