@@ -14,6 +14,7 @@ from realsim_calibration.faults.half_turns import half_turn, synchronise_half_tu
 from realsim_calibration.faults.motion_check import check_motion
 from realsim_calibration.faults.rotation_readings import (
     four_number_conventions,
+    reading_of,
     three_number_conventions,
 )
 
@@ -33,6 +34,22 @@ def test_every_form_of_a_rotation_decodes_to_it():
     for name, convention in CONVENTIONS.items():
         forms = convention.decode(convention.encode(R))
         assert np.abs(forms - R[:, None]).max() < 1e-9, name
+
+
+def test_the_reading_that_a_remedy_names_decodes_like_its_convention():
+    rng, told = np.random.default_rng(0), 0
+    for name, convention in CONVENTIONS.items():
+        reading = reading_of(name)
+        if reading is None:
+            continue
+        told += 1
+        numbers = rng.normal(size=(5, reading.widths[0] - 3))
+        numbers /= np.linalg.norm(numbers, axis=-1, keepdims=True)
+        R = reading.apply(np.hstack([np.zeros((5, 3)), numbers]))[:, :3, :3]
+        assert np.allclose(R, convention.decode(numbers)), name
+    assert told == 15  # all but rx ry rz multiplied in another order
+    assert str(reading_of("rotation vector in degrees")) == "rotvec,deg,m"
+    assert str(reading_of("Euler angles (product XYZ) in degrees")) == "euler_XYZ,deg,m"
 
 
 def test_euler_conventions_are_those_of_the_textbook():

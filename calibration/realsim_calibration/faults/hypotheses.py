@@ -16,6 +16,7 @@ from realsim_calibration.faults.pairing import Pairing, find_move, find_pairing
 from realsim_calibration.faults.rotation_readings import (
     Reread,
     every_reading,
+    reading_of,
     reread,
     reread_degrees,
 )
@@ -162,7 +163,10 @@ def inverted(p: Poses, config: DiagnosisConfig) -> Hypothesis:
         )
     mode = "eye_to_hand" if p.eye_in_hand else "eye_in_hand"
     flag = "give --eye-to-hand" if p.eye_in_hand else "leave --eye-to-hand out"
-    remedy = "add ',inverted' to --reading, as in --reading rotvec,m,inverted (Python: T_base_ee)"
+    remedy = (
+        "add ',inverted' to the reading that was told or given, as in --reading matrix,m,inverted "
+        "where it is matrix,m (Python: give T_base_ee)"
+    )
     other_remedy = f"{flag} (Python: mode='{mode}')"
     # What is in the hand is nearer to it than what stands in the base.
     if (x > z) == p.eye_in_hand:
@@ -258,11 +262,10 @@ def reread_as_degrees(p: Poses, config: DiagnosisConfig) -> list[Hypothesis]:
             h = _reread(p, "degrees_as_radians", replace(r, Rs=Rs), config, h.sentence)
         found.append(h)
     return [
-        replace(h, note="", advice="Read the file again with its angles in degrees; the poses as "
-                "decoded have lost them.")
+        replace(h, note="", advice=f"{h.advice} The poses as decoded have lost the degrees.")
         for h in found
         if h.score <= config.accept_degrees
-    ]  # fmt: skip
+    ]
 
 
 def _predicted_rotations(p: Poses, h: Hypothesis) -> Array:
@@ -276,9 +279,11 @@ def _reread(
     p: Poses, fault: Fault, r: Reread, config: DiagnosisConfig, sentence: str
 ) -> Hypothesis:
     T = se3.from_rt(r.Rs, p.T[:, :3, 3])
+    reading = reading_of(r.meant)
+    flag = "" if reading is None else f": --reading {reading} (mm for m if the file holds them)"
     return replace(
         simple(p, fault, r.name, T, p.C, config), sentence=sentence,
-        advice=f"Read the rotations as {r.meant}.",
+        advice=f"Read the rotations as {r.meant}{flag}.",
         note=f"the rotations were read as {r.name}.",
     )  # fmt: skip
 

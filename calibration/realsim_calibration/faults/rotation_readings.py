@@ -12,6 +12,7 @@ after which every form of every view votes for its R_X = R_A^T R_Z R_D: the righ
 coincide.
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +22,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.geometry import se3
+from realsim_calibration.inputs.readings import ROTATIONS, PoseReading
 
 AXES = "xyz"
 JUDGES = 12
@@ -100,6 +102,18 @@ def rotation_vectors(R: Array) -> Array:
     w = se3.log_so3(R)
     n = np.maximum(np.linalg.norm(w, axis=-1, keepdims=True), 1e-12)
     return np.stack([w, w * (1 - 2 * np.pi / n)], -2)
+
+
+def reading_of(meant: str) -> PoseReading | None:
+    """Return the reading of a pose file in metres that a convention's name means, None = none."""
+    text = meant.removesuffix(" in degrees")
+    euler = re.match(r"Euler (?:angles \(product )?([xyzXYZ]{3})", text)
+    matrix = text == "matrices column by column"
+    name = f"euler_{euler[1]}" if euler else "matrix_column_major" if matrix else text
+    rotation = name.replace(" ", "_", 1).replace(" ", "")
+    if rotation not in ROTATIONS:
+        return None
+    return PoseReading(rotation=rotation, angle_unit="rad" if text == meant else "deg")
 
 
 def _euler(name: str, order: str, slots: tuple[int, int, int]) -> Convention:
