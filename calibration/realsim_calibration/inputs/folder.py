@@ -233,8 +233,8 @@ def _warnings(
     if same_images:
         groups = "; ".join(", ".join(g) for g in same_images[:6])
         said.append(
-            f"{_count(len(same_images), 'image')} there more than once, byte by byte ({groups}): at "
-            "least one of each has the pose of another. Delete the copies with their poses."
+            f"{_count(len(same_images), 'image')} there more than once, byte by byte ({groups}): "
+            "at least one of each has the pose of another. Delete the copies with their poses."
         )
     if same_poses:
         groups = "; ".join(", ".join(g) for g in same_poses[:6])

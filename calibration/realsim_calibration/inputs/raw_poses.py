@@ -298,13 +298,12 @@ def _angle_units(
     degrees = np.mean(size > 2 * FULL_TURN) >= 0.5
     if np.mean(size > limits.most_deg) > 1 - limits.share:
         return (), f"Not angles: most rows hold numbers beyond {limits.most_deg:g}."
-    if said.angle_unit == "rad" and degrees:
-        return ("rad",), (
+    if said.angle_unit is not None:
+        why = (
             f"The names state rad, and the largest angle is {largest:.4g}, beyond two turns. If "
             f"these are degrees, give --reading, such as {replace(reading, angle_unit='deg')}."
         )
-    if said.angle_unit is not None:
-        return (said.angle_unit,), ""
+        return (said.angle_unit,), why if said.angle_unit == "rad" and degrees else ""
     if limits.tiny_rad <= largest <= FULL_TURN * (1 + 1e-3):
         return ("rad",), f"The largest angle is {largest:.4g}, at most a turn: radians."
     if degrees:
