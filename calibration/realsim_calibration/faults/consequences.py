@@ -49,9 +49,11 @@ def examine(
 
 
 def told(found: Diagnosis) -> str:
-    """Return a diagnosis as a paragraph: what, what to do, the figures."""
+    """Return a diagnosis as a paragraph: what, what to do, the figures of what fits better."""
+    given = found.evidence[:1]
+    better = [e for e in found.evidence[1:SHOWN] if e.score < given[0].score]
     rows = "; ".join(
-        f"{e.hypothesis}: {e.view_deg:.2f} deg, {e.view_mm:.1f} mm" for e in found.evidence[:SHOWN]
+        f"{e.hypothesis}: {e.view_deg:.2f} deg, {e.view_mm:.1f} mm" for e in (*given, *better)
     )
     tried = f"Misfit of the views: {rows}." if rows else ""
     return " ".join(part for part in (found.sentence, found.advice, tried) if part)
@@ -74,10 +76,14 @@ def check_of(found: Diagnosis | None, indices: Sequence[int]) -> Check:
             "Lengths differ: measure the target's squares, and check the camera's focal length "
             "and that the poses are the controller's."
         )
+    # Single views are dropped, whatever could have mended them.
+    n = len(found.views)
+    left = f"{n} view{'s were' if n != 1 else ' was'} left out."
+    done = left if found.fault in SINGLE_VIEWS else found.note
     return Check(
         name="conventions",
         verdict="good" if good else "warn",
-        sentence=" ".join(part for part in (found.sentence, found.note) if part),
+        sentence=" ".join(part for part in (found.sentence, done) if part),
         advice=advice,
         value=found.evidence[0].rotation_mismatch_deg if found.evidence else float("nan"),
         unit="deg",

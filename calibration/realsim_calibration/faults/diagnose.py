@@ -429,14 +429,14 @@ def _proof(entries: list[tuple[ReadingFit, Array, bool]], config: DiagnosisConfi
     elif not decisive:
         text += "That is not decisive: say how the poses are written. "
     twin = "a fixed camera" if best.mode == "eye_in_hand" else "a camera in the hand"
-    text += (
-        f"The same poses inverted would fit {twin} exactly as well; the size of the frames "
-        f"{'agrees with' if natural else 'speaks against'} this place of the camera"
-        f"{'.' if natural else ': say where it sits.'}"
-    )
+    if not natural:
+        text += (
+            f"The same poses inverted would fit {twin} exactly as well; the size of the frames "
+            "speaks against this place of the camera: say where it sits."
+        )
     return ReadingProof(
         fits=tuple(entry[0] for entry in entries), best=best.name, best_mode=best.mode,
         equivalent=tuple(f"{s[0].name} ({s[0].mode})" for s in same),
         runner_up=f"{runner.name} ({runner.mode})" if runner else "", ratio=float(ratio),
-        decisive=decisive, mode_sure=natural, sentence=text,
+        decisive=decisive, mode_sure=natural, sentence=text.strip(),
     )  # fmt: skip

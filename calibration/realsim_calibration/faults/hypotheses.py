@@ -224,7 +224,7 @@ def reread_rotations(p: Poses, config: DiagnosisConfig, *, thorough: bool) -> li
     readings = every_reading(R) if thorough else reread(R, t, D, config.readings)
     found = [
         _reread(p, "rotation_reading", r, config,
-                f"They agree when what was read as {r.read_as} is read as {r.meant}.")
+                f"Hand and camera agree when what was read as {r.read_as} is read as {r.meant}.")
         for r in readings
     ]  # fmt: skip
     hand, cam = (float(np.sqrt(np.mean(np.sum(m.turns**2, -1)))) for m in motions(p.T, p.C))
@@ -325,7 +325,7 @@ def paired_otherwise(p: Poses, config: DiagnosisConfig) -> Hypothesis | None:
         C=p.C[found.rows[:, 1]], rows=found.rows, sentence=sentence, views=views,
         advice="Pair by file name or time stamp, never by position in a list: a failed detection "
         "moves every later image." if fault == "shifted_pairing" else
-        "Check which image belongs to which pose; leave out the views named.",
+        "Check which image belongs to which pose, and calibrate again.",
         note=f"{kept} of {n} images were paired anew with the poses that they fit.",
     )  # fmt: skip
 
