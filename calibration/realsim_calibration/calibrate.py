@@ -128,8 +128,8 @@ def calibrate(
             )
         raise
     if lens is not None:  # no camera was given, so nothing is said of one
-        alone, fitted = (float(np.sqrt(c.fx * c.fy)) for c in (camera, report.intrinsics))
-        own = own_lens_check(alone, fitted, hand_eye.checks)
+        both = (lens.covariance + report.intrinsics_covariance)[2:4, 2:4]
+        own = own_lens_check(camera, report.intrinsics, both, hand_eye.checks)
         checks = tuple(own if c.name == "given camera" else c for c in report.checks)
         report = replace(report, checks=checks)
     return Calibration(hand_eye=report, lens=lens)

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from realsim.arrays import Array
-from realsim.records import ArmErrorMap, Check
+from realsim.records import ArmErrorMap, CameraIntrinsics, Check
 from realsim_calibration.faults.hypotheses import option_of, size_name
 from realsim_calibration.results import HandEyeReport
 
@@ -263,22 +263,34 @@ def given_camera_check(f_given: float, f_fitted: float, config: CheckConfig) -> 
     )  # fmt: skip
 
 
-def own_lens_check(f_alone: float, f_fitted: float, config: CheckConfig) -> Check:
-    """Return the check of a lens from the views alone against the one that the poses agree with."""
+def own_lens_check(
+    alone: CameraIntrinsics, fitted: CameraIntrinsics, covariance: Array, config: CheckConfig
+) -> Check:
+    """Return the check of a lens from the views alone against the one that the poses agree with.
+
+    `covariance` (2, 2) is that of the difference of the principal points, as if they were apart.
+    """
+    f_alone, f_fitted = (float(np.sqrt(c.fx * c.fy)) for c in (alone, fitted))
+    step = np.array([fitted.cx - alone.cx, fitted.cy - alone.cy])
+    sigmas = float(np.sqrt(step @ np.linalg.pinv(covariance) @ step))
+    px = float(np.linalg.norm(step))
     return _focal_check(
         f_alone, f_fitted, config, "focal length with poses",
         "with the robot's poses the views show a focal length of {:.1f} px, without them {:.1f} px "
-        "({:+.1f} %).",
-        "Add views at other distances and tilts: these hardly tell focal length from distance. Was "
-        "the focus changed between them?",
+        f"({{:+.1f}} %). The principal points lie {px:.1f} px apart, {sigmas:.1f} combined sigma, "
+        "of which a tilt of the camera and the tangential distortion take up a part.",
+        "Add views at other distances and tilts: these hardly tell focal length and principal "
+        "point from the camera's place. Was the focus changed between them?",
+        px / f_alone,
     )  # fmt: skip
 
 
 def _focal_check(
-    f_before: float, f_fitted: float, config: CheckConfig, name: str, sentence: str, advice: str
-) -> Check:
+    f_before: float, f_fitted: float, config: CheckConfig, name: str, sentence: str, advice: str,
+    moved: float = 0.0,
+) -> Check:  # fmt: skip
     off = f_fitted / f_before - 1
-    verdict = _verdict(abs(off), config.focal)
+    verdict = _verdict(max(abs(off), moved), config.focal)
     return Check(
         name=name,
         verdict=verdict,

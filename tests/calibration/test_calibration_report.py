@@ -206,5 +206,6 @@ def test_a_camera_beside_the_robot_with_lens_and_depth(
                                      depth_report=depth)  # fmt: skip
     shown = " ".join(outline(paths[0]).words)
     assert "camera in the base for this arm [mm]" in shown and "lens alone" in shown
+    assert "exported, with X_alone" in shown and lens.checks[0].sentence in shown
     assert {"lens_alone.png", "depth_bias.png"} <= {p.name for p in paths}
     assert "3 of the views <lie>" in shown

@@ -7,6 +7,7 @@ from realsim.errors import DegenerateError, InputError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim_calibration import JointConfig
+from realsim_calibration.checks import CheckConfig, own_lens_check
 from realsim_calibration.detect.drawings import DRAWN
 from realsim_calibration.fit.board_pose import estimate_board_pose
 from realsim_calibration.hand_eye import (
@@ -115,6 +116,8 @@ def test_a_swapped_pair_is_dropped_and_named(simulate):
     e = error_of(h, sim)
     assert np.degrees(np.linalg.norm(e[:3])) < 0.2 and np.linalg.norm(e[3:]) < 1.5e-3
     checks = {c.name: c for c in h.checks}
+    said = checks["conventions"].sentence
+    assert "2 views were left out" in said and "paired anew" not in said
     assert checks["drawings"].verdict == "warn" and checks["drawings"].views == (5,)
     assert checks["drawings"].sentence.startswith(f"1 of 24 images: {DRAWN}")
 
@@ -202,6 +205,14 @@ def test_a_view_without_tags_and_a_repeated_index_are_handled(simulate):
     assert calibrate(sim, views).rejected[0][0] == 4
     with pytest.raises(InputError, match="same index"):
         calibrate(sim, [*sim.views, sim.views[0]])
+
+
+def test_principal_points_apart_are_told(simulate):
+    lens = simulate(0, views=4).intrinsics0
+    moved = replace(lens, cx=lens.cx + 9.0)
+    check = own_lens_check(lens, moved, 4.0 * np.eye(2), CheckConfig())
+    assert "9.0 px apart, 4.5 combined sigma" in check.sentence and check.verdict == "warn"
+    assert own_lens_check(lens, lens, np.eye(2), CheckConfig()).verdict == "good"
 
 
 def test_board_pose_keeps_the_twin_apart(simulate):

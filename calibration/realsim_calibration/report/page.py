@@ -226,7 +226,12 @@ def _lens_section(
     page: _Page, report: HandEyeReport, intrinsics_report: IntrinsicsReport | None
 ) -> None:
     """Show the lens as calibrated with the hand-eye, and alone where that was done."""
-    page.section("The lens")
+    page.section(
+        "The lens",
+        "Files for other programs (camera_info.yaml, opencv.yml, calibration.npz) carry the lens "
+        "of the table's last column, which belongs to X_alone. calibration.json has it as "
+        "intrinsics_alone, and the one with the hand-eye, which belongs to X, as intrinsics.",
+    )
     caption = (
         "Left: how far the lens moves the picture from an ideal camera's. Right: how well a "
         "pixel's direction is known, the turn that a pose would absorb taken out; dashed: the "
@@ -251,6 +256,9 @@ def _lens_section(
             lambda: model_plots.plot_lens(r.intrinsics, r.open_covariance, _points(r.used)),
             f"The lens alone, {r.model}. {caption}",
         )
+    header.append("exported, with X_alone")
+    i = report.intrinsics_alone
+    columns.append([f"{v:.6g}" for v in (i.fx, i.fy, i.cx, i.cy, *i.distortion)])
     page.table(header, [[name, *[c[k] for c in columns]] for k, name in enumerate(TERM_NAMES)])
     if intrinsics_report is not None:
         page.table(
