@@ -184,6 +184,7 @@ def test_a_board_file_that_does_not_match_is_told_apart():
         ("tags", "12 markers of DICT_APRILTAG_36h11, ids 0 to 11"),
         ("chessboard", "a chessboard with 7x6 inner corners"),
         ("asymmetric", "an asymmetric grid of 28 dots"),
+        ("charuco old", "lie as on charuco:7x6,legacy"),
     ],
 )
 def test_what_is_visible_names_what_was_printed(name, words):

@@ -73,7 +73,7 @@ def find_charuco(
     config = config or CharucoConfig()
     gray = gray_image(rgb)
     ids, quads = decode_markers(gray, board.dictionary)
-    good, quads, rejected = _on_board(ids, quads, board, config)
+    good, quads, rejected = markers_on_board(ids, quads, board, config)
     ids, quads = ids[good], quads[good]
     if not len(ids):
         return _nothing(gray, rejected)
@@ -132,7 +132,7 @@ def _told(faults: dict[int, str]) -> list[str]:
     return told
 
 
-def _on_board(
+def markers_on_board(
     ids: Int64, quads: Array, board: CharucoBoard, config: CharucoConfig
 ) -> tuple[Mask, Array, list[str]]:
     """Return which markers (n,) lie on the board, all corners as it counts them, and faults."""

@@ -1,8 +1,12 @@
 """What does a picture show, whatever the board file says? For messages where nothing was found."""
 
+from itertools import product
+
 import numpy as np
 
 from realsim.arrays import Array, Int64, UInt8
+from realsim.records import CharucoBoard
+from realsim_calibration.detect.charuco import CharucoConfig, markers_on_board
 from realsim_calibration.detect.chessboard import largest_chessboard
 from realsim_calibration.detect.ellipses import DotConfig, find_blobs
 from realsim_calibration.detect.images import gray_image
@@ -45,6 +49,12 @@ SIZE_SPREAD = 0.35
 DARK = 40
 """A picture is too dark where 99 % of it is below this level of 255: a tenth of its range and
 less is left to tell black from white."""
+
+
+USUAL_MARKER = 0.7
+"""Edge of a ChArUco board's markers, in squares: 0.6 to 0.85 are in use."""
+LEAST_SQUARES, MOST_SQUARES = 3, 40
+"""Squares along the edges of ChArUco boards."""
 
 
 def dark_reason(image: UInt8) -> str:
@@ -116,22 +126,38 @@ def _chessboard(gray: UInt8, marker_px: float) -> Array | None:
 
 def _markers(gray: UInt8) -> tuple[str, float]:
     """Return the markers of the dictionary that explains most, and their median side [px]."""
-    best: tuple[int, str, Int64, float] | None = None
+    best: tuple[int, str, Int64, Array] | None = None
     for name in LARGEST:
         ids, quads = decode_markers(gray, name)
         different = len(np.unique(ids))
         if different < MIN_MARKERS.get(name, USUAL_MIN_MARKERS):
             continue
         if best is None or different > best[0]:
-            side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=-1)
-            best = (different, name, ids, float(np.median(side)))
+            best = (different, name, ids, quads)
     if best is None:
         return "", 0.0
-    different, name, ids, side = best
+    different, name, ids, quads = best
+    side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=-1)
     double = len(ids) - different
-    twice = f" ({double} of them more than once: two boards?)" if double else ""
+    more = f" ({double} of them more than once: two boards?)" if double else _layout(*best[1:])
     name = _smallest(name, int(ids.max()))
-    return f"{different} markers of {name}, ids {ids.min()} to {ids.max()}{twice}", side
+    text = f"{different} markers of {name}, ids {ids.min()} to {ids.max()}{more}"
+    return text, float(np.median(side))
+
+
+def _layout(dictionary: str, ids: Int64, quads: Array) -> str:
+    """Return the ChArUco board whose last markers these may be, as a clause; empty where none."""
+    config, count = CharucoConfig(), int(ids.max()) + 1
+    squares = range(LEAST_SQUARES, MOST_SQUARES)
+    for rows, columns, legacy in product(squares, squares, (False, True)):
+        if rows * columns // 2 != count:
+            continue
+        board = CharucoBoard(rows=rows, columns=columns, square_m=1.0, marker_m=USUAL_MARKER,
+                             dictionary=dictionary, legacy=legacy)  # fmt: skip
+        lie = markers_on_board(ids, quads, board, config)[0]
+        if lie.sum() >= config.agreeing_share * len(ids):
+            return f", which lie as on charuco:{columns}x{rows}{',legacy' * legacy}"
+    return ""
 
 
 def _smallest(name: str, most: int) -> str:
