@@ -153,6 +153,8 @@ def test_the_covariance_of_all_holds_each_and_the_pairs() -> None:
     e = se3.log(se3.invert(truth) @ pair.T_a_b)
     assert e @ np.linalg.solve(pair.covariance, e) < 22.5
     assert pair.together == VIEWS
+    # A view of a few tenths of a pixel is good, however good the others are.
+    assert report.disagreeing(0.5, 0.0) and min(v.unseen_px for v in report.disagreeing(0.5)) > 0.3
 
 
 def test_the_step_is_that_of_all_unknowns_solved_at_once() -> None:

@@ -128,13 +128,16 @@ class CamerasReport:
         """The views that were not used."""
         return tuple(v for v in self.views if not v.used)
 
-    def disagreeing(self, ratio: float = 3.0) -> tuple[SightingReport, ...]:
-        """Return the used views predicted worse than `ratio` times their camera's median."""
+    def disagreeing(self, ratio: float = 3.0, floor_px: float = 0.3) -> tuple[SightingReport, ...]:
+        """Return the used views predicted worse than `ratio` times their camera's median.
+
+        Below `floor_px` a view is good, whatever the others do.
+        """
         odd: list[SightingReport] = []
         for camera in self.rig.cameras:
             own = [v for v in self.views if v.used and v.camera == camera.name]
             usual = float(np.median([v.unseen_px for v in own]))
-            odd += [v for v in own if v.unseen_px > ratio * usual]
+            odd += [v for v in own if v.unseen_px > max(ratio * usual, floor_px)]
         return tuple(sorted(odd, key=lambda v: -v.unseen_px))
 
 
