@@ -96,6 +96,7 @@ def _views(r: HandEyeReport, c: CheckConfig) -> Check:
     share = _verdict(1 - used / given, c.rejected_share)
     worst: Verdict = max(verdict, share, key=["good", "unknown", "warn", "bad"].index)
     gone = [v for v in r.views if not v.used]
+    empty = sum(not len(v.uv) for v in gone)
     names = "; dropped: " + ", ".join(v.label for v in gone[:6]) if gone else ""
     more = f" and {len(gone) - 6} more" if len(gone) > 6 else ""
     return Check(
@@ -103,7 +104,8 @@ def _views(r: HandEyeReport, c: CheckConfig) -> Check:
         verdict=worst,
         sentence=f"{used} of {given} views were used{names}{more}.",
         advice=_advice(worst, "Take 24 views or more in which the whole target is sharp. The table "
-                       "of views says why the others were dropped."),
+                       "of views says why the others were dropped."
+                       + f" Images without it: {empty}; keep one board a folder." * (empty > 0)),
         value=used,
         views=tuple(v.index for v in gone),
     )  # fmt: skip
@@ -132,8 +134,7 @@ def _sigma(r: HandEyeReport, c: CheckConfig) -> Check:
         verdict=worst,
         sentence=f"for this arm as it moves here the camera's place is known to {r.here_mm:.2f} mm "
         f"and {r.here_deg:.3f} deg (1 sigma, worst axis).",
-        advice=_advice(worst, "Add views: other tilts, other rolls, other distances; the table of "
-                       "further views names the ones that help most."),
+        advice=_advice(worst, "Add views: other tilts, other rolls, other distances."),
         value=r.here_mm,
         unit="mm",
     )  # fmt: skip
@@ -242,11 +243,16 @@ def _scale(r: HandEyeReport, c: CheckConfig) -> Check:
 
 
 def _flatness(r: HandEyeReport, c: CheckConfig) -> Check:
+    if not np.any(r.board.sd[2:]):
+        return Check(
+            name="board flatness", verdict="unknown", sentence="the board was taken to be flat."
+        )
     verdict = _verdict(r.board.warp_mm, c.warp_mm)
     return Check(
         name="board flatness",
         verdict=verdict,
-        sentence=f"the board bends by up to {r.board.warp_mm:.2f} mm; the fit allows for it.",
+        sentence=f"with the poses the board bends by up to {r.board.warp_mm:.2f} mm; the fit "
+        "allows for it.",
         advice=_advice(verdict, "Glue the print to glass or aluminium."),
         value=r.board.warp_mm,
         unit="mm",

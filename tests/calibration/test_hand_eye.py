@@ -202,7 +202,10 @@ def test_a_view_without_tags_and_a_repeated_index_are_handled(simulate):
         detection=sim.views[4].detection.__class__(point_ids=[], uv=[], image_size=(1280, 720)),
     )
     views = [*sim.views[:4], blind, *sim.views[5:]]
-    assert calibrate(sim, views).rejected[0][0] == 4
+    h = calibrate(sim, views)
+    assert h.rejected[0][0] == 4
+    advice = next(c.advice for c in h.checks if c.name == "views")
+    assert "Images without it: 1; keep one board a folder." in advice
     with pytest.raises(InputError, match="same index"):
         calibrate(sim, [*sim.views, sim.views[0]])
 

@@ -120,6 +120,9 @@ def test_perfect_corners_give_back_lens_and_print():
     assert report.board.aspect == pytest.approx(shape[0], abs=1e-6)
     assert np.allclose(report.board.warp, shape[1:], atol=1e-6)
     assert report.rms_px < 1e-4
+    short = calibrate_intrinsics(see(3, noise=0, shape=(-0.006, 0, 0, 0)), BOARD, config=FOUR)
+    said = next(c.sentence for c in short.checks if c.name == "board shape")
+    assert "0.60% (+- 0.00%) too short" in said
 
 
 def test_the_order_of_the_views_does_not_matter():

@@ -243,8 +243,9 @@ def _board(report: IntrinsicsReport, limits: CheckLimits) -> Check:
     return Check(
         name="board shape",
         verdict="warn" if warped or stretched else "good",
-        sentence=f"The board bends by {b.warp_mm:.2f} mm and is {b.aspect:+.2%} (+- {b.sd[1]:.2%}) "
-        "too tall for its width; both are part of the fit.",
+        sentence=f"By the images alone the board bends by {b.warp_mm:.2f} mm and is "
+        f"{abs(b.aspect):.2%} (+- {b.sd[1]:.2%}) too {'tall' if b.aspect > 0 else 'short'} for its "
+        "width; both are part of the fit.",
         advice=advice,
         value=b.warp_mm,
         unit="mm",
