@@ -169,7 +169,9 @@ def test_verdict_and_table_count_the_checks_of_the_lens(report: HandEyeReport) -
 def test_checks_name_views_by_their_files(report: HandEyeReport) -> None:
     row = next(r for r in check_rows(report) if r[1] == "dropped views")
     assert "view_007.png, view_015.png" in row[3] and row[4].startswith("Look at")
-    assert all(len(r) == 2 for r in summary_rows(report))
+    rows = summary_rows(report)
+    assert all(len(r) == 2 for r in rows)
+    assert "ros2_static_transform.sh" in dict(rows)["camera pose for ROS and URDF"]
 
 
 # --- reports at the edge ------------------------------------------------------------------------

@@ -142,8 +142,13 @@ def pose_rows(report: HandEyeReport) -> list[list[str]]:
             ]
         )
     if report.plain_scores:
-        held = ", ".join(f"{name} {amount(px, 2)}" for name, px in report.plain_scores)
-        rows.append([f"X_alone is '{report.plain_name}'; unseen views without a map [px]", held])
+        held = ", ".join(
+            f"{name} {amount(px, 2)}{' (taken)' * (name == report.plain_name)}"
+            for name, px in report.plain_scores
+        )
+        rows.append(["candidates for X_alone: unseen views without a map [px]", held])
+    files = "X_alone, in exports/: ros2_static_transform.sh, camera.urdf"
+    rows.append(["camera pose for ROS and URDF", files])
     return rows
 
 

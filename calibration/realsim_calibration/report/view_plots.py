@@ -220,8 +220,7 @@ def _image_coverage(figure: Any, ax: Any, report: HandEyeReport) -> None:
     shown = np.ma.masked_equal(counts.T, 0)
     mesh = ax.pcolormesh(x, y, shown, cmap="YlGnBu", vmin=0)
     style.color_bar(figure, mesh, ax, "points per cell")
-    covered = 100 * float(np.mean(counts > 0))
-    ax.set_title(f"Image: {covered:.0f} % of the cells hold points")
+    ax.set_title("Image: where points were")
 
 
 def _directions(figure: Any, ax: Any, report: HandEyeReport) -> None:
