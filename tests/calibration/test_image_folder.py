@@ -32,7 +32,7 @@ def save(path, array):
 
 
 def make_images(folder, names):
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     for k, name in enumerate(names):
         save(folder / name, pixels(k))
     return folder
@@ -219,6 +219,49 @@ def test_folders_without_usable_images_say_what_is_there(tmp_path):
     save(tmp_path / "colour" / "0.jpg", pixels(0))
     with pytest.raises(InputError, match="two images of one name"):
         list_images(tmp_path / "colour")
+
+
+def test_images_are_looked_for_two_folders_deep(tmp_path):
+    with pytest.raises(InputError, match=r"holds no images .*Give the folder of the pictures"):
+        list_images(tmp_path)
+    for place in ("left/rgb", "right/rgb"):
+        make_images(tmp_path / place, ["0.png"])
+    with pytest.raises(InputError, match="images in left/rgb, right/rgb: give one of them"):
+        list_images(tmp_path)
+
+
+def test_all_broken_images_are_named_at_once_with_what_to_do(tmp_path):
+    names = [f"{k}.png" for k in range(14)]
+    make_images(tmp_path, names)
+    np.save(tmp_path / "poses.npy", np.array([np.eye(4)] * 14))
+    broken = names[2:12]
+    for name in broken:
+        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:60])
+    (tmp_path / "2.png").write_text("no image")
+    with pytest.raises(InputError, match="10 of 14 images cannot be used") as e:
+        read_image_folder(tmp_path, tmp_path)
+    said = str(e.value)
+    assert all(f"{tmp_path / name} is " in said for name in broken[:8])
+    assert "... and 2 more" in said and said.count("Copy it again") == 1
+    # the advice works: the images and their rows are taken out
+    for name in broken:
+        (tmp_path / name).unlink()
+    np.save(tmp_path / "poses.npy", np.delete(np.load(tmp_path / "poses.npy"), range(2, 12), 0))
+    assert len(read_image_folder(tmp_path, tmp_path)) == 4
+
+
+def test_results_are_no_pose_of_a_set_with_one_folder_a_pose(tmp_path):
+    for k in range(3):
+        make_images(tmp_path / f"pose_{k}", ["image.png"])
+        write_rows(tmp_path / f"pose_{k}/pose.txt", rows(1))
+    make_images(tmp_path / "calibration", ["views.png", "lens.png"])
+    (tmp_path / "calibration/calibrated_of.json").write_text("{}")
+    found = read_image_folder(tmp_path, tmp_path)
+    assert len(found) == 3 and not found.unpaired_images
+    for k in (0, 2):
+        (tmp_path / f"pose_{k}/image.png").write_text("no image")
+    with pytest.raises(InputError, match="2 of 3 images cannot be used"):
+        read_image_folder(tmp_path, tmp_path)
 
 
 def test_board_poses_of_other_count_are_refused(tmp_path):

@@ -21,6 +21,14 @@ MAX_PIXELS = 250_000_000
 """Pixels of one image: beyond it the file is a decompression bomb."""
 MAX_BYTES = 512 * 2**20
 """Size of one image file."""
+SHOWN = 8
+"""Images that cannot be used, and folders with images, that a message lists."""
+AGAIN = (
+    " Copy it again from where it came, or delete it together with its pose: the file or the line "
+    "that belongs to it, or in an array its row (numpy.delete(poses, k, axis=0) for image k, "
+    "counted from 0). Where the poses name their images, delete the image alone."
+)
+"""What to do about a file that was not copied well."""
 TAIL_BYTES = 512
 """A file whose last so many bytes are zero was not copied completely."""
 _KIND_WORDS = re.compile(
@@ -50,17 +58,14 @@ def list_images(folder: Path) -> ImageListing:
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder; a folder of images was expected there.")
-    files = sorted(
-        (
-            p
-            for p in folder.iterdir()
-            if p.suffix.lower() in IMAGE_ENDINGS and p.is_file() and not p.name.startswith(".")
-        ),
-        key=lambda p: natural_key(p.name),
-    )
+    files = image_files(folder)
     if len(files) > MAX_IMAGES:
         raise InputError(f"{folder} holds {len(files)} images; at most {MAX_IMAGES} are read.")
-    deep = [p for p in files if is_deep(p)]
+    try:
+        deep = [p for p in files if is_deep(p)]
+    except InputError:
+        require_readable(files)
+        raise
     images = [p for p in files if p not in set(deep)]
     if not images:
         raise InputError(_nothing(folder, deep))
@@ -76,6 +81,37 @@ def list_images(folder: Path) -> ImageListing:
     return ImageListing(images=tuple(images), depths=depths, ignored=ignored)
 
 
+def image_files(folder: Path) -> list[Path]:
+    """Return the files of a folder that have the ending of an image, in natural order."""
+    found = [
+        p
+        for p in folder.iterdir()
+        if p.suffix.lower() in IMAGE_ENDINGS and p.is_file() and not p.name.startswith(".")
+    ]
+    return sorted(found, key=lambda p: natural_key(p.name))
+
+
+def require_readable(files: Sequence[Path]) -> None:
+    """Raise one error for all images that cannot be used, if they are several.
+
+    Raises:
+        InputError: names them, says what is wrong with each and what to do.
+    """
+    faults: list[str] = []
+    for path in files:
+        try:
+            if not is_deep(path):
+                load_image(path)
+        except InputError as error:
+            faults.append(str(error))
+    if len(faults) > 1:
+        told = [f.removesuffix(AGAIN) for f in faults]
+        more = [f"... and {len(faults) - SHOWN} more"] * (len(faults) > SHOWN)
+        advice = [AGAIN.strip()] * (told != faults)
+        head = f"{len(faults)} of {len(files)} images cannot be used:"
+        raise InputError("\n".join([head, *told[:SHOWN], *more, *advice]))
+
+
 def _nothing(folder: Path, deep: Sequence[Path]) -> str:
     """Return what to say of a folder without 8-bit images."""
     if deep:
@@ -83,13 +119,18 @@ def _nothing(folder: Path, deep: Sequence[Path]) -> str:
             f"{folder} holds {len(deep)} images of 16 bit and none of 8 bit ({deep[0].name}): "
             "depth cannot be calibrated with. Give the folder of the colour images."
         )
-    below = sorted(
-        d.name
-        for d in folder.iterdir()
-        if d.is_dir() and any(p.suffix.lower() in IMAGE_ENDINGS for p in d.iterdir())
-    )
-    advice = f" There are images in {', '.join(below[:6])}: give that folder." if below else ""
-    return f"{folder} holds no images ({', '.join(IMAGE_ENDINGS)}).{advice}"
+    inside = [p for depth in ("*/*", "*/*/*") for p in folder.glob(depth)]
+    images = [p for p in inside if p.suffix.lower() in IMAGE_ENDINGS]
+    below = sorted({str(p.parent.relative_to(folder)) for p in images})
+    if below:
+        which = "that folder" if len(below) == 1 else "one of them"
+        advice = f"There are images in {', '.join(below[:SHOWN])}: give {which}."
+    else:
+        advice = (
+            "Give the folder of the pictures that the camera took of the board, with the robot's "
+            "poses beside them or in --poses."
+        )
+    return f"{folder} holds no images ({', '.join(IMAGE_ENDINGS)}). {advice}"
 
 
 def _with_depth(
@@ -143,7 +184,7 @@ def _opened(path: Path, action: Callable[[Path, Any], Any]) -> Any:
     size = path.stat().st_size
     if not 0 < size <= MAX_BYTES:
         what = "is empty" if size == 0 else f"has {size / 2**20:.0f} MB"
-        raise InputError(f"{path} {what}; an image was expected. Was it copied completely?")
+        raise InputError(f"{path} {what}; an image was expected.{AGAIN}")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of size, checked below, and of odd metadata
@@ -158,13 +199,11 @@ def _opened(path: Path, action: Callable[[Path, Any], Any]) -> Any:
         raise
     except UnidentifiedImageError as error:
         raise InputError(
-            f"{path} is not an image that can be read ({size} bytes). Copy it again from where it "
-            "came, or delete it together with its pose."
+            f"{path} is not an image that can be read ({size} bytes).{AGAIN}"
         ) from error
     except Exception as error:  # decoders raise nearly anything on damaged files
         raise InputError(
-            f"{path} is damaged or truncated ({size} bytes; {error}). Copy it again from where it "
-            "came, or delete it together with its pose."
+            f"{path} is damaged or truncated ({size} bytes; {error}).{AGAIN}"
         ) from error
 
 
@@ -184,8 +223,7 @@ def load_image(path: Path | str) -> UInt8:
             tail = file.read()
         if tail and not any(tail):  # decoders fill the rest in grey without a word
             raise InputError(
-                f"{path} is truncated: it ends in zeros, so it was not copied completely. Copy it "
-                "again, or delete it together with its pose."
+                f"{path} is truncated: it ends in zeros, so it was not copied completely.{AGAIN}"
             )
     return _opened(path, _pixels)
 

@@ -11,7 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from realsim.errors import InputError
-from realsim_calibration.inputs.image_files import IMAGE_ENDINGS, ImageListing, list_images
+from realsim_calibration.inputs.image_files import (
+    IMAGE_ENDINGS,
+    ImageListing,
+    image_files,
+    list_images,
+    require_readable,
+)
 from realsim_calibration.inputs.pairing import natural_key
 from realsim_calibration.inputs.pose_file import pose_files_in, read_pose_file, read_single_files
 from realsim_calibration.inputs.raw_poses import RawPoses
@@ -20,6 +26,8 @@ IMAGE_FOLDERS = frozenset("images image imgs img rgb color colour photos picture
 """Names of a folder that holds the images of the set that it lies in."""
 POSE_FOLDERS = frozenset("poses pose robot_poses robot tcp tcp_poses ee_poses arm_poses".split())
 """Names of a folder that holds the poses."""
+MADE_OF = "calibrated_of.json"
+"""File that says of which images the results beside it are: they are replaced, and never read."""
 MIN_FOLDERS = 3
 """Folders with one image each that are one folder a pose."""
 
@@ -62,11 +70,16 @@ def pose_folders(folder: Path, key: str | None) -> PoseFolders | None:
         return None
     below = sorted((d for d in folder.iterdir() if d.is_dir()), key=lambda d: natural_key(d.name))
     below = [d for d in below if not d.name.startswith(".") and any(d.iterdir())]
+    below = [d for d in below if not (d / MADE_OF).is_file()]
     with_both = [d for d in below if _has_images(d) and pose_files_in(d)]
     if len(with_both) < MIN_FOLDERS:
         return None
     missing = [d.name for d in below if d not in with_both]
-    listings = [list_images(d) for d in with_both]
+    try:
+        listings = [list_images(d) for d in with_both]
+    except InputError:
+        require_readable([p for d in with_both for p in image_files(d)])
+        raise
     for d, listing in zip(with_both, listings, strict=True):
         if len(listing.images) > 1:
             names = ", ".join(p.name for p in listing.images[:4])

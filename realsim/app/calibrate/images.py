@@ -35,6 +35,7 @@ def find_in_images(
     Images are searched side by side, as many as there are cores: OpenCV and numpy let go of the
     interpreter while they work.
     """
+    from realsim_calibration.inputs.image_files import require_readable
     from realsim_calibration.targets.target_text import format_target
 
     what = f"{format_target(target)} {SEARCH}".encode()
@@ -49,8 +50,10 @@ def find_in_images(
                         write_json(note, _detection_json(seen))
                     found.append(seen)
                     tick(k + 1, len(images))
-            except BaseException:
+            except BaseException as error:
                 pool.shutdown(cancel_futures=True)  # one bad image: the others are not waited for
+                if isinstance(error, InputError):
+                    require_readable(images)
                 raise
     return found
 
