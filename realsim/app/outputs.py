@@ -7,6 +7,7 @@ such an option cannot forget it. A test holds every output option to these types
 """
 
 import os
+import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -124,7 +125,7 @@ def require_no_data(path: Path, name: str, besides: Sequence[str] = ()) -> None:
 
 
 def require_no_links(path: Path, name: str, files: Sequence[str] | None = None) -> None:
-    """Raise where a folder has links that lead out of it: results would be written there.
+    """Raise where a folder is a link or has links that lead out of it: results would go there.
 
     Args:
         path: the folder, there or not.
@@ -134,6 +135,11 @@ def require_no_links(path: Path, name: str, files: Sequence[str] | None = None) 
     Raises:
         InputError: there is such a link.
     """
+    if path.is_symlink():
+        raise InputError(
+            f"{name} '{path}' is a link to {path.resolve()}; nothing is written through links. "
+            "Give that name, or another one."
+        )
     if not path.is_dir():
         return
     real = path.resolve()
@@ -210,26 +216,42 @@ def require_free_file(
 
 
 def require_free_folder(
-    path: Path, name: str, files: Sequence[str], own: tuple[str, Sequence[str]]
+    path: Path, name: str, files: Sequence[str] | None, own: tuple[str, Sequence[str]]
 ) -> None:
     """Raise unless a folder can be filled without loss of anything but what was written there.
 
+    Args:
+        path: the folder, there or not.
+        name: of the option, for messages.
+        files: names that are written there; None = any, so the folder has to be empty or own.
+        own: see `OutputFolder`.
+
     Raises:
-        InputError: a file, a session, a folder of a session's data, or it holds files of the same
-            names that another program or user made.
+        InputError: a file, a link, a session, a folder of a session's data, one that cannot be
+            written, or it holds files of the same names that another program or user made.
     """
     if os.path.lexists(path) and not path.is_dir():
         raise InputError(f"{name} '{path}' is a file; give a folder.")
     if _is_session(path):
         raise _is_data(path, name, path)
     require_no_data(path, name)
-    there = [path / file for file in files if os.path.lexists(path / file)]
+    names = sorted(path.glob("[!.]*")) if files is None else [path / file for file in files]
+    there = [p for p in names if os.path.lexists(p)]
     marked = [file for file in path.glob(own[0]) if file.is_file()] if own[0] else []
     if there and not (marked and all(has_texts(file, own[1]) for file in marked)):
         raise InputError(
             f"{name} '{path}': {there[0]} is there, made by something else or of something else; "
-            "it is not replaced. Give another folder, or delete it first."
+            "it is not replaced. "
+            + ("Give another folder, or delete it first." if files else "Give a new or empty one.")
         )
+    parent = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
+    try:
+        tempfile.TemporaryDirectory(dir=parent).cleanup()
+    except OSError as error:
+        raise InputError(
+            f"{name} '{path}': nothing can be written in {parent} ({error.strerror}). Give a "
+            "folder that you may write."
+        ) from error
 
 
 def has_texts(path: Path, texts: Iterable[str]) -> bool:

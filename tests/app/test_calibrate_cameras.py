@@ -235,19 +235,30 @@ def test_a_board_that_is_said_to_be_elsewhere_is_named(
     photos: Path, tmp_path: Path, cameras: str, option: str, file: str, words: str, stated: bool
 ) -> None:
     """Whether the poses' reading is stated or must be proven, and whatever lens cannot be told."""
-    source = photos
+    poses = photos / "arm.csv"
     if not stated:
-        source = shutil.copytree(photos, tmp_path / "lab")
+        poses = tmp_path / "arm.csv"
         rows = ["name,x,y,z,rx,ry,rz"]
         for k, T in enumerate(hands(np.random.default_rng(3))):
             numbers = [*T[:3, 3], *se3.log_so3(T[:3, :3])]
             rows.append(f"{k:03d}.png," + ",".join(f"{v:.9f}" for v in numbers))
-        (source / "arm.csv").write_text("\n".join(rows) + "\n")
+        poses.write_text("\n".join(rows) + "\n")
     board = [option, str(photos.parent / f"{file}.json")]
     out = str(photos.parent / "refused")  # the points found are noted there
     said = refusal(
         CliRunner().invoke(
-            commands, ["calibrate", str(source), "--cameras", cameras, *board, "--out", out]
+            commands,
+            [
+                "calibrate",
+                str(photos),
+                "--cameras",
+                cameras,
+                *board,
+                "--out",
+                out,
+                "--poses",
+                str(poses),
+            ],
         )
     )
     assert "contradict the robot" in said and words in said

@@ -8,7 +8,7 @@ import pytest
 
 from pictured_folders import X, Z, pictures, save_pictures
 from pictured_targets import CAMERA, TARGETS, truth
-from realsim.app.calibrate.folder import FolderRequest, read_views
+from realsim.app.calibrate.folder import FolderRequest, read_views, require_free_results
 from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim.geometry import se3
@@ -93,6 +93,20 @@ def test_a_fixed_camera_is_told_by_its_flag(lab):
     with pytest.raises(InputError, match=r"inverted") as e:
         calibrate(found.views, found.target)
     assert "--eye-to-hand" in str(e.value) and "--reading" in str(e.value)
+
+
+def test_a_folder_is_its_own_from_the_first_note_on(lab):
+    """A run that ends after the search goes on there; one of other images does not."""
+    (lab.parent / "out/calibrated_of.json").unlink()
+    (lab.parent / "camera.json").write_text("{}")
+    with pytest.raises(InputError, match=r"camera\.json"):
+        read(lab, intrinsics=lab.parent / "camera.json")
+    require_free_results(lab.parent / "out", lab)
+    (lab.parent / "more").mkdir()
+    with pytest.raises(
+        InputError, match=r"made by something else or of something else.*new or empty"
+    ):
+        require_free_results(lab.parent / "out", lab.parent / "more")
 
 
 def replace_pictures(lab, changed):

@@ -84,6 +84,10 @@ def test_nothing_goes_into_data_or_through_a_link(name: str, session: Path, tmp_
     via.symlink_to(session / "rgb")
     with pytest.raises(InputError, match="part of the session"):
         convert(name, via)
+    straight = tmp_path / "straight"
+    straight.symlink_to(outside)
+    with pytest.raises(InputError, match=f"straight' is a link to {outside}; nothing is written"):
+        convert(name, straight)
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -109,6 +113,8 @@ def test_a_session_is_no_folder_for_results(name: str, session: Path, tmp_path: 
         with pytest.raises(InputError, match=r"part of the session|is a file"):
             convert(name, path)
     assert convert(name, session / "reports/more") and convert(name, tmp_path)
+    with pytest.raises(InputError, match="'/proc/x/y': nothing can be written in /proc "):
+        convert(name, Path("/proc/x/y"))
     for file in OUTPUTS[name][1].type.files:
         (tmp_path / file).write_text("mine")
         with pytest.raises(InputError, match="not replaced"):
@@ -144,6 +150,30 @@ def test_a_calibration_of_other_images_is_not_replaced(tmp_path: Path) -> None:
     note = json.dumps({"images": str(tmp_path.resolve())})
     (done.parent / "calibrated_of.json").write_text(note)
     assert "made by something else" not in str(CliRunner().invoke(commands, call).exception)
+
+
+@pytest.mark.parametrize("cameras", [[], ["--cameras", "wrist=hand"]], ids=["one", "several"])
+@pytest.mark.parametrize(
+    ("out", "said"),
+    [
+        ("lab", "is the data set itself"),
+        (".", "lab is there, made by something else"),
+        ("lab/wrist", "00.png is there, made by something else"),
+        ("other", "camera_place.png is there, made by something else"),
+        ("/proc/x", "--out '/proc/x': nothing can be written in /proc"),
+    ],
+)
+def test_a_calibration_goes_into_a_folder_of_its_own(
+    tmp_path: Path, out: str, said: str, cameras: list[str]
+) -> None:
+    for file in ("lab/board.png", "lab/wrist/00.png", "lab/poses.json", "other/camera_place.png"):
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_text("not to be lost")
+    before = contents(tmp_path)
+    words = ["calibrate", tmp_path / "lab", "--board", "tag:7,size=80mm", "--out", tmp_path / out]
+    done = CliRunner().invoke(commands, [*map(str, words), *cameras])
+    assert isinstance(done.exception, InputError) and said in str(done.exception)
+    assert contents(tmp_path) == before
 
 
 def test_a_session_without_its_header_is_told_and_how_it_is_mended(

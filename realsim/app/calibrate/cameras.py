@@ -23,11 +23,10 @@ from realsim.app.calibrate.camera_frames import (
     with_intrinsics,
 )
 from realsim.app.calibrate.fixed import place_fixed
-from realsim.app.calibrate.folder import MADE_OF, made_of
+from realsim.app.calibrate.folder import MADE_OF, made_of, require_free_results
 from realsim.app.calibrate.images import find_in_images, why_not_found
 from realsim.app.calibrate.show import show_checks
 from realsim.app.console import Console
-from realsim.app.outputs import require_free_folder
 from realsim.app.stages import BOARD_VIEWS
 from realsim.errors import InputError, RealsimError
 from realsim.store import SessionStore
@@ -81,12 +80,13 @@ def run_cameras(source: Path, console: Console, options: dict[str, Any]) -> bool
     if not source.is_dir():
         raise InputError(f"'{source}' is not a folder; one with a folder per camera is expected.")
     out: Path = options["out"]
-    require_free_folder(out, "--out", (CAMERAS_FILE, PAGE), (MADE_OF, (made_of(source),)))
+    require_free_results(out, source)
     boards = boards_of(options)
     poses = pose_file_of(source, options["poses"], [c.name for c in cameras])
     raw = None if poses is None else read_pose_file(poses, key=options["key"] or None)
     frames = frames_of(source, cameras, raw)
     cameras = with_intrinsics(cameras, options["intrinsics"])
+    write_text(out / MADE_OF, made_of(source))
     sightings = _sightings(frames, cameras, boards, out, console)
     rig = Rig(
         cameras=cameras, boards=boards, sightings=sightings,
@@ -95,7 +95,6 @@ def run_cameras(source: Path, console: Console, options: dict[str, Any]) -> bool
     _require_seen(rig, frames)
     rig = _with_poses(rig, frames, raw, options["reading"], console)
     report = _calibrated(rig, options["arm"], console)
-    write_text(out / MADE_OF, made_of(source))
     return _told(report, write_files(report, out), console)
 
 

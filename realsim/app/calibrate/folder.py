@@ -21,6 +21,7 @@ from realsim.app.calibrate.images import (
     warn_of_pictures,
 )
 from realsim.app.console import Console
+from realsim.app.outputs import require_free_folder
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry.dh import DhArm
@@ -39,15 +40,12 @@ from realsim_calibration import (
     prove_reading,
 )
 from realsim_calibration.calibrate import require_given_camera
+from realsim_calibration.inputs.layouts import MADE_OF
 from realsim_calibration.results import Clock
 
 if TYPE_CHECKING:
     from realsim_calibration.inputs import FolderInput, PoseReading, RawPoses
 
-CALIBRATED = ("exports/calibration.json", "calibration_report.html")
-"""What a folder holds that somebody has calibrated into."""
-MADE_OF = "calibrated_of.json"
-"""File beside them that says what they were made of: only that is replaced."""
 MIN_POSE_POINTS = 6
 """Fewest points of a board pose that may speak for a reading."""
 MIN_DIAGNOSED = 6
@@ -89,6 +87,21 @@ class FolderRequest:
 def made_of(images: Path) -> str:
     """Return the text of the file that says what a folder of results was made of."""
     return json.dumps({"images": str(images.resolve())})
+
+
+def require_free_results(out: Path, source: Path) -> None:
+    """Raise unless results can go to a folder: a new or empty one, or one made of this source.
+
+    Raises:
+        InputError: it holds anything else, or cannot be written.
+    """
+    if out.resolve() == source.resolve():
+        raise InputError(
+            f"--out '{out}' is the data set itself: pictures of the report would lie among its "
+            f"images, and replace those of the same name. Give a folder of its own, such as "
+            f"{out / 'calibration'}."
+        )
+    require_free_folder(out, "--out", None, (MADE_OF, (made_of(source),)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -143,6 +156,7 @@ def read_views(request: FolderRequest, console: Console) -> FolderViews:
         console.warn(note)
     for name, reason in (*folder.unpaired_images, *folder.unpaired_poses):
         console.warn(f"{name} was left out: {reason}")
+    write_text(request.out / MADE_OF, made_of(request.images))
     detections = find_in_images(folder.images, target, request.out, console)
     require_target(folder, detections, target)
     require_views(folder, detections, CalibrationConfig().hand_eye.motion.min_views)

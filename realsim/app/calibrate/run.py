@@ -176,15 +176,14 @@ def _refuse_folder_options(options: dict[str, Any]) -> None:
 
 def _request(source: Path, options: dict[str, Any]) -> Any:
     """Return the request for a plain folder; relative pose files may lie inside it."""
-    from realsim.app.calibrate.folder import CALIBRATED, MADE_OF, FolderRequest, made_of
-    from realsim.app.outputs import require_free_folder
+    from realsim.app.calibrate.folder import FolderRequest, require_free_results
 
     def inside(path: Path | None) -> Path | None:
         if path is None or path.exists() or path.is_absolute():
             return path
         return source / path if (source / path).exists() else path
 
-    require_free_folder(options["out"], "--out", CALIBRATED, (MADE_OF, (made_of(source),)))
+    require_free_results(options["out"], source)
     return FolderRequest(
         images=source,
         out=options["out"],
