@@ -164,6 +164,8 @@ def test_every_camera_has_the_files_of_a_camera_alone(calibrated: tuple[Result, 
         one = read_calibration(out / name / "exports/calibration.json")
         assert one.mode == mode
         assert np.array_equal(one.X, cameras.camera(name).T)
+    page = (out / "cameras_report.html").stat().st_mtime_ns
+    assert all(p.stat().st_mtime_ns <= page for p in out.rglob("*")), "the page is written last"
     assert "left_optical_frame" in (out / "left/exports/camera.urdf").read_text()
 
 

@@ -5,10 +5,12 @@ import shutil
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from pictured_folders import X, Z, pictures, save_pictures
 from pictured_targets import CAMERA, TARGETS, truth
 from realsim.app.calibrate.folder import FolderRequest, read_views, require_free_results
+from realsim.app.cli import commands
 from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim.geometry import se3
@@ -107,6 +109,21 @@ def test_a_folder_is_its_own_from_the_first_note_on(lab):
         InputError, match=r"made by something else or of something else.*new or empty"
     ):
         require_free_results(lab.parent / "out", lab.parent / "more")
+
+
+def test_results_that_are_half_replaced_have_no_page(tmp_path):
+    _, hands = pictures()
+    write_matrices(tmp_path / "hand.json", hands)
+    write_matrices(tmp_path / "board.json", se3.invert(hands @ X) @ Z)
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "calibrated_of.json").write_text(json.dumps({"images": str(tmp_path)}))
+    (out / "calibration_report.html").write_text("of the earlier run")
+    (out / "exports").write_text("no folder: nothing can be written in it")
+    words = [tmp_path, "--poses", "hand.json", "--board-poses", tmp_path / "board.json"]
+    done = CliRunner().invoke(commands, ["calibrate", *map(str, words), "--out", str(out)])
+    assert isinstance(done.exception, OSError), done.output
+    assert not (out / "calibration_report.html").exists()
 
 
 def replace_pictures(lab, changed):

@@ -156,9 +156,10 @@ def write_results(
 ) -> None:
     """Write report, pictures, depth bias and the files for other tools into the session."""
     from realsim_calibration.exports import FrameNames, write_exports
-    from realsim_calibration.report import write_calibration_report
+    from realsim_calibration.report.page import PAGE_NAME, write_calibration_report
 
     folder = store.folder / RESULTS
+    (folder / "report" / PAGE_NAME).unlink(missing_ok=True)  # written last: not whole without it
     depth = _depth_bias(report, seen, store, views_store)
     write_exports(report, folder / "exports", frames=FrameNames())
     write_calibration_report(report, folder / "report", images=views_store.rgb, depth_report=depth)

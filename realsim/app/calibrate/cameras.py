@@ -288,11 +288,14 @@ def _calibrated(rig: Rig, arm: str, console: Console) -> CamerasReport:
 
 
 def write_files(report: CamerasReport, out: Path) -> list[Path]:
-    """Write page, `cameras.json` and every camera's own exports; return the paths, page first."""
+    """Write `cameras.json`, every camera's own exports, then the page; return it first.
+
+    An earlier page is taken away before: without it, the folder is not whole.
+    """
     from realsim_calibration.exports import FrameNames, write_exports
 
+    (out / PAGE).unlink(missing_ok=True)
     files = [out / PAGE, write_cameras(report, out / CAMERAS_FILE)]
-    write_bytes(out / PAGE, cameras_page(report).encode())
     for camera, own in zip(report.rig.cameras, report.cameras, strict=True):
         moved = any(
             rig_board.target is own.target and rig_board.place == "hand"
@@ -303,6 +306,7 @@ def write_files(report: CamerasReport, out: Path) -> list[Path]:
             # The board does not hang on the hand: what the files call the hand is the base.
             names = replace(names, hand=names.robot_base)
         files += write_exports(own, out / camera.name / "exports", frames=names)
+    write_bytes(out / PAGE, cameras_page(report).encode())
     return files
 
 

@@ -374,14 +374,18 @@ def _of_pairs(
 def write_calibration(
     result: Calibration, request: FolderRequest, images: Sequence[Path], console: Console
 ) -> list[Path]:
-    """Write report, pictures and exports; return the paths, the page first."""
+    """Write report, pictures and exports; return the paths, the page first.
+
+    The page is taken away first and written last: without it, the folder is not whole.
+    """
     from realsim_calibration.exports import FrameNames, write_exports
     from realsim_calibration.inputs import load_image
-    from realsim_calibration.report import write_calibration_report
+    from realsim_calibration.report.page import PAGE_NAME, write_calibration_report
 
     out = request.out
     with console.stage("report", str(out)):
         write_text(out / MADE_OF, made_of(request.images))
+        (out / PAGE_NAME).unlink(missing_ok=True)
         exports = write_exports(result.hand_eye, out / "exports", frames=FrameNames())
         pages = write_calibration_report(
             result.hand_eye, out,
