@@ -220,15 +220,10 @@ def require_free_folder(
 ) -> None:
     """Raise unless a folder can be filled without loss of anything but what was written there.
 
-    Args:
-        path: the folder, there or not.
-        name: of the option, for messages.
-        files: names that are written there; None = any, so the folder has to be empty or own.
-        own: see `OutputFolder`.
-
     Raises:
         InputError: a file, a link, a session, a folder of a session's data, one that cannot be
-            written, or it holds files of the same names that another program or user made.
+            written, or it holds files of the same names (None = any) that another program or user
+            made.
     """
     if os.path.lexists(path) and not path.is_dir():
         raise InputError(f"{name} '{path}' is a file; give a folder.")
@@ -241,16 +236,15 @@ def require_free_folder(
     if there and not (marked and all(has_texts(file, own[1]) for file in marked)):
         raise InputError(
             f"{name} '{path}': {there[0]} is there, made by something else or of something else; "
-            "it is not replaced. "
-            + ("Give another folder, or delete it first." if files else "Give a new or empty one.")
+            "it is not replaced. Give "
+            + ("another folder, or delete it first." if files else "a new or an empty folder.")
         )
     parent = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
     try:
         tempfile.TemporaryDirectory(dir=parent).cleanup()
     except OSError as error:
         raise InputError(
-            f"{name} '{path}': nothing can be written in {parent} ({error.strerror}). Give a "
-            "folder that you may write."
+            f"{name} '{path}': {parent} cannot be written ({error.strerror}). Give another folder."
         ) from error
 
 

@@ -106,7 +106,7 @@ def test_a_folder_is_its_own_from_the_first_note_on(lab):
     require_free_results(lab.parent / "out", lab)
     (lab.parent / "more").mkdir()
     with pytest.raises(
-        InputError, match=r"made by something else or of something else.*new or empty"
+        InputError, match=r"made by something else or of something else.*an empty folder"
     ):
         require_free_results(lab.parent / "out", lab.parent / "more")
 

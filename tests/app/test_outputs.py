@@ -113,7 +113,7 @@ def test_a_session_is_no_folder_for_results(name: str, session: Path, tmp_path: 
         with pytest.raises(InputError, match=r"part of the session|is a file"):
             convert(name, path)
     assert convert(name, session / "reports/more") and convert(name, tmp_path)
-    with pytest.raises(InputError, match="'/proc/x/y': nothing can be written in /proc "):
+    with pytest.raises(InputError, match="'/proc/x/y': /proc cannot be written "):
         convert(name, Path("/proc/x/y"))
     for file in OUTPUTS[name][1].type.files:
         (tmp_path / file).write_text("mine")
@@ -160,7 +160,7 @@ def test_a_calibration_of_other_images_is_not_replaced(tmp_path: Path) -> None:
         (".", "lab is there, made by something else"),
         ("lab/wrist", "00.png is there, made by something else"),
         ("other", "camera_place.png is there, made by something else"),
-        ("/proc/x", "--out '/proc/x': nothing can be written in /proc"),
+        ("/proc/x", "--out '/proc/x': /proc cannot be written"),
     ],
 )
 def test_a_calibration_goes_into_a_folder_of_its_own(

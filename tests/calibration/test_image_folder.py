@@ -222,7 +222,7 @@ def test_folders_without_usable_images_say_what_is_there(tmp_path):
 
 
 def test_images_are_looked_for_two_folders_deep(tmp_path):
-    with pytest.raises(InputError, match=r"holds no images .*Give the folder of the pictures"):
+    with pytest.raises(InputError, match=r"holds no images .*Give the folder of the board's"):
         list_images(tmp_path)
     for place in ("left/rgb", "right/rgb"):
         make_images(tmp_path / place, ["0.png"])

@@ -24,9 +24,9 @@ MAX_BYTES = 512 * 2**20
 SHOWN = 8
 """Images that cannot be used, and folders with images, that a message lists."""
 AGAIN = (
-    " Copy it again from where it came, or delete it together with its pose: the file or the line "
-    "that belongs to it, or in an array its row (numpy.delete(poses, k, axis=0) for image k, "
-    "counted from 0). Where the poses name their images, delete the image alone."
+    " Copy it again from where it came, or delete it together with its pose: its file, line, or "
+    "in an array its row (numpy.delete(poses, k, axis=0) for image k, counted from 0). Where the "
+    "poses name their images, delete the image alone."
 )
 """What to do about a file that was not copied well."""
 TAIL_BYTES = 512
@@ -83,25 +83,16 @@ def list_images(folder: Path) -> ImageListing:
 
 def image_files(folder: Path) -> list[Path]:
     """Return the files of a folder that have the ending of an image, in natural order."""
-    found = [
-        p
-        for p in folder.iterdir()
-        if p.suffix.lower() in IMAGE_ENDINGS and p.is_file() and not p.name.startswith(".")
-    ]
+    found = (p for p in folder.glob("[!.]*") if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
     return sorted(found, key=lambda p: natural_key(p.name))
 
 
 def require_readable(files: Sequence[Path]) -> None:
-    """Raise one error for all images that cannot be used, if they are several.
-
-    Raises:
-        InputError: names them, says what is wrong with each and what to do.
-    """
+    """Raise one error for all images that cannot be used, if they are several."""
     faults: list[str] = []
     for path in files:
         try:
-            if not is_deep(path):
-                load_image(path)
+            _ = is_deep(path) or load_image(path)
         except InputError as error:
             faults.append(str(error))
     if len(faults) > 1:
@@ -122,14 +113,10 @@ def _nothing(folder: Path, deep: Sequence[Path]) -> str:
     inside = [p for depth in ("*/*", "*/*/*") for p in folder.glob(depth)]
     images = [p for p in inside if p.suffix.lower() in IMAGE_ENDINGS]
     below = sorted({str(p.parent.relative_to(folder)) for p in images})
+    advice = "Give the folder of the board's pictures, with the robot's poses there or in --poses."
     if below:
         which = "that folder" if len(below) == 1 else "one of them"
         advice = f"There are images in {', '.join(below[:SHOWN])}: give {which}."
-    else:
-        advice = (
-            "Give the folder of the pictures that the camera took of the board, with the robot's "
-            "poses beside them or in --poses."
-        )
     return f"{folder} holds no images ({', '.join(IMAGE_ENDINGS)}). {advice}"
 
 

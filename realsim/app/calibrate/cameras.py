@@ -288,10 +288,7 @@ def _calibrated(rig: Rig, arm: str, console: Console) -> CamerasReport:
 
 
 def write_files(report: CamerasReport, out: Path) -> list[Path]:
-    """Write `cameras.json`, every camera's own exports, then the page; return it first.
-
-    An earlier page is taken away before: without it, the folder is not whole.
-    """
+    """Write all files, and last the page, which tells that all are there; return it first."""
     from realsim_calibration.exports import FrameNames, write_exports
 
     (out / PAGE).unlink(missing_ok=True)

@@ -90,16 +90,11 @@ def made_of(images: Path) -> str:
 
 
 def require_free_results(out: Path, source: Path) -> None:
-    """Raise unless results can go to a folder: a new or empty one, or one made of this source.
-
-    Raises:
-        InputError: it holds anything else, or cannot be written.
-    """
+    """Raise unless results can go to a folder: a new or empty one, or one made of this source."""
     if out.resolve() == source.resolve():
         raise InputError(
-            f"--out '{out}' is the data set itself: pictures of the report would lie among its "
-            f"images, and replace those of the same name. Give a folder of its own, such as "
-            f"{out / 'calibration'}."
+            f"--out '{out}' is the data set itself: pictures of the report would replace images of "
+            f"the same name. Give a folder of its own, such as {out / 'calibration'}."
         )
     require_free_folder(out, "--out", None, (MADE_OF, (made_of(source),)))
 
@@ -374,10 +369,7 @@ def _of_pairs(
 def write_calibration(
     result: Calibration, request: FolderRequest, images: Sequence[Path], console: Console
 ) -> list[Path]:
-    """Write report, pictures and exports; return the paths, the page first.
-
-    The page is taken away first and written last: without it, the folder is not whole.
-    """
+    """Write all files, and last the page, which tells that all are there; return it first."""
     from realsim_calibration.exports import FrameNames, write_exports
     from realsim_calibration.inputs import load_image
     from realsim_calibration.report.page import PAGE_NAME, write_calibration_report
