@@ -54,9 +54,10 @@ def merge(documents: Sequence[Document]) -> Document:
     runs = [d["figures"] for d in documents]
     keys = list(dict.fromkeys(key for run in runs for key in run))
     values = {k: [r[k] for r in runs if r.get(k) is not None] for k in keys}
-    same = ("benchmark", "machine", "versions", "quick", "goals", "over")
+    same = ("benchmark", "machine", "versions", "quick", "goals")
     kept: Document = {key: documents[-1].get(key) for key in same}
-    kept["seeds"] = [d.get("seed") for d in documents]
+    kept["over"] = {key: what for d in documents for key, what in (d.get("over") or {}).items()}
+    kept["seeds"] = list(dict.fromkeys(d.get("seed") for d in documents))  # parts share theirs
     kept["figures"] = {k: median(v) if v else None for k, v in values.items()}
     kept["noise"] = {k: max(v) - min(v) for k, v in values.items() if len(v) > 1}
     return kept

@@ -278,7 +278,9 @@ def loop(given: argparse.Namespace) -> Found:
             scene = argparse.Namespace(truth=truth.objects, models=models)
             rows = list(poses_of(seed, scene, result.objects))
         inside += [r.inside for r in rows if r.mssd_mm <= RIGHT_MM]
-        shifts = ", ".join(f"{r.mssd_mm:.2f}" for r in rows)
+        shifts = ", ".join(
+            f"{r.mssd_mm:.2f}" + (f" ({r.verdict})" if r.mssd_mm > RIGHT_MM else "") for r in rows
+        )
         found.notes.append(f"loop, seed {seed}: {shifts} mm")
     found.add("loop_coverage95", float(np.mean(inside)), f"{len(inside)} objects")
     return found
