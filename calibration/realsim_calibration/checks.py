@@ -244,9 +244,7 @@ def _scale(r: HandEyeReport, c: CheckConfig) -> Check:
 
 def _flatness(r: HandEyeReport, c: CheckConfig) -> Check:
     if not np.any(r.board.sd[2:]):
-        return Check(
-            name="board flatness", verdict="unknown", sentence="the board was taken to be flat."
-        )
+        return Check(name="board flatness", verdict="unknown", sentence="the board was held flat.")
     verdict = _verdict(r.board.warp_mm, c.warp_mm)
     return Check(
         name="board flatness",

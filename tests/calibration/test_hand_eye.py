@@ -117,7 +117,7 @@ def test_a_swapped_pair_is_dropped_and_named(simulate):
     assert np.degrees(np.linalg.norm(e[:3])) < 0.2 and np.linalg.norm(e[3:]) < 1.5e-3
     checks = {c.name: c for c in h.checks}
     said = checks["conventions"].sentence
-    assert "2 views were left out" in said and "paired anew" not in said
+    assert "Left out: 2." in said and "paired anew" not in said
     assert checks["drawings"].verdict == "warn" and checks["drawings"].views == (5,)
     assert checks["drawings"].sentence.startswith(f"1 of 24 images: {DRAWN}")
 

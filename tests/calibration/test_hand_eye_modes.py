@@ -118,7 +118,7 @@ def test_perfect_poses_alone_give_the_truth():
     flipped = calibrate_from_poses(A, C @ outwards)
     assert np.abs(se3.log(se3.invert(Z @ outwards) @ flipped.Z)).max() < 1e-6
     flat = next(c for c in r.checks if c.name == "board flatness")
-    assert flat.verdict == "unknown" and "taken to be flat" in flat.sentence
+    assert flat.verdict == "unknown" and "held flat" in flat.sentence
     for record in (r, flipped):
         seen = [viewpoint(record, v) for v in record.used]
         distances = np.linalg.norm(C[:, :3, 3], axis=-1)

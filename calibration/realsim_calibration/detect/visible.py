@@ -147,10 +147,9 @@ def _markers(gray: UInt8) -> tuple[str, float]:
 
 def _layout(dictionary: str, ids: Int64, quads: Array) -> str:
     """Return the ChArUco board whose last markers these may be, as a clause; empty where none."""
-    config, count = CharucoConfig(), int(ids.max()) + 1
-    squares = range(LEAST_SQUARES, MOST_SQUARES)
+    config, squares = CharucoConfig(), range(LEAST_SQUARES, MOST_SQUARES)
     for rows, columns, legacy in product(squares, squares, (False, True)):
-        if rows * columns // 2 != count:
+        if rows * columns // 2 != ids.max() + 1:
             continue
         board = CharucoBoard(rows=rows, columns=columns, square_m=1.0, marker_m=USUAL_MARKER,
                              dictionary=dictionary, legacy=legacy)  # fmt: skip

@@ -77,9 +77,7 @@ def check_of(found: Diagnosis | None, indices: Sequence[int]) -> Check:
             "and that the poses are the controller's."
         )
     # Single views are dropped, whatever could have mended them.
-    n = len(found.views)
-    left = f"{n} view{'s were' if n != 1 else ' was'} left out."
-    done = left if found.fault in SINGLE_VIEWS else found.note
+    done = f"Left out: {len(found.views)}." if found.fault in SINGLE_VIEWS else found.note
     return Check(
         name="conventions",
         verdict="good" if good else "warn",

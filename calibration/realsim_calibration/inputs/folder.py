@@ -233,14 +233,14 @@ def _warnings(
     if same_images:
         groups = "; ".join(", ".join(g) for g in same_images[:6])
         said.append(
-            f"{_count(len(same_images), 'image')} there more than once, byte by byte ({groups}): "
-            "at least one of each has the pose of another. Delete the copies with their poses."
+            f"Images are there more than once, byte by byte ({groups}): at least one "
+            "of each has the pose of another. Delete the copies with their poses."
         )
     if same_poses:
         groups = "; ".join(", ".join(g) for g in same_poses[:6])
         said.append(
-            f"{_count(len(same_poses), 'pose')} there more than once, with the very same numbers "
-            f"({groups}): a controller never repeats all digits. Was an old pose stored again?"
+            f"Poses are there more than once, with the very same numbers ({groups}): a controller "
+            "never repeats all digits. Was an old pose stored again?"
         )
     left = len(found.unpaired_images), len(found.unpaired_poses)
     if any(left):
@@ -248,8 +248,3 @@ def _warnings(
     if not_measured:
         said.append(f"Images left out for a pose of NaN or infinite numbers: {not_measured}.")
     return tuple(said)
-
-
-def _count(n: int, what: str) -> str:
-    """Return "1 image is" or "2 images are"."""
-    return f"{n} {what} is" if n == 1 else f"{n} {what}s are"

@@ -129,20 +129,14 @@ class RawPoses:
             times=None if self.times is None else self.times[pick],
         )
 
-    def poses(
-        self,
-        reading: PoseReading,
-        *,
-        ranges: ReadingRanges | None = None,
-        despite_names: bool = False,
-    ) -> Array:
+    def poses(self, reading: PoseReading, *, despite_names: bool = False) -> Array:
         """Return T_base_ee (n, 4, 4) [m] of this reading, which a person may say against the names.
 
         Raises:
             InputError: the file says otherwise, or a row cannot be a pose; the rows are named.
             UnitError: all poses come to lie within a millimetre of the base, or beyond all reach.
         """
-        limits = ranges or ReadingRanges()
+        limits = ReadingRanges()
         if self.said.position_first is not None:
             reading = replace(reading, position_first=self.said.position_first)
         contradiction = self.contradiction(reading)
