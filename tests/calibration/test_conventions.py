@@ -157,18 +157,6 @@ def test_a_shuffled_list_is_unknown_with_figures():
     assert d.evidence[0].hypothesis == "as given" and len(d.evidence) > 5
 
 
-def test_a_raw_reading_that_fits_is_named():
-    s = session(5)
-    numbers = np.degrees(three_number_conventions()[0].encode(s.T[:, :3, :3])[:, 0])
-    wrong = se3.from_rt(se3.exp_so3(numbers), s.T[:, :3, 3])
-    d = diagnose(
-        wrong, s.C, target=faults.BOARD, raw=[("rotation vector in degrees", s.T)],
-        mode="eye_in_hand" if s.eye_in_hand else "eye_to_hand",
-    )  # fmt: skip
-    assert d.fault == "rotation_reading" and "in degrees" in d.sentence
-    assert np.allclose(d.repaired_base_ee, s.T)
-
-
 def test_a_small_print_error_is_a_scale_and_not_a_fault():
     s = session(7)
     C = s.C.copy()

@@ -42,7 +42,6 @@ from realsim_calibration.faults.hypotheses import (
     moved,
     option_of,
     paired_otherwise,
-    raw_readings,
     reread_as_degrees,
     reread_rotations,
     simple,
@@ -67,7 +66,6 @@ def diagnose(
     *,
     labels: Sequence[str] | None = None,
     target: Target | None = None,
-    raw: Sequence[tuple[str, Array]] | None = None,
     nominal: ArrayLike | None = None,
     mode: Mode = "eye_in_hand",
     config: DiagnosisConfig | None = None,
@@ -79,7 +77,6 @@ def diagnose(
         Ts_cam_board: (n, 4, 4) board poses in the camera [m].
         labels: names of the views; their rows where not given.
         target: the printed target: for its middle, its size in messages, whether it can be turned.
-        raw: further readings of the pose file, (name, (n, 4, 4)).
         nominal: (n, 4, 4) T_base_flange by the nominal kinematics [m], for the tool offset.
         mode: where the camera is said to sit.
         config: when a reading is believed.
@@ -110,9 +107,8 @@ def diagnose(
         T=T[rows], C=C[rows], eye_in_hand=p.eye_in_hand, middle=middle,
         labels=tuple(names[k] for k in rows), target=target,
     )  # fmt: skip
-    kept_raw = [(name, np.asarray(S)[rows]) for name, S in raw or () if len(S) == len(T)]
     known = None if nominal is None else np.asarray(nominal, dtype=np.float64)[rows]
-    found, tried = _search(part, kept_raw, known, config)
+    found, tried = _search(part, known, config)
     found = _with_rows(found, rows)
     if copied is not None:
         if found.fault in ("none", "tool_offset", "base_turned"):
@@ -195,7 +191,7 @@ def _without_copies(
 
 
 def _search(
-    p: Poses, raw: Sequence[tuple[str, Array]], nominal: Array | None, config: DiagnosisConfig
+    p: Poses, nominal: Array | None, config: DiagnosisConfig
 ) -> tuple[Hypothesis, list[Hypothesis]]:
     """Return what is wrong with the poses, and all that was tried, as given first."""
     given = simple(p, "none", "as given", p.T, p.C, config)
@@ -203,7 +199,7 @@ def _search(
         return replace(given, fault="untestable", sentence=reason[0], advice=reason[1]), [given]
     if given.score <= config.sure_score and given.fit.errors.max() <= config.pairing.floor:
         return _sound(p, given, nominal, config), [given]
-    tried = [*raw_readings(p, raw, config), inverted(p, config), *mirrored(p, config)]
+    tried = [inverted(p, config), *mirrored(p, config)]
     tried += [h for h in (flipped_boards(p, config), paired_otherwise(p, config), moved(p, config))
               if h is not None]  # fmt: skip
     tried += reread_rotations(p, config, thorough=False)

@@ -288,21 +288,6 @@ def _reread(
     )  # fmt: skip
 
 
-def raw_readings(
-    p: Poses, raw: Sequence[tuple[str, Array]], config: DiagnosisConfig
-) -> list[Hypothesis]:
-    """Return the hypotheses that the pose file is to be read otherwise."""
-    return [
-        replace(
-            simple(p, "rotation_reading", f"file read as {name}", np.array(T), p.C, config),
-            sentence=f"Hand and camera agree when the pose file is read as {name}.",
-            advice=f"Read the file as {name}.", note=f"the pose file was read as {name}.",
-        )
-        for name, T in raw
-        if len(T) == len(p.C)
-    ]  # fmt: skip
-
-
 def paired_otherwise(p: Poses, config: DiagnosisConfig) -> Hypothesis | None:
     """Return the hypothesis that images and hand poses were paired wrongly."""
     found = find_pairing(hand_side(p.T, p.eye_in_hand), p.C, p.middle, config.pairing)

@@ -146,7 +146,7 @@ def read_views(request: FolderRequest, console: Console) -> FolderViews:
     folder = read_image_folder(
         request.images, request.poses or request.images, reading=reading, key=request.key or None
     )
-    console.say(f"{len(folder)} images with poses: {folder.pairing}")
+    console.say(f"Images with poses: {len(folder)}. {folder.pairing}")
     for note in (*folder.warnings, *folder.poses.notes):
         console.warn(note)
     for name, reason in (*folder.unpaired_images, *folder.unpaired_poses):
