@@ -9,6 +9,7 @@ cuts of the same sets.
 
 import resource
 import subprocess
+import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,7 +116,8 @@ def run_command(task: Command) -> tuple[int, float]:
             poses = images if source.poses == source.images else folder / source.poses
             words = [str(images), "--poses", str(poses), "--board", source.target,
                      "--reading", source.reading]  # fmt: skip
-        command = ["realsim", "calibrate", *words, "--out", str(Path(place) / "calibration")]
+        program = str(Path(sys.executable).with_name("realsim"))
+        command = [program, "calibrate", *words, "--out", str(Path(place) / "calibration")]
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         code = subprocess.run(command, check=False, capture_output=True).returncode
         after = resource.getrusage(resource.RUSAGE_CHILDREN)

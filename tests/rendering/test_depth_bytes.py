@@ -59,7 +59,10 @@ def test_a_profile_written_and_loaded_is_the_same(name: str, tmp_path: Path) -> 
         ('{"format": "realsim depth sensor 1", "model": {"baseline_m": "0.018"}}', "finite float"),
         ('{"format": "realsim depth sensor 1", "model": {"baseline_m": 18}}', "millimetres"),
         ('{"format": "realsim depth sensor 1", "model": {"border": 1}}', "finite bool"),
-        ('{"format": "realsim depth sensor 1", "model": {"quantum_px": NaN}}', "NaN is no number"),
+        (
+            '{"format": "realsim depth sensor 1", "model": {"quantum_px": NaN}}',
+            "NaN at model.quantum_px",
+        ),
         (
             f'{{"format": "realsim depth sensor 1", "model": {{"quantum_px": {10**309}}}}}',
             "finite float",
