@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from realsim.arrays import Array
-from realsim.pages import Cell, Page, plots
+from realsim.pages import Cell, Page
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check
 from realsim.store import atomic
 from realsim_calibration.depth.bias import DepthBiasReport
@@ -45,7 +45,7 @@ class _Page(Page):
     def plot(self, name: str, draw: Callable[[], Any], caption: str) -> None:
         """Draw a picture, write it beside the page and put it into the page itself."""
         with style.paper_style():
-            data = plots.png(draw())
+            data = style.png(draw())
         atomic.write_bytes(self.folder / name, data)
         self.written.append(self.folder / name)
         self.picture(data, caption)

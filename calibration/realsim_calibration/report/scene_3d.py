@@ -250,9 +250,9 @@ def plot_scene(report: HandEyeReport) -> Any:
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
     figure = style.new_figure(4.4)
-    grid = figure.add_gridspec(1, 3, width_ratios=(1.15, 0.2, 1))
+    grid = figure.add_gridspec(1, 2, width_ratios=(1.3, 1))
     corner = figure.add_subplot(grid[0], projection="3d")
-    above = figure.add_subplot(grid[2])
+    above = figure.add_subplot(grid[1])
     errors = style.finite([v.unseen_px for v in report.used])
     colors = ScalarMappable(Normalize(0, float(errors.max(initial=1e-3))), style.ERROR_MAP)
     drawn = _scene_lines(report)
@@ -319,7 +319,7 @@ def _corner_looks(ax: Any, points: Array, length: float) -> None:
     _triad(ax, np.zeros(3), np.eye(3), length, "base", np.array([-0.4, -0.4, -0.2]) * length)
     _equal_box(ax, points, 0.98)
     ax.view_init(elev=24, azim=-60)
-    ax.set_title("From a corner", pad=0)
+    ax.set_title("From a corner", y=1.04, pad=0)
     ax.set_xlabel("base x [m]", labelpad=-3)
     ax.set_ylabel("base y [m]", labelpad=-3)
     ax.set_zlabel("base z [m]", labelpad=-4)

@@ -136,7 +136,7 @@ def _draw_photo(ax: Any, rgb: UInt8 | None, width: int, height: int) -> str:
         (round(width * shrink), max(1, round(height * shrink))),
         interpolation=cv2.INTER_AREA,
     )
-    pale = (255 * PALER + np.asarray(small, dtype=np.float64) * (1 - PALER)).astype(np.uint8)
+    pale = cv2.convertScaleAbs(small, alpha=1 - PALER, beta=255 * PALER)
     ax.imshow(
         pale, cmap="gray", vmin=0, vmax=255, extent=(-0.5, width - 0.5, height - 0.5, -0.5),
         interpolation="bilinear",
@@ -196,7 +196,7 @@ def plot_views(report: HandEyeReport) -> Any:
 def plot_coverage(report: HandEyeReport) -> Any:
     """Plot where in the image points lay, from where the target was seen, and the camera's roll."""
     figure = style.new_figure(3.1)
-    grid = figure.add_gridspec(1, 3, width_ratios=(1.45, 1.1, 0.9))
+    grid = figure.add_gridspec(1, 3, width_ratios=(1.4, 1.3, 1))
     _image_coverage(figure, figure.add_subplot(grid[0]), report)
     _directions(figure, figure.add_subplot(grid[1], projection="polar"), report)
     _rolls(figure.add_subplot(grid[2], projection="polar"), report)
@@ -245,7 +245,7 @@ def _directions(figure: Any, ax: Any, report: HandEyeReport) -> None:
     ax.set_yticks(np.arange(15, most + 1, 15), [f"{t:.0f}°" for t in np.arange(15, most + 1, 15)])
     ax.set_rlabel_position(67)
     _polar_looks(ax)
-    ax.set_title("Viewpoints: tilt and azimuth", pad=14, loc="center")
+    ax.set_title("Viewpoints: tilt and azimuth", pad=20, loc="center")
 
 
 def _rolls(ax: Any, report: HandEyeReport) -> None:
@@ -266,7 +266,7 @@ def _rolls(ax: Any, report: HandEyeReport) -> None:
     ax.set_rlabel_position(float(np.degrees(middles[int(np.argmax(nearest))])))
     _polar_looks(ax)
     ax.set_title(
-        f"Camera roll: {amount(report.roll_range_deg, 0, '°')} (views)", pad=14, loc="center"
+        f"Camera roll: {amount(report.roll_range_deg, 0, '°')} (views)", pad=20, loc="center"
     )
 
 
