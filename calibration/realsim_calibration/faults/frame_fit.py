@@ -15,11 +15,13 @@ Gauss-Newton with Geman-McClure weights.
 
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from realsim.arrays import Array, Int64
+from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_calibration.fit.closed_forms import clear_of_half_turns, motions
@@ -254,18 +256,21 @@ def _refine(
     spread = float(np.median(np.linalg.norm(A[:, :3, 3] - np.median(A[:, :3, 3], 0), axis=-1)))
     least = max(COLLAPSED * spread / distance, 1e-9)
     s = max(s, least)
+    data = (np.ascontiguousarray(A), np.ascontiguousarray(Rc), q)
+    units = (np.radians(config.unit_deg), distance, distance * config.unit_part)
+    weights = (config.agree, config.width_share)
     for _ in range(config.steps):
-        J, r, errors = _weighted(A, Rc, q, (Rx, Rz, tx, z, s), distance, config)
+        J, r, errors, _ = _weighted(*data, Rx, Rz, tx, z, s, units, weights)
         H = J.T @ J
         move = -np.linalg.solve(H + RIDGE * np.trace(H) / 13 * np.eye(13), J.T @ r)
         if np.linalg.norm(move) < SETTLED:
             break
-        Rx, Rz = Rx @ se3.exp_so3(move[:3]), Rz @ se3.exp_so3(move[3:6])
+        turns = se3.exp_so3(move[:6].reshape(2, 3))
+        Rx, Rz = Rx @ turns[0], Rz @ turns[1]
         tx, z = tx + s * distance * move[6:9], z + s * distance * move[9:12]
         # The unit of the residual follows s: a step may not carry it through zero.
         s = max(s * float(np.exp(np.clip(move[12], -1.0, 1.0))), least)
-    J, rw, errors = _weighted(A, Rc, q, (Rx, Rz, tx, z, s), distance, config)
-    r = linearise(A, Rc, q, Rx, Rz, tx, z, s)[1]
+    J, rw, errors, r = _weighted(*data, Rx, Rz, tx, z, s, units, weights)
     freedom = max(6 * n - 13, 1)
     capped = np.minimum(errors, config.cap)
     inverse = np.linalg.pinv(J.T @ J, hermitian=True)
@@ -279,36 +284,52 @@ def _refine(
     )  # fmt: skip
 
 
-def _weighted(
-    A: Array, Rc: Array, q: Array, frames: tuple[Array, Array, Array, Array, float],
-    distance: float, config: FitConfig,
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Return J (6 n, 13) and residuals (6 n) in units, weighted, and the errors (n,) before that.
+@njit
+def _weighted(  # noqa: PLR0913, PLR0917 - compiled code takes no records
+    A: Any, Rc: Any, q: Any, Rx: Any, Rz: Any, tx: Any, z: Any, s: float, units: Any, weights: Any
+) -> Any:
+    """Return J (6 n, 13) and r (6 n) in units, weighted; the errors (n,), and r before that.
 
     Lengths among the unknowns are in units of the distance, s in units of itself.
     """
-    s = frames[4]
-    J, r = linearise(A, Rc, q, *frames)
-    unit = np.array([np.radians(config.unit_deg)] * 3 + [s * distance * config.unit_part] * 3)
-    errors = np.linalg.norm(r / unit, axis=-1)
-    width = config.agree * max(float(np.quantile(errors, config.width_share)), 1.0)
-    root = (1.0 / (1.0 + (errors / width) ** 2))[:, None]
-    column = np.array([1.0] * 6 + [s * distance] * 6 + [s])
-    J = (J / unit[:, None] * root[..., None]).reshape(-1, 13) * column
-    return J, (r / unit * root).ravel(), errors
+    turn, distance, part = units
+    J, r = linearise(A, Rc, q, Rx, Rz, tx, z, s)
+    unit = np.array([turn, turn, turn, s * part, s * part, s * part])
+    errors = np.sqrt(np.sum((r / unit) ** 2, axis=1))
+    width = weights[0] * max(np.quantile(errors, weights[1]), 1.0)
+    root = (1.0 / (1.0 + (errors / width) ** 2)).reshape(-1, 1) / unit
+    J[:, :, 6:12] *= s * distance
+    J[:, :, 12] *= s
+    return (J * root[:, :, None]).reshape(-1, 13), (r * root).ravel(), errors, r
 
 
-def linearise(
-    A: Array, Rc: Array, q: Array, Rx: Array, Rz: Array, tx: Array, z: Array, s: float
-) -> tuple[Array, Array]:
+@njit
+def linearise(A: Any, Rc: Any, q: Any, Rx: Any, Rz: Any, tx: Any, z: Any, s: float) -> Any:
     """Return J (n, 6, 13) and residuals (n, 6): R_X, R_Z turned on the right, then t_X, z, s."""
-    Ra = A[:, :3, :3]
-    RaRx = Ra @ Rx
-    J = np.zeros((len(A), 6, 13))
-    # The turn is measured on the right of R_X: R_C R_Z^T R_A R_X.
-    J[:, :3, :3], J[:, :3, 3:6] = np.eye(3), -Rc
-    J[:, 3:, :3] = -s * RaRx @ se3.hat(q)
-    J[:, 3:, 6:9], J[:, 3:, 9:12] = Ra, -np.eye(3)
-    J[:, 3:, 12] = (RaRx @ q[..., None])[..., 0]
-    slip = s * J[:, 3:, 12] + Ra @ tx + A[:, :3, 3] - z
-    return J, np.concatenate([se3.log_so3(Rc @ Rz.T @ RaRx), slip], -1)
+    J, r = np.zeros((len(A), 6, 13)), np.empty((len(A), 6))
+    for k in range(len(A)):
+        R = np.ascontiguousarray(A[k, :3, :3]) @ Rx
+        # The turn is measured on the right of R_X: R_C R_Z^T R_A R_X.
+        r[k, :3] = _log(Rc[k] @ (Rz.T @ R))
+        for i in range(3):
+            J[k, i, i], J[k, i, 3:6], J[k, 3 + i, 9 + i] = 1.0, -Rc[k, i], -1.0
+            J[k, 3 + i, :3] = -s * np.cross(R[i], q[k])
+            J[k, 3 + i, 6:9], J[k, 3 + i, 12] = A[k, i, :3], R[i] @ q[k]
+            r[k, 3 + i] = s * J[k, 3 + i, 12] + A[k, i, :3] @ tx + A[k, i, 3] - z[i]
+    return J, r
+
+
+@njit
+def _log(R: Any) -> Any:
+    """Return the rotation vector of a rotation (`se3.log_so3`)."""
+    a, b, c = R[0, 0], R[1, 1], R[2, 2]
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    u, v, w = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
+    rows = np.array([
+        [1 + a + b + c, x, y, z], [x, 1 + a - b - c, u, v],
+        [y, u, 1 - a + b - c, w], [z, v, w, 1 - a - b + c],
+    ])  # fmt: skip
+    row = rows[np.argmax(np.diag(rows))]
+    q = row / (np.sqrt(np.sum(row**2)) * (1.0 if row[0] >= 0 else -1.0))
+    n = np.sqrt(np.sum(q[1:] ** 2))
+    return q[1:] * (2.0 if n < 1e-12 else 2.0 * np.arctan2(n, q[0]) / n)

@@ -130,7 +130,8 @@ def _best_sd(
     q = C[:, :3, :3] @ m + C[:, :3, 3]
     s = fit.length_ratio
     z = fit.Z[:3, 3] + s * fit.Z[:3, :3] @ m
-    J, _ = linearise(A, C[:, :3, :3], q, fit.X[:3, :3], fit.Z[:3, :3], fit.X[:3, 3], z, s)
+    given = (A, C[:, :3, :3], q, fit.X[:3, :3], fit.Z[:3, :3], fit.X[:3, 3], z)
+    J, _ = linearise(*(np.ascontiguousarray(v) for v in given), s=s)
     sd = np.array([np.radians(config.expected_deg)] * 3 + [s * 1e-3 * config.expected_mm] * 3)
     Jw = (J / sd[:, None]).reshape(-1, 13)
     H = Jw.T @ Jw
