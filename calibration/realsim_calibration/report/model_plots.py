@@ -28,7 +28,7 @@ ARROW_STEP = 4
 
 def plot_uncertainty(report: HandEyeReport) -> Any:
     """Plot the 1 and 2 sigma ellipses of X along the camera's axes: translation and rotation."""
-    figure = style.new_figure(5.4)
+    figure = style.new_figure(5.4, grid=(2, 3))
     axes = figure.subplots(2, 3)
     C = report.place_covariance
     rows = (
@@ -72,7 +72,7 @@ def plot_board(report: HandEyeReport) -> Any:
     """Plot the target's bend as a height map, and its shape against the drawing, enlarged."""
     from matplotlib.ticker import MaxNLocator
 
-    figure = style.new_figure(3.6)
+    figure = style.new_figure(3.6, grid=(1, 2), room=(0.7, 0.15, 0.7, 0.45, 0.8, 0))
     left, right = figure.subplots(1, 2, width_ratios=(1.15, 1))
     board, points = report.board, report.target.points_board[:, :2]
     middle = (points.min(0) + points.max(0)) / 2
@@ -131,7 +131,7 @@ def _rms_text(values: Array, unit: str) -> str:
 
 def plot_robot(report: HandEyeReport) -> Any:
     """Plot the robot's error of every used view, as it is and after the map."""
-    figure = style.new_figure(3.2)
+    figure = style.new_figure(3.2, grid=(1, 2), room=(0.65, 0.1, 0.6, 0.5, 0.8, 0))
     axes = figure.subplots(1, 2)
     used = report.used
     before = np.array([v.robot_error for v in used]).reshape(-1, 6)
@@ -173,7 +173,9 @@ def _shown_maps(report: HandEyeReport) -> tuple[tuple[str, float], ...]:
 def plot_choices(report: HandEyeReport) -> Any:
     """Plot how well every error map predicts unseen views, and where every closed form started."""
     maps, starts = _shown_maps(report), report.starts[:MOST_CANDIDATES]
-    figure = style.new_figure(1.2 + 0.2 * max(4, len(maps), len(starts)))
+    side = style.room_for(style.short_label(n) for n, _ in (*maps, *starts))
+    height_in, room = 1.2 + 0.2 * max(4, len(maps), len(starts)), (side, 0.1, 0.5, 0.3, side, 0)
+    figure = style.new_figure(height_in, grid=(1, 2), room=room)
     left, right = figure.subplots(1, 2)
     least = min((px for _, px in starts if np.isfinite(px)), default=float("nan"))
     first = next((name for name, px in starts if px == least), "")
@@ -238,7 +240,8 @@ def plot_lens(intrinsics: CameraIntrinsics, covariance: Array, seen_uv: Array) -
         seen_uv: (n, 2) points that it was calibrated with [px]: their hull is drawn.
     """
     w, h = intrinsics.width, intrinsics.height
-    figure = style.new_figure(0.75 + 0.43 * style.PAGE_WIDTH_IN * h / w)
+    height_in, room = 0.75 + 0.43 * style.PAGE_WIDTH_IN * h / w, (0.65, 0.75, 0.5, 0.3, 1.35, 0)
+    figure = style.new_figure(height_in, grid=(1, 2), room=room)
     left, right = figure.subplots(1, 2)
     i = intrinsics
     for ax in (left, right):
@@ -300,7 +303,7 @@ def bias_curve(report: DepthBiasReport, distance_m: Array) -> tuple[Array, Array
 
 def plot_depth_bias(report: DepthBiasReport) -> Any:
     """Plot the depth's error over distance: every view, the fitted curve with 2 sigma, the rest."""
-    figure = style.new_figure(3.3)
+    figure = style.new_figure(3.3, grid=(1, 2), room=(0.7, 0.15, 0.5, 0.5, 0.8, 0))
     left, right = figure.subplots(1, 2)
     used = [v for v in report.views if v.used]
     z = np.array([v.distance_m for v in used])

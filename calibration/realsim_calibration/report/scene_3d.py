@@ -58,8 +58,9 @@ def plot_camera_in_hand(report: HandEyeReport) -> Any:
     """Draw carrier and camera: a view in space and two sides with dimensions [mm]."""
     side = _side(report)
     tall = (side.high[2] - side.low[2] + 0.42 * side.span) / (1.56 * side.span)
-    figure = style.new_figure(1.2 + SIDE_WIDTH_IN * tall)
-    grid = figure.add_gridspec(1, 3, width_ratios=(1.05, 1, 1))
+    room = (0.05, 0.35, 0.45, 0.52, 0.85, 0)
+    figure = style.new_figure(1.2 + SIDE_WIDTH_IN * tall, grid=(1, 3), room=room)
+    grid = figure.add_gridspec(1, 3, width_ratios=(1.3, 1, 1))
     _space_view(figure.add_subplot(grid[0], projection="3d"), report)
     for across in (0, 1):
         _side_view(figure.add_subplot(grid[across + 1]), side, across)
@@ -98,14 +99,8 @@ def _space_view(ax: Any, report: HandEyeReport) -> None:
     ax.add_collection3d(Line3DCollection(list(frustum_lines(corners)), colors=style.INK, lw=1.1))
     origin = np.zeros(3)
     up = np.array([0.0, 0.0, length])
-    _triad(
-        ax,
-        origin,
-        turn,
-        length,
-        carrier(report),
-        origin + 0.6 * up * (1.0 if report.mode == "eye_in_hand" else -1.0),
-    )
+    above = 0.6 * up * (1.0 if report.mode == "eye_in_hand" else -1.0)
+    _triad(ax, origin, turn, length, carrier(report), above)
     camera = turn @ X[:3, :3]
     aside = corners[0] + 0.75 * up
     _triad(ax, corners[0], camera, 0.7 * length, "camera", aside)
@@ -249,7 +244,7 @@ def plot_scene(report: HandEyeReport) -> Any:
     from matplotlib.colors import Normalize
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-    figure = style.new_figure(4.4)
+    figure = style.new_figure(4.4, grid=(1, 2), room=(0.1, 0.8, 0.5, 0.3, 0.8, 0))
     grid = figure.add_gridspec(1, 2, width_ratios=(1.3, 1))
     corner = figure.add_subplot(grid[0], projection="3d")
     above = figure.add_subplot(grid[1])
@@ -319,7 +314,7 @@ def _corner_looks(ax: Any, points: Array, length: float) -> None:
     _triad(ax, np.zeros(3), np.eye(3), length, "base", np.array([-0.4, -0.4, -0.2]) * length)
     _equal_box(ax, points, 0.98)
     ax.view_init(elev=24, azim=-60)
-    ax.set_title("From a corner", y=1.04, pad=0)
+    ax.set_title("From a corner", y=1.05, pad=0)
     ax.set_xlabel("base x [m]", labelpad=-3)
     ax.set_ylabel("base y [m]", labelpad=-3)
     ax.set_zlabel("base z [m]", labelpad=-4)

@@ -35,7 +35,8 @@ FULL_TILT_DEG = 60.0
 def plot_residuals(report: HandEyeReport) -> Any:
     """Plot every residual over the image plane, and their mean per cell."""
     w, h = report.intrinsics.width, report.intrinsics.height
-    figure = style.new_figure(0.75 + 0.43 * style.PAGE_WIDTH_IN * h / w)
+    height_in, room = 0.75 + 0.43 * style.PAGE_WIDTH_IN * h / w, (0.65, 0.1, 0.5, 0.3, 1.35, 0)
+    figure = style.new_figure(height_in, grid=(1, 2), room=room)
     axes = figure.subplots(1, 2)
     uv = np.concatenate([v.uv for v in report.used] or [np.zeros((0, 2))])
     r = np.concatenate([v.residuals for v in report.used] or [np.zeros((0, 2))])
@@ -87,7 +88,9 @@ def plot_worst_views(
     i = report.intrinsics
     columns = max(1, len(views))
     width_in = style.PAGE_WIDTH_IN * min(1.0, 0.42 * columns)
-    figure = style.new_figure(0.55 + width_in / columns * i.height / i.width, width_in)
+    height_in = 0.55 + width_in / columns * i.height / i.width
+    room = (0.05, 0.05, 0.27, 0.28, 0.08, 0)
+    figure = style.new_figure(height_in, width_in, (1, columns), room)
     for k, view in enumerate(views):
         ax = figure.add_subplot(1, columns, k + 1)
         note = _draw_photo(ax, images(view.index) if images else None, i.width, i.height)
@@ -131,11 +134,8 @@ def _draw_photo(ax: Any, rgb: UInt8 | None, width: int, height: int) -> str:
     if rgb.shape[:2] != (height, width):
         return f"; photo left out, it is {rgb.shape[1]}x{rgb.shape[0]}"
     shrink = min(1.0, PHOTO_WIDTH_PX / width)
-    small = cv2.resize(
-        np.ascontiguousarray(rgb),
-        (round(width * shrink), max(1, round(height * shrink))),
-        interpolation=cv2.INTER_AREA,
-    )
+    size = (round(width * shrink), max(1, round(height * shrink)))
+    small = cv2.resize(np.ascontiguousarray(rgb), size, interpolation=cv2.INTER_AREA)
     pale = cv2.convertScaleAbs(small, alpha=1 - PALER, beta=255 * PALER)
     ax.imshow(
         pale, cmap="gray", vmin=0, vmax=255, extent=(-0.5, width - 0.5, height - 0.5, -0.5),
@@ -151,7 +151,9 @@ def plot_views(report: HandEyeReport) -> Any:
     used = sorted(report.used, key=lambda v: -np.nan_to_num(v.unseen_px, nan=-1.0))
     dropped = [v for v in report.views if not v.used]
     shown = [*used[: max(0, MOST_BARS - len(dropped))], *dropped[:MOST_BARS]]
-    figure = style.new_figure(0.9 + 0.165 * max(4, len(shown)))
+    names = [style.view_label(v.label, v.index) for v in shown]
+    room = (style.room_for(names), 0.1, 0.5, 0.5, 0, 0)
+    figure = style.new_figure(0.9 + 0.165 * max(4, len(shown)), room=room)
     ax = figure.add_subplot()
     largest = float(np.max(style.finite([v.unseen_px for v in used]), initial=0.1))
     for k, v in enumerate(shown):
@@ -162,7 +164,7 @@ def plot_views(report: HandEyeReport) -> Any:
             ax.barh(k, largest, height=0.72, color=style.BAD, alpha=0.13)
             reason = style.short_label(f"dropped: {v.reason}", 120)
             ax.text(largest * 0.008, k, reason, va="center", fontsize=7, color=style.BAD)
-    ax.set_yticks(range(len(shown)), [style.view_label(v.label, v.index) for v in shown])
+    ax.set_yticks(range(len(shown)), names)
     for tick, v in zip(ax.get_yticklabels(), shown, strict=True):
         tick.set_color(style.INK if v.used else style.BAD)
     ax.set_ylim(len(shown) - 0.4, -0.6)
@@ -177,14 +179,8 @@ def plot_views(report: HandEyeReport) -> Any:
     more = f", {left_out} better ones are in the table below" if left_out else ""
     ax.set_title(f"Reprojection error of each view, worst first{more}", pad=22)
     ax.set_xlabel("RMS through the robot's pose [px]")
-    ax.legend(
-        handles.values(),
-        handles.keys(),
-        loc="lower left",
-        bbox_to_anchor=(0, 1.0),
-        ncols=3,
-        borderaxespad=0.2,
-    )
+    ax.legend(handles.values(), handles.keys(), loc="lower left", bbox_to_anchor=(0, 1.0), ncols=3,
+              borderaxespad=0.2)  # fmt: skip
     ax.grid(axis="x")
     ax.set_axisbelow(True)
     return figure
@@ -195,8 +191,8 @@ def plot_views(report: HandEyeReport) -> Any:
 
 def plot_coverage(report: HandEyeReport) -> Any:
     """Plot where in the image points lay, from where the target was seen, and the camera's roll."""
-    figure = style.new_figure(3.1)
-    grid = figure.add_gridspec(1, 3, width_ratios=(1.4, 1.3, 1))
+    figure = style.new_figure(3.1, grid=(1, 3), room=(0.6, 0.3, 0.3, 0.5, 0.85, 0))
+    grid = figure.add_gridspec(1, 3, width_ratios=(1.4, 1.4, 1))
     _image_coverage(figure, figure.add_subplot(grid[0]), report)
     _directions(figure, figure.add_subplot(grid[1], projection="polar"), report)
     _rolls(figure.add_subplot(grid[2], projection="polar"), report)
