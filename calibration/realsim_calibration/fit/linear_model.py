@@ -170,14 +170,14 @@ class LinearModel:
         U /= sigma
         U, residual = U[..., :-1], U[..., -1] + U[..., :-1] @ step
         try:
-            away = _left_out(H, U, residual)
+            away, swings = _left_out(H, U, residual)
         except np.linalg.LinAlgError as error:
             raise DegenerateError(
                 "hand-eye: without one of the views the fit is no longer determined. Add views."
             ) from error
         return LinearFit(
             step=step, sigma_px=sigma, information=H, view_rows=U, away=away,
-            pulls=np.einsum("nrc,nr->nc", U, residual), swings=_swings(H, U, residual),
+            pulls=np.einsum("nrc,nr->nc", U, residual), swings=swings,
             seen_px=self.predicted(basis, np.broadcast_to(step, away.shape)),
             unseen_px=self.predicted(basis, step + away),
         )  # fmt: skip
@@ -202,18 +202,19 @@ class LinearModel:
         return -np.linalg.solve(fit.information, pulled)
 
 
-def _left_out(H: Array, U: Array, residual: Array) -> Array:
-    """Return (H - U_i^T U_i)^-1 U_i^T rho_i (views, dim) by Woodbury's identity."""
+def _left_out(H: Array, U: Array, residual: Array) -> tuple[Array, Array]:
+    """Return (H - U_i^T U_i)^-1 U_i^T rho_i (views, dim) by Woodbury's identity.
+
+    The second one has the views' leverage bounded: no eigenvalue of what is left of a view's rows
+    is below the bound. Where their leverages' sum is not above it, none of them is.
+    """
     V = np.linalg.solve(H, np.swapaxes(U, 1, 2).transpose(1, 0, 2).reshape(len(H), -1))
     V = V.reshape(len(H), len(U), -1).transpose(1, 0, 2)  # H^-1 U_i^T (views, dim, 24)
     inner = np.eye(U.shape[1]) - U @ V
-    return (V @ np.linalg.solve(inner, residual[..., None]))[..., 0]
-
-
-def _swings(H: Array, U: Array, residual: Array) -> Array:
-    """Return `_left_out` (views, dim) with the views' leverage bounded."""
-    V = np.linalg.solve(H, np.swapaxes(U, 1, 2).transpose(1, 0, 2).reshape(len(H), -1))
-    V = V.reshape(len(H), len(U), -1).transpose(1, 0, 2)
-    left, axes = np.linalg.eigh(np.eye(U.shape[1]) - U @ V)
-    along = np.swapaxes(axes, 1, 2) @ residual[..., None]
-    return (V @ axes @ (along / np.maximum(left, LEAST_LEFT)[..., None]))[..., 0]
+    away = (V @ np.linalg.solve(inner, residual[..., None]))[..., 0]
+    swings = away.copy()
+    at = np.trace(inner, axis1=1, axis2=2) < U.shape[1] - 1 + LEAST_LEFT
+    left, axes = np.linalg.eigh(inner[at])
+    along = np.swapaxes(axes, 1, 2) @ residual[at, :, None]
+    swings[at] = (V[at] @ axes @ (along / np.maximum(left, LEAST_LEFT)[..., None]))[..., 0]
+    return away, swings

@@ -73,7 +73,7 @@ def whiteness(problem: JointProblem, state: JointState, config: NoiseConfig) -> 
         x, y = (view.xy / problem.setup.half_extent).T
         powers = [(a, b) for a in range(config.degree + 1) for b in range(config.degree + 1 - a)]
         terms = np.stack([x**a * y**b for a, b in powers], -1)
-        S = np.kron(terms, np.eye(2))
+        S = (terms[:, None, :, None] * np.eye(2)[:, None]).reshape(len(r), -1)  # Kronecker's
         S = S - free_pose @ (free_pose.T @ S)
         u, s, _ = np.linalg.svd(S, full_matrices=False)
         u = u[:, s > 1e-6 * max(float(s[0]), 1e-12)]
