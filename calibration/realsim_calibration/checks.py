@@ -226,7 +226,8 @@ def _scale(r: HandEyeReport, c: CheckConfig) -> Check:
     sd = float(b.sd[0])
     off = abs(b.scale - 1)
     if sd == 0:
-        return Check(name="board size", verdict="unknown", sentence="the board's size was held.")
+        said = "these data cannot measure the board's size: the size given was used."
+        return Check(name="board size", verdict="unknown", sentence=said)
     verdict = _verdict(off, c.scale)
     if verdict == "bad" and off <= c.scale_sigmas * sd:
         verdict = "warn"

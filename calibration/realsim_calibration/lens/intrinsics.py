@@ -48,7 +48,7 @@ REFERENCE = "Brown 5"
 chosen, and it says how uncertain the lens is where there were no corners."""
 TILT_ADVICE = (
     "Add views that tilt the board by 30 deg about two axes (towards you, away from you, to the "
-    "left, to the right), or give the factory's intrinsics as `start`."
+    "left, to the right), or give the factory's intrinsics (`--intrinsics`; `start` in Python)."
 )
 
 
