@@ -22,7 +22,6 @@ from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.records import ObjectModel
 
 COLOUR_FILE, DEPTH_FILE, META_FILE = "color.png", "depth.png", "meta.mat"
-WORKSPACE_FILE = "workspace_mask.png"
 
 
 class GraspnetFrame:
@@ -96,18 +95,6 @@ class GraspnetFrame:
         """None: there are no masks of objects."""
         self.frame(index)
         return None
-
-    def workspace_mask(self) -> Mask | None:
-        """Return where grasps are looked for (H, W); None = there is no such mask.
-
-        Raises:
-            InputError: it is damaged, or of another size.
-        """
-        path = self.folder / WORKSPACE_FILE
-        if not path.is_file():
-            return None
-        image_files.same_size([self.folder / COLOUR_FILE, path])
-        return images.read_grey(path) > 0
 
     def models(self) -> Mapping[int, ObjectModel]:
         """Return the models by object id; none unless their folder was given."""
