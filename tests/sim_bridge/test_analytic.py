@@ -10,7 +10,7 @@ from realsim.records import Mesh
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.grasping.analytic import AnalyticConfig, analytic_labels, gripper_boxes
 from realsim_sim_bridge.grasping.analytic_given import given_candidates, standing_labels
-from realsim_sim_bridge.grasping.analytic_select import select_analytic, select_rows
+from realsim_sim_bridge.grasping.analytic_select import select_rows
 from realsim_sim_bridge.grasping.candidates import CandidateConfig, Surroundings
 from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
 from tried_grasps import assert_same
@@ -86,7 +86,7 @@ def test_what_closes_on_a_wedge_needs_the_friction_of_its_slopes():
 def test_a_box_that_nothing_can_hold_has_no_label():
     labels = labels_of(box(0.3, 0.3, 0.3))
     assert len(labels) == 0 and len(labels.points) == 12
-    assert len(select_analytic(labels, 10, np.random.default_rng(0), obj_id=1)) == 0
+    assert len(select_rows(labels, 10, np.random.default_rng(0))) == 0
 
 
 def test_graspnets_gripper_has_the_boxes_of_its_collision_check():
@@ -115,7 +115,8 @@ def test_a_palm_in_the_object_collides_with_it():
 def test_the_choice_is_free_spread_and_of_every_level(of_box):
     labels = of_box[1]
     rng = np.random.default_rng(1)
-    s = select_analytic(labels, 60, rng, obj_id=3, instance=2, file="grasp_label/002_labels.npz")
+    few = labels.rows(select_rows(labels, 60, rng))
+    s = few.as_set(3, 2, file="grasp_label/002_labels.npz")
     assert len(s) == 60 and (s.obj_id, s.instance) == (3, 2) and np.isnan(s.scores).all()
     rows = select_rows(labels, 60, np.random.default_rng(1))
     np.testing.assert_array_equal(s.parameters["label_index"], labels.index[rows])
@@ -143,7 +144,7 @@ def standing(mesh):
 
 def test_given_grasps_keep_their_contacts_and_their_friction(of_box):
     mesh, labels = of_box
-    s = select_analytic(labels, 80, np.random.default_rng(0), obj_id=1)
+    s = labels.rows(select_rows(labels, 80, np.random.default_rng(0))).as_set(1)
     found, rows = given_candidates(
         mesh, standing(mesh), Surroundings(), s.Ts_obj_grasp, CandidateConfig(), HAND
     )
@@ -172,7 +173,7 @@ def test_labels_that_stand_are_those_the_hand_can_take(of_box):
     config, rng = CandidateConfig(), np.random.default_rng(0)
     found = standing_labels(labels, mesh, T, Surroundings(), config, HAND, rng)
     assert 20 < len(found) < (~labels.collision).sum() and not found.collision.any()
-    s = select_analytic(found, 40, rng, obj_id=1)
+    s = found.rows(select_rows(found, 40, rng)).as_set(1)
     again, rows = given_candidates(mesh, T, Surroundings(), s.Ts_obj_grasp, config, HAND)
     assert len(rows) == len(s) == 40
     lowest = np.min((T @ again.Ts_obj_grasp)[:, 2, 3])

@@ -115,7 +115,7 @@ def standing_labels(
 ) -> GraspLabels:
     """Return the labels whose grasps the hand can take where the object stands.
 
-    Most of an object's labels come from below. Those that are left are what `select_analytic` is to
+    Most of an object's labels come from below. Those that are left are what `select_rows` is to
     choose from for a scene. Of very many labels MOST_TRIED are looked at, chosen by chance.
 
     Args:

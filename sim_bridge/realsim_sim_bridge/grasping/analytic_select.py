@@ -5,7 +5,6 @@ import numpy as np
 from realsim.arrays import Array, Int64, Rows
 from realsim.errors import InputError
 from realsim.formats.graspnet.grasp_labels import GraspLabels
-from realsim.records import GraspSet
 
 # --- Rows far apart from one another -------------------------------------------------------------
 
@@ -39,36 +38,14 @@ MOST_COMPARED = 4000
 """Grasps of a level that are looked at; a level of a large object has 100,000."""
 
 
-def select_analytic(
-    labels: GraspLabels,
-    count: int,
-    rng: np.random.Generator,
-    *,
-    obj_id: int,
-    instance: int = 0,
-    file: str = "",
-) -> GraspSet:
-    """Return analytic grasps for the School to try, with their label as `closure_friction`.
+def select_rows(labels: GraspLabels, count: int, rng: np.random.Generator) -> Rows:
+    """Return increasing rows (N,) of at most `count` analytic labels for the School to try.
 
-    Grasps whose gripper is in the object are left out. The set's parameters say which label each
-    row is (`label_index`) and how far the gripper opens (`openings_m`).
-
-    Args:
-        labels: of the object; computed, or read from a file.
-        count: grasps at most.
-        rng: the only source of chance.
-        obj_id: realsim's id.
-        instance: of the object.
-        file: where the labels came from.
+    Grasps whose gripper is in the object are left out.
 
     Raises:
         InputError: the count is negative.
     """
-    return labels.rows(select_rows(labels, count, rng)).as_set(obj_id, instance, file=file)
-
-
-def select_rows(labels: GraspLabels, count: int, rng: np.random.Generator) -> Rows:
-    """Return increasing rows (N,) of at most `count` labels; see `select_analytic`."""
     if count < 0:
         raise InputError(f"analytic grasps: {count} are asked for; a number from 0 is expected.")
     free = np.flatnonzero(~labels.collision)
