@@ -1,5 +1,6 @@
 """Pose logs and recordings by two clocks through `realsim calibrate`."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -145,3 +146,101 @@ def test_views_at_stops_are_no_stream() -> None:
 def test_what_is_no_offset_is_named() -> None:
     with pytest.raises(InputError, match="auto, off, or seconds"):
         clock_option("soon")
+
+
+Change = Callable[[Array], Array]
+
+
+def same(a: Array) -> Array:
+    return a
+
+
+def changed(logs: Path, folder: Path, robot: Change, board: Change = same) -> Path:
+    """Return a folder with both logs, their rows of numbers changed."""
+    folder.mkdir()
+    for name, how in (("robot.csv", robot), ("board.csv", board)):
+        a = how(np.loadtxt(logs / name, delimiter=",", skiprows=1))
+        np.savetxt(folder / name, a, "%.9f", ",", header="t,x,y,z,qx,qy,qz,qw", comments="")
+    return folder
+
+
+def ms(a: Array) -> Array:
+    return a * [1e3, 1, 1, 1, 1, 1, 1, 1]
+
+
+def still(a: Array) -> Array:
+    return a * [0, 1, 1, 1, 1, 1, 1, 1]
+
+
+def reset(a: Array) -> Array:
+    """Return a log whose clock began anew half-way."""
+    return a - np.outer(np.arange(len(a)) >= len(a) // 2, 3.993 * np.eye(8)[0])
+
+
+def stuck(a: Array) -> Array:
+    """Return a log whose clock stood for two seconds."""
+    b = a.copy()
+    b[151:250, 0] = b[151, 0]
+    return b
+
+
+def few(a: Array) -> Array:
+    return a[:10]
+
+
+def no_stamp(a: Array) -> Array:
+    b = a.copy()
+    b[100, 0] = np.nan
+    return b
+
+
+@pytest.mark.parametrize(
+    ("robot", "board", "option", "words"),
+    [
+        (ms, ms, "auto", "robot.csv: the time stamps are 20 apart .*milliseconds.*by 1000"),
+        (same, ms, "auto", "board.csv: the time stamps are 100 apart .*milliseconds"),
+        (ms, ms, "0.08", "robot.csv: the time stamps are 20 apart .*milliseconds"),
+        (same, ms, "0.08", "no time in common. Are both in seconds"),
+        (still, same, "auto", "robot.csv: all time stamps are equal"),
+        (same, few, "auto", "board.csv: 10 poses .* 30 are needed"),
+        (same, same, "off", "400 robot poses and 70 board poses.*--clock-offset off"),
+        (reset, same, "auto", "robot.csv: line 202: the time goes back by 3.973 s: two record"),
+        (reset, same, "0.08", "robot.csv: line 202: the time goes back by 3.973 s"),
+    ],
+)
+def test_stamps_that_cannot_pair_are_named(
+    logs: Path, tmp_path: Path, robot: Change, board: Change, option: str, words: str
+) -> None:
+    folder = changed(logs, tmp_path / "s", robot, board)
+    with pytest.raises(InputError, match=words):
+        calibrated = calibrate(folder, tmp_path / "c", "--clock-offset", option)
+        raise calibrated.exception or AssertionError(calibrated.output)
+
+
+def test_what_a_log_does_not_know_is_left_out_and_named(
+    logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One stamp that is NaN, and two seconds in which the clock stood: their frames are not used.
+
+    Lines that are not in the order of time are still one stream.
+    """
+
+    def pairs(name: str, how: Change) -> tuple[int, str]:
+        folder = changed(logs, tmp_path / name, how)
+        robot, board = read_logs(folder / "robot.csv", folder / "board.csv", "")
+        assert robot.stated is not None and board.stated is not None
+        readings = robot.stated, board.stated
+        found = pair_pose_logs(robot, board, readings, "eye_in_hand", "auto", Console())
+        assert found is not None and found[4] is not None
+        assert found[4].offset_s == pytest.approx(0.08, abs=3e-3)
+        said = capsys.readouterr()
+        return len(found[0]), " ".join((said.out + said.err).split())
+
+    nan = pairs("nan", no_stamp)
+    assert nan[0] == 70 and "1 of 400 poses are left out: without a time stamp" in nan[1]
+    assert "line 102" in nan[1]
+    n, said = pairs("stuck", stuck)
+    assert 48 <= n <= 52 and "98 of 400 poses are left out: with the time stamp of" in said
+    assert "line 154" in said and f"{70 - n} poses of" in said and "lie in gaps of" in said
+    for name, how in (("b", np.flipud), ("m", np.random.default_rng(0).permutation)):
+        assert pairs(name, how)[0] == 70

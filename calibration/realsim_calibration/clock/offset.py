@@ -23,6 +23,7 @@ from realsim_calibration.clock.streams import (
     STEPS_PER_WINDOW,
     checked_stream,
     correlated,
+    in_gap,
     interpolated,
     turning_speeds,
     velocities,
@@ -218,6 +219,7 @@ class _Fit:
         """Return the hand (m, 4, 4) at the frames, its velocity (m, 6), and where it is known."""
         at = self.tc - offset
         Ts, inside = interpolated(self.tr, self.A, at)
+        inside &= ~in_gap(self.tr, at)
         return Ts, velocities(self.tr, self.A, at, self.window), inside
 
     def run(self, offset: float) -> ClockOffset:

@@ -14,6 +14,8 @@ LEAST_OVERLAP = 0.25
 SPIKE_RATIO, SPIKE_RAD, SPIKE_ROUNDS = 8.0, 0.05, 4
 """A pose is a spike when its detour exceeds so many medians and so much [rad]."""
 LEAST_POSES = 3
+GAP_S = 0.5
+"""Nothing is known of a hand between poses further apart than this [s] and than two periods."""
 STEPS_PER_WINDOW = 10
 """Lags tried per window: the peak is as wide as the window."""
 
@@ -54,6 +56,13 @@ def interpolated(times: Array, Ts: Array, at: Array) -> tuple[Array, Mask]:
     turn = se3.log_so3(np.swapaxes(R, 1, 2) @ Ts[k + 1, :3, :3])
     t = Ts[k, :3, 3] * (1 - share) + Ts[k + 1, :3, 3] * share
     return se3.from_rt(R @ se3.exp_so3(share * turn), t), inside
+
+
+def in_gap(times: Array, at: Array) -> Mask:
+    """Return (m,) which times lie between two poses of a stream that are too far apart."""
+    k = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
+    wide = times[k + 1] - times[k] > max(GAP_S, window_of(times))
+    return wide & (at > times[k]) & (at < times[k + 1])
 
 
 def velocities(times: Array, Ts: Array, at: Array, window_s: float) -> Array:

@@ -190,6 +190,9 @@ def read_board_poses(
             raise InputError(
                 f"there are {len(a)} robot poses and {len(b)} board poses, and no names say which "
                 "belong together. Write the image's name beside each pose of both files."
+                + (a.times is not None and b.times is not None)
+                * " Or pair them by their time stamps: without `--clock-offset off`, and with "
+                "--reading where the format of the poses is open."
             )
         else:
             sentence = f"Paired by order, as the counts agree ({len(a)}). No names confirm it."

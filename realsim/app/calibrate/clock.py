@@ -15,7 +15,7 @@ from realsim.arrays import Array, Mask
 from realsim.errors import DegenerateError, InputError
 from realsim.records import CameraIntrinsics, Target
 from realsim_calibration import BoardView, ClockOffset, estimate_board_pose, estimate_clock_offset
-from realsim_calibration.clock.streams import checked_stream, interpolated
+from realsim_calibration.clock.streams import checked_stream, in_gap, interpolated
 from realsim_calibration.inputs import PoseReading, RawPoses
 from realsim_calibration.results import Clock, Mode
 
@@ -25,6 +25,10 @@ STREAM_POSES = 30
 """Fewer poses are no stream either."""
 MIN_POINTS = 6
 """Fewest points of a board pose that may speak for a clock."""
+LONGER = 1.5
+"""A way that is so much longer in the order of time than in the file's is that of two recordings
+whose times overlap; lines that are merely not sorted make it shorter."""
+UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -67,6 +71,62 @@ def is_stream(times: Array | None) -> bool:
     return len(known) >= STREAM_POSES and float(np.median(np.diff(known))) <= STREAM_PERIOD_S
 
 
+def why_no_stream(poses: RawPoses, least: int = STREAM_POSES) -> str:
+    """Return why stamped poses are no stream of at least so many; empty where they are one."""
+    assert poses.times is not None
+    known = np.unique(poses.times[np.isfinite(poses.times)])
+    if len(known) < 2:
+        return f"{poses.path}: all time stamps are equal."
+    apart = float(np.median(np.diff(known)))
+    if apart > STREAM_PERIOD_S:
+        unit = next(((u, f) for f, u in UNITS.items() if apart / f <= STREAM_PERIOD_S), None)
+        return (
+            f"{poses.path}: the time stamps are {apart:.6g} apart (median); a stream in seconds "
+            f"has at most {STREAM_PERIOD_S:g} s between poses."
+            + (f" Are they {unit[0]}? Divide by {unit[1]:.0f}." if unit else "")
+        )
+    if len(known) < least:
+        return (
+            f"{poses.path}: {len(known)} poses have a time stamp of their own; {least} are needed "
+            "to find the offset of the clocks. Record longer, or give it (--clock-offset SECONDS)."
+        )
+    return ""
+
+
+def own_times(poses: RawPoses, Ts: Array, console: Console) -> Mask:
+    """Return which poses (n, 4, 4) have a time stamp that is theirs alone; say which have not.
+
+    Raises:
+        InputError: the clock goes back to a time that was recorded already.
+    """
+    assert poses.times is not None
+    t, finite = poses.times, np.isfinite(poses.times)
+    known = np.flatnonzero(finite)
+    by_time = known[np.argsort(t[known], kind="stable")]
+    way, way_by_time = (
+        float(np.linalg.norm(np.diff(Ts[rows], axis=0), axis=(1, 2)).sum())
+        for rows in (known, by_time)
+    )
+    if way_by_time > LONGER * way:
+        k = int(np.argmin(np.diff(t[known])))
+        raise InputError(
+            f"{poses.path}: {poses.where[known[k + 1]]}: the time goes back by "
+            f"{t[known[k]] - t[known[k + 1]]:.4g} s: two recordings in one file? Give each its own."
+        )
+    own = np.zeros(len(t), dtype=bool)
+    own[known[np.unique(t[known], return_index=True)[1]]] = True
+    for lost, what in (
+        (~finite, "without a time stamp"),
+        (finite & ~own, "with the time stamp of a pose before"),
+    ):
+        if lost.any():
+            console.warn(
+                f"{poses.path}: {lost.sum()} of {len(t)} poses are left out: {what} (the first is "
+                f"{poses.where[int(np.argmax(lost))]})."
+            )
+    return own
+
+
 def arm_at(
     times: Array, Ts: Array, joints: Array | None, frames: Array, offset_s: float
 ) -> Stamped:
@@ -104,7 +164,8 @@ def pair_pose_logs(
     """Return hand poses, board poses, joints, labels and clock of two logs, None without stamps.
 
     Raises:
-        InputError: no offset explains both, or they have no time in common.
+        InputError: no offset explains both, they have no time in common, or time stamps by which
+            alone they could be paired are no stream.
     """
     given = clock_option(option)
     times, frames = robot.times, board.times
@@ -115,9 +176,21 @@ def pair_pose_logs(
                 "stamps each (time, t, stamp)."
             )
         return None
+    named = all(label or stem for label, stem in zip(board.labels, board.stems, strict=True))
+    if len(robot) != len(board) and not named:
+        # An offset that is given needs many poses of neither, and no stream of the board.
+        auto = why_no_stream(robot) or why_no_stream(board)
+        why = auto if given is None else why_no_stream(robot, 2)
+        if why:
+            raise InputError(
+                f"{why} (Poses at stops are paired by the image's name beside each pose of both "
+                "files.)"
+            )
     if given is None and not (is_stream(times) and is_stream(frames)):
         return None
     Ts, boards = robot.poses(readings[0]), board.poses(readings[1])
+    own_times(robot, Ts, console)
+    own = own_times(board, boards, console)
     if given is None:
         # The frames lie between the arm's poses: they follow even an offset that hardly matters.
         found = estimate_clock_offset(times, Ts, frames, boards, mode=mode)
@@ -126,11 +199,20 @@ def pair_pose_logs(
         clock = as_given(given)
     offset = clock.offset_s
     arm = arm_at(times, Ts, robot.joints, frames, offset)
-    keep = np.flatnonzero(arm.inside & board.measured)
+    gap = own & in_gap(np.unique(times[np.isfinite(times)]), frames - offset)
+    if gap.any():
+        rows = np.flatnonzero(gap)
+        console.warn(
+            f"{len(rows)} poses of {board.path} lie in gaps of {robot.path} and are not used: "
+            f"{', '.join(board.where[k] for k in rows[:8])}{', ...' * (len(rows) > 8)}."
+        )
+    keep = np.flatnonzero(arm.inside & own & ~gap)
     if not len(keep):
         raise InputError(
-            f"with the clocks {offset:+.3f} s apart no frame of {board.path} lies in the time of "
-            f"{robot.path}: they have no time in common. Give another --clock-offset."
+            f"with the clocks {offset:+.3f} s apart no frame of {board.path} "
+            f"({np.nanmin(frames):.10g} to {np.nanmax(frames):.10g}) lies in the time of "
+            f"{robot.path} ({np.nanmin(times):.10g} to {np.nanmax(times):.10g}): they have no time "
+            "in common. Are both in seconds? Else give another --clock-offset."
         )
     labels = [board.where[k] or str(k) for k in keep]
     joints = None if arm.joints is None else arm.joints[keep]
