@@ -138,6 +138,19 @@ def refusal(result: Result) -> str:
     return str(result.exception)
 
 
+def test_cameras_without_an_arm_get_all_their_files(photos: Path, tmp_path: Path) -> None:
+    held = ["--moved-board", str(photos.parent / "held.json")]
+    fixed = ["--cameras", "left=fixed,right=fixed", "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(commands, ["calibrate", str(photos), *fixed, *held])
+    assert result.exit_code in {0, 1}, result.output
+    assert (tmp_path / "out/cameras_report.html").is_file()
+    urdf = (tmp_path / "out/right/exports/camera.urdf").read_text()
+    assert 'parent link="base"' in urdf and 'child link="right_optical_frame"' in urdf
+    (pair,) = read_cameras(tmp_path / "out/cameras.json").pairs
+    off = se3.invert(se3.invert(FIXED["left"]) @ FIXED["right"]) @ pair.T_a_b
+    assert np.linalg.norm(off[:3, 3]) < 0.01
+
+
 @pytest.fixture(scope="module")
 def calibrated(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
     out = tmp_path_factory.mktemp("out") / "calibration"

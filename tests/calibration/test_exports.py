@@ -255,8 +255,14 @@ def test_write_exports_writes_readable_files(full_record: Maker, tmp_path: Path)
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"hand": "/tool0"}, {"hand": "tool 0"}, {"hand": "base"}, {"name": "../x"}, {"target": ""}],
+    [{"hand": "/tool0"}, {"hand": "tool 0"}, {"target": "base"}, {"name": "../x"}, {"target": ""}],
 )
 def test_frame_names_that_tf_refuses(wrong: dict[str, Any]) -> None:
     with pytest.raises(InputError):
         FrameNames(**wrong)
+
+
+def test_the_base_is_no_hand_that_carries_a_camera(full_record: Maker, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="robot_base and hand have the same name: 'base'"):
+        write_exports(full_record(np.eye(4)), tmp_path / "out", frames=FrameNames(hand="base"))
+    assert not list(tmp_path.rglob("*.*"))

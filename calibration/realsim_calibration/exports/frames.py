@@ -39,7 +39,8 @@ class FrameNames:
     """Frame in which the controller gives the tool's pose. On UR robots that is `base`, not
     `base_link`: the two are turned by 180 deg about z."""
     hand: str = "tool0"
-    """Frame whose pose the controller gave: the flange only where no tool offset was active."""
+    """Frame whose pose the controller gave: the flange only where no tool offset was active. The
+    same as `robot_base` where a camera and its target both stand still."""
     camera_optical: str = "camera_color_optical_frame"
     """Optical frame of the calibrated image: x right, y down, z forward."""
     target: str = "calibration_target"
@@ -71,6 +72,8 @@ class FrameNames:
                     f"the frame name {name!r} of {what} cannot be used: letters, digits and _ - . "
                     "/ are accepted, without a leading slash (tf2 refuses it) and without spaces."
                 )
+        if self.hand == self.robot_base:
+            del names["hand"]  # of an eye to hand whose target hangs on no hand; see parent_frame
         if len(set(names.values())) < len(names):
             raise InputError(f"two frames have the same name: {names}. Every frame needs its own.")
         if not FILE_NAME.fullmatch(self.name):
@@ -82,8 +85,18 @@ class FrameNames:
 
 
 def parent_frame(report: HandEyeReport, frames: FrameNames) -> str:
-    """Return the frame that carries the camera: the hand, or the robot's base (eye to hand)."""
-    return frames.hand if report.mode == "eye_in_hand" else frames.robot_base
+    """Return the frame that carries the camera: the hand, or the robot's base (eye to hand).
+
+    Raises:
+        InputError: hand and base of a camera in the hand have the same name.
+    """
+    if report.mode != "eye_in_hand":
+        return frames.robot_base
+    if frames.hand == frames.robot_base:
+        raise InputError(
+            f"robot_base and hand have the same name: {frames.hand!r}. Every frame needs its own."
+        )
+    return frames.hand
 
 
 def published_transform(report: HandEyeReport, frames: FrameNames) -> tuple[Array, str, str]:
