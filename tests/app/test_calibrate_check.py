@@ -103,6 +103,7 @@ def test_the_calibration_that_lies_there_now_is_checked(pristine: Path, tmp_path
         (["--check", "--tolerance", "nan"], "above 0"),
         (["--check", "--tolerance", "-1"], "above 0"),
         (["--check", "--live"], "no meaning with --check"),
+        (["--check", "--out", "xx"], "--out has no meaning with --check"),
         (["--tolerance", "2"], "belongs to --check"),
         (["--cameras", "a=hand", "--clock-offset", "0.1"], "one camera alone"),
     ],

@@ -33,7 +33,7 @@ def require_used(check: bool, live: bool, tolerance: float, options: dict[str, A
     clock = options["clock_offset"] != "auto"
     given = [f"--{name.replace('_', '-')}" for name, value in options.items()
              if value and name not in ("out", "clock_offset")]  # fmt: skip
-    given += ["--clock-offset"] * clock + ["--live"] * live
+    given += ["--clock-offset"] * clock + ["--live"] * live + ["--out"] * (options["out"] != OUT)
     if check and given:
         raise InputError(f"{given[0]} has no meaning with --check, which calibrates nothing.")
     if not check and tolerance != TOLERANCE_MM:
