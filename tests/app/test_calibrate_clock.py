@@ -88,6 +88,9 @@ def test_files_hold_the_offset(logs: Path, tmp_path: Path) -> None:
     assert clock.offset_s == pytest.approx(0.08, abs=3e-3)
     for name in ("camera.urdf", "easy_handeye/hand_eye.yaml", "ros2_static_transform.sh"):
         assert clock.sentence in (tmp_path / "c/exports" / name).read_text()
+    page = (tmp_path / "c/calibration_report.html").read_text()
+    offset = f"{1e3 * clock.offset_s:+.2f} ± {1e3 * clock.sigma_s:.2f} ms, applied"
+    assert "clock offset arm to camera" in page and offset in page
 
 
 def test_a_given_offset_is_taken_and_off_pairs_rows(logs: Path, tmp_path: Path) -> None:
@@ -184,6 +187,12 @@ def stuck(a: Array) -> Array:
     return b
 
 
+def no_pose(a: Array) -> Array:
+    b = a.copy()
+    b[100, 1] = np.nan
+    return b
+
+
 def few(a: Array) -> Array:
     return a[:10]
 
@@ -204,6 +213,7 @@ def no_stamp(a: Array) -> Array:
         (still, same, "auto", "robot.csv: all time stamps are equal"),
         (same, few, "auto", "board.csv: 10 poses .* 30 are needed"),
         (same, same, "off", "400 robot poses and 70 board poses.*--clock-offset off"),
+        (no_pose, same, "auto", r"line 102 \(1 of 400\): NaN .* images if there are any"),
         (reset, same, "auto", "robot.csv: line 202: the time goes back by 3.973 s: two record"),
         (reset, same, "0.08", "robot.csv: line 202: the time goes back by 3.973 s"),
     ],

@@ -226,8 +226,8 @@ class PoseReading:
         bad: Mask = ~np.all(np.isfinite(values), axis=1)
         if bad.any():
             raise InputError(
-                f"{_listed(names, bad)} hold NaN or infinite numbers: these poses were not "
-                "measured. Delete them together with their images."
+                f"{_listed(names, bad)}: NaN or infinite numbers were not measured. Delete such "
+                "poses, with their images if there are any."
             )
         return values, names
 

@@ -11,7 +11,7 @@ from realsim.geometry import metrics, se3
 from realsim.records import ArmErrorMap, Check, RobotErrorMap
 from realsim.records.calibration import worst_sigmas
 from realsim_calibration.exports.frames import quaternion_xyzw, roll_pitch_yaw
-from realsim_calibration.results import HandEyeReport, ViewReport
+from realsim_calibration.results import Clock, HandEyeReport, ViewReport
 
 Verdict = Literal["good", "warn", "bad", "unknown"]
 NOT_KNOWN = "not known"
@@ -209,7 +209,17 @@ def accuracy_rows(report: HandEyeReport) -> list[list[str]]:
         ["corner noise", amount(report.sigma_px, 3, "px")],
         ["views used, dropped", f"{len(report.used)}, {len(report.rejected)}"],
         ["roll about the optical axis", amount(report.roll_range_deg, 0, "deg")],
+        *([] if report.clock is None else [["clock offset arm to camera", _offset(report.clock)]]),
     ]
+
+
+def _offset(clock: Clock) -> str:
+    """Return the offset of the clocks in words."""
+    known = np.isfinite(clock.sigma_s)
+    sigma = f" ± {1e3 * clock.sigma_s:.2f}" if known else ""
+    source = "" if known else ", as given"
+    used = "applied" if clock.applied else "too small to matter, left out"
+    return f"{1e3 * clock.offset_s:+.2f}{sigma} ms{source}, {used}"
 
 
 def summary_rows(report: HandEyeReport) -> list[list[str]]:
