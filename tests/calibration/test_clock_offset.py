@@ -96,6 +96,13 @@ def test_whether_it_matters() -> None:
     assert far.moved_mm > 5.0
 
 
+def test_clocks_that_start_at_different_times_are_told_in_seconds() -> None:
+    """What an offset of years would move the board by is no figure."""
+    told = streams().offset(1.7e9).sentence
+    assert "+1699999999.99" in told and " s off" in told
+    assert "start at different times" in told and "moves the board" not in told
+
+
 def test_frames_without_a_board_and_wrong_ones_do_no_harm() -> None:
     """NaN frames are left out, invented poses are gated."""
     s = streams(d=0.02)

@@ -57,6 +57,8 @@ NO_OFFSET = (
     "motion repeats itself. Record a motion that does not repeat, or give the offset "
     "(--clock-offset SECONDS)."
 )
+STARTS_S = 1.0
+"""Clocks further apart were never set to the same time [s]."""
 NOISE_STEPS = (0, 1, 3)
 """Steps of the least squares before which the sizes are estimated anew."""
 
@@ -115,6 +117,11 @@ class ClockOffset:
     @property
     def sentence(self) -> str:
         """Return the offset in words."""
+        if abs(self.offset_s) > STARTS_S:
+            return (
+                f"the camera's clock is {self.offset_s:+.6f} s off the robot's (+-"
+                f"{1e3 * self.sigma_s:.2f} ms): the clocks start at different times."
+            )
         told = (
             "it matters" if self.matters else "too small to matter"
         ) + f": it moves the board by {self.moved_mm:.2f} mm, the pairs scatter by "
