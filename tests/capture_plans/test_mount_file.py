@@ -1,10 +1,12 @@
 """Mount and work cell files: what is written is read back, what is wrong is named."""
 
+import json
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,11 +14,7 @@ from realsim.errors import InputError, RealsimError, UnitError
 from realsim.geometry import se3
 from realsim.robots.arm import UR5
 from realsim.robots.shapes import Box, Mount, Shape, WorkCell
-from realsim_capture_plans.collision.cell_files import (
-    read_mount,
-    read_work_cell_obstacles,
-    write_mount,
-)
+from realsim_capture_plans.collision.cell_files import read_mount, read_work_cell_obstacles
 from realsim_capture_plans.collision.model import CollisionModel
 from realsim_capture_plans.collision.mount import CAMERA_BODIES, d405_mount, plain_bracket
 
@@ -39,6 +37,33 @@ def written(folder: Path, text: str, name: str = "mount.toml") -> Path:
     path = folder / name
     path.write_text(text)
     return path
+
+
+def text_of(mount: Mount, folder: Path) -> str:
+    """A mount as its file; the hulls of its convex pieces are written beside it."""
+    top = {
+        "name": mount.name, "camera": mount.camera, "cover_m": mount.cover_m,
+        "translation_m": mount.T_ee_cam[:3, 3].tolist(),
+        "matrix": mount.T_ee_cam[:3, :3].tolist(),
+    }  # fmt: skip
+    lines = [lines_of(top), "" if mount.bracket else "bracket = []"]
+    for k, piece in enumerate(mount.bracket):
+        T = piece.T_frame_shape
+        table = {
+            "kind": piece.kind, "position_m": T[:3, 3].tolist(),
+            "rotation_vector_rad": se3.log_so3(T[:3, :3]).tolist(),
+        }  # fmt: skip
+        if piece.points is None:
+            table["size_m"] = list(piece.size_m)
+        else:
+            table |= {"file": f"{k}.obj", "unit": "m"}
+            trimesh.convex.convex_hull(piece.points).export(folder / f"{k}.obj", digits=17)
+        lines += ["[[bracket]]", lines_of(table)]
+    return "\n".join(lines)
+
+
+def lines_of(table: dict[str, object]) -> str:
+    return "\n".join(f"{k} = {json.dumps(v, ensure_ascii=False)}" for k, v in table.items())
 
 
 def same(a: Mount, b: Mount) -> bool:
@@ -85,9 +110,8 @@ def test_what_is_written_is_read_back(
         bracket=tuple(pieces[: rng.integers(0, 6)]),
         cover_m=float(rng.choice([0.0, 0.004])),
     )
-    path = tmp_path_factory.mktemp("mount") / "m.toml"
-    write_mount(mount, path)
-    assert same(read_mount(path), mount)
+    folder = tmp_path_factory.mktemp("mount")
+    assert same(read_mount(written(folder, text_of(mount, folder))), mount)
 
 
 def test_three_ways_to_say_the_same_rotation(tmp_path: Path) -> None:

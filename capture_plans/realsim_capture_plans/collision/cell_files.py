@@ -156,42 +156,6 @@ def read_mount(path: Path | str) -> Mount:
     return Mount(name=fields.text("name"), camera=camera, T_ee_cam=T, bracket=pieces, cover_m=cover)
 
 
-def write_mount(mount: Mount, path: Path | str) -> None:
-    """Write a mount file that `read_mount` reads back; corners of convex pieces as STL beside it.
-
-    Raises:
-        InputError: the folder does not exist or cannot be written.
-    """
-    from realsim.store.atomic import write_text
-
-    path = Path(path)
-    lines = [
-        f"name = {_quoted(mount.name)}",
-        f"camera = {_quoted(mount.camera)}",
-        "# the colour camera's frame in the flange, z out of it",
-        f"translation_m = {_numbers(mount.T_ee_cam[:3, 3])}",
-        "matrix = [" + ", ".join(_numbers(row) for row in mount.T_ee_cam[:3, :3]) + "]",
-        f"cover_m = {float(mount.cover_m)!r}",
-    ]
-    if not mount.bracket:
-        lines.append("bracket = []")
-    try:
-        for k, piece in enumerate(mount.bracket, 1):
-            lines += ["", "[[bracket]]", f'kind = "{piece.kind}"']
-            if piece.kind == "convex":
-                file = path.with_name(f"{path.stem}_bracket_{k}.obj")
-                write_text(file, _hull_obj(piece))
-                lines += [f"file = {_quoted(file.name)}", 'unit = "m"']
-            else:
-                lines.append(f"size_m = {_numbers(np.array(piece.size_m))}")
-            at = piece.T_frame_shape
-            lines.append(f"position_m = {_numbers(at[:3, 3])}")
-            lines.append(f"rotation_vector_rad = {_numbers(se3.log_so3(at[:3, :3]))}")
-        write_text(path, "\n".join(lines) + "\n")
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error}.") from None
-
-
 def _rotation(fields: Fields) -> Array:
     """Return R_ee_cam (3, 3) from whichever of the three is there."""
     given = [key for key in ROTATIONS if key in fields.values]
@@ -309,26 +273,6 @@ def _corners(fields: Fields, folder: Path) -> Array:
             f"nothing on a flange is beyond {REACH_M} m. Is the unit another?"
         )
     return hull
-
-
-def _hull_obj(piece: Shape) -> str:
-    """Return a convex piece as the text of an OBJ file [m]."""
-    from scipy.spatial import ConvexHull
-
-    assert piece.points is not None  # Shape checks it
-    corners = [f"v {x!r} {y!r} {z!r}" for x, y, z in piece.points.tolist()]
-    faces = [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in ConvexHull(piece.points).simplices]
-    return "\n".join([*corners, *faces]) + "\n"
-
-
-def _quoted(text: str) -> str:
-    """Return a TOML basic string."""
-    escapes = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r"}
-    return '"' + "".join(escapes.get(c, c) for c in text) + '"'
-
-
-def _numbers(row: Array) -> str:
-    return "[" + ", ".join(repr(float(v)) for v in row) + "]"
 
 
 FAR_M = 20.0
