@@ -20,6 +20,7 @@ def camera_rows(report: CamerasReport) -> list[list[str]]:
         place = " ".join(f"{v:.2f}" for v in 1e3 * r.X[:3, 3])
         rows.append([
             camera.name, MOUNTS[camera.mount], place,
+            f"{r.here_mm:.2f} mm / {r.here_deg:.3f} deg",
             f"{r.sigma_mm:.2f} mm / {r.sigma_deg:.3f} deg",
             f"{sum(v.used for v in own)} / {len(own)}",
             f"{r.held_out_px:.2f} px / {r.held_out_mm:.2f} mm",
@@ -27,8 +28,12 @@ def camera_rows(report: CamerasReport) -> list[list[str]]:
     return rows
 
 
-CAMERA_HEADER = ["camera", "mount", "place [mm]", "1 sigma", "views used / found", "unseen views"]
-PAIR_HEADER = ["cameras", "sees the board together", "1 sigma", "apart (RMS)", "worst"]
+CAMERA_HEADER = [
+    "camera", "mount", "place [mm]", "1 sigma for this arm as it moves here", "1 sigma absolute",
+    "views used / found", "unseen views",
+]  # fmt: skip
+PAIR_HEADER = ["cameras", "sees the board together", "1 sigma absolute", "apart (RMS)", "worst"]
+ODD_HEADER = ["camera", "view", "unseen", "why"]
 
 
 def pair_rows(report: CamerasReport) -> list[list[str]]:
@@ -48,7 +53,7 @@ def odd_rows(report: CamerasReport) -> list[list[str]]:
     return [
         *([v.camera, v.name, "left out", v.reason] for v in report.rejected if len(v.detection)),
         *(
-            [v.camera, v.name, f"{v.unseen_px:.2f} px", "three times its camera's usual error"]
+            [v.camera, v.name, f"{v.unseen_px:.2f} px", "three times its camera's median"]
             for v in report.disagreeing()
         ),
     ]
@@ -64,8 +69,9 @@ def cameras_page(report: CamerasReport) -> Page:
         f"{report.reference}",
     )
     said = {"bad": "A check is bad.", "warn": "Usable; look at the warnings."}
+    amiss = [c for c in checks if c.verdict in {"bad", "warn"}]
     page.verdict(KIND.get(worst, worst), said.get(worst, "No check found anything wrong."), "",
-                 [[c.sentence] for c in checks if c.verdict in {"bad", "warn"}])  # fmt: skip
+                 [[f"{c.name}: {c.sentence} {c.advice}".strip()] for c in amiss])  # fmt: skip
     page.cards([
         (f"{r.held_out_mm:.2f} mm", f"unseen views of {c.name}")
         for c, r in zip(report.rig.cameras, report.cameras, strict=True)
@@ -81,7 +87,7 @@ def cameras_page(report: CamerasReport) -> Page:
         if report.bad_arm:
             page.text(f"The arm's pose is not believed at {', '.join(report.bad_arm)}.", "note")
         if odd:
-            page.table(["camera", "view", "", "why"], odd)
+            page.table(ODD_HEADER, odd)
     page.section("Checks", key="checks")
     page.table(["check", "verdict", "what was found"], [_row(c) for c in checks])
     return page

@@ -38,6 +38,7 @@ from realsim_calibration.cameras.faults import FEW_VIEWS
 from realsim_calibration.cameras.files import document, write_cameras
 from realsim_calibration.cameras.page import (
     CAMERA_HEADER,
+    ODD_HEADER,
     PAGE,
     PAIR_HEADER,
     camera_rows,
@@ -314,7 +315,7 @@ def _told(report: CamerasReport, files: list[Path], console: Console) -> bool:
         console.table("Pairs", PAIR_HEADER, pair_rows(report))
     odd = odd_rows(report)
     if odd:
-        console.table("Views that disagree", ["camera", "view", "", "why"], odd)
+        console.table("Views that disagree", ODD_HEADER, odd)
     show_checks(report.all_checks, console)
     console.say(f"report: {files[0]}")
     console.say(f"{len(files) - 1} files for programs beside it, a folder for each camera")
