@@ -160,6 +160,7 @@ def test_a_plan_goes_out_and_comes_back(realsim: Callable[..., Done]) -> None:
         (["bare.csv", "q.json", "--arm", "UR5"], "--joints-unit"),
         (["bare.csv", "q.json", "--arm", "UR5", "--joints-unit", "deg"], "look like radians"),
         (["degrees.csv", "q.json", "--arm", "UR5"], "look like degrees"),
+        (["bare.csv", "q.json", "--joints-unit", "rad"], "choose --arm"),
         (["other.json", "q.json", "--arm", "UR5"], "path of another robot"),
     ],
 )

@@ -5,6 +5,7 @@ import os
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from realsim_capture_plans.plan_files.exported import (
     export_urscript,
     table_frame,
 )
-from realsim_capture_plans.plan_files.imported import colliding_legs, import_plan
+from realsim_capture_plans.plan_files.imported import colliding_legs, plan_of_path
 from realsim_capture_plans.plan_files.joint_paths import read_path
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig, plan_content, plan_of
@@ -76,16 +77,23 @@ def write_path(
     return q
 
 
+def imported(path: Path, chain: DhChain | None = None, **options: Any) -> CapturePlan:
+    """The plan of a file, for the arm that its tool poses prove where none is given."""
+    found = read_path(path, chain)
+    if chain is None:
+        assert found.reading is not None
+        chain = found.reading.chain
+    settings = {"mount": MOUNT, "config": PlanConfig(), "center": CENTER} | options
+    return plan_of_path(found, chain=chain, **settings)
+
+
 # --- out and back ----------------------------------------------------------------------------
 
 
 def test_csv_comes_back_bit_for_bit(tmp_path: Path) -> None:
     plan = a_plan()
     export_csv(plan, tmp_path / "p.csv")
-    back = import_plan(
-        tmp_path / "p.csv", chain=UR5, mount=MOUNT, config=plan.config, cell=plan.cell,
-        center=plan.center_world,
-    )  # fmt: skip
+    back = imported(tmp_path / "p.csv", UR5, config=plan.config)
     assert back.kind == "imported"
     for name in ("home", "joints", "Ts_base_cam"):
         assert np.array_equal(getattr(back, name), getattr(plan, name)), name
@@ -101,12 +109,11 @@ def test_csv_comes_back_bit_for_bit(tmp_path: Path) -> None:
 def test_csv_of_another_robot_or_mount_is_named(tmp_path: Path) -> None:
     export_csv(a_plan(), tmp_path / "p.csv")
     with pytest.raises(InputError, match="mm from those of this robot"):
-        import_plan(tmp_path / "p.csv", chain=UR5E, mount=MOUNT)
+        imported(tmp_path / "p.csv", UR5E)
     with pytest.raises(InputError, match="mm from those of this robot"):
         other = d405_mount(se3.from_translation([0.0, 0.065, 0.035]))
-        import_plan(tmp_path / "p.csv", chain=UR5, mount=other)
-    with pytest.raises(InputError, match="--arm"):
-        import_plan(tmp_path / "p.csv", mount=MOUNT)
+        imported(tmp_path / "p.csv", UR5, mount=other)
+    assert read_path(tmp_path / "p.csv", None).reading is None
 
 
 def test_urscript_drives_the_same_corners_and_nothing_else(tmp_path: Path) -> None:
@@ -143,10 +150,10 @@ def test_a_seven_joint_plan_goes_out_and_comes_back(tmp_path: Path) -> None:
     save_plan(plan, tmp_path / "p.json")
     assert load_plan(tmp_path / "p.json").content_hash == plan.content_hash
     export_csv(plan, tmp_path / "p.csv")
-    back = import_plan(tmp_path / "p.csv", chain=plan.chain, mount=MOUNT, center=CENTER)
+    back = imported(tmp_path / "p.csv", plan.chain)
     assert np.array_equal(back.joints, plan.joints) and np.array_equal(back.home, plan.home)
     with pytest.raises(InputError, match=r"7 joint angles in a row, and a UR5 has 6.*Panda"):
-        import_plan(tmp_path / "p.csv", chain=UR5, mount=MOUNT, center=CENTER)
+        imported(tmp_path / "p.csv", UR5)
     with pytest.raises(InputError, match=r"URScript drives Universal.*Panda.*\.csv"):
         export_urscript(plan, tmp_path / "p.script")
     # Only a flange that stands off the last DH frame is written: files of a UR stay as they were.
@@ -187,7 +194,7 @@ def test_robot_units_and_tool_are_found(
     assert found.chain is chain and found.joint_unit == ("deg" if degrees else "rad")
     assert found.length_unit == ("m" if scale == 1.0 else "mm")
     assert np.abs(found.T_ee_tcp - tool).max() < 1e-9 and found.gap_m < 1e-9
-    plan = import_plan(tmp_path / "p.json", mount=MOUNT, center=CENTER)
+    plan = imported(tmp_path / "p.json")
     assert plan.chain is chain and np.abs(plan.home - q[0]).max() < 1e-12
     assert np.abs(plan.joints - q[2:-1]).max() < 1e-12
     assert np.abs(plan.move(0) - q[:3]).max() < 1e-12
@@ -198,7 +205,7 @@ def test_robot_units_and_tool_are_found(
 def test_a_path_for_the_other_robot_is_refused_with_both_fits(tmp_path: Path) -> None:
     write_path(tmp_path / "p.json", UR5E)
     with pytest.raises(InputError, match=r"fit a UR5e.*for a UR5 \d+ mm are left"):
-        import_plan(tmp_path / "p.json", chain=UR5, mount=MOUNT)
+        imported(tmp_path / "p.json", UR5)
 
 
 def test_a_claim_against_the_evidence_is_refused(tmp_path: Path) -> None:
@@ -248,7 +255,7 @@ def test_tables_that_cannot_be_right_are_named(
 ) -> None:
     (tmp_path / "p.csv").write_text(text)
     with pytest.raises(error, match=says) as caught:
-        import_plan(tmp_path / "p.csv", chain=UR5, mount=MOUNT, center=CENTER)
+        imported(tmp_path / "p.csv", UR5)
     assert "p.csv" in str(caught.value)
 
 
@@ -266,7 +273,7 @@ def test_no_path_ends_in_a_traceback(tmp_path: Path) -> None:
     for text in ("[]", '{"joints": 3}', '{"joints": [[1]]}', '{"joints": [[0,0,0,0,0,0]]}', "{"):
         (tmp_path / "p.json").write_text(text)
         with pytest.raises(InputError, match=r"p\.json"):
-            import_plan(tmp_path / "p.json", chain=UR5, mount=MOUNT)
+            imported(tmp_path / "p.json", UR5)
 
 
 # --- what is imported is checked ---------------------------------------------------------------
@@ -277,7 +284,7 @@ def test_colliding_moves_are_named_and_stay(tmp_path: Path) -> None:
     header = HEADER.format(u="rad")
     rows = [",".join(map(repr, q.tolist())) for q in (HOME, through, HOME)]
     (tmp_path / "p.csv").write_text("\n".join([header, *rows]))
-    plan = import_plan(tmp_path / "p.csv", chain=UR5, mount=MOUNT, center=CENTER)
+    plan = imported(tmp_path / "p.csv", UR5)
     assert len(plan) == 3 and plan.metrics["colliding_legs"] == 2
     lines = colliding_legs(plan)
     assert len(lines) == 2
@@ -288,9 +295,7 @@ def test_colliding_moves_are_named_and_stay(tmp_path: Path) -> None:
     rows = [",".join(map(repr, q.tolist())) for q in (HOME, HOME + 0.01)]
     (tmp_path / "p.csv").write_text("\n".join([header, *rows]))
     for boxes, count in (((), 0), ((("lamp", lamp),), 2)):
-        plan = import_plan(
-            tmp_path / "p.csv", chain=UR5, mount=MOUNT, center=CENTER, obstacles=boxes
-        )
+        plan = imported(tmp_path / "p.csv", UR5, obstacles=boxes)
         assert plan.metrics["colliding_legs"] == count
 
 
@@ -306,7 +311,7 @@ def test_the_papers_own_paths_are_a_ur5_in_degrees(path: Path) -> None:
     assert long_tool == (found.reading.length_unit == "mm")
     with pytest.raises(InputError, match="of another robot"):
         read_path(path, UR5E)
-    plan = import_plan(path, mount=MOUNT, center=[-0.1, -0.67, 0.1])
+    plan = imported(path, center=[-0.1, -0.67, 0.1])
     assert len(plan) + np.sum(found.via) == len(found.joints)
     assert plan.kind == "imported" and np.all(UR5.limits.contains(plan.joints))
     assert len(colliding_legs(plan)) == plan.metrics["colliding_legs"]

@@ -31,7 +31,7 @@ JOINT_DIGITS = 15
 
 
 def export_csv(plan: CapturePlan, path: Path | str) -> None:
-    """Write one row per configuration in driving order; `import_plan` reads it back.
+    """Write one row per configuration in driving order; `read_path` reads it back.
 
     Columns: view (of a via point: the view that it leads to), via (1 = only passed; the first one
     is home), q1_rad ... qn_rad, and at views the expected camera pose in base, cam_x_m ... cam_qz.

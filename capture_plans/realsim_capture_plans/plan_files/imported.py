@@ -5,7 +5,6 @@ and named by `colliding_legs`.
 """
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,12 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError, UnitError
 from realsim.geometry import se3
-from realsim.robots.arm import known_chains
 from realsim.robots.kinematics import DhChain
-from realsim.robots.shapes import Box, Mount, WorkCell
+from realsim.robots.shapes import Box, Mount
 from realsim_capture_plans.collision.model import interpolate
-from realsim_capture_plans.plan_files.evidence import FITS_M, MILLIMETRES_FROM_M, JointUnit
-from realsim_capture_plans.plan_files.joint_paths import JointPath, read_path
+from realsim_capture_plans.plan_files.evidence import FITS_M, MILLIMETRES_FROM_M
+from realsim_capture_plans.plan_files.joint_paths import JointPath
 from realsim_capture_plans.planning.metrics import Meaning, joint_names
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
@@ -46,16 +44,14 @@ IMPORT_MEANINGS = {
 """What the metrics say that only imported plans have."""
 
 
-def import_plan(
-    path: Path | str,
+def plan_of_path(
+    path: JointPath,
     *,
+    chain: DhChain,
     mount: Mount,
-    chain: DhChain | None = None,
-    config: PlanConfig | None = None,
-    cell: WorkCell | None = None,
+    config: PlanConfig,
     center: ArrayLike | None = None,
     obstacles: tuple[tuple[str, Box], ...] = (),
-    joints_unit: JointUnit | None = None,
 ) -> CapturePlan:
     """Return the plan of kind "imported" of a joint path.
 
@@ -63,51 +59,18 @@ def import_plan(
     comes after the last view is left out and counted (`rows_after_last_view`).
 
     Args:
-        path: .json (joints, cart_pose, via_points) or .csv (q1_rad ... or q1_deg ..., via).
+        path: of `read_path`.
+        chain: the arm that will drive it.
         mount: the camera on the flange.
-        chain: the arm that will drive it; None takes what the file's tool poses prove.
-        config: clearances and speeds.
-        cell: what the moves are checked against; by default the config's table and keep-out box,
-            and the obstacles.
+        config: clearances, speeds, the table and the keep-out box.
         center: (3,) what the views look at, in base [m]; by default where the optical axes meet.
-        obstacles: named boxes in base, where no cell is given.
-        joints_unit: of joints that say no unit themselves.
+        obstacles: further named boxes in base.
 
     Raises:
-        InputError: not a path, another robot's, or joints beyond the limits.
-        UnitError: joints or lengths in another unit.
+        InputError: another robot's path, or joints beyond the limits.
+        UnitError: a centre in another unit.
         DegenerateError: no centre is given and the optical axes meet nowhere.
     """
-    found = read_path(path, chain, joints_unit)
-    if chain is None:
-        if found.reading is None:
-            raise InputError(
-                f"{path} does not say which robot it is for; choose --arm "
-                f"({', '.join(known_chains())})."
-            )
-        chain = found.reading.chain
-    return plan_of_path(
-        found,
-        chain=chain,
-        mount=mount,
-        config=config or PlanConfig(),
-        cell=cell,
-        center=center,
-        obstacles=obstacles,
-    )
-
-
-def plan_of_path(
-    path: JointPath,
-    *,
-    chain: DhChain,
-    mount: Mount,
-    config: PlanConfig,
-    cell: WorkCell | None = None,
-    center: ArrayLike | None = None,
-    obstacles: tuple[tuple[str, Box], ...] = (),
-) -> CapturePlan:
-    """Return the plan of a joint path that has been read, see `import_plan`."""
     _check_limits(path, chain)
     views = np.flatnonzero(~path.via)
     if not len(views):
@@ -126,7 +89,7 @@ def plan_of_path(
         kind="imported",
         chain=chain,
         mount=mount,
-        cell=config.work_cell(aim, "imported", obstacles) if cell is None else cell,
+        cell=config.work_cell(aim, "imported", obstacles),
         home=path.joints[0],
         joints=joints,
         center_world=aim,
