@@ -24,6 +24,7 @@ from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics, Chessboard
 from realsim_calibration import BoardView, detection_of, solve_pose_pairs
 from realsim_calibration.exports import read_calibration
+from realsim_calibration.results import Clock
 
 X_TRUE = se3.exp([0.1, -0.2, 0.7, 0.03, -0.05, 0.08])
 Z_TRUE = se3.from_rt(np.diag([1.0, -1, -1]), [0.4, 0.05, 0.0])
@@ -254,3 +255,19 @@ def test_what_a_log_does_not_know_is_left_out_and_named(
     assert "line 154" in said and f"{70 - n} poses of" in said and "lie in gaps of" in said
     for name, how in (("b", np.flipud), ("m", np.random.default_rng(0).permutation)):
         assert pairs(name, how)[0] == 70
+
+
+def test_the_table_tells_years_in_seconds() -> None:
+    """Clocks may start at different times; an offset that was given has no sigma."""
+    from realsim_calibration.report.summary import clock_in_words
+
+    words = [
+        clock_in_words(Clock(offset_s=d, sigma_s=s, applied=d > 0.01))
+        for d, s in ((1.7e9, 4e-5), (1.7e9, np.nan), (0.135, np.nan), (0.001, 4e-5))
+    ]
+    assert words == [
+        "+1700000000.000000 s ± 0.04 ms, applied",
+        "+1700000000.000000 s as given, applied",
+        "+135.00 ms, as given, applied",
+        "+1.00 ± 0.04 ms, too small to matter, left out",
+    ]

@@ -209,17 +209,21 @@ def accuracy_rows(report: HandEyeReport) -> list[list[str]]:
         ["corner noise", amount(report.sigma_px, 3, "px")],
         ["views used, dropped", f"{len(report.used)}, {len(report.rejected)}"],
         ["roll about the optical axis", amount(report.roll_range_deg, 0, "deg")],
-        *([] if report.clock is None else [["clock offset arm to camera", _offset(report.clock)]]),
+        *(
+            []
+            if report.clock is None
+            else [["clock offset arm to camera", clock_in_words(report.clock)]]
+        ),
     ]
 
 
-def _offset(clock: Clock) -> str:
+def clock_in_words(clock: Clock) -> str:
     """Return the offset of the clocks in words."""
-    known = np.isfinite(clock.sigma_s)
-    sigma = f" ± {1e3 * clock.sigma_s:.2f}" if known else ""
-    source = "" if known else ", as given"
+    sigma = f"± {1e3 * clock.sigma_s:.2f} ms" if np.isfinite(clock.sigma_s) else "ms, as given"
     used = "applied" if clock.applied else "too small to matter, left out"
-    return f"{1e3 * clock.offset_s:+.2f}{sigma} ms{source}, {used}"
+    if abs(clock.offset_s) > 1.0:
+        return f"{clock.offset_s:+.6f} s {sigma.replace('ms, as', 'as')}, {used}"
+    return f"{1e3 * clock.offset_s:+.2f} {sigma}, {used}"
 
 
 def summary_rows(report: HandEyeReport) -> list[list[str]]:

@@ -28,7 +28,6 @@ MIN_POINTS = 6
 LONGER = 1.5
 """A way that is so much longer in the order of time than in the file's is that of two recordings
 whose times overlap; lines that are merely not sorted make it shorter."""
-UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -79,11 +78,10 @@ def why_no_stream(poses: RawPoses, least: int = STREAM_POSES) -> str:
         return f"{poses.path}: all time stamps are equal."
     apart = float(np.median(np.diff(known)))
     if apart > STREAM_PERIOD_S:
-        unit = next(((u, f) for f, u in UNITS.items() if apart / f <= STREAM_PERIOD_S), None)
+        unit = "milliseconds? Divide by 1000" if apart < 1e4 else "nanoseconds? Divide by 1e9"
         return (
             f"{poses.path}: the time stamps are {apart:.6g} apart (median); a stream in seconds "
-            f"has at most {STREAM_PERIOD_S:g} s between poses."
-            + (f" Are they {unit[0]}? Divide by {unit[1]:.0f}." if unit else "")
+            f"has at most {STREAM_PERIOD_S:g} s between poses. Are they {unit}."
         )
     if len(known) < least:
         return (
