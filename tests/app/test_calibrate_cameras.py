@@ -289,12 +289,35 @@ def test_images_without_partners_are_left_out(photos: Path, tmp_path: Path) -> N
     folder = shutil.copytree(photos, tmp_path / "lab")
     (folder / "left/004.png").unlink()
     shutil.copy(folder / "right/000.png", folder / "right/099.png")
+    arm = folder / "arm.csv"
     cameras = cameras_of("wrist=hand,left=fixed,right=fixed")
-    frames = frames_of(folder, cameras, read_pose_file(folder / "arm.csv"))
+    frames = frames_of(folder, cameras, read_pose_file(arm))
+    stranger = f"camera 'right': images without a pose are left out: 1 of {VIEWS + 1} (099.png)."
+    assert frames.left_out == (stranger,)
     assert [len(frames.images[c.name]) for c in cameras] == [VIEWS, VIEWS - 1, VIEWS]
     names = {c.name: {i: p.name for i, p in frames.images[c.name].items()} for c in cameras}
     assert all(names["right"][i] == name for i, name in names["wrist"].items())
     assert all(names["wrist"][i] == name for i, name in names["left"].items())
+    rows = arm.read_text().splitlines()
+    rows[3] = rows[3].replace("002.png,", "002.png,nan,").rsplit(",", 1)[0]
+    arm.write_text("\n".join(rows[:-1]) + "\n")
+    said = frames_of(folder, cameras, read_pose_file(arm)).left_out
+    assert f"left out: 1 of {VIEWS} ({VIEWS - 1:03d}.png)." in said[0]
+    assert said[1].endswith(f"with a NaN or infinite pose are left out: 1 of {VIEWS} "
+                            "(002.png (line 4)).")  # fmt: skip
+
+
+def test_an_image_of_another_size_is_named_though_it_shows_no_board(
+    photos: Path, tmp_path: Path
+) -> None:
+    import cv2
+
+    folder = shutil.copytree(photos, tmp_path / "lab")
+    for board in ("table", "held"):
+        shutil.copy(photos.parent / f"{board}.json", tmp_path)
+    cv2.imwrite(str(folder / "left/004.png"), np.full((240, 320, 3), 90, np.uint8))
+    said = refusal(run(folder, tmp_path / "out"))
+    assert "camera 'left' has images of several sizes" in said and "004.png (320x240)" in said
 
 
 def plane_depth(T_cam_board: Array) -> Array:

@@ -1,6 +1,6 @@
 """Cameras, boards and images as `realsim calibrate --cameras` is given them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -31,6 +31,8 @@ class Frames:
     """Camera's name -> instant -> image."""
     rows: dict[int, int]
     """Row of the poses at an instant; empty where there are none."""
+    left_out: tuple[str, ...] = ()
+    """Sentences on images that have no pose, or one of NaN."""
 
 
 def cameras_of(text: str) -> tuple[RigCamera, ...]:
@@ -203,4 +205,22 @@ def _by_poses(images: dict[str, list[Path]], keys: dict[str, list[str]], raw: Ra
             name: {place[r]: p for r, p in own.items() if r in place}
             for name, own in found.items()
         },
+        left_out=tuple(_left_out(images, found, raw)),
     )  # fmt: skip
+
+
+def _left_out(
+    images: dict[str, list[Path]], found: dict[str, dict[int, Path]], raw: RawPoses
+) -> Iterator[str]:
+    """Say which images of a camera no instant has."""
+    for name, paths in images.items():
+        own = found[name]
+        without = [p.name for p in paths if p not in set(own.values())]
+        unread = [f"{p.name} ({raw.where[r]})" for r, p in own.items() if not raw.measured[r]]
+        for what, which in (("without a", without), ("with a NaN or infinite", unread)):
+            if which:
+                few = ", ".join(which[:5]) + (", ..." if len(which) > 5 else "")
+                yield (
+                    f"camera '{name}': images {what} pose are left out: {len(which)} of "
+                    f"{len(paths)} ({few})."
+                )

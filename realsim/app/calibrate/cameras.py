@@ -86,6 +86,8 @@ def run_cameras(source: Path, console: Console, options: dict[str, Any]) -> bool
     poses = pose_file_of(source, options["poses"], [c.name for c in cameras])
     raw = None if poses is None else read_pose_file(poses, key=options["key"] or None)
     frames = frames_of(source, cameras, raw)
+    for sentence in frames.left_out:
+        console.warn(sentence)
     cameras = with_intrinsics(cameras, options["intrinsics"])
     write_text(out / MADE_OF, made_of(source))
     sightings = _sightings(frames, cameras, boards, out, console)
@@ -159,12 +161,25 @@ def _sightings(
         own = sorted(frames.images[camera.name].items())
         for b, board in enumerate(boards):
             seen = find_in_images([p for _, p in own], board.target, out, console)
+            _require_one_size(camera.name, [p.name for _, p in own], [d.image_size for d in seen])
             found += [
                 Sighting(camera=c, board=b, instant=i, detection=d, name=f"{camera.name}/{p.name}")
                 for (i, p), d in zip(own, seen, strict=True)
                 if len(d) or len(boards) == 1
             ]
     return tuple(found)
+
+
+def _require_one_size(camera: str, names: list[str], sizes: list[tuple[int, int]]) -> None:
+    """Raise if an image, with a board or without, has another size than most of a camera's."""
+    usual = max(set(sizes), key=sizes.count, default=(0, 0))
+    odd = [f"{n} ({w}x{h})" for n, (w, h) in zip(names, sizes, strict=True) if (w, h) != usual]
+    if odd:
+        raise InputError(
+            f"camera '{camera}' has images of several sizes: most have {usual[0]}x{usual[1]} px, "
+            f"not {', '.join(odd[:5])}. One camera at one resolution is calibrated: take these "
+            "out, and put images of another camera into a folder of its own."
+        )
 
 
 def _require_seen(rig: Rig, frames: Frames) -> None:
