@@ -53,11 +53,10 @@ from realsim.untrusted.own_json import read_object
 
 __all__ = [
     "Box", "Click", "Hint", "HintConfig", "HintScene", "Marked", "RoughPose", "Where",
-    "hint_rows", "parse_object", "parse_objects", "read_hints", "read_starts", "region_of",
-    "save_hints", "wanted_objects",
+    "parse_object", "parse_objects", "read_hints", "read_starts", "region_of",
+    "wanted_objects",
 ]  # fmt: skip
 
-STARTS_FILE = "registration/starts.json"
 MOST_INSTANCES = 100
 """Instances of one object that can be asked for at once."""
 KINDS = ("T_world_obj", "click", "box", "mask")
@@ -255,37 +254,6 @@ def _rigid(values: ArrayLike, label: str) -> Array:
             f"{FARTHEST_M:g} m is accepted. Metres are expected: were millimetres given?"
         )
     return T
-
-
-def hint_rows(hints: Sequence[Hint], mask_files: Mapping[int, str]) -> list[dict[str, Any]]:
-    """Return hints as rows of a starts file; masks by the files of their instances."""
-    rows: list[dict[str, Any]] = []
-    for h in hints:
-        row: dict[str, Any] = {"obj_id": h.obj_id, "instance": h.instance}
-        w = h.where
-        if isinstance(w, RoughPose):
-            row["T_world_obj"] = w.T_world_obj.tolist()
-            row |= {} if w.radius_m is None else {"radius_mm": 1e3 * w.radius_m}
-            row |= {} if w.turn_deg is None else {"turn_deg": w.turn_deg}
-        elif isinstance(w, Click):
-            row["click"] = {"view": w.view, "pixel": list(w.pixel)}
-        elif isinstance(w, Box):
-            row["box"] = {"view": w.view, "xywh": list(w.xywh)}
-        elif isinstance(w, Marked):
-            row["mask"] = {"view": w.view, "file": mask_files[h.instance]}
-        rows.append(row)
-    return rows
-
-
-def save_hints(store: SessionStore, hints: Sequence[Hint], source: str) -> None:
-    """Write hints as the session's starts file, masks beside it and before it."""
-    files: dict[int, str] = {}
-    for h in hints:
-        if isinstance(h.where, Marked):
-            files[h.instance] = f"masks/{h.instance:06d}.png"
-            image = h.where.inside.astype(np.uint8) * np.uint8(255)
-            store.write_image(f"registration/{files[h.instance]}", image)
-    store.write_json(STARTS_FILE, {"source": source, "starts": hint_rows(hints, files)})
 
 
 def wanted_objects(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from realsim.arrays import Array, Array32, Int32, UInt16
+from realsim.arrays import Array, Array32, UInt16
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
@@ -39,7 +39,7 @@ from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
 
 __all__ = [
     "DEPTH_UNIT_M", "Scattered", "TableLabConfig", "TableScene", "full_size", "render_depth",
-    "resized", "scatter_objects", "seen_instances", "table_scene", "with_found_symmetries",
+    "resized", "scatter_objects", "table_scene", "with_found_symmetries",
 ]  # fmt: skip
 
 DEPTH_UNIT_M = 1e-4
@@ -75,30 +75,6 @@ class TableScene:
     """(4, 4) where the camera really sits on the hand [m]."""
     sensor: DepthSensorModel
     """The depth camera in pixels of these images."""
-
-    @property
-    def Ts_base_ee_true(self) -> Array:
-        """(F, 4, 4) where the hand really was [m]: T_world_cam inv(T_ee_cam), both true."""
-        return self.Ts_world_cam @ se3.invert(self.T_ee_cam_true)
-
-    @property
-    def Ts_world_cam_claimed(self) -> Array:
-        """(F, 4, 4) the camera poses of the frames as they were made [m]."""
-        return self.Ts_base_ee @ self.T_ee_cam
-
-    def true_pose(self, instance: int) -> ObjectPose:
-        """Return where an instance really stands.
-
-        Raises:
-            InputError: the scene has no such instance.
-        """
-        for pose in self.truth:
-            if pose.instance == instance:
-                return pose
-        raise InputError(
-            f"instance {instance} is not in this scene; it has "
-            f"{', '.join(str(p.instance) for p in self.truth)}."
-        )
 
 
 def table_scene(
@@ -193,31 +169,6 @@ def render_depth(
         path.parent.mkdir(parents=True, exist_ok=True)
         write_arrays(path, {"depth": images}, {"unit_m": DEPTH_UNIT_M})
     return images
-
-
-def seen_instances(scene: TableScene, views: Sequence[int], stride: int = 1) -> Int32:
-    """Return which instance each pixel really shows (V, H', W'); -1 = the table or nothing.
-
-    Args:
-        scene: of `table_scene`.
-        views: numbers of views.
-        stride: every how many rows and columns a pixel is looked at.
-    """
-    placed = [
-        PlacedMesh(p.instance, scene.models[p.obj_id].mesh, p.T_world_obj) for p in scene.truth
-    ]
-    things = [*placed, PlacedMesh(BACKGROUND, table_square((0.0, 0.0)), np.eye(4))]
-    world = RayScene(things)
-    # The last entry answers -1, nothing.
-    instances = np.array([*(p.instance for p in things), BACKGROUND], np.int32)
-    rays = np.ascontiguousarray(ray_table(scene.intrinsics)[::stride, ::stride])
-    images: list[Int32] = []
-    for k in views:
-        T_world_cam = scene.Ts_world_cam[k]
-        directions = rotated(rays, T_world_cam[:3, :3]).reshape(-1, 3)
-        _, which = world.first_hits(T_world_cam[:3, 3], directions)
-        images.append(instances[which].reshape(rays.shape[:2]))
-    return np.stack(images)
 
 
 def _check(models: Mapping[int, ObjectModel], placed: Sequence[ObjectPose]) -> None:

@@ -12,7 +12,7 @@ import pytest
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.registration.depth_alignment import AlignmentConfig, check_alignment, pooled_alignment
-from realsim.registration.simulated import seen_instances
+from table_faults import seen_instances
 from table_scenes import small_scene
 
 ROOT = Path(__file__).resolve().parents[2]

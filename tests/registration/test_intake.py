@@ -66,7 +66,7 @@ def test_table_noise_and_points_are_those_of_the_scene():
     assert np.degrees(np.arccos(T[2, 2])) < 0.1 and abs(T[2, 3]) < 7e-4
     k = scene().sensor.disparity_noise_px / (scene().intrinsics.fx * 0.018)
     assert intake.noise.per_m == pytest.approx(k, rel=0.35)
-    np.testing.assert_array_equal(intake.cameras, scene().Ts_world_cam_claimed)
+    np.testing.assert_array_equal(intake.cameras, scene().Ts_base_ee @ scene().T_ee_cam)
 
 
 def test_a_known_bias_is_taken_out():

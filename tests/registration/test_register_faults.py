@@ -61,7 +61,8 @@ def run(
 
 
 def error_mm(result: Registration, instance: int) -> float:
-    found, true = result.scene.object(instance), scene().true_pose(instance)
+    found = result.scene.object(instance)
+    (true,) = (p for p in scene().truth if p.instance == instance)
     model = scene().models[true.obj_id]
     return 1e3 * mssd_symmetric(true.T_world_obj, found.T_world_obj, model)
 

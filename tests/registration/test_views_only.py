@@ -59,7 +59,7 @@ def steps(true: np.ndarray, cameras: np.ndarray) -> tuple[float, float]:
 
 def test_a_bad_arm_is_put_right(scene):
     views, noise = points_of(scene)
-    before = steps(scene.Ts_world_cam, scene.Ts_world_cam_claimed)
+    before = steps(scene.Ts_world_cam, scene.Ts_base_ee @ scene.T_ee_cam)
     refined = refine_views(scene.intrinsics, views, noise, CONFIG)
     after = steps(scene.Ts_world_cam, refined.cameras)
     assert before[0] > 3.0

@@ -3,23 +3,46 @@
 Each fault is a pure function: it returns spoilt frames and leaves those it was given alone.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from realsim.arrays import Array32
+from realsim.arrays import Array32, Int32
+from realsim.geometry.camera import ray_table
 from realsim.registration.evidence import DepthFrame
-from realsim.registration.simulated import TableScene, seen_instances
+from realsim.registration.simulated import TableScene
+from realsim.registration.simulated_lab import table_square
+from realsim.rendering.rays import BACKGROUND, PlacedMesh, RayScene, rotated
 
 MARGIN_PX = 1
 """Pixels around an object whose match also fails: a matching window is wider than one pixel."""
+
+
+def seen_instances(scene: TableScene, views: Sequence[int]) -> Int32:
+    """Return which instance each pixel really shows (V, H, W); -1 = the table or nothing."""
+    placed = [
+        PlacedMesh(p.instance, scene.models[p.obj_id].mesh, p.T_world_obj) for p in scene.truth
+    ]
+    things = [*placed, PlacedMesh(BACKGROUND, table_square((0.0, 0.0)), np.eye(4))]
+    world = RayScene(things)
+    # The last entry answers -1, nothing.
+    instances = np.array([*(p.instance for p in things), BACKGROUND], np.int32)
+    rays = ray_table(scene.intrinsics)
+    images: list[Int32] = []
+    for k in views:
+        T_world_cam = scene.Ts_world_cam[k]
+        directions = rotated(rays, T_world_cam[:3, :3]).reshape(-1, 3)
+        _, which = world.first_hits(T_world_cam[:3, 3], directions)
+        images.append(instances[which].reshape(rays.shape[:2]))
+    return np.stack(images)
 
 
 def without_depth_on(scene: TableScene, instance: int) -> tuple[DepthFrame, ...]:
     """Return the frames as if an object sent back no light: black, its pixels have no depth."""
     import cv2
 
-    scene.true_pose(instance)
+    assert instance in {p.instance for p in scene.truth}
     kernel = np.ones((2 * MARGIN_PX + 1, 2 * MARGIN_PX + 1), np.uint8)
     frames: list[DepthFrame] = []
     for k, frame in enumerate(scene.frames):
