@@ -33,11 +33,8 @@ def run_check(source: Path, console: Console, tolerance_mm: float = 1.0) -> bool
     from realsim.app.register.results import load_registered
     from realsim.app.stages import open_session
 
-    if not (source / "session.json").is_file():
-        raise InputError(
-            f"'{source}' is not a session (it holds no session.json): --check needs a session of "
-            "objects that `realsim register` has placed."
-        )
+    if not source.is_dir():
+        raise InputError(f"'{source}' does not exist: --check needs a registered session.")
     store = open_session(source)
     if not store.has("registration/report.json"):
         raise InputError(
