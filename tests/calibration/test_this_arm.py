@@ -51,6 +51,7 @@ def calibrated() -> HandEyeReport:
     return calibrate_hand_eye_report(shots(), BOARD, FACTORY)
 
 
+@cache
 def solved() -> tuple[Solution, Screened]:
     """Return the joint fit's solution and what was screened."""
     config = HandEyeConfig()
