@@ -23,7 +23,7 @@ from realsim.geometry import se3
 from realsim.models.library_records import KnownSolid
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.store.session_store import CAMERA_FILE
-from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, Support, known_solids
+from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, known_solids
 
 TABLE_STRIDE = 6
 """Every how many rows and columns of a depth image is looked at for the table."""
@@ -32,42 +32,12 @@ SUNK_M = 0.0015
 to about a millimetre at half a metre."""
 
 
-def from_graspit_yaml(
-    path: Path | str,
-    matter: Matter | None = None,
-    *,
-    supports: Sequence[Support] = (),
-    order: QuaternionOrder | None = None,
-    meshes: Path | None = None,
-) -> SchoolScene:
-    """Return the scene of a scene.yaml; see `read_graspit_scene`."""
-    found = read_graspit_scene(path, order=order, meshes=meshes)
-    return _with_matter(found, matter, supports)
-
-
-def from_graspnet(
-    folder: Path | str,
-    matter: Matter | None = None,
-    *,
-    models: Path | None = None,
-    supports: Sequence[Support] = (),
-    camera: str | None = None,
-    view: int = 0,
-) -> SchoolScene:
-    """Return a scene of GraspNet-1Billion; see `read_graspnet_scene`."""
-    found = read_graspnet_scene(folder, models, camera=camera, view=view)
-    return _with_matter(found, matter, supports)
-
-
-def _with_matter(
-    found: GraspitScene | GraspnetScene, matter: Matter | None, supports: Sequence[Support]
-) -> SchoolScene:
-    """Return what a reader found, with masses, convex parts and what stands around."""
+def _with_matter(found: GraspitScene | GraspnetScene, matter: Matter | None) -> SchoolScene:
+    """Return what a reader found, with masses and convex parts."""
     return SchoolScene(
         scene=found.scene,
         models=found.models,
         solids=known_solids(found.models, matter),
-        supports=tuple(supports),
         notes=found.notes,
     )
 
@@ -79,7 +49,6 @@ def from_bop(
     *,
     image: int | None = None,
     models: Path | None = None,
-    supports: Sequence[Support] = (),
 ) -> SchoolScene:
     """Return a scene of a BOP dataset, its objects as annotated, its table as the depth shows it.
 
@@ -93,7 +62,6 @@ def from_bop(
         matter: weighed masses, convex parts.
         image: number of the image; None = the first that has annotations and depth.
         models: folder of the models; None = 'models' of the dataset.
-        supports: bodies that stand still.
 
     Raises:
         InputError: no scene or several, no annotation, no depth, no table in it, no model.
@@ -137,7 +105,6 @@ def from_bop(
         scene=scene,
         models=loaded,
         solids=known_solids(loaded, matter, _library_solids(models_folder, loaded)),
-        supports=tuple(supports),
         notes=tuple(notes),
     )
 
@@ -182,11 +149,7 @@ def _consensus(
 
 
 def from_graspnet_frame(
-    folder: Path | str,
-    matter: Matter | None = None,
-    *,
-    models: Path | None = None,
-    supports: Sequence[Support] = (),
+    folder: Path | str, matter: Matter | None = None, *, models: Path | None = None
 ) -> SchoolScene:
     """Return one image of GraspNet on its own: objects as its meta file has them, world its camera.
 
@@ -210,7 +173,6 @@ def from_graspnet_frame(
         scene=Scene(name=found.name, objects=objects, plane=plane),
         models=loaded,
         solids=known_solids(loaded, matter),
-        supports=tuple(supports),
         notes=(*found.notes, *said, *_sunk(objects, loaded, plane)),
     )
 
@@ -272,7 +234,6 @@ def load_scene_source(
     *,
     models: Path | None = None,
     scene_id: int | None = None,
-    supports: Sequence[Support] = (),
     order: QuaternionOrder | None = None,
 ) -> SchoolScene:
     """Read a scene of any known kind, told apart by what the folder holds.
@@ -282,7 +243,6 @@ def load_scene_source(
         matter: weighed masses, convex parts.
         models: folder of the models (meshes), where it is not at its usual place.
         scene_id: number of the scene in a BOP dataset of several.
-        supports: bodies besides the table that stand still.
         order: of a scene.yaml's quaternions, where its content does not tell it.
 
     Raises:
@@ -292,14 +252,14 @@ def load_scene_source(
     if not path.exists():
         raise InputError(f"'{path}' does not exist; a scene's file or folder is expected.")
     if is_graspit_scene(path):
-        return from_graspit_yaml(path, matter, supports=supports, order=order, meshes=models)
+        return _with_matter(read_graspit_scene(path, order=order, meshes=models), matter)
     if path.is_dir():
         if is_graspnet_frame(path):
-            return from_graspnet_frame(path, matter, models=models, supports=supports)
+            return from_graspnet_frame(path, matter, models=models)
         if cameras_of(path) or ((path / POSES).is_file() and cameras_of(path.parent)):
-            return from_graspnet(path, matter, models=models, supports=supports)
+            return _with_matter(read_graspnet_scene(path, models), matter)
         if any(next(path.glob(f"{p}{CAMERA_FILE}"), None) for p in ("", "*/", "*/*/")):
-            return from_bop(path, scene_id, matter, models=models, supports=supports)
+            return from_bop(path, scene_id, matter, models=models)
     raise InputError(
         f"'{path}' holds no scene that is known: {_contents(path)}. Read are a {SCENE_FILE} of "
         "GraspIT (object1: {file_path, name, orientation, position}), a scene of GraspNet-1Billion "
