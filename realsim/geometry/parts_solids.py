@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import DegenerateError, InputError
 
 Array = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 WELD_M = 1e-9
 """Corners nearer than this are one vertex [m]: a thousandth of the tightest tolerance here."""

@@ -5,8 +5,6 @@ from typing import Any, Literal
 
 from realsim.store.manifest import Entry
 
-Line = tuple[int, str]
-"""Number and text of a line."""
 Kind = Literal[
     "missing",
     "changed",

@@ -94,7 +94,6 @@ def judged(held, evidence, kinds=2, digest="none", **columns):
         held=np.asarray(held, dtype=bool),
         objects=np.array([f"object {k % kinds}" for k in range(n)]),
         evidence=np.asarray(evidence, dtype=float),
-        evidence_error=np.full(n, 0.1),
         columns={"score_old": np.asarray(evidence, dtype=float), **columns},
         shares={},
         digest=digest,

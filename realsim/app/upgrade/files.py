@@ -30,7 +30,6 @@ DOCUMENTS = {
     "graspnet": ("annotations/*.xml", "*.npy", "meta.mat"),
 }
 """Copied to imported/: small, and all that before and after can be compared by."""
-LABELS = "grasp_label/{:03d}_labels.npz"
 COLLISIONS = "collision_label/scene_{:04d}/collision_labels.npz"
 
 

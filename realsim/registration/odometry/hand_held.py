@@ -182,8 +182,6 @@ class HandHeld:
     """Pairs of key views that do not follow each other and were aligned."""
     residual_mm: float
     """Median of what is left of a pair's shift [mm]."""
-    residual_deg: float
-    """Median of what is left of a pair's turn [deg]."""
     cpu_s: float
     """CPU time [s]."""
 
@@ -236,7 +234,6 @@ def hand_held_poses(
         keys=tuple(path.keys),
         loops=len(loops),
         residual_mm=float(1e3 * np.median(np.linalg.norm(r[:, 3:], axis=1))),
-        residual_deg=float(np.degrees(np.median(np.linalg.norm(r[:, :3], axis=1)))),
         cpu_s=time.process_time() - began,
     )
 

@@ -27,8 +27,6 @@ class MeshPart:
     """(3 F, 2) texture coordinates, v down; None = no image lies on it."""
     colors: Array32 | None
     """(3 F, 3) linear vertex colours."""
-    faces_of_mesh: NDArray[np.intp]
-    """(F,) which faces of the placed mesh these are."""
     is_mirrored: bool
     """Whether (u, v up, normal) is left-handed on these faces."""
     repeats: bool
@@ -91,7 +89,6 @@ def mesh_parts(
                 normals=normals[rows].reshape(-1, 3),
                 uv=None if uv is None else (uv[rows] * [1, -1] + [0, 1]).reshape(-1, 2),
                 colors=None if linear is None else linear[rows].reshape(-1, 3),
-                faces_of_mesh=rows,
                 is_mirrored=side,
                 repeats=wraps,
             )

@@ -50,8 +50,6 @@ class DisplayMesh:
     """(3,) least corner of its bounds [m]."""
     high: Array
     """(3,) greatest corner [m]."""
-    triangles_given: int
-    """Triangles of the model itself."""
 
 
 def display_mesh(mesh: Mesh, config: SceneConfig) -> DisplayMesh:
@@ -65,7 +63,6 @@ def display_mesh(mesh: Mesh, config: SceneConfig) -> DisplayMesh:
         glb=glb_of(few, config.most_texels),
         low=mesh.bounds[0],
         high=mesh.bounds[1],
-        triangles_given=len(mesh.faces),
     )
 
 

@@ -4,13 +4,13 @@ plane and object found -> poses made to agree -> distances fused -> surface clos
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from realsim.arrays import Array, Int32, Mask
+from realsim.arrays import Array, Mask
 from realsim.geometry import se3
 from realsim.geometry.mesh import vertex_normals
 from realsim.records import CameraIntrinsics, Mesh, SupportPlane, Verdict
@@ -49,7 +49,6 @@ __all__ = [
     "fuse_object",
 ]
 
-Progress = Callable[[str], None]
 HOPELESS_SHARE = 0.4
 """With less than this of the surface above the cut measured the mesh is rejected."""
 FACING_DOWN = -0.2
@@ -63,7 +62,6 @@ def fuse_object(
     frames: Sequence[FusionFrame],
     plane: SupportPlane | None,
     config: FusionConfig,
-    progress: Progress | None = None,
 ) -> FusedObject:
     """Return the mesh of the one object on the table, in world, with what it is worth.
 
@@ -72,7 +70,6 @@ def fuse_object(
         frames: at least three; their order does not matter.
         plane: the table in world, or None to find it in the depth.
         config: settings.
-        progress: is told in a few words what is being done.
 
     Raises:
         InputError: frames that cannot be used, nothing or several things on the table.
@@ -80,15 +77,11 @@ def fuse_object(
         DegenerateError: no table, or views that do not agree.
     """
     started = time.process_time()
-    tell = progress or _silent
     usable, notes = checked_frames(frames, intrinsics)
     noise = measured_noise(usable, config)
     config = fitted_to_noise(usable, noise, config)
-    tell("looking for the table and the object")
     region = find_region(intrinsics, usable, plane, noise, config)
-    tell(f"aligning {len(usable)} views" if config.refine else "fusing at the poses as given")
     alignment = aligned(intrinsics, usable, region, noise, config)
-    tell("fusing")
     low, high = volume_box(region, config)
     cell = _voxel(low, high, config)
     if cell > config.voxel_m:
@@ -105,12 +98,7 @@ def fuse_object(
     Ts_cam_table = se3.invert(alignment.Ts_world_cam) @ T_world_table
     volume = fused_volume(crops, Ts_cam_table, (low, high, cell), alignment.coarse, config)
     surface = closed_surface(volume, cut_height(region, config), config)
-    tell("judging the surface")
     return _judged(surface, crops, Ts_cam_table, alignment, (region.notes, notes, started), config)
-
-
-def _silent(_: str) -> None:
-    """Tell nobody."""
 
 
 def _voxel(low: Array, high: Array, config: FusionConfig) -> float:
@@ -134,7 +122,7 @@ def _judged(
     needed = least_views(config, len(alignment.frames))
     measured = surface.known & (seen.views >= needed)
     sigma = _sigma(seen, alignment.surface_sigma_m, measured)
-    coverage = _coverage(surface, normals[:, 2] < FACING_DOWN, measured, seen.views)
+    coverage = _coverage(surface, normals[:, 2] < FACING_DOWN, measured)
     verdict, reasons = _verdict(coverage, alignment, config)
     mesh = Mesh(
         vertices=in_world(alignment.plane.T_world_table, surface),
@@ -180,7 +168,7 @@ def _sigma(seen: VertexEvidence, pose_sigma_m: float, measured: Mask) -> Array:
     return np.where(measured, np.hypot(noise, pose), np.nan)
 
 
-def _coverage(surface: Surface, down: Mask, measured: Mask, views: Int32) -> Coverage:
+def _coverage(surface: Surface, down: Mask, measured: Mask) -> Coverage:
     """Return the shares of the area that were measured and invented."""
     a, b, c = np.moveaxis(surface.vertices[surface.faces], 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -200,7 +188,6 @@ def _coverage(surface: Surface, down: Mask, measured: Mask, views: Int32) -> Cov
         closed=closed,
         overhang=overhang,
         largest_hole_mm=float(1e3 * np.max(holes, initial=0.0)),
-        views_per_vertex=float(np.median(views[measured])) if measured.any() else 0.0,
     )
 
 

@@ -133,8 +133,6 @@ class Coverage:
     largest_hole_mm: float
     """Width of the largest invented patch above the cut that does not face down: the diameter of a
     disc of its area [mm]."""
-    views_per_vertex: float
-    """Median number of views that measured a vertex of the measured part."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

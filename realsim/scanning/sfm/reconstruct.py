@@ -182,9 +182,7 @@ def outcome(
     """Measure the reconstruction and judge it."""
     residuals = reprojection_errors(geometry)
     lengths = np.linalg.norm(residuals, axis=1)
-    count = len(geometry.points)
-    seen = np.bincount(geometry.points_of, minlength=count)
-    squares = np.bincount(geometry.points_of, np.nan_to_num(lengths) ** 2, minlength=count)
+    seen = np.bincount(geometry.points_of, minlength=len(geometry.points))
     covariances = point_covariances(geometry, robust_sigma(residuals))
     unit = 1e3 if mapped.is_metric else 1.0
     missing = set(matching.names) - set(geometry.names)
@@ -200,7 +198,6 @@ def outcome(
         depth=None,
         reliability=mapped.reliability,
         camera_covariance=_camera_covariance(mapped, geometry),
-        point_error_px=np.sqrt(squares / np.maximum(seen, 1)),
         point_sigma_mm=unit * np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0)),
         track_lengths=seen.astype(np.int64),
         reprojection_px=float(np.nanmedian(lengths)),

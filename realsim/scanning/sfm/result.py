@@ -137,8 +137,6 @@ class SfmResult:
     camera_covariance: Array | None
     """(V, 6, 6) of the right perturbation of each camera [rad, m]; of a free reconstruction about
     the best similarity. None at the robot's own poses."""
-    point_error_px: Array
-    """(P,) RMS reprojection error of each point."""
     point_sigma_mm: Array
     """(P,) 1-sigma of each point along its worst direction [mm], cameras taken as right."""
     track_lengths: Int64

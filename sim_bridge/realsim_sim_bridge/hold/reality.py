@@ -65,8 +65,6 @@ class Judged:
     """(T,)"""
     evidence: Array
     """(T,) of p_hold, before calibration."""
-    evidence_error: Array
-    """(T,) its standard error."""
     columns: dict[str, Array]
     """(T,) each: other predictors, greater = more likely to hold."""
     shares: dict[str, Array]
@@ -157,12 +155,11 @@ def judge_trials(
             progress(done, total)
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     shares = {name: joined.pop(name) for name in tuple(joined) if name.startswith("share_")}
-    share, error = joined.pop("draws"), joined.pop("error")
+    share = joined.pop("draws")
     return Judged(
         held=np.concatenate([o.held for o in objects]),
         objects=np.array([o.name for o in objects for _ in o.held], dtype=np.str_),
         evidence=evidence_of(share, joined["score"], config.hold.draws),
-        evidence_error=error,
         columns={"draws": share, **joined},
         shares=shares,
         digest=_digest(objects),
@@ -205,10 +202,10 @@ def _of_object(obj: TriedObject, trial: SlipTrial, config: RealityConfig) -> dic
         hand, trial.body.center_of_mass,
     )  # fmt: skip
     columns = chance_columns(obj.mesh, trial, config.slip, hand, config.hold)
+    del columns["p_hold_error"]  # predicts nothing
     share = 1.0 - sum(columns[f"share_{name}"] for name in FAILURES)
     return {
         "draws": np.asarray(share),
-        "error": columns.pop("p_hold_error"),
         "dexnet_closure": closure.dexnet_closure,
         "closure_friction": -closure.closure_friction,
         "ferrari_canny": closure.ferrari_canny,
