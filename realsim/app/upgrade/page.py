@@ -32,8 +32,6 @@ PAIRS = 60
 FRAMES = 12
 """Whole frames at the top of the page."""
 POSES = ("T_cam_obj_before", "T_cam_obj", "T_cam_obj_proposed")
-RIGHT = {"improved": "improved", "kept": "kept", "rejected": "new pose refused"}
-"""What stands right of the handle, by what became of the annotation."""
 ROWS = 400
 """Objects in the page's table; upgrade.csv has all."""
 CROP_WIDTH_PX = 560
@@ -156,16 +154,16 @@ def _pair(out: Path, record: Record, o: Mapping[str, Any]) -> View:
     """Return the two pictures of an object, drawn when the page asks for them."""
     before, after = _pictures(out, str(record["place"]), o)
     moved = f"moved by {o['moved_mm']:.1f} mm and {o['moved_deg']:.1f} deg"
-    became = {
-        "improved": f"annotation improved, {moved}", "kept": "annotation kept",
-        "rejected": "annotation kept, new pose refused",
+    right, became = {  # what stands right of the handle, and what is said of the annotation
+        "improved": ("improved", f"improved, {moved}"), "kept": ("kept", "kept"),
+        "rejected": ("new pose refused", "kept, new pose refused"),
     }[o["outcome"]]  # fmt: skip
     label = (
-        f"{record['place']} image {o['shown']['image']}, {o['name']}: {became}; the written pose "
-        f"is {o['verdict']}; {o['why']}"
+        f"{record['place']} image {o['shown']['image']}, {o['name']}: annotation {became}; the "
+        f"written pose is {o['verdict']}; {o['why']}"
     )
     more = "".join(f"; {r}" for r in o["reasons"] if o["why"] not in r)
-    return View(label + more, {"as given": before, RIGHT[o["outcome"]]: after})
+    return View(label + more, {"as given": before, right: after})
 
 
 def _pictures(
