@@ -25,7 +25,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from realsim import stand_ins
 from realsim.arrays import Array
@@ -342,15 +342,3 @@ def T_world_gl_from_cam(T_world_cam: ArrayLike) -> Array:
 def T_world_cam_from_gl(T_world_gl: ArrayLike) -> Array:
     """Return T_world_cam (..., 4, 4), OpenCV axes, of a camera given in OpenGL axes."""
     return np.asarray(T_world_gl, dtype=np.float64) @ T_CAM_GL
-
-
-# --- arrays -----------------------------------------------------------------------------------
-
-
-def native(array: ArrayLike, dtype: Any) -> NDArray[Any]:
-    """Return a contiguous array in this machine's own byte order.
-
-    Arrays of scipy.io.loadmat say '<f8', which open3d.core.Tensor refuses although it means the
-    same ("unsupported python array format").
-    """
-    return np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("="))

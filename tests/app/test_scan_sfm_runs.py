@@ -11,7 +11,6 @@ from realsim.app.console import Console
 from realsim.app.scan.sfm.run import SfmRequest, run_scan_sfm
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession, View
-from realsim.scanning.sfm.files import read_cameras
 from realsim.store import SessionStore
 
 CAMERA = CameraIntrinsics(width=400, height=300, fx=330.0, fy=330.0, cx=199.5, cy=149.5)
@@ -75,13 +74,19 @@ def report(folder: Path, **options: object) -> dict[str, Any]:
     return json.loads((folder / "scans/sfm/sfm.json").read_text())
 
 
+def read_cameras(folder: Path) -> np.ndarray:
+    """T_world_cam (V, 4, 4) of the views that were found."""
+    views = json.loads((folder / "scans/sfm/cameras.json").read_text())["views"]
+    return np.array([v["T_world_cam"] for v in views])
+
+
 @pytest.mark.slow
 def test_free_mapping_has_the_robots_metre(tmp_path: Path) -> None:
     Ts = cameras()
     session(tmp_path / "s", Ts)
     told = report(tmp_path / "s", poses="unknown")
-    names, found = read_cameras(tmp_path / "s/scans/sfm/cameras.json")
-    assert len(names) == VIEWS and told["verdict"] == "accepted", told["reasons"]
+    found = read_cameras(tmp_path / "s")
+    assert len(found) == VIEWS and told["verdict"] == "accepted", told["reasons"]
     apart = np.linalg.norm(found[:, :3, 3] - Ts[:, :3, 3], axis=1)
     assert 1e3 * apart.max() < 2.0
     size = np.linalg.norm(found[0, :3, 3] - found[-1, :3, 3])
@@ -102,5 +107,5 @@ def test_refinement_mends_poses_that_are_wrong(tmp_path: Path) -> None:
 
     session(tmp_path / "wrong", Ts).set_cameras(CAMERA, dict(enumerate(robot)))
     report(tmp_path / "wrong", poses="refined")
-    _, found = read_cameras(tmp_path / "wrong/scans/sfm/cameras.json")
+    found = read_cameras(tmp_path / "wrong")
     assert between(found) <= max(0.5 * between(robot), 0.3)

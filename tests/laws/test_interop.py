@@ -90,12 +90,6 @@ def test_opengl_cameras_look_along_minus_z():
     np.testing.assert_allclose(interop.T_world_cam_from_gl(T_world_gl), T)
 
 
-def test_arrays_of_another_byte_order_become_native():
-    swapped = np.arange(3.0).astype(">f8")
-    fixed = interop.native(swapped, np.float64)
-    assert fixed.dtype.isnative and fixed.tolist() == [0, 1, 2]
-
-
 def run(code):
     env = os.environ | {"OMP_NUM_THREADS": "1"}
     return subprocess.run(

@@ -14,13 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from realsim.arrays import Array
-from realsim.errors import InputError
 from realsim.scanning.sfm.config import SfmConfig
 from realsim.scanning.sfm.result import Alignment, SfmResult
 from realsim.store import provenance
 from realsim.store.atomic import write_bytes, write_json
-from realsim.untrusted.own_json import read_object, to_json
+from realsim.untrusted.own_json import to_json
 
 RESULT, CAMERAS, CLOUD = "sfm.json", "cameras.json", "sparse.ply"
 VERSION = 1
@@ -76,23 +74,6 @@ def cameras_json(result: SfmResult) -> dict[str, Any]:
         ],
         "unregistered": list(result.unregistered),
     }
-
-
-def read_cameras(path: Path) -> tuple[tuple[str, ...], Array]:
-    """Return names and T_world_cam (V, 4, 4) of a cameras.json.
-
-    Raises:
-        InputError: it is missing or another file.
-    """
-    document = read_object(path)
-    if document.get("format") != "realsim-sfm-cameras":
-        raise InputError(
-            f"{path} is no cameras.json of `realsim scan sfm`: its format is "
-            f"{document.get('format')!r}."
-        )
-    views: list[dict[str, Any]] = document["views"]
-    Ts = np.array([v["T_world_cam"] for v in views], dtype=np.float64).reshape(-1, 4, 4)
-    return tuple(str(v["name"]) for v in views), Ts
 
 
 def result_json(result: SfmResult, config: SfmConfig) -> dict[str, Any]:
