@@ -124,13 +124,12 @@ def require_no_data(path: Path, name: str, besides: Sequence[str] = ()) -> None:
     require_no_links(path, name)
 
 
-def require_no_links(path: Path, name: str, files: Sequence[str] | None = None) -> None:
+def require_no_links(path: Path, name: str) -> None:
     """Raise where a folder is a link or has links that lead out of it: results would go there.
 
     Args:
         path: the folder, there or not.
         name: of the option, for messages.
-        files: those that are looked at; None = all at its top.
 
     Raises:
         InputError: there is such a link.
@@ -143,7 +142,7 @@ def require_no_links(path: Path, name: str, files: Sequence[str] | None = None) 
     if not path.is_dir():
         return
     real = path.resolve()
-    for entry in path.iterdir() if files is None else (path / file for file in files):
+    for entry in path.iterdir():
         if entry.is_symlink() and not entry.resolve().is_relative_to(real):
             raise InputError(
                 f"{name} '{path}': {entry} is a link to {entry.resolve()}, out of the folder; "

@@ -76,9 +76,7 @@ def write_points(
     return count
 
 
-def coloured_points(
-    scene: LabelledScene, most: int, *, tick: Callable[[], None] | None = None
-) -> ColouredPoints:
+def coloured_points(scene: LabelledScene, most: int) -> ColouredPoints:
     """Return at most so many points of the images that have depth and a camera pose.
 
     Points are averaged in voxels, image by image, so that a scene of any length needs the memory of
@@ -87,7 +85,6 @@ def coloured_points(
     Args:
         scene: the scene.
         most: number of points; 0 = none.
-        tick: called once per image taken.
 
     Raises:
         InputError: depth and colour of an image have different sizes, or one cannot be read.
@@ -104,8 +101,6 @@ def coloured_points(
         while len(points) > most:
             size_m *= COARSER
             points, weights, _, colours = voxel_mean(points, size_m, weights, colours)
-        if tick is not None:
-            tick()
     return ColouredPoints(points, np.clip(np.rint(colours), 0, 255).astype(np.uint8))
 
 

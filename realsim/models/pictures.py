@@ -52,22 +52,13 @@ MOST_LINES = 25
 """Lines of the figures; a longer text ends with '...'."""
 
 
-def model_sheet(
-    mesh: Mesh,
-    properties: ModelProperties,
-    parts: ConvexParts | None = None,
-    *,
-    name: str = "",
-    obj_id: int | None = None,
-) -> Image:
+def model_sheet(mesh: Mesh, properties: ModelProperties, parts: ConvexParts | None = None) -> Image:
     """Return the sheet of a model (H, W, 3).
 
     Args:
         mesh: the model's mesh; metres, or its own units where `properties.matter` is None.
         properties: what is known of it.
         parts: its convex parts in the same unit.
-        name: for the title; else that of the properties.
-        obj_id: for the title; else that of the properties.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -75,7 +66,7 @@ def model_sheet(
     width, height = 3 * PANEL[0] / DPI, 2 * PANEL[1] / DPI + TITLE_IN
     figure = Figure(figsize=(width, height), dpi=DPI, facecolor=PAPER)
     FigureCanvasAgg(figure)
-    _title(figure, properties, name or properties.name, obj_id or properties.obj_id)
+    _title(figure, properties)
     drawn, factor = drawn_size(mesh)
     layers = _layers(mesh, properties, factor)
     for k, (title, direction) in enumerate(VIEWS):
@@ -120,10 +111,11 @@ def _panel(figure: Any, column: int, row: int, title: str) -> Any:
     return ax
 
 
-def _title(figure: Any, properties: ModelProperties, name: str, obj_id: int | None) -> None:
+def _title(figure: Any, properties: ModelProperties) -> None:
     height = float(figure.get_size_inches()[1])
     at = 1 - 0.5 * TITLE_IN / height
-    label = name if obj_id is None else f"{name}  ({obj_id})"
+    obj_id = properties.obj_id
+    label = properties.name if obj_id is None else f"{properties.name}  ({obj_id})"
     figure.text(0.009, at, label, fontsize=16, weight="bold", color=INK, va="center")
     is_plain = properties.matter is None and properties.verdict == "accepted"
     color = MUTED if is_plain else VERDICT_COLORS.get(properties.verdict, MUTED)

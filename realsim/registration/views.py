@@ -3,7 +3,7 @@
 All steps after this one work on these points: 256 images of 1280x720 pixels become 60 MB.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,15 +135,9 @@ def sample_views(
     frames: Sequence[DepthFrame],
     noise: DepthNoise,
     config: SampleConfig,
-    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[ViewPoints, ...]:
     """Return the trusted points of every frame; each image is looked at once."""
-    views: list[ViewPoints] = []
-    for n, frame in enumerate(frames):
-        views.append(sample_view(intrinsics, frame, noise, config))
-        if progress is not None:
-            progress(n + 1, len(frames))
-    return tuple(views)
+    return tuple(sample_view(intrinsics, frame, noise, config) for frame in frames)
 
 
 def world_cloud(views: Sequence[ViewPoints], noise: DepthNoise) -> Cloud:

@@ -6,7 +6,7 @@ masks by projecting the models' vertices. Nothing is rendered: what needs a rend
 pixel exactly belongs to the silhouette) is only bounded.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -106,29 +106,17 @@ class Sheet:
             )
 
 
-def check_bop_scene(
-    scene: LabelledScene,
-    models: Mapping[int, ObjectModel] | None = None,
-    *,
-    delta_m: float = DELTA_M,
-    progress: Callable[[], None] | None = None,
-) -> BopCheck:
+def check_bop_scene(scene: LabelledScene) -> BopCheck:
     """Return where the labels of a scene contradict each other.
 
     Compared are, as far as they are there: mask_visib with mask; bbox_visib, bbox_obj,
     px_count_visib, px_count_valid, px_count_all and visib_fract with masks and depth; bbox_obj and
     the masks with the projected model; measured depth with the model's nearest and farthest point.
 
-    Args:
-        scene: the scene.
-        models: by object id; None = the scene's own.
-        delta_m: BOP's tolerance of visibility [m].
-        progress: called once per frame.
-
     Raises:
         InputError: an image or a mask cannot be read.
     """
-    models = scene.models() if models is None else models
+    models = scene.models()
     layout = SceneLayout(folder=Path(), camera=scene.camera)
     findings: list[BopFinding] = []
     compared: dict[str, int] = {}
@@ -138,13 +126,11 @@ def check_bop_scene(
         depth_m = _depth(scene, frame)
         for k, o in enumerate(frame.objects):
             sheet = Sheet(layout, index, k, o.obj_id)
-            _check_object(scene, frame, k, o, depth_m, models.get(o.obj_id), delta_m, sheet)
+            _check_object(scene, frame, k, o, depth_m, models.get(o.obj_id), sheet)
             objects += 1
             findings += sheet.findings
             for what in sheet.compared:
                 compared[what] = compared.get(what, 0) + 1
-        if progress is not None:
-            progress()
     return BopCheck(
         scene=scene.name,
         frames=len(scene.indices),
@@ -175,7 +161,6 @@ def _check_object(
     o: LabelledObject,
     depth_m: Array32 | None,
     model: ObjectModel | None,
-    delta_m: float,
     sheet: Sheet,
 ) -> None:
     whole = scene.mask(frame.index, k, visible=False)
@@ -189,7 +174,7 @@ def _check_object(
     if o.gt_info is not None:
         check_info(dict(o.gt_info), whole, visible, depth_m, shape, sheet)
     if shape is not None:
-        pose_findings(shape, whole, visible, depth_m, delta_m, sheet)
+        pose_findings(shape, whole, visible, depth_m, DELTA_M, sheet)
 
 
 def check_info(

@@ -8,7 +8,6 @@ models in `models`, the estimates that come with YCB-V in `keyframes`; `labelled
 everything in them and a camera per image.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -162,12 +161,8 @@ def _refs(folder: Path) -> list[BopSceneRef]:
     ]
 
 
-def read_scene(ref: BopSceneRef, image_ids: Sequence[int] | None = None) -> BopScene:
+def read_scene(ref: BopSceneRef) -> BopScene:
     """Read the cameras and the ground truth of a scene.
-
-    Args:
-        ref: a scene of `find_scenes`.
-        image_ids: only these images; None = all.
 
     Raises:
         InputError: no image, no depth_scale, a camera that changes, two ground truths.
@@ -176,14 +171,6 @@ def read_scene(ref: BopSceneRef, image_ids: Sequence[int] | None = None) -> BopS
     """
     path = ref.layout.document("scene_camera")
     cameras = read_cameras(path)
-    if image_ids is not None:
-        absent = sorted(set(image_ids) - set(cameras))
-        if absent:
-            raise InputError(
-                f"image {', '.join(map(str, absent))} is not in {path}; it has "
-                f"{', '.join(map(str, sorted(cameras)[:12]))}."
-            )
-        cameras = {i: cameras[i] for i in image_ids}
     there = ref.layout.colour_files()
     color = {i: there[i] for i in cameras if i in there}
     missing = tuple(sorted(set(cameras) - set(color)))

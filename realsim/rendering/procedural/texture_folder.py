@@ -59,10 +59,7 @@ class _Pack:
 
 
 def material_from_images(
-    source: Path | str | Sequence[Path | str],
-    period_m: float,
-    name: str | None = None,
-    notes: list[str] | None = None,
+    source: Path | str | Sequence[Path | str], period_m: float, notes: list[str] | None = None
 ) -> Material:
     """Return a material out of a folder of maps, a list of them, or one picture.
 
@@ -72,15 +69,13 @@ def material_from_images(
     Args:
         source: the folder or the files. A single picture is the base colour, whatever its name.
         period_m: edge of one tile [m]; the width of the picture.
-        name: of the material; default that of the folder or file.
         notes: which maps are missing and what stands for them is added to it.
 
     Raises:
         InputError: nothing there, no base colour, two files for one map, or a broken file.
     """
     notes = [] if notes is None else notes
-    paths, default = _paths(source)
-    name = name or default
+    paths, name = _paths(source)
     pack = _sorted(paths, name)
     color = read_picture(pack.files["color"])
     rough, base_roughness = _roughness(pack, name, notes)

@@ -1,7 +1,6 @@
 """The fused mesh from four sides, shaded and coloured by how sure it is, as one PNG."""
 
 import io
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,29 +24,21 @@ WORST_SHARE = 98.0
 """The colour scale ends at this percentile of the sigmas."""
 
 
-def fusion_picture(
-    fused: FusedObject, path: Path | str | None = None, values_mm: Array | None = None
-) -> bytes:
-    """Return a PNG of the fused mesh from four sides; also save it if a path is given.
+def fusion_picture(fused: FusedObject) -> bytes:
+    """Return a PNG of the fused mesh from four sides.
 
     The upper row shows the mesh in its own colours (grey without), the lower the 1-sigma of every
     vertex; what is invented is orange in both.
-
-    Args:
-        fused: the result of the fusion.
-        path: where to save the picture.
-        values_mm: (V,) drawn instead of sigma, signed (for instance errors against a known truth).
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
-    values = 1e3 * fused.sigma_m if values_mm is None else np.asarray(values_mm, dtype=np.float64)
+    values = 1e3 * fused.sigma_m
     known = values[fused.measured & np.isfinite(values)]
-    top = float(np.percentile(np.abs(known), WORST_SHARE)) if len(known) else 1.0
-    scale = Normalize(0.0 if values_mm is None else -top, top)
-    shades = ScalarMappable(scale, "viridis" if values_mm is None else "RdBu_r")
+    top = float(np.percentile(known, WORST_SHARE)) if len(known) else 1.0
+    shades = ScalarMappable(Normalize(0.0, top), "viridis")
     rows = _vertex_paints(fused, shades.to_rgba(np.nan_to_num(values))[:, :3])
     standing = se3.transform(se3.invert(fused.plane.T_world_table), fused.mesh.vertices)
     mesh = Mesh(vertices=standing, faces=fused.mesh.faces)
@@ -62,7 +53,7 @@ def fusion_picture(
             ax.set_axis_off()
             if row == 0:
                 ax.set_title(name, fontsize=11)
-    what = "1-sigma of the surface [mm]" if values_mm is None else "signed error [mm]"
+    what = "1-sigma of the surface [mm]"
     figure.colorbar(shades, ax=axes[1, :], label=what, fraction=0.02, pad=0.01)
     size = 1e3 * np.ptp(standing, axis=0)
     c = fused.coverage
@@ -73,12 +64,7 @@ def fusion_picture(
     )
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
-    data = buffer.getvalue()
-    if path is not None:
-        from realsim.store.atomic import write_bytes
-
-        write_bytes(Path(path), data)
-    return data
+    return buffer.getvalue()
 
 
 def _vertex_paints(fused: FusedObject, scale: Array) -> tuple[Array, Array]:
