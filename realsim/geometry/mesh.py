@@ -7,6 +7,7 @@ meshes, their symmetries, and their forms in other libraries.
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ from realsim.records import Mesh, ObjectModel
 
 __all__ = [
     "MassProperties",
+    "box_mesh",
     "check_unit",
     "decimated",
     "diameter",
@@ -53,6 +55,17 @@ __all__ = [
 
 GREY = 160
 """Colour of a part without colour when it is merged with parts that have one."""
+BOX_FACES = np.array(
+    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+     [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]], dtype=np.int32,
+)  # fmt: skip
+"""(12, 3) of a box's corners in the order z fastest, outward."""
+
+
+def box_mesh(low: ArrayLike, high: ArrayLike) -> Mesh:
+    """Return a closed box along the axes, from its least corner (3,) to its greatest one."""
+    ends = np.array([low, high], dtype=np.float64)
+    return Mesh(vertices=np.array(list(product(*ends.T))), faces=BOX_FACES)
 
 
 def transformed(mesh: Mesh, T: ArrayLike) -> Mesh:

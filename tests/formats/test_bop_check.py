@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from plain_meshes import box
 from realsim.formats.bop.check import Sheet, check_bop_scene
 from realsim.formats.bop.check_poses import pose_findings, silhouette
 from realsim.formats.bop.layout import SceneLayout
@@ -15,7 +16,7 @@ from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics
 from realsim_sim_bridge.annotation.annotate import AnnotationConfig, annotate
 from tests.support import synthetic_scenes
-from tests.support.bop_scenes import box_mesh, edit, write_boxes
+from tests.support.bop_scenes import edit, write_boxes
 
 
 def test_labels_that_realsim_computed_agree_with_a_lens(tmp_path):
@@ -93,7 +94,7 @@ def test_depth_that_was_not_used_for_visibility_is_found(tmp_path):
 def test_a_bar_that_the_border_cuts_agrees_with_its_own_silhouette(tmp_path):
     intrinsics = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
     T = se3.from_rt(se3.exp_so3([0.0, 0.0, np.pi / 4]), [-0.27, 0.0, 0.5])
-    mesh = box_mesh((0.3, 0.02, 0.01))
+    mesh = box((0.3, 0.02, 0.01))
     uv = project(intrinsics, se3.transform(T, mesh.vertices))
     assert uv[:, 0].min() < 0 < uv[:, 0].max()
     canvas = np.zeros((240, 320), np.uint8)
@@ -102,7 +103,7 @@ def test_a_bar_that_the_border_cuts_agrees_with_its_own_silhouette(tmp_path):
     shape = silhouette(intrinsics, T, mesh)
     pose_findings(shape, mask, mask, None, 0.015, sheet)
     assert "pose and box" in sheet.compared and not sheet.findings
-    wider = silhouette(intrinsics, T, box_mesh((0.3, 0.2, 0.01)))
+    wider = silhouette(intrinsics, T, box((0.3, 0.2, 0.01)))
     sheet = Sheet(SceneLayout(folder=tmp_path), 0, 0, 1)
     pose_findings(wider, mask, mask, None, 0.015, sheet)
     assert [f.what for f in sheet.findings] == ["pose and box"]

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from plain_meshes import ball, box
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
-from realsim.records import CameraIntrinsics, Mesh
+from realsim.records import CameraIntrinsics
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 
 LENS = np.array([-0.08, 0.06, 0.0008, -0.0011, -0.02])
@@ -13,35 +14,15 @@ CAMERA = CameraIntrinsics(width=320, height=180, fx=163.0, fy=161.0, cx=158.7, c
                           distortion=LENS)  # fmt: skip
 
 
-def box(x: float, y: float, z: float) -> Mesh:
-    corners = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-             [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
-    return Mesh(vertices=corners * [x, y, z], faces=np.array(faces))
-
-
-def ball(radius: float, rings: int = 16) -> Mesh:
-    polar = np.linspace(0.02, np.pi - 0.02, rings)
-    around = np.arange(2 * rings) * np.pi / rings
-    p, a = np.meshgrid(polar, around, indexing="ij")
-    xyz = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], -1).reshape(-1, 3)
-    m = 2 * rings
-    i, j = np.divmod(np.arange((rings - 1) * m), m)
-    k = i * m + (j + 1) % m
-    q = i * m + j
-    faces = np.concatenate([np.stack([q, q + m, k + m], -1), np.stack([q, k + m, k], -1)])
-    return Mesh(vertices=radius * xyz, faces=faces)
-
-
 def table() -> PlacedMesh:
-    return PlacedMesh(-1, box(1.2, 1.0, 0.02), se3.from_translation([0.4, 0, -0.01]))
+    return PlacedMesh(-1, box((1.2, 1.0, 0.02)), se3.from_translation([0.4, 0, -0.01]))
 
 
 def clutter(seed: int = 0, n: int = 6) -> list[PlacedMesh]:
     rng = np.random.default_rng(seed)
     placed = [table()]
     for i in range(n):
-        mesh = ball(0.04) if i % 2 else box(0.06, 0.04, 0.08)
+        mesh = ball(0.04) if i % 2 else box((0.06, 0.04, 0.08))
         T = se3.from_rt(
             se3.exp_so3([0, 0, rng.uniform(0, 6)]),
             [0.4 + rng.uniform(-0.12, 0.12), rng.uniform(-0.12, 0.12), 0.04],
@@ -83,8 +64,8 @@ def test_box_over_a_plane_covers_the_pixels_of_its_projection() -> None:
     i = CameraIntrinsics(width=64, height=48, fx=90, fy=90, cx=30.5, cy=20.5)
     T = se3.look_at([0, 0, 1.0], [0, 0, 0])
     placed = [
-        PlacedMesh(-1, box(3, 3, 0.2), se3.from_translation([0, 0, -0.1])),
-        PlacedMesh(5, box(0.2, 0.1, 0.1), se3.from_translation([0, 0, 0.05])),
+        PlacedMesh(-1, box((3, 3, 0.2)), se3.from_translation([0, 0, -0.1])),
+        PlacedMesh(5, box((0.2, 0.1, 0.1)), se3.from_translation([0, 0, 0.05])),
     ]
     labels = LabelRenderer(placed).render(i, T)
     assert labels.px_count_visib == {5: 200}
@@ -150,7 +131,7 @@ def test_what_is_behind_the_camera_or_aside_is_counted_as_nothing() -> None:
 
 def test_an_object_around_the_camera_fills_the_canvas() -> None:
     i = CameraIntrinsics(width=40, height=30, fx=30, fy=30, cx=19.5, cy=14.5)
-    room = PlacedMesh(0, box(2, 2, 2), np.eye(4))
+    room = PlacedMesh(0, box((2, 2, 2)), np.eye(4))
     labels = LabelRenderer([room]).render(i, se3.look_at([0, 0, 0], [1, 0, 0]))
     assert labels.amodal[0].all()
     assert labels.px_count_all[0] == 9 * 40 * 30
@@ -161,7 +142,7 @@ def test_pixels_without_a_ray_are_background() -> None:
                               distortion=np.array([-0.3, 0.0, 0.0, 0.0]))  # fmt: skip
     gone = np.isnan(camera.ray_table(strong)[..., 0])
     assert 0 < gone.sum() < gone.size
-    wall = PlacedMesh(0, box(0.01, 20, 20), se3.from_translation([0.5, 0, 0]))
+    wall = PlacedMesh(0, box((0.01, 20, 20)), se3.from_translation([0.5, 0, 0]))
     labels = LabelRenderer([wall]).render(strong, se3.look_at([0, 0, 0], [1, 0, 0]))
     assert np.all(labels.ids[gone] == -1) and np.all(labels.depth_m[gone] == 0)
     assert np.all(labels.ids[~gone] == 0)

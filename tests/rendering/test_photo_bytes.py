@@ -5,12 +5,14 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 from realsim.geometry import se3
+from realsim.geometry.mesh import box_mesh
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.photo import Lighting, PhotoRenderer, PlacedMesh
@@ -30,11 +32,8 @@ GOLDEN_STD, GOLDEN_STEP = 38.07, 2.873
 
 
 def box(half: tuple[float, float, float], colors: bool = False) -> Mesh:
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
-    quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-    faces = [f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))]
     paint = (np.arange(24).reshape(8, 3) * 10).astype(np.uint8) if colors else None
-    return Mesh(vertices=corners, faces=np.array(faces), colors=paint)
+    return replace(box_mesh(-np.array(half), half), colors=paint)
 
 
 def still_life() -> list[PlacedMesh]:

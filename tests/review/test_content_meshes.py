@@ -5,13 +5,13 @@ import io
 import numpy as np
 import trimesh
 
+from plain_meshes import box
 from realsim import CameraIntrinsics, Mesh
 from realsim.geometry import se3
 from realsim.models.simplify import deviation
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.review.content.config import SceneConfig
 from realsim.review.content.meshes import glb_of, within_budget
-from tests.support.reviewed_boxes import box
 
 CAMERA = CameraIntrinsics(width=400, height=300, fx=900.0, fy=900.0, cx=199.5, cy=149.5)
 
@@ -64,7 +64,7 @@ def test_a_mesh_is_not_touched_below_its_budget_and_textures_have_a_larger_one()
     square = textured_square()
     config = SceneConfig(most_triangles=1, most_textured_triangles=2)
     assert within_budget(square, config) is square
-    plain = box((0.1, 0.1, 0.1))
+    plain = box((0.1, 0.1, 0.1), (180, 60, 40))
     assert within_budget(plain, SceneConfig(most_triangles=12)) is plain
 
 

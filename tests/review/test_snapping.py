@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from plain_meshes import box
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
@@ -25,7 +26,6 @@ from tests.support.registered_sessions import (
     true_cameras,
     true_poses,
 )
-from tests.support.synthetic_scenes import box
 
 MODELS = models_of()
 TUBE = part("tube")

@@ -7,6 +7,7 @@ import pytest
 
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
+from realsim.geometry.mesh import box_mesh
 from realsim.geometry.parts import part
 from realsim.records import Mesh
 from realsim.scanning.scale.measured import (
@@ -27,10 +28,7 @@ from scale_fits import SMALL, UNIT_M, fit_of, known_scan
 
 def brick(*size: float) -> Mesh:
     """A box with a corner at the origin."""
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-             [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
-    return Mesh(vertices=corners * size, faces=np.array(faces))
+    return box_mesh((0.0, 0.0, 0.0), size)
 
 
 def turned(mesh: Mesh, seed: int) -> tuple[Mesh, np.ndarray]:

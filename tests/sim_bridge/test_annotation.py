@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from plain_meshes import box
 from realsim import (
     CameraIntrinsics,
     CaptureSession,
@@ -24,7 +25,6 @@ from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore
 from realsim_sim_bridge.annotation.annotate import AnnotationConfig, annotate
 from realsim_sim_bridge.annotation.inputs import table_slab
-from synthetic_scenes import box
 
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 TABLE = se3.from_translation([0.5, 0.0, 0.1])

@@ -25,6 +25,7 @@ from realsim.arrays import Mask, UInt16
 from realsim.formats import label_maps
 from realsim.formats.bop.labels import mask_of, rle_area_and_bbox
 from realsim.geometry import camera, se3
+from realsim.geometry.mesh import box_mesh
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore
 from realsim_sim_bridge.annotation.annotate import AnnotationConfig, annotate
@@ -39,8 +40,8 @@ ALL = AnnotationConfig(plane_clearance_m=0.0, maps=("instance", "depth", "coordi
 
 
 def box(size: tuple[float, float, float]) -> Mesh:
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-    return Mesh(vertices=corners * np.array(size) / 2 + 0.01, faces=table_slab(ALL).faces)
+    half = np.array(size) / 2
+    return box_mesh(0.01 - half, 0.01 + half)
 
 
 MODELS = {

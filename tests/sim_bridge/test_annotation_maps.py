@@ -2,13 +2,13 @@
 
 import numpy as np
 
+from plain_meshes import box
 from realsim.formats import label_maps
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim_sim_bridge.annotation import frame_maps
-from synthetic_scenes import box
 
 CAMERA = CameraIntrinsics(
     width=160, height=120, fx=150, fy=150, cx=79.5, cy=59.5,

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from plain_meshes import box
 from realsim import CameraIntrinsics, GraspSet, ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.arrays import Array, Array32
 from realsim.geometry import se3
@@ -12,7 +13,6 @@ from realsim.rendering.rays import BACKGROUND
 from realsim_sim_bridge.annotation.config import AnnotationConfig, OccluderConfig
 from realsim_sim_bridge.annotation.frame import frame_files
 from realsim_sim_bridge.annotation.inputs import FrameInputs, FrameView, table_slab
-from synthetic_scenes import box
 
 CAMERA = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
 Depth = Array32

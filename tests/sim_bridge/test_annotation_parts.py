@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from plain_meshes import box
 from realsim import CameraIntrinsics, GraspSet, ObjectPose
 from realsim.arrays import Array
 from realsim.formats.bop.labels import bbox_of
@@ -21,7 +22,6 @@ from realsim_sim_bridge.annotation.frame_labels import (
     unknown_occluder,
 )
 from realsim_sim_bridge.annotation.unmodelled import object_masks
-from synthetic_scenes import box
 
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 SIDE = 0.05

@@ -6,7 +6,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from realsim import Mesh, ObjectModel
+from plain_meshes import box
+from realsim import ObjectModel
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 
@@ -17,18 +18,7 @@ THINGS = ((1, -0.08, -0.03, 0.4), (7, 0.03, 0.05, 1.1), (1, 0.09, -0.05, 2.2))
 """Object id, x, y [m], turn about z [rad]; two alike."""
 
 
-def box_mesh(size):
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-    faces = np.array([
-        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-    ], np.int32)  # fmt: skip
-    return Mesh(vertices=corners * np.array(size) / 2, faces=faces)
-
-
-MODELS = {
-    i: ObjectModel(obj_id=i, name=f"box{i}", mesh=box_mesh(size)) for i, size in SIZES_M.items()
-}
+MODELS = {i: ObjectModel(obj_id=i, name=f"box{i}", mesh=box(size)) for i, size in SIZES_M.items()}
 
 
 def rays(K=K):

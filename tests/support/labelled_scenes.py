@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from realsim import CameraIntrinsics, Mesh, ObjectModel, images
+from plain_meshes import box
+from realsim import CameraIntrinsics, ObjectModel, images
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer
@@ -15,16 +16,6 @@ from realsim_sim_bridge.synthetic.cameras import hemisphere_cameras
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=151.0, cx=78.7, cy=60.2)
 TABLE = se3.from_rt(se3.exp_so3([0.0, 0.0, 0.7]), [0.5, -0.1, 0.1])
 DEPTH_UNIT_M = 1e-3
-
-
-def box(size, color):
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-    faces = np.array([
-        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-    ], np.int32)  # fmt: skip
-    colors = np.tile(np.array(color, np.uint8), (8, 1))
-    return Mesh(vertices=corners * np.array(size) / 2, faces=faces, colors=colors)
 
 
 MODELS = {

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from plain_meshes import box
 from realsim import (
     CameraIntrinsics,
     CaptureSession,
     GraspSet,
-    Mesh,
     ObjectModel,
     ObjectPose,
     Scene,
@@ -29,28 +29,17 @@ INTRINSICS = CameraIntrinsics(
     distortion=np.array([-0.05, 0.02, 1e-3, -1e-3, 0.0]),
 )  # fmt: skip
 DEPTH_UNIT_M = 1e-4
+RED = (180, 60, 40)
 CAMERAS = [
     se3.look_at([0.5 + 0.4 * np.cos(a), 0.4 * np.sin(a), 0.3], [0.5, 0.0, 0.03])
     for a in (0.0, 1.6, 3.1, 4.7)
 ]
 
 
-def box(size: tuple[float, float, float], rgb: tuple[int, int, int] = (180, 60, 40)) -> Mesh:
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    faces = [
-        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-    ]  # fmt: skip
-    return Mesh(
-        vertices=corners * np.array(size) / 2, faces=np.array(faces, np.int32),
-        colors=np.tile(np.array(rgb, np.uint8), (8, 1)),
-    )  # fmt: skip
-
-
 MODELS = {
-    1: ObjectModel(obj_id=1, name="tall", mesh=box((0.04, 0.04, 0.12))),
-    7: ObjectModel(obj_id=7, name="flat", mesh=box((0.08, 0.06, 0.03))),
-    9: ObjectModel(obj_id=9, name="spare", mesh=box((0.05, 0.05, 0.05))),
+    1: ObjectModel(obj_id=1, name="tall", mesh=box((0.04, 0.04, 0.12), RED)),
+    7: ObjectModel(obj_id=7, name="flat", mesh=box((0.08, 0.06, 0.03), RED)),
+    9: ObjectModel(obj_id=9, name="spare", mesh=box((0.05, 0.05, 0.05), RED)),
 }
 SCENE = Scene(
     name="two boxes",
@@ -104,7 +93,7 @@ def _make(folder: Path, larger: int) -> None:
     )  # fmt: skip
     session = CaptureSession(name="boxes", intrinsics=camera, views=(), depth_unit_m=DEPTH_UNIT_M)
     store = SessionStore.create(folder, session)
-    table = PlacedMesh(-1, box((1.0, 1.0, 0.02)), se3.from_translation([0.5, 0.0, -0.01]))
+    table = PlacedMesh(-1, box((1.0, 1.0, 0.02), RED), se3.from_translation([0.5, 0.0, -0.01]))
     placed = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in SCENE.objects]
     renderer = LabelRenderer([*placed, table])
     rng = np.random.default_rng(1)

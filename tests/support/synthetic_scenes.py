@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from plain_meshes import box
 from realsim import (
     CameraIntrinsics,
     CaptureSession,
-    Mesh,
     ObjectModel,
     ObjectPose,
     Scene,
@@ -31,16 +31,6 @@ INTRINSICS = CameraIntrinsics(
 )  # fmt: skip
 TABLE = se3.from_translation([0.5, 0.0, 0.1])
 DEPTH_UNIT_M = 1e-4
-
-
-def box(size, color=None):
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-    faces = np.array([
-        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-    ], np.int32)  # fmt: skip
-    colors = None if color is None else np.tile(np.array(color, np.uint8), (8, 1))
-    return Mesh(vertices=corners * np.array(size) / 2, faces=faces, colors=colors)
 
 
 MODELS = {

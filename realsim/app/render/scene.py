@@ -9,6 +9,7 @@ from realsim.app.render.light import ObservedLook, matched_look, neutral_environ
 from realsim.app.render.request import RenderRequest
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.mesh import box_mesh
 from realsim.records import Mesh, ObjectModel, Scene
 from realsim.rendering.appearance import Material
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
@@ -138,12 +139,7 @@ def table_top_m(scene: Scene, models: dict[int, ObjectModel]) -> float:
 def table_slab() -> Mesh:
     """Return the table: a closed box under the plane z = 0 of its frame [m]."""
     h, t = TABLE_M / 2, TABLE_THICKNESS_M
-    corners = np.array([[x, y, z] for x in (-h, h) for y in (-h, h) for z in (-t, 0.0)])
-    faces = [
-        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-    ]  # fmt: skip
-    return Mesh(vertices=corners, faces=np.array(faces, dtype=np.int32))
+    return box_mesh((-h, -h, -t), (h, h, 0.0))
 
 
 def table_material(request: RenderRequest) -> Material | None:

@@ -17,11 +17,6 @@ PLAIN_RGB = (176, 182, 190)
 """Colour of what has none of its own."""
 HAND_RGB = (222, 226, 232)
 """Colour of the plain hand: light lacquer, which stands out from the grasps' colours."""
-BOX_FACES = np.array(
-    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-     [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]], dtype=np.int32,
-)  # fmt: skip
-"""(12, 3) of the corners in the order z fastest, outward."""
 
 
 class ReplayNodes:
@@ -112,11 +107,11 @@ class ReplayNodes:
         )
 
     def _add_box(self, part: str, low: Array, high: Array) -> Any:
-        corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1)
+        box = mesh_tools.box_mesh(low, high)
         return self._scene.add_mesh_simple(
             f"{self._name}/{part}",
-            corners.reshape(-1, 3).astype(np.float32),
-            BOX_FACES,
+            box.vertices.astype(np.float32),
+            box.faces,
             color=HAND_RGB,
             flat_shading=True,
             side="double",

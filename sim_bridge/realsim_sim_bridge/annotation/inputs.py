@@ -10,6 +10,7 @@ import numpy as np
 from realsim import images
 from realsim.arrays import Array
 from realsim.errors import InputError
+from realsim.geometry.mesh import box_mesh
 from realsim.records import (
     CameraIntrinsics,
     GraspSet,
@@ -121,14 +122,7 @@ def _table(scene: Scene, config: AnnotationConfig) -> list[PlacedMesh]:
 def table_slab(config: AnnotationConfig) -> Mesh:
     """Return the table as a closed box under the plane z = 0 of frame `table` [m]."""
     half, top = config.table_m / 2, -config.plane_clearance_m
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)], float)
-    corners[:, :2] *= half
-    corners[:, 2] = top - config.table_thickness_m * (1 - corners[:, 2])
-    faces = [
-        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-    ]  # fmt: skip
-    return Mesh(vertices=corners, faces=np.array(faces, dtype=np.int32))
+    return box_mesh((-half, -half, top - config.table_thickness_m), (half, half, top))
 
 
 def _scene_digest(

@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull
 
 from realsim.arrays import Array, Int32
 from realsim.geometry import se3
+from realsim.geometry.mesh import BOX_FACES, box_mesh
 from realsim.geometry.mesh_files import load_mesh
 from realsim.models.simplify import colors_at, simplified
 from realsim.records import Mesh
@@ -279,15 +280,4 @@ def drawn_mesh(mesh: Mesh) -> Mesh:
 def table_slab() -> Mesh:
     """Return the table: a closed box under the plane z = 0 [m]."""
     h, t = TABLE_M / 2, TABLE_THICKNESS_M
-    corners = np.array(list(product((-h, h), (-h, h), (-t, 0.0))))
-    return Mesh(vertices=corners, faces=BOX_FACES)
-
-
-BOX_FACES = np.array(
-    [
-        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-    ],
-    dtype=np.int32,
-)  # fmt: skip
-"""Triangles of a box whose corners are `product` of its ends."""
+    return box_mesh((-h, -h, -t), (h, h, 0.0))

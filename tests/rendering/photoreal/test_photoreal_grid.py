@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from llvm_library import NEEDS_LLVM
+from plain_meshes import ball, box
 from realsim.geometry import se3
-from realsim.records import CameraIntrinsics, Mesh
+from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.photoreal import PhotorealConfig, PhotorealRenderer
@@ -24,30 +25,11 @@ def lens(name: str, width: int, height: int) -> CameraIntrinsics:
     )  # fmt: skip
 
 
-def box(x: float, y: float, z: float) -> Mesh:
-    corners = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-             [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
-    return Mesh(vertices=corners * [x, y, z], faces=np.array(faces))
-
-
-def ball(radius: float, rings: int = 16) -> Mesh:
-    polar = np.linspace(0.02, np.pi - 0.02, rings)
-    around = np.arange(2 * rings) * np.pi / rings
-    p, a = np.meshgrid(polar, around, indexing="ij")
-    xyz = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], -1).reshape(-1, 3)
-    i, j = np.divmod(np.arange((rings - 1) * 2 * rings), 2 * rings)
-    q, k = i * 2 * rings + j, i * 2 * rings + (j + 1) % (2 * rings)
-    faces = np.concatenate([np.stack([q, q + 2 * rings, k + 2 * rings], -1),
-                            np.stack([q, k + 2 * rings, k], -1)])  # fmt: skip
-    return Mesh(vertices=radius * xyz, faces=faces)
-
-
 def clutter(origin: np.ndarray) -> list[PlacedMesh]:
     rng = np.random.default_rng(3)
-    placed = [PlacedMesh(-1, box(1.0, 1.0, 0.02), se3.from_translation(origin - [0, 0, 0.01]))]
+    placed = [PlacedMesh(-1, box((1.0, 1.0, 0.02)), se3.from_translation(origin - [0, 0, 0.01]))]
     for i in range(7):
-        mesh = ball(0.04) if i % 2 else box(0.06, 0.04, 0.09)
+        mesh = ball(0.04) if i % 2 else box((0.06, 0.04, 0.09))
         # Apart, and off the table: where two faces coincide either answer is right.
         at = [0.09 * (i % 3 - 1), 0.1 * (i // 3 - 1), 0.051]
         T = se3.from_rt(se3.exp_so3([0, 0, rng.uniform(0, 6)]), origin + at)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from llvm_library import NEEDS_LLVM
+from plain_meshes import box
 from realsim.errors import InputError, MissingLibraryError
 from realsim.geometry import se3
-from realsim.records import CameraIntrinsics, Mesh
+from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment
 from realsim.rendering.photoreal import PhotorealConfig, PhotorealRenderer, find_llvm, llvm_probe
 from realsim.rendering.photoreal.tracing import denoised
@@ -25,13 +26,8 @@ SKY = Environment(
 
 
 def scene() -> list[PlacedMesh]:
-    corners = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-             [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
-    table = Mesh(vertices=corners * [1.0, 1.0, 0.02], faces=np.array(faces))
-    cube = Mesh(vertices=corners * 0.1, faces=np.array(faces))
-    return [PlacedMesh(-1, table, se3.from_translation([0, 0, -0.01])),
-            PlacedMesh(2, cube, se3.from_translation([0, 0, 0.05]))]  # fmt: skip
+    return [PlacedMesh(-1, box((1.0, 1.0, 0.02)), se3.from_translation([0, 0, -0.01])),
+            PlacedMesh(2, box((0.1, 0.1, 0.1)), se3.from_translation([0, 0, 0.05]))]  # fmt: skip
 
 
 @pytest.fixture
