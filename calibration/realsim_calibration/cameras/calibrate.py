@@ -11,7 +11,7 @@ from realsim.geometry.dh import DhArm
 from realsim.geometry.normal_equations import inverse
 from realsim.records import CameraIntrinsics
 from realsim_calibration.calibrate import CalibrationConfig, determined_priors
-from realsim_calibration.cameras.checks import rig_checks
+from realsim_calibration.cameras.checks import armless_checks, rig_checks
 from realsim_calibration.cameras.faults import (
     FEW_VIEWS,
     require_distinct,
@@ -319,10 +319,12 @@ def _camera(
         information=inverse(known),
     )  # fmt: skip
     checks = [check for camera_of, check in start.checks if camera_of == c]
+    told = hand_eye_checks(report, config.hand_eye.checks)
+    if not problem.arm_used:
+        told = armless_checks(told, report, "" if c == 0 else rig.cameras[0].name)
     checks += [
-        check for check in hand_eye_checks(report, config.hand_eye.checks)
-        if moves or check.name not in {"roll", "robot poses", "joint zeros"}
-    ]  # fmt: skip
+        check for check in told if moves or check.name not in {"roll", "robot poses", "joint zeros"}
+    ]
     checks += drawings_check([(v.instant, v.detection) for v in mine])
     if camera.intrinsics0 is not None and own is not None:
         given, fitted = (

@@ -1,9 +1,13 @@
 """What a person should know of several cameras calibrated together."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
 from realsim.records import Check
 from realsim_calibration.cameras.results import CamerasReport
+from realsim_calibration.results import HandEyeReport
 
 TOGETHER_MM = (2.0, 6.0)
 """Board's middle seen by two cameras at once: as the held-out limits of one camera."""
@@ -15,6 +19,31 @@ NAMED = 4
 def rig_checks(report: CamerasReport) -> tuple[Check, ...]:
     """Return the checks of the cameras together."""
     return (*_few_views(report), *_pairs(report), *_arm(report), *_odd(report), *_base(report))
+
+
+def armless_checks(
+    checks: Sequence[Check], own: HandEyeReport, reference: str
+) -> tuple[Check, ...]:
+    """Return a camera's checks where no arm gives metres or a base: what they say of one goes.
+
+    Args:
+        checks: as of a camera with an arm.
+        own: the camera's report.
+        reference: the camera that all places are in; empty for that camera itself.
+    """
+    kept = [c for c in checks if c.name not in {"uncertainty elsewhere", "board size"}]
+    place = Check(
+        name="uncertainty", verdict="good", value=own.here_mm, unit="mm",
+        sentence=f"in camera '{reference}' its place is known to {own.here_mm:.2f} mm and "
+        f"{own.here_deg:.3f} deg (1 sigma, worst axis); the board's size, which no arm's metres "
+        "prove, is part of it.",
+        advice="Measure the board's squares with a calliper.",
+    )  # fmt: skip
+    return tuple(
+        replace(place, verdict=c.verdict) if c.name == "uncertainty" else c
+        for c in kept
+        if reference or c.name != "uncertainty"
+    )
 
 
 def _few_views(r: CamerasReport) -> list[Check]:

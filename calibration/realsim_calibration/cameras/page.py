@@ -17,7 +17,7 @@ def camera_rows(report: CamerasReport) -> list[list[str]]:
     rows: list[list[str]] = []
     for camera, r in zip(report.rig.cameras, report.cameras, strict=True):
         own = [v for v in report.views if v.camera == camera.name]
-        place = " ".join(f"{v:.2f}" for v in 1e3 * r.X[:3, 3])
+        place = " ".join(f"{v:.2f}" for v in np.round(1e3 * r.X[:3, 3], 2) + 0.0)
         rows.append([
             camera.name, MOUNTS[camera.mount], place,
             f"{r.here_mm:.2f} mm / {r.here_deg:.3f} deg",
