@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from file_trees import bytes_of
 from realsim.app.calibrate.run import require_no_bag
 from realsim.app.calibrate.session import keep_board
 from realsim.app.cli import commands
@@ -19,7 +20,7 @@ from realsim.records import CameraIntrinsics, CaptureSession, TagBoard, View
 from realsim.store import SessionStore, load_hand_eye
 from realsim.store.atomic import json_bytes
 from realsim_calibration.targets.target_file import target_to_json
-from stored_sessions import bytes_of, flip
+from stored_sessions import flip
 
 CAMERA = CameraIntrinsics(width=640, height=400, fx=440.0, fy=440.0, cx=319.5, cy=199.5)
 BOARD = TagBoard(rows=3, columns=4, tag_size_m=0.04, gap_m=0.01)

@@ -14,6 +14,7 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import symmetry_transforms
 from realsim.records import CameraIntrinsics, CaptureSession, Mesh, ObjectModel, View
 from realsim.store import SessionStore
+from trimesh_solids import box
 
 CAMERA = CameraIntrinsics(width=64, height=48, fx=60, fy=60, cx=32, cy=24)
 
@@ -47,13 +48,6 @@ def read(folder):
     return bop.read_scene(ref)
 
 
-def cube(size=0.06):
-    import trimesh
-
-    solid = trimesh.creation.box((size, size, size))
-    return Mesh(vertices=solid.vertices, faces=solid.faces)
-
-
 # --- round trips ---------------------------------------------------------------------------------
 
 
@@ -85,7 +79,7 @@ def test_the_file_holds_bops_units_and_row_major_lists(tmp_path):
 
 def test_models_come_back(tmp_path):
     texture = np.random.default_rng(0).integers(0, 256, (8, 8, 3), dtype=np.uint8)
-    plain = cube()
+    plain = box((0.06, 0.06, 0.06))
     uv = np.random.default_rng(1).random((8, 2))
     textured = Mesh(vertices=plain.vertices, faces=plain.faces, uv=uv, texture=texture)
     flip = se3.from_rt(np.diag([1.0, -1, -1]), [0.001, 0, 0])
@@ -269,14 +263,14 @@ def test_a_truncated_image_is_named(tmp_path):
 
 
 def test_models_in_the_wrong_unit_are_found_out(tmp_path):
-    models = {1: ObjectModel(obj_id=1, name="die", mesh=cube())}
+    models = {1: ObjectModel(obj_id=1, name="die", mesh=box((0.06, 0.06, 0.06)))}
     bop_models.save_models(tmp_path, models)
     edited(tmp_path, "models_info.json", lambda d: d["1"].update(diameter=0.104))
     with pytest.raises(UnitError, match=r"models_info\.json says 0\.104 mm"):
         bop_models.load_models(tmp_path)
     from realsim.geometry.mesh import save_ply
 
-    save_ply(tmp_path / "obj_000001.ply", cube(), "m")
+    save_ply(tmp_path / "obj_000001.ply", box((0.06, 0.06, 0.06)), "m")
     with pytest.raises(UnitError, match="scan import FILE --unit m` makes"):
         bop_models.load_models(tmp_path)
     with pytest.raises(InputError, match="nowhere does not exist; files obj"):

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from file_trees import bytes_of
 from realsim.errors import InputError
 from realsim.formats.bop.models import load_models
 from realsim.formats.bop.opening import open_labelled_bop, open_labelled_scene
@@ -37,14 +38,6 @@ def export(scene, out, config=None, **root):
     return written
 
 
-def content(folder):
-    return {
-        p.relative_to(folder).as_posix(): p.read_bytes()
-        for p in sorted(Path(folder).rglob("*"))
-        if p.is_file()
-    }
-
-
 # --- round trips --------------------------------------------------------------------------------
 
 
@@ -68,7 +61,7 @@ def test_numbers_come_back_to_the_last_digit_and_unknown_keys_survive(tmp_path):
             assert np.array_equal(same, cv2.imread(str(file), -1))
     # A second time round nothing changes any more.
     export(open_labelled_bop(tmp_path / "b"), tmp_path / "c")
-    assert content(tmp_path / "b") == content(tmp_path / "c")
+    assert bytes_of(tmp_path / "b") == bytes_of(tmp_path / "c")
 
 
 def test_models_keep_their_numbers_and_their_own_keys(tmp_path):
@@ -308,4 +301,4 @@ def test_a_killed_export_goes_on_and_ends_with_the_same_bytes(tmp_path):
         write_bop_root(folder, name="copy")
         folder.finish({})
         assert (out / "SHA256SUMS").read_text().splitlines() == sums
-        assert content(out) == content(tmp_path / "whole")
+        assert bytes_of(out) == bytes_of(tmp_path / "whole")

@@ -5,6 +5,7 @@ import json
 
 import pytest
 
+from file_trees import bytes_of
 from realsim.errors import InputError
 from realsim.formats.export_folder import FINISHED, STATE, SUMS_FILE, ExportFolder
 
@@ -25,20 +26,12 @@ def fill(folder, stop_after=None):
     return export
 
 
-def content(folder):
-    return {
-        p.relative_to(folder).as_posix(): p.read_bytes()
-        for p in sorted(folder.rglob("*"))
-        if p.is_file()
-    }
-
-
 @pytest.mark.parametrize("stop_after", [1, PIECES - 1])
 def test_an_interrupted_export_ends_with_the_bytes_of_a_whole_one(tmp_path, stop_after):
     fill(tmp_path / "whole")
     fill(tmp_path / "torn", stop_after=stop_after)
     fill(tmp_path / "torn")
-    assert content(tmp_path / "torn") == content(tmp_path / "whole")
+    assert bytes_of(tmp_path / "torn") == bytes_of(tmp_path / "whole")
 
 
 def test_a_torn_row_is_not_glued_to_the_next_one(tmp_path):
@@ -48,12 +41,12 @@ def test_a_torn_row_is_not_glued_to_the_next_one(tmp_path):
     with rows.open("a") as file:
         file.write('["frame 5", "5", {"num')
     fill(tmp_path / "torn")
-    assert content(tmp_path / "torn") == content(tmp_path / "whole")
+    assert bytes_of(tmp_path / "torn") == bytes_of(tmp_path / "whole")
 
 
 def test_the_sums_are_those_of_the_files_and_of_all_files(tmp_path):
     fill(tmp_path)
-    found = content(tmp_path)
+    found = bytes_of(tmp_path)
     listed = dict(reversed(line.split("  ", 1)) for line in found[SUMS_FILE].decode().splitlines())
     assert listed == {
         name: hashlib.sha256(data).hexdigest()

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from file_trees import bytes_of
 from labelled_scenes import INTRINSICS, MODELS, labelled_scene
 from realsim import CameraIntrinsics, images
 from realsim.errors import InputError
@@ -28,11 +29,6 @@ def write(scene, out, **config):
 def opened(out):
     (ref,) = open_graspnet(out).scenes
     return open_scene(ref)
-
-
-def tree_bytes(folder):
-    files = [p for p in folder.rglob("*") if p.is_file()]
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in files}
 
 
 @pytest.fixture
@@ -65,7 +61,7 @@ def test_an_interrupted_export_ends_with_the_same_bytes_and_notes(source, tmp_pa
         folder = ExportFolder.begin(out, {"what": "test"})
         results.append(write_graspnet_scene(source, folder, GraspnetWriteConfig()))
         folder.finish({})
-    assert tree_bytes(tmp_path / "whole") == tree_bytes(tmp_path / "killed")
+    assert bytes_of(tmp_path / "whole") == bytes_of(tmp_path / "killed")
     whole, killed = results
     assert whole.notes == killed.notes and whole.counts == killed.counts
     assert (whole.frames_written, killed.frames_written) == (3, 0)

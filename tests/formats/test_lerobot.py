@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from file_trees import bytes_of
 from realsim.errors import InputError, MissingLibraryError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.lerobot import episodes as layout
@@ -108,11 +109,6 @@ def decoded(path):
         assert file.streams.video[0].codec_context.name == "h264"
         frames = [(float(f.time), f.to_ndarray(format="rgb24")) for f in file.decode(video=0)]
     return np.array([t for t, _ in frames]), [rgb for _, rgb in frames]
-
-
-def files_of(folder):
-    return {p.relative_to(folder).as_posix(): p.read_bytes()
-            for p in sorted(folder.rglob("*")) if p.is_file()}  # fmt: skip
 
 
 def test_the_steps_are_those_that_were_given(folder):
@@ -217,7 +213,7 @@ def test_a_killed_export_goes_on_at_the_next_episode(folder, tmp_path, dies_at):
     assert first.asked + second.asked == list(range(len(LENGTHS)))
     assert written.frames == sum(LENGTHS)
     assert written.frames_written == sum(LENGTHS[dies_at:])
-    assert files_of(tmp_path / "set") == files_of(folder)
+    assert bytes_of(tmp_path / "set") == bytes_of(folder)
 
 
 def test_columns_without_pictures_are_a_data_set(tmp_path):
@@ -300,4 +296,4 @@ def test_encoding_elsewhere_gives_the_same_bytes(folder, tmp_path):
 
     write_lerobot(source, export, LeRobotConfig(episodes_per_file=2), encode=elsewhere)
     export.finish({})
-    assert files_of(tmp_path / "set") == files_of(folder)
+    assert bytes_of(tmp_path / "set") == bytes_of(folder)

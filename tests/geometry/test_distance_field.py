@@ -8,23 +8,20 @@ from realsim.errors import InputError
 from realsim.geometry import distance_field, se3
 from realsim.geometry.distance_field import DistanceField
 from realsim.records import Mesh
+from trimesh_solids import solid
 
 HALF = np.array([0.03, 0.04, 0.05])
 RADIUS = 0.04
 
 
-def as_mesh(m: trimesh.Trimesh) -> Mesh:
-    return Mesh(vertices=np.array(m.vertices), faces=np.array(m.faces, dtype=np.int32))
-
-
 @pytest.fixture(scope="module")
 def box():
-    return DistanceField.from_mesh(as_mesh(trimesh.creation.box(2 * HALF)), 48)
+    return DistanceField.from_mesh(solid(trimesh.creation.box(2 * HALF)), 48)
 
 
 @pytest.fixture(scope="module")
 def sphere():
-    return DistanceField.from_mesh(as_mesh(trimesh.creation.icosphere(4, RADIUS)), 48)
+    return DistanceField.from_mesh(solid(trimesh.creation.icosphere(4, RADIUS)), 48)
 
 
 def box_distance(p):
@@ -82,7 +79,7 @@ def test_outside_the_grid_distance_grows_and_points_away(box):
 
 def test_a_moved_mesh_has_the_moved_field():
     rng = np.random.default_rng(3)
-    mesh = as_mesh(trimesh.creation.box(2 * HALF))
+    mesh = solid(trimesh.creation.box(2 * HALF))
     T = se3.random_transform(rng, spread=0.1)
     moved = DistanceField.from_mesh(
         Mesh(vertices=se3.transform(T, mesh.vertices), faces=mesh.faces), 48
@@ -96,14 +93,14 @@ def test_a_moved_mesh_has_the_moved_field():
 
 
 def test_a_hole_does_not_turn_the_inside_out():
-    solid = trimesh.creation.icosphere(3, RADIUS)
-    holed = Mesh(vertices=np.array(solid.vertices), faces=np.array(solid.faces[3:], np.int32))
+    shape = trimesh.creation.icosphere(3, RADIUS)
+    holed = Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces[3:], np.int32))
     p = shell(np.random.default_rng(4), 800, 0.3 * RADIUS, 0.9 * RADIUS)
     assert np.mean(DistanceField.from_mesh(holed, 32).distance(p) < 0) > 0.99
 
 
 def test_a_field_is_computed_once_and_kept_in_the_folder(tmp_path, monkeypatch):
-    mesh = as_mesh(trimesh.creation.box(HALF))
+    mesh = solid(trimesh.creation.box(HALF))
     first = DistanceField.from_mesh(mesh, 16, tmp_path)
     copy = Mesh(vertices=mesh.vertices.copy(), faces=mesh.faces.copy())
     assert DistanceField.from_mesh(copy, 16, tmp_path) is first

@@ -11,26 +11,11 @@ from realsim.errors import InputError, UnitError
 from realsim.geometry import mesh as meshes
 from realsim.geometry import metrics, se3
 from realsim.records import Mesh, ObjectModel
+from trimesh_solids import ball, box
 
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
 YCBV = DATA / "scenes/ycbv_mini"
 needs_ycbv = pytest.mark.skipif(not YCBV.is_dir(), reason=f"no YCB-V data at {YCBV}")
-
-
-def from_trimesh(solid):
-    return Mesh(vertices=solid.vertices, faces=solid.faces)
-
-
-def box(extents=(0.1, 0.06, 0.04)):
-    import trimesh
-
-    return from_trimesh(trimesh.creation.box(extents))
-
-
-def ball(radius=0.05, subdivisions=4):
-    import trimesh
-
-    return from_trimesh(trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius))
 
 
 def textured_square():

@@ -19,18 +19,9 @@ from realsim.models.convex import (
 )
 from realsim.models.convex_hulls import fewest, hull_volume, outermost
 from realsim.records import Mesh
+from trimesh_solids import box, solid
 
 QUICK = ConvexConfig(thresholds=(0.1, 0.05), mcts_iterations=10, mcts_depth=1)
-
-
-def solid(shape):
-    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
-
-
-def box():
-    import trimesh
-
-    return solid(trimesh.creation.box((0.05, 0.05, 0.05)))
 
 
 def annulus(sections=24):
@@ -54,7 +45,7 @@ def inside(parts, points):
 
 
 def test_a_convex_mesh_is_its_hull():
-    whole = convex_parts(box(), ConvexConfig())
+    whole = convex_parts(box((0.05, 0.05, 0.05)), ConvexConfig())
     assert whole.method == "hull" and len(whole.parts) == 1 and whole.notes == ()
     assert abs(whole.volume_ratio - 1) < 1e-9
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import trimesh_solids
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties, merged
@@ -14,24 +15,15 @@ from realsim.models.inspect import inspect_mesh, solved
 from realsim.models.repair import RepairConfig, repaired
 from realsim.models.simplify import colors_at, deviation
 from realsim.records import Mesh
+from trimesh_solids import box
 
 
 def solid(name="mug"):
     return replace(part(name).mesh, colors=None)
 
 
-def box(extents=(0.1, 0.06, 0.04), center=(0.0, 0.0, 0.0)):
-    import trimesh
-
-    b = trimesh.creation.box(extents)
-    return Mesh(vertices=b.vertices + np.asarray(center), faces=b.faces)
-
-
 def ball(radius=0.05, center=(0.0, 0.0, 0.0), subdivisions=3):
-    import trimesh
-
-    b = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
-    return Mesh(vertices=b.vertices + np.asarray(center), faces=b.faces)
+    return trimesh_solids.ball(radius, subdivisions, center)
 
 
 def inside_out(mesh):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from file_trees import bytes_of
 from realsim.errors import InputError
 from realsim.formats.bop.models import load_models, save_models
 from realsim.geometry.mesh import diameter, mass_properties
@@ -44,10 +45,6 @@ def textured() -> Mesh:
 @pytest.fixture
 def library(tmp_path: Path) -> ModelLibrary:
     return ModelLibrary.create(tmp_path / "models")
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 # --- what goes in comes out -------------------------------------------------------------------
@@ -134,14 +131,14 @@ def test_ids_are_given_once_and_never_changed(library: ModelLibrary):
     assert library.add(made("box"), "box").model.obj_id == 1
     assert library.add(made("wedge"), "wedge", obj_id=5).model.obj_id == 5
     assert library.next_id() == 6
-    before = content(library.folder)
+    before = bytes_of(library.folder)
     with pytest.raises(InputError, match=r"object 1 .* is 'box'.*--overwrite"):
         library.add(made("wedge"), "box")
     with pytest.raises(InputError, match=r"object 5 .* is 'wedge'"):
         library.add(made("box"), "other", obj_id=5)
     with pytest.raises(InputError, match="not renumbered to 9"):
         library.add(made("box"), "box", obj_id=9, overwrite=True)
-    assert content(library.folder) == before
+    assert bytes_of(library.folder) == before
     assert library.add(made("wedge"), "box", overwrite=True).model.obj_id == 1
     assert [e.name for e in library.entries()] == ["box", "wedge"]
 
@@ -151,7 +148,7 @@ def test_replacing_leaves_nothing_of_the_old_model(library: ModelLibrary):
     assert (library.folder / "obj_000001.png").is_file()
     plain = prepare_mesh(part("box").mesh, replace(CONFIG, with_parts=False))
     library.add(plain, "new", obj_id=1, overwrite=True)
-    assert sorted(content(library.folder)) == [
+    assert sorted(bytes_of(library.folder)) == [
         "models_info.json", "obj_000001.ply", "properties/obj_000001.json",
     ]  # fmt: skip
     assert check_library(library) == []
@@ -209,7 +206,7 @@ def test_a_kill_leaves_the_library_old_or_new(tmp_path: Path, name: str):
     new_id = ModelLibrary(tmp_path / "new").add(
         made("wedge"), name, overwrite=True, picture=b"new"
     ).model.obj_id  # fmt: skip
-    old, new = content(tmp_path / "old"), content(tmp_path / "new")
+    old, new = bytes_of(tmp_path / "old"), bytes_of(tmp_path / "new")
     outcomes: set[str] = set()
     for step in range(100):
         folder = tmp_path / f"killed_{step}"
@@ -220,12 +217,12 @@ def test_a_kill_leaves_the_library_old_or_new(tmp_path: Path, name: str):
         assert 1 in load_models(folder)
         library = ModelLibrary.open(folder)
         assert all(f.is_harmless for f in check_library(library))
-        now = {k: v for k, v in content(folder).items() if not k.startswith(".adding")}
+        now = {k: v for k, v in bytes_of(folder).items() if not k.startswith(".adding")}
         assert now in (old, new)
         outcomes.add("old" if now == old else "new")
         # The next writer goes on as if nothing had been.
         library.add(made("wedge"), name, overwrite=True, picture=b"new")
-        assert content(folder) == new
+        assert bytes_of(folder) == new
         if not was_killed:
             break
     assert step > 6 and outcomes == {"old", "new"} and new_id in (1, 2)
@@ -313,7 +310,7 @@ def test_a_foreign_models_folder_is_a_library(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(library_complete, "sheet_png", lambda *_: b"picture")
     models = {3: replace(part("box"), obj_id=3), 4: replace(part("cone"), obj_id=4)}
     save_models(tmp_path, models)
-    before = content(tmp_path)
+    before = bytes_of(tmp_path)
     library = ModelLibrary.open(tmp_path)
     back = library.load("box")
     assert back.properties is None and back.parts is None and "not imported" in back.notes[0]
@@ -321,7 +318,7 @@ def test_a_foreign_models_folder_is_a_library(tmp_path: Path, monkeypatch: pytes
     found = complete(library, 3, CONFIG)
     assert found.properties is not None and found.parts is not None and found.notes == ()
     assert np.array_equal(found.properties.symmetries.discrete, models[3].symmetries)
-    after = content(tmp_path)
+    after = bytes_of(tmp_path)
     assert {k: after[k] for k in before} == before
     assert set(after) - set(before) == {
         "collision/obj_000003.obj", "pictures/box.png", "properties/obj_000003.json",

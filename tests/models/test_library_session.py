@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from file_trees import bytes_of
 from realsim.errors import InputError
 from realsim.formats.bop.models import load_models, save_models
 from realsim.geometry.parts import part
@@ -31,10 +32,6 @@ def library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModelLibrary:
     # Pictures have tests of their own, and take longer than all that is tested here.
     monkeypatch.setattr("realsim.models.pictures.sheet_png", lambda *_: b"picture")
     return ModelLibrary.create(tmp_path / "models")
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 # --- without metric scale ---------------------------------------------------------------------
@@ -105,10 +102,10 @@ def test_a_session_gets_what_it_needs_and_no_more(library: ModelLibrary, tmp_pat
     assert not session.exists()
     assert copy_models(library, [3, 1, 1], session) == (1, 3)
     assert sorted(load_models(session)) == [1, 3]
-    taken = content(session)
-    assert {k: v for k, v in content(library.folder).items() if k in taken and "info" not in k} == {
-        k: v for k, v in taken.items() if "info" not in k
-    }
+    taken = bytes_of(session)
+    assert {
+        k: v for k, v in bytes_of(library.folder).items() if k in taken and "info" not in k
+    } == {k: v for k, v in taken.items() if "info" not in k}
     solids, unknown = known_solids(session, [1, 3])
     assert sorted(solids) == [1, 3] and unknown == {}
     library.add(prepare_mesh(part("box").mesh, BARE), "box", overwrite=True)

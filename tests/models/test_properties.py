@@ -12,16 +12,7 @@ from realsim.geometry.parts import part
 from realsim.models.model_records import ConvexParts
 from realsim.models.properties import physical_properties
 from realsim.records import Mesh
-
-
-def solid(shape):
-    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
-
-
-def box(size=(0.04, 0.06, 0.1), at=(0.0, 0.0, 0.0)):
-    import trimesh
-
-    return transformed(solid(trimesh.creation.box(size)), se3.from_translation(at))
+from trimesh_solids import box
 
 
 def opened(mesh):
@@ -30,7 +21,7 @@ def opened(mesh):
 
 def test_a_box_is_as_the_books_say():
     a, b, c = 0.04, 0.06, 0.1
-    p = physical_properties(box(at=(1.0, 2.0, -0.5)), density=700.0)
+    p = physical_properties(box((0.04, 0.06, 0.1), (1.0, 2.0, -0.5)), density=700.0)
     m = 700 * a * b * c
     assert p.volume_m3 == pytest.approx(a * b * c) and p.mass_kg == pytest.approx(m)
     assert (p.volume_of, p.mass_from) == ("mesh", "density")

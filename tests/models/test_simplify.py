@@ -18,13 +18,7 @@ from realsim.models.reading import read_scan
 from realsim.models.repair import RepairConfig, repaired
 from realsim.models.simplify import deviation, simplified
 from realsim.records import Mesh
-
-
-def ball(radius=0.05, subdivisions=4):
-    import trimesh
-
-    b = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
-    return Mesh(vertices=b.vertices, faces=b.faces)
+from trimesh_solids import ball
 
 
 def bent_torus(faces):

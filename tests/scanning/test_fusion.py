@@ -15,6 +15,7 @@ from realsim.records import CameraIntrinsics, Mesh
 from realsim.scanning.fusion.fuse import FusedObject, FusionConfig, FusionFrame, fuse_object
 from realsim.scanning.fusion.picture import fusion_picture
 from realsim.scanning.simulated import ScanLabConfig, scan_views, standing
+from trimesh_solids import ball, box
 
 CAMERA = CameraIntrinsics(width=640, height=360, fx=324.0, fy=324.0, cx=319.5, cy=179.5)
 AS_GIVEN = FusionConfig(refine=False, rounds=2, voxel_m=0.0015)
@@ -22,28 +23,18 @@ RADIUS = 0.045
 RED = np.array([200, 30, 40], np.uint8)
 
 
-def ball() -> Mesh:
-    """A sphere that touches the table's plane at the world's origin."""
-    import trimesh
-
-    sphere = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
-    return Mesh(vertices=sphere.vertices + np.array([0, 0, RADIUS]), faces=sphere.faces)
-
-
 def brick() -> Mesh:
     """A box of 100 x 60 x 50 mm on the table, turned by 0.4 rad."""
-    import trimesh
-
-    box = trimesh.creation.box((0.10, 0.06, 0.05))
     T = se3.from_rt(se3.exp_so3([0, 0, 0.4]), [0.01, -0.01, 0.025])
-    return Mesh(vertices=se3.transform(T, box.vertices), faces=box.faces)
+    return transformed(box((0.10, 0.06, 0.05)), T)
 
 
 @cache
 def ball_frames() -> tuple[FusionFrame, ...]:
     """Exact frames of the ball in one colour."""
     red = np.full((CAMERA.height, CAMERA.width, 3), RED, np.uint8)
-    return tuple(replace(f, rgb=red) for f in exact_frames((ball(),), CAMERA))
+    things = (ball(RADIUS, at=(0.0, 0.0, RADIUS)),)  # touches the table at the origin
+    return tuple(replace(f, rgb=red) for f in exact_frames(things, CAMERA))
 
 
 @cache

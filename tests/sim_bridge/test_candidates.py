@@ -17,15 +17,10 @@ from realsim_sim_bridge.grasping.candidates import (
 from realsim_sim_bridge.grasping.force_closure import force_closure
 from realsim_sim_bridge.grasping.hand_free import boxes_free, lowest_corner
 from realsim_sim_bridge.grasping.pad_contacts import pad_heights
-from trimesh_solids import solid
+from trimesh_solids import box
 
 HAND = find_hand()
-
-
-def box(x=0.05, y=0.05, z=0.05):
-    import trimesh
-
-    return solid(trimesh.creation.box((x, y, z)))
+CUBE = (0.05, 0.05, 0.05)
 
 
 def candidates(mesh, height=0.025, seed=0, surroundings=None, limit=60, hand=HAND):
@@ -41,7 +36,7 @@ def candidates(mesh, height=0.025, seed=0, surroundings=None, limit=60, hand=HAN
 
 
 def test_contacts_lie_on_the_surface_and_inside_both_friction_cones():
-    found = candidates(box())
+    found = candidates(box(CUBE))
     assert 0 < len(found.widths_m) <= 60
     y, z = found.Ts_obj_grasp[:, :3, 1], found.Ts_obj_grasp[:, :3, 2]
     middle = found.Ts_obj_grasp[:, :3, 3] + found.contact_depths_m[:, None] * z
@@ -56,7 +51,7 @@ def test_contacts_lie_on_the_surface_and_inside_both_friction_cones():
 @pytest.mark.parametrize("name", sorted(names_of("hand")))
 def test_every_hand_s_pads_close_on_the_contacts(name):
     """The pads, where the law has them at that width, touch the faces; the linkage is free."""
-    hand, mesh = find_hand(name), box()
+    hand, mesh = find_hand(name), box(CUBE)
     found = candidates(mesh, hand=hand)
     assert len(found) > 20
     depths = found.contact_depths_m - hand.z_pad(found.widths_m)
@@ -78,8 +73,8 @@ def test_every_hand_s_pads_close_on_the_contacts(name):
 
 
 def test_each_filter_s_counts_add_up_to_what_came_in():
-    near = standing_object(box(), se3.from_translation([0.09, 0.0, 0.025]), 1, 500)
-    c = candidates(box(0.05, 0.05, 0.09), height=0.045, surroundings=near).counts
+    near = standing_object(box(CUBE), se3.from_translation([0.09, 0.0, 0.025]), 1, 500)
+    c = candidates(box((0.05, 0.05, 0.09)), height=0.045, surroundings=near).counts
     assert c["surface_points"] == c["points_without_pair"] + c["antipodal_points"] == 400
     assert c["exits"] == sum(
         c[k] for k in ("too_near", "too_wide", "outside_cone", "antipodal_pairs")
@@ -95,7 +90,7 @@ def test_each_filter_s_counts_add_up_to_what_came_in():
 def test_hands_are_free_of_table_object_and_neighbours():
     near = np.random.default_rng(0).uniform([0.05, -0.05, 0.0], [0.07, 0.05, 0.08], (2000, 3))
     neighbours = Surroundings(points=near, instances=np.ones(2000, dtype=np.int64))
-    found = candidates(box(), surroundings=neighbours)
+    found = candidates(box(CUBE), surroundings=neighbours)
     assert found.counts["hand_in_neighbour"] > 0
     Ts = se3.from_translation([0.0, 0.0, 0.025]) @ found.Ts_obj_grasp
     boxes = HAND.boxes(found.openings_m)
@@ -117,7 +112,7 @@ def test_boxes_free_agrees_with_looking_at_each_point():
 
 
 def test_contacts_nearer_to_the_tips_let_the_fingers_clear_a_table():
-    plate = box(0.04, 0.04, 0.02)
+    plate = box((0.04, 0.04, 0.02))
     T = se3.from_translation([0.0, 0.0, 0.01])
     found = {}
     for depths in ((0.0,), (0.0, 0.003, 0.006)):
@@ -132,12 +127,12 @@ def test_contacts_nearer_to_the_tips_let_the_fingers_clear_a_table():
 
 
 def test_a_thin_neighbour_that_points_miss_stops_the_hand_by_its_triangles():
-    sheet = box(0.0004, 0.2, 0.2)
+    sheet = box((0.0004, 0.2, 0.2))
     T = se3.from_translation([0.04, 0.0, 0.1])
     exact = standing_object(sheet, T, 1, 4)
     points = Surroundings(points=exact.points[:4], instances=exact.instances[:4])
     with_triangles, with_points = (
-        candidates(box(), surroundings=s).counts for s in (exact, points)
+        candidates(box(CUBE), surroundings=s).counts for s in (exact, points)
     )
     assert with_triangles["hand_in_neighbour"] > 1.3 * with_points["hand_in_neighbour"] > 0
 

@@ -15,20 +15,15 @@ from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, Support,
 from realsim_sim_bridge.scenes.stable_state import HEADERS, StandConfig, stable_state, stand_rows
 from realsim_sim_bridge.scenes.stand_picture import stand_picture
 from realsim_sim_bridge.scenes.table_world import TableWorld, WorldConfig
+from trimesh_solids import box
 
 SIDE = 0.05
+CUBE = (SIDE, SIDE, SIDE)
 ONE_SECOND = StandConfig(shortest_s=1.0, longest_s=1.0, rest_s=0.25)
 
 
-def box(extents=(SIDE, SIDE, SIDE), at=(0.0, 0.0, 0.0)):
-    import trimesh
-
-    shape = trimesh.creation.box(extents)
-    return Mesh(vertices=np.array(shape.vertices) + at, faces=np.array(shape.faces))
-
-
 def cube(obj_id=1, **kwargs):
-    return ObjectModel(obj_id=obj_id, name=f"cube{obj_id}", mesh=box(), **kwargs)
+    return ObjectModel(obj_id=obj_id, name=f"cube{obj_id}", mesh=box(CUBE), **kwargs)
 
 
 def place(x, y, z, instance=0, obj_id=1, turn=(0.0, 0.0, 0.0)):
@@ -181,14 +176,13 @@ def test_blown_up_parts_and_meshes_without_volume_are_named():
     )
     (note,) = run(replace(scene, solids={1: fat})).notes
     assert "cube1" in note and "1.40" in note
-    opened = Mesh(vertices=box().vertices, faces=box().faces[2:])
+    opened = Mesh(vertices=box(CUBE).vertices, faces=box(CUBE).faces[2:])
     matter = physical_properties(opened)
     lidless = replace(scene, solids={1: KnownSolid(parts=solid.parts, matter=matter)})
     (note,) = run(lidless).notes
     assert "cube1" in note and "no volume" in note
-    flat = ObjectModel(
-        obj_id=1, name="sheet", mesh=Mesh(vertices=box().vertices * [1, 1, 0], faces=box().faces)
-    )
+    sheet = Mesh(vertices=box(CUBE).vertices * [1, 1, 0], faces=box(CUBE).faces)
+    flat = ObjectModel(obj_id=1, name="sheet", mesh=sheet)
     with pytest.raises(InputError, match=r"sheet.*flat"):
         known_solids({1: flat})
 

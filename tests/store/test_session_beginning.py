@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from file_trees import bytes_of
 from realsim.errors import InputError
 from realsim.records import CaptureSession
 from realsim.store import SessionStore, atomic
 from realsim.store.opening import BEGUN_FILE, RECOVERED, read_begun
 from realsim.store.session_check import check_session
 from realsim.store.session_repair import repair_session
-from stored_sessions import CAMERA, VIEWS, bytes_of, flip
+from stored_sessions import CAMERA, VIEWS, flip
 
 
 @pytest.mark.parametrize(

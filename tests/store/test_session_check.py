@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from file_trees import bytes_of
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.store import SessionStore
 from realsim.store.manifest import NAME as MANIFEST
 from realsim.store.session_check import check_session
 from realsim.store.session_repair import repair_session
-from stored_sessions import CAMERA, VIEWS, add, bytes_of, flip, images_of, view_of
+from stored_sessions import CAMERA, VIEWS, add, flip, images_of, view_of
 
 DEAD = 2**22 + 1
 """A process number that no process has."""

@@ -5,13 +5,14 @@ from pathlib import Path
 
 import pytest
 
+from file_trees import bytes_of
 from realsim.errors import InputError
 from realsim.records import CaptureSession, View
 from realsim.store import SessionStore
 from realsim.store.manifest import NAME as MANIFEST
 from realsim.store.session_check import check_session
 from realsim.store.session_repair import repair_session
-from stored_sessions import CAMERA, VIEWS, add, bytes_of, images_of
+from stored_sessions import CAMERA, VIEWS, add, images_of
 
 
 @pytest.mark.parametrize("left", [None, b'{"path": "half'])

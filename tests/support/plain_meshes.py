@@ -1,5 +1,6 @@
 """Boxes and balls of a few triangles."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ from realsim.geometry.mesh import box_mesh
 from realsim.records import Mesh
 
 
-def box(size, color=None) -> Mesh:
+def box(size: Sequence[float], color: tuple[int, int, int] | None = None) -> Mesh:
     """A box round the origin."""
     half = np.array(size) / 2
     paint = None if color is None else np.tile(np.array(color, np.uint8), (8, 1))

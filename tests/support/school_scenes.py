@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 
 from realsim.geometry import se3
-from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
+from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim_sim_bridge.grasping.antipodal import CandidateConfig
 from realsim_sim_bridge.school import SchoolConfig
+from trimesh_solids import box
 
 CONFIG = SchoolConfig(max_candidates=6, candidates=CandidateConfig(surface_points=200))
 
@@ -18,15 +19,8 @@ def small_worlds(config=CONFIG, pairs=2):
     return dataclasses.replace(config, slip=dataclasses.replace(config.slip, engine=engine))
 
 
-def box(size=0.05):
-    import trimesh
-
-    shape = trimesh.creation.box((size, size, size))
-    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
-
-
 def model(obj_id=1, size=0.05, **kwargs):
-    return ObjectModel(obj_id=obj_id, name=f"box{obj_id}", mesh=box(size), **kwargs)
+    return ObjectModel(obj_id=obj_id, name=f"box{obj_id}", mesh=box((size, size, size)), **kwargs)
 
 
 def at(x, y, instance=0, obj_id=1, size=0.05, **kwargs):

@@ -10,6 +10,18 @@ def solid(shape: trimesh.Trimesh) -> Mesh:
     return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
 
 
+def box(size=(0.1, 0.06, 0.04), at=(0.0, 0.0, 0.0)) -> Mesh:
+    return moved(trimesh.creation.box(size), at)
+
+
+def ball(radius=0.05, subdivisions=4, at=(0.0, 0.0, 0.0)) -> Mesh:
+    return moved(trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius), at)
+
+
+def moved(shape: trimesh.Trimesh, at) -> Mesh:
+    return Mesh(vertices=np.array(shape.vertices) + np.array(at), faces=np.array(shape.faces))
+
+
 def wedge(half_angle: float, length: float = 0.04, thin: float = 0.008, half_height: float = 0.03):
     """Return a prism along z that grows along x: its sides +y and -y open at +-half_angle."""
     end = thin + length * np.tan(half_angle)
