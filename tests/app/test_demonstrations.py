@@ -16,10 +16,8 @@ from realsim_sim_bridge.demonstrations.lerobot_episodes import (
     LeRobotDemonstrations,
     episode_columns,
 )
-from school_sessions import registered, run
+from school_sessions import registered, tried_weakly
 
-WEAK = ("--engine", "mujoco", "--grasps", "8", "--workers", "1", "--quiet", "--force", "4",
-        "--friction", "0.3")  # fmt: skip
 SMALL = ("--fps", "4", "--width", "64", "--height", "48", "--limit", "3", "--quiet",
          "--episodes-per-file", "2")  # fmt: skip
 
@@ -36,10 +34,7 @@ def refused(*args):
 
 @pytest.fixture(scope="module")
 def school(tmp_path_factory):
-    folder = registered(tmp_path_factory.mktemp("weak") / "session")
-    result = run("run", folder, *WEAK)
-    assert result.exception is None, result.output
-    return folder
+    return tried_weakly(tmp_path_factory.mktemp("weak") / "session")
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 import json
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Literal
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from page_tags import Tags
 from realsim import CaptureSession
 from realsim.app.register.files import write_result
 from realsim.app.report.cli import report_command
@@ -27,7 +27,6 @@ STAGES = (
     "calibration", "plan", "capture", "registration", "review", "school", "labels", "files",
     "settings",
 )  # fmt: skip
-VOID = {"img", "meta", "input", "br", "hr", "link"}
 
 
 @pytest.fixture(scope="module")
@@ -51,32 +50,6 @@ def store(tmp_path: Path) -> SessionStore:
 def page(registered: SessionStore) -> Path:
     """Its report."""
     return write_report(registered, None)
-
-
-class Balance(HTMLParser):
-    """Notes which elements are open, and every address."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.addresses: list[str] = []
-        self.faults: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag not in VOID:
-            self.open.append(tag)
-        self.addresses += [v or "" for k, v in attrs if k in ("src", "href", "action")]
-
-    def handle_endtag(self, tag: str) -> None:
-        if not self.open or self.open.pop() != tag:
-            self.faults.append(tag)
-
-
-def checked(text: str) -> Balance:
-    found = Balance()
-    found.feed(text)
-    assert found.faults == [] and found.open == []
-    return found
 
 
 def embedded(text: str) -> dict[str, object]:
@@ -114,14 +87,15 @@ def test_the_page_is_whole_needs_no_network_and_names_no_folder(
 ) -> None:
     text = page.read_text("utf-8")
     assert text.startswith("<!DOCTYPE html>") and len(text) < 15_000_000
-    found = checked(text)
-    assert all(a.startswith(("data:image/", "#")) for a in found.addresses)
+    attributes = [pair for _, given in Tags(text).seen for pair in given.items()]
+    addresses = [v or "" for k, v in attributes if k in ("src", "href", "action")]
+    assert all(a.startswith(("data:image/", "#")) for a in addresses)
     assert "http://" not in text and "https://" not in text
-    pictures = [a for a in found.addresses if a.startswith("data:")]
+    pictures = [a for a in addresses if a.startswith("data:")]
     assert len(pictures) == len(set(pictures)) > 3
     for place in (str(registered.folder), str(Path.home()), str(Path(__file__).parents[2])):
         assert place not in text
-    anchors = {a[1:] for a in found.addresses if a.startswith("#")}
+    anchors = {a[1:] for a in addresses if a.startswith("#")}
     assert anchors <= set(re.findall(r' id="([\w-]+)"', text)) and set(STAGES) <= anchors
 
 
@@ -195,7 +169,7 @@ def test_a_hostile_name_is_only_text(tmp_path: Path) -> None:
     session = CaptureSession(name=HOSTILE, intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
     store = SessionStore.create(tmp_path / "s", session, {"camera": HOSTILE, "x": "</script><b>"})
     text = write_report(store, None, notes=[HOSTILE]).read_text("utf-8")
-    checked(text)
+    Tags(text)
     assert "<script>alert" not in text and "<b>" not in text.partition("</div>")[2]
     assert embedded(text)["session"] == HOSTILE
 

@@ -17,10 +17,8 @@ from realsim_sim_bridge.arm.reach_config import base_on_table, grasping_arm, hom
 from realsim_sim_bridge.demonstrations.lerobot_episodes import LeRobotDemonstrations
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of
 from realsim_sim_bridge.demonstrations.source import DemonstrationSource
-from school_sessions import refused, registered, run
+from school_sessions import WEAK, refused, registered, run, tried_weakly
 
-WEAK = ("--engine", "mujoco", "--grasps", "8", "--workers", "1", "--quiet", "--force", "4",
-        "--friction", "0.3")  # fmt: skip
 CLOSE = PHASES.index("close")
 SAME = 1e-5
 """The school follows poses to 1e-6 m; files round."""
@@ -28,10 +26,7 @@ SAME = 1e-5
 
 @pytest.fixture(scope="module")
 def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = registered(tmp_path_factory.mktemp("motions") / "session")
-    result = run("run", folder, *WEAK)
-    assert result.exception is None, result.output
-    return folder
+    return tried_weakly(tmp_path_factory.mktemp("motions") / "session")
 
 
 @pytest.fixture(scope="module")

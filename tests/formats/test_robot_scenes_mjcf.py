@@ -7,16 +7,12 @@ import numpy as np
 import pytest
 
 import placed_scenes
-from realsim.formats.export_folder import ExportFolder
 from realsim.formats.robot_scenes.mesh_obj import collision_parts, look_of
 from realsim.formats.robot_scenes.mjcf import MjcfConfig, write_mjcf_scene
 
 
 def write(scene, folder, **config):
-    out = ExportFolder.begin(folder, {"scene": scene.name})
-    written = write_mjcf_scene(scene, out, MjcfConfig(**config))
-    out.finish({})
-    return written
+    return placed_scenes.written(write_mjcf_scene, scene, folder, MjcfConfig(**config))
 
 
 @pytest.fixture(scope="module")

@@ -17,10 +17,7 @@ from realsim.interop import T_from_pybullet, import_pinocchio, quiet_output
 
 
 def write(scene, folder, **config):
-    out = ExportFolder.begin(folder, {"scene": scene.name})
-    written = write_urdf_scene(scene, out, UrdfConfig(**config))
-    out.finish({})
-    return written
+    return placed_scenes.written(write_urdf_scene, scene, folder, UrdfConfig(**config))
 
 
 @pytest.fixture(scope="module")

@@ -15,10 +15,7 @@ from realsim.formats.robot_scenes.usd_scene import UsdConfig, write_usd_scene
 
 
 def write(scene, folder, **config):
-    out = ExportFolder.begin(folder, {"scene": scene.name})
-    written = write_usd_scene(scene, out, UsdConfig(**config))
-    out.finish({})
-    return written
+    return placed_scenes.written(write_usd_scene, scene, folder, UsdConfig(**config))
 
 
 @pytest.fixture(scope="module")

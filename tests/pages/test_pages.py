@@ -5,7 +5,6 @@ import io
 import re
 import shutil
 from collections.abc import Iterator
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
+from page_tags import Tags
 from realsim.errors import InputError
 from realsim.pages import Cell, Page, View, plots, spread
 
@@ -60,25 +60,6 @@ def everything() -> Page:
     page.sheet([View(f"picture {k}", {"": flat(40 * k, 90, 90)}) for k in range(3)])
     page.document = {"figure": "</script>"}
     return page
-
-
-class Tags(HTMLParser):
-    """Collects the tags and checks that they close."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.seen: list[tuple[str, dict[str, str | None]]] = []
-        self.feed(text)
-        assert self.open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.seen.append((tag, dict(attrs)))
-        if tag not in ("img", "meta", "input", "br"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
 
 
 def test_a_page_is_whole_escaped_and_asks_for_nothing() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial import QhullError
 
-from held_boxes import held_box
+from held_boxes import DOWN, held_box, held_from_above
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand import find_hand
@@ -22,28 +22,12 @@ from realsim_sim_bridge.slip.motion import (
     pendulum_wrenches,
 )
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
-from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
+from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
 from realsim_sim_bridge.slip.world import Closing, Replay, SlipPhysics
 
-DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
-SIDE = 0.05
 
-
-def cube(mass=0.125):
-    return held_box(mass)
-
-
-def trial(n=1, mass=0.125, R=DOWN):
-    Ts = np.repeat(se3.from_rt(R, np.zeros(3))[None], n, axis=0)
-    return SlipTrial(
-        body=cube(mass),
-        Ts_obj_grasp=Ts,
-        Ts_table_grasp=Ts,
-        openings_m=np.full(n, SIDE + 0.008),
-        swing_axes=np.tile([0.0, 1.0, 0.0], (n, 1)),
-        swing_points=np.tile([-0.088, 0.0, -0.21], (n, 1)),
-        swing_ranges=np.tile([-2.0, 2.0], (n, 1)),
-    )
+def trial(n=1, mass=0.125):
+    return held_from_above(held_box(mass), [0.0] * n)
 
 
 def run(physics=None, engine=None, **kwargs):

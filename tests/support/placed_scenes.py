@@ -3,6 +3,7 @@
 import numpy as np
 import trimesh
 
+from realsim.formats.export_folder import ExportFolder
 from realsim.formats.robot_scenes.placed_scene import SceneCamera
 from realsim.formats.robot_scenes.placing import Matter, PlacingConfig, place_scene
 from realsim.geometry import se3
@@ -111,3 +112,11 @@ def turned_to(scene, seed=3):
     from realsim.formats.robot_scenes.placed_scene import seen_from
 
     return seen_from(scene, se3.random_transform(np.random.default_rng(seed)))
+
+
+def written(write, scene, folder, config):
+    """Write a scene as an export of its own by a format's writer."""
+    out = ExportFolder.begin(folder, {"scene": scene.name})
+    told = write(scene, out, config)
+    out.finish({})
+    return told

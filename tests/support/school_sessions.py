@@ -16,6 +16,9 @@ from registered_sessions import CAMERA
 
 GRASPS = 5
 QUICK = ("--engine", "mujoco", "--grasps", GRASPS, "--workers", "1", "--quiet")
+WEAK = ("--engine", "mujoco", "--grasps", "8", "--workers", "1", "--quiet", "--force", "4",
+        "--friction", "0.3")  # fmt: skip
+"""So weak that some grasps hold and some slip."""
 NAMES = ("cube", "wedge")
 T_WORLD_TABLE = se3.from_rt(se3.exp_so3(np.array([0.0, 0.0, 0.4])), [0.3, 0.1, 0.02])
 
@@ -58,4 +61,12 @@ def registered(folder: Path) -> Path:
     store = SessionStore.create(folder, session)
     save_models(folder / "models", {part(n).obj_id: part(n) for n in NAMES})
     save_scene(store, scene())
+    return folder
+
+
+def tried_weakly(folder: Path, grasps: int = 8) -> Path:
+    """Write a registered session whose grasps a weak hand tried: some hold, some slip."""
+    registered(folder)
+    result = run("run", folder, *WEAK, "--grasps", grasps)
+    assert result.exception is None, result.output
     return folder

@@ -7,20 +7,15 @@ import pytest
 from realsim.app.school.files import stored_grasps
 from realsim_sim_bridge.demonstrations.front_view import FrontView, wrist_camera
 from realsim_sim_bridge.demonstrations.source import DemonstrationSource
-from school_sessions import registered, run
+from school_sessions import tried_weakly
 
-WEAK = ("--engine", "mujoco", "--grasps", "14", "--workers", "1", "--quiet", "--force", "4",
-        "--friction", "0.3")  # fmt: skip
 SMALL = (64, 48)
 
 
 @pytest.fixture(scope="session")
 def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session that was tried with a weak hand."""
-    folder = registered(tmp_path_factory.mktemp("weak") / "session")
-    result = run("run", folder, *WEAK)
-    assert result.exception is None, result.output
-    return folder
+    return tried_weakly(tmp_path_factory.mktemp("weak") / "session", grasps=14)
 
 
 @pytest.fixture(scope="session")
