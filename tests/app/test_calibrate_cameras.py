@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from realsim.app.calibrate.folder import MADE_OF, made_of
 from realsim.app.cli import commands
 from realsim.app.register.config import load_depth_bias
 from realsim.arrays import Array, UInt8
@@ -142,11 +143,15 @@ def refusal(result: Result) -> str:
 def test_cameras_without_an_arm_get_all_their_files(photos: Path, tmp_path: Path) -> None:
     held = ["--moved-board", str(photos.parent / "held.json")]
     fixed = ["--cameras", "left=fixed,right=fixed", "--out", str(tmp_path / "out")]
+    (tmp_path / "out/wrist/exports").mkdir(parents=True)
+    (tmp_path / "out" / MADE_OF).write_text(made_of(photos))
     result = CliRunner().invoke(commands, ["calibrate", str(photos), *fixed, *held])
     assert result.exit_code in {0, 1}, result.output
     page = (tmp_path / "out/cameras_report.html").read_text()
     assert re.search("in camera .{,5}left.{,5} its place is known to", page)
     assert "arm error" not in page and " metres the board is" not in page and "-0.00" not in page
+    assert "for this arm" not in page
+    assert "is of an earlier run: camera 'wrist' is not in this one." in result.output
     urdf = (tmp_path / "out/right/exports/camera.urdf").read_text()
     assert 'parent link="base"' in urdf and 'child link="right_optical_frame"' in urdf
     (pair,) = read_cameras(tmp_path / "out/cameras.json").pairs

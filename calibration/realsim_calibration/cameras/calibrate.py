@@ -21,7 +21,12 @@ from realsim_calibration.cameras.faults import (
     require_sizes,
 )
 from realsim_calibration.cameras.problem import RigProblem, first_state
-from realsim_calibration.cameras.results import CamerasReport, SightingReport, pair_reports
+from realsim_calibration.cameras.results import (
+    ROBOT_BASE,
+    CamerasReport,
+    SightingReport,
+    pair_reports,
+)
 from realsim_calibration.cameras.rig import Rig, Sighting
 from realsim_calibration.cameras.solve import (
     RigSolution,
@@ -200,7 +205,7 @@ def _report(
     )
     report = CamerasReport(
         rig=rig,
-        reference="robot base" if problem.arm_used else rig.cameras[0].name,
+        reference=ROBOT_BASE if problem.arm_used else rig.cameras[0].name,
         cameras=cameras,
         covariance=covariance,
         boards=tuple(

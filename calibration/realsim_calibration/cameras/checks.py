@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from realsim.records import Check
-from realsim_calibration.cameras.results import CamerasReport
+from realsim_calibration.cameras.results import ROBOT_BASE, CamerasReport
 from realsim_calibration.results import HandEyeReport
 
 TOGETHER_MM = (2.0, 6.0)
@@ -112,7 +112,7 @@ def _odd(r: CamerasReport) -> list[Check]:
 
 
 def _base(r: CamerasReport) -> list[Check]:
-    if r.reference == "robot base":
+    if r.reference == ROBOT_BASE:
         return []
     return [
         Check(

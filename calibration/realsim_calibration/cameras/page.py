@@ -4,7 +4,7 @@ import numpy as np
 
 from realsim.pages import Cell, Page
 from realsim.records import Check
-from realsim_calibration.cameras.results import CamerasReport
+from realsim_calibration.cameras.results import ROBOT_BASE, CamerasReport
 from realsim_calibration.cameras.rig import MOUNTS
 
 ORDER = ("bad", "warn", "unknown", "good")
@@ -13,14 +13,15 @@ PAGE = "cameras_report.html"
 
 
 def camera_rows(report: CamerasReport) -> list[list[str]]:
-    """Return a row of every camera: where, how sure, views, unseen error."""
+    """Return a row of every camera, as `camera_header`: where, how sure, views, unseen error."""
+    armless = report.reference != ROBOT_BASE
     rows: list[list[str]] = []
     for camera, r in zip(report.rig.cameras, report.cameras, strict=True):
         own = [v for v in report.views if v.camera == camera.name]
         place = " ".join(f"{v:.2f}" for v in np.round(1e3 * r.X[:3, 3], 2) + 0.0)
         rows.append([
             camera.name, MOUNTS[camera.mount], place,
-            f"{r.here_mm:.2f} mm / {r.here_deg:.3f} deg",
+            *([] if armless else [f"{r.here_mm:.2f} mm / {r.here_deg:.3f} deg"]),
             f"{r.sigma_mm:.2f} mm / {r.sigma_deg:.3f} deg",
             f"{sum(v.used for v in own)} / {len(own)}",
             f"{r.held_out_px:.2f} px / {r.held_out_mm:.2f} mm",
@@ -28,10 +29,13 @@ def camera_rows(report: CamerasReport) -> list[list[str]]:
     return rows
 
 
-CAMERA_HEADER = [
-    "camera", "mount", "place [mm]", "1 sigma for this arm as it moves here", "1 sigma absolute",
-    "views used / found", "unseen views",
-]  # fmt: skip
+def camera_header(report: CamerasReport) -> list[str]:
+    """Return the names of the columns; without an arm there is one sigma only."""
+    armless = report.reference != ROBOT_BASE
+    sigmas = ["1 sigma for this arm as it moves here"] * (not armless) + ["1 sigma absolute"]
+    return ["camera", "mount", "place [mm]", *sigmas, "views used / found", "unseen views"]
+
+
 PAIR_HEADER = ["cameras", "sees the board together", "1 sigma absolute", "apart (RMS)", "worst"]
 ODD_HEADER = ["camera", "view", "unseen", "why"]
 
@@ -77,7 +81,7 @@ def cameras_page(report: CamerasReport) -> Page:
         for c, r in zip(report.rig.cameras, report.cameras, strict=True)
     ])  # fmt: skip
     page.section("Cameras", f"Robot error map: {report.map_name}.", key="cameras")
-    page.table(CAMERA_HEADER, camera_rows(report))
+    page.table(camera_header(report), camera_rows(report))
     if report.pairs:
         page.section("Pairs", "The board's middle, as either camera alone sees it.", key="pairs")
         page.table(PAIR_HEADER, pair_rows(report))

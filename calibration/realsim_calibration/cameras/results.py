@@ -13,6 +13,9 @@ from realsim_calibration.cameras.rig import Rig
 from realsim_calibration.results import HandEyeReport
 from realsim_calibration.views import TargetDetection
 
+ROBOT_BASE = "robot base"
+"""`reference` of a report whose cameras an arm ties to the robot."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class PairReport:

@@ -37,10 +37,10 @@ from realsim_calibration.cameras.calibrate import calibrate_cameras
 from realsim_calibration.cameras.faults import FEW_VIEWS
 from realsim_calibration.cameras.files import document, write_cameras
 from realsim_calibration.cameras.page import (
-    CAMERA_HEADER,
     ODD_HEADER,
     PAGE,
     PAIR_HEADER,
+    camera_header,
     camera_rows,
     cameras_page,
     odd_rows,
@@ -325,7 +325,13 @@ def write_files(report: CamerasReport, out: Path) -> list[Path]:
 
 def _told(report: CamerasReport, files: list[Path], console: Console) -> bool:
     """Print a calibration; return whether no check is bad."""
-    console.table("Cameras", CAMERA_HEADER, camera_rows(report))
+    names = {c.name for c in report.rig.cameras}
+    for old in sorted(files[0].parent.glob("*/exports")):
+        if old.parent.name not in names:
+            console.warn(
+                f"'{old}' is of an earlier run: camera '{old.parent.name}' is not in this one."
+            )
+    console.table("Cameras", camera_header(report), camera_rows(report))
     if report.pairs:
         console.table("Pairs", PAIR_HEADER, pair_rows(report))
     odd = odd_rows(report)
