@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from franka_server import FrankaServer
+from given_plans import plan_through
 from realsim.app.doctor.devices import robot_findings
 from realsim.arrays import Array
 from realsim.geometry import se3
@@ -19,7 +20,7 @@ from realsim_capture_plans.capturing.contact_sheet import SheetConfig, contact_s
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
 from realsim_capture_plans.plan_files.plan_json import save_plan
-from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from realsim_capture_plans.planning.record import CapturePlan
 from typed_commands import realsim
 
 VIEWS = 2
@@ -27,7 +28,7 @@ VIEWS = 2
 
 def made_plan(kind: str, n: int, chain=UR5) -> CapturePlan:
     """Views round the middle of the lab's table, tilted and turned."""
-    center, config = np.array([0.45, 0.0, 0.01]), PlanConfig()
+    center = np.array([0.45, 0.0, 0.01])
     home = find_arm("ur5").home + np.pi * np.eye(6)[0]
     joints: list[Array] = []
     for k, turn in enumerate(np.linspace(0.0, 2 * np.pi, n, endpoint=False)):
@@ -36,11 +37,7 @@ def made_plan(kind: str, n: int, chain=UR5) -> CapturePlan:
         T = se3.look_at(eye, center, 1.2 * np.sin(2.4 * k))
         q = chain.inverse(T @ se3.invert(d405_mount().T_ee_cam))
         joints.append(q[np.argmin(np.abs(q - (joints[-1] if joints else home)).max(-1))])
-    return CapturePlan(
-        kind=kind, chain=chain, mount=d405_mount(), cell=config.work_cell(center, kind),
-        home=home, joints=np.stack(joints), center_world=center, vias=(), reference_view=0,
-        config=config,
-    )  # fmt: skip
+    return plan_through(np.stack(joints), home, center, kind, chain=chain)
 
 
 @pytest.fixture(scope="module")
@@ -185,13 +182,8 @@ def test_a_dry_run_drives_the_robot_without_a_camera(plans: Path, tmp_path: Path
 def seven_joint_plan(arm: str, path: Path) -> CapturePlan:
     """Write a plan of two views near where franky-sim's arm begins."""
     home = np.array([0.0, 0.0, 0.0, -np.pi / 2, 0.0, np.pi / 2, np.pi / 4])
-    center, config = np.array([0.5, 0.0, 0.01]), PlanConfig()
-    plan = CapturePlan(
-        kind="hemisphere", chain=find_arm(arm).chain, mount=d405_mount(),
-        cell=config.work_cell(center, "hemisphere"), home=home,
-        joints=home + np.array([[0.05], [-0.05]]) * np.eye(7)[0], center_world=center, vias=(),
-        reference_view=0, config=config,
-    )  # fmt: skip
+    joints = home + np.array([[0.05], [-0.05]]) * np.eye(7)[0]
+    plan = plan_through(joints, home, [0.5, 0.0, 0.01], chain=find_arm(arm).chain)
     save_plan(plan, path)
     return plan
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from given_plans import plan_through
 from realsim.app.cli import main
 from realsim.formats.graspnet.cameras import read_camera_poses
 from realsim.geometry import se3
-from realsim.robots.arm import UR5, UR5E
-from realsim_capture_plans.collision.mount import d405_mount
+from realsim.robots.arm import UR5E
 from realsim_capture_plans.plan_files.exported import table_frame
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
-from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from realsim_capture_plans.planning.record import CapturePlan
 
 HOME = np.array([0.0, -1.9, 1.9, -1.57, -1.57, 0.0])
 CENTER = np.array([0.40, 0.1, 0.05])
@@ -52,19 +52,7 @@ def realsim(
 def a_plan(n: int = 3) -> CapturePlan:
     """A few views high above the table, free of everything."""
     rng = np.random.default_rng(0)
-    config = PlanConfig()
-    plan = CapturePlan(
-        kind="hemisphere",
-        chain=UR5,
-        mount=d405_mount(),
-        cell=config.work_cell(CENTER, "hemisphere"),
-        home=HOME,
-        joints=HOME + rng.normal(0, 0.05, (n, 6)),
-        center_world=CENTER,
-        vias=(),
-        reference_view=0,
-        config=config,
-    )
+    plan = plan_through(HOME + rng.normal(0, 0.05, (n, 6)), HOME, CENTER)
     assert np.all(plan.collision_model().free(plan.joints))
     return plan
 

@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from given_plans import joints_looking_at, plan_through
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, CaptureSession
 from realsim.robots.arm import UR5, UR5E, find_arm
@@ -38,7 +38,7 @@ from realsim_capture_plans.capturing.look import SettleConfig
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, DeviceError, Frame
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
-from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from realsim_capture_plans.planning.record import CapturePlan
 
 UR5_HOME = find_arm("ur5").home
 
@@ -113,25 +113,13 @@ class TableCamera:
 @lru_cache(maxsize=1)
 def plan() -> CapturePlan:
     """A ring of views that look down at the middle of the table, every third over a via point."""
-    center, config = np.array([0.40, 0.0, 0.0]), PlanConfig()
+    center = np.array([0.40, 0.0, 0.0])
     home = UR5_HOME + np.pi * np.eye(6)[0]  # turned to the side where the table is
-    joints: list[Array] = []
-    for turn in np.linspace(0.0, 2 * np.pi, VIEWS, endpoint=False):
-        eye = center + 0.32 * np.array([0.25 * np.cos(turn), 0.25 * np.sin(turn), 1.0])
-        z = (center - eye) / np.linalg.norm(center - eye)
-        y = UR5.forward(home)[:3, 1]  # turned about the optical axis as the home is
-        x = np.cross(y, z) / np.linalg.norm(np.cross(y, z))
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
-        q = UR5.inverse(T @ se3.invert(d405_mount().T_ee_cam))
-        near = joints[-1] if joints else home
-        joints.append(q[np.argmin(np.abs(q - near).max(-1))])
+    turns = np.linspace(0.0, 2 * np.pi, VIEWS, endpoint=False)
+    eyes = [center + 0.32 * np.array([0.25 * np.cos(a), 0.25 * np.sin(a), 1.0]) for a in turns]
+    joints = joints_looking_at(center, eyes, home)
     vias = tuple((k, (joints[k - 1] + joints[k])[None] / 2) for k in range(3, VIEWS, 3))
-    made = CapturePlan(
-        kind="calibration", chain=UR5, mount=d405_mount(),
-        cell=config.work_cell(center, "calibration"), home=home, joints=np.stack(joints),
-        center_world=center, vias=vias, reference_view=0, config=config,
-    )  # fmt: skip
+    made = plan_through(np.stack(joints), home, center, "calibration", vias=vias)
     corners = np.concatenate([made.move(k) for k in range(VIEWS)])
     assert driven_clear(list(corners[1:]), corners[0], made)
     return made
@@ -376,7 +364,8 @@ def test_a_killed_capture_goes_on_without_losing_a_view(tmp_path: Path) -> None:
     def lines() -> int:
         return robot.read_bytes().count(b"\n") if robot.is_file() else 0
 
-    child = subprocess.Popen([sys.executable, __file__, str(tmp_path)])
+    env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1] / "support")}
+    child = subprocess.Popen([sys.executable, __file__, str(tmp_path)], env=env)
     try:
         wait_for(lambda: lines() >= 4, 60.0)
     finally:

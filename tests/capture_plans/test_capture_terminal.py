@@ -19,13 +19,13 @@ from typing import Any
 
 import numpy as np
 
+from given_plans import plan_through
 from realsim.records import CameraIntrinsics, CaptureSession
-from realsim.robots.arm import UR5, find_arm
+from realsim.robots.arm import find_arm
 from realsim.store import SessionStore
 from realsim_capture_plans.capturing.capture import CaptureJob, capture
 from realsim_capture_plans.capturing.log import LOG_FILE, CaptureLog
 from realsim_capture_plans.capturing.operator import TerminalOperator
-from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import Frame
 from realsim_capture_plans.lab.devices import SimulatedArm
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
@@ -38,15 +38,11 @@ CAMERA = CameraIntrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.
 
 def plan() -> CapturePlan:
     """The wrist turns a little from view to view, above the middle of the table."""
-    config = PlanConfig()
     home = UR5_HOME + np.pi * np.eye(6)[0]
     joints = home + 0.02 * np.arange(1, VIEWS + 1)[:, None] * np.eye(6)[5]
     center = np.array([0.45, 0.0, 0.0])
-    return CapturePlan(
-        kind="imported", chain=UR5, mount=d405_mount(),
-        cell=config.work_cell(center, "calibration"), home=home, joints=joints,
-        center_world=center, vias=(), reference_view=0, config=config,
-    )  # fmt: skip
+    cell = PlanConfig().work_cell(center, "calibration")
+    return plan_through(joints, home, center, "imported", cell=cell)
 
 
 class SlowCamera:
@@ -98,6 +94,7 @@ class Terminal:
             [sys.executable, __file__, str(folder)],
             stdin=self.theirs, stdout=self.theirs, stderr=self.theirs,
             preexec_fn=take_the_terminal,
+            env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1] / "support")},
         )  # fmt: skip
         threading.Thread(target=self._read, daemon=True).start()
 

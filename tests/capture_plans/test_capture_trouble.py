@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from given_plans import joints_looking_at, plan_through
 from realsim.arrays import Array
-from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession, Mesh
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
-from realsim.robots.arm import UR5, find_arm
+from realsim.robots.arm import find_arm
 from realsim.store import SessionStore
 from realsim_capture_plans.capturing.capture import (
     CaptureConfig,
@@ -31,11 +31,10 @@ from realsim_capture_plans.capturing.contact_sheet import SHEET_FILE, write_cont
 from realsim_capture_plans.capturing.log import CaptureLog
 from realsim_capture_plans.capturing.look import SettleConfig
 from realsim_capture_plans.capturing.operator import CaptureStatus, Command, NoOperator
-from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError, Frame, Stop
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
 from realsim_capture_plans.lab.devices import SimulatedArm, SimulatedDepthCamera
-from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from realsim_capture_plans.planning.record import CapturePlan
 
 UR5_HOME = find_arm("ur5").home
 
@@ -48,23 +47,11 @@ QUICK = CaptureConfig(still=SettleConfig(window_s=0.0))
 @lru_cache(maxsize=1)
 def plan() -> CapturePlan:
     """An arc of views round the lab's objects."""
-    center, config = np.array([0.45, 0.0, 0.03]), PlanConfig()
+    center = np.array([0.45, 0.0, 0.03])
     home = UR5_HOME + np.pi * np.eye(6)[0]
-    joints: list[Array] = []
-    for turn in np.linspace(0.0, np.pi, VIEWS):
-        eye = center + 0.36 * np.array([-0.3 * np.sin(turn), 0.3 * np.cos(turn), 0.95])
-        z = (center - eye) / np.linalg.norm(center - eye)
-        y = UR5.forward(home)[:3, 1]
-        x = np.cross(y, z) / np.linalg.norm(np.cross(y, z))
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
-        q = UR5.inverse(T @ se3.invert(d405_mount().T_ee_cam))
-        joints.append(q[np.argmin(np.abs(q - (joints[-1] if joints else home)).max(-1))])
-    return CapturePlan(
-        kind="hemisphere", chain=UR5, mount=d405_mount(),
-        cell=config.work_cell(center, "hemisphere"), home=home, joints=np.stack(joints),
-        center_world=center, vias=(), reference_view=0, config=config,
-    )  # fmt: skip
+    turns = np.linspace(0.0, np.pi, VIEWS)
+    eyes = [center + 0.36 * np.array([-0.3 * np.sin(a), 0.3 * np.cos(a), 0.95]) for a in turns]
+    return plan_through(np.stack(joints_looking_at(center, eyes, home)), home, center)
 
 
 class StoppingArm(SimulatedArm):

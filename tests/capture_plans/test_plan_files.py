@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from given_plans import plan_through
 from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
 from realsim.robots.arm import UR5, UR5E
@@ -27,21 +28,14 @@ CENTER = np.array([0.37, 0.02, 0.05])
 def a_plan(chain: DhChain = UR5, n: int = 9, seed: int = 0) -> CapturePlan:
     """Views scattered round home, two moves over via points: files do not ask how it was made."""
     rng = np.random.default_rng(seed)
-    config = PlanConfig(settle_s=0.4)
     lamp = Box(lower=(-np.inf, 0.5, 0.0), upper=(-0.6, 0.6, 0.8))
-    return CapturePlan(
-        kind="hemisphere",
-        chain=chain,
+    return plan_through(
+        HOME + rng.normal(0, 0.4, (n, 6)), HOME, CENTER, obstacles=(("lamp", lamp),), chain=chain,
+        config=PlanConfig(settle_s=0.4),
         mount=d405_mount(se3.exp([0.02, -0.1, 0.3, 0.0, -0.065, 0.035])),
-        cell=config.work_cell(CENTER, "hemisphere", (("lamp", lamp),)),
-        home=HOME,
-        joints=HOME + rng.normal(0, 0.4, (n, 6)),
-        center_world=CENTER,
         vias=((0, HOME + rng.normal(0, 0.2, (2, 6))), (4, HOME + rng.normal(0, 0.2, (1, 6)))),
-        reference_view=3,
-        config=config,
-        metrics={"views": float(n), "seconds": 12.345678901234567},
-    )
+        reference_view=3, metrics={"views": float(n), "seconds": 12.345678901234567},
+    )  # fmt: skip
 
 
 def rewritten(plan: CapturePlan, change: Callable[[dict[str, Any]], None]) -> dict[str, Any]:

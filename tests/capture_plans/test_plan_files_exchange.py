@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from given_plans import plan_through
 from realsim.errors import InputError, UnitError
 from realsim.formats.graspnet.cameras import read_camera_poses
 from realsim.geometry import se3
@@ -36,19 +37,11 @@ REAL = Path(os.environ.get("REALSIM_DATA", "../shared/data")) / "motion" / "koch
 
 def a_plan(chain: DhChain = UR5, n: int = 9) -> CapturePlan:
     rng = np.random.default_rng(0)
-    config = PlanConfig(table_height_m=-0.02)
-    return CapturePlan(
-        kind="hemisphere",
-        chain=chain,
-        mount=MOUNT,
-        cell=config.work_cell(CENTER, "hemisphere"),
-        home=HOME,
-        joints=HOME + rng.normal(0, 0.3, (n, 6)),
-        center_world=CENTER,
+    return plan_through(
+        HOME + rng.normal(0, 0.3, (n, 6)), HOME, CENTER, config=PlanConfig(table_height_m=-0.02),
+        chain=chain, mount=MOUNT, reference_view=3,
         vias=((0, HOME + rng.normal(0, 0.2, (2, 6))), (4, HOME + rng.normal(0, 0.2, (1, 6)))),
-        reference_view=3,
-        config=config,
-    )
+    )  # fmt: skip
 
 
 def write_path(

@@ -1,17 +1,17 @@
 """Metrics of a plan: laws (turning, slowing down), then answers worked out by hand."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from given_plans import plan_through
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.robots.arm import UR5
-from realsim.robots.shapes import Box, Mount, WorkCell
+from realsim.robots.shapes import Box, WorkCell
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.planning import view_quality
 from realsim_capture_plans.planning.metrics import METRIC_MEANINGS, plan_metrics
@@ -27,28 +27,9 @@ LOOKING = np.array([0.0, -1.9, -1.6, -1.2, 1.57, 0.0])
 
 
 def plan_of(
-    joints: np.ndarray,
-    *,
-    kind: Any = "hemisphere",
-    config: PlanConfig = CONFIG,
-    vias: Iterable[tuple[int, np.ndarray]] = (),
-    home: np.ndarray = LOOKING,
-    center: np.ndarray = CENTER,
-    mount: Mount | None = None,
-    cell: WorkCell | None = None,
+    joints: np.ndarray, *, home: np.ndarray = LOOKING, center: np.ndarray = CENTER, **more: Any
 ) -> CapturePlan:
-    return CapturePlan(
-        kind=kind,
-        chain=UR5,
-        mount=mount or d405_mount(),
-        cell=cell or config.work_cell(center, kind),
-        home=home,
-        joints=joints,
-        center_world=center,
-        vias=tuple(vias),
-        reference_view=0,
-        config=config,
-    )
+    return plan_through(joints, home, center, **({"config": CONFIG} | more))
 
 
 def many(n: int, seed: int = 0, spread: float = 0.35) -> np.ndarray:

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from realsim.robots.arm import UR5
+from given_plans import plan_through
 from realsim.robots.shapes import Box
-from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.pictures.drawing import PlanCurves
 from realsim_capture_plans.pictures.motion_charts import clearance_chart
 from realsim_capture_plans.pictures.plan_pictures import plan_pictures
@@ -25,20 +24,10 @@ N = 30
 
 def make(kind: Any = "hemisphere", n: int = N, config: PlanConfig | None = None) -> CapturePlan:
     rng = np.random.default_rng(0)
-    config = config or PlanConfig()
+    joints = LOOKING + rng.uniform(-0.35, 0.35, (n, 6))
+    vias = ((5, LOOKING + rng.uniform(-0.3, 0.3, (2, 6))),) if n > 5 else ()
     lamp = Box(lower=(-1.0, -1.0, 0.0), upper=(-0.9, 1.0, 1.0))
-    return CapturePlan(
-        kind=kind,
-        chain=UR5,
-        mount=d405_mount(),
-        cell=config.work_cell(CENTER, kind, (("lamp", lamp),)),
-        home=LOOKING,
-        joints=LOOKING + rng.uniform(-0.35, 0.35, (n, 6)),
-        center_world=CENTER,
-        vias=((5, LOOKING + rng.uniform(-0.3, 0.3, (2, 6))),) if n > 5 else (),
-        reference_view=0,
-        config=config,
-    )
+    return plan_through(joints, LOOKING, CENTER, kind, (("lamp", lamp),), config, vias=vias)
 
 
 @pytest.fixture(scope="module")

@@ -12,11 +12,11 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from given_plans import plan_through
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.arm import UR5
 from realsim.robots.shapes import Box
-from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.pictures.replay import (
     NEAR_RGB,
     PlanReplay,
@@ -24,7 +24,7 @@ from realsim_capture_plans.pictures.replay import (
     serve_replay,
     write_replay,
 )
-from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from realsim_capture_plans.planning.record import CapturePlan
 
 CENTER = np.array([0.40, 0.05, 0.05])
 LOOKING = np.array([0.0, -1.9, -1.6, -1.2, 1.57, 0.0])
@@ -34,21 +34,10 @@ N = 8
 
 
 def make() -> CapturePlan:
-    rng = np.random.default_rng(0)
-    config = PlanConfig()
+    joints = LOOKING + np.random.default_rng(0).uniform(-0.3, 0.3, (N, 6))
     lamp = Box(lower=(-1.0, -1.0, 0.0), upper=(-0.9, 1.0, 1.0))
-    return CapturePlan(
-        kind="hemisphere",
-        chain=UR5,
-        mount=d405_mount(),
-        cell=config.work_cell(CENTER, "hemisphere", (("lamp", lamp),)),
-        home=LOOKING,
-        joints=LOOKING + rng.uniform(-0.3, 0.3, (N, 6)),
-        center_world=CENTER,
-        vias=((5, LOOKING[None] + 0.1),),
-        reference_view=0,
-        config=config,
-    )
+    vias = ((5, LOOKING[None] + 0.1),)
+    return plan_through(joints, LOOKING, CENTER, obstacles=(("lamp", lamp),), vias=vias)
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from given_plans import plan_through
 from realsim.geometry import se3
 from realsim.records import CaptureSession
 from realsim.robots.arm import UR5
@@ -18,7 +19,7 @@ from realsim_capture_plans.devices.ur import UrArm
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
 from realsim_capture_plans.lab.devices import SimulatedDepthCamera
 from realsim_capture_plans.lab.lab import LabConfig, SimulatedLab
-from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from realsim_capture_plans.planning.record import CapturePlan
 
 VIEWS = 4
 TCP = [0.0, 0.0, 0.12, 0.0, 0.0, 0.5]
@@ -27,7 +28,7 @@ HOME = np.radians([180.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 
 def small_plan(center: np.ndarray) -> CapturePlan:
     """Views on a narrow ring that look down at a point of the table."""
-    config, joints = PlanConfig(), [HOME]
+    joints = [HOME]
     for turn in np.linspace(0.0, 2 * np.pi, VIEWS, endpoint=False):
         eye = center + 0.32 * np.array([0.25 * np.cos(turn), 0.25 * np.sin(turn), 1.0])
         T = se3.look_at(eye, center)
@@ -38,11 +39,7 @@ def small_plan(center: np.ndarray) -> CapturePlan:
             ]
         )
         joints.append(candidates[np.argmin(np.abs(candidates - joints[-1]).max(-1))])
-    return CapturePlan(
-        kind="calibration", chain=UR5, mount=d405_mount(),
-        cell=config.work_cell(center, "calibration"), home=HOME, joints=np.stack(joints[1:]),
-        center_world=center, vias=(), reference_view=0, config=config,
-    )  # fmt: skip
+    return plan_through(np.stack(joints[1:]), HOME, center, "calibration")
 
 
 def T_cam_ee() -> np.ndarray:
