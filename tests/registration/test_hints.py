@@ -202,7 +202,8 @@ def test_hints_are_read_from_the_file(store):
     path = store.path("registration/starts.json")
     back = read_hints(path, part_models())
     assert [(h.obj_id, h.instance) for h in back] == [(a, 0), (b, 1), (c, 2), (d, 3), (e, 7)]
-    assert back[3].where is None
+    kinds = [RoughPose, Click, Box, type(None), Marked]
+    assert [type(h.where) for h in back] == kinds and store.verify() == []
     pose, click, box, _, mask = (h.where for h in back)
     assert isinstance(pose, RoughPose) and np.array_equal(pose.T_world_obj, T)
     assert (pose.radius_m, pose.turn_deg) == (pytest.approx(0.03), 20.0)
