@@ -121,13 +121,12 @@ class Clock:
     @property
     def sentence(self) -> str:
         """The offset in words."""
-        sigma = f" +-{1e3 * self.sigma_s:.2f}" if np.isfinite(self.sigma_s) else ""
+        ms = f"{1e3 * self.offset_s:+.2f} ms"
+        offset = ms if abs(self.offset_s) < 1 else f"{self.offset_s:+.6f} s"
+        sigma = f" +-{1e3 * self.sigma_s:.2f} ms" if np.isfinite(self.sigma_s) else ""
         source = "found from the motion" if sigma else "as given"
         follows = "the arm's poses follow it" if self.applied else "too small to matter, left out"
-        return (
-            f"The camera's clock is {1e3 * self.offset_s:+.2f}{sigma} ms ahead of the robot's "
-            f"({source}; {follows})."
-        )
+        return f"The camera's clock is {offset}{sigma} ahead of the robot's ({source}; {follows})."
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -203,6 +203,7 @@ def test_json_says_what_the_file_says(calibrated: tuple[Result, Path]) -> None:
 @pytest.mark.parametrize(
     ("gone", "copied", "cameras", "words"),
     [
+        ("", "", "", "--cameras has ''; NAME=hand or NAME=fixed"),
         ("", "", "wrist=hand,left", "NAME=hand or NAME=fixed"),
         ("", "", "wrist=hand,top=fixed", "no folder"),
         ("", "", "wrist=hand,wrist=fixed", "twice"),

@@ -67,7 +67,7 @@ def _run(source: Path, console: Console, *, live: bool, **options: Any) -> bool:
     from realsim.store.opening import require_header
     from realsim.store.results import BOARD_FILE
 
-    if options.get("cameras"):
+    if options.get("cameras") is not None:
         from realsim.app.calibrate.cameras import run_cameras
 
         return run_cameras(source, console, options)
