@@ -331,8 +331,8 @@ def plot_depth_bias(report: DepthBiasReport) -> Any:
     right.plot(1e3 * z, 1e3 * np.array([v.unseen_m for v in used]), "o", ms=4, color=style.BLUE)
     right.axhline(0, color=style.MUTED, lw=0.7)
     right.set_title(
-        f"Views corrected by the others: {amount(1e3 * report.held_out_m, 2, 'mm')} RMS, "
-        f"{amount(1e3 * report.uncorrected_m, 2, 'mm')} before", pad=20,
+        f"Unseen views: {amount(1e3 * report.held_out_m, 2, 'mm')} RMS, "
+        f"{amount(1e3 * report.uncorrected_m, 2, 'mm')} uncorrected", pad=20,
     )  # fmt: skip
     right.set_xlabel("distance [mm]")
     right.set_ylabel("error after correction [mm]")

@@ -99,10 +99,11 @@ def _space_view(ax: Any, report: HandEyeReport) -> None:
     ax.add_collection3d(Line3DCollection(list(frustum_lines(corners)), colors=style.INK, lw=1.1))
     origin = np.zeros(3)
     up = np.array([0.0, 0.0, length])
-    above = 0.6 * up * (1.0 if report.mode == "eye_in_hand" else -1.0)
+    apart = length * corners[0] / max(float(np.linalg.norm(corners[0])), 1e-9)
+    above = 0.6 * up * (1.0 if report.mode == "eye_in_hand" else -1.0) - 0.5 * apart
     _triad(ax, origin, turn, length, carrier(report), above)
     camera = turn @ X[:3, :3]
-    aside = corners[0] + 0.75 * up
+    aside = corners[0] + 0.45 * up + apart
     _triad(ax, corners[0], camera, 0.7 * length, "camera", aside)
     ax.plot(*np.stack([origin, corners[0]], -1), color=style.MUTED, lw=1, ls=(0, (4, 3)))
     tips = [_triad_tips(origin, turn, length), _triad_tips(corners[0], camera, 0.7 * length)]

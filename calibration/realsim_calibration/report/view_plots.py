@@ -191,7 +191,7 @@ def plot_views(report: HandEyeReport) -> Any:
 
 def plot_coverage(report: HandEyeReport) -> Any:
     """Plot where in the image points lay, from where the target was seen, and the camera's roll."""
-    figure = style.new_figure(3.1, grid=(1, 3), room=(0.6, 0.3, 0.3, 0.5, 0.85, 0))
+    figure = style.new_figure(3.1, grid=(1, 3), room=(0.6, 0.3, 0.3, 0.5, 1.2, 0))
     grid = figure.add_gridspec(1, 3, width_ratios=(1.4, 1.4, 1))
     _image_coverage(figure, figure.add_subplot(grid[0]), report)
     _directions(figure, figure.add_subplot(grid[1], projection="polar"), report)
