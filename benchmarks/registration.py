@@ -31,9 +31,6 @@ Parts and the figures they give (keys of the JSON's "figures"):
       mesh_cache_cpu_s        of each mesh, once
   real
       real_*                  YCB-Video frames: see `registration_real.py`
-      apc_step_mm, apc_step_deg
-                              a robot's scan of a shelf without any model: ICP between neighbouring
-                              views after refinement
 Shares are 0 to 1. Eight scenes from the seed on; seeds from 100 are those of the published figures,
 use lower ones while developing.
 """

@@ -49,8 +49,6 @@ GOALS = {
     "real_dz_mm_ours": Goal(),
     "real_dz_mm_truth": Goal(),
     "real_shift_named_share": Goal(low=1.0),
-    "apc_step_mm": Goal(high=1.5),
-    "apc_step_deg": Goal(high=0.3),
 }
 
 

@@ -1,4 +1,4 @@
-"""Real data: single frames of YCB-Video, and a robot's scan of a shelf.
+"""Real data: single frames of YCB-Video.
 
 Imported by the registration benchmark. Figures:
   real_start_spread_mm, real_start_spread_deg
@@ -13,15 +13,10 @@ Imported by the registration benchmark. Figures:
   real_shift_named_share
                         scenes 52, 53, whose poses belong to a neighbouring image: does the tool
                         say by itself that all are off by one shift
-  apc_step_mm, apc_step_deg (and _before)
-                        what Open3D's point-to-plane ICP between neighbouring views still corrects,
-                        median, after `refine_views` and before
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from figures import DATA
@@ -32,15 +27,11 @@ from realsim.formats.bop import scene as bop
 from realsim.formats.bop.keyframes import read_keyframe_poses
 from realsim.formats.bop.models import load_models
 from realsim.geometry import se3
-from realsim.geometry.depth import points_from_depth
-from realsim.interop import import_open3d
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose
 from realsim.registration.body import footprint, make_body
 from realsim.registration.config import RegistrationConfig
-from realsim.registration.evidence import DepthFrame, EvidenceConfig, measure_noise
-from realsim.registration.refinement.views_only import refine_views
+from realsim.registration.evidence import DepthFrame
 from realsim.registration.register import Registration, register_scene
-from realsim.registration.views import SampleConfig, sample_views
 
 MATCHING, SHIFTED = (50, 51, 54), (52, 53)
 SYMMETRIC = (1, 4, 6, 13, 16, 18, 19, 20, 21)
@@ -50,9 +41,6 @@ TURNED_DEG = 90.0
 """A network's estimate that is turned further is of another pose."""
 NEAR_M = 0.03
 """Pixels further from the rendered depth are another object's [m]."""
-APC_STRIDE = 2
-ICP_REACH_M, ICP_TUKEY_M, ICP_STEPS = (0.02, 0.01, 0.005), 0.005, 60
-NORMAL_M = 0.015
 
 
 def real(keep: Path | None) -> Done:
@@ -64,10 +52,6 @@ def real(keep: Path | None) -> Done:
         _add_ycbv(figures, notes)
     else:
         notes.append(f"no ycbv_mini under {DATA} (set REALSIM_DATA): real_* not run")
-    if (DATA / "scenes/apc_shelf_multiview").is_dir():
-        _add_apc(figures, notes)
-    else:
-        notes.append(f"no apc_shelf_multiview under {DATA} (set REALSIM_DATA): apc_* not run")
     return Done(figures=figures, notes=tuple(notes))
 
 
@@ -168,96 +152,3 @@ def apart_by(model: ObjectModel, T: Array, U: Array) -> tuple[float, float]:
     middle = model.mesh.bounds.mean(0)[None]
     gap = se3.transform(T, middle) - se3.transform(U, middle)
     return 1e3 * float(np.linalg.norm(gap)), float(np.degrees(se3.angle(T[:3, :3].T @ U[:3, :3])))
-
-
-def apc_frames(data: Path) -> tuple[CameraIntrinsics, list[DepthFrame]]:
-    """Return the shelf scan: depth along the colour camera's axis, poses of the robot's arm."""
-    import cv2
-
-    folder = data / "scenes/apc_shelf_multiview/scene-0000"
-    blocks = _matrices((folder / "cam.info.txt").read_text())
-    frames: list[DepthFrame] = []
-    for path in sorted(folder.glob("frame-*.depth.png")):
-        k = int(path.name[6:12])
-        v: Any = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        depth = (((v >> 3) | (v << 13)) * 1e-4).astype(np.float32)
-        T = se3.check_rigid(_rigid(blocks[f"frame-{k:06d}"]), f"the camera of {path.name}")
-        frames.append(DepthFrame(index=k, depth_m=depth, T_world_cam=T))
-    height, width = frames[0].depth_m.shape
-    return CameraIntrinsics.from_K(blocks["Color camera intrinsic"], width, height), frames
-
-
-def _matrices(text: str) -> dict[str, Array]:
-    """Return the matrices of a cam.info.txt by their headings' first or last words."""
-    found: dict[str, Array] = {}
-    name, rows = "", list[list[float]]()
-    for line in [*text.splitlines(), "#"]:
-        if line.startswith("#"):
-            if rows:
-                found[name] = np.array(rows)
-            rows, words = [], line[1:].split()
-            head = " ".join(words)
-            name = words[-1] if head.startswith("Camera-to-world") else head.split(" matrix")[0]
-        elif line.strip():
-            rows.append([float(v) for v in line.split()])
-    return found
-
-
-def _rigid(T: Array) -> Array:
-    """Return a transform whose printed rotation is made orthonormal."""
-    U, _, Vt = np.linalg.svd(T[:3, :3])
-    return se3.from_rt(U @ Vt, T[:3, 3])
-
-
-def neighbour_steps(
-    intrinsics: CameraIntrinsics, frames: Sequence[DepthFrame], cameras: Sequence[Array] | Array
-) -> tuple[float, float, float, float]:
-    """Return by how much ICP corrects neighbouring views: median [mm], [deg], greatest likewise."""
-    o3d = import_open3d()
-    registration: Any = o3d.pipelines.registration
-    clouds: list[Any] = []
-    for frame in frames:
-        points, _ = points_from_depth(frame.depth_m, intrinsics, APC_STRIDE)
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-        cloud = cloud.voxel_down_sample(0.003)
-        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=NORMAL_M, max_nn=30))
-        cloud.orient_normals_towards_camera_location(np.zeros(3))
-        clouds.append(cloud)
-    mm: list[float] = []
-    deg: list[float] = []
-    for k in range(len(frames) - 1):
-        given = se3.invert(np.asarray(cameras[k])) @ np.asarray(cameras[k + 1])
-        T = given
-        for reach in ICP_REACH_M:
-            method = registration.TransformationEstimationPointToPlane(
-                registration.TukeyLoss(k=ICP_TUKEY_M)
-            )
-            criteria = registration.ICPConvergenceCriteria(1e-8, 1e-8, ICP_STEPS)
-            result = registration.registration_icp(
-                clouds[k + 1], clouds[k], reach, T, method, criteria
-            )
-            T = np.array(result.transformation)
-        D = se3.invert(given) @ T
-        mm.append(1e3 * float(np.linalg.norm(D[:3, 3])))
-        deg.append(float(np.degrees(se3.angle(D[:3, :3]))))
-    return float(np.median(mm)), float(np.median(deg)), max(mm), max(deg)
-
-
-def _add_apc(figures: dict[str, float], notes: list[str]) -> None:
-    """Add the figures of the shelf."""
-    intrinsics, frames = apc_frames(DATA)
-    noise = measure_noise(frames, EvidenceConfig())
-    views = sample_views(intrinsics, frames, noise, SampleConfig(stride=APC_STRIDE))
-    refined = refine_views(intrinsics, views, noise)
-    before = neighbour_steps(intrinsics, frames, [f.T_world_cam for f in frames])
-    after = neighbour_steps(intrinsics, frames, refined.cameras)
-    figures |= {
-        "apc_step_mm": after[0], "apc_step_deg": after[1],
-        "apc_step_mm_before": before[0], "apc_step_deg_before": before[1],
-        "apc_step_mm_worst": after[2], "apc_step_deg_worst": after[3],
-    }  # fmt: skip
-    notes.append(
-        f"apc: the views' own errors are {refined.view_sigma[1]:.2f} mm / "
-        f"{refined.view_sigma[0]:.3f} deg; ICP corrects {before[0]:.2f} mm / {before[1]:.3f} deg "
-        f"before, {after[0]:.2f} mm / {after[1]:.3f} deg after"
-    )
