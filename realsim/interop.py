@@ -19,6 +19,7 @@ import signal
 import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -160,6 +161,7 @@ def import_extra(module: str, extra: str, use: str, instead: str = "") -> Any:
         ) from error
 
 
+@cache  # the search for its libraries is dear, and loops ask for it
 def import_open3d() -> Any:
     """Return the module `open3d`; the only way realsim imports it.
 

@@ -76,8 +76,8 @@ class Picture:
     """(4, 4)."""
     rgb: UInt8
     """(H, W, 3)."""
-    changes: Array32 = field(init=False)
-    """(H, W, 6) change along u of red, green, blue, and along v [of 255 per px]."""
+    changes: tuple[Array32, Array32] = field(init=False)
+    """(H, W, 3) change of red, green, blue along u, and along v [of 255 per px]."""
     noise: float = field(init=False)
     """What it changes by in the median [of 255 per px]."""
 
@@ -85,9 +85,9 @@ class Picture:
         """Take the changes of the photograph, smoothed by a pixel."""
         smooth = cv2.GaussianBlur(self.rgb.astype(np.float32), (0, 0), 1.0)
         both = [cv2.Sobel(smooth, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1))]
-        changes = np.concatenate(both, axis=2)
-        object.__setattr__(self, "changes", changes)
-        noise = np.median(np.linalg.norm(changes[::4, ::4], axis=2) / np.sqrt(2.0))
+        object.__setattr__(self, "changes", tuple(both))
+        some = np.concatenate([c[::4, ::4] for c in both], axis=2)
+        noise = np.median(np.linalg.norm(some, axis=2) / np.sqrt(2.0))
         object.__setattr__(self, "noise", float(noise))
 
     def depth_of(self, mesh: Mesh, T_world_obj: Array) -> Array32:
@@ -190,8 +190,7 @@ def _edges(picture: Picture, pixels: Array, normals: Array, config: PhotoConfig)
     s = np.arange(-n, n + 1) * config.step_px
     at = (pixels[:, None] + s[None, :, None] * normals[:, None]).astype(np.float32)
     along_u, along_v = (
-        cv2.remap(picture.changes[..., k : k + 3], at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-        for k in (0, 3)
+        cv2.remap(c, at[..., 0], at[..., 1], cv2.INTER_LINEAR) for c in picture.changes
     )
     across = along_u * normals[:, :1, None] + along_v * normals[:, 1:, None]
     change = np.linalg.norm(across, axis=2)

@@ -119,7 +119,8 @@ class Edges:
     def _rows(self, T_world_obj: Array) -> tuple[Array, Array]:
         """Return (N, 6) how the outline's points move along their normals, and the edges (N,)."""
         T = se3.invert(self.picture.T_world_cam) @ T_world_obj
-        seen = _outline(self.picture, self.body, T, self.others, self.config.photo)
+        depth = _depth_of(self.body, self.picture.intrinsics, T)
+        seen = _outline(self.picture, self.body, T, depth, self.others, self.config.photo)
         B = np.kron(np.eye(2), T[:3, :3]) / np.repeat([self.body.radius_m, 1.0], 3)
         o = seen.outline
         return seen.J @ B, o.offsets - o.normals @ self.beside_px - self.rim_px
@@ -157,6 +158,8 @@ class _Seen:
     outline: Outline
     J: Array
     """(N, 6) of the distance along the normal, camera axes, about the centre [px/rad, px/m]."""
+    others: Array32
+    """(H, W) depth of all other objects; inf beside them [m]."""
 
 
 def photo_fit(
@@ -194,14 +197,12 @@ def photo_fit(
     taken = len(before) > 0 and after.mean() < config.better * before.mean()
     if not taken or np.linalg.norm(_places(x), axis=1).max() > config.most_m:
         return _untouched(fits, before, offset)
-    depths = [_depth_of(b, picture.intrinsics, T) for b, T in zip(bodies, now, strict=True)]
     edges: list[Edges] = []
     covariances: list[Array] = []
     for k, (body, s) in enumerate(zip(bodies, seen, strict=True)):
         B = np.kron(np.eye(2), now[k][:3, :3]) / np.repeat([body.radius_m, 1.0], 3)
-        others = np.min([*depths[:k], *depths[k + 1 :], np.full_like(depths[k], np.inf)], axis=0)
         edges.append(
-            Edges(picture=picture, body=body, others=others, beside_px=x[1:3],
+            Edges(picture=picture, body=body, others=s.others, beside_px=x[1:3],
                   rim_px=float(x[9 + 7 * k]), sigma_px=float(sigmas[k]),
                   count=len(s.outline.offsets), information=B.T @ H[k] @ B, config=config)
         )  # fmt: skip
@@ -288,22 +289,22 @@ def _outlines(
     out: list[_Seen] = []
     for k, (body, T) in enumerate(zip(bodies, Ts_cam_obj, strict=True)):
         others = np.min([*depths[:k], *depths[k + 1 :], np.full_like(depths[k], np.inf)], axis=0)
-        out.append(_outline(picture, body, T, others, config))
+        out.append(_outline(picture, body, T, depths[k], others, config))
     return out
 
 
 def _outline(
-    picture: Picture, body: Body, T_cam_obj: Array, others: Array32, config: PhotoConfig
-) -> _Seen:
+    picture: Picture, body: Body, T_cam_obj: Array, depth: Array32, others: Array32,
+    config: PhotoConfig,
+) -> _Seen:  # fmt: skip
     """Return the outline of one object."""
-    depth = _depth_of(body, picture.intrinsics, T_cam_obj)
     o = outline_of(picture, depth, others, config)
     at = np.round(o.pixels - o.normals).astype(np.int64)
     z = depth[at[:, 1], at[:, 0]].astype(np.float64)
     o, at, z = o.part(np.isfinite(z)), at[np.isfinite(z)], z[np.isfinite(z)]
     p = ray_table(picture.intrinsics)[at[:, 1], at[:, 0]] * z[:, None]
     J = _jacobian(o.normals, p, p - body.center(T_cam_obj), picture.intrinsics)
-    return _Seen(o, J)
+    return _Seen(o, J, others)
 
 
 def _depth_of(body: Body, intrinsics: CameraIntrinsics, T_cam_obj: Array) -> Array32:

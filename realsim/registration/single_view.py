@@ -64,6 +64,8 @@ def fit_single_view(
     Raises:
         DegenerateError: the object is not in the frame, or nothing was measured where it should be.
     """
+    from scipy.spatial import KDTree
+
     o3d = import_open3d()
     T_cam_obj = se3.invert(frame.T_world_cam) @ body.T_start
     source = _visible_points(body, intrinsics, T_cam_obj, config)
@@ -78,16 +80,15 @@ def fit_single_view(
     target.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(knn=20))
     target.orient_normals_towards_camera_location(np.zeros(3))
     normals = np.asarray(target.normals)
-    T = T_cam_obj
+    T, tree = T_cam_obj, KDTree(target_points)
     for reach, tukey in zip(config.reach_m, config.tukey_m, strict=True):
-        T = _point_to_plane(source, target_points, normals, T, (reach, tukey), config)
+        T = _point_to_plane(source, (target_points, normals, tree), T, (reach, tukey), config)
     return frame.T_world_cam @ se3.check_rigid(T, "the pose found by ICP")
 
 
 def _point_to_plane(
     source: Array,
-    target: Array,
-    normals: Array,
+    target: tuple[Array, Array, Any],
     T: Array,
     round_m: tuple[float, float],
     config: SingleViewConfig,
@@ -98,16 +99,13 @@ def _point_to_plane(
 
     Args:
         source: (N, 3) points of the model, object frame [m].
-        target: (M, 3) measured points [m].
-        normals: (M, 3) of them.
+        target: (M, 3) measured points [m], (M, 3) their normals, a tree of the points.
         T: (4, 4) the pose before.
         round_m: reach of a correspondence, and Tukey's cut-off [m].
         config: steps and when to stop.
     """
-    from scipy.spatial import KDTree
-
     reach, cut = round_m
-    tree = KDTree(target)
+    points, normals, tree = target
     before = (np.inf, np.inf)
     for _ in range(config.steps):
         moved = se3.transform(T, source)
@@ -120,7 +118,7 @@ def _point_to_plane(
         if max(abs(now[0] - before[0]), abs(now[1] - before[1])) < config.converged:
             return T
         before = now
-        p, q, n = moved[has], target[partner[has]], normals[partner[has]]
+        p, q, n = moved[has], points[partner[has]], normals[partner[has]]
         r = np.sum((p - q) * n, axis=1)
         J = np.concatenate([np.cross(p, n), n], axis=1)
         weighted = J * tukey_weights(np.square(r / cut))[:, None]

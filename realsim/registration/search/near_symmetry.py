@@ -290,12 +290,12 @@ def _fit_motions(
 def _distinct(shape: _Shape, Ts: Array, config: NearSymmetryConfig) -> Array:
     """Return the motions that differ from all symmetries, and from each other modulo these."""
     limit = config.distinct_share * shape.size
-    backs = [np.eye(4)]
+    backs = np.concatenate([np.eye(4)[None], np.zeros_like(Ts)])
     kept: list[int] = []
     for k, T in enumerate(Ts):
-        if shape.gaps(np.stack(backs) @ T).min() > limit:
+        if shape.gaps(backs[: len(kept) + 1] @ T).min() > limit:
             kept.append(k)
-            backs.append(se3.invert(T))
+            backs[len(kept)] = se3.invert(T)
     return Ts[kept]
 
 
