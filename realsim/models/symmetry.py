@@ -58,6 +58,8 @@ EXACT_M, EXACT_SHARE = 0.0003, 0.005
 """A model that declares no symmetry has those of its shape that miss by at most this [m], or by
 this share of its diameter if that is more: 0.65 mm of 13 cm, half of what `SymmetryConfig` allows
 a scan. No depth camera sees less."""
+NO_MIRROR = IsometryFit(worst=math.inf, rms=math.inf, share=0.0)
+"""Of a mirror image that was not tried."""
 REMEMBERED = 64
 """Models whose symmetries are kept in memory."""
 _memory: dict[str, Symmetries] = {}
@@ -103,12 +105,15 @@ class _Trial:
         return moved_about(rotations, self.frame)
 
 
-def find_symmetries(mesh: Mesh, config: SymmetryConfig | None = None) -> Symmetries:
+def find_symmetries(
+    mesh: Mesh, config: SymmetryConfig | None = None, *, with_mirror: bool = True
+) -> Symmetries:
     """Return the discrete and continuous symmetries of a mesh's shape.
 
     Args:
         mesh: a scan or a CAD mesh in any unit; it need not be closed.
         config: tolerances, as shares of the diameter.
+        with_mirror: whether mirror images are tried; if not, the shape counts as having none.
 
     Raises:
         InputError: the mesh has no area.
@@ -118,7 +123,7 @@ def find_symmetries(mesh: Mesh, config: SymmetryConfig | None = None) -> Symmetr
         raise InputError("the mesh is a single point; a surface is needed to find its symmetries.")
     surface = surface_of(mesh, config.judging_points, np.random.default_rng(config.seed))
     axes = found_axes(surface, config)
-    mirror = best_mirror(surface, config, axes)
+    mirror = best_mirror(surface, config, axes) if with_mirror else NO_MIRROR
     # Of each axis the largest turn: a small one misses by little whatever the shape.
     best = min([mirror.worst, *(a.fits[a.orders[0]].worst for a in axes if a.orders)])
     tolerance = min(max(config.tolerance, config.noise_factor * best), config.greatest_tolerance)
@@ -188,7 +193,7 @@ def _exact_symmetries(mesh: Mesh, folder: Path | None) -> Symmetries:
     path = None if folder is None else folder / f"symmetries_{key}.npz"
     known = _memory.get(key) or (None if path is None else _loaded(path))
     if known is None:
-        known = find_symmetries(mesh, config)
+        known = find_symmetries(mesh, config, with_mirror=False)
         if path is not None:
             notes = {"worst_m": known.worst_m, "near": known.near, "breaks": known.texture_breaks}
             axes = np.array(known.axes, dtype=np.float64).reshape(-1, 2, 3)

@@ -133,17 +133,16 @@ def footprint(body: Body, intrinsics: CameraIntrinsics, T_cam_obj: Array, stride
     left, top, right, bottom = pixel_box(body, intrinsics, T_cam_obj)
     rows = np.arange(-(-top // stride) * stride, bottom, stride)
     columns = np.arange(-(-left // stride) * stride, right, stride)
-    v, u = (a.ravel() for a in np.meshgrid(rows, columns, indexing="ij"))
-    directions = ray_table(intrinsics)[v, u]
-    known = np.isfinite(directions[:, 0])
-    v, u, directions = v[known], u[known], directions[known]
-    if len(v) == 0:
-        return Footprint(rows=v, columns=u, z=np.zeros(0))
+    if len(rows) == 0 or len(columns) == 0:
+        return Footprint(rows=rows[:0], columns=columns[:0], z=np.zeros(0))
+    directions = ray_table(intrinsics)[rows[0] : bottom : stride, columns[0] : right : stride]
     T_obj_cam = se3.invert(T_cam_obj)
-    rays = np.empty((len(v), 6), dtype=np.float32)
-    rays[:, :3] = T_obj_cam[:3, 3]
-    rays[:, 3:] = directions @ T_obj_cam[:3, :3].T
-    # Rays have z = 1 in the camera, so the parameter of the hit is the depth.
+    rays = np.empty((*directions.shape[:2], 6), dtype=np.float32)
+    rays[..., :3] = T_obj_cam[:3, 3]
+    # Rays have z = 1 in the camera, so the parameter of the hit is the depth; NaN hits nothing.
+    rays[..., 3:] = np.nan_to_num(directions.reshape(-1, 3) @ T_obj_cam[:3, :3].T).reshape(
+        directions.shape
+    )
     t = body.ray_scene.cast_rays(o3d.core.Tensor(rays), 1)["t_hit"].numpy()
-    hit = np.isfinite(t)
-    return Footprint(rows=v[hit], columns=u[hit], z=t[hit].astype(np.float64))
+    v, u = np.nonzero(np.isfinite(t))
+    return Footprint(rows=rows[v], columns=columns[u], z=t[v, u].astype(np.float64))

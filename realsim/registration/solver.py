@@ -304,7 +304,7 @@ def solve_pose(
         history.append(float(1e3 * rms))
     return PoseFit(
         T_world_obj=se3.check_rigid(T, "the fitted pose"),
-        information=sums.information,
+        information=sums.upper + np.triu(sums.upper, 1).T,
         weight=sums.weight,
         variance=sums.square / sums.kernels if sums.kernels > 0 else float("nan"),
         points=sums.used,
@@ -317,7 +317,7 @@ def solve_pose(
 class _Sums(NamedTuple):
     """What one pass over the points adds up to."""
 
-    information: Array
+    upper: Array
     weight: float
     square: float
     kernels: float
@@ -337,4 +337,4 @@ def _linearised(
         body.center_obj,
         (H, b),
     )
-    return _Sums(H + np.triu(H, 1).T, weight, square, kernels, used), H, b
+    return _Sums(H.copy(), weight, square, kernels, used), H, b
