@@ -17,8 +17,8 @@ from realsim.app.outputs import GOES_ON
 @SOURCE
 @options(
     board="", poses=Has(None, "  [SOURCE]"), reading="", intrinsics=None, eye_to_hand=False,
-    arm=Has(None, "; found out where joints are given"),
-    out=Has(Path("calibration"), kind=GOES_ON), cameras=None, live=False, check=False, tolerance=1.0,
+    arm=Has(None, "; found out where joints are given"), cameras=None,
+    out=Has(Path("calibration"), kind=GOES_ON), live=False, check=False, tolerance=1.0,
 )  # fmt: skip
 @rare(key="", board_poses=None, held_board="", moved_board="", clock_offset="auto")
 def calibrate_command(
