@@ -171,10 +171,6 @@ class ReviewServer:
             )
         local_pages.refuse_foreign_messages(server)
         self._server = server
-        # Without a graphics card a picture of the surroundings, and shadows, cost half a minute.
-        server.scene.configure_environment_map(None)
-        server.scene.configure_default_lights(cast_shadow=False)
-        server.scene.add_light_ambient("/light", intensity=1.8)
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         server.on_client_connect(self._came)
         server.on_client_disconnect(self._went)

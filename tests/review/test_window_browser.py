@@ -110,9 +110,7 @@ PANELS = """[...document.querySelectorAll('[data-dock-window], .mantine-Paper-ro
 
 def _scene_share(page: ReviewPage) -> float:
     """Return how much of the window's middle shows the measured table and boxes."""
-    image = page.screenshot()
-    high, wide = image.shape[:2]
-    image = image[high // 4 : 3 * high // 4, wide // 4 : 3 * wide // 4]
+    image = page.screenshot()[200:600, 300:900]
     return share_of(image, TABLE_RGB) + share_of(image, BOX_RGB)
 
 

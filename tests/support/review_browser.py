@@ -143,10 +143,9 @@ class ReviewPage:
             self.page.mouse.move(*at)
             self.page.wait_for_timeout(500)
             self.page.mouse.click(*at, delay=50)
-            for _ in range(30):
-                self.page.wait_for_timeout(100)
-                if until in self.text():
-                    return
+            self.page.wait_for_timeout(3000)
+            if until in self.text():
+                return
         self.wait_for(until)
 
     def key(self, key: str) -> None:
@@ -230,10 +229,7 @@ class ReviewBrowser:
     @contextmanager
     def page(self, url: str, *, width: int = 1000, height: int = 640) -> Generator[ReviewPage]:
         """Open a page for as long as the block lasts; at its end no error may have been heard."""
-        # A quarter of the pixels: without a graphics card the processor draws each of them.
-        context = self.browser.new_context(
-            viewport={"width": width, "height": height}, device_scale_factor=0.5
-        )
+        context = self.browser.new_context(viewport={"width": width, "height": height})
         opened = ReviewPage(context, url)
         try:
             yield opened
