@@ -7,9 +7,6 @@ longest way (`school_scaling`), so that others on the machine do not change it:
 """
 
 import argparse
-import json
-import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -33,8 +30,6 @@ from realsim_sim_bridge.table_scenes.pool import open_pool as open_objects
 SCENES, QUICK_SCENES = 16, 6
 VIEWS, QUICK_VIEWS = 12, 4
 SIZE = (320, 240)
-PROGRAM = Path(__file__).resolve().parents[1] / "tests/support/ray_on_loopback.py"
-LONGEST_S = 600
 
 
 def school(args: argparse.Namespace) -> Found:
@@ -114,33 +109,24 @@ def _silent(outcome: Any) -> None:
 
 def losses(args: argparse.Namespace) -> Found:
     """Return whether a lost node changes nothing, and a lost head is told in a sentence."""
+    sys.path.append(str(Path(__file__).resolve().parents[1] / "tests/support"))
+    from ray_on_loopback import SCENES, generated, generated_with_a_loss, two_nodes
+
     found = Found()
-    node, head = (_program(what) for what in ("node", "head"))
-    in_middle = 1 <= node["finished_when_lost"] < node["scenes"]
-    found.add(
-        "lost_node_equal", float(in_middle and node["code"] == 0 and node["same"]),
-        f"a node killed after {node['finished_when_lost']} of {node['scenes']} scenes",
-    )  # fmt: skip
-    lines = [line for line in head["told"].splitlines() if line.strip()] or [""]
+    with tempfile.TemporaryDirectory(prefix="campaign_") as folder, two_nodes() as nodes:
+        _, whole = generated(Path(folder) / "whole")
+        at, said, scenes = generated_with_a_loss(Path(folder) / "node", nodes, "node")
+        is_equal = 1 <= at < SCENES and said.returncode == 0 and scenes == whole
+        told = f"a node killed after {at} of {SCENES} scenes"
+        found.add("lost_node_equal", float(is_equal), told)
+        at, said, kept = generated_with_a_loss(Path(folder) / "head", nodes, "head")
+        again, scenes = generated(Path(folder) / "head")
+    lines = [line for line in said.stderr.splitlines() if line.strip()] or [""]
     is_told = (
-        head["code"] == 2
+        said.returncode == 2
         and lines[-1].startswith("error: the Ray cluster")
         and not any("Traceback" in line or "ray." in line for line in lines)
-        and head["kept_same"] and head["again_code"] == 0 and head["same"]
+        and kept.items() <= whole.items() and again.returncode == 0 and scenes == whole
     )  # fmt: skip
     found.add("lost_head_told", float(is_told), lines[-1])
     return found
-
-
-def _program(what: str) -> dict[str, Any]:
-    """Return what came of a command whose cluster lost a node or its head."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
-    with tempfile.TemporaryDirectory(prefix="campaign_") as folder:
-        done = subprocess.run(
-            [sys.executable, str(PROGRAM), what, folder], env=kept, capture_output=True, text=True,
-            timeout=LONGEST_S, check=True,
-        )  # fmt: skip
-    told: dict[str, Any] = json.loads(
-        next(line for line in done.stdout.splitlines() if line.startswith("{"))
-    )
-    return told

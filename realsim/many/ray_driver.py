@@ -50,6 +50,8 @@ import sys, ray
 ray.init(address=sys.argv[1], log_to_driver=False, logging_level="CRITICAL")
 """
 """Succeeds where a cluster lets in who has no token."""
+AS_STRANGER = {"RAY_AUTH_MODE": "disabled", "RAY_NUM_REDIS_GET_RETRIES": "3"}
+"""Ray asks twenty times, once a second, though a cluster says at once that it lets nobody in."""
 OBJECT_STORE_BYTES = 200_000_000
 """Memory for jobs and results of a cluster that is started here; what is more goes to the disk."""
 PIECES_AHEAD = 4
@@ -157,11 +159,8 @@ def _lets_strangers_in(address: str) -> bool:
     try:
         done = subprocess.run(
             [sys.executable, "-c", STRANGER, address],
-            env=hidden | {"RAY_AUTH_MODE": "disabled"},
-            capture_output=True,
-            timeout=STRANGER_S,
-            check=False,
-        )
+            env=hidden | AS_STRANGER, capture_output=True, timeout=STRANGER_S, check=False,
+        )  # fmt: skip
     except subprocess.TimeoutExpired:
         return False
     return done.returncode == 0

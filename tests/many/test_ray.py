@@ -1,13 +1,10 @@
 """Many tasks on a Ray cluster: the same results, a dead node survived, a lost head told."""
 
-import json
 import os
 import pickle
 import signal
 import subprocess
 import sys
-import time
-from pathlib import Path
 
 import pytest
 
@@ -19,6 +16,13 @@ from many_tasks import (
     rewrites,
     sizes,
     spoils_and_fails,
+)
+from ray_on_loopback import (
+    SCENES,
+    generated,
+    generated_with_a_loss,
+    listening_beyond_loopback,
+    two_nodes,
 )
 from realsim.errors import InputError
 from realsim.many import (
@@ -36,10 +40,6 @@ from realsim.many.ray_driver import on_node
 from realsim.many.ray_node import work
 from realsim.many.ray_pool import _ending
 from realsim.store.lock import only_run_in
-
-SUPPORT = Path(__file__).parents[1] / "support"
-LONGEST_S = 240
-
 
 # --- without Ray ----------------------------------------------------------------------------------
 
@@ -159,56 +159,69 @@ def test_files_travel_and_changes_come_back_or_nothing_does(cluster, tmp_path):
 # --- several machines, and commands ---------------------------------------------------------------
 
 
-def program(*arguments):
-    # Ray reads its variables when it is imported: it has a process of its own.
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
-    done = subprocess.run(
-        [sys.executable, SUPPORT / "ray_on_loopback.py", *map(str, arguments)],
-        env=kept | {"PYTHONPATH": str(SUPPORT), "OPENBLAS_NUM_THREADS": "1"},
-        capture_output=True, text=True, timeout=LONGEST_S, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-2000:]
-    # Ray tells of its nodes on the same way out.
-    return json.loads(next(line for line in done.stdout.splitlines() if line.startswith("{")))
+@pytest.fixture(scope="module")
+def nodes():
+    pytest.importorskip("ray")
+    with two_nodes() as cluster:
+        yield cluster
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The scenes that one machine makes."""
+    said, scenes = generated(tmp_path_factory.mktemp("whole") / "out")
+    assert said.returncode == 0 and scenes, said.stderr
+    return scenes
 
 
 @pytest.mark.slow
-def test_of_two_nodes_one_is_killed_and_the_result_is_that_of_one_machine(tmp_path):
-    pytest.importorskip("ray")
-    found = program("node", tmp_path)
-    assert 1 <= found["finished_when_lost"] < 4, "the node was killed in the middle"
-    assert found["code"] == 0, found["told"]
-    assert found["same"] and not found["leftovers"] and not found["beyond_loopback"]
+def test_of_two_nodes_one_is_killed_and_the_result_is_that_of_one_machine(nodes, whole, tmp_path):
+    assert not listening_beyond_loopback(nodes[0])
+    at, said, scenes = generated_with_a_loss(tmp_path / "out", nodes, "node")
+    assert 1 <= at < SCENES, "the node was killed in the middle"
+    assert said.returncode == 0, said.stderr
+    assert scenes == whole and not list(tmp_path.rglob("*.part"))
 
 
 @pytest.mark.slow
-def test_a_lost_head_ends_in_a_sentence_and_the_same_command_goes_on(tmp_path):
-    pytest.importorskip("ray")
-    found = program("head", tmp_path)
-    assert 1 <= found["finished_when_lost"] < 4, "the head was killed in the middle"
-    assert found["code"] == 2
-    told = [line for line in found["told"].splitlines() if line.strip()]
+def test_a_lost_head_ends_in_a_sentence_and_the_same_command_goes_on(nodes, whole, tmp_path):
+    out = tmp_path / "out"
+    at, said, kept = generated_with_a_loss(out, nodes, "head")
+    assert 1 <= at < SCENES, "the head was killed in the middle"
+    assert said.returncode == 2
+    told = [line for line in said.stderr.splitlines() if line.strip()]
     assert told[-1].startswith("error: the Ray cluster (127.0.0.1:")
     assert "is lost: its head is gone. Until then" in told[-1] and "goes on from here" in told[-1]
     assert not any("ray." in line or "Traceback" in line for line in told), told
-    assert found["kept_same"] and found["kept"] and not found["leftovers"]
-    assert found["again_code"] == 0 and found["same"]
+    assert kept and kept.items() <= whole.items()
+    again, scenes = generated(out)
+    assert again.returncode == 0 and scenes == whole and not list(out.rglob("*.part"))
+
+
+INTERRUPTED = """
+import time
+from realsim.app import cli
+from realsim.many import PoolConfig, Task, open_pool, run_many
+
+def work():
+    tasks = [Task(name=str(s), fn=time.sleep, args=(s,)) for s in (0, 600)]
+    with open_pool(PoolConfig(workers=1, address="local")) as pool:
+        run_many(tasks, pool, lambda outcome: print("one is done", flush=True))
+
+cli.commands.command("work")(work)
+cli.main()
+"""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_ctrl_c_and_sigterm_end_in_a_sentence(number, code, tmp_path):
+def test_ctrl_c_ends_in_a_sentence():
     pytest.importorskip("ray")
-    sys.path.insert(0, str(SUPPORT))
-    import ray_on_loopback as loopback
-
-    process = loopback.generate(tmp_path / "out", "--address", "local", "--workers", "1")
-    loopback.wait_for_one(process, tmp_path / "out")
-    process.send_signal(number)
-    begun = time.monotonic()
-    _, told = process.communicate(timeout=LONGEST_S)
-    assert process.returncode == code, told
-    assert time.monotonic() - begun < 30
-    assert told.strip().splitlines()[-1].startswith("interrupted: ")
-    assert told.strip().endswith("; the same command goes on from here.")
-    assert "Traceback" not in told and not list((tmp_path / "out").rglob("*.part"))
+    run = subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTED, "work"], start_new_session=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert run.stdout.readline() == "one is done\n"
+    os.killpg(run.pid, signal.SIGINT)  # as a terminal does: to all its processes
+    told = run.communicate(timeout=30)[1].strip()
+    expected = "interrupted: 1 task is done; the same command goes on from here."
+    assert (run.returncode, told) == (130, expected)

@@ -1,36 +1,64 @@
-"""A program: a Ray cluster on loopback loses a node, or its head, while a command runs on it.
+"""A Ray cluster of two nodes on loopback loses one, or its head, while a command runs on it.
 
-    python ray_on_loopback.py node|head FOLDER      -> what came of it, as one JSON line
+The command is `realsim generate`: its scenes are made on the nodes and come back as files. The
+nodes are started by this file as a program, for Ray reads its variables when it is imported:
 
-The command is `realsim generate`: its scenes are made on the nodes and come back as files.
+    python ray_on_loopback.py       -> the address; then, for every line `node` or `head`, `lost`
 """
 
 import hashlib
-import json
 import os
 import socket
 import subprocess
 import sys
+import threading
 import time
-from pathlib import Path
+from contextlib import contextmanager
+from unittest import mock
+
+from typed_commands import realsim
 
 SCENES = 4
-GENERATE = ("--views", "2", "--objects", "1-2", "--size", "160x120", "--hull-only", "--no-maps",
+GENERATE = ("--views", "1", "--objects", "1", "--size", "64x48", "--hull-only", "--no-maps",
             "--scenes", str(SCENES))  # fmt: skip
-ONE_NODE = {"num_cpus": 1, "object_store_memory": 80_000_000}
-LONGEST_S = 200
+ONE_NODE = {"num_cpus": 1, "object_store_memory": 80_000_000, "include_log_monitor": False}
+VARIABLES = {
+    "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "t" * 64, "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
+}  # fmt: skip
 
 
-def nodes(count):
-    """Start nodes whose every port is on loopback."""
-    os.environ.update(RAY_AUTH_MODE="token", RAY_USAGE_STATS_ENABLED="0")
-    os.environ.update(RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER="0", RAY_ENABLE_UV_RUN_RUNTIME_ENV="0")
-    os.environ["RAY_AUTH_TOKEN"] = "t" * 64
+@contextmanager
+def two_nodes():
+    """Yield the nodes' address, and what loses `node` or `head`."""
+    with (
+        mock.patch.dict(os.environ, VARIABLES),
+        subprocess.Popen(
+            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as program,
+    ):
+
+        def lose(what):
+            program.stdin.write(f"{what}\n")
+            program.stdin.flush()
+            assert program.stdout.readline() == "lost\n"
+
+        yield program.stdout.readline().strip(), lose
+        program.stdin.close()
+
+
+def _serve():
+    """Start the nodes, whose every port is on loopback, and lose what the lines say."""
     from ray.cluster_utils import Cluster
 
-    head = {**ONE_NODE, "include_dashboard": False}
+    head = {**ONE_NODE, "include_dashboard": False, "no_monitor": True}
     cluster = Cluster(initialize_head=True, head_node_args=head)
-    return cluster, [cluster.add_node(**ONE_NODE) for _ in range(count - 1)]
+    other = cluster.add_node(**ONE_NODE)
+    print(cluster.address, flush=True)
+    for line in sys.stdin:
+        lost = other if line == "node\n" else cluster.head_node
+        cluster.remove_node(lost, allow_graceful=False)
+        print("lost", flush=True)
 
 
 def listening_beyond_loopback(address):
@@ -45,25 +73,39 @@ def listening_beyond_loopback(address):
     return found
 
 
-def generate(out, *more):
-    """Start the command."""
-    line = "import sys; from realsim.app.cli import main; sys.argv[0] = 'realsim'; main()"
-    return subprocess.Popen(
-        [sys.executable, "-c", line, "generate", str(out), *GENERATE, *more],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+def generated(out):
+    """Make the scenes on this machine; return what the command said, and the scenes."""
+    return realsim("generate", out, *GENERATE, "--workers", "1"), digests(out)
+
+
+def generated_with_a_loss(out, cluster, what):
+    """Make the scenes on the nodes, of which `what` is lost after the first scene.
+
+    Returns:
+        How many scenes were there when it was lost, what the command said, and the scenes.
+    """
+    address, lose = cluster
+    at, is_over = [], threading.Event()
+
+    def lose_after_one():
+        while not (finished(out) or is_over.is_set()):
+            time.sleep(0.02)
+        lose(what)
+        at.append(finished(out))
+
+    watch = threading.Thread(target=lose_after_one)
+    watch.start()
+    try:
+        said = realsim("generate", out, *GENERATE, "--address", address)
+    finally:
+        is_over.set()
+        watch.join()
+    return at[0], said, digests(out)
 
 
 def finished(out):
     """Return how many scenes are there."""
     return len(list(out.glob("layouts/*.finished.json")))
-
-
-def wait_for_one(process, out):
-    """Wait until the first scene is there, or the command has ended."""
-    begun = time.monotonic()
-    while not finished(out) and process.poll() is None and time.monotonic() - begun < LONGEST_S:
-        time.sleep(0.05)
 
 
 def digests(out):
@@ -77,35 +119,5 @@ def digests(out):
     }
 
 
-def lose(what, folder):
-    """Lose a node, or the head, after the first scene; return what came of the command."""
-    cluster, others = nodes(2 if what == "node" else 1)
-    out = folder / what
-    process = generate(out, "--address", cluster.address)
-    wait_for_one(process, out)
-    beyond = listening_beyond_loopback(cluster.address)
-    lost = others[0] if what == "node" else cluster.head_node
-    cluster.remove_node(lost, allow_graceful=False)
-    at = finished(out)
-    _, told = process.communicate(timeout=LONGEST_S)
-    kept = digests(out)
-    again, code = "", process.returncode
-    if what == "head":
-        process = generate(out)
-        again = process.communicate(timeout=LONGEST_S)[1]
-    else:
-        cluster.shutdown()
-    whole = generate(folder / "whole")
-    whole.communicate(timeout=LONGEST_S)
-    expected = digests(folder / "whole")
-    return {
-        "scenes": SCENES, "finished_when_lost": at, "code": code, "told": told, "again": again,
-        "again_code": process.returncode, "same": digests(out) == expected and bool(expected),
-        "kept_same": all(expected.get(name) == digest for name, digest in kept.items()),
-        "kept": len(kept), "beyond_loopback": beyond,
-        "leftovers": [str(p) for p in out.rglob("*.part")],
-    }  # fmt: skip
-
-
 if __name__ == "__main__":
-    print(json.dumps(lose(sys.argv[1], Path(sys.argv[2]))), flush=True)
+    _serve()
