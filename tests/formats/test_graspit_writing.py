@@ -11,7 +11,7 @@ from realsim.errors import InputError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspit.grasps import WorldGrasps, read_grasp_file
 from realsim.formats.graspit.scene import read_graspit_scene
-from realsim.formats.graspit.writing import GraspitConfig, paired_grasps, write_graspit
+from realsim.formats.graspit.writing import paired_grasps, write_graspit
 from realsim.geometry import se3
 from realsim.records import GraspSet
 
@@ -44,9 +44,9 @@ def grasps():
     return [paired_grasps(s) for s in sets]
 
 
-def write(scene, sets, folder, **config):
+def write(scene, sets, folder):
     out = ExportFolder.begin(folder, {"scene": scene.name})
-    written = write_graspit(scene, sets, out, GraspitConfig(**config))
+    written = write_graspit(scene, sets, out)
     out.finish({})
     return written
 
@@ -116,7 +116,7 @@ def test_the_same_scene_gives_the_same_bytes_and_several_go_into_one_export(tmp_
     assert sums[0] == sums[1]
     out = ExportFolder.begin(tmp_path / "c", {})
     for k in range(2):
-        write_graspit(scene, grasps(), out, GraspitConfig(under=f"scenes/scene_{k}"))
+        write_graspit(scene, grasps(), out.below(f"scenes/scene_{k}"))
     out.finish({})
     same(read_graspit_scene(tmp_path / "c/scenes/scene_1"), scene, grasps())
     text = (tmp_path / "c/scenes/scene_1/scene.yaml").read_text()

@@ -8,11 +8,11 @@ import pytest
 
 import placed_scenes
 from realsim.formats.robot_scenes.mesh_obj import collision_parts, look_of
-from realsim.formats.robot_scenes.mjcf import MjcfConfig, write_mjcf_scene
+from realsim.formats.robot_scenes.mjcf import write_mjcf_scene
 
 
-def write(scene, folder, **config):
-    return placed_scenes.written(write_mjcf_scene, scene, folder, MjcfConfig(**config))
+def write(scene, folder):
+    return placed_scenes.written(write_mjcf_scene, scene, folder)
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,12 @@ from pybullet_utils.bullet_client import BulletClient
 
 import placed_scenes
 from realsim.formats.export_folder import ExportFolder
-from realsim.formats.robot_scenes.urdf import UrdfConfig, write_urdf_scene
+from realsim.formats.robot_scenes.urdf import write_urdf_scene
 from realsim.interop import T_from_pybullet, import_pinocchio, quiet_output
 
 
-def write(scene, folder, **config):
-    return placed_scenes.written(write_urdf_scene, scene, folder, UrdfConfig(**config))
+def write(scene, folder):
+    return placed_scenes.written(write_urdf_scene, scene, folder)
 
 
 @pytest.fixture(scope="module")
@@ -121,9 +121,8 @@ def test_several_scenes_go_into_one_export(scene, tmp_path):
     out = ExportFolder.begin(tmp_path / "out", {})
     steps = []
     for name in ("a", "b"):
-        told = write_urdf_scene(
-            scene, out, UrdfConfig(under=f"scenes/{name}"), progress=lambda: steps.append(1)
-        )
+        place = out.below(f"scenes/{name}")
+        told = write_urdf_scene(scene, place, progress=lambda: steps.append(1))
         assert told.folder == tmp_path / "out/scenes" / name
         assert told.objects == 3 and told.counts["collision shapes"] == 3
     out.finish({})

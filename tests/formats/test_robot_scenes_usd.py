@@ -11,11 +11,11 @@ import placed_scenes
 from realsim.errors import MissingLibraryError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.robot_scenes.mesh_obj import collision_parts
-from realsim.formats.robot_scenes.usd_scene import UsdConfig, write_usd_scene
+from realsim.formats.robot_scenes.usd_scene import write_usd_scene
 
 
-def write(scene, folder, **config):
-    return placed_scenes.written(write_usd_scene, scene, folder, UsdConfig(**config))
+def write(scene, folder):
+    return placed_scenes.written(write_usd_scene, scene, folder)
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +30,8 @@ def folder(scene, tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module", params=[True, False])
-def stage(scene, request, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("usd") / "scene"
-    write(scene, folder, binary=request.param)
+@pytest.fixture(scope="module")
+def stage(folder):
     return Usd.Stage.Open(str(folder / "scene.usda"))
 
 

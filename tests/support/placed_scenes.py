@@ -114,9 +114,9 @@ def turned_to(scene, seed=3):
     return seen_from(scene, se3.random_transform(np.random.default_rng(seed)))
 
 
-def written(write, scene, folder, config):
+def written(write, scene, folder):
     """Write a scene as an export of its own by a format's writer."""
     out = ExportFolder.begin(folder, {"scene": scene.name})
-    told = write(scene, out, config)
+    told = write(scene, out)
     out.finish({})
     return told

@@ -65,10 +65,10 @@ def _graspnet_root(folder: ExportFolder, job: RootJob) -> Sequence[str]:
 
 
 def _colmap(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
-    from realsim.formats.colmap.writing import ColmapWriteConfig, write_colmap
+    from realsim.formats.colmap.writing import write_colmap
 
-    config = ColmapWriteConfig(points=job.request.points)
-    return write_colmap(scene, folder.below(job.place.name), config, progress=job.tick)
+    place = folder.below(job.place.name)
+    return write_colmap(scene, place, job.request.points, progress=job.tick)
 
 
 def _nerfstudio(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:

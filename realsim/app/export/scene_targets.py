@@ -2,6 +2,7 @@
 
 import shutil
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -64,48 +65,44 @@ def placed_scene(session: SessionScene) -> "PlacedScene":
 
 
 def _urdf(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
-    from realsim.formats.robot_scenes.urdf import UrdfConfig, write_urdf_scene
+    from realsim.formats.robot_scenes.urdf import write_urdf_scene
 
-    config = UrdfConfig(under=job.place.name)
-    session = session_of(scene)
-    written = write_urdf_scene(placed_scene(session), folder, config, progress=job.tick)
-    return _told(written, session)
+    return _engine_scene(scene, folder, job, write_urdf_scene)
 
 
 def _mjcf(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
-    from realsim.formats.robot_scenes.mjcf import MjcfConfig, write_mjcf_scene
+    from realsim.formats.robot_scenes.mjcf import write_mjcf_scene
 
-    config = MjcfConfig(under=job.place.name)
-    session = session_of(scene)
-    written = write_mjcf_scene(placed_scene(session), folder, config, progress=job.tick)
-    return _told(written, session)
+    return _engine_scene(scene, folder, job, write_mjcf_scene)
 
 
 def _usd(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
-    from realsim.formats.robot_scenes.usd_scene import UsdConfig, write_usd_scene
+    from realsim.formats.robot_scenes.usd_scene import write_usd_scene
 
-    config = UsdConfig(under=job.place.name)
-    session = session_of(scene)
-    written = write_usd_scene(placed_scene(session), folder, config, progress=job.tick)
-    return _told(written, session)
+    return _engine_scene(scene, folder, job, write_usd_scene)
 
 
 def _graspit(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
-    from realsim.formats.graspit.writing import GraspitConfig, paired_grasps, write_graspit
+    from realsim.formats.graspit.writing import paired_grasps, write_graspit
 
     session = session_of(scene)
     grasps = session.grasps()
-    pairs = [] if grasps is None else [paired_grasps(s) for s in grasps.sets]
-    config = GraspitConfig(under=job.place.name)
-    written = write_graspit(placed_scene(session), pairs, folder, config, progress=job.tick)
-    tried = sum(len(s) for s in (grasps.sets if grasps is not None else ()))
-    bad = sum(int((~s.good).sum()) for s in (grasps.sets if grasps is not None else ()))
+    sets = () if grasps is None else grasps.sets
+    pairs = [paired_grasps(s) for s in sets]
+    place = folder.below(job.place.name)
+    written = write_graspit(placed_scene(session), pairs, place, progress=job.tick)
+    tried = sum(len(s) for s in sets)
+    bad = sum(int((~s.good).sum()) for s in sets)
     note = f"all {tried} grasps are there, the {bad} that failed among them: scores have no place."
     return replace(written, name=session.name, notes=(*written.notes, note))
 
 
-def _told(written: WrittenScene, session: SessionScene) -> WrittenScene:
-    """Return what was written under the session's own name, with the views that stayed out."""
+def _engine_scene(
+    scene: LabelledScene, folder: ExportFolder, job: SceneJob, write: Callable[..., WrittenScene]
+) -> WrittenScene:
+    """Write a session's scene for an engine, under its own name; note the views that stay out."""
+    session = session_of(scene)
+    written = write(placed_scene(session), folder.below(job.place.name), progress=job.tick)
     posed = sum(v.T_world_cam is not None for v in session.store.session.views)
     notes = list(written.notes)
     if posed > CAMERAS:

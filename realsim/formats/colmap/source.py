@@ -17,7 +17,7 @@ from realsim.formats.folders.source import require_one_size
 from realsim.records import CameraIntrinsics
 
 FOLDER = "depth"
-"""Where `realsim export` puts depth in a COLMAP project."""
+"""Where depth is looked for in a COLMAP project."""
 REMEDY = "COLMAP's poses are world to camera, with OpenCV's axes; export the model again."
 
 

@@ -1,29 +1,26 @@
 """A labelled scene as a COLMAP project: a sparse model and the images it places.
 
     FOLDER/images/000000.png ...                               colour images
-    FOLDER/sparse/0/{cameras,images,points3D,rigs,frames}      .bin, .txt, or both
-    FOLDER/depth/000000.png ...                                only if asked for
+    FOLDER/sparse/0/{cameras,images,points3D,rigs,frames}.bin
 
 This is what trainers of Gaussian splatting, MVS programs and COLMAP's own window open. Poses and
 points are in metres. The model has no tracks: its cameras were measured, not matched.
 
-Files are after COLMAP's own description of its output (binary: little endian, no padding; text: 17
-digits, which is every bit of a double). Each camera is a rig of its own and each image a frame of
-its own, as COLMAP writes models of single cameras since 3.12.
+Files are after COLMAP's own description of its output: little endian, no padding. Each camera is a
+rig of its own and each image a frame of its own, as COLMAP writes models of single cameras since
+3.12.
 """
 
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
 from realsim.formats.coloured_points import ColouredPoints, require_points, write_points
-from realsim.formats.export_folder import Content, ExportFolder
+from realsim.formats.export_folder import ExportFolder
 from realsim.formats.folders.listing import shown
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene, WrittenScene
 from realsim.geometry import se3
@@ -85,14 +82,11 @@ def image_row(image_id: int, camera_id: int, T_cam_world: Array, name: str) -> I
     return ImageRow(image_id=image_id, camera_id=camera_id, pose=(w, x, y, z, *t), name=name)
 
 
-# --- binary -----------------------------------------------------------------------------------
-
-
-def binary_files(
+def model_files(
     cameras: Sequence[CameraRow], images: Sequence[ImageRow], points: Array,
     colours: UInt8,
 ) -> dict[str, bytes]:  # fmt: skip
-    """Return the five binary files of a model, by name.
+    """Return the five files of a model, by name.
 
     Args:
         cameras: at least one.
@@ -141,92 +135,13 @@ def _point_bytes(points: Array, colours: UInt8) -> bytes:
     return struct.pack("<Q", len(points)) + rows.tobytes()
 
 
-# --- text -------------------------------------------------------------------------------------
-
-
-def text_files(
-    cameras: Sequence[CameraRow], images: Sequence[ImageRow], points: Array,
-    colours: UInt8,
-) -> dict[str, bytes]:  # fmt: skip
-    """Return the five text files of a model, by name; arguments as `binary_files`."""
-    rigs = [f"{c.camera_id} 1 CAMERA {c.camera_id}" for c in cameras]
-    frames = [
-        f"{i.image_id} {i.camera_id} {_digits(i.pose)} 1 CAMERA {i.camera_id} {i.image_id}"
-        for i in images
-    ]
-    return {
-        "cameras.txt": _text(
-            "cameras",
-            "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
-            [f"{c.camera_id} {c.model} {c.width} {c.height} {_digits(c.params)}" for c in cameras],
-        ),
-        "images.txt": _text(
-            "images",
-            "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then a line of POINTS2D[]",
-            [f"{i.image_id} {_digits(i.pose)} {i.camera_id} {i.name}\n" for i in images],
-        ),
-        "points3D.txt": _text(
-            "points",
-            "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]",
-            [
-                f"{k} {_digits(p)} {r} {g} {b} {NO_ERROR:g}"
-                for k, (p, (r, g, b)) in enumerate(
-                    zip(points.tolist(), colours.tolist(), strict=True), start=1
-                )
-            ],
-        ),
-        "rigs.txt": _text("rigs", "RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID", rigs),
-        "frames.txt": _text(
-            "frames",
-            "FRAME_ID, RIG_ID, RIG_FROM_WORLD[QW QX QY QZ TX TY TZ], NUM_DATA_IDS, "
-            "DATA_IDS[] as SENSOR_TYPE, SENSOR_ID, DATA_ID",
-            frames,
-        ),
-    }
-
-
-def _digits(values: Sequence[float]) -> str:
-    return " ".join(f"{v:.17g}" for v in values)
-
-
-def _text(what: str, columns: str, lines: Sequence[str]) -> bytes:
-    head = [f"# {columns}", f"# Number of {what}: {len(lines)}"]
-    return "\n".join([*head, *lines, ""]).encode("utf-8")
-
-
 MODEL_FOLDER = "sparse/0"
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ColmapWriteConfig:
-    """How a scene is written as a COLMAP project."""
-
-    encoding: Literal["binary", "text", "both"] = "binary"
-    """Encoding of the model. Both hold every bit of a double; binary is a third of the size, and
-    every reader takes it."""
-    images: Literal["copied", "referenced"] = "copied"
-    """Referenced: no image is written and the model names them as their files are called, relative
-    to the folder that a note says (COLMAP's --image_path)."""
-    points: int = 100_000
-    """Most points in points3D, averaged out of the depth images; 0 = none. A hundred thousand is
-    what Gaussian splatting usually begins with."""
-    depth: bool = False
-    """Whether the depth images are written, too; COLMAP has no place for them, `realsim import
-    --kind colmap` finds them there."""
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if self.encoding not in ("binary", "text", "both"):
-            raise InputError(f"the encoding '{self.encoding}' is none of binary, text, both.")
-        if self.images not in ("copied", "referenced"):
-            raise InputError(f"images can be copied or referenced, not '{self.images}'.")
-        require_points(self.points)
 
 
 def write_colmap(
     scene: LabelledScene,
     folder: ExportFolder,
-    config: ColmapWriteConfig,
+    points: int = 100_000,
     *,
     progress: Callable[[], None] | None = None,
 ) -> WrittenScene:
@@ -235,17 +150,17 @@ def write_colmap(
     Args:
         scene: its images with camera poses are written, the others are named in the notes.
         folder: to fill; gone on with where it was interrupted.
-        config: what to write.
+        points: the most in points3D, averaged out of the depth images; 0 = none. A hundred thousand
+            is what Gaussian splatting usually begins with.
         progress: called once per frame.
 
     Raises:
         InputError: no image has a camera pose, or an image cannot be read.
     """
-    place = _common_place(scene) if config.images == "referenced" else None
+    require_points(points)
     cameras: dict[tuple[float, ...], CameraRow] = {}
     images: list[ImageRow] = []
     without: list[str] = []
-    units_m: set[float] = set()
     objects = written = 0
     for index in scene.indices:
         frame = scene.frame(index)
@@ -256,22 +171,13 @@ def write_colmap(
             continue
         source = scene.colour_file(index)
         name = f"{index:06d}{source.suffix.lower()}"
-        if place is not None:
-            name = source.resolve().relative_to(place).as_posix()
-            if config.encoding != "binary" and len(name.split()) > 1:
-                raise InputError(
-                    f"the image '{name}' has a space in its name, at which COLMAP's text reader "
-                    "cuts it. Write the model as binary, or copy the images."
-                )
         camera = _camera_of(frame, cameras)
         T_cam_world = se3.invert(frame.T_world_cam)
         images.append(image_row(index + 1, camera.camera_id, T_cam_world, name))
         objects += len(frame.objects)
-        files, unit_m = _files_of(scene, frame, name, config)
-        units_m |= {unit_m} if unit_m is not None else set()
         piece = f"frame {index}"
-        if files and not folder.has(piece):
-            folder.write_piece(piece, files)
+        if not folder.has(piece):
+            folder.write_piece(piece, {f"images/{name}": source})
             written += 1
     if not images:
         raise InputError(
@@ -280,17 +186,14 @@ def write_colmap(
         )
 
     def model_of(cloud: ColouredPoints) -> dict[str, bytes]:
-        parts = (list(cameras.values()), images, cloud.points, cloud.colours)
-        files = binary_files(*parts) if config.encoding != "text" else {}
-        files |= text_files(*parts) if config.encoding != "binary" else {}
+        files = model_files(list(cameras.values()), images, cloud.points, cloud.colours)
         return {f"{MODEL_FOLDER}/{name}": data for name, data in files.items()}
 
-    count = write_points(scene, folder, config.points, "model", model_of)
+    count = write_points(scene, folder, points, "model", model_of)
     return WrittenScene(
         name=scene.name, folder=folder.place, frames=len(images),
-        frames_written=written if config.images == "copied" or config.depth else len(images),
-        objects=objects,
-        notes=_notes(without, place, list(cameras.values()), sorted(units_m), objects),
+        frames_written=written, objects=objects,
+        notes=_notes(without, list(cameras.values()), objects),
         counts={"cameras": len(cameras), "points": count},
     )  # fmt: skip
 
@@ -301,52 +204,17 @@ def _camera_of(frame: LabelledFrame, cameras: dict[tuple[float, ...], CameraRow]
     return cameras.setdefault((row.width, row.height, *row.params), row)
 
 
-def _files_of(
-    scene: LabelledScene, frame: LabelledFrame, name: str, config: ColmapWriteConfig
-) -> tuple[dict[str, Content], float | None]:
-    """Return the image files of a frame, and the unit [m] of its depth where it is written."""
-    files: dict[str, Content] = {}
-    unit_m: float | None = None
-    if config.images == "copied":
-        files[f"images/{name}"] = scene.colour_file(frame.index)
-    if config.depth:
-        depth = scene.depth_file(frame.index)
-        if depth is not None and frame.depth_unit_m is not None:
-            files[f"depth/{frame.index:06d}.png"] = depth
-            unit_m = frame.depth_unit_m
-    return files, unit_m
-
-
-def _common_place(scene: LabelledScene) -> Path:
-    """Return the folder that all colour images lie in or below."""
-    parents = {scene.colour_file(i).resolve().parent for i in scene.indices}
-    if not parents:
-        raise InputError(f"{scene.name} has no images.")
-    place = sorted(parents)[0]
-    while not all(p.is_relative_to(place) for p in parents):
-        place = place.parent
-    return place
-
-
-def _notes(
-    without: list[str], place: Path | None, cameras: list[CameraRow], units_m: list[float],
-    objects: int,
-) -> tuple[str, ...]:  # fmt: skip
+def _notes(without: list[str], cameras: list[CameraRow], objects: int) -> tuple[str, ...]:
     notes: list[str] = []
     if without:
         notes.append(
             f"{len(without)} images have no camera pose and were left out: {shown(without)}."
         )
-    if place is not None:
-        notes.append(f"the images stay where they are: give {place} as the image path.")
     if any(c.model != "PINHOLE" for c in cameras):
         notes.append(
             "the images are distorted and the cameras say so; trainers that take PINHOLE only need "
             "COLMAP's image_undistorter first."
         )
-    if units_m:
-        said = " and ".join(f"{u:g}" for u in units_m)
-        notes.append(f"depth/ has {said} m per count; COLMAP has no field that says it.")
     if objects:
         notes.append("COLMAP has no place for objects and their poses: they were left out.")
     return tuple(notes)

@@ -8,7 +8,6 @@ import io
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -34,14 +33,6 @@ NOT_TEXT = frozenset(("y", "n", "yes", "no", "on", "off", "true", "false", "null
 """What YAML would take for something else."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class GraspitConfig:
-    """How a scene of GraspIT is written."""
-
-    under: str = ""
-    """Folder in the export that the scene gets; '' = the export's own. One export, many scenes."""
-
-
 def paired_grasps(grasps: GraspSet) -> WorldGrasps:
     """Return tried grasps with their half turns about the approach axis."""
     T = grasps.Ts_obj_grasp
@@ -57,7 +48,6 @@ def write_graspit(
     scene: PlacedScene,
     grasps: Sequence[WorldGrasps],
     folder: ExportFolder,
-    config: GraspitConfig | None = None,
     *,
     progress: Callable[[], None] | None = None,
 ) -> WrittenScene:
@@ -68,20 +58,17 @@ def write_graspit(
             format has z up.
         grasps: of its objects, in the objects' frames; see `paired_grasps`.
         folder: what is filled; a mesh is a piece.
-        config: how.
         progress: called once a mesh.
 
     Raises:
         InputError: grasps of an object that is not in the scene.
         StorageError: the disk is full, or refuses.
     """
-    config = config or GraspitConfig()
-    at = f"{config.under.strip('/')}/" if config.under.strip("/") else ""
     scene, notes = _upright(scene)
     names = unique_names({o.instance: o.name for o in scene.objects})
     files = scene.body_names()
     for obj_id, name in files.items():
-        piece = f"{at}{ASSETS}/{name}"
+        piece = f"{ASSETS}/{name}"
         if not folder.has(piece):
             folder.write_piece(piece, {f"{piece}.stl": stl_bytes(scene.bodies[obj_id].model.mesh)})
         if progress is not None:
@@ -90,22 +77,19 @@ def write_graspit(
     bare += [n for i, n in files.items() if scene.bodies[i].model.mesh.colors is not None]
     if bare:
         notes.append(f"STL has no colours; those of {', '.join(bare)} are not written.")
-    rows = _rows(scene, names, files, config)
-    last = {f"{at}{SCENE_FILE}": yaml_text(rows).encode("utf-8")}
-    last[f"{at}{ASSETS}/{TABLE}.obj"] = part_file(table_mesh(scene.table))
+    grasp_path = (folder.place / GRASP_FILE).relative_to(folder.folder).as_posix()
+    rows = {"grasp_path": grasp_path, **_rows(scene, names, files)}
+    last = {SCENE_FILE: yaml_text(rows).encode("utf-8")}
+    last[f"{ASSETS}/{TABLE}.obj"] = part_file(table_mesh(scene.table))
     by_name = _world_grasps(scene, grasps, names)
     if by_name:
-        last[f"{at}{GRASP_FILE}"] = hdf5_bytes(by_name)
-    folder.write_piece(f"{at}{SCENE_FILE}", last)
+        last[GRASP_FILE] = hdf5_bytes(by_name)
+    folder.write_piece(SCENE_FILE, last)
+    counts = {"meshes": len(files), "grasps": sum(len(T) for T in by_name.values())}
     return WrittenScene(
-        name=scene.name,
-        folder=folder.folder / config.under,
-        frames=0,
-        frames_written=0,
-        objects=len(scene.objects),
-        notes=tuple(notes),
-        counts={"meshes": len(files), "grasps": sum(len(T) for T in by_name.values())},
-    )
+        name=scene.name, folder=folder.place, frames=0, frames_written=0,
+        objects=len(scene.objects), notes=tuple(notes), counts=counts,
+    )  # fmt: skip
 
 
 def _upright(scene: PlacedScene) -> tuple[PlacedScene, list[str]]:
@@ -120,11 +104,9 @@ def _upright(scene: PlacedScene) -> tuple[PlacedScene, list[str]]:
 # --- scene.yaml ---------------------------------------------------------------------------------
 
 
-def _rows(
-    scene: PlacedScene, names: Mapping[int, str], files: Mapping[int, str], config: GraspitConfig
-) -> dict[str, Any]:
-    """Return the values of scene.yaml, in the order of the authors' file."""
-    rows: dict[str, Any] = {"grasp_path": f"{config.under.strip('/')}/{GRASP_FILE}".lstrip("/")}
+def _rows(scene: PlacedScene, names: Mapping[int, str], files: Mapping[int, str]) -> dict[str, Any]:
+    """Return the objects and the table, in the order of the authors' file."""
+    rows: dict[str, Any] = {}
     for k, o in enumerate(scene.objects):
         rows[f"object{k + 1}"] = {
             "file_path": f"{ASSETS}/{files[o.obj_id]}.stl",

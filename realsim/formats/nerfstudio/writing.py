@@ -3,7 +3,6 @@
     FOLDER/transforms.json
     FOLDER/images/000000.png ...
     FOLDER/depth/000000.png ...     16 bit, millimetres unless asked otherwise
-    FOLDER/masks/000000.png ...     if asked for: white where an object is
     FOLDER/sparse_pc.ply            what Gaussian splatting begins with
 
 Poses and points are in metres in the scene's own world: `applied_transform` is the identity.
@@ -44,9 +43,6 @@ class NerfstudioWriteConfig:
     depth_unit_m: float | None = DEFAULT_DEPTH_UNIT_M
     """Metres per count of the depth images. nerfstudio takes millimetres unless it is told another
     on its command line, so finer depth is rounded to them; None = the scene's own unit, exactly."""
-    masks: bool = False
-    """Whether masks of the visible objects are written: nerfstudio then trains on their pixels
-    only, which is not what most want."""
     points: int = 100_000
     """Most points in sparse_pc.ply, averaged out of the depth images; 0 = none."""
 
@@ -81,7 +77,7 @@ def write_nerfstudio(
     posed, without = _posed(scene)
     shared = _shared_camera(scene, posed)
     unit_m = _depth_unit(scene, posed, config)
-    written = objects = masks = 0
+    written = objects = 0
     for index in scene.indices:
         if progress is not None:
             progress()
@@ -89,11 +85,10 @@ def write_nerfstudio(
             continue
         frame = scene.frame(index)
         objects += len(frame.objects)
-        masks += config.masks and _has_masks(scene, frame)
         piece = f"frame {index}"
         if folder.has(piece):
             continue
-        entry, files = _frame(scene, frame, config, unit_m)
+        entry, files = _frame(scene, frame, unit_m)
         if shared is None:
             entry |= camera_entry(frame.intrinsics, f"image {index} of {scene.name}")
         folder.write_piece(piece, files, {ROWS: (str(index), entry)})
@@ -107,7 +102,7 @@ def write_nerfstudio(
     return WrittenScene(
         name=scene.name, folder=folder.place, frames=len(posed), frames_written=written,
         objects=objects, notes=_notes(scene, posed, without, unit_m, objects),
-        counts={"points": points, "masks": masks},
+        counts={"points": points, "masks": 0},
     )  # fmt: skip
 
 
@@ -150,7 +145,7 @@ def _depth_unit(
 
 
 def _frame(
-    scene: LabelledScene, frame: LabelledFrame, config: NerfstudioWriteConfig, unit_m: float | None
+    scene: LabelledScene, frame: LabelledFrame, unit_m: float | None
 ) -> tuple[dict[str, Any], dict[str, Content]]:
     """Return the entry of a frame without its camera, and its files."""
     colour = scene.colour_file(frame.index)
@@ -165,26 +160,9 @@ def _frame(
         if frame.depth_unit_m != unit_m:
             depth_m = read_counts(depth) * np.float64(frame.depth_unit_m)
             files[name] = images.png_bytes(images.depth_counts(depth_m, unit_m))
-    if config.masks and _has_masks(scene, frame):
-        name = f"masks/{frame.index:06d}.png"
-        entry["mask_path"] = name
-        files[name] = images.png_bytes(_objects_mask(scene, frame))
     assert frame.T_world_cam is not None  # only posed frames come here
     entry["transform_matrix"] = transform_matrix(frame.T_world_cam)
     return entry, files
-
-
-def _has_masks(scene: LabelledScene, frame: LabelledFrame) -> bool:
-    return bool(frame.objects) and scene.mask(frame.index, 0, visible=True) is not None
-
-
-def _objects_mask(scene: LabelledScene, frame: LabelledFrame) -> Any:
-    """Return where (H, W) any object is seen."""
-    union = np.zeros((frame.intrinsics.height, frame.intrinsics.width), dtype=np.bool_)
-    for k in range(len(frame.objects)):
-        mask = scene.mask(frame.index, k, visible=True)
-        union |= False if mask is None else mask
-    return union
 
 
 def ply_of(cloud: ColouredPoints) -> bytes:

@@ -8,7 +8,6 @@ mass and inertia of the shapes. Shapes of group 2 are seen, those of group 3 col
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -45,60 +44,46 @@ INSET_PX = 0.5
 """MuJoCo's image plane begins at the edge of the first pixel, ours in its middle."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class MjcfConfig:
-    """How a scene.xml is written."""
-
-    under: str = ""
-    """Folder in the export that the scene gets; '' = the export's own. One export, many scenes."""
-    step_s: float = 0.002
-    """Time step [s]."""
-    contact_time_s: float = 0.004
-    """Time constant of contacts [s]: two steps, the stiffest that MuJoCo integrates; with its 20 ms
-    things sink in and swing."""
-    impratio: float = 100.0
-    """Stiffness of friction against that of the normal: at 1, MuJoCo's own, things creep."""
+STEP_S = 0.002
+CONTACT_TIME_S = 0.004
+"""Time constant of contacts [s]: two steps, the stiffest that MuJoCo integrates; with its 20 ms
+things sink in and swing."""
+IMPRATIO = 100.0
+"""Stiffness of friction against that of the normal: at 1, MuJoCo's own, things creep."""
 
 
 def write_mjcf_scene(
-    scene: PlacedScene,
-    folder: ExportFolder,
-    config: MjcfConfig | None = None,
-    *,
-    progress: Callable[[], None] | None = None,
+    scene: PlacedScene, folder: ExportFolder, *, progress: Callable[[], None] | None = None
 ) -> WrittenScene:
     """Write a scene as MJCF.
 
     Args:
         scene: the scene.
         folder: what is filled; a body's meshes are a piece.
-        config: how.
         progress: called once a body.
 
     Raises:
         InputError: a body without convex parts is flat.
         StorageError: the disk is full, or refuses.
     """
-    config = config or MjcfConfig()
-    at = f"{config.under.strip('/')}/" if config.under.strip("/") else ""
     names = scene.body_names()
     counts: dict[int, int] = {}
     for obj_id, name in names.items():
         body = scene.bodies[obj_id]
         parts = collision_parts(body)
         counts[obj_id] = len(parts)
-        piece = f"{at}{ASSETS}/{name}"
+        piece = f"{ASSETS}/{name}"
         if not folder.has(piece):
             files = {f"{piece}/{n}": data for n, data in visual_files(body.model.mesh).items()}
             files |= {f"{piece}/{part_name(k)}.obj": part_file(p) for k, p in enumerate(parts)}
             folder.write_piece(piece, files)
         if progress is not None:
             progress()
-    text = scene_xml(scene, names, counts, config)
-    folder.write_piece(f"{at}{SCENE_FILE}", {f"{at}{SCENE_FILE}": text})
+    text = scene_xml(scene, names, counts)
+    folder.write_piece(SCENE_FILE, {SCENE_FILE: text})
     shapes = sum(counts.values())
     counted = {"bodies": len(names), "collision shapes": shapes, "cameras": len(scene.cameras)}
-    return told(scene, folder.folder / config.under, counted, without_lens(scene, "MJCF"))
+    return told(scene, folder.place, counted, without_lens(scene, "MJCF"))
 
 
 def part_name(k: int) -> str:
@@ -106,16 +91,13 @@ def part_name(k: int) -> str:
     return f"part_{k:03d}"
 
 
-def scene_xml(
-    scene: PlacedScene, names: dict[int, str], counts: dict[int, int], config: MjcfConfig
-) -> bytes:
+def scene_xml(scene: PlacedScene, names: dict[int, str], counts: dict[int, int]) -> bytes:
     """Return scene.xml.
 
     Args:
         scene: the scene.
         names: of the bodies' assets, by object id.
         counts: of the bodies' convex parts, by object id.
-        config: how.
     """
     root = ET.Element("mujoco", model=scene.name)
     ET.SubElement(
@@ -131,12 +113,12 @@ def scene_xml(
         root,
         "option",
         gravity=spaced(scene.gravity),
-        timestep=repr(config.step_s),
+        timestep=repr(STEP_S),
         integrator="implicitfast",
         cone="elliptic",
-        impratio=repr(config.impratio),
+        impratio=repr(IMPRATIO),
     )
-    ET.SubElement(ET.SubElement(root, "default"), "geom", solref=f"{config.contact_time_s!r} 1")
+    ET.SubElement(ET.SubElement(root, "default"), "geom", solref=f"{CONTACT_TIME_S!r} 1")
     assets = ET.SubElement(root, "asset")
     for obj_id, name in names.items():
         _assets(assets, scene.bodies[obj_id], name, counts[obj_id])

@@ -1,7 +1,6 @@
 """Roll, pitch and yaw as URDF means them: fixed axes, R = Rz(yaw) Ry(pitch) Rx(roll)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -63,58 +62,43 @@ TABLE_DENSITY = 700.0
 """Wood's [kg/m^3]: the table stands still, but a link without matter is warned of."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class UrdfConfig:
-    """How a folder of URDFs is written."""
-
-    under: str = ""
-    """Folder in the export that the scene gets; '' = the export's own. One export, many scenes."""
-
-
 def write_urdf_scene(
-    scene: PlacedScene,
-    folder: ExportFolder,
-    config: UrdfConfig | None = None,
-    *,
-    progress: Callable[[], None] | None = None,
+    scene: PlacedScene, folder: ExportFolder, *, progress: Callable[[], None] | None = None
 ) -> WrittenScene:
     """Write a scene as a folder of URDFs.
 
     Args:
         scene: the scene.
         folder: what is filled; a body is a piece.
-        config: how.
         progress: called once a body.
 
     Raises:
         InputError: a body without convex parts is flat.
         StorageError: the disk is full, or refuses.
     """
-    config = config or UrdfConfig()
-    at = f"{config.under.strip('/')}/" if config.under.strip("/") else ""
     names = scene.body_names()
     shapes = 0
     for obj_id, name in names.items():
         body = scene.bodies[obj_id]
         parts = collision_parts(body)
         shapes += len(parts)
-        piece = f"{at}objects/{name}"
+        piece = f"objects/{name}"
         if not folder.has(piece):
-            meshes = f"{at}objects/meshes/{name}"
+            meshes = f"objects/meshes/{name}"
             files = {f"{meshes}/{n}": data for n, data in visual_files(body.model.mesh).items()}
             files |= {f"{meshes}/{_part_name(k)}": part_file(p) for k, p in enumerate(parts)}
             link = body_link(body, name, f"meshes/{name}", len(parts))
-            files[f"{at}objects/{name}.urdf"] = _robot(name, [link])
+            files[f"objects/{name}.urdf"] = _robot(name, [link])
             folder.write_piece(piece, files)
         if progress is not None:
             progress()
-    files = {f"{at}{SCENE_FILE}": atomic.json_bytes(scene_json(scene, names))}
-    files[f"{at}{SCRIPT}"] = Path(__file__).with_name(SCRIPT).read_bytes()
-    files[f"{at}{TABLE_NAME}.urdf"] = _robot(TABLE_NAME, [table_link(scene.table)])
-    files[f"{at}{WORLD_FILE}"] = _world(scene, names)
-    folder.write_piece(f"{at}{SCENE_FILE}", files)
+    files = {SCENE_FILE: atomic.json_bytes(scene_json(scene, names))}
+    files[SCRIPT] = Path(__file__).with_name(SCRIPT).read_bytes()
+    files[f"{TABLE_NAME}.urdf"] = _robot(TABLE_NAME, [table_link(scene.table)])
+    files[WORLD_FILE] = _world(scene, names)
+    folder.write_piece(SCENE_FILE, files)
     counts = {"bodies": len(names), "collision shapes": shapes, "cameras": len(scene.cameras)}
-    return told(scene, folder.folder / config.under, counts)
+    return told(scene, folder.place, counts)
 
 
 def _part_name(k: int) -> str:

@@ -1,7 +1,7 @@
 """A scene as USD for Isaac Sim: physics by UsdPhysics, metres, z up.
 
     scene.usda                     physics scene, table, cameras; the objects by reference
-    objects/NAME.usdc (or .usda)   a body: see `usd_body`
+    objects/NAME.usdc              a body: see `usd_body`
     objects/NAME.png               its texture
 
 Open scene.usda in Isaac Sim, or reference it in another stage. Bodies are shared by all places
@@ -10,7 +10,6 @@ where they stand.
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -47,29 +46,14 @@ HALF_PIXEL = 0.5
 """The film begins at the edge of the first pixel, whose middle is our 0."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class UsdConfig:
-    """How a scene is written as USD."""
-
-    under: str = ""
-    """Folder in the export that the scene gets; '' = the export's own. One export, many scenes."""
-    binary: bool = True
-    """Bodies as .usdc, a fifth of the size and quick to open; else .usda, text."""
-
-
 def write_usd_scene(
-    scene: PlacedScene,
-    folder: ExportFolder,
-    config: UsdConfig | None = None,
-    *,
-    progress: Callable[[], None] | None = None,
+    scene: PlacedScene, folder: ExportFolder, *, progress: Callable[[], None] | None = None
 ) -> WrittenScene:
     """Write a scene as USD.
 
     Args:
         scene: the scene.
         folder: what is filled; a body is a piece.
-        config: how.
         progress: called once a body.
 
     Raises:
@@ -77,36 +61,31 @@ def write_usd_scene(
         MissingLibraryError: the extra `usd` is not installed.
         StorageError: the disk is full, or refuses.
     """
-    pxr, config = Pixar(), config or UsdConfig()
-    at = f"{config.under.strip('/')}/" if config.under.strip("/") else ""
-    kind = "usdc" if config.binary else "usda"
+    pxr = Pixar()
     names = scene.body_names()
     for obj_id, name in names.items():
-        piece = f"{at}{OBJECTS}/{name}"
+        piece = f"{OBJECTS}/{name}"
         if not folder.has(piece):
             body = scene.bodies[obj_id]
             stage = body_stage(pxr, body, name, f"./{name}.png")
-            files = {f"{piece}.{kind}": layer_bytes(stage.GetRootLayer(), kind)}
+            files = {f"{piece}.usdc": _usdc(stage.GetRootLayer())}
             texture = texture_png(body)
             if texture is not None:
                 files[f"{piece}.png"] = texture
             folder.write_piece(piece, files)
         if progress is not None:
             progress()
-    files = {n: f"./{OBJECTS}/{name}.{kind}" for n, name in names.items()}
-    data = layer_bytes(_scene_layer(pxr, scene, files), "usda")
-    folder.write_piece(f"{at}{SCENE_FILE}", {f"{at}{SCENE_FILE}": data})
+    files = {n: f"./{OBJECTS}/{name}.usdc" for n, name in names.items()}
+    data = _scene_layer(pxr, scene, files).ExportToString().encode("utf-8")
+    folder.write_piece(SCENE_FILE, {SCENE_FILE: data})
     counts = {"bodies": len(names), "cameras": len(scene.cameras)}
-    return told(scene, folder.folder / config.under, counts, without_lens(scene, "USD"))
+    return told(scene, folder.place, counts, without_lens(scene, "USD"))
 
 
-def layer_bytes(layer: Any, kind: str) -> bytes:
-    """Return a layer as the bytes of a file of this kind, 'usda' or 'usdc'."""
-    if kind == "usda":
-        text: str = layer.ExportToString()
-        return text.encode("utf-8")
+def _usdc(layer: Any) -> bytes:
+    """Return a layer as the bytes of a binary file, a fifth of the size of text."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"layer.{kind}"
+        path = Path(folder) / "layer.usdc"
         layer.Export(str(path))
         return path.read_bytes()
 
