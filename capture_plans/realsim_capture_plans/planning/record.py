@@ -7,8 +7,8 @@ file is read: it is no part of the hash, whose last bits it would make depend on
 
 import hashlib
 import json
-from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any, Literal, cast
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +19,7 @@ from realsim.records.checked_arrays import frozen
 from realsim.robots.kinematics import DhChain
 from realsim.robots.limits import JointLimits
 from realsim.robots.shapes import Box, Mount, Shape, WorkCell
+from realsim.untrusted.json_values import json_value
 from realsim_capture_plans.collision.model import CollisionModel
 
 LEAST_DEGREES = 2.0
@@ -226,7 +227,7 @@ def plan_content(plan: CapturePlan) -> dict[str, Any]:
     A change of these keys, or of the fields of `PlanConfig`, changes every hash: it needs a new
     schema version of the file.
     """
-    dh = _plain(plan.chain)
+    dh = json_value(plan.chain)
     for name in ("T_base_0", "T_n_ee"):  # plans of arms that need none are as they always were
         if np.array_equal(getattr(plan.chain, name), np.eye(4)):
             del dh[name]
@@ -239,19 +240,8 @@ def plan_content(plan: CapturePlan) -> dict[str, Any]:
         "robot": dh.pop("name"),
         "limits": dh.pop("limits"),
         "dh": dh,
-        **{name: _plain(getattr(plan, name)) for name in names},
+        **{name: json_value(getattr(plan, name)) for name in names},
     }
-
-
-def _plain(value: Any) -> Any:
-    """Return records, arrays and tuples as mappings and lists."""
-    if is_dataclass(value):
-        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, np.ndarray):
-        return cast("Array", value).tolist()
-    if isinstance(value, tuple):
-        return [_plain(v) for v in cast("tuple[Any, ...]", value)]
-    return None if isinstance(value, float) and np.isinf(value) else value
 
 
 def expected_poses(plan: CapturePlan) -> dict[str, Any]:

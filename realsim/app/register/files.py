@@ -45,23 +45,10 @@ from realsim.geometry import se3
 from realsim.records import ObjectModel, Scene, bop_units
 from realsim.store import SessionStore, atomic
 from realsim.store.cameras import open_cameras
+from realsim.untrusted.json_values import json_value
 from realsim.untrusted.own_json import to_json
 
 # --- to JSON ----------------------------------------------------------------------------------
-
-
-def plain(value: Any) -> Any:
-    """Return JSON values with NaN and infinity, which JSON has not, as null."""
-    if isinstance(value, Mapping):
-        items: Any = value.items()  # pyright: ignore[reportUnknownVariableType, reportUnknownMemberType]
-        return {str(k): plain(v) for k, v in items}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]  # pyright: ignore[reportUnknownVariableType]
-    if isinstance(value, np.generic | np.ndarray):
-        return plain(value.tolist())  # pyright: ignore[reportUnknownMemberType]
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
 
 
 def documents(
@@ -82,7 +69,7 @@ def documents(
         f"{FOLDER}/scene_gt.json": _bop_objects(result),
         f"{FOLDER}/scene_camera.json": _bop_cameras(result, store),
         SINGLE_FILE: to_json(result.single_view),
-        REPORT_FILE: plain(_without_costs(report)),
+        REPORT_FILE: json_value(_without_costs(report)),
         SCENE_FILE: to_json(result.scene),
     }
 
@@ -102,7 +89,7 @@ def _without_costs(report: Json) -> Json:
 def costs_of(report: Json) -> list[Json]:
     """Return what the parts of a report cost."""
     return [
-        {"name": name, COSTS: plain(part[COSTS])}
+        {"name": name, COSTS: json_value(part[COSTS])}
         for name, part in report.items()
         if isinstance(part, dict) and COSTS in part
     ]

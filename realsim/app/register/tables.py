@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from realsim.app.console import Console
-from realsim.app.register.files import plain
 from realsim.app.register.results import Registered
 from realsim.app.register.uncertainty import sigmas
 from realsim.records import ObjectModel, ObjectPose
+from realsim.untrusted.json_values import json_value
 
 Rows = list[list[str]]
 WORST_FIRST = {"rejected": 0, "doubtful": 1, "unchecked": 2, "accepted": 3}
@@ -271,6 +271,6 @@ def as_json(result: Registered, models: Mapping[int, ObjectModel]) -> dict[str, 
         "common_sigma_mm": result.report.get("refinement", {}).get("common_sigma_mm"),
         "own_sigma_mm": result.report.get("refinement", {}).get("own_sigma_mm"),
         "common_sigma_deg": result.report.get("refinement", {}).get("common_sigma_deg"),
-        "kinematics": plain(result.report.get("kinematics")),
+        "kinematics": json_value(result.report.get("kinematics")),
         "views": sorted(result.cameras.refined),
     }

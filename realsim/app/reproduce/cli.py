@@ -1,6 +1,5 @@
 """`realsim reproduce`: its options."""
 
-from dataclasses import asdict
 from math import isfinite
 from pathlib import Path
 
@@ -40,10 +39,8 @@ def reproduce_command(console: Console, result: Path, stage: str, workers: int) 
         console.say(f"{found.stage}: equal, {counts}")
     else:
         console.say(f"{found.stage}: {len(found.differing)} of {counts} differ")
-    rows = [asdict(d) | {"greatest": d.greatest if isfinite(d.greatest) else None}
-            for d in found.differing]  # fmt: skip
     console.result({
-        "stage": found.stage, "equal": found.equal, "files": found.files, "differing": rows,
-        "other_versions": list(found.other_versions),
+        "stage": found.stage, "equal": found.equal, "files": found.files,
+        "differing": found.differing, "other_versions": list(found.other_versions),
     })  # fmt: skip
     return found.equal

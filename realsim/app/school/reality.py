@@ -9,6 +9,7 @@ from realsim.app.console import Console
 from realsim.app.school.inputs import named_mass, spread_of
 from realsim.errors import InputError
 from realsim.store import atomic
+from realsim.untrusted.json_values import json_value
 
 if TYPE_CHECKING:
     from realsim_sim_bridge.hold.reality import Reality, RealityConfig
@@ -168,16 +169,7 @@ def _document(found: "Reality", config: dict[str, Any], notes: tuple[str, ...]) 
     """Return the report as plain values; null where nothing is known."""
     document = asdict(replace(found, p_hold=found.p_hold.tolist()))
     document["predictors"] = {row.pop("name"): row for row in document.pop("rows")}
-    return _plain(document | {"config": config, "notes": list(notes)})
-
-
-def _plain(value: Any) -> Any:
-    """Return values for JSON, which has no NaN."""
-    if isinstance(value, dict):
-        return {key: _plain(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return json_value(document | {"config": config, "notes": list(notes)})
 
 
 def _number(value: float, form: str = ".3f") -> str:

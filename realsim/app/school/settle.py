@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from realsim.app.console import Console
-from realsim.app.register.files import plain
 from realsim.app.school.inputs import CACHE, SchoolInputs, SchoolRequest, is_session, read_inputs
 from realsim.errors import InputError
 from realsim.store import atomic
+from realsim.untrusted.json_values import json_value
 
 if TYPE_CHECKING:
     from realsim_sim_bridge.scenes.school_scene import SchoolScene
@@ -142,7 +142,7 @@ def with_supports(scene: "SchoolScene", urdfs: Sequence[Path]) -> "SchoolScene":
 
 def as_json(report: "StandReport") -> dict[str, Any]:
     """Return what a program wants to know, as plain JSON values."""
-    return plain(
+    return json_value(
         {
             "stable": report.stable,
             "simulated_s": report.simulated_s,

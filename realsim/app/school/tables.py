@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from realsim.app.console import Console
-from realsim.app.register.files import plain
 from realsim.arrays import Array
 from realsim.records import STAGES, GraspSet, ObjectModel
+from realsim.untrusted.json_values import json_value
 
 Rows = list[list[str]]
 Names = Mapping[int, ObjectModel]
@@ -322,7 +322,7 @@ def as_json(sets: Sequence[GraspSet], models: Names) -> dict[str, Any]:
     low, high = found.interval
     agree = {"count": found.count, "agree": found.agree, "share": found.share,
              "interval": [low, high]}  # fmt: skip
-    return plain(
+    return json_value(
         {
             "objects": objects,
             "reasons": reasons(sets),

@@ -8,7 +8,7 @@ and 0.1 degrees, which is what a hand-eye calibration leaves.
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,7 @@ from realsim.registration.odometry.pairs import (
     view_cloud,
 )
 from realsim.registration.views import ViewPoints
+from realsim.untrusted.json_values import json_value
 
 AXES = ("x (to the image's right)", "y (down in the image)", "z (along the line of sight)")
 
@@ -190,8 +191,8 @@ class KinematicsCheck:
             "noise_deg": self.noise_deg,
             "pairs": self.pairs,
             "cpu_s": self.cpu_s,
-            "views": [_plain(asdict(v)) for v in self.views],
-            "faults": [_plain(asdict(f)) for f in self.faults],
+            "views": json_value(self.views),
+            "faults": json_value(self.faults),
             "unchecked": [{"index": k, "reason": why} for k, why in self.unchecked],
             "words": list(self.words()),
         }
@@ -365,10 +366,3 @@ def _number(difference: ViewDifference, index: int) -> ViewDifference:
     from dataclasses import replace
 
     return replace(difference, index=index)
-
-
-def _plain(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values with None for NaN, which JSON does not know."""
-    return {
-        k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in values.items()
-    }

@@ -8,8 +8,7 @@ reaches is said.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
-from math import isfinite
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from realsim.rendering.depth_sensors.plane import find_plane
 from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.twins import PlaneFigures, PlaneTwin, plane_twin
+from realsim.untrusted.json_values import json_value
 
 MOST_TWINS = 5
 """Frames that are simulated: evenly over the measured distances."""
@@ -91,7 +91,7 @@ class FittedStereo:
             **self.config.document(),
             "fit": {
                 "profile": self.profile,
-                "frames": [_finite(asdict(f)) for f in self.frames],
+                "frames": json_value(self.frames),
                 "notes": list(self.notes),
             },
         }
@@ -278,11 +278,3 @@ def _notes(frames: Sequence[TwinFigures], config: StereoConfig, kind: DepthProfi
             "full_well stands for both."
         )
     return notes
-
-
-def _finite(document: dict[str, Any]) -> dict[str, Any]:
-    """Return a document for JSON, which knows no NaN: null stands for it."""
-    return {
-        k: _finite(v) if isinstance(v, dict) else v if isinstance(v, str) or isfinite(v) else None
-        for k, v in document.items()
-    }

@@ -25,6 +25,7 @@ from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.formats.grasps.scene_grasps import check_values, executed
 from realsim.records import STAGES, GraspSet
+from realsim.untrusted.json_values import json_value
 from realsim_sim_bridge.school.measure_statistics import (
     ClosureConfusion,
     PHoldSpread,
@@ -273,7 +274,7 @@ class SchoolSummary:
             values["by_paper"] = self.by_paper.to_json()
         for entry, c in zip(values["closures"], self.closures, strict=True):
             entry |= {"agree": c.agree, "balanced_accuracy": c.balanced_accuracy}
-        return _plain(values)
+        return json_value(values)
 
 
 def summarise(
@@ -424,12 +425,3 @@ def _spread(values: Array) -> Spread:
     if len(values) == 0:
         return Spread(mean=math.nan, sd=math.nan)
     return Spread(mean=float(np.mean(values)), sd=float(np.std(values)))
-
-
-def _plain(value: Any) -> Any:
-    """Return values as JSON has them: null for what is not finite."""
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}  # pyright: ignore[reportUnknownVariableType]
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]  # pyright: ignore[reportUnknownVariableType]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
