@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import viser
 
 from realsim import local_pages
@@ -24,6 +25,7 @@ from realsim.errors import InputError, RealsimError
 from realsim.local_pages import Door
 from realsim.review import journal, scene_list
 from realsim.review.content.config import SceneConfig
+from realsim.review.drawing.scene_nodes import light
 from realsim.review.journal import Entry
 from realsim.review.replaying.grasp_replay import Motions
 from realsim.review.reviewed_session import ReviewedSession
@@ -171,6 +173,7 @@ class ReviewServer:
             )
         local_pages.refuse_foreign_messages(server)
         self._server = server
+        light(server.scene, np.array([0.0, 0.0, 1.0]))
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         server.on_client_connect(self._came)
         server.on_client_disconnect(self._went)

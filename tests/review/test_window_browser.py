@@ -110,7 +110,7 @@ PANELS = """[...document.querySelectorAll('[data-dock-window], .mantine-Paper-ro
 
 def _scene_share(page: ReviewPage) -> float:
     """Return how much of the window's middle shows the measured table and boxes."""
-    image = page.screenshot()[200:600, 300:900]
+    image = page.screenshot()[100:300, 150:450]
     return share_of(image, TABLE_RGB) + share_of(image, BOX_RGB)
 
 
@@ -207,7 +207,7 @@ def test_the_photographs_open_at_the_worst_view_and_follow_the_object(
 ) -> None:
     with browser.page(server.url, width=1280, height=800) as page:
         page.page.keyboard.press("g")  # before anything stands
-        page.wait_for("flat \u00b7 view", "against the pose", seconds=180)
+        page.wait_for("flat \u00b7 view", "against the pose")
         page.wait_until(lambda: share_of(page.screenshot(), BOX_RGB) > 0.003, "the photograph")
         zoom = float(in_photograph(page, ".rs-zoom").split()[0])
         assert zoom > 1  # the object fills a third of a photograph of 160 pixels
@@ -307,7 +307,7 @@ def test_the_mouse_chooses_objects_frustums_grasps_and_three_points(
         page.wait_until(lambda: _scene_share(page) > 0.02, "the scene")
         camera = window.client.camera
         window.views.first_look()
-        page.page.wait_for_timeout(1500)
+        window.browser.wait()
         page.click_at(camera, [0.46, 0.0, 0.12], "\u25b6 0 tall")
         T_cam = max((v.T_world_cam for v in window.content.views),
                     key=lambda T: np.linalg.norm(T[:3, 3] - camera.position))  # fmt: skip

@@ -3,7 +3,7 @@
 import shutil
 import time
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -20,13 +20,15 @@ ARGS = (
     "--ignore-gpu-blocklist", "--disable-background-networking", "--no-first-run",
     "--disable-dev-shm-usage",
 )  # fmt: skip
-WAIT_S = 60.0
+WAIT_S = 240.0
 """How long is waited for a page without a graphics card on a busy machine [s]."""
 HARMLESS = ("GPU stall due to ReadPixels", "GL Driver Message")
 """Messages of the software renderer, not of the page."""
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 SMALL = SceneConfig(coarse_points=4_000, shown_points=4_000, most_points=20_000)
 """So little that a processor draws it fast enough."""
+DRAWN = """async () => { for (let k = 0; k < 3 || __viserMutable.messageQueue.length; k++) {
+    __viserMutable.requestRender(); await new Promise(requestAnimationFrame); } }"""
 VISIBLE = "e => e.offsetParent !== null"
 
 
@@ -109,7 +111,7 @@ class ReviewPage:
             f"{VISIBLE}).find(b => b.innerText.includes(label) && !b.disabled);"
             " if (b) b.click(); return !!b; }"
         )
-        self.wait_until(lambda: self.page.evaluate(script, label), f"the button '{label}'", 20.0)
+        self.wait_until(lambda: self.page.evaluate(script, label), f"the button '{label}'")
 
     def tab(self, name: str) -> None:
         """Turn to a tab of the panel; tabs can be dragged, so it takes a real pointer."""
@@ -141,12 +143,16 @@ class ReviewPage:
         for _ in range(10):
             self.page.mouse.move(at[0] + 3, at[1])
             self.page.mouse.move(*at)
-            self.page.wait_for_timeout(500)
+            self.wait_drawn()
             self.page.mouse.click(*at, delay=50)
-            self.page.wait_for_timeout(3000)
-            if until in self.text():
+            with suppress(AssertionError):
+                self.wait_for(until, seconds=WAIT_S / 10)
                 return
         self.wait_for(until)
+
+    def wait_drawn(self) -> None:
+        """Wait until what has come from the server is drawn."""
+        self.page.evaluate(DRAWN)
 
     def key(self, key: str) -> None:
         """Press a key, no text being written."""
@@ -229,7 +235,10 @@ class ReviewBrowser:
     @contextmanager
     def page(self, url: str, *, width: int = 1000, height: int = 640) -> Generator[ReviewPage]:
         """Open a page for as long as the block lasts; at its end no error may have been heard."""
-        context = self.browser.new_context(viewport={"width": width, "height": height})
+        # Half the pixels a side: a processor draws them all.
+        context = self.browser.new_context(
+            viewport={"width": width, "height": height}, device_scale_factor=0.5
+        )
         opened = ReviewPage(context, url)
         try:
             yield opened

@@ -38,6 +38,8 @@ BOX_MARGIN_M = 0.004
 """The box about a highlighted object keeps so far off it [m], not to be lost in its faces."""
 SIGHT_SHARE, SIGHT_COS = 0.7, 0.8
 """Share of the line of sight, and cosine of the angle about it, in which a frustum is hidden."""
+SKY, GROUND_RGB = 4.0, (77, 77, 77)
+"""Light of the sky, and colour of the light from below."""
 FRUSTUM_LINE_M = 0.001
 """Thickness of a frustum's lines [m]."""
 
@@ -76,6 +78,7 @@ class SceneNodes:
         """Send the scene, what is seen at once first; the finer cloud follows in the background."""
         with self._lock:
             self._api.set_up_direction(self._content.look.up)
+            light(self._api, self._content.look.up)
             if self._content.scene.plane is not None:
                 T_world_table = self._content.scene.plane.T_world_table
                 self._grid = add_table(self._api, T_world_table, self._config)
@@ -356,6 +359,17 @@ class SceneNodes:
     def _tell(self, callbacks: list[OnInstance], number: int) -> None:
         for callback in callbacks:
             callback(number)
+
+
+def light(api: viser.SceneApi, up: Array) -> None:
+    """Light a scene from an open sky; `up` (3,) is in world.
+
+    Viser's own photograph of a sky and its maps of shadows cost a browser without a graphics card
+    more than all that is drawn. The sky here has the mean light of that photograph.
+    """
+    api.configure_environment_map(None)
+    api.configure_default_lights(cast_shadow=False)
+    api.add_light_hemisphere("/sky", ground_color=GROUND_RGB, intensity=SKY, position=tuple(up))
 
 
 def add_frustum(

@@ -21,7 +21,7 @@ from realsim.review.content.content import SceneContent
 from realsim.review.content.meshes import glb_of, within_budget
 from realsim.review.content.views import spread
 from realsim.review.drawing.grasp_drawing import gripper_mesh, gripper_scales, linear_rgb
-from realsim.review.drawing.scene_nodes import add_frustum, add_table, box_edges
+from realsim.review.drawing.scene_nodes import add_frustum, add_table, box_edges, light
 
 LABEL_EDGES = (0.0, 0.25, 0.5, 0.75)
 """Lower ends of the classes of p_hold or score that the page can show or hide."""
@@ -73,6 +73,7 @@ def viewer_html(content: SceneContent, scene: Scene, size: StaticSize) -> str:
         try:
             look = content.look
             _build(server.scene, content, scene, size)
+            light(server.scene, look.up)
             server.scene.set_up_direction(look.up)
             server.initial_camera.up = tuple(look.up)
             server.initial_camera.position = tuple(look.position)

@@ -1,6 +1,15 @@
 // The review's page: the address says what is looked at, so that a link shows a colleague the same.
 // The server reads and writes it as an item of the browser's storage that is none: PLACE.
 (() => {
+  const open = HTMLCanvasElement.prototype.getContext, probe = document.createElement("canvas");
+  const drawn = probe.getContext("webgl2") || probe.getContext("webgl");
+  const named = drawn && drawn.getExtension("WEBGL_debug_renderer_info");
+  if (named && /swiftshader|llvmpipe|software/i.test(drawn.getParameter(named.UNMASKED_RENDERER_WEBGL)))
+    // Smoothed edges cost a processor as much as the rest of the scene.
+    HTMLCanvasElement.prototype.getContext = function (kind, wish) {
+      return open.call(this, kind, String(kind).startsWith("webgl") ? { ...wish, antialias: false } : wish);
+    };
+  if (drawn) drawn.getExtension("WEBGL_lose_context")?.loseContext();
   // Keys that come before the scene stands wait for it: only then is somebody there to hear them.
   const waiting = [], stands = () => document.querySelector("[data-realsim-photograph]");
   addEventListener("keydown", (event) => {
@@ -67,8 +76,7 @@
       tab.dispatchEvent(new PointerEvent(kind, { ...where, pointerId: 1, isPrimary: true }));
   }, 200);
   addEventListener("DOMContentLoaded", () => {
-    const canvas = document.createElement("canvas");
-    if (canvas.getContext("webgl2") || canvas.getContext("webgl")) return;
+    if (drawn) return;
     const note = document.createElement("p");
     note.className = "realsim-no-webgl";
     note.textContent = "This browser cannot draw in three dimensions (WebGL is off), so the scene stays "
