@@ -62,6 +62,9 @@ class Browser:
         window = msgspec.msgpack.decode(inner)
         self.messages += window["messages"]
         for message in window["messages"]:
+            if message["type"] == "LocalStorageGetItemRequestMessage":  # it keeps nothing
+                said = {"value": None, "error": None, "request_uuid": message["request_uuid"]}
+                self.send({"type": "LocalStorageGetItemResponseMessage"} | said)
             self._lengths[id(message)] = window["binaryBufferLengths"]
         return True
 

@@ -16,11 +16,9 @@ DRAFTS_KEY = "realsim corrections"
 """Under which it keeps the corrections that were not saved."""
 NAME_WAIT_S = 60.0
 """How long a browser is waited for that does not tell the name it keeps [s]; nothing else waits."""
-PLACE_WAIT_S = 1.5
-"""How long a browser is waited for that does not tell its address [s]."""
-TURNED_WAIT_S = 10.0
-"""How long it may take a browser to do what was sent before [s]: one without a graphics card is
-still drawing then."""
+ANSWER_WAIT_S = 10.0
+"""How long a browser is waited for that does not tell its address or what it keeps, or has not done
+what was sent before [s]: one without a graphics card is still drawing then."""
 
 
 class Draft(msgspec.Struct, frozen=True, kw_only=True):
@@ -51,7 +49,7 @@ class Browser:
     def wait(self) -> None:
         """Wait until the browser has done what was sent before."""
         self._window.client.flush()
-        self._asked(PLACE_KEY, TURNED_WAIT_S)
+        self._asked(PLACE_KEY, ANSWER_WAIT_S)
 
     def name(self) -> str:
         """Return the reviewer's name that it keeps; '' = none."""
@@ -70,7 +68,7 @@ class Browser:
 
     def read_drafts(self) -> None:
         """Take the corrections that the browser keeps; none where they are not understood."""
-        text = self._asked(DRAFTS_KEY, PLACE_WAIT_S) or "[]"
+        text = self._asked(DRAFTS_KEY, ANSWER_WAIT_S) or "[]"
         with contextlib.suppress(msgspec.DecodeError):
             found = msgspec.json.decode(text, type=list[Draft])
             self.drafts = {(d.scene, d.instance): d for d in found}
@@ -87,7 +85,7 @@ class Browser:
     def go_to_place(self) -> bool:
         """Show what the address names; return whether it names a scene that is here."""
         window = self._window
-        place = Place.of(self._asked(PLACE_KEY, PLACE_WAIT_S))
+        place = Place.of(self._asked(PLACE_KEY, ANSWER_WAIT_S))
         names = [s.name for s in window.server.sessions]
         if place.scene not in names:
             return False
