@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -21,15 +20,9 @@ from realsim.review.static.page_nodes import LABEL_EDGES, drawn_grasps, label_cl
 from realsim.review.static.static_page import PageWords, StaticSummary, write_static
 from realsim.store import save_grasps, save_scene
 from registered_sessions import registered_by_hand, table_session
+from tests.support.review_browser import CHROMIUM, WAIT_S, review_browser
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-ARGS = (
-    "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist", "--disable-background-networking", "--no-first-run",
-)  # fmt: skip
 NASTY = "</script><script>document.title='taken'</script> & \"quoted\" <img src=http://e.example/x>"
-WAIT_S = 60.0
-"""How long is waited for a page without a graphics card on a busy machine [s]."""
 MADE = datetime(2026, 1, 2, 3, 4, tzinfo=UTC)
 
 
@@ -189,13 +182,12 @@ def page(
     """A small scene in a small window: nothing here has a graphics card."""
     if CHROMIUM is None:
         pytest.skip("no chromium on this machine")
-    from playwright.sync_api import sync_playwright
-
     path = tmp_path_factory.mktemp("browser") / "scene.html"
     write_static(content, state, path, title=f"Scene {NASTY}", most_points=2000)
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, headless=True, args=ARGS)
-        context = browser.new_context(viewport={"width": 820, "height": 300}, offline=True)
+    with review_browser() as browser:
+        context = browser.browser.new_context(
+            viewport={"width": 820, "height": 300}, offline=True, device_scale_factor=0.5
+        )
         opened = context.new_page()
         opened.said = []
         opened.asked = []
@@ -205,7 +197,6 @@ def page(
         opened.goto(f"file://{path}")
         opened.wait_for_function("document.body.dataset.ready === 'yes'", timeout=WAIT_S * 1e3)
         yield opened
-        browser.close()
 
 
 def inside(page: Any, script: str) -> Any:
