@@ -72,10 +72,8 @@ class Browser:
         """Take what comes until nothing has come for a while; return when the last came [s]."""
         last = time.perf_counter()
         end = last + timeout_s
-        while self.receive(quiet_s):
+        while last <= end and self.receive(quiet_s):
             last = time.perf_counter()
-            if last > end:
-                break
         return last
 
     def until_scene(self, quiet_s: float, timeout_s: float = 240.0) -> None:
@@ -97,10 +95,9 @@ class Browser:
 
     def control(self, label: str, kind: str = "GuiButtonMessage") -> str | None:
         """Return the uuid of the first control whose label begins so; None = there is none."""
-        for message in self.of_type(kind):
-            if str(message["props"].get("label", "")).startswith(label):
-                return str(message["uuid"])
-        return None
+        of_kind = self.of_type(kind)
+        named = (m for m in of_kind if str(m["props"].get("label", "")).startswith(label))
+        return next((str(m["uuid"]) for m in named), None)
 
     def set(self, uuid: str, value: Any) -> None:
         """Press a button, or set a control."""

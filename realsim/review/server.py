@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import viser
 
 from realsim import local_pages
@@ -173,7 +172,7 @@ class ReviewServer:
             )
         local_pages.refuse_foreign_messages(server)
         self._server = server
-        light(server.scene, np.array([0.0, 0.0, 1.0]))
+        light(server.scene, (0.0, 0.0, 1.0))
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         server.on_client_connect(self._came)
         server.on_client_disconnect(self._went)

@@ -65,7 +65,7 @@ def test_levels_nest_and_grow(shown: SceneContent) -> None:
     cloud = shown.cloud
     assert list(cloud.ends) == sorted(set(cloud.ends)) and cloud.ends[-1] == len(cloud)
     assert 100 <= cloud.ends[0] <= CONFIG.coarse_points
-    levels = [cloud.points[cloud.level(k)] for k in range(len(cloud.ends))]
+    levels = [cloud.points[:end] for end in cloud.ends]
     for coarse, fine in pairwise(levels):
         np.testing.assert_array_equal(fine[: len(coarse)], coarse)
     assert len(np.unique(cloud.points, axis=0)) == len(cloud)

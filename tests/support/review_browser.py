@@ -220,10 +220,6 @@ class ReviewPage:
         """Load the page anew."""
         self.page.reload()
 
-    def close(self) -> None:
-        """Close the page."""
-        self.page.close()
-
 
 class ReviewBrowser:
     """A browser in which pages are opened; each in a context of its own, as two people's are."""
@@ -236,9 +232,8 @@ class ReviewBrowser:
     def page(self, url: str, *, width: int = 1000, height: int = 640) -> Generator[ReviewPage]:
         """Open a page for as long as the block lasts; at its end no error may have been heard."""
         # Half the pixels a side: a processor draws them all.
-        context = self.browser.new_context(
-            viewport={"width": width, "height": height}, device_scale_factor=0.5
-        )
+        size = {"width": width, "height": height}
+        context = self.browser.new_context(viewport=size, device_scale_factor=0.5)
         opened = ReviewPage(context, url)
         try:
             yield opened

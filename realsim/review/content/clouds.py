@@ -51,10 +51,6 @@ class LeveledCloud:
         """Return the distance of neighbours among the first `count` points, on a surface [m]."""
         return float(np.sqrt(self.area_m2 / max(1, min(count, len(self)))))
 
-    def level(self, k: int) -> slice:
-        """Return what of the points level k is; -1 = the finest."""
-        return slice(0, self.ends[k])
-
     def pieces(self, most: int, piece: int) -> list[slice]:
         """Return the levels up to about `most` points as messages carry them.
 

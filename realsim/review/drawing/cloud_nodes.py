@@ -13,8 +13,8 @@ from realsim.review.content.clouds import LeveledCloud
 from realsim.review.content.config import SceneConfig
 
 POINT_SHARE = 0.85
-"""Half a point's edge over the distance of neighbours: a surface looks closed. Squares, because round
-points cost a processor three powers for every pixel."""
+"""Half a point's edge over the distance of neighbours: a surface looks closed. Points are square,
+because round ones cost a processor three powers a pixel."""
 PAUSE_S = 0.02
 """Between two pieces [s], and between two looks whether the last one has left: clicks come first.
 """
@@ -107,9 +107,7 @@ class CloudNodes:
         A server's own scene is kept for browsers to come and is never empty: it is not asked.
         """
         buffer = self._buffer()
-        if buffer.persistent_messages or buffer.done:
-            return False
-        return len(buffer.message_from_id) > 0
+        return not (buffer.persistent_messages or buffer.done) and bool(buffer.message_from_id)
 
     def _buffer(self) -> Any:
         """Return viser's queue of messages; it is done when the browser is gone."""

@@ -15,7 +15,7 @@ import viser
 from realsim.arrays import Array, Array32, UInt8
 from realsim.errors import InputError
 from realsim.interop import viser_wxyz_position
-from realsim.records import ObjectModel, View
+from realsim.records import View
 from realsim.rendering.overlay import VERDICT_RGB
 from realsim.review.content.config import SceneConfig
 from realsim.review.content.content import SceneContent
@@ -69,8 +69,8 @@ class SceneNodes:
         self._box: viser.LineSegmentsHandle | None = None
         self._cloud = CloudNodes(api, content.cloud, config)
         self._grasps = GraspNodes(api, config)
-        self._on_object: list[OnInstance] = []
-        self._on_camera: list[OnInstance] = []
+        self._on_object: OnInstance = lambda _: None
+        self._on_camera: OnInstance = lambda _: None
         # The pieces of the cloud come from a thread of their own while buttons are pressed.
         self._lock = threading.RLock()
 
@@ -78,7 +78,6 @@ class SceneNodes:
         """Send the scene, what is seen at once first; the finer cloud follows in the background."""
         with self._lock:
             self._api.set_up_direction(self._content.look.up)
-            light(self._api, self._content.look.up)
             if self._content.scene.plane is not None:
                 T_world_table = self._content.scene.plane.T_world_table
                 self._grid = add_table(self._api, T_world_table, self._config)
@@ -113,14 +112,13 @@ class SceneNodes:
         root = self._root(instance)
         root.wxyz, root.position = viser_wxyz_position(T_world_obj)
 
-    def swap(self, instance: int, model: ObjectModel | int) -> None:
+    def swap(self, instance: int, obj_id: int) -> None:
         """Show another model in an object's place.
 
         Raises:
             InputError: there is no such object or model.
         """
         self._root(instance)
-        obj_id = model if isinstance(model, int) else model.obj_id
         _ = self._content.meshes[obj_id]
         if self._models[instance] == obj_id:
             return
@@ -240,7 +238,7 @@ class SceneNodes:
         handle = self._api.add_glb(
             f"/objects/{instance}/appearance", mesh.glb, cast_shadow=False, receive_shadow=False
         )
-        handle.on_click(lambda _: self._tell(self._on_object, instance))
+        handle.on_click(lambda _: self._on_object(instance))
         self._appearance[instance] = handle
 
     def _add_judged(self, instance: int) -> None:
@@ -250,7 +248,7 @@ class SceneNodes:
             color=VERDICT_RGB[self._verdicts[instance]], flat_shading=True, side="double",
             cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
-        handle.on_click(lambda _: self._tell(self._on_object, instance))
+        handle.on_click(lambda _: self._on_object(instance))
         self._judged[instance] = handle
 
     # --- cloud, cameras, table ----------------------------------------------------------------
@@ -314,7 +312,7 @@ class SceneNodes:
         for view in self._content.shown_views:
             name = f"/cameras/{view.index:06d}"
             handle = add_frustum(self._api, name, view, self._content, self._config)
-            handle.on_click(lambda _, index=view.index: self._tell(self._on_camera, index))
+            handle.on_click(lambda _, index=view.index: self._on_camera(index))
             self._frustums[view.index] = handle
 
     # --- grasps -------------------------------------------------------------------------------
@@ -341,11 +339,11 @@ class SceneNodes:
 
     def on_object(self, callback: OnInstance) -> None:
         """Call back with the instance of an object that is clicked."""
-        self._on_object.append(callback)
+        self._on_object = callback
 
     def on_camera(self, callback: OnInstance) -> None:
         """Call back with the number of the view whose frustum is clicked."""
-        self._on_camera.append(callback)
+        self._on_camera = callback
 
     @property
     def drawn_grasps(self) -> Sequence[tuple[int, int]]:
@@ -356,12 +354,8 @@ class SceneNodes:
         """Call back with instance and row of a grasp that is clicked."""
         self._grasps.on_click(callback)
 
-    def _tell(self, callbacks: list[OnInstance], number: int) -> None:
-        for callback in callbacks:
-            callback(number)
 
-
-def light(api: viser.SceneApi, up: Array) -> None:
+def light(api: viser.SceneApi, up: Array | tuple[float, float, float]) -> None:
     """Light a scene from an open sky; `up` (3,) is in world.
 
     Viser's own photograph of a sky and its maps of shadows cost a browser without a graphics card

@@ -48,7 +48,6 @@ class Browser:
 
     def wait(self) -> None:
         """Wait until the browser has done what was sent before."""
-        self._window.client.flush()
         self._asked(PLACE_KEY, ANSWER_WAIT_S)
 
     def name(self) -> str:

@@ -19,7 +19,7 @@ from realsim.errors import InputError, RealsimError
 from realsim.records import ObjectModel, ObjectPose
 from realsim.review import scene_list
 from realsim.review.content.content import SceneContent
-from realsim.review.drawing.scene_nodes import SceneNodes
+from realsim.review.drawing.scene_nodes import SceneNodes, light
 from realsim.review.journal import Entry
 from realsim.review.refusals import SessionGone, disk_words
 from realsim.review.reviewed_session import ReviewedSession, Standing
@@ -250,6 +250,7 @@ class Window:
                     self._opened.nodes.clear()
                 nodes = SceneNodes(self.client.scene, content, session.config)
                 with self.client.atomic():
+                    light(self.client.scene, content.look.up)
                     nodes.build()
                 nodes.on_object(self._guarded_call(self.select))
                 nodes.on_camera(self._guarded_call(self.views.show_photograph))
