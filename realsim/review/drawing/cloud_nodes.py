@@ -12,9 +12,8 @@ from realsim.errors import InputError
 from realsim.review.content.clouds import LeveledCloud
 from realsim.review.content.config import SceneConfig
 
-POINT_SHARE = 0.85
-"""Half a point's edge over the distance of neighbours: a surface looks closed. Points are square,
-because round ones cost a processor three powers a pixel."""
+POINT_SHARE = 1.0
+"""Size of a point over the distance of neighbours: a surface looks closed."""
 PAUSE_S = 0.02
 """Between two pieces [s], and between two looks whether the last one has left: clicks come first.
 """
@@ -124,7 +123,7 @@ class CloudNodes:
         self._handles.append(
             self._api.add_point_cloud(
                 f"/cloud/{k}", self._cloud.points[piece], shown[piece],
-                point_size=size, point_shape="square", point_shading="flat",
+                point_size=size, point_shape="circle", point_shading="flat",
                 precision="float32",
             )
         )  # fmt: skip
