@@ -33,6 +33,7 @@ from realsim.rendering.embedded.room_light import (
     room_surfaces,
     room_view,
     sample_room,
+    sun_rays,
     tones,
 )
 from realsim.rendering.rays import PlacedMesh, RayScene, rotated
@@ -223,10 +224,9 @@ class PhotoRenderer:
         """Return the light (N, 3) that rays see: with one shadow ray each; see `sample_room`."""
         out, every = empty_samples(len(rays)), np.arange(len(rays))
         sample_room(self._surfaces, view, rays, hits, every, pixel_rad, out)
-        lit = np.isfinite(out.toward_sun[:, 0])
-        start = rotated(out.toward_sun[lit], view.R_sun_world.T) + self._scene.center
-        sun = np.broadcast_to(view.R_sun_world[2].astype(np.float32), start.shape)
-        lit[lit] = ~self._scene.occluded(start, sun)
+        lit = np.zeros(len(rays), np.bool_)
+        to_sun, facing = sun_rays(out.toward_sun, view.R_sun_world.astype(np.float32))
+        lit[facing] = ~self._scene.shadowed(to_sun)
         return lit_colors(out, lit)
 
     def _expose(self, color: Array32, rng: np.random.Generator | None) -> UInt8:

@@ -119,7 +119,7 @@ class RayScene:
         rays = np.empty((len(directions), 6), np.float32)
         rays[:, :3] = origins - self.center
         rays[:, 3:] = directions
-        return self._core.Tensor(rays)
+        return self._core.Tensor.from_numpy(rays)
 
     def first_hits(self, origins: Array, directions: Array32) -> tuple[Array32, Int32]:
         """Return t (N,), inf = nothing, and the placed mesh (N,), -1 = nothing, of rays.
@@ -179,6 +179,10 @@ class RayScene:
             return np.zeros(len(directions), dtype=bool)
         rays = self._rays(origins, directions)
         return self._scene.test_occlusions(rays, tfar=until).numpy()
+
+    def shadowed(self, rays: Array32) -> Mask:
+        """Return (N,) whether rays (N, 6) about `center` meet anything."""
+        return self._scene.test_occlusions(self._core.Tensor.from_numpy(rays)).numpy()
 
 
 def rotated(directions: Array32, R: Array) -> Array32:

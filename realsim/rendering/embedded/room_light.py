@@ -330,6 +330,18 @@ def sample_room(
             sunny[n, k] = light[SUN, k] * (facing * paint[k] + shine)
 
 
+@njit(error_model="numpy")
+def sun_rays(toward_sun: Array32, R: Array32) -> tuple[Array32, Int64]:
+    """Return rays (M, 6) to the sun from where it may shine, and their rows; R (3, 3) sun-world."""
+    rows = np.flatnonzero(~np.isnan(toward_sun[:, 0]))
+    rays = np.empty((len(rows), 6), np.float32)
+    for m in range(len(rows)):
+        x, y, z = toward_sun[rows[m]]
+        for k in range(3):
+            rays[m, k], rays[m, 3 + k] = x * R[0, k] + y * R[1, k] + z * R[2, k], R[2, k]
+    return rays, rows
+
+
 @njit(error_model="numpy", fastmath=FAST)
 def lit_colors(samples: RoomSamples, lit: Mask) -> Array32:
     """Return the light (N, 3) of samples, the sun's part where it shines."""
