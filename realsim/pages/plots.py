@@ -101,7 +101,7 @@ def bars(
     return drawn, ax
 
 
-def png(drawn: Any, software: str | None = None) -> bytes:
+def png(drawn: Any, software: str | None = None, paper: str = "white") -> bytes:
     """Return the figure as PNG, which names its maker; the same figure gives the same bytes."""
     buffer = io.BytesIO()
     engine = drawn.get_layout_engine()
@@ -111,7 +111,7 @@ def png(drawn: Any, software: str | None = None) -> bytes:
         if engine is not None:  # once: savefig would draw all of it in vain before
             engine.execute(drawn)
             drawn.set_layout_engine(None)
-        drawn.savefig(buffer, format="png", facecolor="white", metadata={"Software": software})
+        drawn.savefig(buffer, format="png", facecolor=paper, metadata={"Software": software})
     return buffer.getvalue()
 
 

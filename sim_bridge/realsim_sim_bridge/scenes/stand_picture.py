@@ -30,11 +30,9 @@ def stand_picture(scene: SchoolScene, report: StandReport) -> bytes:
 
     Table's frame, millimetres.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 12), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
     meshes = {i: _light(m.mesh) for i, m in scene.models.items()}
     axes: Any = figure.subplots(len(VIEWS), 1, sharex=True)
     for ax, (title, right, up, along) in zip(axes, VIEWS, strict=True):
@@ -56,12 +54,9 @@ def stand_picture(scene: SchoolScene, report: StandReport) -> bytes:
 
 def _light(mesh: Mesh) -> Mesh:
     """Return the bare surface, thinned out where it is fine."""
-    mesh = welded_mesh(mesh)
-    if len(mesh.faces) <= MOST_FACES:
-        return mesh
     from realsim.models.simplify import simplified
 
-    return simplified(mesh, MOST_FACES)
+    return simplified(welded_mesh(mesh), MOST_FACES)
 
 
 def _draw(
@@ -77,7 +72,7 @@ def _draw(
         for T in (stand.T_world_before, stand.T_world_after)
     )
     flat = after[mesh.faces][:, :, [right, up]]
-    ax.add_collection(PolyCollection(list(flat), facecolors=color, edgecolors="none", alpha=0.25))
+    ax.add_collection(PolyCollection(flat, facecolors=color, edgecolors="none", alpha=0.25))
     lines = outline(after, mesh.faces, along)[:, :, [right, up]]
     ax.add_collection(LineCollection(list(lines), colors=color, linewidths=0.8))
     if is_moved:

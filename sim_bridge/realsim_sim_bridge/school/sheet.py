@@ -5,7 +5,6 @@ are distributed; below, every object with its grasps as small hands, red to gree
 dashed where it is of few draws.
 """
 
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,6 +15,7 @@ from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.formats.grasps.scene_grasps import labelled
 from realsim.models.model_picture_views import INK, MUTED, PAPER
+from realsim.pages.plots import png
 from realsim.records import GraspSet, ObjectModel
 from realsim.records.grasps import label_words
 from realsim.rendering.overlay import score_hex, score_rgb
@@ -70,11 +70,7 @@ def school_sheet(
     Raises:
         InputError: an object has no model, or there are more than 60.
     """
-    figure = sheet_figure(sets, models, title, Ts_up_obj or {})
-    buffer = io.BytesIO()
-    # Without the software's name the same sets give the same bytes.
-    figure.savefig(buffer, format="png", metadata={"Software": None}, facecolor=PAPER)
-    return buffer.getvalue()
+    return png(sheet_figure(sets, models, title, Ts_up_obj or {}), paper=PAPER)
 
 
 def sheet_figure(
