@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
-from scipy.stats import qmc
 
 from realsim.arrays import Array, Mask, Rows
 from realsim.errors import InputError
@@ -384,6 +383,8 @@ def covariance_root(covariance: Array) -> Array:
 @lru_cache(maxsize=4)
 def _normals(count: int, seed: int) -> Array:
     """Return standard normal numbers (K, 14), spread evenly (Sobol), the same for every object."""
+    from scipy.stats import qmc  # takes longer to load than all else here
+
     sobol = qmc.Sobol(14, scramble=True, rng=np.random.default_rng(seed))
     uniform = sobol.random_base2(int(np.ceil(np.log2(count))))[:count]
     return np.asarray(ndtri(np.clip(uniform, 1e-9, 1.0 - 1e-9)))
