@@ -1,7 +1,5 @@
 """Find a whole chessboard: OpenCV says which corners, the saddles say where."""
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
 from realsim.arrays import Array, Mask, UInt8
@@ -20,30 +18,22 @@ LINE_SHARE = 0.6
 """Share of a line that must be corners for it to be part of a chessboard."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ChessboardConfig:
-    """When a chessboard is good enough to calibrate with."""
-
-    saddles: SaddleConfig = field(default_factory=SaddleConfig)
-    """How corners are measured."""
-    search_px: int = 1600
-    """Larger images are searched at this width or height first; corners are always measured in the
-    full image."""
-    min_share: float = 0.7
-    """Least share of the corners that must be measurable; fewer mean glare or a wrong grid."""
-    look_for_twins: bool = True
-    """Search once more beside the board found: of two equal boards neither can be trusted."""
-    twin_square_px: float = 28.0
-    """For that search the picture is halved until squares like those found are narrower; OpenCV
-    finds squares of 8 px, so a twin may stand 1.7 times as far away at least."""
+SADDLES = SaddleConfig()
+"""How corners are measured."""
+SEARCH_PX = 1600
+"""Larger images are searched at this width or height first; corners are always measured in the
+full image."""
+MIN_SHARE = 0.7
+"""Least share of the corners that must be measurable; fewer mean glare or a wrong grid."""
+LOOK_FOR_TWINS = True
+"""Search once more beside the board found: of two equal boards neither can be trusted."""
+TWIN_SQUARE_PX = 28.0
+"""For that search the picture is halved until squares like those found are narrower; OpenCV
+finds squares of 8 px, so a twin may stand 1.7 times as far away at least."""
 
 
 def find_chessboard(
-    rgb: UInt8,
-    board: Chessboard,
-    config: ChessboardConfig | None = None,
-    *,
-    intrinsics: CameraIntrinsics | None = None,
+    rgb: UInt8, board: Chessboard, *, intrinsics: CameraIntrinsics | None = None
 ) -> TargetDetection:
     """Return the inner corners of a chessboard that is seen as a whole.
 
@@ -53,21 +43,20 @@ def find_chessboard(
     Raises:
         InputError: the image is not 8 bit.
     """
-    config = config or ChessboardConfig()
     gray = gray_image(rgb)
-    grid, fault = _whole(gray, board, config)
+    grid, fault = _whole(gray, board)
     if grid is None:
         return _nothing(gray, fault)
-    found = _measured(gray, grid, config, intrinsics)
+    found = _measured(gray, grid, intrinsics)
     lost = _lost_line(found.good.reshape(grid.shape[:2]))
     exact = _classic(gray, board) if lost else None
     if exact is not None:
-        found = _measured(gray, exact, config, intrinsics)
+        found = _measured(gray, exact, intrinsics)
         lost = _lost_line(found.good.reshape(exact.shape[:2]))
     faults = tuple(f"corner {k}: {f}" for k, f in enumerate(found.faults) if f)
     if lost:
         return _nothing(gray, lost, *faults[:3])
-    if found.good.mean() < config.min_share:
+    if found.good.mean() < MIN_SHARE:
         share = f"{int(found.good.sum())} of {len(found.good)} corners could be measured"
         return _nothing(gray, share, *faults[:3])
     return TargetDetection(
@@ -79,9 +68,7 @@ def find_chessboard(
     )
 
 
-def _measured(
-    gray: UInt8, grid: Array, config: ChessboardConfig, intrinsics: CameraIntrinsics | None
-) -> Saddles:
+def _measured(gray: UInt8, grid: Array, intrinsics: CameraIntrinsics | None) -> Saddles:
     """Return the corners of a grid, numbered and measured."""
     grid, dark = number_corners(gray, grid)
     r, c = np.divmod(np.arange(grid.shape[0] * grid.shape[1]), grid.shape[1])
@@ -91,7 +78,7 @@ def _measured(
         grid_arms(grid).reshape(-1, 4, 2),
         ((r + c) % 2 == 0) == dark,
         1.0,
-        config.saddles,
+        SADDLES,
         intrinsics,
     )
 
@@ -118,10 +105,10 @@ def _nothing(gray: UInt8, *reasons: str) -> TargetDetection:
     )
 
 
-def _whole(gray: UInt8, board: Chessboard, config: ChessboardConfig) -> tuple[Array | None, str]:
+def _whole(gray: UInt8, board: Chessboard) -> tuple[Array | None, str]:
     """Return the corners (rows, columns, 2) in an order of the right shape, or what is wrong."""
     shapes = {(board.rows, board.columns), (board.columns, board.rows)}
-    grid = largest_chessboard(gray, config.search_px)
+    grid = largest_chessboard(gray, SEARCH_PX)
     if grid is not None and grid.shape[:2] not in shapes and not _fits_in(grid, board):
         grid = _without_clutter(gray, grid)
     if grid is None or (grid.shape[:2] not in shapes and _fits_in(grid, board)):
@@ -140,8 +127,8 @@ def _whole(gray: UInt8, board: Chessboard, config: ChessboardConfig) -> tuple[Ar
             f"the picture shows a chessboard of {max(grid.shape[:2])}x{min(grid.shape[:2])} inner "
             f"corners, not of {board.columns}x{board.rows}: correct rows and columns"
         )
-    if config.look_for_twins:
-        other = largest_chessboard(*_for_twins(_covered(gray, grid), grid, config))
+    if LOOK_FOR_TWINS:
+        other = largest_chessboard(*_for_twins(_covered(gray, grid), grid))
         if other is not None and other.shape[:2] in shapes:
             return None, "two equal chessboards are in view: cover one"
     if grid.shape[:2] != (board.rows, board.columns):
@@ -220,14 +207,14 @@ def _sizes(gray: UInt8, search_px: float) -> list[tuple[UInt8, float]]:
     return [(small, float(scale)), (gray, 1.0)]
 
 
-def _for_twins(gray: UInt8, grid: Array, config: ChessboardConfig) -> tuple[UInt8, int]:
+def _for_twins(gray: UInt8, grid: Array) -> tuple[UInt8, int]:
     """Return the picture, shrunk as far as squares like the grid's stay large, and its search size.
 
     Most pictures have no second board, and a search for none costs as much as one for the first.
     """
     square = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=-1)))
-    small, _ = _sizes(gray, max(gray.shape) * config.twin_square_px / max(square, 1.0))[0]
-    return small, min(config.search_px, max(small.shape))
+    small, _ = _sizes(gray, max(gray.shape) * TWIN_SQUARE_PX / max(square, 1.0))[0]
+    return small, min(SEARCH_PX, max(small.shape))
 
 
 def _covered(gray: UInt8, grid: Array) -> UInt8:

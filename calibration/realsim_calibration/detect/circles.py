@@ -1,7 +1,7 @@
 """Find a whole grid of dots, number it, and measure where the dots' middles are seen."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,13 +9,7 @@ from realsim.arrays import Array, Int64, UInt8
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import CircleGrid
 from realsim_calibration.detect.edges import bend, straighten
-from realsim_calibration.detect.ellipses import (
-    DotConfig,
-    Dots,
-    find_blobs,
-    outline_bias,
-    refine_dots,
-)
+from realsim_calibration.detect.ellipses import Dots, find_blobs, outline_bias, refine_dots
 from realsim_calibration.detect.homography import apply_homography, fit_homography, seen_from_front
 from realsim_calibration.detect.images import gray_image, size_of
 from realsim_calibration.detect.lattice import Laid, Node, grow_lattices, lay_pattern
@@ -31,8 +25,6 @@ MIN_CUBIC = 30
 class CirclesConfig:
     """When a circle grid is good enough to calibrate with."""
 
-    dots: DotConfig = field(default_factory=DotConfig)
-    """What counts as a dot, and how it is measured."""
     large_area: float = 1.6
     """Least area of the large origin dot in others' areas."""
     max_misfit: float = 0.25
@@ -102,7 +94,7 @@ def _of_one_shade(
     gray: UInt8, grid: CircleGrid, config: CirclesConfig, intrinsics: CameraIntrinsics | None
 ) -> tuple[TargetDetection | None, str]:
     """Return the grid of dark dots, or why there is none."""
-    middles, axes = find_blobs(gray, config.dots)
+    middles, axes = find_blobs(gray)
     sizes = np.abs(np.linalg.det(axes))
     lattice, laid = _best_fit(grow_lattices(middles, sizes), grid)
     total = grid.rows * grid.columns
@@ -128,7 +120,7 @@ def _of_one_shade(
                 reason = "the large dot is at the wrong corner: is the picture mirrored?"
         return None, reason
     middles, axes = middles[points], axes[points]
-    dots = refine_dots(gray, middles, axes, _gaps(middles, axes), config.dots)
+    dots = refine_dots(gray, middles, axes, _gaps(middles, axes))
     return _measured(gray, dots, grid, config, intrinsics)
 
 

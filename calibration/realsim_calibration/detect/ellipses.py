@@ -30,51 +30,47 @@ FIRST_NOISE = 4.0
 """Noise for the prior's weight before it is measured [gray levels]."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DotConfig:
-    """What counts as a dot, and how its outline is measured."""
-
-    min_radius_px: float = 1.8
-    """Shortest half axis of a dot [px]: below it the blur has eaten it."""
-    max_area_share: float = 0.02
-    """Largest dot as a share of the image."""
-    max_misfit: float = 0.12
-    """How far area and second moments may depart from an ellipse's; small dots are ragged."""
-    max_flatness: float = 4.5
-    """Longest half axis in shortest ones: a dot seen at 77 deg."""
-    windows: tuple[float, ...] = (0.02, 0.06, 0.18)
-    """Windows of the local threshold as shares of the longer image side, small dots to large."""
-    threshold: float = 8.0
-    """A dot is darker than its window's mean by this [gray levels of 255]."""
-    profiles: int = 32
-    """Gray profiles about a dot; a multiple of four."""
-    samples: int = 13
-    """Samples per profile."""
-    half_window_px: float = 3.5
-    """Longest reach of a profile [px]."""
-    min_half_window_px: float = 1.5
-    """Shortest reach of a profile [px]."""
-    radius_share: float = 0.85
-    """Reach of a profile in shortest half axes: the opposite edge stays out of view."""
-    passes: int = 3
-    """Measure about the refined outline this often."""
-    outlier_sigmas: float = 3.0
-    """Edge points further than this off the ellipse are dropped."""
-    residual_floor_px: float = 0.03
-    """Least scatter for the outlier rule [px]."""
-    independent_px: float = 1.3
-    """Profiles closer than this share their noise [px]; enters the predicted error alone."""
-    min_contrast: float = 15.0
-    """Least step across the outline [gray levels of 255]."""
-    max_residual_px: float = 0.6
-    """Largest scatter of the outline about the ellipse [px]: beyond it the dot is covered."""
-    small_px: float = 12.0
-    """Dots up to this half axis are fitted to all their pixels, larger ones by their outline, where
-    the gain is small and the cost is not [px]."""
-    max_apart_px: float = 0.7
-    """Furthest that the two fits' middles may lie apart [px]: more, and the dot is covered."""
-    smoothing_px: float = 0.8
-    """Sigma of the smoothing before dots are looked for [px]: noise makes specks otherwise."""
+MIN_RADIUS_PX = 1.8
+"""Shortest half axis of a dot [px]: below it the blur has eaten it."""
+MAX_AREA_SHARE = 0.02
+"""Largest dot as a share of the image."""
+MAX_MISFIT = 0.12
+"""How far area and second moments may depart from an ellipse's; small dots are ragged."""
+MAX_FLATNESS = 4.5
+"""Longest half axis in shortest ones: a dot seen at 77 deg."""
+WINDOWS = (0.02, 0.06, 0.18)
+"""Windows of the local threshold as shares of the longer image side, small dots to large."""
+THRESHOLD = 8.0
+"""A dot is darker than its window's mean by this [gray levels of 255]."""
+PROFILES = 32
+"""Gray profiles about a dot; a multiple of four."""
+SAMPLES = 13
+"""Samples per profile."""
+HALF_WINDOW_PX = 3.5
+"""Longest reach of a profile [px]."""
+MIN_HALF_WINDOW_PX = 1.5
+"""Shortest reach of a profile [px]."""
+RADIUS_SHARE = 0.85
+"""Reach of a profile in shortest half axes: the opposite edge stays out of view."""
+PASSES = 3
+"""Measure about the refined outline this often."""
+OUTLIER_SIGMAS = 3.0
+"""Edge points further than this off the ellipse are dropped."""
+RESIDUAL_FLOOR_PX = 0.03
+"""Least scatter for the outlier rule [px]."""
+INDEPENDENT_PX = 1.3
+"""Profiles closer than this share their noise [px]; enters the predicted error alone."""
+MIN_CONTRAST = 15.0
+"""Least step across the outline [gray levels of 255]."""
+MAX_RESIDUAL_PX = 0.6
+"""Largest scatter of the outline about the ellipse [px]: beyond it the dot is covered."""
+SMALL_PX = 12.0
+"""Dots up to this half axis are fitted to all their pixels, larger ones by their outline, where
+the gain is small and the cost is not [px]."""
+MAX_APART_PX = 0.7
+"""Furthest that the two fits' middles may lie apart [px]: more, and the dot is covered."""
+SMOOTHING_PX = 0.8
+"""Sigma of the smoothing before dots are looked for [px]: noise makes specks otherwise."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -96,24 +92,24 @@ class Dots:
         return np.pi * np.abs(np.linalg.det(self.axes))
 
 
-def find_blobs(gray: UInt8, config: DotConfig) -> tuple[Array, Array]:
+def find_blobs(gray: UInt8) -> tuple[Array, Array]:
     """Return middles (n, 2) and axes (n, 2, 2) of dark ellipses in an image, roughly [px]."""
     import cv2
 
     found: list[tuple[float, Array, Array]] = []
-    gray = np.asarray(cv2.GaussianBlur(gray, (0, 0), config.smoothing_px), dtype=np.uint8)
-    for window in config.windows:
+    gray = np.asarray(cv2.GaussianBlur(gray, (0, 0), SMOOTHING_PX), dtype=np.uint8)
+    for window in WINDOWS:
         block = max(5, 2 * round(window * max(gray.shape) / 2) + 1)
         dark = cv2.adaptiveThreshold(
-            gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, block, config.threshold
+            gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, block, THRESHOLD
         )
         # Two levels: outlines of dark regions have no parent, outlines of holes in them have one.
         contours, tree = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-        most = config.max_area_share * gray.size
+        most = MAX_AREA_SHARE * gray.size
         for k, contour in enumerate(contours):
             if tree[0][k][3] >= 0 or len(contour) < MIN_OUTLINE:
                 continue
-            blob = _ellipse_of(cv2.moments(contour), most, config)
+            blob = _ellipse_of(cv2.moments(contour), most)
             if blob is not None:
                 found.append(blob)
     found.sort(key=lambda blob: blob[0])
@@ -125,27 +121,25 @@ def find_blobs(gray: UInt8, config: DotConfig) -> tuple[Array, Array]:
     return middles, axes
 
 
-def _ellipse_of(
-    m: dict[str, float], most: float, config: DotConfig
-) -> tuple[float, Array, Array] | None:
+def _ellipse_of(m: dict[str, float], most: float) -> tuple[float, Array, Array] | None:
     """Return (misfit, middle, A) of the ellipse with an outline's moments, None if it is none."""
     area = m["m00"]
-    if not (0.5 * np.pi * config.min_radius_px**2 < area < most):
+    if not (0.5 * np.pi * MIN_RADIUS_PX**2 < area < most):
         return None
     C = np.array([[m["mu20"], m["mu11"]], [m["mu11"], m["mu02"]]]) / area
     small, large = np.linalg.eigvalsh(C)
-    if small <= 0 or large > config.max_flatness**2 * small:
+    if small <= 0 or large > MAX_FLATNESS**2 * small:
         return None
     misfit = abs(area / (4 * np.pi * np.sqrt(small * large)) - 1)
     # The outline runs through pixel centres, so that the dot is half a pixel larger.
     axes = 2 * np.sqrt([small, large]) + 0.5
-    if misfit > config.max_misfit or axes[0] < config.min_radius_px:
+    if misfit > MAX_MISFIT or axes[0] < MIN_RADIUS_PX:
         return None
     V = np.linalg.eigh(C)[1]
     return misfit, np.array([m["m10"], m["m01"]]) / area, (V * axes) @ V.T
 
 
-def refine_dots(gray: UInt8, middles: Array, axes: Array, gap: Array, config: DotConfig) -> Dots:
+def refine_dots(gray: UInt8, middles: Array, axes: Array, gap: Array) -> Dots:
     """Return the dots' outlines, to a few hundredths of a pixel.
 
     Args:
@@ -153,50 +147,47 @@ def refine_dots(gray: UInt8, middles: Array, axes: Array, gap: Array, config: Do
         middles: (n, 2) rough middles [px].
         axes: (n, 2, 2) rough A of c + A (cos, sin) [px].
         gap: (n,) white space to the next dot [px].
-        config: how outlines are measured.
     """
     image = gray.astype(np.float64)
-    n, m = len(middles), config.profiles // 4
+    n, m = len(middles), PROFILES // 4
     uv, A = middles.copy(), axes.copy()
     angle = np.linspace(0, 2 * np.pi, 4 * m, endpoint=False)
     u = np.stack([np.cos(angle), np.sin(angle)], -1)
     blur = None
     rms, share, sd, contrast = (np.zeros(n) for _ in range(4))
-    for _ in range(config.passes):
+    for _ in range(PASSES):
         normal = u @ np.linalg.inv(A)
         normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
         foot = uv[:, None] + u @ A
         radius = np.linalg.eigvalsh(A)[:, 0]
-        reach = np.minimum(config.radius_share * radius, 0.5 * gap)
-        reach = np.clip(reach, config.min_half_window_px, config.half_window_px)
-        t = np.linspace(-1.0, 1.0, config.samples) * reach[:, None]
+        reach = np.minimum(RADIUS_SHARE * radius, 0.5 * gap)
+        reach = np.clip(reach, MIN_HALF_WINDOW_PX, HALF_WINDOW_PX)
+        t = np.linspace(-1.0, 1.0, SAMPLES) * reach[:, None]
         profiles = bilinear(image, foot[:, :, None] + t[:, None, :, None] * normal[:, :, None])
         t4 = np.repeat(t[:, None], 4, axis=1)
         far = np.full((n, 4), NO_PATTERN_PX)
-        shift, step, blur = fit_blurred_steps(
-            t4, profiles.reshape(n, 4, m, config.samples), far, blur
-        )
+        shift, step, blur = fit_blurred_steps(t4, profiles.reshape(n, 4, m, SAMPLES), far, blur)
         shift, step = shift.reshape(n, 4 * m), step.reshape(n, 4 * m)
         contrast = np.median(step, axis=-1)
         usable = (np.abs(shift) < 0.9 * reach[:, None]) & (step > 0.3 * contrast[:, None])
-        change, weight, rms = _fit_change(u, normal, shift, usable, config)
+        change, weight, rms = _fit_change(u, normal, shift, usable)
         uv = uv + change[:, :2]
         A = A + _symmetric(change[:, 2:])
         share = weight.mean(-1)
-        independent = np.minimum(weight.sum(-1), 2 * np.pi * radius / config.independent_px)
+        independent = np.minimum(weight.sum(-1), 2 * np.pi * radius / INDEPENDENT_PX)
         sd = rms * np.sqrt(2.0 / np.maximum(independent, 1.0))
     assert blur is not None
-    faults = list(_faults(uv, middles, A, (rms, share, contrast), gray.shape, config))
+    faults = list(_faults(uv, middles, A, (rms, share, contrast), gray.shape))
     small = np.array([not f for f in faults], dtype=bool)
-    small &= np.linalg.eigvalsh(A)[:, 1] <= config.small_px
+    small &= np.linalg.eigvalsh(A)[:, 1] <= SMALL_PX
     if small.any():
         k = np.flatnonzero(small)
-        margin = np.clip(0.5 * gap[k], config.min_half_window_px, config.half_window_px)
+        margin = np.clip(0.5 * gap[k], MIN_HALF_WINDOW_PX, HALF_WINDOW_PX)
         fit = fit_small_dots(image, uv[k], A[k], blur[k], margin)
         apart = np.linalg.norm(fit.uv - uv[k], axis=-1)
-        for i in np.flatnonzero(~(apart <= config.max_apart_px)):
+        for i in np.flatnonzero(~(apart <= MAX_APART_PX)):
             faults[k[i]] = f"outline and inside disagree by {apart[i]:.1f} px: covered?"
-        kept = apart <= config.max_apart_px
+        kept = apart <= MAX_APART_PX
         uv[k[kept]], A[k[kept]], sd[k[kept]] = fit.uv[kept], fit.axes[kept], fit.sd_px[kept]
     return Dots(uv=uv, axes=A, sd_px=sd, faults=tuple(faults))
 
@@ -206,9 +197,7 @@ def _symmetric(c: Array) -> Array:
     return np.stack([np.stack([c[:, 0], c[:, 1]], -1), np.stack([c[:, 1], c[:, 2]], -1)], 1)
 
 
-def _fit_change(
-    u: Array, normal: Array, shift: Array, usable: Mask, config: DotConfig
-) -> tuple[Array, Array, Array]:
+def _fit_change(u: Array, normal: Array, shift: Array, usable: Mask) -> tuple[Array, Array, Array]:
     """Return the change (n, 5) of middle and A that moves the outline by `shift`.
 
     And the weights (n, m), 0 or 1, and the RMS that remains (n,) [px].
@@ -223,20 +212,15 @@ def _fit_change(
         change = np.linalg.solve(H, np.swapaxes(Jw, 1, 2) @ shift[..., None])[..., 0]
         residual = shift - (J @ change[..., None])[..., 0]
         scale = MAD_TO_SIGMA * np.median(np.abs(residual), axis=-1, keepdims=True)
-        scale = np.maximum(scale, config.residual_floor_px)
-        weight = (usable & (np.abs(residual) <= config.outlier_sigmas * scale)).astype(np.float64)
+        scale = np.maximum(scale, RESIDUAL_FLOOR_PX)
+        weight = (usable & (np.abs(residual) <= OUTLIER_SIGMAS * scale)).astype(np.float64)
     rms = np.sqrt((weight * residual**2).sum(-1) / np.maximum(weight.sum(-1) - 5, 1.0))
     limited = np.clip(change, -2.0, 2.0).astype(np.float64)
     return limited, weight, np.asarray(rms, dtype=np.float64)
 
 
 def _faults(
-    uv: Array,
-    start: Array,
-    A: Array,
-    seen: tuple[Array, Array, Array],
-    shape: tuple[int, ...],
-    config: DotConfig,
+    uv: Array, start: Array, A: Array, seen: tuple[Array, Array, Array], shape: tuple[int, ...]
 ) -> tuple[str, ...]:
     """Return why each dot cannot be used, '' where it can."""
     rms, share, contrast = seen
@@ -250,12 +234,12 @@ def _faults(
         # Written as "is it good", so that a NaN is a fault.
         checks = (
             (inside, "cut by the image border"),
-            (contrast[k] >= config.min_contrast,
-             f"low contrast: {contrast[k]:.0f} levels (at least {config.min_contrast:g})"),
-            (small[k] >= 0.7 * config.min_radius_px, "too small"),
+            (contrast[k] >= MIN_CONTRAST,
+             f"low contrast: {contrast[k]:.0f} levels (at least {MIN_CONTRAST:g})"),
+            (small[k] >= 0.7 * MIN_RADIUS_PX, "too small"),
             (share[k] >= 0.6, f"covered or broken: {share[k]:.0%} of its outline fits"),
-            (rms[k] <= config.max_residual_px,
-             f"outline scatters by {rms[k]:.2f} px (at most {config.max_residual_px:g})"),
+            (rms[k] <= MAX_RESIDUAL_PX,
+             f"outline scatters by {rms[k]:.2f} px (at most {MAX_RESIDUAL_PX:g})"),
             (moved <= 0.5 * large[k], f"outline lies {moved:.1f} px from the blob"),
         )  # fmt: skip
         faults.append(next((reason for good, reason in checks if not good), ""))

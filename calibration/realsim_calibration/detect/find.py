@@ -10,7 +10,7 @@ from realsim.records import CameraIntrinsics
 from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim_calibration.detect.blur import blur_reason
 from realsim_calibration.detect.charuco import CharucoConfig, find_charuco
-from realsim_calibration.detect.chessboard import ChessboardConfig, find_chessboard
+from realsim_calibration.detect.chessboard import find_chessboard
 from realsim_calibration.detect.circles import CirclesConfig, find_circles
 from realsim_calibration.detect.drawings import drawing_reason
 from realsim_calibration.detect.images import gray_image, size_of
@@ -29,8 +29,6 @@ class FindConfig:
     """Boards of AprilTags."""
     charuco: CharucoConfig = field(default_factory=CharucoConfig)
     """ChArUco boards."""
-    chessboard: ChessboardConfig = field(default_factory=ChessboardConfig)
-    """Plain chessboards."""
     circles: CirclesConfig = field(default_factory=CirclesConfig)
     """Grids of dots."""
 
@@ -86,7 +84,7 @@ def _points(
     if isinstance(target, CharucoBoard):
         return find_charuco(gray, target, config.charuco, intrinsics=intrinsics)
     if isinstance(target, Chessboard):
-        return find_chessboard(gray, target, config.chessboard, intrinsics=intrinsics)
+        return find_chessboard(gray, target, intrinsics=intrinsics)
     assert isinstance(target, CircleGrid)
     return find_circles(gray, target, config.circles, intrinsics=intrinsics)
 

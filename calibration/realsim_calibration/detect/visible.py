@@ -8,7 +8,7 @@ from realsim.arrays import Array, Int64, UInt8
 from realsim.records import CharucoBoard
 from realsim_calibration.detect.charuco import CharucoConfig, markers_on_board
 from realsim_calibration.detect.chessboard import largest_chessboard
-from realsim_calibration.detect.ellipses import DotConfig, find_blobs
+from realsim_calibration.detect.ellipses import find_blobs
 from realsim_calibration.detect.images import gray_image
 from realsim_calibration.detect.lattice import grow_lattices, unimodular
 from realsim_calibration.detect.markers import (
@@ -176,7 +176,7 @@ def _dots(gray: UInt8) -> tuple[str, int]:
     """Return the grid of dots in words, '' where there is none, and how many there are."""
     best: dict[tuple[int, int], int] = {}
     for shade in (gray, 255 - gray):
-        middles, axes = find_blobs(np.asarray(shade, dtype=np.uint8), DotConfig())
+        middles, axes = find_blobs(np.asarray(shade, dtype=np.uint8))
         for lattice in grow_lattices(middles, np.abs(np.linalg.det(axes))):
             radius = np.sqrt(np.abs(np.linalg.det(axes[list(lattice.values())])))
             if np.median(np.abs(radius / np.median(radius) - 1)) <= SIZE_SPREAD:

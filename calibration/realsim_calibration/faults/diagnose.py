@@ -17,6 +17,7 @@ from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Target
+from realsim_calibration.faults import pairing
 from realsim_calibration.faults.copied_views import Copies, find_copies
 from realsim_calibration.faults.diagnosis import (
     Diagnosis,
@@ -159,7 +160,7 @@ def _without_copies(
     if doubtful and len(sure) > MIN_VIEWS:
         fit = p.fit(p.T[sure], p.C[sure], config)
         errors = np.diag(mismatch(fit, hand_side(p.T, p.eye_in_hand), p.C, config.fit))
-        gate = max(config.pairing.ratio * fit.usual, config.pairing.swap_floor)
+        gate = max(pairing.RATIO * fit.usual, pairing.SWAP_FLOOR)
         for kind in ("frozen_pose", "repeated_image"):
             for group in groups[kind]:
                 best = min(group, key=lambda k: errors[k])
@@ -197,7 +198,7 @@ def _search(
     given = simple(p, "none", "as given", p.T, p.C, config)
     if (reason := _untestable(p, config)) is not None:
         return replace(given, fault="untestable", sentence=reason[0], advice=reason[1]), [given]
-    if given.score <= config.sure_score and given.fit.errors.max() <= config.pairing.floor:
+    if given.score <= config.sure_score and given.fit.errors.max() <= pairing.FLOOR:
         return _sound(p, given, nominal, config), [given]
     tried = [inverted(p, config), *mirrored(p, config)]
     tried += [h for h in (flipped_boards(p, config), paired_otherwise(p, config), moved(p, config))
@@ -218,7 +219,7 @@ def _search(
             f"{_mm(given)}; so {best.fit.usual_deg:.2f} deg, {_mm(best)}."
         )
         if best.fault == "tool_change" and nominal is not None:
-            offset = tool_offset(p.T, nominal, config.tool)
+            offset = tool_offset(p.T, nominal)
             if offset.known and len(offset.offsets) > 1:
                 figures += f" {offset.sentence}"
         return replace(best, sentence=best.sentence + figures), listed
@@ -324,7 +325,7 @@ def _sound(
 
 def _with_tool(p: Poses, none: Hypothesis, nominal: Array, config: DiagnosisConfig) -> Hypothesis:
     """Return what the nominal kinematics add to sound poses."""
-    offset = tool_offset(p.T, nominal, config.tool)
+    offset = tool_offset(p.T, nominal)
     fault: Fault = "none"
     if offset.known and offset.active:
         fault = "tool_change" if len(offset.offsets) > 1 else "tool_offset"

@@ -6,10 +6,6 @@ from typing import Literal
 from realsim.arrays import Array, Int64
 from realsim_calibration.faults.frame_fit import FitConfig
 from realsim_calibration.faults.gates import GateConfig
-from realsim_calibration.faults.half_turns import HalfTurnConfig
-from realsim_calibration.faults.pairing import PairingConfig
-from realsim_calibration.faults.rotation_readings import ReadingConfig
-from realsim_calibration.faults.tool_offset import ToolOffsetConfig
 from realsim_calibration.results import Mode
 
 Fault = Literal[
@@ -71,10 +67,6 @@ class DiagnosisConfig:
     decisive: float = 3.0
     """A reading of a pose file is proven when the next one fits this many times worse."""
     fit: FitConfig = field(default_factory=FitConfig)
-    pairing: PairingConfig = field(default_factory=PairingConfig)
-    half_turns: HalfTurnConfig = field(default_factory=HalfTurnConfig)
-    readings: ReadingConfig = field(default_factory=ReadingConfig)
-    tool: ToolOffsetConfig = field(default_factory=ToolOffsetConfig)
     gates: GateConfig = field(default_factory=GateConfig)
 
 

@@ -20,19 +20,14 @@ from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class HalfTurnConfig:
-    """How the turns are decided."""
-
-    soft_deg: float = 0.5
-    """Differences of angle below this say nothing [deg]: the angle error of a planar pose."""
-    sweeps: int = 5
-    """Passes over the views in which each is turned once more if that fits better."""
-    decisive_ratio: float = 5.0
-    """The angles must fit this many times better after than before."""
-    max_after_deg: float = 2.0
-    """Median angle over the pairs to which they must fit [deg]: right data measure 0.1 to 0.6."""
+SOFT_DEG = 0.5
+"""Differences of angle below this say nothing [deg]: the angle error of a planar pose."""
+SWEEPS = 5
+"""Passes over the views in which each is turned once more if that fits better."""
+DECISIVE_RATIO = 5.0
+"""The angles must fit this many times better after than before."""
+MAX_AFTER_DEG = 2.0
+"""Median angle over the pairs to which they must fit [deg]: right data measure 0.1 to 0.6."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -59,10 +54,7 @@ def half_turn(middle_m: ArrayLike) -> Array:
 
 
 def synchronise_half_turns(
-    Ts_base_ee: ArrayLike,
-    Ts_cam_board: ArrayLike,
-    middle_m: ArrayLike,
-    config: HalfTurnConfig | None = None,
+    Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike, middle_m: ArrayLike
 ) -> HalfTurns:
     """Return which boards were read turned, from the angles between the views alone.
 
@@ -70,12 +62,10 @@ def synchronise_half_turns(
         Ts_base_ee: (n, 4, 4) hand poses, camera in the hand or fixed.
         Ts_cam_board: (n, 4, 4) board poses.
         middle_m: (3,) middle of the board in its own frame, in the unit of the board poses.
-        config: how the turns are decided.
 
     Raises:
         InputError: stacks of different lengths, or fewer than three views.
     """
-    config = config or HalfTurnConfig()
     A, C = np.asarray(Ts_base_ee, dtype=np.float64), np.asarray(Ts_cam_board, dtype=np.float64)
     if len(A) != len(C) or len(A) < 3:
         raise InputError(
@@ -83,14 +73,14 @@ def synchronise_half_turns(
             "one of each are needed."
         )
     off = _differences(A, C)
-    flips = _polish(off, _synchronise(off, np.radians(config.soft_deg)), config.sweeps)
+    flips = _polish(off, _synchronise(off, np.radians(SOFT_DEG)), SWEEPS)
     if 2 * flips.sum() > len(flips):
         flips = ~flips
     before, after = _rms(off, np.zeros_like(flips)), _rms(off, flips)
-    sure = flips.any() and after * config.decisive_ratio < before
+    sure = flips.any() and after * DECISIVE_RATIO < before
     return HalfTurns(
         flips=flips, before_deg=before, after_deg=after,
-        decisive=bool(sure and after < config.max_after_deg),
+        decisive=bool(sure and after < MAX_AFTER_DEG),
         repaired=np.where(flips[:, None, None], C @ half_turn(middle_m), C),
     )  # fmt: skip
 

@@ -8,12 +8,14 @@ import numpy as np
 from realsim.arrays import Array, Rows
 from realsim.geometry import se3
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
+from realsim_calibration.faults import pairing
 from realsim_calibration.faults.diagnosis import DiagnosisConfig, Evidence, Fault
 from realsim_calibration.faults.frame_fit import FrameFit, fit_frames, hand_side, mismatch
 from realsim_calibration.faults.gates import rotation_mismatch_deg, screw_ratio
 from realsim_calibration.faults.half_turns import synchronise_half_turns
 from realsim_calibration.faults.pairing import Pairing, find_move, find_pairing
 from realsim_calibration.faults.rotation_readings import (
+    FINALISTS,
     Reread,
     every_reading,
     reading_of,
@@ -191,7 +193,7 @@ def flipped_boards(p: Poses, config: DiagnosisConfig) -> Hypothesis | None:
     """Return the hypothesis that some boards were read turned by 180 deg."""
     if p.target is None or not _can_turn(p.target):
         return None
-    turns = synchronise_half_turns(p.T, p.C, p.middle, config.half_turns)
+    turns = synchronise_half_turns(p.T, p.C, p.middle)
     if not turns.flips.any():
         return None
     views = tuple(int(k) for k in np.flatnonzero(turns.flips))
@@ -221,7 +223,7 @@ def reread_rotations(p: Poses, config: DiagnosisConfig, *, thorough: bool) -> li
     """
     D = se3.invert(p.C) if p.eye_in_hand else p.C
     R, t = p.T[:, :3, :3], p.T[:, :3, 3]
-    readings = every_reading(R) if thorough else reread(R, t, D, config.readings)
+    readings = every_reading(R) if thorough else reread(R, t, D)
     found = [
         _reread(p, "rotation_reading", r, config,
                 f"Hand and camera agree when what was read as {r.read_as} is read as {r.meant}.")
@@ -230,7 +232,7 @@ def reread_rotations(p: Poses, config: DiagnosisConfig, *, thorough: bool) -> li
     hand, cam = (float(np.sqrt(np.mean(np.sum(m.turns**2, -1)))) for m in motions(p.T, p.C))
     if hand < config.small_turn_part * cam:
         scale = float(np.degrees(1.0))
-        readings = every_reading(R, scale) if thorough else reread(R, t, D, config.readings, scale)
+        readings = every_reading(R, scale) if thorough else reread(R, t, D, scale)
         found += [
             _reread(p, "radians_as_degrees", r, config,
                     f"Angles in radians were taken for degrees: the hand turns by "
@@ -239,7 +241,7 @@ def reread_rotations(p: Poses, config: DiagnosisConfig, *, thorough: bool) -> li
             for r in readings
         ]  # fmt: skip
     found.sort(key=lambda h: h.score)
-    return found[: config.readings.finalists]
+    return found[:FINALISTS]
 
 
 def reread_as_degrees(p: Poses, config: DiagnosisConfig) -> list[Hypothesis]:
@@ -251,7 +253,7 @@ def reread_as_degrees(p: Poses, config: DiagnosisConfig) -> list[Hypothesis]:
     """
     D = se3.invert(p.C) if p.eye_in_hand else p.C
     found: list[Hypothesis] = []
-    for r in reread_degrees(p.T[:, :3, :3], p.T[:, :3, 3], D, config.readings):
+    for r in reread_degrees(p.T[:, :3, :3], p.T[:, :3, 3], D):
         h = _reread(p, "degrees_as_radians", r, config,
                     "Angles in degrees were taken for radians: hand and camera agree when the "
                     f"numbers are read as {r.meant}.")  # fmt: skip
@@ -290,12 +292,12 @@ def _reread(
 
 def paired_otherwise(p: Poses, config: DiagnosisConfig) -> Hypothesis | None:
     """Return the hypothesis that images and hand poses were paired wrongly."""
-    found = find_pairing(hand_side(p.T, p.eye_in_hand), p.C, p.middle, config.pairing)
+    found = find_pairing(hand_side(p.T, p.eye_in_hand), p.C, p.middle)
     if found is None:
         return None
     n, kept = len(p.C), len(found.rows)
     dropped = n - kept
-    penalty = config.pairing.floor**2 * dropped
+    penalty = pairing.FLOOR**2 * dropped
     score = float(np.sqrt((found.fit.score**2 * kept + penalty) / n))
     fault, name, sentence, views = _pairing_text(p, found)
     if fault == "none":
@@ -365,7 +367,7 @@ def _pairing_text(p: Poses, found: Pairing) -> tuple[Fault, str, str, tuple[int,
 def moved(p: Poses, config: DiagnosisConfig) -> Hypothesis | None:
     """Return the hypothesis that camera, tool or board was moved within the session."""
     A = hand_side(p.T, p.eye_in_hand)
-    m = find_move(A, p.C, p.middle, config.pairing)
+    m = find_move(A, p.C, p.middle)
     if m is None:
         return None
     T = p.T.copy()

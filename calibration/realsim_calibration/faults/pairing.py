@@ -7,7 +7,7 @@ belongs to another pose, or to none. If instead a stretch fits other frames of i
 the tool or the board was moved.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -30,33 +30,29 @@ MOVE_ROUNDS = 3
 """The move and the frames are found in turn, from the frames of either stretch."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PairingConfig:
-    """What is tried, and what counts as belonging together."""
-
-    fit: FitConfig = field(default_factory=FitConfig)
-    max_shift: int = 4
-    """Largest shift of the images against the poses that is tried."""
-    ratio: float = 4.0
-    """Pose and image belong together when their error is below this many usual errors."""
-    floor: float = 6.0
-    """Pose and image belong together below this error, too, in units of `FitConfig`: 3 deg or 6 %
-    of the distance. Planar poses of good real sets reach 5."""
-    swap_floor: float = 3.0
-    """Two views that fit far better exchanged are swapped from this error on."""
-    swap_gain: float = 4.0
-    """Exchanged they must fit this many times better."""
-    switch_price: float = 2.0
-    """Price of another shift, in views that do not fit: two views off the path are cheaper kept
-    apart, three are a new shift."""
-    max_dropped: float = 0.3
-    """Largest share of views that a pairing may leave over."""
-    alike: float = 1.1
-    """Moves whose scores are within this factor cannot be told apart."""
-    max_dropped_run: float = 0.5
-    """The same where they all stand at the beginning or at the end of the list."""
-    min_stretch: int = 4
-    """Views of a stretch for which frames of its own are accepted."""
+FIT = FitConfig()
+MAX_SHIFT = 4
+"""Largest shift of the images against the poses that is tried."""
+RATIO = 4.0
+"""Pose and image belong together when their error is below this many usual errors."""
+FLOOR = 6.0
+"""Pose and image belong together below this error, too, in units of `FitConfig`: 3 deg or 6 %
+of the distance. Planar poses of good real sets reach 5."""
+SWAP_FLOOR = 3.0
+"""Two views that fit far better exchanged are swapped from this error on."""
+SWAP_GAIN = 4.0
+"""Exchanged they must fit this many times better."""
+SWITCH_PRICE = 2.0
+"""Price of another shift, in views that do not fit: two views off the path are cheaper kept
+apart, three are a new shift."""
+MAX_DROPPED = 0.3
+"""Largest share of views that a pairing may leave over."""
+ALIKE = 1.1
+"""Moves whose scores are within this factor cannot be told apart."""
+MAX_DROPPED_RUN = 0.5
+"""The same where they all stand at the beginning or at the end of the list."""
+MIN_STRETCH = 4
+"""Views of a stretch for which frames of its own are accepted."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -93,63 +89,63 @@ class Moved:
     """Whether a move of the other frame explains the views as well."""
 
 
-def find_pairing(A: Array, C: Array, middle: Array, config: PairingConfig) -> Pairing | None:
+def find_pairing(A: Array, C: Array, middle: Array) -> Pairing | None:
     """Return the pairing that fits best, None where no stretch of the lists is consistent."""
-    best = _best_stretch(A, C, middle, config)
+    best = _best_stretch(A, C, middle)
     if best is None:
         return None
     fit = best
     result: Pairing | None = None
     # Twice: the first frames come from a part of the views, the second from all that were paired.
     for _ in range(2):
-        table = mismatch(fit, A, C, config.fit)
-        paired = table[table < config.floor * config.fit.agree]
+        table = mismatch(fit, A, C, FIT)
+        paired = table[table < FLOOR * FIT.agree]
         usual = float(np.median(np.min(table, 0))) if len(paired) else np.inf
-        gate = max(config.ratio * usual, config.floor)
-        shifts = _path(table, gate, config)
-        result = _pairing(A, C, middle, table, shifts, gate, config)
+        gate = max(RATIO * usual, FLOOR)
+        shifts = _path(table, gate)
+        result = _pairing(A, C, middle, table, shifts, gate)
         if result is None:
             return None
         fit = result.fit
     return result
 
 
-def _best_stretch(A: Array, C: Array, middle: Array, config: PairingConfig) -> FrameFit | None:
+def _best_stretch(A: Array, C: Array, middle: Array) -> FrameFit | None:
     """Return the frames of the most consistent stretch: all, the first or the second half."""
     n = len(A)
     fits: list[FrameFit] = []
-    for shift in range(-config.max_shift, config.max_shift + 1):
+    for shift in range(-MAX_SHIFT, MAX_SHIFT + 1):
         a, c = A[max(shift, 0) : n + min(shift, 0)], C[max(-shift, 0) : n - max(shift, 0)]
         half = len(a) // 2
         for part in (slice(None), slice(half), slice(half, None)):
             if len(a[part]) >= MIN_VIEWS + 1:
-                fits.append(fit_frames(a[part], c[part], middle, config.fit))
+                fits.append(fit_frames(a[part], c[part], middle, FIT))
     if not fits:
         return None
     # A few views fit wrong frames by chance: the stretch that explains most of the table wins.
     fits.sort(key=lambda f: f.usual)
-    return min(fits[:6], key=lambda f: _explained(mismatch(f, A, C, config.fit), config))
+    return min(fits[:6], key=lambda f: _explained(mismatch(f, A, C, FIT)))
 
 
-def _explained(table: Array, config: PairingConfig) -> float:
+def _explained(table: Array) -> float:
     """Return the mean capped error of the images with their best pose of a permitted shift."""
     n = len(table)
     i, j = np.indices((n, n))
-    near = np.where(np.abs(i - j) <= config.max_shift, table, np.inf)
-    return float(np.mean(np.minimum(near.min(0), config.fit.cap)))
+    near = np.where(np.abs(i - j) <= MAX_SHIFT, table, np.inf)
+    return float(np.mean(np.minimum(near.min(0), FIT.cap)))
 
 
-def _path(table: Array, gate: float, config: PairingConfig) -> Rows:
+def _path(table: Array, gate: float) -> Rows:
     """Return the shift (n,) of every image along the cheapest path."""
     n = len(table)
-    shifts = np.arange(-config.max_shift, config.max_shift + 1)
+    shifts = np.arange(-MAX_SHIFT, MAX_SHIFT + 1)
     cost = np.full((n, len(shifts)), 1.0)
     for s, shift in enumerate(shifts):
         j = np.arange(max(-shift, 0), n - max(shift, 0))
         cost[j, s] = np.minimum(table[j + shift, j] / gate, 1.0)
     # Standing still is preferred where the data do not care.
     cost = cost + 1e-3 * np.abs(shifts)
-    price = config.switch_price * (1 - np.eye(len(shifts)))
+    price = SWITCH_PRICE * (1 - np.eye(len(shifts)))
     total, back = cost[0], np.zeros((n, len(shifts)), dtype=np.int64)
     for j in range(1, n):
         step = total[:, None] + price
@@ -168,14 +164,13 @@ def _path(table: Array, gate: float, config: PairingConfig) -> Rows:
 
 def _pairing(
     A: Array, C: Array, middle: Array, table: Array, shifts: Rows, gate: float,
-    config: PairingConfig,
-) -> Pairing | None:  # fmt: skip
+    ) -> Pairing | None:  # fmt: skip
     n = len(table)
     pose = np.arange(n) + shifts
     inside = (pose >= 0) & (pose < n)
     own = np.full(n, np.inf)
     own[inside] = table[pose[inside], np.flatnonzero(inside)]
-    swapped = _swaps(table, pose, own, inside, config)
+    swapped = _swaps(table, pose, own, inside)
     exchanged = {row for pair in swapped for row in pair}
     rows: list[tuple[int, int]] = []
     strays: list[int] = []
@@ -199,14 +194,14 @@ def _pairing(
     rows.sort(key=lambda row: row[1])
     dropped = [j for j in range(n) if j not in {image for _, image in rows}]
     at_end = dropped == list(range(n - len(dropped), n)) or dropped == list(range(len(dropped)))
-    most = config.max_dropped_run if at_end else config.max_dropped
+    most = MAX_DROPPED_RUN if at_end else MAX_DROPPED
     if len(rows) < MIN_VIEWS + 1 or len(rows) < (1 - most) * n:
         return None
     kept = np.array(rows, dtype=np.int64)
     return Pairing(
         rows=kept, shifts=shifts, swapped=swapped, strays=tuple(strays),
         elsewhere=tuple(elsewhere),
-        fit=fit_frames(A[kept[:, 0]], C[kept[:, 1]], middle, config.fit),
+        fit=fit_frames(A[kept[:, 0]], C[kept[:, 1]], middle, FIT),
     )  # fmt: skip
 
 
@@ -216,18 +211,16 @@ def _mutual(elsewhere: list[tuple[int, int]], shifts: Rows) -> list[tuple[int, i
     return [(j, k) for j, k in place.items() if j < k and place.get(k) == j]
 
 
-def _swaps(
-    table: Array, pose: Rows, own: Array, inside: Mask, config: PairingConfig
-) -> tuple[tuple[int, int], ...]:
+def _swaps(table: Array, pose: Rows, own: Array, inside: Mask) -> tuple[tuple[int, int], ...]:
     """Return pairs of images that fit far better exchanged, the clearest first."""
-    suspects = [int(j) for j in np.flatnonzero(inside & (own > config.swap_floor))]
+    suspects = [int(j) for j in np.flatnonzero(inside & (own > SWAP_FLOOR))]
     usual = float(np.median(own[inside]))
     found: list[tuple[float, int, int]] = []
     for k, a in enumerate(suspects):
         for b in suspects[k + 1 :]:
             exchanged = float(np.hypot(table[pose[a], b], table[pose[b], a]))
-            if exchanged * config.swap_gain < np.hypot(own[a], own[b]) and exchanged < max(
-                config.ratio * usual, config.swap_floor
+            if exchanged * SWAP_GAIN < np.hypot(own[a], own[b]) and exchanged < max(
+                RATIO * usual, SWAP_FLOOR
             ):
                 found.append((exchanged, a, b))
     taken: set[int] = set()
@@ -239,34 +232,34 @@ def _swaps(
     return tuple(pairs)
 
 
-def find_move(A: Array, C: Array, middle: Array, config: PairingConfig) -> Moved | None:
+def find_move(A: Array, C: Array, middle: Array) -> Moved | None:
     """Return the move of the camera, tool or board after which the views fit anew, else None."""
     n = len(A)
     half = n // 2
     found: list[Moved] = []
     for part in (slice(half), slice(half, None)):
-        if half < config.min_stretch:
+        if half < MIN_STRETCH:
             return None
-        seed = fit_frames(A[part], C[part], middle, config.fit)
-        errors = np.minimum(np.diag(mismatch(seed, A, C, config.fit)), config.fit.cap)
+        seed = fit_frames(A[part], C[part], middle, FIT)
+        errors = np.minimum(np.diag(mismatch(seed, A, C, FIT)), FIT.cap)
         if part.start is None:
             cost = (
                 np.cumsum(np.append(0, errors))
-                + np.cumsum(np.append(0, (config.fit.cap - errors)[::-1]))[::-1]
+                + np.cumsum(np.append(0, (FIT.cap - errors)[::-1]))[::-1]
             )
         else:
             cost = (
-                np.cumsum(np.append(0, config.fit.cap - errors))
+                np.cumsum(np.append(0, FIT.cap - errors))
                 + np.cumsum(np.append(0, errors[::-1]))[::-1]
             )
         start = int(np.argmin(cost))
-        if min(start, n - start) < config.min_stretch:
+        if min(start, n - start) < MIN_STRETCH:
             continue
-        found += _moves_at(A, C, middle, start, config)
-    return _likeliest(found, config)
+        found += _moves_at(A, C, middle, start)
+    return _likeliest(found)
 
 
-def _likeliest(found: list[Moved], config: PairingConfig) -> Moved | None:
+def _likeliest(found: list[Moved]) -> Moved | None:
     """Return the move of least score; of two that fit alike the one without a turn.
 
     A tool offset is set as a pure shift. Where the hand hardly turns, a shifted board explains it
@@ -275,29 +268,26 @@ def _likeliest(found: list[Moved], config: PairingConfig) -> Moved | None:
     best = min(found, key=lambda m: m.score, default=None)
     if best is None:
         return None
-    alike = [m for m in found if m.score <= config.alike * best.score]
+    alike = [m for m in found if m.score <= ALIKE * best.score]
     chosen = min(alike, key=lambda m: float(se3.angle(m.step)) + (m.frame == "Z") * PREFER_TOOL)
     other = any(m.frame != chosen.frame for m in alike)
     return replace(chosen, either=other)
 
 
-def _moves_at(A: Array, C: Array, middle: Array, start: int, config: PairingConfig) -> list[Moved]:
+def _moves_at(A: Array, C: Array, middle: Array, start: int) -> list[Moved]:
     """Return both kinds of move at a row, each with the score of a model that shares the rest."""
-    halves = [
-        fit_frames(A[s], C[s], middle, config.fit) for s in (slice(start), slice(start, None))
-    ]
+    halves = [fit_frames(A[s], C[s], middle, FIT) for s in (slice(start), slice(start, None))]
     moves: list[Moved] = []
     for frame in MOVED_FRAMES:
         for fit in halves:
-            step, best = _carried(A, C, middle, start, frame, fit, config)
+            step, best = _carried(A, C, middle, start, frame, fit)
             moves.append(Moved(frame=frame, start=start, step=step, score=best.score))
     return moves
 
 
 def _carried(
     A: Array, C: Array, middle: Array, start: int, frame: MovedFrame, fit: FrameFit,
-    config: PairingConfig,
-) -> tuple[Array, FrameFit]:  # fmt: skip
+    ) -> tuple[Array, FrameFit]:  # fmt: skip
     """Return the move of a frame at a row, and the fit of all views with the move taken back.
 
     Every view shows where the frame stands, given the other one: X_i = A_i^-1 Z C_i^-1 or
@@ -315,7 +305,7 @@ def _carried(
             places = A @ fit.X @ seen
             step = _mean(places[:start]) @ se3.invert(_mean(places[start:]))
             hands = np.concatenate([A[:start], step @ A[start:]])
-        fit = fit_frames(hands, C, middle, config.fit)
+        fit = fit_frames(hands, C, middle, FIT)
     return step, fit
 
 

@@ -31,25 +31,21 @@ PAIRS_KEPT = 30
 """Pairs of the first two Euler angles, of 3000, for which the third is tried."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ReadingConfig:
-    """How the votes are counted."""
-
-    agree_deg: float = 5.0
-    """Two votes for R_X within this angle agree [deg]: several times the error of R_Z that 2 mm of
-    robot error leave over 0.2 m, and a chance agreement of forms is one in 10^4."""
-    starts: int = 64
-    """Rotations from which the base's is sought: the cost has few minima."""
-    steps: int = 30
-    """Gauss-Newton steps from every start."""
-    minima: int = 2
-    """Different minima that may vote: positions near a plane have a mirror twin."""
-    finalists: int = 4
-    """Readings whose poses are fitted in full after the vote."""
-    number_tolerance: float = 1.25
-    """Degrees that are known modulo 2 pi = 6.28 agree within this: twice the error that R_Z has."""
-    seed: int = 0
-    """Seed of the starts."""
+AGREE_DEG = 5.0
+"""Two votes for R_X within this angle agree [deg]: several times the error of R_Z that 2 mm of
+robot error leave over 0.2 m, and a chance agreement of forms is one in 10^4."""
+STARTS = 64
+"""Rotations from which the base's is sought: the cost has few minima."""
+STEPS = 30
+"""Gauss-Newton steps from every start."""
+MINIMA = 2
+"""Different minima that may vote: positions near a plane have a mirror twin."""
+FINALISTS = 4
+"""Readings whose poses are fitted in full after the vote."""
+NUMBER_TOLERANCE = 1.25
+"""Degrees that are known modulo 2 pi = 6.28 agree within this: twice the error that R_Z has."""
+SEED = 0
+"""Seed of the starts."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -178,7 +174,7 @@ class Reread:
     """For degrees known modulo 2 pi: the rotations they allow nearest to predicted ones."""
 
 
-def base_rotations(t_A: Array, D: Array, config: ReadingConfig) -> list[Array]:
+def base_rotations(t_A: Array, D: Array) -> list[Array]:
     """Return the rotations (3, 3) of the base that positions and images allow, the best first.
 
     The equation above is linear in w, s and u; projected on what they cannot explain it is B vec M
@@ -195,10 +191,10 @@ def base_rotations(t_A: Array, D: Array, config: ReadingConfig) -> list[Array]:
     U = U[:, S > 1e-9 * S[0]]
     H = known - U @ (U.T @ known)
     H = H.T @ H / n
-    M = se3.random_rotation(np.random.default_rng(config.seed), config.starts)
+    M = se3.random_rotation(np.random.default_rng(SEED), STARTS)
     turn = np.stack([se3.hat(e) for e in np.eye(3)])
     damping = 1e-3 * np.trace(H) / 9
-    for _ in range(config.steps):
+    for _ in range(STEPS):
         J = np.einsum("nij,cjk->nikc", M, turn).reshape(-1, 9, 3)
         gradient = np.einsum("npc,pq,nq->nc", J, H, M.reshape(-1, 9))
         curvature = np.einsum("npc,pq,nqd->ncd", J, H, J) + damping * np.eye(3)
@@ -208,22 +204,19 @@ def base_rotations(t_A: Array, D: Array, config: ReadingConfig) -> list[Array]:
     costs = np.einsum("np,pq,nq->n", M.reshape(-1, 9), H, M.reshape(-1, 9))
     found: list[Array] = []
     for k in np.argsort(costs):
-        if all(se3.angle(M[k] @ other) > np.radians(config.agree_deg) for other in found):
+        if all(se3.angle(M[k] @ other) > np.radians(AGREE_DEG) for other in found):
             found.append(M[k].T)
-        if len(found) == config.minima:
+        if len(found) == MINIMA:
             break
     return found
 
 
-def vote(
-    forms: Array, G: Array, config: ReadingConfig, voters: int | None = None
-) -> tuple[Array, float]:
+def vote(forms: Array, G: Array, voters: int | None = None) -> tuple[Array, float]:
     """Return the forms (n, 3, 3) whose R_X = R_A^T G agree best, and their disagreement (0 to 1).
 
     Args:
         forms: (n, f, 3, 3) every rotation that a view may have.
         G: (n, 3, 3) R_Z R_D, which R_A R_X must be.
-        config: how near agreeing votes are.
         voters: how many views may propose an R_X; None = all.
     """
     Rx = np.swapaxes(forms, -1, -2) @ G[:, None]
@@ -232,25 +225,22 @@ def vote(
     # |R - S|^2 = 6 - 2 tr(R^T S)
     chord = 6 - 2 * (proposals @ Rx.reshape(-1, 9).T).reshape(-1, n, f)
     nearest = np.maximum(chord.min(-1), 0.0)
-    limit = 8 * np.sin(np.radians(config.agree_deg) / 2) ** 2
+    limit = 8 * np.sin(np.radians(AGREE_DEG) / 2) ** 2
     cost = np.minimum(nearest, limit).mean(1) / limit
     best = int(np.argmin(cost))
     return forms[np.arange(n), chord[best].argmin(-1)], float(np.sqrt(cost[best]))
 
 
-def reread(
-    R: Array, t_A: Array, D: Array, config: ReadingConfig, scale: float = 1.0
-) -> list[Reread]:
+def reread(R: Array, t_A: Array, D: Array, scale: float = 1.0) -> list[Reread]:
     """Return the pairs of conventions whose votes agree best, the best first.
 
     Args:
         R: (n, 3, 3) hand rotations as decoded.
         t_A: (n, 3) hand positions.
         D: (n, 4, 4) T_board_cam (camera in the hand) or T_cam_board (fixed).
-        config: how votes are counted.
         scale: factor of the numbers (180 / pi where radians were read as degrees).
     """
-    bases = base_rotations(t_A, D, config)
+    bases = base_rotations(t_A, D)
     found: list[Reread] = []
     for family in (three_number_conventions(), four_number_conventions()):
         if scale != 1.0 and family[0].decode is se3.from_quaternion_wxyz:
@@ -261,13 +251,13 @@ def reread(
                 if F is E and scale == 1.0:
                     continue
                 forms = F.decode(numbers)
-                found.append(_best_vote(forms, bases, D, config, F.name, E.name))
+                found.append(_best_vote(forms, bases, D, F.name, E.name))
     if scale == 1.0:
         transposed = np.swapaxes(R, -1, -2)[:, None]
-        found.append(_best_vote(transposed, bases, D, config, "matrices column by column",
+        found.append(_best_vote(transposed, bases, D, "matrices column by column",
                                 "matrices row by row"))  # fmt: skip
     found.sort(key=lambda r: r.agreement)
-    return found[: config.finalists]
+    return found[:FINALISTS]
 
 
 def usual_form(convention: Convention, numbers: Array) -> Array:
@@ -299,24 +289,20 @@ def every_reading(R: Array, scale: float = 1.0) -> list[Reread]:
     return found
 
 
-def _best_vote(
-    forms: Array, bases: list[Array], D: Array, config: ReadingConfig, meant: str, read_as: str
-) -> Reread:
-    Rs, cost = min(
-        (vote(forms, Rz @ D[:, :3, :3], config) for Rz in bases), key=lambda pair: pair[1]
-    )
+def _best_vote(forms: Array, bases: list[Array], D: Array, meant: str, read_as: str) -> Reread:
+    Rs, cost = min((vote(forms, Rz @ D[:, :3, :3]) for Rz in bases), key=lambda pair: pair[1])
     return Reread(name=f"{meant}, not {read_as}", meant=meant, read_as=read_as, Rs=Rs,
                   agreement=cost)  # fmt: skip
 
 
-def reread_degrees(R: Array, t_A: Array, D: Array, config: ReadingConfig) -> list[Reread]:
+def reread_degrees(R: Array, t_A: Array, D: Array) -> list[Reread]:
     """Return what fits if numbers in degrees were taken for radians, best first; empty = nothing.
 
     A number d [deg] taken for radians is only known modulo 2 pi: 57 values each. For a rotation
     vector the direction is known, so a view has 58 forms, which vote. For Euler angles every form
     of the first view proposes an R_X, which must then predict all numbers of the other views.
     """
-    bases = base_rotations(t_A, D, config)
+    bases = base_rotations(t_A, D)
     w = se3.log_so3(R)
     n = np.maximum(np.linalg.norm(w, axis=-1), 1e-12)
     turns = np.arange(-29, 29)
@@ -324,13 +310,13 @@ def reread_degrees(R: Array, t_A: Array, D: Array, config: ReadingConfig) -> lis
     forms = se3.exp_so3(np.radians(lengths[..., None] * (w / n[:, None])[:, None]))
     found: list[Reread] = []
     for Rz in bases:
-        Rs, cost = vote(forms, Rz @ D[:, :3, :3], config, voters=3)
+        Rs, cost = vote(forms, Rz @ D[:, :3, :3], voters=3)
         found.append(_degrees("rotation vector", Rs, cost, partial(_nearest_form, forms)))
     for order in permutations(AXES):
         name = "".join(order)
         snap = partial(_nearest_degrees, name, euler_numbers(name, (0, 1, 2), R))
         for Rz in bases:
-            Rs, cost = _euler_degrees(name, R, Rz @ D[:, :3, :3], config)
+            Rs, cost = _euler_degrees(name, R, Rz @ D[:, :3, :3])
             found.append(_degrees(f"Euler angles (product {name.upper()})", Rs, cost, snap))
     return sorted(found, key=lambda r: r.agreement)
 
@@ -362,7 +348,7 @@ def _nearest_degrees(order: str, numbers: Array, predicted: Array) -> Array:
     return euler_rotation(order, (0, 1, 2), np.radians(meant))
 
 
-def _euler_degrees(order: str, R: Array, G: Array, config: ReadingConfig) -> tuple[Array, float]:
+def _euler_degrees(order: str, R: Array, G: Array) -> tuple[Array, float]:
     """Return the rotations meant and their disagreement (0 to 1).
 
     The last column of R_i(a) R_j(b) R_k(c) does not hold c: the values of (a, b) of one view are
@@ -381,7 +367,7 @@ def _euler_degrees(order: str, R: Array, G: Array, config: ReadingConfig) -> tup
     column = np.einsum("vab,pb->pva", G[:JUDGES], start[:, :, k] @ G[0])
     seen = np.stack([np.arctan2(-e * column[..., j], column[..., k]),
                      np.arcsin(np.clip(e * column[..., i], -1, 1))], -1)  # fmt: skip
-    cost = _off(np.degrees(seen)[:, :, None], numbers[None, :JUDGES, :, :2], config).mean(1)
+    cost = _off(np.degrees(seen)[:, :, None], numbers[None, :JUDGES, :, :2]).mean(1)
     best = np.argsort(cost)[:PAIRS_KEPT]
     tried = np.concatenate(
         [np.c_[np.broadcast_to(pairs[p], (len(turns), 2)), c[form[p]]] for p in best]
@@ -389,7 +375,7 @@ def _euler_degrees(order: str, R: Array, G: Array, config: ReadingConfig) -> tup
     tried = tried[np.abs(tried[:, 2]) <= 180.0]
     Rx = np.swapaxes(euler_rotation(order, (0, 1, 2), np.radians(tried)), -1, -2) @ G[0]
     predicted = np.degrees(euler_numbers(order, (0, 1, 2), G @ np.swapaxes(Rx, -1, -2)[:, None]))
-    cost = _off(predicted[:, :, :1], numbers[None], config).mean(1)
+    cost = _off(predicted[:, :, :1], numbers[None]).mean(1)
     winner = int(np.argmin(cost))
     meant = _nearest_degrees(order, numbers, G @ Rx[winner].T)
     return meant, float(np.sqrt(cost[winner]))
@@ -399,7 +385,7 @@ def _wrap(angle: Array) -> Array:
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def _off(degrees: Array, numbers: Array, config: ReadingConfig) -> Array:
+def _off(degrees: Array, numbers: Array) -> Array:
     """Return how far degrees are from the nearest form of numbers known modulo 2 pi, at most 1."""
     rest = np.abs(_wrap(degrees - numbers)).max(-1).min(-1)
-    return np.minimum(rest / config.number_tolerance, 1.0) ** 2
+    return np.minimum(rest / NUMBER_TOLERANCE, 1.0) ** 2

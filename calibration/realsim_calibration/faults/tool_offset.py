@@ -6,7 +6,7 @@ by 1 to 3 mm and 0.1 to 0.5 deg, which varies with the pose; more, and constant,
 frames come from the same robust fit as a hand-eye, with the nominal poses in the camera's place.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,26 +16,21 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_calibration.faults.frame_fit import FitConfig, fit_frames
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ToolOffsetConfig:
-    """What the nominal kinematics can and cannot say."""
-
-    least_mm: float = 5.0
-    """Offsets below this are the nominal kinematics' own error [mm]: real arms show 1 to 3."""
-    least_deg: float = 1.5
-    """The same for angles [deg]."""
-    simpler: float = 2.0
-    """A frame fewer is believed while it fits at most this many times worse."""
-    floor_mm: float = 4.0
-    """It is believed, too, while it fits to this RMS [mm]."""
-    min_group: int = 3
-    """Fewest views that share a tool offset where it changes."""
-    lever_m: float = 0.5
-    """Angles count as the slip they make at this distance [m]."""
-    max_error_mm: float = 15.0
-    """Beyond this RMS the nominal poses belong to another robot or to other joints [mm]."""
-    fit: FitConfig = field(default_factory=FitConfig)
+LEAST_MM = 5.0
+"""Offsets below this are the nominal kinematics' own error [mm]: real arms show 1 to 3."""
+LEAST_DEG = 1.5
+"""The same for angles [deg]."""
+SIMPLER = 2.0
+"""A frame fewer is believed while it fits at most this many times worse."""
+FLOOR_MM = 4.0
+"""It is believed, too, while it fits to this RMS [mm]."""
+MIN_GROUP = 3
+"""Fewest views that share a tool offset where it changes."""
+LEVER_M = 0.5
+"""Angles count as the slip they make at this distance [m]."""
+MAX_ERROR_MM = 15.0
+"""Beyond this RMS the nominal poses belong to another robot or to other joints [mm]."""
+FIT = FitConfig()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -62,46 +57,40 @@ class ToolOffset:
     advice: str
 
 
-def tool_offset(
-    Ts_base_ee: ArrayLike, nominal: ArrayLike, config: ToolOffsetConfig | None = None
-) -> ToolOffset:
+def tool_offset(Ts_base_ee: ArrayLike, nominal: ArrayLike) -> ToolOffset:
     """Return the constant frames between the controller's poses and the nominal ones.
 
     Args:
         Ts_base_ee: (n, 4, 4) the controller's poses [m].
         nominal: (n, 4, 4) T_base_flange from the joints by the nominal kinematics [m].
-        config: what the nominal kinematics can say.
 
     Raises:
         InputError: stacks of different lengths, or fewer than three views.
     """
-    config = config or ToolOffsetConfig()
     A, N = np.asarray(Ts_base_ee, dtype=np.float64), np.asarray(nominal, dtype=np.float64)
     if len(A) != len(N) or len(A) < 3:
         raise InputError(
             f"tool offset: {len(A)} hand poses and {len(N)} nominal ones; three or more with one "
             "of each are needed."
         )
-    chosen = _simplest(A, N, config)
+    chosen = _simplest(A, N)
     L, offsets, groups, error = chosen
     mm, deg = _rms(error)
-    known = mm <= config.max_error_mm
-    active = known and any(_differs(E, config) for E in offsets)
-    turned = known and _differs(L, config)
-    sentence, advice = _sentence(L, offsets, groups, (mm, deg), known, config)
+    known = mm <= MAX_ERROR_MM
+    active = known and any(_differs(E) for E in offsets)
+    turned = known and _differs(L)
+    sentence, advice = _sentence(L, offsets, groups, (mm, deg), known)
     return ToolOffset(
         known=known, offsets=offsets, groups=groups, T_base_nominal=L, rms_mm=mm, rms_deg=deg,
         active=active, base_turned=turned, sentence=sentence, advice=advice,
     )  # fmt: skip
 
 
-def _simplest(
-    A: Array, N: Array, config: ToolOffsetConfig
-) -> tuple[Array, tuple[Array, ...], Int64, Array]:
+def _simplest(A: Array, N: Array) -> tuple[Array, tuple[Array, ...], Int64, Array]:
     """Return L, offsets, groups, errors (n, 6) of the simplest model that fits nearly as well."""
     one = np.zeros(len(A), dtype=np.int64)
     I4 = np.eye(4)
-    fit = fit_frames(A, se3.invert(N), config=config.fit)
+    fit = fit_frames(A, se3.invert(N), config=FIT)
     L = se3.from_rt(fit.Z[:3, :3], fit.Z[:3, 3])
     E = se3.invert(fit.X)
     turn = se3.from_rt(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
@@ -114,19 +103,19 @@ def _simplest(
         (L, (E,), one),
     ]
     for base in (I4, turn):
-        offsets, groups = _groups(se3.invert(base @ N) @ A, config)
+        offsets, groups = _groups(se3.invert(base @ N) @ A)
         # Offsets of a view or two are wrong poses, not tools.
-        if len(offsets) > 1 and np.bincount(groups).min() >= config.min_group:
+        if len(offsets) > 1 and np.bincount(groups).min() >= MIN_GROUP:
             models.append((base, offsets, groups))
     results: list[tuple[float, tuple[Array, tuple[Array, ...], Int64, Array]]] = []
     for base, offsets, groups in models:
         ends = np.array(offsets)[groups]
         error = se3.log(se3.invert(base @ N @ ends) @ A)
         mm, deg = _rms(error)
-        cost = float(np.hypot(mm, 1e3 * config.lever_m * np.radians(deg)))
+        cost = float(np.hypot(mm, 1e3 * LEVER_M * np.radians(deg)))
         results.append((cost, (base, offsets, groups, error)))
     least = min(cost for cost, _ in results)
-    limit = max(config.simpler * least, config.floor_mm)
+    limit = max(SIMPLER * least, FLOOR_MM)
     return next(model for cost, model in results if cost <= limit)
 
 
@@ -135,7 +124,7 @@ def _middle(Ts: Array) -> Array:
     return se3.from_rt(se3.mean_rotation(Ts[:, :3, :3]), np.median(Ts[:, :3, 3], 0))
 
 
-def _groups(Ts: Array, config: ToolOffsetConfig) -> tuple[tuple[Array, ...], Int64]:
+def _groups(Ts: Array) -> tuple[tuple[Array, ...], Int64]:
     """Return the different transforms among (n, 4, 4) and which one each view has."""
     groups = np.full(len(Ts), -1)
     offsets: list[Array] = []
@@ -143,8 +132,8 @@ def _groups(Ts: Array, config: ToolOffsetConfig) -> tuple[tuple[Array, ...], Int
         if groups[k] >= 0:
             continue
         step = se3.log(se3.invert(Ts[k]) @ Ts)
-        near = np.linalg.norm(step[:, 3:], axis=-1) < 2e-3 * config.least_mm
-        near &= np.linalg.norm(step[:, :3], axis=-1) < np.radians(2 * config.least_deg)
+        near = np.linalg.norm(step[:, 3:], axis=-1) < 2e-3 * LEAST_MM
+        near &= np.linalg.norm(step[:, :3], axis=-1) < np.radians(2 * LEAST_DEG)
         members = near & (groups < 0)
         groups[members] = len(offsets)
         offsets.append(_middle(Ts[members]))
@@ -156,9 +145,9 @@ def _rms(error: Array) -> tuple[float, float]:
     return float(mm), float(np.degrees(np.sqrt(np.mean(np.sum(error[:, :3] ** 2, -1)))))
 
 
-def _differs(T: Array, config: ToolOffsetConfig) -> bool:
-    far = np.linalg.norm(T[:3, 3]) > 1e-3 * config.least_mm
-    return bool(far or np.degrees(se3.angle(T)) > config.least_deg)
+def _differs(T: Array) -> bool:
+    far = np.linalg.norm(T[:3, 3]) > 1e-3 * LEAST_MM
+    return bool(far or np.degrees(se3.angle(T)) > LEAST_DEG)
 
 
 def describe_offset(T: Array) -> str:
@@ -178,8 +167,7 @@ def describe_offset(T: Array) -> str:
 
 def _sentence(
     L: Array, offsets: tuple[Array, ...], groups: Int64, rms: tuple[float, float],
-    known: bool, config: ToolOffsetConfig,
-) -> tuple[str, str]:  # fmt: skip
+    known: bool, ) -> tuple[str, str]:  # fmt: skip
     rest = f"what remains is {rms[0]:.1f} mm and {rms[1]:.2f} deg RMS"
     if not known:
         return (
@@ -193,14 +181,14 @@ def _sentence(
         texts = [f"{n} views {describe_offset(E)}" for E, n in zip(offsets, counts, strict=True)]
         parts.append(f"The tool offset changes within the poses: {'; '.join(texts)}.")
         advice = "Give every pose for the same tool: read the flange, or set one TCP throughout."
-    elif offsets and _differs(offsets[0], config):
+    elif offsets and _differs(offsets[0]):
         parts.append(f"The poses are of a point {describe_offset(offsets[0])}.")
         advice = (
             "A tool offset (TCP) is active in the controller: the camera's place will be given "
             "from that point, and is right only while the same TCP is set. Set it to zero to get "
             "the camera in the flange."
         )
-    if _differs(L, config):
+    if _differs(L):
         angle = float(np.degrees(se3.angle(L)))
         axis = se3.log_so3(L[:3, :3]) / max(np.radians(angle), 1e-9)
         z = abs(axis[2]) > 0.99

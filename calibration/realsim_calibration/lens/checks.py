@@ -1,7 +1,5 @@
 """What is looked at in a camera calibration, and what to do about it."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from realsim.geometry.camera import undistort
@@ -12,57 +10,52 @@ from realsim_calibration.lens.covariance import border_pixels
 from realsim_calibration.lens.models import TERM_NAMES
 from realsim_calibration.lens.report import IntrinsicsReport
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CheckLimits:
-    """From which figures on a check warns."""
-
-    good_views: int = 12
-    """Views from which on the covariance can be trusted."""
-    good_share: float = 0.8
-    """Share of the image's cells with corners."""
-    bad_share: float = 0.4
-    """Share below which the lens is a guess in most of the image."""
-    good_focal: float = 0.005
-    """1-sigma of the focal length, relative: 2 mm at 0.4 m."""
-    good_rms_px: float = 1.0
-    """RMS of the residuals [px]; good corners are below 0.3."""
-    good_unseen_ratio: float = 1.3
-    """Error on unseen views relative to the error in sample."""
-    good_border_px: float = 1.0
-    """1-sigma of the lens at the image's border [px]."""
-    good_warp_mm: float = 1.0
-    """Bending of the board [mm] above which a flatter one is advised; it is modelled."""
-    good_aspect: float = 0.003
-    """Stretch of the print above which it is named; it is modelled."""
-    outlier_share: float = 0.02
-    """Share of outlier corners that is no news."""
-    believed_sigmas: float = 3.0
-    """Distance from a belief (a centred principal point, the given intrinsics) that is named."""
+GOOD_VIEWS = 12
+"""Views from which on the covariance can be trusted."""
+GOOD_SHARE = 0.8
+"""Share of the image's cells with corners."""
+BAD_SHARE = 0.4
+"""Share below which the lens is a guess in most of the image."""
+GOOD_FOCAL = 0.005
+"""1-sigma of the focal length, relative: 2 mm at 0.4 m."""
+GOOD_RMS_PX = 1.0
+"""RMS of the residuals [px]; good corners are below 0.3."""
+GOOD_UNSEEN_RATIO = 1.3
+"""Error on unseen views relative to the error in sample."""
+GOOD_BORDER_PX = 1.0
+"""1-sigma of the lens at the image's border [px]."""
+GOOD_WARP_MM = 1.0
+"""Bending of the board [mm] above which a flatter one is advised; it is modelled."""
+GOOD_ASPECT = 0.003
+"""Stretch of the print above which it is named; it is modelled."""
+OUTLIER_SHARE = 0.02
+"""Share of outlier corners that is no news."""
+BELIEVED_SIGMAS = 3.0
+"""Distance from a belief (a centred principal point, the given intrinsics) that is named."""
 
 
 def intrinsics_checks(
-    report: IntrinsicsReport, prior: Prior, start: CameraIntrinsics | None, limits: CheckLimits
+    report: IntrinsicsReport, prior: Prior, start: CameraIntrinsics | None
 ) -> tuple[Check, ...]:
     """Return every check of a camera calibration, good ones too."""
     checks = [
-        _views(report, limits),
-        _outliers(report, limits),
-        _coverage(report, limits),
-        _focal(report, limits),
-        _center(report, prior, limits),
-        _model(report, limits),
+        _views(report),
+        _outliers(report),
+        _coverage(report),
+        _focal(report),
+        _center(report, prior),
+        _model(report),
         _refused(report),
-        _residuals(report, limits),
-        _border(report, limits),
-        _board(report, limits),
+        _residuals(report),
+        _border(report),
+        _board(report),
     ]
     if start is not None:
-        checks.append(_start(report, start, limits))
+        checks.append(_start(report, start))
     return tuple(checks)
 
 
-def _views(report: IntrinsicsReport, limits: CheckLimits) -> Check:
+def _views(report: IntrinsicsReport) -> Check:
     left_out = [v for v in report.views if not v.used]
     n = len(report.used)
     sentence = f"{n} of {len(report.views)} views were used."
@@ -70,8 +63,8 @@ def _views(report: IntrinsicsReport, limits: CheckLimits) -> Check:
         shown = "; ".join(f"{v.name}: {v.reason}" for v in left_out[:4])
         more = f"; and {len(left_out) - 4} more" if len(left_out) > 4 else ""
         sentence += f" Left out: {shown}{more}."
-    few = n < limits.good_views
-    advice = f"Take at least {limits.good_views} views." if few else ""
+    few = n < GOOD_VIEWS
+    advice = f"Take at least {GOOD_VIEWS} views." if few else ""
     if left_out:
         advice = (advice + " Look at the views that were left out.").strip()
     return Check(
@@ -80,7 +73,7 @@ def _views(report: IntrinsicsReport, limits: CheckLimits) -> Check:
     )  # fmt: skip
 
 
-def _outliers(report: IntrinsicsReport, limits: CheckLimits) -> Check:
+def _outliers(report: IntrinsicsReport) -> Check:
     guilty = [v for v in report.used if v.outliers]
     count = sum(len(v.outliers) for v in guilty)
     share = count / max(count + sum(len(v.uv) for v in report.used), 1)
@@ -92,7 +85,7 @@ def _outliers(report: IntrinsicsReport, limits: CheckLimits) -> Check:
             f" Most of them in view {worst.name} ({len(worst.outliers)}; point {point} is "
             f"{px:.1f} px off)."
         )
-    warn = share > limits.outlier_share
+    warn = share > OUTLIER_SHARE
     return Check(
         name="outlier corners", verdict="warn" if warn else "good", sentence=sentence,
         advice="Look at these views: reflections, fingers, motion blur." if warn else "",
@@ -100,11 +93,11 @@ def _outliers(report: IntrinsicsReport, limits: CheckLimits) -> Check:
     )  # fmt: skip
 
 
-def _coverage(report: IntrinsicsReport, limits: CheckLimits) -> Check:
+def _coverage(report: IntrinsicsReport) -> Check:
     c = report.coverage
     verdict = "good"
-    if c.advice or c.share < limits.good_share:
-        verdict = "bad" if c.share < limits.bad_share else "warn"
+    if c.advice or c.share < GOOD_SHARE:
+        verdict = "bad" if c.share < BAD_SHARE else "warn"
     return Check(
         name="coverage",
         verdict=verdict,
@@ -116,10 +109,10 @@ def _coverage(report: IntrinsicsReport, limits: CheckLimits) -> Check:
     )
 
 
-def _focal(report: IntrinsicsReport, limits: CheckLimits) -> Check:
+def _focal(report: IntrinsicsReport) -> Check:
     i, sd = report.intrinsics, report.sd
     relative = float(max(sd[0] / i.fx, sd[1] / i.fy))
-    warn = relative > limits.good_focal
+    warn = relative > GOOD_FOCAL
     return Check(
         name="focal length",
         verdict="warn" if warn else "good",
@@ -130,11 +123,11 @@ def _focal(report: IntrinsicsReport, limits: CheckLimits) -> Check:
     )
 
 
-def _center(report: IntrinsicsReport, prior: Prior, limits: CheckLimits) -> Check:
+def _center(report: IntrinsicsReport, prior: Prior) -> Check:
     i, sd = report.intrinsics, report.sd[2:4]
     offset = (np.array([i.cx, i.cy]) - prior.mean[2:4]) / prior.sd[2:4]
     unmeasured = bool(np.any(sd > 0.7 * prior.sd[2:4]))
-    odd = bool(np.any(np.abs(offset) > limits.believed_sigmas))
+    odd = bool(np.any(np.abs(offset) > BELIEVED_SIGMAS))
     sentence = f"Principal point ({i.cx:.2f} +- {sd[0]:.2f}, {i.cy:.2f} +- {sd[1]:.2f}) px."
     advice = ""
     if unmeasured:
@@ -149,18 +142,18 @@ def _center(report: IntrinsicsReport, prior: Prior, limits: CheckLimits) -> Chec
     )  # fmt: skip
 
 
-def _model(report: IntrinsicsReport, limits: CheckLimits) -> Check:
+def _model(report: IntrinsicsReport) -> Check:
     if not report.held_out:
         return Check(
             name="lens model",
             verdict="warn",
             sentence=f"The lens model '{report.model}' was not chosen by unseen views: there are "
             "too few.",
-            advice=f"Take at least {limits.good_views} views.",
+            advice=f"Take at least {GOOD_VIEWS} views.",
         )
     table = ", ".join(f"{s.model} {s.held_out_px:.3f}" for s in report.held_out)
     ratio = report.held_out_px / max(report.rms_px, 1e-12)
-    warn = not ratio < limits.good_unseen_ratio
+    warn = not ratio < GOOD_UNSEEN_RATIO
     return Check(
         name="lens model",
         verdict="warn" if warn else "good",
@@ -188,9 +181,9 @@ def _refused(report: IntrinsicsReport) -> Check:
     )
 
 
-def _residuals(report: IntrinsicsReport, limits: CheckLimits) -> Check:
+def _residuals(report: IntrinsicsReport) -> Check:
     worst = max(report.used, key=lambda v: v.rms_px)
-    warn = report.rms_px > limits.good_rms_px
+    warn = report.rms_px > GOOD_RMS_PX
     return Check(
         name="residuals",
         verdict="warn" if warn else "good",
@@ -205,7 +198,7 @@ def _residuals(report: IntrinsicsReport, limits: CheckLimits) -> Check:
     )
 
 
-def _border(report: IntrinsicsReport, limits: CheckLimits) -> Check:
+def _border(report: IntrinsicsReport) -> Check:
     border = border_pixels(report.intrinsics)
     _, valid = undistort(report.intrinsics, border)
     if not valid.all():
@@ -217,7 +210,7 @@ def _border(report: IntrinsicsReport, limits: CheckLimits) -> Check:
             advice="Add views with the board in the image's corners, or use fewer terms.",
         )
     sd = float(report.projection_sd_px(border).max())
-    warn = not sd < limits.good_border_px
+    warn = not sd < GOOD_BORDER_PX
     return Check(
         name="lens at the border",
         verdict="warn" if warn else "good",
@@ -228,7 +221,7 @@ def _border(report: IntrinsicsReport, limits: CheckLimits) -> Check:
     )
 
 
-def _board(report: IntrinsicsReport, limits: CheckLimits) -> Check:
+def _board(report: IntrinsicsReport) -> Check:
     b = report.board
     held = not np.any(b.sd > 0)
     if held:
@@ -236,7 +229,7 @@ def _board(report: IntrinsicsReport, limits: CheckLimits) -> Check:
             name="board shape", verdict="unknown",
             sentence="The print was taken to be flat and true to its drawing.",
         )  # fmt: skip
-    warped, stretched = b.warp_mm > limits.good_warp_mm, abs(b.aspect) > limits.good_aspect
+    warped, stretched = b.warp_mm > GOOD_WARP_MM, abs(b.aspect) > GOOD_ASPECT
     advice = "Glue the print to something flat (glass, aluminium)." if warped else ""
     if stretched:
         advice = (advice + " Measure the print along both edges.").strip()
@@ -252,12 +245,12 @@ def _board(report: IntrinsicsReport, limits: CheckLimits) -> Check:
     )
 
 
-def _start(report: IntrinsicsReport, start: CameraIntrinsics, limits: CheckLimits) -> Check:
+def _start(report: IntrinsicsReport, start: CameraIntrinsics) -> Check:
     difference = camera_vector(report.intrinsics)[:4] - camera_vector(start)[:4]
     sd = np.maximum(report.sd[:CAMERA_TERMS][:4], 1e-9)
     worst = int(np.argmax(np.abs(difference) / sd))
     sigmas = float(abs(difference[worst]) / sd[worst])
-    warn = sigmas > limits.believed_sigmas
+    warn = sigmas > BELIEVED_SIGMAS
     return Check(
         name="given intrinsics",
         verdict="warn" if warn else "good",

@@ -10,24 +10,20 @@ from realsim.errors import InputError
 QUARTERS = ("upper left", "upper right", "lower left", "lower right")
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CoverageConfig:
-    """When a part of the image or of the orientations counts as seen."""
-
-    columns: int = 8
-    """Cells across the image: small enough that an empty one matters to the lens."""
-    rows: int = 6
-    """Cells down the image."""
-    good_share: float = 0.8
-    """Share of cells with corners from which on nothing is asked for."""
-    thin_quarter: float = 0.5
-    """A quarter of the image with a smaller share of its cells seen is named."""
-    good_reach: float = 0.9
-    """Distance of the outermost corners from the image's middle, relative to half the diagonal."""
-    good_tilt_deg: float = 20.0
-    """Tilts that the board should reach: without them focal length and distance trade places."""
-    reach_quantile: float = 0.99
-    """Corner whose distance counts as the reach: a single stray corner says little."""
+COLUMNS = 8
+"""Cells across the image: small enough that an empty one matters to the lens."""
+ROWS = 6
+"""Cells down the image."""
+GOOD_SHARE = 0.8
+"""Share of cells with corners from which on nothing is asked for."""
+THIN_QUARTER = 0.5
+"""A quarter of the image with a smaller share of its cells seen is named."""
+GOOD_REACH = 0.9
+"""Distance of the outermost corners from the image's middle, relative to half the diagonal."""
+GOOD_TILT_DEG = 20.0
+"""Tilts that the board should reach: without them focal length and distance trade places."""
+REACH_QUANTILE = 0.99
+"""Corner whose distance counts as the reach: a single stray corner says little."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -57,29 +53,26 @@ class Coverage:
         return float(self.distance_m.max() / self.distance_m.min())
 
 
-def measure_coverage(
-    uv: Array, image_size: tuple[int, int], poses: Array, config: CoverageConfig | None = None
-) -> Coverage:
+def measure_coverage(uv: Array, image_size: tuple[int, int], poses: Array) -> Coverage:
     """Return the coverage of corners (N, 2) [px] by boards at poses (views, 4, 4) [m].
 
     Raises:
         InputError: there is no corner or no view.
     """
-    config = config or CoverageConfig()
     uv = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
     if len(uv) == 0 or len(poses) == 0:
         raise InputError("coverage: there are no corners; give the views that were detected.")
     width, height = image_size
-    cells = np.floor((uv + 0.5) / [width / config.columns, height / config.rows]).astype(np.int64)
-    cells = np.clip(cells, 0, [config.columns - 1, config.rows - 1])
-    counts = np.zeros((config.rows, config.columns), dtype=np.int64)
+    cells = np.floor((uv + 0.5) / [width / COLUMNS, height / ROWS]).astype(np.int64)
+    cells = np.clip(cells, 0, [COLUMNS - 1, ROWS - 1])
+    counts = np.zeros((ROWS, COLUMNS), dtype=np.int64)
     np.add.at(counts, (cells[:, 1], cells[:, 0]), 1)
     middle = (np.array([width, height]) - 1) / 2
     radius = np.linalg.norm(uv - middle, axis=-1) / np.hypot(width / 2, height / 2)
     normal = poses[:, :3, 2] * np.where(poses[:, 2:3, 2] > 0, -1.0, 1.0)
     tilt = np.degrees(np.arccos(np.clip(-normal[:, 2], -1, 1)))
     share = float(np.mean(counts > 0))
-    reach = float(np.quantile(radius, config.reach_quantile))
+    reach = float(np.quantile(radius, REACH_QUANTILE))
     spread = float(np.degrees(np.arccos(np.clip(np.min(normal @ normal.T), -1, 1))))
     return Coverage(
         counts=counts,
@@ -89,37 +82,35 @@ def measure_coverage(
         tilt_azimuth_deg=np.degrees(np.arctan2(normal[:, 1], normal[:, 0])),
         distance_m=poses[:, 2, 3].copy(),
         normal_spread_deg=spread,
-        advice=_advice(counts, share, reach, tilt, spread, config),
+        advice=_advice(counts, share, reach, tilt, spread),
     )
 
 
-def _advice(
-    counts: Int64, share: float, reach: float, tilt: Array, spread: float, config: CoverageConfig
-) -> str:
+def _advice(counts: Int64, share: float, reach: float, tilt: Array, spread: float) -> str:
     parts: list[str] = []
     seen = counts > 0
-    r, c = config.rows // 2, config.columns // 2
+    r, c = ROWS // 2, COLUMNS // 2
     quarters = (seen[:r, :c], seen[:r, c:], seen[r:, :c], seen[r:, c:])
     shares = [float(q.mean()) for q in quarters]
     empty = [name for name, s in zip(QUARTERS, shares, strict=True) if s == 0]
-    thin = [n for n, s in zip(QUARTERS, shares, strict=True) if 0 < s < config.thin_quarter]
+    thin = [n for n, s in zip(QUARTERS, shares, strict=True) if 0 < s < THIN_QUARTER]
     if empty:
         parts.append(f"There are no corners in the {_list(empty)} quarter of the image.")
     if thin:
         parts.append(f"There are few corners in the {_list(thin)} quarter of the image.")
-    if not empty and not thin and share < config.good_share:
+    if not empty and not thin and share < GOOD_SHARE:
         parts.append(f"Only {share:.0%} of the image has corners.")
-    if reach < config.good_reach:
+    if reach < GOOD_REACH:
         parts.append(
             f"Corners reach {reach:.0%} of the way to the image's corners: add views with the "
             "board in the corners, where the distortion is largest."
         )
-    if float(tilt.max()) < config.good_tilt_deg:
+    if float(tilt.max()) < GOOD_TILT_DEG:
         parts.append(
             f"The board is tilted by {float(tilt.max()):.0f} deg at most: tilt it by 30 deg about "
             "two axes."
         )
-    elif spread < config.good_tilt_deg:
+    elif spread < GOOD_TILT_DEG:
         parts.append("All views see the board under the same angle: tilt it to other sides too.")
     return " ".join(parts)
 

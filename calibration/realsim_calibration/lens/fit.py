@@ -17,11 +17,8 @@ from realsim_calibration.lens.bundle import (
     State,
     adjust,
 )
-from realsim_calibration.lens.checks import CheckLimits
 from realsim_calibration.lens.covariance import GlobalCovariance, border_effect, global_covariance
-from realsim_calibration.lens.coverage import CoverageConfig
-from realsim_calibration.lens.models import MODELS, TERM_NAMES, LensBeliefs, free_terms
-from realsim_calibration.lens.observations import OutlierConfig
+from realsim_calibration.lens.models import MODELS, TERM_NAMES, free_terms
 
 HOLD_ORDER = ((("k6",), ("k5",), ("k4",), ("k3",), ("k2",), ("k1",)), (("p1", "p2"),))
 """In which order terms are asked whether the views determine them."""
@@ -71,11 +68,7 @@ class IntrinsicsConfig:
     measured_sigmas: float = 2.0
     """A term this many sigmas from where it would be held is not held for the border's sake: the
     corners there are contradict holding it."""
-    outliers: OutlierConfig = field(default_factory=OutlierConfig)
-    beliefs: LensBeliefs = field(default_factory=LensBeliefs)
     solver: SolverConfig = field(default_factory=SolverConfig)
-    coverage: CoverageConfig = field(default_factory=CoverageConfig)
-    limits: CheckLimits = field(default_factory=CheckLimits)
 
     def __post_init__(self) -> None:
         """Check the names of the models."""

@@ -27,7 +27,7 @@ from realsim_calibration.lens.choice import (
     score_models,
 )
 from realsim_calibration.lens.covariance import global_covariance
-from realsim_calibration.lens.coverage import measure_coverage
+from realsim_calibration.lens.coverage import GOOD_TILT_DEG, measure_coverage
 from realsim_calibration.lens.fit import (
     Candidate,
     IntrinsicsConfig,
@@ -37,7 +37,7 @@ from realsim_calibration.lens.fit import (
     settle,
 )
 from realsim_calibration.lens.models import MODELS, lens_prior
-from realsim_calibration.lens.observations import Corners, find_outliers, gather
+from realsim_calibration.lens.observations import ROUNDS, Corners, find_outliers, gather
 from realsim_calibration.lens.report import IntrinsicsReport, LensView
 from realsim_calibration.lens.start import choose_twins, start_state, view_errors
 from realsim_calibration.results import BoardShape
@@ -75,7 +75,7 @@ def calibrate_intrinsics(
         DegenerateError: the views do not determine the focal length; the message says what to add.
     """
     config = config or IntrinsicsConfig()
-    corners = gather(detections, target, names, start, config.outliers)
+    corners = gather(detections, target, names, start)
     _require_views(corners, start)
     corners, fit, prior, how = _first_fit(corners, start, config)
     corners, fit = _clean(corners, fit, start, config)
@@ -87,7 +87,7 @@ def calibrate_intrinsics(
     wider = candidates[REFERENCE] if _is_wider(REFERENCE, model, candidates) else chosen
     report = _report(corners, target, chosen, wider, config)
     report = replace(report, held_out=scores, start=how)
-    return replace(report, checks=intrinsics_checks(report, prior, start, config.limits))
+    return replace(report, checks=intrinsics_checks(report, prior, start))
 
 
 def _is_wider(name: str, model: str, candidates: dict[str, Candidate]) -> bool:
@@ -133,12 +133,12 @@ def _first_fit(
         _require_views(corners, start)
         state, errors = state.only_views(fits), errors[fits]
     obs = corners.obs
-    prior = lens_prior(config.beliefs, float(state.camera[0]), obs.image_size, start)
+    prior = lens_prior(float(state.camera[0]), obs.image_size, start)
     # The misfit of the closed form is taken for noise.
     sigma = max(float(np.median(errors)), config.sigma_floor_px)
     fit = adjust(state, obs, model_prior(prior, "k1", config), sigma, config.solver)
     # The beliefs about the distortion need the focal length, which is known well enough by now.
-    prior = lens_prior(config.beliefs, float(fit.state.camera[0]), obs.image_size, start)
+    prior = lens_prior(float(fit.state.camera[0]), obs.image_size, start)
     sigma = robust_sigma(fit.residuals, obs.weight, config.sigma_floor_px)
     state = choose_twins(fit.state, obs, sigma, config.solver)
     fit = settle(state, obs, model_prior(prior, "Brown 5", config), sigma, config)
@@ -149,8 +149,8 @@ def _clean(
     corners: Corners, fit: LensFit, start: CameraIntrinsics | None, config: IntrinsicsConfig
 ) -> tuple[Corners, LensFit]:
     """Return corners and fit without outlier corners and views, which are named."""
-    for _ in range(config.outliers.rounds):
-        cleaned, keep_views = find_outliers(corners, fit, config.outliers)
+    for _ in range(ROUNDS):
+        cleaned, keep_views = find_outliers(corners, fit)
         if cleaned is None:
             break
         corners = cleaned
@@ -169,14 +169,12 @@ def _check_focal(
     """
     if start is not None:
         return
-    coverage = measure_coverage(
-        corners.obs.uv, corners.obs.image_size, fit.state.poses, config.coverage
-    )
+    coverage = measure_coverage(corners.obs.uv, corners.obs.image_size, fit.state.poses)
     n = corners.obs.views
     if coverage.normal_spread_deg < config.least_spread_deg:
         tilt = float(np.median(coverage.tilt_deg))
         how = (
-            "face the board squarely" if tilt < config.coverage.good_tilt_deg / 2
+            "face the board squarely" if tilt < GOOD_TILT_DEG / 2
             else f"see the board under the same angle ({tilt:.0f} deg)"
         )  # fmt: skip
         raise DegenerateError(
@@ -260,7 +258,7 @@ def _report(
         sigma_px=fit.sigma_px,
         rms_px=float(np.sqrt(np.mean(np.sum(fit.residuals**2, -1)))),
         views=tuple(views),
-        coverage=measure_coverage(obs.uv, obs.image_size, fit.state.poses, config.coverage),
+        coverage=measure_coverage(obs.uv, obs.image_size, fit.state.poses),
         board=BoardShape(
             scale=1.0,
             aspect=float(fit.state.board[0]),

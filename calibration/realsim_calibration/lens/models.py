@@ -1,7 +1,5 @@
 """The lens models that are tried, from the pinhole to the rational, and beliefs about a lens."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from realsim.arrays import Array, Mask
@@ -25,31 +23,23 @@ SMALLEST_RADIUS = 0.1
 """Least half field of view (as a tangent) that the distortion's priors are scaled with."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class LensBeliefs:
-    """What is known of any lens and any printed board before it is measured: 1-sigmas.
-
-    They only decide where the views say little: a good set of views knows every term ten to a
-    hundred times better.
-    """
-
-    focal_sd: float = 0.02
-    """Focal length about the one given in `start`, relative; without a start it is free."""
-    aspect_sd: float = 0.004
-    """fx / fy about 1 (or that of `start`), relative: pixels are square, resampled images nearly.
-    Without it a print that is too tall cannot be told from such a sensor unless the board rolls."""
-    center_sd: float = 0.03
-    """Principal point about the image's middle (or that of `start`), in longer image sides."""
-    radial_sd: tuple[float, float, float] = (0.25, 0.25, 0.15)
-    """Displacement in the image's corner due to k1, k2, k3 (and k4, k5, k6), relative to the
-    corner's distance from the centre. Stated in the image's corner because k1 means nothing
-    without the field of view: 0.1 is nothing on a long lens and a fisheye on a wide one."""
-    tangential_sd: float = 0.004
-    """The same of p1 and p2: a lens that is off its axis or tilted."""
-    board_aspect_sd: float = 0.003
-    """Height of the print relative to its width: printers stretch the paper by up to 0.5 %."""
-    board_warp_sd: float = 0.01
-    """Bending of the board, lift at its end relative to half its longer side: 1 mm at 0.1 m."""
+FOCAL_SD = 0.02
+"""Focal length about the one given in `start`, relative; without a start it is free."""
+ASPECT_SD = 0.004
+"""fx / fy about 1 (or that of `start`), relative: pixels are square, resampled images nearly.
+Without it a print that is too tall cannot be told from such a sensor unless the board rolls."""
+CENTER_SD = 0.03
+"""Principal point about the image's middle (or that of `start`), in longer image sides."""
+RADIAL_SD = (0.25, 0.25, 0.15)
+"""Displacement in the image's corner due to k1, k2, k3 (and k4, k5, k6), relative to the
+corner's distance from the centre. Stated in the image's corner because k1 means nothing
+without the field of view: 0.1 is nothing on a long lens and a fisheye on a wide one."""
+TANGENTIAL_SD = 0.004
+"""The same of p1 and p2: a lens that is off its axis or tilted."""
+BOARD_ASPECT_SD = 0.003
+"""Height of the print relative to its width: printers stretch the paper by up to 0.5 %."""
+BOARD_WARP_SD = 0.01
+"""Bending of the board, lift at its end relative to half its longer side: 1 mm at 0.1 m."""
 
 
 def corner_radius(camera: Array, image_size: tuple[int, int]) -> float:
@@ -60,13 +50,10 @@ def corner_radius(camera: Array, image_size: tuple[int, int]) -> float:
     return float(max(np.hypot(x, y), SMALLEST_RADIUS))
 
 
-def lens_prior(
-    beliefs: LensBeliefs, focal: float, image_size: tuple[int, int], start: CameraIntrinsics | None
-) -> Prior:
+def lens_prior(focal: float, image_size: tuple[int, int], start: CameraIntrinsics | None) -> Prior:
     """Return the prior of a lens and a board, all terms free.
 
     Args:
-        beliefs: the 1-sigmas.
         focal: rough focal length, which sets the distortion's scale [px].
         image_size: width and height.
         start: known intrinsics, the prior's centre; None = the middle of the image, no distortion.
@@ -77,14 +64,14 @@ def lens_prior(
     if start is not None:
         mean[:CAMERA_TERMS] = camera_vector(start)
     radius = corner_radius(mean, image_size)
-    k = np.array(beliefs.radial_sd) / radius ** np.array([2, 4, 6])
+    k = np.array(RADIAL_SD) / radius ** np.array([2, 4, 6])
     # A point at the radius r moves by up to 3 p r^2.
-    p = beliefs.tangential_sd / (3 * radius)
-    f = np.inf if start is None else beliefs.focal_sd
-    center = beliefs.center_sd * max(image_size)
-    board = [beliefs.board_aspect_sd] + [beliefs.board_warp_sd] * 3
+    p = TANGENTIAL_SD / (3 * radius)
+    f = np.inf if start is None else FOCAL_SD
+    center = CENTER_SD * max(image_size)
+    board = [BOARD_ASPECT_SD] + [BOARD_WARP_SD] * 3
     sd = np.array([f, f, center, center, k[0], k[1], p, p, k[2], *k, *board])
-    return Prior(mean=mean, sd=sd, aspect_sd=beliefs.aspect_sd, free=np.ones(GLOBALS, dtype=bool))
+    return Prior(mean=mean, sd=sd, aspect_sd=ASPECT_SD, free=np.ones(GLOBALS, dtype=bool))
 
 
 def free_terms(model: str, held: tuple[str, ...] = (), board: bool = True) -> Mask:

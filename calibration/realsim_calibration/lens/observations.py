@@ -19,25 +19,21 @@ OUTSIDE_PX = 2.0
 """Corners may lie this far outside the image [px]: detectors extrapolate a little."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class OutlierConfig:
-    """When a corner or a view is left out."""
-
-    least_corners: int = 6
-    """Corners a view needs: a pose takes three, and with few more it says nothing of the lens."""
-    corner_sigmas: float = 6.0
-    """A corner further off than this many sigmas is left out: of a million good ones none is."""
-    least_corner_px: float = 0.3
-    """A corner nearer than this is never left out [px]: it does no harm."""
-    view_ratio: float = 5.0
-    """A view whose median error is more than this times the median view's is left out."""
-    least_view_px: float = 1.0
-    """A view with a smaller median error is never left out [px]."""
-    rounds: int = 3
-    """Rounds of leaving out and fitting again."""
-    weight_ratio: float = 16.0
-    """Predicted variances of corners may differ by this factor; detectors' predictions are not
-    trusted further."""
+LEAST_CORNERS = 6
+"""Corners a view needs: a pose takes three, and with few more it says nothing of the lens."""
+CORNER_SIGMAS = 6.0
+"""A corner further off than this many sigmas is left out: of a million good ones none is."""
+LEAST_CORNER_PX = 0.3
+"""A corner nearer than this is never left out [px]: it does no harm."""
+VIEW_RATIO = 5.0
+"""A view whose median error is more than this times the median view's is left out."""
+LEAST_VIEW_PX = 1.0
+"""A view with a smaller median error is never left out [px]."""
+ROUNDS = 3
+"""Rounds of leaving out and fitting again."""
+WEIGHT_RATIO = 16.0
+"""Predicted variances of corners may differ by this factor; detectors' predictions are not
+trusted further."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -89,7 +85,6 @@ def gather(
     target: Target,
     names: Sequence[str] | None,
     start: CameraIntrinsics | None,
-    config: OutlierConfig,
 ) -> Corners:
     """Return the corners of all views that have enough of them.
 
@@ -111,8 +106,8 @@ def gather(
     for i, (d, label) in enumerate(zip(detections, labels, strict=True)):
         _check_points(d, label, size, target)
         reason = ""
-        if len(d) < config.least_corners:
-            reason = f"{len(d)} corners, {config.least_corners} are needed"
+        if len(d) < LEAST_CORNERS:
+            reason = f"{len(d)} corners, {LEAST_CORNERS} are needed"
         elif is_line(drawing[d.point_ids]) or is_line(d.uv):
             reason = "its corners lie on one line"
         reasons.append(reason)
@@ -123,7 +118,7 @@ def gather(
     obs = Observations(
         flat=drawing[ids] - middle,
         uv=np.concatenate([np.zeros((0, 2)), *(d.uv for d in parts)]),
-        weight=_weights(parts, config.weight_ratio),
+        weight=_weights(parts, WEIGHT_RATIO),
         offsets=np.cumsum([0, *(len(d) for d in parts)]).astype(np.int64),
         half_extent_m=max(half_x, half_y),
         image_size=size,
@@ -190,9 +185,7 @@ def _weights(parts: Sequence[TargetDetection], ratio: float) -> Array:
     return np.clip(weight, 1 / ratio, ratio)
 
 
-def find_outliers(
-    corners: Corners, fit: LensFit, config: OutlierConfig
-) -> tuple[Corners | None, Mask]:
+def find_outliers(corners: Corners, fit: LensFit) -> tuple[Corners | None, Mask]:
     """Return the corners without outliers (None = there are none), and the views kept (views,).
 
     A corner is judged by the scatter of all corners or, where that is larger, by its own view's: a
@@ -205,12 +198,12 @@ def find_outliers(
     cuts = list(zip(obs.offsets[:-1], obs.offsets[1:], strict=True))
     own = np.array([MAD_TO_SIGMA * float(np.median(scaled[a:b])) for a, b in cuts])
     view_px = np.array([float(np.median(distance[a:b])) for a, b in cuts])
-    limit_px = max(config.view_ratio * float(np.median(view_px)), config.least_view_px)
+    limit_px = max(VIEW_RATIO * float(np.median(view_px)), LEAST_VIEW_PX)
     keep_view = view_px <= limit_px
-    allowed = config.corner_sigmas * np.maximum(own, everyone)[obs.view] / np.sqrt(obs.weight)
-    keep = distance <= np.maximum(allowed, config.least_corner_px)
+    allowed = CORNER_SIGMAS * np.maximum(own, everyone)[obs.view] / np.sqrt(obs.weight)
+    keep = distance <= np.maximum(allowed, LEAST_CORNER_PX)
     left = np.bincount(obs.view[keep], minlength=obs.views)
-    thin = keep_view & (left < config.least_corners)
+    thin = keep_view & (left < LEAST_CORNERS)
     if keep_view.all() and keep.all():
         return None, keep_view
     reasons, outliers = list(corners.reasons), dict(corners.outliers)

@@ -22,7 +22,6 @@ from realsim_calibration.planning.next_view import (
 )
 from realsim_calibration.planning.view_proposals import (
     Need,
-    NeedsConfig,
     SeenBoard,
     ViewLimits,
     describe_move,
@@ -82,7 +81,6 @@ class LiveConfig:
     same_m: float = 0.01
     """A hand that turned so little and moved by less than this [m] has taken the same view
     again."""
-    needs: NeedsConfig = field(default_factory=NeedsConfig)
     next_view: NextViewConfig = field(default_factory=NextViewConfig)
     limits: ViewLimits = field(default_factory=ViewLimits)
     """Where the next view may be, where no plan is given."""
@@ -176,7 +174,7 @@ class LiveCalibration:
                 "intrinsics of the resolution at which the images are taken."
             )
         note = self._accept(view)
-        needs = missing(self._seen, self.target, self.intrinsics0, self.config.needs)
+        needs = missing(self._seen, self.target, self.intrinsics0)
         if len(self._seen) < self.config.min_views:
             self.status = self._collecting(note, needs)
         else:

@@ -1,7 +1,7 @@
 """What refining the cameras gained: outlines before and after, much enlarged."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,14 +18,10 @@ CLAIMED_RGB, REFINED_RGB = (255, 92, 205), (58, 188, 92)
 """Outlines through the camera as it was claimed to be, and as it was refined."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class GainConfig:
-    """How the gain is drawn."""
-
-    crop_px: int = 40
-    """Side of the part of a photograph that shows what cameras gained [px]."""
-    zoom: int = 16
-    """By which it is enlarged: one pixel is then as wide as a hand-drawn line."""
+CROP_PX = 40
+"""Side of the part of a photograph that shows what cameras gained [px]."""
+ZOOM = 16
+"""By which it is enlarged: one pixel is then as wide as a hand-drawn line."""
 
 
 def placed_objects(result: Registered, models: Mapping[int, ObjectModel]) -> list[PlacedMesh]:
@@ -68,16 +64,12 @@ def _corners(bounds: Array) -> Array:
 
 
 def gain_picture(
-    store: SessionStore,
-    result: Registered,
-    models: Mapping[int, ObjectModel],
-    config: GainConfig | None = None,
+    store: SessionStore, result: Registered, models: Mapping[int, ObjectModel]
 ) -> Image | None:
     """Return a small part of a photograph, much enlarged, with outlines before and after.
 
     The object that moved most in the images stands for all; None if cameras were not refined.
     """
-    config = config or GainConfig()
     intrinsics = store.session.intrinsics
     shifts = camera_shifts_px(result, models, intrinsics)
     usable = {
@@ -90,9 +82,9 @@ def gain_picture(
     scene = FirstSurfaces(placed_objects(result, models))
     ends = (result.cameras.claimed[index], result.cameras.refined[index])
     ids = scene.look(intrinsics, ends[1])[0]
-    corner = _edge_corner(store.rgb(index), ids == instance, config.crop_px)
-    zoomed = zoomed_camera(intrinsics, corner, config.crop_px, config.zoom)
-    ground = _enlarged(store.rgb(index), corner, config)
+    corner = _edge_corner(store.rgb(index), ids == instance, CROP_PX)
+    zoomed = zoomed_camera(intrinsics, corner, CROP_PX, ZOOM)
+    ground = _enlarged(store.rgb(index), corner)
     pictures: list[Image] = []
     for T, color in zip(ends, (CLAIMED_RGB, REFINED_RGB), strict=True):
         fine = scene.look(zoomed, T)[0]
@@ -143,12 +135,12 @@ def _edge_corner(rgb: Image, mask: Mask, side_px: int) -> tuple[int, int]:
     )
 
 
-def _enlarged(rgb: Image, corner: tuple[int, int], config: GainConfig) -> Image:
+def _enlarged(rgb: Image, corner: tuple[int, int]) -> Image:
     """Return a square part of a photograph, enlarged without smoothing its pixels away."""
     x, y = corner
-    part = rgb[y : y + config.crop_px, x : x + config.crop_px]
+    part = rgb[y : y + CROP_PX, x : x + CROP_PX]
     part = np.pad(
-        part, ((0, config.crop_px - part.shape[0]), (0, config.crop_px - part.shape[1]), (0, 0)),
+        part, ((0, CROP_PX - part.shape[0]), (0, CROP_PX - part.shape[1]), (0, 0)),
         mode="edge",
     )  # fmt: skip
-    return np.repeat(np.repeat(part, config.zoom, axis=0), config.zoom, axis=1)
+    return np.repeat(np.repeat(part, ZOOM, axis=0), ZOOM, axis=1)

@@ -26,30 +26,26 @@ OUTLINE: Color = (70, 78, 88)
 OVERLAY, GAIN, RESIDUALS, MAP = "overlay.jpg", "cameras.jpg", "residuals.jpg", "map.png"
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PictureConfig:
-    """How pictures are drawn."""
-
-    views: int = 6
-    """Photographs of a contact sheet."""
-    columns: int = 2
-    """Columns of a contact sheet: on three, names are too small to read."""
-    width_px: int = 960
-    """Width of one photograph in a contact sheet [px]."""
-    margin: float = 0.3
-    """Surroundings shown on each side of the objects [share of their size in the picture]."""
-    least_share: float = 0.4
-    """At least so much of a photograph's width is shown: one small object alone says little."""
-    range_mm: float = 1.5
-    """The strongest colour of depth residuals [mm]: an object that is off by more is not used."""
-    smooth_px: int = 21
-    """Residuals are averaged over so many pixels of the same object: noise is not the question."""
-    wild_mm: float = 6.0
-    """Residuals beyond this count as this much: one flying pixel is not a patch [mm]."""
-    table_m: float = 0.25
-    """Half the side of the piece of table that residuals are drawn on, beyond the objects [m]."""
-    quality: int = 88
-    """Quality of JPEG files [percent]."""
+VIEWS = 6
+"""Photographs of a contact sheet."""
+COLUMNS = 2
+"""Columns of a contact sheet: on three, names are too small to read."""
+WIDTH_PX = 960
+"""Width of one photograph in a contact sheet [px]."""
+MARGIN = 0.3
+"""Surroundings shown on each side of the objects [share of their size in the picture]."""
+LEAST_SHARE = 0.4
+"""At least so much of a photograph's width is shown: one small object alone says little."""
+RANGE_MM = 1.5
+"""The strongest colour of depth residuals [mm]: an object that is off by more is not used."""
+SMOOTH_PX = 21
+"""Residuals are averaged over so many pixels of the same object: noise is not the question."""
+WILD_MM = 6.0
+"""Residuals beyond this count as this much: one flying pixel is not a patch [mm]."""
+TABLE_M = 0.25
+"""Half the side of the piece of table that residuals are drawn on, beyond the objects [m]."""
+QUALITY = 88
+"""Quality of JPEG files [percent]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -66,10 +62,7 @@ class _Look:
 
 
 def draw_pictures(
-    store: SessionStore,
-    result: Registered,
-    models: Mapping[int, ObjectModel],
-    config: PictureConfig | None = None,
+    store: SessionStore, result: Registered, models: Mapping[int, ObjectModel]
 ) -> dict[str, bytes]:
     """Return file name -> bytes of every picture that can be drawn of a registration.
 
@@ -77,27 +70,25 @@ def draw_pictures(
         store: the session, for photographs and depth.
         result: what was found.
         models: obj_id -> model.
-        config: how they are drawn.
     """
     from realsim.app.register.gain import gain_picture, placed_objects
     from realsim.app.register.map import map_png
 
-    config = config or PictureConfig()
     if not result.scene.objects or not result.cameras.refined:
         return {}
-    scene = FirstSurfaces([*placed_objects(result, models), *_table(result, config)])
+    scene = FirstSurfaces([*placed_objects(result, models), *_table(result)])
     looks: list[_Look] = []
-    for index in spread_views(result, config.views):
+    for index in spread_views(result, VIEWS):
         ids, depth = scene.look(store.session.intrinsics, result.cameras.refined[index])
-        looks.append(_Look(index=index, ids=ids, depth_m=depth, window=window_of(ids, config)))
+        looks.append(_Look(index=index, ids=ids, depth_m=depth, window=window_of(ids)))
     pictures = {
-        OVERLAY: jpeg(_overlay_sheet(store, result, models, looks, config), config.quality),
-        RESIDUALS: jpeg(_residual_sheet(store, result, looks, config), config.quality),
+        OVERLAY: jpeg(_overlay_sheet(store, result, models, looks), QUALITY),
+        RESIDUALS: jpeg(_residual_sheet(store, result, looks), QUALITY),
         MAP: map_png(result, models),
     }
     gain = gain_picture(store, result, models)
     if gain is not None:
-        pictures[GAIN] = jpeg(gain, config.quality)
+        pictures[GAIN] = jpeg(gain, QUALITY)
     return pictures
 
 
@@ -108,7 +99,7 @@ def spread_views(result: Registered, n: int) -> list[int]:
     return [views[k] for k in pick]
 
 
-def window_of(ids: Int32, config: PictureConfig) -> Window:
+def window_of(ids: Int32) -> Window:
     """Return the part of a picture around all objects, of the picture's own proportions.
 
     The whole picture where no object is in it.
@@ -119,8 +110,8 @@ def window_of(ids: Int32, config: PictureConfig) -> Window:
         return slice(0, height), slice(0, width)
     low, high = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1
     size = np.array([width, height])
-    share = float(np.max((high - low) * (1 + 2 * config.margin) / size))
-    wide = np.round(np.clip(share, config.least_share, 1.0) * size).astype(int)
+    share = float(np.max((high - low) * (1 + 2 * MARGIN) / size))
+    wide = np.round(np.clip(share, LEAST_SHARE, 1.0) * size).astype(int)
     x, y = np.clip(np.round((low + high - wide) / 2).astype(int), 0, size - wide)
     return slice(int(y), int(y + wide[1])), slice(int(x), int(x + wide[0]))
 
@@ -134,35 +125,35 @@ def jpeg(rgb: Image, quality: int) -> bytes:
     return buffer.getvalue()
 
 
-def _table(result: Registered, config: PictureConfig) -> list[PlacedMesh]:
+def _table(result: Registered) -> list[PlacedMesh]:
     """Return a piece of the table around the objects."""
     plane = result.scene.plane
     if plane is None:
         return []
     places = np.stack([o.T_world_obj[:3, 3] for o in result.scene.objects])
     local = se3.transform(se3.invert(plane.T_world_table), places)[:, :2]
-    (x0, y0), (x1, y1) = local.min(0) - config.table_m, local.max(0) + config.table_m
+    (x0, y0), (x1, y1) = local.min(0) - TABLE_M, local.max(0) + TABLE_M
     corners = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
     return [PlacedMesh(BACKGROUND, Mesh(vertices=corners, faces=faces), plane.T_world_table)]
 
 
-def _resized(rgb: Image, config: PictureConfig) -> Image:
+def _resized(rgb: Image) -> Image:
     """Return a picture at the width of the sheet."""
     import cv2
 
-    height = round(rgb.shape[0] * config.width_px / rgb.shape[1])
-    kind = cv2.INTER_AREA if rgb.shape[1] > config.width_px else cv2.INTER_CUBIC
-    sized = cv2.resize(rgb, (config.width_px, height), interpolation=kind)
+    height = round(rgb.shape[0] * WIDTH_PX / rgb.shape[1])
+    kind = cv2.INTER_AREA if rgb.shape[1] > WIDTH_PX else cv2.INTER_CUBIC
+    sized = cv2.resize(rgb, (WIDTH_PX, height), interpolation=kind)
     return np.ascontiguousarray(np.asarray(sized, dtype=np.uint8))
 
 
-def _resized_ids(ids: Int32, config: PictureConfig) -> Int32:
+def _resized_ids(ids: Int32) -> Int32:
     """Return instances (H, W) at the width of the sheet."""
     import cv2
 
-    height = round(ids.shape[0] * config.width_px / ids.shape[1])
-    sized = cv2.resize(ids, (config.width_px, height), interpolation=cv2.INTER_NEAREST)
+    height = round(ids.shape[0] * WIDTH_PX / ids.shape[1])
+    sized = cv2.resize(ids, (WIDTH_PX, height), interpolation=cv2.INTER_NEAREST)
     return np.asarray(sized, dtype=np.int32)
 
 
@@ -174,19 +165,18 @@ def _overlay_sheet(
     result: Registered,
     models: Mapping[int, ObjectModel],
     looks: Sequence[_Look],
-    config: PictureConfig,
 ) -> Image:
     """Return photographs with every object's outline and name in the colour of its verdict."""
     colors = {o.instance: VERDICT_RGB[o.verdict] for o in result.scene.objects}
     names = {o.instance: _name_of(o, models) for o in result.scene.objects}
     pictures: list[Image] = []
     for look in looks:
-        ids = _resized_ids(look.ids[look.window], config)
-        photo = _resized(store.rgb(look.index)[look.window], config)
+        ids = _resized_ids(look.ids[look.window])
+        photo = _resized(store.rgb(look.index)[look.window])
         picture = draw_outlines(photo, ids, colors, 2)
         pictures.append(write_names(picture, ids, names, colors))
     captions = [_view_caption(result, look.index) for look in looks]
-    return contact_sheet(pictures, config.columns, captions)
+    return contact_sheet(pictures, COLUMNS, captions)
 
 
 def _name_of(o: ObjectPose, models: Mapping[int, ObjectModel]) -> str:
@@ -204,9 +194,7 @@ def _view_caption(result: Registered, index: int) -> str:
 # --- depth ------------------------------------------------------------------------------------
 
 
-def _residual_sheet(
-    store: SessionStore, result: Registered, looks: Sequence[_Look], config: PictureConfig
-) -> Image:
+def _residual_sheet(store: SessionStore, result: Registered, looks: Sequence[_Look]) -> Image:
     """Return by how much the measured depth is nearer than the scene's, in colours."""
     bias = bias_of(result)
     pictures: list[Image] = []
@@ -214,26 +202,26 @@ def _residual_sheet(
     for look in looks:
         measured = bias.corrected(store.depth_m(look.index).astype(np.float64))
         nearer = np.where(measured > 0, 1e3 * (look.depth_m - measured), np.nan)
-        smooth = _averaged(nearer, look.ids, config)[look.window]
+        smooth = _averaged(nearer, look.ids)[look.window]
         photo = store.rgb(look.index)[look.window]
         grey = 0.4 * photo.mean(-1, keepdims=True).repeat(3, -1) + 0.6 * 255
-        colored = np.where(np.isfinite(smooth)[..., None], diverging(smooth, config.range_mm), grey)
-        picture = _resized(np.clip(np.round(colored), 0, 255).astype(np.uint8), config)
-        ids = _resized_ids(look.ids[look.window], config)
+        colored = np.where(np.isfinite(smooth)[..., None], diverging(smooth, RANGE_MM), grey)
+        picture = _resized(np.clip(np.round(colored), 0, 255).astype(np.uint8))
+        ids = _resized_ids(look.ids[look.window])
         outlines = dict.fromkeys(np.unique(ids[ids >= 0]).tolist(), OUTLINE)
         pictures.append(draw_outlines(picture, ids, outlines, 1))
         captions.append(_residual_caption(look.index, nearer[look.ids >= 0]))
-    sheet = contact_sheet(pictures, config.columns, captions)
-    return np.concatenate([sheet, _color_bar(sheet.shape[1], config.range_mm)], axis=0)
+    sheet = contact_sheet(pictures, COLUMNS, captions)
+    return np.concatenate([sheet, _color_bar(sheet.shape[1], RANGE_MM)], axis=0)
 
 
-def _averaged(values: Array, ids: Int32, config: PictureConfig) -> Array:
+def _averaged(values: Array, ids: Int32) -> Array:
     """Return values (H, W) averaged over the pixels around that see the same thing; NaN stays."""
     import cv2
 
     out = np.full(values.shape, np.nan)
-    side = (config.smooth_px, config.smooth_px)
-    held = np.clip(values, -config.wild_mm, config.wild_mm)
+    side = (SMOOTH_PX, SMOOTH_PX)
+    held = np.clip(values, -WILD_MM, WILD_MM)
     for instance in np.unique(ids):
         mine = (ids == instance) & np.isfinite(values)
         total = cv2.boxFilter(np.where(mine, held, 0.0), -1, side, normalize=False)

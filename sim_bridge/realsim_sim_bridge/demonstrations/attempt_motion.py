@@ -23,7 +23,7 @@ from realsim.arrays import Array, Int64, Mask
 from realsim.geometry import se3
 from realsim.records.trajectories import PHASES, GraspTrajectories
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
-from realsim_sim_bridge.demonstrations.falling import FallConfig, fall
+from realsim_sim_bridge.demonstrations.falling import fall
 from realsim_sim_bridge.demonstrations.slip_replay import HeldStage, SlipReplay
 from realsim_sim_bridge.slip.world import SlipBody
 
@@ -92,16 +92,13 @@ class _Clock:
     end_s: float
 
 
-def attempt_motion(
-    attempt: Attempt, rate_hz: float, fall_s: float, falling: FallConfig
-) -> AttemptMotion:
+def attempt_motion(attempt: Attempt, rate_hz: float, fall_s: float) -> AttemptMotion:
     """Return an attempt at the steps of a rate.
 
     Args:
         attempt: trajectory and replay.
         rate_hz: steps per second.
         fall_s: how long a lost object is watched [s].
-        falling: how it falls.
     """
     rows = attempt.trajectories.attempt(attempt.row)
     assert rows is not None, "only rows with a trajectory are attempts"
@@ -127,7 +124,7 @@ def attempt_motion(
         phase=phases[at],
         held=held,
         Ts_base_ee=Ts_base_ee,
-        Ts_table_obj=_object(attempt, clock, t, planned, times, falling),
+        Ts_table_obj=_object(attempt, clock, t, planned, times),
         notes=tuple(notes),
     )
 
@@ -190,9 +187,7 @@ def _fingers(
 # --- the object ---------------------------------------------------------------------------------
 
 
-def _object(
-    attempt: Attempt, clock: _Clock, t: Array, planned: Array, times: Array, falling: FallConfig
-) -> Array:
+def _object(attempt: Attempt, clock: _Clock, t: Array, planned: Array, times: Array) -> Array:
     """Return where the object is (S, 4, 4), table frame [m]."""
     Ts = np.empty((len(t), 4, 4))
     in_hand = t <= clock.lost_s
@@ -209,9 +204,7 @@ def _object(
     if clock.begins[0] < clock.lost_s and len(attempt.replay.stages) > 1:
         twist[:3] = se3.log_so3(lost[:3, :3] @ before[:3, :3].T) / LOOK_S
         twist[3:] = step / LOOK_S
-    Ts[~in_hand] = fall(
-        attempt.body, lost, twist, attempt.others, t[~in_hand] - clock.lost_s, falling
-    )
+    Ts[~in_hand] = fall(attempt.body, lost, twist, attempt.others, t[~in_hand] - clock.lost_s)
     return Ts
 
 

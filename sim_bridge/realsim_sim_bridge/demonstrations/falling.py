@@ -7,7 +7,6 @@ hulls of their meshes, and the hand is not in the way any more.
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,32 +19,22 @@ from realsim.models.convex import collision_obj
 from realsim_sim_bridge.slip.bullet_shapes import drawn_in
 from realsim_sim_bridge.slip.world import SlipBody
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class FallConfig:
-    """How a lost object falls."""
-
-    rate_hz: float = 960.0
-    """Steps per second: at Bullet's own 240 an object sinks 8 mm into the table as it lands."""
-    iterations: int = 100
-    """Solver iterations a step: resting contacts of hulls need more than Bullet's 50."""
-    friction: float = 0.5
-    """Coulomb coefficient of object and table: wood on plastic."""
-    margin_m: float = 0.0005
-    """Bullet's margin around hulls [m], which are drawn in by it first; the slip test's."""
-    gravity: float = 9.81
-    """[m/s^2], along -z of the table."""
-    table_m: float = 4.0
-    """Edge of the table [m]: nothing falls off it in a second."""
+RATE_HZ = 960.0
+"""Steps per second: at Bullet's own 240 an object sinks 8 mm into the table as it lands."""
+ITERATIONS = 100
+"""Solver iterations a step: resting contacts of hulls need more than Bullet's 50."""
+FRICTION = 0.5
+"""Coulomb coefficient of object and table: wood on plastic."""
+MARGIN_M = 0.0005
+"""Bullet's margin around hulls [m], which are drawn in by it first; the slip test's."""
+GRAVITY = 9.81
+"""[m/s^2], along -z of the table."""
+TABLE_M = 4.0
+"""Edge of the table [m]: nothing falls off it in a second."""
 
 
 def fall(
-    body: SlipBody,
-    T_table_obj: Array,
-    twist: Array,
-    others: Sequence[Array],
-    times_s: Array,
-    config: FallConfig,
+    body: SlipBody, T_table_obj: Array, twist: Array, others: Sequence[Array], times_s: Array
 ) -> Array:
     """Return where a lost object is (S, 4, 4), table frame [m].
 
@@ -56,7 +45,6 @@ def fall(
         others: corners (V, 3) of what else stands there, each taken as its convex hull, table frame
             [m].
         times_s: (S,) since it was lost, not decreasing [s].
-        config: rate, friction and gravity.
     """
     with interop.quiet_output():
         import pybullet
@@ -65,8 +53,8 @@ def fall(
         engine: Any = BulletClient(connection_mode=pybullet.DIRECT)
     try:
         with tempfile.TemporaryDirectory(prefix="realsim_fall_") as folder:
-            number = _build(engine, Path(folder), body, T_table_obj, twist, others, config)
-            return _poses(engine, number, se3.invert(body.principal_frame()[0]), times_s, config)
+            number = _build(engine, Path(folder), body, T_table_obj, twist, others)
+            return _poses(engine, number, se3.invert(body.principal_frame()[0]), times_s)
     finally:
         engine.disconnect()
 
@@ -78,24 +66,23 @@ def _build(
     T_table_obj: Array,
     twist: Array,
     others: Sequence[Array],
-    config: FallConfig,
 ) -> int:
     """Put everything into the engine and return the object's number."""
     engine.setPhysicsEngineParameter(
-        fixedTimeStep=1.0 / config.rate_hz, numSolverIterations=config.iterations, numSubSteps=0,
+        fixedTimeStep=1.0 / RATE_HZ, numSolverIterations=ITERATIONS, numSubSteps=0,
         deterministicOverlappingPairs=1,
     )  # fmt: skip
-    engine.setGravity(0.0, 0.0, -config.gravity)
-    half = config.table_m / 2.0
+    engine.setGravity(0.0, 0.0, -GRAVITY)
+    half = TABLE_M / 2.0
     table = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=[half, half, 0.25])
     statics = [engine.createMultiBody(0.0, table, -1, [0.0, 0.0, -0.25])]
     for k, corners in enumerate(others):
-        shape, margin = _shape(engine, folder / f"other{k}.obj", [corners], config)
+        shape, margin = _shape(engine, folder / f"other{k}.obj", [corners])
         statics.append(engine.createMultiBody(0.0, shape))
         engine.changeDynamics(statics[-1], -1, collisionMargin=margin)
     T_obj_body, moments = body.principal_frame()
     parts = [se3.transform(se3.invert(T_obj_body), part) for part in body.parts]
-    shape, margin = _shape(engine, folder / "object.obj", parts, config)
+    shape, margin = _shape(engine, folder / "object.obj", parts)
     position, xyzw = interop.pybullet_from_T(T_table_obj @ T_obj_body)
     number: int = engine.createMultiBody(body.mass_kg, shape, -1, position, xyzw)
     # Damping never in one call with friction: PyBullet then drops the friction.
@@ -103,29 +90,25 @@ def _build(
     engine.changeDynamics(number, -1, localInertiaDiagonal=moments.tolist(), collisionMargin=margin)
     for each in (*statics, number):
         # Bullet multiplies the two.
-        engine.changeDynamics(each, -1, lateralFriction=float(np.sqrt(config.friction)))
+        engine.changeDynamics(each, -1, lateralFriction=float(np.sqrt(FRICTION)))
     engine.resetBaseVelocity(number, twist[3:].tolist(), twist[:3].tolist())
     return number
 
 
-def _shape(
-    engine: Any, path: Path, parts: Sequence[Array], config: FallConfig
-) -> tuple[int, float]:
+def _shape(engine: Any, path: Path, parts: Sequence[Array]) -> tuple[int, float]:
     """Return a collision shape of convex parts and the margin that makes it as large."""
-    cores, margin = drawn_in(list(parts), config.margin_m)
+    cores, margin = drawn_in(list(parts), MARGIN_M)
     path.write_bytes(collision_obj(cores))
     shape: int = engine.createCollisionShape(engine.GEOM_MESH, fileName=str(path))
     return shape, margin
 
 
-def _poses(
-    engine: Any, number: int, T_body_obj: Array, times_s: Array, config: FallConfig
-) -> Array:
+def _poses(engine: Any, number: int, T_body_obj: Array, times_s: Array) -> Array:
     """Let time pass and return T_table_obj (S, 4, 4) at the times."""
     Ts = np.empty((len(times_s), 4, 4))
     done = 0
     for k, time_s in enumerate(times_s.tolist()):
-        while done < round(time_s * config.rate_hz):
+        while done < round(time_s * RATE_HZ):
             engine.stepSimulation()
             done += 1
         position, xyzw = engine.getBasePositionAndOrientation(number)

@@ -20,7 +20,7 @@ from realsim.records.trajectories import PHASES
 from realsim.robots.compiled_chain import follow_lines
 from realsim_sim_bridge.arm.timing import trapezoid, trapezoid_share
 from realsim_sim_bridge.demonstrations.attempt_motion import AttemptMotion
-from realsim_sim_bridge.demonstrations.falling import FallConfig, fall
+from realsim_sim_bridge.demonstrations.falling import fall
 from realsim_sim_bridge.demonstrations.placing import PlaceGoal, Standing, goals_of, middle, unmet
 from realsim_sim_bridge.demonstrations.records import ALL_PHASES, GraspGoal
 from realsim_sim_bridge.demonstrations.source import (
@@ -208,9 +208,7 @@ class PlacingSource(DemonstrationSource):
         Ts[:first] = self.scenery.T_table_base @ Ts_base_ee[:first] @ T_ee_obj
         others = [c for i, c in self.standing.corners.items() if i != name.instance]
         times = (np.arange(1, len(q) - first + 1) * dt).astype(np.float64)
-        Ts[first:] = fall(
-            self._body(name.instance), Ts[first - 1], np.zeros(6), others, times, FallConfig()
-        )
+        Ts[first:] = fall(self._body(name.instance), Ts[first - 1], np.zeros(6), others, times)
         held = np.arange(len(q)) < first
         command = np.where(held, 0.0, np.array(openings))
         steps = lifted.time_s[-1] + dt * np.arange(1, len(q) + 1)

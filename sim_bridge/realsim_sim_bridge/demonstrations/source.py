@@ -28,7 +28,6 @@ from realsim.untrusted.own_json import to_json
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.reach_config import base_on_table, grasping_arm
 from realsim_sim_bridge.demonstrations.attempt_motion import Attempt, AttemptMotion, attempt_motion
-from realsim_sim_bridge.demonstrations.falling import FallConfig
 from realsim_sim_bridge.demonstrations.front_view import (
     FrontView,
     happening,
@@ -357,7 +356,7 @@ class DemonstrationSource(Sequence[Demonstration]):
             ],
             closing_speed=min(config.reach.timing.close_speed, config.hand.closing_speed),
         )
-        motion = attempt_motion(attempt, self.config.rate_hz, self.config.fall_s, FallConfig())
+        motion = attempt_motion(attempt, self.config.rate_hz, self.config.fall_s)
         return Demonstration(
             name=name,
             goal=self.goal(self.attempts.index(name)),

@@ -10,7 +10,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 from realsim.records import GraspSet
-from realsim_sim_bridge.demonstrations.falling import FallConfig, fall
+from realsim_sim_bridge.demonstrations.falling import fall
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of, tried_body
 from realsim_sim_bridge.demonstrations.slip_replay import RecordedEngine, replay_grasp
 from realsim_sim_bridge.school import run_school_results
@@ -78,7 +78,7 @@ def test_a_field_that_a_version_did_not_have_takes_its_default():
 
 def test_a_box_that_is_dropped_lands_on_its_face():
     T = se3.from_translation([0.0, 0.0, 0.12])
-    Ts = fall(box_body(), T, np.zeros(6), [], np.array([0.0, 0.1, 1.0]), FallConfig())
+    Ts = fall(box_body(), T, np.zeros(6), [], np.array([0.0, 0.1, 1.0]))
     np.testing.assert_allclose(Ts[0], T, atol=1e-6)
     assert Ts[1, 2, 3] == pytest.approx(0.12 - 0.5 * 9.81 * 0.1**2, abs=3e-3)
     assert Ts[2, 2, 3] == pytest.approx(0.025, abs=1e-3)
@@ -90,8 +90,7 @@ def test_a_thrown_box_flies_on_and_lands_on_what_stands_there():
     block = CORNERS * [4, 4, 1] + [0.07, 0, 0.025]
     Ts = fall(
         box_body(), se3.from_translation([0.0, 0, 0.2]), twist, [block], np.array([0.1, 1.0]),
-        FallConfig(),
-    )  # fmt: skip
+        )  # fmt: skip
     assert Ts[0, 0, 3] == pytest.approx(0.05, abs=2e-3)
     assert Ts[1, 2, 3] == pytest.approx(0.075, abs=2e-3)
 
