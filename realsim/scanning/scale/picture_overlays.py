@@ -36,24 +36,20 @@ class Photograph:
     """(4, 4) camera in world [m]."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class OverlayConfig:
-    """How photographs are drawn."""
-
-    views: int = 6
-    """At most so many: the worst, and others spread over the session."""
-    margin: float = 0.35
-    """Surroundings shown on each side of the object [share of its size in the picture]."""
-    aspect: float = 4 / 3
-    """Width / height of a picture."""
-    range_mm: float = 5.0
-    """The strongest colour of the depth residual [mm]: a scale off by 5 % moves the surface of a
-    10 cm object by that."""
+VIEWS = 6
+"""At most so many: the worst, and others spread over the session."""
+MARGIN = 0.35
+"""Surroundings shown on each side of the object [share of its size in the picture]."""
+ASPECT = 4 / 3
+"""Width / height of a picture."""
+RANGE_MM = 5.0
+"""The strongest colour of the depth residual [mm]: a scale off by 5 % moves the surface of a
+10 cm object by that."""
 
 
-def chosen_views(fit: ScaleFit, config: OverlayConfig | None = None) -> tuple[int, ...]:
+def chosen_views(fit: ScaleFit) -> tuple[int, ...]:
     """Return the numbers of the views to look at: the worst two, the others spread evenly."""
-    n = (config or OverlayConfig()).views
+    n = VIEWS
     if len(fit.views) <= n:
         return tuple(v.index for v in fit.views)
     worst = [v.index for v in worst_views(fit)[:2]]
@@ -68,11 +64,7 @@ def worst_views(fit: ScaleFit) -> list[ViewAgreement]:
 
 
 def overlays_png(
-    mesh: Mesh,
-    fit: ScaleFit,
-    intrinsics: CameraIntrinsics,
-    photographs: Sequence[Photograph],
-    config: OverlayConfig | None = None,
+    mesh: Mesh, fit: ScaleFit, intrinsics: CameraIntrinsics, photographs: Sequence[Photograph]
 ) -> bytes:
     """Return photographs with the scaled model's outline, the depth residual beside each.
 
@@ -81,12 +73,10 @@ def overlays_png(
         fit: its fit.
         intrinsics: the raw camera.
         photographs: the views to draw.
-        config: how they are drawn.
 
     Raises:
         InputError: no photographs.
     """
-    config = config or OverlayConfig()
     if not photographs:
         raise InputError("no photographs were given to draw the model on.")
     scaled = Mesh(vertices=fit.scale * mesh.vertices, faces=mesh.faces)
@@ -102,12 +92,12 @@ def overlays_png(
     for k, photo in enumerate(photographs):
         row, column = divmod(k, columns)
         left, right = axes[row, 2 * column : 2 * column + 2]
-        picture, residual = _view_pair(scene, world, intrinsics, photo, config)
+        picture, residual = _view_pair(scene, world, intrinsics, photo)
         left.imshow(picture, interpolation="antialiased")
         right.imshow(residual, interpolation="antialiased")
         title, color = _caption(photo.index, agreement.get(photo.index))
         left.set_title(title, fontsize=8, color=color, loc="left")
-    _residual_bar(figure, axes, config.range_mm)
+    _residual_bar(figure, axes, RANGE_MM)
     return png(figure)
 
 
@@ -137,14 +127,10 @@ def _residual_bar(figure: Any, axes: Any, limit: float) -> None:
 
 
 def _view_pair(
-    scene: RayScene,
-    world: Array,
-    intrinsics: CameraIntrinsics,
-    photo: Photograph,
-    config: OverlayConfig,
+    scene: RayScene, world: Array, intrinsics: CameraIntrinsics, photo: Photograph
 ) -> tuple[Image, Image]:
     """Return the photograph with the outline, and the depth residual, around the object."""
-    window = object_window(world, intrinsics, photo.T_world_cam, config)
+    window = object_window(world, intrinsics, photo.T_world_cam)
     rgb = np.ascontiguousarray(photo.rgb[window])
     rendered = rendered_depth(scene, intrinsics, photo.T_world_cam, window)
     is_object = np.isfinite(rendered)
@@ -154,7 +140,7 @@ def _view_pair(
     measured = photo.depth_m[window].astype(np.float64)
     beyond = np.where(measured > 0, 1e3 * (rendered - measured), np.nan)
     grey = 0.45 * rgb.mean(-1, keepdims=True).repeat(3, -1) + 0.55 * 255
-    residual = np.where(is_object[..., None], diverging(beyond, config.range_mm), grey)
+    residual = np.where(is_object[..., None], diverging(beyond, RANGE_MM), grey)
     return picture, np.clip(np.round(residual), 0, 255).astype(np.uint8)
 
 
@@ -172,9 +158,7 @@ def rendered_depth(
     return depth.reshape(shape)
 
 
-def object_window(
-    world: Array, intrinsics: CameraIntrinsics, T_world_cam: Array, config: OverlayConfig
-) -> Window:
+def object_window(world: Array, intrinsics: CameraIntrinsics, T_world_cam: Array) -> Window:
     """Return the part of the picture that shows points (N, 3) of world, with its surroundings.
 
     The whole picture where they are not in it.
@@ -186,10 +170,10 @@ def object_window(
     if len(uv) == 0:
         return whole
     low, high = np.clip(uv.min(0), 0, size - 1), np.clip(uv.max(0), 0, size - 1)
-    wide = (high - low) * (1 + 2 * config.margin)
+    wide = (high - low) * (1 + 2 * MARGIN)
     if not np.all(wide > 2):
         return whole
-    wide = np.array([max(wide[0], wide[1] * config.aspect), max(wide[1], wide[0] / config.aspect)])
+    wide = np.array([max(wide[0], wide[1] * ASPECT), max(wide[1], wide[0] / ASPECT)])
     wide = np.minimum(wide, size)
     corner = np.clip((low + high) / 2 - wide / 2, 0, size - wide)
     x, y = np.floor(corner).astype(int)
