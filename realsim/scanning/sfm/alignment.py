@@ -60,18 +60,21 @@ class _Problem:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class _State:
-    """A similarity about the mean of the reconstructed centres, and the hand-eye's correction."""
+    """A similarity about the mean of the reconstructed centres, and the hand-eye's correction.
 
-    log_scale: float
+    Several states are one whose every field has the same axes in front.
+    """
+
+    log_scale: Array
     R: Array
     t: Array
     twist: Array
 
     def moved(self, step: Array) -> "_State":
-        """Return the state after a step [w, t, log s, xi]."""
+        """Return the state after a step (..., 13) [w, t, log s, xi]."""
         return _State(
-            log_scale=self.log_scale + float(step[6]), R=se3.exp_so3(step[:3]) @ self.R,
-            t=self.t + step[3:6], twist=self.twist + step[7:],
+            log_scale=self.log_scale + step[..., 6], R=se3.exp_so3(step[..., :3]) @ self.R,
+            t=self.t + step[..., 3:6], twist=self.twist + step[..., 7:],
         )  # fmt: skip
 
 
@@ -157,24 +160,24 @@ def _require_motion(found: Array, robot: Array, config: AlignmentConfig) -> None
 
 
 def _predicted(problem: _Problem, state: _State) -> Array:
-    """Return S(T_i) (V, 4, 4)."""
-    scale = np.exp(state.log_scale)
-    R = state.R @ problem.found[:, :3, :3]
-    return se3.from_rt(R, scale * problem.found[:, :3, 3] @ state.R.T + state.t)
+    """Return S(T_i) (..., V, 4, 4)."""
+    scale = np.exp(state.log_scale)[..., None, None]
+    R = state.R[..., None, :, :] @ problem.found[:, :3, :3]
+    centres = scale * problem.found[:, :3, 3] @ np.swapaxes(state.R, -1, -2)
+    return se3.from_rt(R, centres + state.t[..., None, :])
 
 
 def _errors(problem: _Problem, state: _State) -> Array:
-    """Return e_i (V, 6) [rad, m]."""
-    hand = problem.robot @ se3.exp(state.twist)
+    """Return e_i (..., V, 6) [rad, m]."""
+    hand = problem.robot @ se3.exp(state.twist)[..., None, :, :]
     return se3.log(se3.invert(hand) @ _predicted(problem, state))
 
 
 def _jacobian(problem: _Problem, state: _State) -> Array:
     """Return d e / d [w, t, log s, xi] (V, 6, 13) by central differences."""
-    columns: list[Array] = []
-    for step in DIFFERENCE * np.eye(13):
-        columns.append(_errors(problem, state.moved(step)) - _errors(problem, state.moved(-step)))
-    return np.stack(columns, -1) / (2 * DIFFERENCE)
+    steps = DIFFERENCE * np.eye(13)
+    there, back = (_errors(problem, state.moved(s)) for s in (steps, -steps))
+    return np.moveaxis(there - back, 0, -1) / (2 * DIFFERENCE)
 
 
 def _robust_start(problem: _Problem, config: AlignmentConfig, rng: np.random.Generator) -> _State:
@@ -196,7 +199,7 @@ def _robust_start(problem: _Problem, config: AlignmentConfig, rng: np.random.Gen
         turns = problem.robot[[i, j], :3, :3] @ np.swapaxes(problem.found[[i, j], :3, :3], 1, 2)
         R = se3.mean_rotation(turns)
         t = p[[i, j]].mean(0) - scale * R @ c[[i, j]].mean(0)
-        state = _State(log_scale=float(np.log(scale)), R=R, t=t, twist=np.zeros(6))
+        state = _State(log_scale=np.asarray(np.log(scale)), R=R, t=t, twist=np.zeros(6))
         squares = np.square(_errors(problem, state) / allowed).mean(-1)
         cost = float(np.minimum(squares, TRUNCATE**2).sum())
         if cost < best_cost:
