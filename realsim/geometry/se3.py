@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from realsim.arrays import Array
+from realsim.arrays import Array, Mask
 from realsim.errors import NotRigidError
 
 RIGID_TOLERANCE = 1e-5
@@ -63,17 +63,21 @@ def transform(T: ArrayLike, points: ArrayLike) -> Array:
     return points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
 
 
+def _turned(w: ArrayLike) -> tuple[Array, Array, Array, Array, Mask]:
+    """Return hat(w), its square, the angle's square, and the angle, 1 where it is small."""
+    W = hat(w)
+    theta2 = W[..., 2, 1] ** 2 + W[..., 0, 2] ** 2 + W[..., 1, 0] ** 2
+    theta2 = np.asarray(theta2)[..., None, None]
+    small = theta2 < 1e-10
+    return W, W @ W, theta2, np.where(small, 1.0, np.sqrt(theta2)), small
+
+
 def exp_so3(w: ArrayLike) -> Array:
     """Return the rotation (..., 3, 3) of a rotation vector (..., 3) [rad] (Rodrigues)."""
-    w = np.asarray(w, dtype=np.float64)
-    theta2 = np.sum(w * w, axis=-1)[..., None, None]
-    theta = np.sqrt(theta2)
-    small = theta2 < 1e-10
-    safe = np.where(small, 1.0, theta)
+    W, WW, theta2, safe, small = _turned(w)
     a = np.where(small, 1.0 - theta2 / 6.0, np.sin(safe) / safe)
     b = np.where(small, 0.5 - theta2 / 24.0, (1.0 - np.cos(safe)) / (safe * safe))
-    W = hat(w)
-    return np.eye(3) + a * W + b * (W @ W)
+    return IDENTITY_3 + a * W + b * WW
 
 
 def log_so3(R: ArrayLike) -> Array:
@@ -134,15 +138,10 @@ def from_quaternion_wxyz(q: ArrayLike) -> Array:
 
 def left_jacobian_so3(w: ArrayLike) -> Array:
     """Return the left Jacobian (..., 3, 3) of SO(3): `exp([w, v])` translates by `J(w) @ v`."""
-    w = np.asarray(w, dtype=np.float64)
-    theta2 = np.sum(w * w, axis=-1)[..., None, None]
-    theta = np.sqrt(theta2)
-    small = theta2 < 1e-10
-    safe = np.where(small, 1.0, theta)
+    W, WW, theta2, safe, small = _turned(w)
     b = np.where(small, 0.5 - theta2 / 24.0, (1.0 - np.cos(safe)) / (safe * safe))
     c = np.where(small, 1.0 / 6.0 - theta2 / 120.0, (safe - np.sin(safe)) / (safe**3))
-    W = hat(w)
-    return np.eye(3) + b * W + c * (W @ W)
+    return IDENTITY_3 + b * W + c * WW
 
 
 def exp(xi: ArrayLike) -> Array:

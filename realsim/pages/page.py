@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template, pass_context
+from jinja2.runtime import Context
 from markupsafe import Markup
 
 from realsim import __version__
@@ -225,7 +226,7 @@ class Page:
         fit(galleries, budget_bytes - MARKUP_BYTES - fixed, self.title)
         # "</" would end the script, "<!--" would begin a comment in it.
         document = json.dumps(self.document, allow_nan=False).replace("<", "\\u003c")
-        text = template("page.html", self).render(
+        text = template("page.html").render(
             page=self, parts=parts, version=__version__,
             document=Markup(document) if self.document else None,
         )  # fmt: skip
@@ -250,25 +251,20 @@ def _once(parts: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return kept
 
 
+@pass_context
+def _without_paths(context: Context, value: Any) -> Any:
+    return context["page"].plain(value) if type(value) is str else value
+
+
 @cache
-def _environment(package: str) -> Environment:
-    return Environment(
-        loader=PackageLoader(package, ""), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, cache_size=0,
-    )  # fmt: skip
-
-
-def template(name: str, page: Page | None = None, package: str = "realsim.pages") -> Template:
-    """Return a template in which every text is escaped and, as on `page`, loses private paths.
+def template(name: str, package: str = "realsim.pages") -> Template:
+    """Return a template in which every text is escaped and, as on its `page`, loses private paths.
 
     Args:
-        name: of the template's file.
-        page: whose rules on private text hold.
+        name: of the template's file; it is rendered with a `page`, whose rules on text hold.
         package: that the file lies in.
     """
-    rules = page or Page()
-
-    def without_paths(value: Any) -> Any:
-        return rules.plain(value) if type(value) is str else value
-
-    return _environment(package).overlay(finalize=without_paths).get_template(name)
+    return Environment(
+        loader=PackageLoader(package, ""), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, finalize=_without_paths,
+    ).get_template(name)  # fmt: skip

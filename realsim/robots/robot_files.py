@@ -146,12 +146,10 @@ def kind_of(name: str) -> Kind:
             raise InputError(f"there is no robot '{name[:80]}'. There are {known}.")
     if not (given / FILE).is_file():
         raise InputError(f"the folder {given} has no {FILE}; a robot is a folder with one.")
-    path = given
-    found = read_toml(path / FILE)[1].get("kind")
-    for kind in KINDS:
-        if found == kind:
-            return kind
-    raise InputError(f'{path / FILE} has kind = {found!r}; "arm" and "hand" are accepted.')
+    found = read_toml(given / FILE)[1].get("kind")
+    if found in KINDS:
+        return found
+    raise InputError(f'{given / FILE} has kind = {found!r}; "arm" and "hand" are accepted.')
 
 
 def same_name(first: str, second: str) -> bool:

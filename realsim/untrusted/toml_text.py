@@ -3,6 +3,7 @@
 import re
 import tomllib
 from collections.abc import Iterable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,9 @@ def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
     return text, parsed_toml(text, str(path))
 
 
+@lru_cache(maxsize=64)  # a robot is looked for by name in every robot's file, again and again
 def parsed_toml(text: str, where: str) -> dict[str, Any]:
-    """Return the values of TOML text; `where` names it in messages.
+    """Return the values of TOML text, not to be changed; `where` names it in messages.
 
     Raises:
         InputError: it is no TOML, nested deeper than 20 levels, has a whole number beyond 64 bits,

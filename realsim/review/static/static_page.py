@@ -25,7 +25,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.bop.models import model_file
 from realsim.geometry import se3
-from realsim.pages.page import template
+from realsim.pages.page import Page, template
 from realsim.records import ObjectModel, ObjectPose, Scene
 from realsim.records.grasps import label_words
 from realsim.review.content.content import SceneContent
@@ -199,7 +199,7 @@ def _page(
     script = files("realsim.review.static").joinpath("static_page.js").read_text("utf-8")
     sets = content.grasp_sets
     text = template("static_page.html", package="realsim.review.static").render(
-        policy=Markup(html.escape(POLICY)), version=__version__, title=title.strip(),
+        page=Page(), policy=Markup(html.escape(POLICY)), version=__version__, title=title.strip(),
         caption=words.caption.strip(), about=counts_words(content, scene, state),
         objects=object_rows(content, scene, state),
         photos=[(v.index, _data_url(content.thumbnails[v.index])) for v in _cameras(content, size)],
