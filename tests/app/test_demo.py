@@ -17,8 +17,10 @@ from realsim.app.demo.run import DemoResult, show_demo
 from realsim.app.demo.site import PAGES, write_site
 from realsim.app.truth import LoopErrors, loop_errors
 from realsim.store import SessionStore
+from typed_commands import realsim
 
-SMALL = ["--quick", "--views", "6", "--objects", "2", "--grasps", "8", "--quiet"]
+SMALL = ["--quick", "--views", "6", "--objects", "2", "--grasps", "8", "--workers", "1",
+         "--quiet"]  # fmt: skip
 """The demo of `demo_session`; `--quick` makes its pictures small."""
 
 
@@ -63,9 +65,8 @@ def test_a_demo_killed_in_two_stages_ends_like_one_left_alone(
     }
     caught = {name: kill_when(killed, moment) for name, moment in moments.items()}
     assert caught == {"capture": True, "school": True}
-    finished = start_demo(killed)
-    _, err = finished.communicate(timeout=900)
-    assert finished.returncode == 0, err
+    finished = realsim("demo", "--out", killed, *SMALL)
+    assert finished.returncode == 0, finished.stderr
     for pattern in ("rgb/*.png", "depth/*.png", "mask_visib/*.png"):
         a = {p.name: digest(p) for p in (killed / "session").glob(pattern)}
         b = {p.name: digest(p) for p in demo_session.glob(pattern)}

@@ -1,17 +1,23 @@
 """`realsim pipeline`: a campaign's file is checked before anything runs; scenes fail alone."""
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from unittest import mock
 
 import pytest
 from click.testing import CliRunner
 
 from realsim.app.cli import commands
+from realsim.app.pipeline import chain
+from realsim.app.pipeline import run as pipeline_run
+from realsim.app.pipeline.chain import SCENE, Ended
 from realsim.errors import InputError
+from typed_commands import realsim
 
 HEAD = '[campaign]\nout = "out"\nstages = ["annotate", "export", "stats"]\n'
 SCENES = '[generate]\nscenes = 2\nviews = 2\nobjects = "2"\nsize = "160x120"\nrange = "d405"\n'
@@ -19,7 +25,7 @@ EXPORT = '[export]\nto = "bop"\n'
 
 
 def run(path, *more):
-    return CliRunner().invoke(commands, ["pipeline", str(path), "--quiet", *more])
+    return CliRunner().invoke(commands, ["pipeline", str(path), "--quiet", "--workers", "1", *more])
 
 
 def written(folder, text):
@@ -64,50 +70,86 @@ def document(out):
     return json.loads((out / "campaign.json").read_text())
 
 
-@pytest.mark.slow
-def test_a_scene_that_fails_is_listed_the_others_go_on_and_only_it_is_done_again(tmp_path):
-    path, out = written(tmp_path, HEAD + SCENES + EXPORT), tmp_path / "out"
-    assert run(path).exit_code == 0
-    whole = document(out)
-    assert whole["done"] == 2 and not whole["failed"]
+def in_this_process(command, scene, folder, log):
+    """Run a command as a campaign does, without a new interpreter."""
+    words = [str(scene) if word == SCENE else word for word in command.words]
+    with contextlib.chdir(folder):
+        done = realsim(*words)
+    return Ended(
+        stage=command.stage, words=command.words, code=done.returncode, wall_s=1.0, cpu_s=1.0,
+        peak_mb=1.0, told=done.stderr if done.returncode > 1 else "",
+    )  # fmt: skip
+
+
+@contextlib.contextmanager
+def no_interpreters(*modules):
+    """Let modules run commands in this process; one that is to fail or be killed has its own."""
+    with contextlib.ExitStack() as stack:
+        for module in modules or (pipeline_run, chain):
+            stack.enter_context(mock.patch.object(module, "run_command", in_this_process))
+        yield
+
+
+def exported(out):
+    return {p.name: p.read_bytes() for p in (out / "export").glob("*/*/scene_gt.json")}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A campaign's file and folder, and what it exported when it was done."""
+    path = written(tmp_path_factory.mktemp("whole"), HEAD + SCENES + EXPORT)
+    with no_interpreters():
+        assert run(path).exit_code == 0
+    out = path.parent / "out"
+    told = document(out)
+    assert told["done"] == 2 and not told["failed"]
     assert len(list((out / "export").glob("*/*/scene_gt.json"))) == 2
+    return path, out, exported(out)
+
+
+@pytest.mark.slow
+def test_a_scene_that_fails_is_listed_the_others_go_on_and_only_it_is_done_again(whole):
+    path, out, _ = whole
     # One scene's poses are damaged, and it has to be done again.
     record = out / "records/scene_000001.json"
     record.unlink()
     views = out / "scenes/scene_000001/registration/scene.json"
     kept = views.read_bytes()
     views.write_bytes(b"{")
-    broken = run(path)
-    assert broken.exit_code == 1
+    with no_interpreters(pipeline_run):
+        assert run(path).exit_code == 1
     told = document(out)
     assert list(told["failed"]) == ["scene_000001"] and told["done"] == 1 and told["kept"] == 1
     assert told["waiting"] == ["export", "stats"] and not told["of_all"][1:]
-    assert run(path, "--without-failed").exit_code == 1
-    assert len(list((out / "export_1_of_2").glob("*/*/scene_gt.json"))) == 1
     assert "scene.json" in told["failed"]["scene_000001"]
-    page = (out / "campaign.html").read_text()
-    assert "scene_000001" in page and "1 failed" in page
-    views.write_bytes(kept)
-    assert run(path).exit_code == 0
-    assert document(out)["done"] == 2
-    # Other options of an export: it is made anew. A photograph is damaged: the others are kept.
-    written(tmp_path, HEAD + SCENES + EXPORT + 'licence = "CC0-1.0"\n')
-    assert run(path).exit_code == 0
-    assert "CC0-1.0" in (out / "export/README.md").read_text()
-    assert not (out / "export.before").exists()
-    photograph = out / "scenes/scene_000000/rgb/000000.png"
-    photograph.write_bytes(photograph.read_bytes()[:100])
-    assert run(path).exit_code == 1
+    with no_interpreters():
+        assert run(path, "--without-failed").exit_code == 1
+        assert len(list((out / "export_1_of_2").glob("*/*/scene_gt.json"))) == 1
+        page = (out / "campaign.html").read_text()
+        assert "scene_000001" in page and "1 failed" in page
+        views.write_bytes(kept)
+        assert run(path).exit_code == 0
+        assert document(out)["done"] == 2
+        # Other options of an export: it is made anew. A photograph is damaged: the others are kept.
+        written(path.parent, HEAD + SCENES + EXPORT + 'licence = "CC0-1.0"\n')
+        assert run(path).exit_code == 0
+        assert "CC0-1.0" in (out / "export/README.md").read_text()
+        assert not (out / "export.before").exists()
+        photograph = out / "scenes/scene_000000/rgb/000000.png"
+        photograph.write_bytes(photograph.read_bytes()[:100])
+        assert run(path).exit_code == 1
     told = document(out)
     assert told["done"] == 2 and list(told["failed"]) == ["generate"]
     assert "scenes/scene_000000/rgb/000000.png" in (out / "campaign.html").read_text()
 
 
 @pytest.mark.slow
-def test_a_campaign_that_was_interrupted_goes_on_and_comes_to_the_same(tmp_path):
+def test_a_campaign_that_was_interrupted_goes_on_and_comes_to_the_same(whole, tmp_path):
     path, out = written(tmp_path, HEAD + SCENES + EXPORT), tmp_path / "out"
     line = [sys.executable, "-c", "from realsim.app.cli import main; main()", "pipeline", str(path)]
-    process = subprocess.Popen(line, start_new_session=True, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [*line, "--workers", "1"], start_new_session=True, stderr=subprocess.PIPE, text=True
+    )
     while not (out / "scenes/scene_000000/session.json").is_file():
         assert process.poll() is None
         time.sleep(0.05)
@@ -115,11 +157,6 @@ def test_a_campaign_that_was_interrupted_goes_on_and_comes_to_the_same(tmp_path)
     _, told = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "the same command goes on from here" in told
-    assert run(path).exit_code == 0
-    first = {p.name: p.read_bytes() for p in (out / "export").glob("*/*/scene_gt.json")}
-    other = tmp_path / "other"
-    other.mkdir()
-    assert run(written(other, HEAD + SCENES + EXPORT)).exit_code == 0
-    assert first == {
-        p.name: p.read_bytes() for p in (other / "out/export").glob("*/*/scene_gt.json")
-    }
+    with no_interpreters():
+        assert run(path).exit_code == 0
+    assert exported(out) == whole[2]

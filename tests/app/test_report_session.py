@@ -74,12 +74,17 @@ def test_the_report_of_the_same_session_is_the_same_bytes(
     assert (again.parent / "report.json").read_bytes() == document
 
 
-def test_a_report_does_not_count_the_record_of_the_one_before(store: SessionStore) -> None:
+def test_a_report_does_not_count_the_record_of_the_one_before_and_exit_codes_tell(
+    store: SessionStore,
+) -> None:
+    rules = ("--fail-on", "registration.accepted<3", "--fail-on", "registration.accepted<2")
     read = []
-    for _ in range(2):
-        CliRunner().invoke(report_command, [str(store.folder)], catch_exceptions=False)
+    for more in ((), ("--json", "--quiet", *rules)):
+        done = CliRunner().invoke(report_command, [str(store.folder), *more])
         read.append((store.folder / "reports" / "report.json").read_bytes())
     assert (store.folder / "stages" / "report.json").is_file() and read[0] == read[1]
+    assert done.exit_code == 1 and "registration.accepted" in done.stderr
+    assert len(json.loads(done.stdout)["failed"]) == 1  # the other is exactly met
 
 
 def test_the_page_is_whole_needs_no_network_and_names_no_folder(
@@ -209,15 +214,3 @@ def test_a_damaged_file_is_named_and_the_other_sections_stand(
     section = next(s for s in report.sections if s.key == stage)
     assert stage in told or section.state == "damaged" or "files" in told
     assert states(report)["settings"] == "done" and report.figures["report.bad"].value >= 0
-
-
-# --- for scripts ------------------------------------------------------------------------------
-
-
-def test_json_is_all_there_is_on_stdout_and_exit_codes_tell(registered: SessionStore) -> None:
-    out = str(registered.folder.parent / "p.html")
-    rules = ("--fail-on", "registration.accepted<2", "--fail-on", "registration.accepted<1")
-    arguments = [str(registered.folder), "--json", "--quiet", "--out", out, *rules]
-    done = CliRunner().invoke(report_command, arguments)
-    assert done.exit_code == 1 and "registration.accepted" in done.stderr
-    assert len(json.loads(done.stdout)["failed"]) == 1  # the other is exactly met

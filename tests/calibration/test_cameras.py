@@ -38,7 +38,7 @@ PLACES = {
     "right": se3.look_at([0.75, -0.45, 0.85], [0.42, 0.05, 0.35], 0.0),
     "top": se3.look_at([0.3, 0.05, 1.1], [0.42, 0.05, 0.35], 0.0),
 }
-VIEWS = 12
+VIEWS = 9
 PLAIN = CalibrationConfig(
     hand_eye=HandEyeConfig(robot_map=False), intrinsics=IntrinsicsConfig(models=("k1 k2 p1 p2",))
 )

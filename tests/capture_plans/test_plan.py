@@ -22,7 +22,7 @@ from realsim_capture_plans.planning.viewpoints import golden_cap, hemisphere_pos
 
 CENTER = np.array([0.375, 0.0, 0.05])
 BOARD = np.array([0.375, 0.0, 0.0])
-N = 24
+N = 16
 
 
 @pytest.fixture(scope="module")

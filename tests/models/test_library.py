@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -202,16 +203,13 @@ def killed_at(step: int, library: ModelLibrary, given: PreparedModel, name: str)
 @pytest.mark.parametrize("name", ["box", "another"])
 def test_a_kill_leaves_the_library_old_or_new(tmp_path: Path, name: str):
     ModelLibrary.create(tmp_path / "old").add(made("box"), "box", picture=b"old")
-    ModelLibrary.create(tmp_path / "new").add(made("box"), "box", picture=b"old")
-    new_id = ModelLibrary(tmp_path / "new").add(
-        made("wedge"), name, overwrite=True, picture=b"new"
-    ).model.obj_id  # fmt: skip
+    changed = ModelLibrary(shutil.copytree(tmp_path / "old", tmp_path / "new"))
+    new_id = changed.add(made("wedge"), name, overwrite=True, picture=b"new").model.obj_id
     old, new = bytes_of(tmp_path / "old"), bytes_of(tmp_path / "new")
     outcomes: set[str] = set()
     for step in range(100):
-        folder = tmp_path / f"killed_{step}"
-        library = ModelLibrary.create(folder)
-        library.add(made("box"), "box", picture=b"old")
+        folder = shutil.copytree(tmp_path / "old", tmp_path / f"killed_{step}")
+        library = ModelLibrary(folder)
         was_killed = killed_at(step, library, made("wedge"), name)
         # A BOP reader that knows nothing of the change in flight reads it all the same.
         assert 1 in load_models(folder)

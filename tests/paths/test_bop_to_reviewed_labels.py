@@ -4,7 +4,6 @@ The review is a person's: a real Chromium opens the page that the command names,
 """
 
 import contextlib
-import os
 import re
 import subprocess
 from collections.abc import Generator
@@ -27,7 +26,6 @@ README = "README.md"
 UPGRADE = documented(README, "realsim", "upgrade", "DATASET", "--out")
 REVIEW = documented(README, "realsim", "review", "upgraded/test/000050")
 EXPORT = documented(README, "realsim", "export", "SESSION", "--to", "bop")
-REAL = Path(os.environ.get("REALSIM_DATA", "nowhere")) / "scenes/ycbv_mini"
 PATIENCE_S = 180.0
 """The browser draws without a graphics card."""
 
@@ -128,25 +126,11 @@ def carries(out: Path, session: Path, scene: Scene) -> None:
 @needs_chromium
 def test_what_the_reviewer_said_is_in_the_labels(tmp_path: Path) -> None:
     bop_dataset(tmp_path / "there", 1, views=2, off_m=0.004)
-    run(UPGRADE, tmp_path, "--grasps", "5", "--workers", "1", "--quiet", DATASET="there")
+    run(UPGRADE, tmp_path, "--grasps", "2", "--workers", "1", "--quiet", DATASET="there")
     session = tmp_path / "upgraded/test/000001"
     registered = (session / "registration/scene.json").read_bytes()
     scene = review(session)
     run(EXPORT, tmp_path, "--quiet", SESSION=str(session), FOLDER="labels")
     carries(tmp_path / "labels", session, scene)
     # A review only ever adds: what was registered stays as it was.
-    assert (session / "registration/scene.json").read_bytes() == registered
-
-
-@pytest.mark.real
-@needs_chromium
-@pytest.mark.skipif(not REAL.is_dir(), reason="REALSIM_DATA is not set")
-def test_the_same_on_real_photographs(tmp_path: Path) -> None:
-    few = ("--scenes", "50", "--views", "2", "--grasps", "5")
-    run(UPGRADE, tmp_path, *few, "--quiet", DATASET=str(REAL))
-    session = tmp_path / "upgraded/test/000050"
-    registered = (session / "registration/scene.json").read_bytes()
-    scene = review(session)
-    run(EXPORT, tmp_path, "--quiet", SESSION=str(session), FOLDER="labels")
-    carries(tmp_path / "labels", session, scene)
     assert (session / "registration/scene.json").read_bytes() == registered
