@@ -193,7 +193,7 @@ class Console:
         if self._told is not None:
             self._told.document = document
         if self.as_json:
-            from realsim.untrusted.json_values import json_document
+            from realsim.json_values import json_document
 
             # Not through rich: no colour, no wrapping, nothing but the document.
             sys.stdout.write(json_document(document) + "\n")

@@ -14,7 +14,7 @@ import pytest
 
 from realsim.app import console as module
 from realsim.app.console import Console, duration
-from realsim.untrusted.json_values import json_document
+from realsim.json_values import json_document
 
 HEADER = ["object", "tried", "reach of the arm [mm]", "place [m]", "sentence"]
 ROWS = [["a mug of twenty words", 123456.789, 98765.4321, "0.123 0.456", "half of it is hidden"]]

@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike
 
 from realsim.arrays import Array
 from realsim.errors import InputError
+from realsim.json_values import json_value
 from realsim.records.checked_arrays import frozen
 from realsim.robots.kinematics import DhChain
 from realsim.robots.limits import JointLimits
 from realsim.robots.shapes import Box, Mount, Shape, WorkCell
-from realsim.untrusted.json_values import json_value
 from realsim_capture_plans.collision.model import CollisionModel
 
 LEAST_DEGREES = 2.0

@@ -42,10 +42,10 @@ from realsim.app.register.results import (
 from realsim.app.register.uncertainty import sigmas
 from realsim.arrays import Array
 from realsim.geometry import se3
+from realsim.json_values import json_value
 from realsim.records import ObjectModel, Scene, bop_units
 from realsim.store import SessionStore, atomic
 from realsim.store.cameras import open_cameras
-from realsim.untrusted.json_values import json_value
 from realsim.untrusted.own_json import to_json
 
 # --- to JSON ----------------------------------------------------------------------------------

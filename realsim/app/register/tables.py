@@ -9,8 +9,8 @@ import numpy as np
 from realsim.app.console import Console
 from realsim.app.register.results import Registered
 from realsim.app.register.uncertainty import sigmas
+from realsim.json_values import json_value
 from realsim.records import ObjectModel, ObjectPose
-from realsim.untrusted.json_values import json_value
 
 Rows = list[list[str]]
 WORST_FIRST = {"rejected": 0, "doubtful": 1, "unchecked": 2, "accepted": 3}

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from realsim.app.console import Console
 from realsim.app.school.inputs import named_mass, spread_of
 from realsim.errors import InputError
+from realsim.json_values import json_value
 from realsim.store import atomic
-from realsim.untrusted.json_values import json_value
 
 if TYPE_CHECKING:
     from realsim_sim_bridge.hold.reality import Reality, RealityConfig

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from realsim.app.console import Console
 from realsim.app.school.inputs import CACHE, SchoolInputs, SchoolRequest, is_session, read_inputs
 from realsim.errors import InputError
+from realsim.json_values import json_value
 from realsim.store import atomic
-from realsim.untrusted.json_values import json_value
 
 if TYPE_CHECKING:
     from realsim_sim_bridge.scenes.school_scene import SchoolScene

@@ -10,8 +10,8 @@ import numpy as np
 
 from realsim.app.console import Console
 from realsim.arrays import Array
+from realsim.json_values import json_value
 from realsim.records import STAGES, GraspSet, ObjectModel
-from realsim.untrusted.json_values import json_value
 
 Rows = list[list[str]]
 Names = Mapping[int, ObjectModel]

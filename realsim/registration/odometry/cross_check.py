@@ -16,6 +16,7 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.json_values import json_value
 from realsim.records import SupportPlane
 from realsim.registration.odometry.faults import (
     FaultConfig,
@@ -43,7 +44,6 @@ from realsim.registration.odometry.pairs import (
     view_cloud,
 )
 from realsim.registration.views import ViewPoints
-from realsim.untrusted.json_values import json_value
 
 AXES = ("x (to the image's right)", "y (down in the image)", "z (along the line of sight)")
 

@@ -16,12 +16,12 @@ from numpy.typing import ArrayLike
 
 from realsim.arrays import Array, Array32
 from realsim.errors import InputError
+from realsim.json_values import json_value
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.plane import find_plane
 from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.twins import PlaneFigures, PlaneTwin, plane_twin
-from realsim.untrusted.json_values import json_value
 
 MOST_TWINS = 5
 """Frames that are simulated: evenly over the measured distances."""

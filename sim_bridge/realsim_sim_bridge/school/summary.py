@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.formats.grasps.scene_grasps import check_values, executed
+from realsim.json_values import json_value
 from realsim.records import STAGES, GraspSet
-from realsim.untrusted.json_values import json_value
 from realsim_sim_bridge.school.measure_statistics import (
     ClosureConfusion,
     PHoldSpread,

@@ -1,4 +1,4 @@
-"""The result of a command as one JSON document."""
+"""Values as JSON has them: results, tables, reports, plans."""
 
 import json
 import math
