@@ -71,7 +71,7 @@ def _draw(
         1e3 * se3.transform(scene.T_table_world @ T, mesh.vertices)
         for T in (stand.T_world_before, stand.T_world_after)
     )
-    flat = after[mesh.faces][:, :, [right, up]]
+    flat: Any = after[mesh.faces][:, :, [right, up]]
     ax.add_collection(PolyCollection(flat, facecolors=color, edgecolors="none", alpha=0.25))
     lines = outline(after, mesh.faces, along)[:, :, [right, up]]
     ax.add_collection(LineCollection(list(lines), colors=color, linewidths=0.8))
