@@ -20,6 +20,8 @@ import numpy as np
 from numba.core import caching
 from numba.core.registry import CPUDispatcher
 
+from realsim.user_cache import user_cache
+
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 DIGITS = 24  # of the hash, in the names of the files
 
@@ -43,8 +45,7 @@ def cache_folder() -> Path:
     """Return the folder that compiled code is kept in."""
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(chosen)
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "realsim" / "numba"
+    return user_cache("numba")
 
 
 @cache

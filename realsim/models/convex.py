@@ -2,8 +2,8 @@
 
 A mesh that nearly fills its hull is its hull; others are decomposed by CoACD (Wei et al. 2022) in a
 process of its own, whose time is bounded. The coarsest parts whose volume is the mesh's are taken,
-else the best found in time, else the hull; `method` and `notes` say which. Results are kept in a
-folder by content, because the search takes seconds.
+else the best found in time, else the hull; `method` and `notes` say which. Results are kept by
+content, in a folder of the caller's and for all runs of the user: the search takes seconds.
 """
 
 import hashlib
@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -31,6 +32,7 @@ from realsim.models.convex_worker import decompose, light, passes, step_path
 from realsim.models.model_records import ConvexParts
 from realsim.records import Mesh
 from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
+from realsim.user_cache import user_cache
 
 __all__ = ["ConvexConfig", "collision_obj", "convex_parts", "parts_from_collision_obj"]
 
@@ -52,23 +54,35 @@ def convex_parts(mesh: Mesh, config: ConvexConfig, cache: Path | None = None) ->
     Args:
         mesh: need not be closed; then it is voxelised first and its volume is its hull's.
         config: how finely, and how long.
-        cache: a folder for results; None = none are kept.
+        cache: a folder for results; None = none are kept, nor taken from earlier runs.
 
     Raises:
         InputError: the mesh is flat.
     """
     mesh = welded_mesh(mesh)
-    path = None if cache is None else cache / f"convex_{_content(mesh, config)}.npz"
-    if path is not None and is_whole(path):
-        return _read(path)
+    if cache is None:
+        return _found(mesh, config)
+    own = cache / f"convex_{_content(mesh, config)}.npz"
+    if is_whole(own):
+        return _read(own)
+    shared = user_cache("convex") / own.name
+    with suppress(OSError):
+        if is_whole(shared):
+            return _kept(own, _read(shared))
+    result = _kept(own, _found(mesh, config))
+    # What a busy machine had no time for is not every run's.
+    if not any(note.startswith("CoACD") for note in result.notes):
+        with suppress(OSError):
+            _kept(shared, result)
+    return result
+
+
+def _found(mesh: Mesh, config: ConvexConfig) -> ConvexParts:
+    """Return the convex parts of a welded mesh."""
     solid = mass_properties(mesh, density=1.0)
     if solid.is_watertight and 1.0 / solid.hull_volume_fraction <= config.hull_ratio:
-        result = _hull(mesh, solid.volume_m3, config, "hull", ())
-    else:
-        result = _decomposed(mesh, solid.is_watertight, solid.volume_m3, config)
-    if path is not None:
-        _write(path, result)
-    return result
+        return _hull(mesh, solid.volume_m3, config, "hull", ())
+    return _decomposed(mesh, solid.is_watertight, solid.volume_m3, config)
 
 
 def _hull(
@@ -230,8 +244,8 @@ def _content(mesh: Mesh, config: ConvexConfig) -> str:
     return digest.hexdigest()[:24]
 
 
-def _write(path: Path, result: ConvexParts) -> None:
-    """Keep the parts on disk."""
+def _kept(path: Path, result: ConvexParts) -> ConvexParts:
+    """Return the parts after keeping them on disk."""
     write_arrays(
         path,
         {
@@ -245,6 +259,7 @@ def _write(path: Path, result: ConvexParts) -> None:
             "notes": result.notes,
         },
     )
+    return result
 
 
 def _read(path: Path) -> ConvexParts:

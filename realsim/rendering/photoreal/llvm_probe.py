@@ -18,8 +18,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+from realsim.user_cache import user_cache
+
 LEAST_LLVM = 19
 """Older ones cannot compile Dr.Jit's minimum and maximum (`fminimum`) and abort."""
+VERDICTS = "llvm_libraries.json"
+"""The file that keeps the verdicts between processes."""
 PROBE_TIMEOUT_S = 120.0
 """A trial takes 2 s; a machine busy with other work may need many times that."""
 HOW_TO_GET = (
@@ -151,16 +155,10 @@ def _try_out(library: Path) -> str:
     return f"a trial picture ended with {how}: {said.strip()[:200]}"
 
 
-def _verdicts_file() -> Path:
-    """Return the file that keeps the verdicts between processes."""
-    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(home) / "realsim" / "llvm_libraries.json"
-
-
 def _read_verdicts() -> dict[str, str]:
     """Return the kept verdicts; an unreadable file counts as none."""
     try:
-        kept = json.loads(_verdicts_file().read_text())
+        kept = json.loads(user_cache(VERDICTS).read_text())
         return {str(k): str(v) for k, v in kept.items()}
     except (OSError, ValueError, AttributeError):
         return {}
@@ -168,7 +166,7 @@ def _read_verdicts() -> dict[str, str]:
 
 def _write_verdicts(verdicts: dict[str, str]) -> None:
     """Keep the verdicts; where nothing can be written the next process tries again."""
-    path = _verdicts_file()
+    path = user_cache(VERDICTS)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False) as file:
