@@ -110,13 +110,8 @@ def _pictures(path: Path, first: int, steps: Collection[int]) -> dict[int, Rgb]:
         first: frame that the episode begins with.
         steps: which.
     """
-    found: dict[int, Rgb] = {}
-    for k, (_, rgb) in enumerate(read_video(path)):
-        if k - first in steps:
-            found[k - first] = np.asarray(rgb, np.uint8)
-        if k - first >= max(steps):
-            break
-    return found
+    found = read_video(path, {first + k for k in steps})
+    return {k: np.asarray(rgb, np.uint8) for k, (_, rgb) in zip(sorted(steps), found, strict=False)}
 
 
 def _scaled(rgb: Rgb, width_px: int) -> Rgb:

@@ -7,7 +7,7 @@ same pictures give the same bytes. Measured on rendered 320 x 240 pictures: 1.6 
 
 import io
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from fractions import Fraction
@@ -153,11 +153,21 @@ def join(parts: Sequence[tuple[Path, int]], path: Path, fps: int) -> None:
             before += frames
 
 
-def read_video(path: Path) -> Iterator[tuple[float, Rgb | Array32]]:
-    """Yield time [s] and picture of every frame of a video: (H, W, 3), or depth (H, W) [m]."""
+def read_video(
+    path: Path, wanted: Collection[int] | None = None
+) -> Iterator[tuple[float, Rgb | Array32]]:
+    """Yield time [s] and picture of frames of a video: (H, W, 3), or depth (H, W) [m].
+
+    Args:
+        path: of the video.
+        wanted: numbers of the frames; None = all. Others are not made pictures of, which is most of
+            the work.
+    """
     av = import_av()
     with av.open(str(path)) as source:
-        for frame in source.decode(source.streams.video[0]):
+        for k, frame in enumerate(source.decode(source.streams.video[0])):
+            if wanted is not None and k not in wanted:
+                continue
             if frame.format.name == DEPTH_PIXELS:
                 yield float(frame.time), depth_of_codes(frame.to_ndarray(format=DEPTH_PIXELS))
             else:
