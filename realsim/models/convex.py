@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -81,17 +82,15 @@ def _found(mesh: Mesh, config: ConvexConfig) -> ConvexParts:
     """Return the convex parts of a welded mesh."""
     solid = mass_properties(mesh, density=1.0)
     if solid.is_watertight and 1.0 / solid.hull_volume_fraction <= config.hull_ratio:
-        return _hull(mesh, solid.volume_m3, config, "hull", ())
+        return _hull(mesh, solid.volume_m3, config, "hull")
     return _decomposed(mesh, solid.is_watertight, solid.volume_m3, config)
 
 
-def _hull(
-    mesh: Mesh, volume_m3: float, config: ConvexConfig, method: str, notes: tuple[str, ...]
-) -> ConvexParts:
+def _hull(mesh: Mesh, volume_m3: float, config: ConvexConfig, method: str) -> ConvexParts:
     """Return the hull as the only part."""
     part = light([hull_vertices(mesh.vertices)], volume_m3, config)[0]
     ratio = hull_volume(part) / volume_m3
-    return ConvexParts(parts=(part,), volume_ratio=ratio, method=method, notes=notes)
+    return ConvexParts(parts=(part,), volume_ratio=ratio, method=method)
 
 
 def _decomposed(mesh: Mesh, closed: bool, volume_m3: float, config: ConvexConfig) -> ConvexParts:
@@ -126,7 +125,7 @@ def _decomposed(mesh: Mesh, closed: bool, volume_m3: float, config: ConvexConfig
         notes.append(ended)
     if not found:
         method = "hull (out of time)" if "time" in ended else "hull"
-        hull = _hull(mesh, volume_m3, config, method, ())
+        hull = _hull(mesh, volume_m3, config, method)
         notes.append(
             f"the hull stands for the mesh: {hull.volume_ratio:.2f} times its volume, no hollow."
         )
@@ -212,13 +211,8 @@ def _why(code: int | None, text: str, config: ConvexConfig) -> str:
     """Return why the process ended early, '' if it did not."""
     if code == 0:
         return ""
-    try:
-        import signal
-
-        out_of_time = code is None or -code in (signal.SIGXCPU, signal.SIGKILL)
-    except AttributeError:  # Windows has no SIGXCPU
-        out_of_time = code is None
-    if out_of_time:
+    ends = [getattr(signal, name, None) for name in ("SIGXCPU", "SIGKILL")]  # Windows has neither
+    if code is None or -code in ends:
         return f"CoACD was stopped: its time of {config.time_limit_s:g} CPU-s was over."
     return f"CoACD failed (exit code {code}): {text[-300:] or 'it said nothing'}."
 
@@ -252,12 +246,7 @@ def _kept(path: Path, result: ConvexParts) -> ConvexParts:
             "vertices": np.concatenate(result.parts),
             "counts": np.array([len(p) for p in result.parts]),
         },
-        {
-            "volume_ratio": result.volume_ratio,
-            "method": result.method,
-            "seconds": result.seconds,
-            "notes": result.notes,
-        },
+        {name: getattr(result, name) for name in ("volume_ratio", "method", "seconds", "notes")},
     )
     return result
 
@@ -265,10 +254,5 @@ def _kept(path: Path, result: ConvexParts) -> ConvexParts:
 def _read(path: Path) -> ConvexParts:
     """Return parts kept on disk."""
     arrays, notes = read_arrays(path)
-    return ConvexParts(
-        parts=_split(arrays),
-        volume_ratio=float(notes["volume_ratio"]),
-        method=str(notes["method"]),
-        seconds=float(notes["seconds"]),
-        notes=tuple(notes["notes"]),
-    )
+    notes["notes"] = tuple(notes["notes"])
+    return ConvexParts(parts=_split(arrays), **notes)
