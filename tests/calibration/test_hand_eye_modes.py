@@ -99,7 +99,7 @@ def test_the_lens_of_pose_pairs_is_the_given_one_or_is_said_to_be_none(tmp_path)
             assert camera is None or (written[key]["fx"] == 910.0 and written[key]["width"] == 1280)
         back = read_calibration(folder / "calibration.json")
         assert back.clock == CLOCK and np.array_equal(back.Z_points, report.Z_points)
-        assert "+35.00 +-0.40 ms" in (folder / "camera.urdf").read_text()
+        assert "+35.00 ms +-0.40 ms" in (folder / "camera.urdf").read_text()
         assert np.abs(se3.log(se3.invert(X) @ back.X)).max() < 1e-6
 
 
