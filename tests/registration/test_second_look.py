@@ -20,7 +20,7 @@ lab = load_benchmark("outside_lab")
 
 @pytest.fixture(scope="module")
 def scene():
-    return named_scene(3, NAMES, 6)
+    return named_scene(3, NAMES, 9)
 
 
 def registered(scene, frames, models=None, starts=()):
