@@ -59,7 +59,7 @@ EXACT_M, EXACT_SHARE = 0.0003, 0.005
 this share of its diameter if that is more: 0.65 mm of 13 cm, half of what `SymmetryConfig` allows
 a scan. No depth camera sees less."""
 NO_MIRROR = IsometryFit(worst=math.inf, rms=math.inf, share=0.0)
-"""Of a mirror image that was not tried."""
+"""What a mirror image that was not tried fits by."""
 REMEMBERED = 64
 """Models whose symmetries are kept in memory."""
 _memory: dict[str, Symmetries] = {}

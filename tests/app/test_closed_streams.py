@@ -45,11 +45,8 @@ def test_what_a_library_prints_never_lands_in_a_file(tmp_path: Path) -> None:
     assert path.read_text() == "kept"
 
 
-@pytest.mark.parametrize(
-    ("words", "also_errors"),
-    [(["--help"], False), (["check", "S"], True), (["check", "S", "--json"], False),
-     (["no"], False), (["no"], True)],
-)  # fmt: skip
+@pytest.mark.parametrize("words", [["--help"], ["check", "S"], ["check", "S", "--json"], ["no"]])
+@pytest.mark.parametrize("also_errors", [False, True])
 def test_a_reader_that_has_gone_is_no_failed_check(
     words: list[str], also_errors: bool, small_session: Path
 ) -> None:

@@ -27,7 +27,7 @@ def pages(registered_session: Path, tmp_path_factory: pytest.TempPathFactory) ->
     """The report and the annotation's page of a registered session."""
     folder = tmp_path_factory.mktemp("pages")
     store = SessionStore.open(copy_of(registered_session, folder / "s"))
-    run_annotate(store.folder, Console(quiet=True), maps="none", workers=1, check_depth=True)
+    run_annotate(store.folder, Console(quiet=True), maps="all", workers=1, check_depth=True)
     comparison = folder / "comparison.html"
     sources = sources_of([store.folder, store.folder])
     comparison.write_bytes(comparison_page(comparison_of(sources)).encode())

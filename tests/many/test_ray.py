@@ -214,14 +214,18 @@ cli.main()
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_in_a_sentence():
+@pytest.mark.parametrize(
+    ("send", "number", "code"),
+    [(os.killpg, signal.SIGINT, 130), (os.kill, signal.SIGTERM, 143)],  # a terminal tells all
+)
+def test_ctrl_c_and_sigterm_end_in_a_sentence(send, number, code):
     pytest.importorskip("ray")
     run = subprocess.Popen(
         [sys.executable, "-c", INTERRUPTED, "work"], start_new_session=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert run.stdout.readline() == "one is done\n"
-    os.killpg(run.pid, signal.SIGINT)  # as a terminal does: to all its processes
+    send(run.pid, number)
     told = run.communicate(timeout=30)[1].strip()
-    expected = "interrupted: 1 task is done; the same command goes on from here."
-    assert (run.returncode, told) == (130, expected)
+    assert run.returncode == code and told.splitlines()[-1].startswith("interrupted: 1 task is")
+    assert told.endswith("; the same command goes on from here.") and "Traceback" not in told

@@ -4,6 +4,7 @@ The review is a person's: a real Chromium opens the page that the command names,
 """
 
 import contextlib
+import os
 import re
 import subprocess
 from collections.abc import Generator
@@ -26,6 +27,7 @@ README = "README.md"
 UPGRADE = documented(README, "realsim", "upgrade", "DATASET", "--out")
 REVIEW = documented(README, "realsim", "review", "upgraded/test/000050")
 EXPORT = documented(README, "realsim", "export", "SESSION", "--to", "bop")
+REAL = Path(os.environ.get("REALSIM_DATA", "nowhere")) / "scenes/ycbv_mini"
 PATIENCE_S = 180.0
 """The browser draws without a graphics card."""
 
@@ -133,4 +135,18 @@ def test_what_the_reviewer_said_is_in_the_labels(tmp_path: Path) -> None:
     run(EXPORT, tmp_path, "--quiet", SESSION=str(session), FOLDER="labels")
     carries(tmp_path / "labels", session, scene)
     # A review only ever adds: what was registered stays as it was.
+    assert (session / "registration/scene.json").read_bytes() == registered
+
+
+@pytest.mark.real
+@needs_chromium
+@pytest.mark.skipif(not REAL.is_dir(), reason="REALSIM_DATA is not set")
+def test_the_same_on_real_photographs(tmp_path: Path) -> None:
+    few = ("--only-scenes", "50", "--views", "2", "--grasps", "2")
+    run(UPGRADE, tmp_path, *few, "--quiet", DATASET=str(REAL))
+    session = tmp_path / "upgraded/test/000050"
+    registered = (session / "registration/scene.json").read_bytes()
+    scene = review(session)
+    run(EXPORT, tmp_path, "--quiet", SESSION=str(session), FOLDER="labels")
+    carries(tmp_path / "labels", session, scene)
     assert (session / "registration/scene.json").read_bytes() == registered

@@ -124,14 +124,14 @@ def test_a_start_and_none_lead_to_the_same():
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth_over_many_seeds():
-    fits = [fitted("scalene"), fitted("bunny")]
-    for name, seed in (("scalene", 1), ("bunny", 1), ("elbow", 2), ("elbow", 3)):
-        known = scanned(name, "lab", seed)
-        mesh = wrong(known.real, 0.02, seed) if seed % 2 else known.real
-        fits.append(fit_of(known, scaled(mesh, 1 / UNIT_M)))
-    z = np.array([z_of(fit) for fit in fits])
-    # One of six is beyond two sigma in a quarter of all draws, two are in one of thirty.
-    assert np.sum(np.abs(z) > 1.96) <= 1 and np.abs(z).max() < 3.5, z.round(1)
+    z: list[float] = []
+    for name in ("scalene", "bunny", "elbow"):
+        for seed in range(4):
+            known = scanned(name, "lab", seed)
+            mesh = wrong(known.real, 0.02, seed) if seed % 2 else known.real
+            z.append(z_of(fit_of(known, scaled(mesh, 1 / UNIT_M))))
+    assert np.mean(np.abs(z) < 1.96) > 0.8, np.round(z, 1)
+    assert np.mean(np.abs(z) < 3.5) > 0.95, np.round(z, 1)
 
 
 @pytest.mark.slow

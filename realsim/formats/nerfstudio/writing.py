@@ -102,7 +102,7 @@ def write_nerfstudio(
     return WrittenScene(
         name=scene.name, folder=folder.place, frames=len(posed), frames_written=written,
         objects=objects, notes=_notes(scene, posed, without, unit_m, objects),
-        counts={"points": points, "masks": 0},
+        counts={"points": points},
     )  # fmt: skip
 
 
