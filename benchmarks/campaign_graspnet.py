@@ -79,22 +79,24 @@ def _compared(session: Path, out: Path) -> tuple[int, int, float, float]:
             [poses[s.instance] @ s.Ts_obj_pads[s.good & executed(s)] for s in grasps.sets]
         )
         places, rotations = load_grasp(out, folder, image)
-        far = np.linalg.norm(Ts[:, None, :3, 3] - places[None], axis=2) * 1e3
-        for k in range(len(Ts)):
-            nearest = int(np.argmin(far[k]))
-            approach = _degrees(Ts[k, :3, 2], rotations[nearest, :, 0])
-            closing = _degrees(Ts[k, :3, 1], rotations[nearest, :, 1])
-            closing = min(closing, 180.0 - closing)
-            near = far[k, nearest] <= NEAR_MM
-            right += bool(near and approach <= VIEW_DEG and closing <= VIEW_DEG)
-            apart.append(float(far[k, nearest]))
-            turns.append(approach)
+        for T in Ts:
+            far = np.linalg.norm(places - T[:3, 3], axis=1) * 1e3
+            nearest = np.flatnonzero(far <= max(NEAR_MM, far.min(initial=np.inf)))
+            # Fingers may meet at one point from several sides: of those, the one turned least.
+            approach = _degrees(rotations[nearest, :, 0], T[:3, 2])
+            closing = _degrees(rotations[nearest, :, 1], T[:3, 1])
+            closing = np.minimum(closing, 180.0 - closing)
+            best = np.argmin(np.maximum(approach, closing))
+            near = far[nearest[best]] <= NEAR_MM
+            right += bool(near and approach[best] <= VIEW_DEG and closing[best] <= VIEW_DEG)
+            apart.append(float(far[nearest[best]]))
+            turns.append(float(approach[best]))
         count += max(len(Ts), len(places))
     return right, count, max(apart, default=np.inf), float(np.median(turns)) if turns else np.nan
 
 
-def _degrees(a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0))))
+def _degrees(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0)))
 
 
 # --- the reader ---------------------------------------------------------------------------------

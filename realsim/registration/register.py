@@ -8,6 +8,7 @@
 5. Covariance, checks, probability, verdict; the same for the paper's way, ICP in one view.
 """
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
@@ -27,6 +28,7 @@ from realsim.registration.config import METHODS, RegistrationConfig
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.few_views import few_around, register_few, with_photograph
 from realsim.registration.finding import (
+    NO_INSTANCE,
     FoundObjects,
     Progress,
     SceneTask,
@@ -146,13 +148,21 @@ def register_scene(  # noqa: PLR0913 - the inputs, and two ways to follow them
     task = SceneTask(name, intake, models, config, up, tick, kinematics, {})
     if asked is not None:
         task = task.symmetric(w.obj_id for w in asked)
+    result = _sought(task, asked, tuple(refused))
+    return result if asked is not None else without_inventions(result)
+
+
+def _sought(
+    task: SceneTask, asked: list[Wanted] | None, refused: tuple[NotPlaced, ...]
+) -> Registration:
+    """Return what was found, fitted and judged."""
     found = seek_objects(task, asked)
     missing = (*refused, *found.not_placed)
     if not found.bodies:
         return _nothing(task, found, missing)
-    many = len(intake.all_views) >= config.refine_from and config.refine_cameras
+    many = len(task.intake.all_views) >= task.config.refine_from and task.config.refine_cameras
     if not many:
-        task = replace(task, intake=without_fixed(intake, config.refine_from))
+        task = replace(task, intake=without_fixed(task.intake, task.config.refine_from))
         return _registration(task, found, missing, _fit_few(task, found))
     before = task.intake.plane
     task, found, fit = _fit_many(task, found, asked or ())
@@ -405,9 +415,7 @@ def _registration(
         **common_report(given, objects, config),
         "search": found.report,
         "single_view": single_report,
-        "not_placed": [
-            {"obj_id": n.obj_id, "instance": n.instance, "reason": n.reason} for n in missing
-        ],
+        "not_placed": missing_report(missing),
         "findings": [{"kind": f.kind, "words": f.words} for f in findings],
         "kinematics": None if task.kinematics is None else task.kinematics.as_json(),
         **fit.report,
@@ -448,3 +456,43 @@ def with_rejected(result: Registration, first: Registration, bad: AbstractSet[in
         result, scene=replace(result.scene, objects=tuple(objects)), seen=seen,
         findings=(*result.findings, *lost), report={**result.report, "objects": every},
     )  # fmt: skip
+
+
+def without_inventions(result: Registration) -> Registration:
+    """Return a registration of objects that nobody named, without those that were rejected.
+
+    A model of which nothing is left is not placed; the report counts the places of all.
+    """
+    rejected = [o for o in result.scene.objects if o.verdict == "rejected"]
+    gone = {o.instance for o in rejected}
+    found = {o.obj_id for o in result.scene.objects if o.instance not in gone}
+    counts = Counter(o.obj_id for o in rejected)
+    first = {o.obj_id: o.reasons[0] for o in reversed(rejected)}
+    lost = tuple(
+        NotPlaced(
+            obj_id=i,
+            instance=NO_INSTANCE,
+            reason=f"places tried: {counts[i]}, all rejected; the first: {first[i]}",
+        )
+        for i in sorted(set(counts) - found)
+    )
+
+    def kept(scene: Scene) -> Scene:
+        return replace(scene, objects=tuple(o for o in scene.objects if o.instance not in gone))
+
+    return replace(
+        result, scene=kept(result.scene), single_view=kept(result.single_view),
+        seen={v: {i: p for i, p in of.items() if i not in gone} for v, of in result.seen.items()},
+        not_placed=(*result.not_placed, *lost),
+        report={
+            **result.report,
+            "objects": [r for r in result.report["objects"] if r["instance"] not in gone],
+            "not_placed": [*result.report.get("not_placed", []), *missing_report(lost)],
+            "rejected_places": {str(i): n for i, n in sorted(counts.items())},
+        },
+    )  # fmt: skip
+
+
+def missing_report(missing: Sequence[NotPlaced]) -> list[dict[str, Any]]:
+    """Return what was not placed, and why, as JSON values."""
+    return [{"obj_id": n.obj_id, "instance": n.instance, "reason": n.reason} for n in missing]

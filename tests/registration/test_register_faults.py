@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 import pytest
@@ -14,7 +14,12 @@ from realsim.geometry.metrics import mssd_symmetric
 from realsim.geometry.parts import part
 from realsim.records import Mesh, ObjectModel, ObjectPose
 from realsim.registration.evidence import DepthFrame
-from realsim.registration.register import Registration, RegistrationConfig, register_scene
+from realsim.registration.register import (
+    Registration,
+    RegistrationConfig,
+    register_scene,
+    without_inventions,
+)
 from realsim.registration.search.records import Wanted
 from realsim.registration.simulated import TableScene
 from table_faults import foreign, without_any_depth, without_depth_on
@@ -167,6 +172,27 @@ def test_unknown_ids_are_found_among_more_models():
         model = scene().models[p.obj_id]
         assert 1e3 * mssd_symmetric(p.T_world_obj, o.T_world_obj, model) < RIGHT_MM
     assert len({o.instance for o in result.scene.objects}) == len(result.scene.objects)
+    assert all(o.verdict != "rejected" for o in result.scene.objects)
+
+
+def test_what_nobody_named_and_was_rejected_is_told_and_stays_out_of_the_scene():
+    asked = one_view()
+    first, second, *rest = asked.scene.objects
+    bad = [replace(o, verdict="rejected", reasons=("it floats",)) for o in (first, second)]
+    # The second place of a model that is there as well; the first of one that is not.
+    bad[1] = replace(bad[1], obj_id=rest[0].obj_id)
+    scene_ = replace(asked.scene, objects=(*bad, *rest))
+    kept = without_inventions(replace(asked, scene=scene_))
+    left = {o.instance for o in rest}
+    assert {o.instance for o in kept.scene.objects} == left
+    assert {o.instance for o in kept.single_view.objects} <= left
+    assert {r["instance"] for r in kept.report["objects"]} == left
+    (missing,) = kept.not_placed
+    assert missing.obj_id == first.obj_id and "it floats" in missing.reason
+    assert kept.report["rejected_places"] == {str(first.obj_id): 1, str(rest[0].obj_id): 1}
+    assert len(kept.report["not_placed"]) == 1
+    none = without_inventions(asked)
+    assert none.scene.objects == asked.scene.objects and none.not_placed == ()
 
 
 # --- views ---------------------------------------------------------------------------------------
@@ -181,8 +207,13 @@ def test_a_foreign_view_is_named_and_does_no_harm():
     assert sorted(result.cameras) == [k for k in range(8) if k != 2]
 
 
+@cache
+def one_view() -> Registration:
+    return run(starts(), scene().frames[:1])
+
+
 def test_one_view_only_is_worse_and_says_so():
-    result = run(starts(), scene().frames[:1])
+    result = one_view()
     assert sorted(result.cameras) == [0] and result.seen == {}
     np.testing.assert_array_equal(result.cameras[0], scene().frames[0].T_world_cam)
     for p in scene().truth:

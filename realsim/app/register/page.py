@@ -14,6 +14,7 @@ from realsim.app.register.tables import (
     missing_rows,
     object_rows,
     odometry_line,
+    places_line,
     summary_line,
     table_line,
     view_rows,
@@ -62,7 +63,7 @@ def page_bytes(
         title=f"Registration of {result.scene.name}",
         about=f"{taken} of {n} views, method {_method(result)}",
     )
-    page.section("Objects", f"{summary_line(result)}. {table_line(result)}")
+    page.section("Objects", f"{summary_line(result)}. {table_line(result)} {places_line(result)}")
     if result.scene.objects:
         rows: list[list[object]] = [
             [name, Cell(verdict, kind=VERDICT_KIND[verdict]), *rest]

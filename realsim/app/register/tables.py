@@ -36,8 +36,9 @@ def worst_first(result: Registered) -> list[ObjectPose]:
 
 
 def named(instance: int, obj_id: int, models: Mapping[int, ObjectModel]) -> str:
-    """Return number and name of an instance."""
-    return f"{instance} {models[obj_id].name if obj_id in models else f'object {obj_id}'}"
+    """Return number and name of an instance; the name alone where it has no number."""
+    name = models[obj_id].name if obj_id in models else f"object {obj_id}"
+    return name if instance < 0 else f"{instance} {name}"
 
 
 def object_rows(result: Registered, models: Mapping[int, ObjectModel]) -> Rows:
@@ -207,6 +208,14 @@ def summary_line(result: Registered) -> str:
     return ", ".join(counts) or "nothing was found"
 
 
+def places_line(result: Registered) -> str:
+    """Return how many places were tried and rejected where nobody named the objects."""
+    counts: Mapping[str, int] = result.report.get("rejected_places", {})
+    if not counts:
+        return ""
+    return f"search: {sum(counts.values())} further places of {len(counts)} models were rejected."
+
+
 def next_line(folder: Path, result: Registered) -> str:
     """Return what to do next."""
     if not result.is_usable:
@@ -234,7 +243,7 @@ def show_registered(
         table_line(result), camera_line(result), photograph_line(result), depth_line(result),
         odometry_line(result),
     )  # fmt: skip
-    for line in (*symmetry_lines(result), *lines):
+    for line in (*symmetry_lines(result), *lines, places_line(result)):
         if line:
             console.say(line)
     console.say(next_line(folder, result))

@@ -15,7 +15,9 @@ from realsim.app.register.tables import (
     check_rows,
     depth_line,
     missing_rows,
+    named,
     odometry_line,
+    places_line,
     table_line,
     view_rows,
     worst_first,
@@ -77,7 +79,7 @@ def registration_section(section: Section, store: SessionStore, state: ReviewSta
     told = [f"{verdicts.count(v)} {v}" for v in VERDICT_KIND if v in verdicts]
     told += [f"{len(result.not_placed)} not placed"] * bool(result.not_placed)
     section.headline = ", ".join(told) or "nothing was found"
-    _findings(section, result, store)
+    _findings(section, result, models)
     section.page.text(" ".join(t[0].upper() + t[1:] for t in _lines(result) if t))
     if scene.objects:
         _object_table(section)
@@ -92,7 +94,13 @@ def registration_section(section: Section, store: SessionStore, state: ReviewSta
 def _lines(result: Registered) -> list[str]:
     if not result.report:
         return [table_line(result)]
-    return [table_line(result), camera_line(result), depth_line(result), odometry_line(result)]
+    return [
+        table_line(result),
+        camera_line(result),
+        depth_line(result),
+        odometry_line(result),
+        places_line(result),
+    ]
 
 
 def _object(
@@ -183,7 +191,7 @@ def _view_sigmas(result: Registered) -> dict[int, list[float]]:
     return {k: v for k, v in rows.items() if v}
 
 
-def _findings(section: Section, result: Registered, store: SessionStore) -> None:
+def _findings(section: Section, result: Registered, models: Mapping[int, ObjectModel]) -> None:
     """Say what speaks against using the objects."""
     for row in section.objects:
         name = f"{row['instance']} {row['name']}"
@@ -195,7 +203,7 @@ def _findings(section: Section, result: Registered, store: SessionStore) -> None
         elif row["verdict"] in ("doubtful", "unchecked"):
             section.say("warn", f"Object {name} is {row['verdict']}: {why or 'not checked'}")
     for missing in result.not_placed:
-        name = f"{missing.instance} (object {missing.obj_id})"
+        name = named(missing.instance, missing.obj_id, models)
         section.say("warn", f"Object {name} is not placed: {missing.reason}")
     for remark in result.remarks:
         where = "Scene" if remark.view is None else f"View {remark.view}"
