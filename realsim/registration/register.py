@@ -171,12 +171,22 @@ def _sought(
         task, found, fit = _fit_many(task, seek_objects(task, asked), asked or ())
     missing = (*refused, *found.not_placed)
     result = _registration(task, found, missing, fit)
-    bad = {o.instance for o in result.scene.objects if o.verdict == "rejected"}
+    bad = {o.instance for o in result.scene.objects if is_wrong(o, task.config)}
     if not bad or len(bad) == len(found.bodies):
         return result
     # What is not there must not pull the cameras.
     task, rest, fit = _fit_many(task, without_objects(found, bad), ())
     return with_rejected(_registration(task, rest, missing, fit), result, bad)
+
+
+def is_wrong(o: ObjectPose, config: RegistrationConfig) -> bool:
+    """Return whether an object is rejected by its own evidence.
+
+    One that fits well and overlaps another may be right and the other wrong: it is judged again
+    without those that are wrong by themselves.
+    """
+    fits = o.checks.get("probability", 0.0) >= config.judging.verdict.accept
+    return o.verdict == "rejected" and not (fits and o.checks.get("penetration_mm", 0.0) > 0.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -7,6 +7,7 @@ import trimesh
 from realsim.errors import InputError
 from realsim.geometry import distance_field, se3
 from realsim.geometry.distance_field import DistanceField
+from realsim.geometry.parts import object_model
 from realsim.records import Mesh
 from trimesh_solids import solid
 
@@ -44,6 +45,20 @@ def test_box_distance_is_exact_on_flat_faces(box):
     assert error[near].max() < 0.6 * box.cell
     # Far inside, where four cells are bridged, the ridge of the field is cut off.
     assert error.max() < 0.6 * distance_field.FAR_STEP * box.cell
+
+
+@pytest.mark.parametrize("name", ["blob_000", "teddy"])
+def test_neighbours_off_the_surface_of_touching_bodies_differ_by_their_distance(name):
+    # Bodies that share walls mislead rays: whole regions were on the wrong side.
+    f = DistanceField.from_mesh(object_model(name).mesh, 48)
+    most = (distance_field.NEAR_CELLS - 1) * f.cell
+    off = (np.abs(f.grid) > 0.51 * f.cell) & (np.abs(f.grid) < most)
+    for axis in range(3):
+        both = np.delete(off, 0, axis) & np.delete(off, -1, axis)
+        assert (np.abs(np.diff(f.grid, axis=axis))[both] <= 1.001 * f.cell).all()
+    edge = np.ones_like(off)
+    edge[1:-1, 1:-1, 1:-1] = False
+    assert (f.grid[edge] > 0).all()
 
 
 def test_sphere_distance_and_gradient(sphere):

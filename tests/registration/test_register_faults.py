@@ -17,6 +17,7 @@ from realsim.registration.evidence import DepthFrame
 from realsim.registration.register import (
     Registration,
     RegistrationConfig,
+    is_wrong,
     register_scene,
     without_inventions,
 )
@@ -205,6 +206,14 @@ def test_a_foreign_view_is_named_and_does_no_harm():
     all_right(result)
     assert any("view 2" in f.words for f in result.findings)
     assert sorted(result.cameras) == [k for k in range(8) if k != 2]
+
+
+def test_what_fits_and_is_overlapped_is_judged_again_without_what_does_not_fit():
+    o = replace(one_view().scene.objects[0], verdict="rejected")
+    overlapped = replace(o, checks={**o.checks, "probability": 0.97, "penetration_mm": 14.2})
+    invented = replace(o, checks={**o.checks, "probability": 0.01, "penetration_mm": 14.2})
+    sunk = replace(o, checks={**o.checks, "probability": 0.97, "penetration_mm": 0.0})
+    assert [is_wrong(x, QUICK) for x in (overlapped, invented, sunk)] == [False, True, True]
 
 
 @cache

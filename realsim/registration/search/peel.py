@@ -44,15 +44,15 @@ class PeelConfig:
     """Number of clusters that are searched, the largest first."""
     rounds: int = 3
     """Times that unsure objects are sought in what is left."""
-    rotations: int = 24
+    rotations: int = 48
     """Random turns tried at each place of a cluster for each object."""
-    most_starts: int = 160
+    most_starts: int = 480
     """Maximum number of starts of one object in a round, spread over all places: 2 ms each."""
     most_starts_together: int = 1600
     """Maximum number of starts of all objects in a round: 53 each with 30 models, 3 s."""
     least_extent: float = 0.25
     """A cluster smaller than this share of the object's size is not it."""
-    greatest_extent: float = 2.5
+    greatest_extent: float = 1.0
     """A cluster larger than this may hold it, but is searched around several of its points."""
 
 

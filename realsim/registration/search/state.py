@@ -42,8 +42,8 @@ class Search:
         canvas, config = self.bench.canvas, self.bench.config.selection
         self.say(f"choosing among {len(self.pool)} poses")
         if self.wanted is None:
-            before = [c for c in first or () if c is not None]
-            chosen = select_any(canvas, self.pool, config, before, self._clash)
+            # A new pose of a large object can stand for several small ones: all compete again.
+            chosen = select_any(canvas, self.pool, config, clash=self._clash)
         else:
             slots = [Slot(choices=frozenset(c)) for c in self.choices]
             chosen = select(canvas, self.pool, slots, config, first)
