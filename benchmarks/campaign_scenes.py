@@ -4,6 +4,9 @@ scenes      scenes_done       scenes that went through all stages, of 20 (--quic
             manual_steps      commands that somebody had to type beside `realsim pipeline`
             memory_growth     of the pipeline's own processes, last quarter of the scenes over the
                               second [share]
+            objects_right_share  of all objects, placed within 3 mm (MSSD) of where the simulator
+                              left them, whatever the verdict
+            wrong_accepted    accepted and farther off, or accepted and not there
             paper_scene_cpu_s CPU time of one scene at the paper's size, from these rates [s]
 
   uv run python benchmarks/campaign.py --part scenes [--quick] [--keep FOLDER]
@@ -31,8 +34,11 @@ FIGURES = {
     "scenes_done": Figure(unit="", goal=Goal(low=20, high=20)),
     "manual_steps": Figure(unit="", goal=Goal(low=0, high=0)),
     "memory_growth": Figure(unit="", goal=Goal(high=0.05)),
+    "objects_right_share": Figure(unit=""),
+    "wrong_accepted": Figure(unit=""),
     "paper_scene_cpu_s": Figure(unit="s"),
 }
+RIGHT_MM = 3.0
 FILE = """[campaign]
 out = "out"
 stages = ["register", "school", "annotate", "export", "stats"]
@@ -70,15 +76,44 @@ def scenes(args: argparse.Namespace) -> Found:
         told = json.loads((folder / "out/campaign.json").read_text())
         size = sum(p.stat().st_size for p in (folder / "out/scenes").rglob("*") if p.is_file())
         tried = tried_grasps(folder / "out/scenes")
+        placed = [objects_right(scene) for scene in sorted((folder / "out/scenes").glob("scene_*"))]
     found.add("scenes_done", told["done"], f"{count} scenes, exit code {code}")
     found.add("manual_steps", 0 if told["done"] == count and not told["failed"] else 1)
     if len(memory) > 3 * count:
         found.add("memory_growth", growth(memory, count), f"{len(memory)} looks")
+    right, there, wrong = np.sum(placed, axis=0)
+    found.add("objects_right_share", right / there, f"{right} of {there}")
+    found.add("wrong_accepted", wrong)
     rates = Rates.of(told, count, views, tried, size)
     found.add("paper_scene_cpu_s", rates.scene_cpu_s(PAPER_VIEWS, PAPER_GRASPS / PAPER_SCENES))
     found.notes += [f"{name}: {why}" for name, why in told["failed"].items()]
     found.notes += [str(rates), *(rates.cost(machines) for machines in (1, 10, 100))]
     return found
+
+
+def objects_right(scene: Path) -> tuple[int, int, int]:
+    """Return the objects of a scene that are right, all there are, and the wrong accepted ones."""
+    from realsim.app.stages import session_models
+    from realsim.geometry.metrics import mssd_symmetric
+    from realsim.store import SessionStore
+
+    models = session_models(SessionStore.open(scene))
+    ids = {m.name: i for i, m in models.items()}
+    laid = json.loads((scene / "synthetic/scene.json").read_text())["provenance"]["layout"]
+    left = [(ids[o["name"]], np.array(o["T_table_obj"])) for o in laid["objects"]]
+    count, right, wrong = len(left), 0, 0
+    for o in json.loads((scene / "registration/scene.json").read_text())["objects"]:
+        off = [
+            1e3 * mssd_symmetric(T, np.array(o["T_world_obj"]), models[i])
+            if i == o["obj_id"] else np.inf
+            for i, T in left
+        ]  # fmt: skip
+        if min(off, default=np.inf) <= RIGHT_MM:
+            right += 1
+            left.pop(int(np.argmin(off)))
+        else:
+            wrong += o["verdict"] == "accepted"
+    return right, count, wrong
 
 
 def run_watched(file: Path, records: Path) -> tuple[int, list[tuple[int, float]]]:

@@ -23,9 +23,9 @@ from numpy.typing import ArrayLike
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.mesh_shape import solid_angle_share
 from realsim.many import Outcome, Shared, Task, Workers, at_most, open_pool, run_many
 from realsim.records import CameraIntrinsics, GraspSet, View
-from realsim.rendering.casting.triangle_rays import solid_angle_share
 from realsim.store import SessionStore, save_scene
 from realsim.store.lock import only_run_in
 from realsim_sim_bridge.annotation.annotate import annotate
