@@ -249,7 +249,8 @@ class _Solid:
 
         off = np.zeros(nodes.max(axis=0, initial=0) + 1, dtype=bool)
         off[tuple(nodes.T)] = True
-        part = np.asarray(label(off)[0])[tuple(nodes.T)]
+        labelled: Any = label(off)
+        part = labelled[0][tuple(nodes.T)]
         # The farthest node of each part speaks for it.
         order = np.lexsort((-distance, part))
         parts, first = np.unique(part[order], return_index=True)
