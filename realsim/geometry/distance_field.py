@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike
 from realsim.arrays import Array, Array32, Int64, Mask
 from realsim.compiled import njit
 from realsim.errors import InputError
-from realsim.geometry.mesh_shape import is_closed, solid_angle_share, welded
+from realsim.geometry.mesh_shape import is_closed, welded
+from realsim.geometry.winding import solid_angle_share
 from realsim.interop import import_open3d
 from realsim.records import Mesh
 from realsim.untrusted.arrays import read_npz

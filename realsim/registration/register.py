@@ -8,9 +8,7 @@
 5. Covariance, checks, probability, verdict; the same for the paper's way, ICP in one view.
 """
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,7 +26,6 @@ from realsim.registration.config import METHODS, RegistrationConfig
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.few_views import few_around, register_few, with_photograph
 from realsim.registration.finding import (
-    NO_INSTANCE,
     FoundObjects,
     Progress,
     SceneTask,
@@ -43,11 +40,18 @@ from realsim.registration.finding import (
 )
 from realsim.registration.fixed_cameras import FixedFrames
 from realsim.registration.intake import check_odometry, take_in, without_fixed
-from realsim.registration.judge import COMMON, Defect, Poses, judge_objects
+from realsim.registration.judge import Defect, Poses, judge_objects
 from realsim.registration.judging.verdict import CONTRAST_DECIDED
 from realsim.registration.many_views import ManyViews, comparer_on, register_many
 from realsim.registration.near_rivals import Duel, duels, duels_by_print
 from realsim.registration.refinement.uncertainty import SeenPose
+from realsim.registration.registered import (
+    Registration,
+    is_wrong,
+    missing_report,
+    with_rejected,
+    without_inventions,
+)
 from realsim.registration.reports import (
     camera_report,
     common_report,
@@ -71,30 +75,6 @@ from realsim.registration.top_down import not_seen, top_down_poses
 from realsim.registration.views import ViewPoints
 
 __all__ = ["DepthFrame", "Registration", "RegistrationConfig", "register_scene"]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Registration:
-    """A registered scene, its baseline, and how it came about."""
-
-    scene: Scene
-    """Poses with covariance, checks, verdict, reasons; and the support plane."""
-    single_view: Scene
-    """The baseline: robust ICP in one reference frame, checked in the same way."""
-    cameras: dict[int, Array]
-    """View number -> (4, 4) T_world_cam; refined if the views allow it. Views that were left out
-    are not in it."""
-    fixed_cameras: dict[str, Array]
-    """Name -> (4, 4) T_world_cam of the cameras that stand still; refined if the views allow it."""
-    seen: dict[int, dict[int, SeenPose]]
-    """View number -> instance -> its pose in that view, with covariance and pixel uncertainty.
-    Empty if cameras were not refined."""
-    not_placed: tuple[NotPlaced, ...]
-    """Objects that were wanted and not found, and why."""
-    findings: tuple[Defect, ...]
-    """What is wrong with views or with the scene."""
-    report: Mapping[str, Any]
-    """Plain JSON values: per object the search, the residuals, what was rejected; the cameras."""
 
 
 def register_scene(  # noqa: PLR0913 - the inputs, and two ways to follow them
@@ -177,16 +157,6 @@ def _sought(
     # What is not there must not pull the cameras.
     task, rest, fit = _fit_many(task, without_objects(found, bad), ())
     return with_rejected(_registration(task, rest, missing, fit), result, bad)
-
-
-def is_wrong(o: ObjectPose, config: RegistrationConfig) -> bool:
-    """Return whether an object is rejected by its own evidence.
-
-    One that fits well and overlaps another may be right and the other wrong: it is judged again
-    without those that are wrong by themselves.
-    """
-    fits = o.checks.get("probability", 0.0) >= config.judging.verdict.accept
-    return o.verdict == "rejected" and not (fits and o.checks.get("penetration_mm", 0.0) > 0.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -445,64 +415,3 @@ def _registration(
 def _said(fixed: Sequence[ViewPoints]) -> dict[str, Array]:
     """Return where the cameras that stand still are, by name."""
     return {v.fixed.name: v.T_world_cam for v in fixed if v.fixed is not None}
-
-
-def with_rejected(result: Registration, first: Registration, bad: AbstractSet[int]) -> Registration:
-    """Return a registration with the objects that were rejected before it was made."""
-    words = "it took no part in the fit of the cameras"
-    out = [
-        replace(o, reasons=(*o.reasons, words)) for o in first.scene.objects if o.instance in bad
-    ]
-    rows = [r for r in first.report["objects"] if r["instance"] in bad]
-    seen = {
-        view: poses | {i: p for i, p in first.seen.get(view, {}).items() if i in bad}
-        for view, poses in result.seen.items()
-    }
-    objects = sorted((*result.scene.objects, *out), key=lambda o: o.instance)
-    every = sorted((*result.report["objects"], *rows), key=lambda r: r["instance"])
-    known = {(f.kind, f.words) for f in result.findings}
-    lost = [f for f in first.findings if (f.kind, f.words) not in known and f.kind not in COMMON]
-    return replace(
-        result, scene=replace(result.scene, objects=tuple(objects)), seen=seen,
-        findings=(*result.findings, *lost), report={**result.report, "objects": every},
-    )  # fmt: skip
-
-
-def without_inventions(result: Registration) -> Registration:
-    """Return a registration of objects that nobody named, without those that were rejected.
-
-    A model of which nothing is left is not placed; the report counts the places of all.
-    """
-    rejected = [o for o in result.scene.objects if o.verdict == "rejected"]
-    gone = {o.instance for o in rejected}
-    found = {o.obj_id for o in result.scene.objects if o.instance not in gone}
-    counts = Counter(o.obj_id for o in rejected)
-    first = {o.obj_id: o.reasons[0] for o in reversed(rejected)}
-    lost = tuple(
-        NotPlaced(
-            obj_id=i,
-            instance=NO_INSTANCE,
-            reason=f"places tried: {counts[i]}, all rejected; the first: {first[i]}",
-        )
-        for i in sorted(set(counts) - found)
-    )
-
-    def kept(scene: Scene) -> Scene:
-        return replace(scene, objects=tuple(o for o in scene.objects if o.instance not in gone))
-
-    return replace(
-        result, scene=kept(result.scene), single_view=kept(result.single_view),
-        seen={v: {i: p for i, p in of.items() if i not in gone} for v, of in result.seen.items()},
-        not_placed=(*result.not_placed, *lost),
-        report={
-            **result.report,
-            "objects": [r for r in result.report["objects"] if r["instance"] not in gone],
-            "not_placed": [*result.report.get("not_placed", []), *missing_report(lost)],
-            "rejected_places": {str(i): n for i, n in sorted(counts.items())},
-        },
-    )  # fmt: skip
-
-
-def missing_report(missing: Sequence[NotPlaced]) -> list[dict[str, Any]]:
-    """Return what was not placed, and why, as JSON values."""
-    return [{"obj_id": n.obj_id, "instance": n.instance, "reason": n.reason} for n in missing]

@@ -14,13 +14,8 @@ from realsim.geometry.metrics import mssd_symmetric
 from realsim.geometry.parts import part
 from realsim.records import Mesh, ObjectModel, ObjectPose
 from realsim.registration.evidence import DepthFrame
-from realsim.registration.register import (
-    Registration,
-    RegistrationConfig,
-    is_wrong,
-    register_scene,
-    without_inventions,
-)
+from realsim.registration.register import Registration, RegistrationConfig, register_scene
+from realsim.registration.registered import is_wrong, without_inventions
 from realsim.registration.search.records import Wanted
 from realsim.registration.simulated import TableScene
 from table_faults import foreign, without_any_depth, without_depth_on

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from realsim.arrays import Array, Array32, Int32, Mask
 from realsim.geometry import camera, se3
-from realsim.geometry.mesh_shape import solid_angle_share
+from realsim.geometry.winding import solid_angle_share
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.casting.triangle_rays import cast_triangles, count_outside, project_vertices
 from realsim.rendering.rays import PlacedMesh

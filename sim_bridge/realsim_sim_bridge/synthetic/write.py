@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.mesh_shape import solid_angle_share
+from realsim.geometry.winding import solid_angle_share
 from realsim.many import Outcome, Shared, Task, Workers, at_most, open_pool, run_many
 from realsim.records import CameraIntrinsics, GraspSet, View
 from realsim.store import SessionStore, save_scene
