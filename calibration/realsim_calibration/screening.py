@@ -30,7 +30,7 @@ from realsim_calibration.faults.gates import (
     screw_ratio,
 )
 from realsim_calibration.fit.board_pose import BoardPose, estimate_board_pose
-from realsim_calibration.fit.closed_forms import CLOSED_FORMS, MotionConfig, check_observable
+from realsim_calibration.fit.closed_forms import CLOSED_FORMS, MIN_VIEWS, check_observable
 from realsim_calibration.fit.joint_solve import JointConfig
 from realsim_calibration.fit.noise_scale import NoiseConfig
 from realsim_calibration.fit.robot_error import RobotErrorConfig
@@ -48,7 +48,6 @@ class HandEyeConfig:
     mode: Mode = "eye_in_hand"
     diagnosis: DiagnosisConfig = field(default_factory=DiagnosisConfig)
     gates: GateConfig = field(default_factory=GateConfig)
-    motion: MotionConfig = field(default_factory=MotionConfig)
     joint: JointConfig = field(default_factory=JointConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     robot: RobotErrorConfig = field(default_factory=RobotErrorConfig)
@@ -107,7 +106,7 @@ def screen(
     candidates, rejected = _candidates(views, target, intrinsics0, config)
     candidates, turned = _counted_from_one_end(candidates, target, intrinsics0)
     A, C = stacks(candidates)
-    check_observable(A, config.motion)
+    check_observable(A)
     labels = [c.view.label for c in candidates]
     diagnosis = examine(
         _given(candidates), C, labels, target, config.mode, _nominal(candidates, arm),
@@ -237,10 +236,10 @@ def _candidates(
             continue
         A = view.T_base_ee if config.mode == "eye_in_hand" else se3.invert(view.T_base_ee)
         candidates.append(Candidate(view=view, points=points, uv=found.uv, pose=pose, A=A))
-    if len(candidates) < config.motion.min_views:
+    if len(candidates) < MIN_VIEWS:
         raise DegenerateError(
             f"hand-eye: {len(candidates)} of {len(ordered)} views show the target; at least "
-            f"{config.motion.min_views} are needed, 24 are advised. "
+            f"{MIN_VIEWS} are needed, 24 are advised. "
             + " ".join(f"View {i} {why}" for i, why in list(rejected.items())[:3])
         )
     return candidates, rejected
@@ -282,7 +281,7 @@ def _closed_forms(
 ) -> dict[str, tuple[Array, Array, Array]]:
     """Return (X, Z, px per view) of every closed form."""
     A, _ = stacks(candidates)
-    check_observable(A, config.motion)
+    check_observable(A)
     tried: dict[str, tuple[Array, Array, Array]] = {}
     for name, solve_closed in CLOSED_FORMS.items():
         X, Z = solve_closed(A, C)

@@ -10,9 +10,8 @@ from realsim.registration.compare import CompareConfig
 from realsim.registration.evidence import EvidenceConfig
 from realsim.registration.find_table import TableSearchConfig
 from realsim.registration.judging.held_out import HeldOutConfig
-from realsim.registration.judging.scene_checks import SceneCheckConfig, SwappedConfig
+from realsim.registration.judging.scene_checks import SceneCheckConfig
 from realsim.registration.judging.surface_residuals import ResidualConfig
-from realsim.registration.judging.unit_checks import UnitConfig
 from realsim.registration.judging.verdict import VerdictConfig
 from realsim.registration.near_rivals import RivalConfig
 from realsim.registration.near_start import JointConfig, SearchConfig
@@ -40,7 +39,6 @@ class JudgingConfig:
     held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
     verdict: VerdictConfig = field(default_factory=VerdictConfig)
     scene: SceneCheckConfig = field(default_factory=SceneCheckConfig)
-    units: UnitConfig = field(default_factory=UnitConfig)
     views: ViewCheckConfig = field(default_factory=ViewCheckConfig)
 
 
@@ -136,7 +134,6 @@ class RegistrationConfig:
     blind: BlindConfig = field(default_factory=BlindConfig)
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
     verify: VerifyConfig = field(default_factory=VerifyConfig)
-    swapped: SwappedConfig = field(default_factory=SwappedConfig)
     rivals: RivalConfig = field(default_factory=RivalConfig)
     second_look: SecondLookConfig = field(default_factory=SecondLookConfig)
     photo_fit: PhotoFitConfig = field(default_factory=PhotoFitConfig)

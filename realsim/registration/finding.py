@@ -156,7 +156,7 @@ def in_units(
         )
         for w in asked
     ]  # fmt: skip
-    errors = unit_errors(models, starts, eyes, float(np.median(depths)), config.judging.units)
+    errors = unit_errors(models, starts, eyes, float(np.median(depths)))
     refused = [
         NotPlaced(obj_id=w.obj_id, instance=w.instance, reason=str(errors[w.instance]))
         for w in asked if w.instance in errors
@@ -230,7 +230,7 @@ def seek_objects(task: SceneTask, asked: list[Wanted] | None) -> FoundObjects:
     if asked is None:  # only of what is there: it takes half a second each
         task = task.symmetric(p.obj_id for p in result.placed)
     if asked is not None:
-        result, findings = with_swaps(result, asked, dict(task.models), search, config.swapped)
+        result, findings = with_swaps(result, asked, dict(task.models), search)
     wrong = {i for f in findings for i in f.instances}
     claims = [w for w in asked or () if w.instance not in wrong]
     return replace(_found_objects(task, result, claims), findings=tuple(findings))

@@ -25,15 +25,11 @@ HALF_TURN = np.radians(175.0)
 """Pairs that turn further are left out: near 180 deg the sign of the axis is decided by noise."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class MotionConfig:
-    """How much motion is asked for before a hand-eye is computed."""
-
-    min_views: int = 3
-    """Two motions about different axes need three poses."""
-    min_turn_deg: float = 2.0
-    """Least RMS rotation of the view pairs about the second-best axis [deg]: ten times the angle
-    error of a planar pose seen from half a metre."""
+MIN_VIEWS = 3
+"""Two motions about different axes need three poses."""
+MIN_TURN_DEG = 2.0
+"""Least RMS rotation of the view pairs about the second-best axis [deg]: ten times the angle
+error of a planar pose seen from half a metre."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -92,7 +88,7 @@ def principal_turns(turns: Array) -> tuple[Array, Array]:
     return np.sqrt(np.maximum(values[::-1], 0.0)), axes[:, ::-1]
 
 
-def check_observable(Ts_base_ee: ArrayLike, config: MotionConfig | None = None) -> Array:
+def check_observable(Ts_base_ee: ArrayLike) -> Array:
     """Return the RMS rotation of the view pairs about the three principal axes [rad], descending.
 
     The hand-eye is determined when the hand turns about two different axes (Chen 1991). With one
@@ -101,24 +97,22 @@ def check_observable(Ts_base_ee: ArrayLike, config: MotionConfig | None = None) 
 
     Args:
         Ts_base_ee: (N, 4, 4) hand poses [m].
-        config: how much motion is enough.
 
     Raises:
         DegenerateError: too few views, no rotation, or rotation about one axis only.
     """
-    config = config or MotionConfig()
     A = np.asarray(Ts_base_ee, dtype=np.float64).reshape(-1, 4, 4)
-    if len(A) < config.min_views:
+    if len(A) < MIN_VIEWS:
         raise DegenerateError(
-            f"hand-eye: {len(A)} usable views; at least {config.min_views} that turn the hand "
+            f"hand-eye: {len(A)} usable views; at least {MIN_VIEWS} that turn the hand "
             "about two different axes are needed, and 12 or more are advised."
         )
     rms, axes = principal_turns(relative(A).turns)
-    least = np.radians(config.min_turn_deg)
+    least = np.radians(MIN_TURN_DEG)
     if rms[0] < least:
         raise DegenerateError(
             f"hand-eye: the hand does not turn between the views (RMS {np.degrees(rms[0]):.2f} "
-            f"deg, at least {config.min_turn_deg:g} are needed): nothing of the camera's place in "
+            f"deg, at least {MIN_TURN_DEG:g} are needed): nothing of the camera's place in "
             "the hand can be observed. Add views that tilt the hand by 20 deg or more about two "
             "different axes, and roll it about the optical axis."
         )
@@ -126,7 +120,7 @@ def check_observable(Ts_base_ee: ArrayLike, config: MotionConfig | None = None) 
         raise DegenerateError(
             "hand-eye: the hand turns about one axis only, "
             f"{_axis_text(axes[:, 0])} of the tool frame (RMS {np.degrees(rms[0]):.1f} deg; about "
-            f"the next axis {np.degrees(rms[1]):.2f} deg, at least {config.min_turn_deg:g} are "
+            f"the next axis {np.degrees(rms[1]):.2f} deg, at least {MIN_TURN_DEG:g} are "
             "needed): the camera's position along this axis is unobservable, its angle about it "
             f"poorly so. Add views that tilt the hand by 20 deg or more about "
             f"{_axis_text(axes[:, 1])} or {_axis_text(axes[:, 2])}."

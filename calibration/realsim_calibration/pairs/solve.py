@@ -15,7 +15,7 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim_calibration.faults.frame_fit import FitConfig, FrameFit, fit_frames, hand_side
-from realsim_calibration.fit.closed_forms import MotionConfig, check_observable
+from realsim_calibration.fit.closed_forms import MIN_VIEWS, check_observable
 from realsim_calibration.fit.robot_error import RobotErrorConfig, arm_basis
 from realsim_calibration.pairs.noise import (
     KINDS,
@@ -42,7 +42,6 @@ class PairsConfig:
     """When a pair is wrong, and how long is looked."""
 
     fit: FitConfig = field(default_factory=lambda: FitConfig(width_share=0.25))
-    motion: MotionConfig = field(default_factory=MotionConfig)
     start_ratio: float = 5.0
     """A pair starts inside when its error through the first frames is at most this many lower
     quartiles: of half good pairs the lower quartile of all is the median of the good ones."""
@@ -108,7 +107,7 @@ def solve_pose_pairs(
     """
     config = config or PairsConfig()
     A, C = checked_pairs(Ts_base_ee, Ts_cam_board)
-    check_observable(hand_side(A, mode == "eye_in_hand"), config.motion)
+    check_observable(hand_side(A, mode == "eye_in_hand"))
     fit = fit_frames(hand_side(A, mode == "eye_in_hand"), C, config=config.fit)
     used = start_inside(fit, config)
     parts = robot_parts(A, joints, arm)
@@ -182,7 +181,7 @@ def start_inside(fit: FrameFit, config: PairsConfig) -> Mask:
 
 def require_agreement(inside: Mask, config: PairsConfig) -> None:
     """Raise if too few pairs agree."""
-    least = max(config.motion.min_views, int(np.ceil(config.least_share * len(inside))))
+    least = max(MIN_VIEWS, int(np.ceil(config.least_share * len(inside))))
     if inside.sum() < least:
         raise InputError(
             f"hand-eye: only {int(inside.sum())} of {len(inside)} pose pairs agree with one place "

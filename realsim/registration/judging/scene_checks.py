@@ -262,18 +262,14 @@ def _turns(yaws: int) -> list[Array]:
     return [Z @ se3.exp_so3(s) for Z in around for s in sides]
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SwappedConfig:
-    """When an object is sought again."""
-
-    failed_gain: float = 0.9
-    """An object that gains less than this per pixel was not surely found at its place: right ones
-    gain 1.1 to 1.25 over the bare table."""
-    failed_agree: float = 0.94
-    """An object with a smaller share of agreeing pixels was not surely found either; right ones
-    reach 0.95."""
-    found_gain: float = 1.0
-    """One that explains this much elsewhere is there."""
+FAILED_GAIN = 0.9
+"""An object that gains less than this per pixel was not surely found at its place: right ones
+gain 1.1 to 1.25 over the bare table."""
+FAILED_AGREE = 0.94
+"""An object with a smaller share of agreeing pixels was not surely found either; right ones
+reach 0.95."""
+FOUND_GAIN = 1.0
+"""One that explains this much elsewhere is there."""
 
 
 def with_swaps(
@@ -281,7 +277,6 @@ def with_swaps(
     asked: Sequence[Wanted],
     models: dict[int, ObjectModel],
     search: Callable[[Sequence[Wanted]], SearchResult],
-    config: SwappedConfig,
 ) -> tuple[SearchResult, list[SceneFinding]]:
     """Return the search's result with objects that stand in each other's places, and who they are.
 
@@ -290,12 +285,11 @@ def with_swaps(
         asked: what was sought.
         models: by id.
         search: seeks objects.
-        config: settings.
     """
     good = {
         p.instance
         for p in result.placed
-        if p.gain_per_pixel >= config.failed_gain and p.agree >= config.failed_agree
+        if p.gain_per_pixel >= FAILED_GAIN and p.agree >= FAILED_AGREE
     }
     failed = [w for w in asked if w.T_start is not None and w.instance not in good]
     if len(failed) < 2:
@@ -307,7 +301,7 @@ def with_swaps(
     findings: list[SceneFinding] = []
     for w in failed:
         there = second.get(w.instance)
-        if there is None or there.gain_per_pixel < config.found_gain:
+        if there is None or there.gain_per_pixel < FOUND_GAIN:
             continue
         other = _claimed_there(there, w, failed, models)
         if other is not None:

@@ -1,7 +1,6 @@
 """Lengths that are off by a factor of 1000: millimetres taken for metres, or metres for them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,20 +8,15 @@ from realsim.arrays import Array
 from realsim.errors import UnitError
 from realsim.records import ObjectModel, ObjectPose
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class UnitConfig:
-    """What lengths a table-top scene can have."""
-
-    object_m: tuple[float, float] = (0.003, 2.0)
-    """Least and greatest diagonal of an object's box [m]: a screw, a chair."""
-    share_of_depth: tuple[float, float] = (0.003, 3.0)
-    """Least and greatest diagonal as a share of the median distance at which it would be seen: 2 px
-    wide, or wider than the image."""
-    far: float = 20.0
-    """A start further from all cameras than this many times the depth they measure is no start."""
-    factor: float = 1000.0
-    """The factor that is suspected."""
+OBJECT_M = (0.003, 2.0)
+"""Least and greatest diagonal of an object's box [m]: a screw, a chair."""
+SHARE_OF_DEPTH = (0.003, 3.0)
+"""Least and greatest diagonal as a share of the median distance at which it would be seen: 2 px
+wide, or wider than the image."""
+FAR = 20.0
+"""A start further from all cameras than this many times the depth they measure is no start."""
+FACTOR = 1000.0
+"""The factor that is suspected."""
 
 
 def unit_errors(
@@ -30,7 +24,6 @@ def unit_errors(
     starts: Sequence[ObjectPose],
     cameras_m: Array,
     depth_m: float,
-    config: UnitConfig | None = None,
 ) -> dict[int, UnitError]:
     """Return per instance whose mesh or start is off by a factor of 1000 an error that says so.
 
@@ -41,28 +34,26 @@ def unit_errors(
         starts: the instances at their start poses.
         cameras_m: (F, 3) camera positions in world [m].
         depth_m: median depth that the cameras measure [m].
-        config: settings.
     """
-    config = config or UnitConfig()
     errors: dict[int, UnitError] = {}
     for start in starts:
         model = models[start.obj_id]
-        words = _mesh_words(model, depth_m, config)
+        words = _mesh_words(model, depth_m)
         if words is None:
-            words = _start_words(model, start, np.asarray(cameras_m, np.float64), depth_m, config)
+            words = _start_words(model, start, np.asarray(cameras_m, np.float64), depth_m)
         if words is not None:
             errors[start.instance] = UnitError(words)
     return errors
 
 
-def _mesh_words(model: ObjectModel, depth_m: float, config: UnitConfig) -> str | None:
+def _mesh_words(model: ObjectModel, depth_m: float) -> str | None:
     """Return what is wrong with a mesh's size, or None."""
     size = float(np.linalg.norm(model.mesh.extent))
-    low = max(config.object_m[0], config.share_of_depth[0] * depth_m)
-    high = min(config.object_m[1], config.share_of_depth[1] * depth_m)
+    low = max(OBJECT_M[0], SHARE_OF_DEPTH[0] * depth_m)
+    high = min(OBJECT_M[1], SHARE_OF_DEPTH[1] * depth_m)
     if low <= size <= high:
         return None
-    guess = size / config.factor if size > high else size * config.factor
+    guess = size / FACTOR if size > high else size * FACTOR
     would = f" {guess:.3g} m would fit: millimetres and metres were mixed up." if (
         low <= guess <= high) else ""  # fmt: skip
     return (
@@ -73,16 +64,16 @@ def _mesh_words(model: ObjectModel, depth_m: float, config: UnitConfig) -> str |
 
 
 def _start_words(
-    model: ObjectModel, start: ObjectPose, cameras: Array, depth_m: float, config: UnitConfig
+    model: ObjectModel, start: ObjectPose, cameras: Array, depth_m: float
 ) -> str | None:
     """Return what is wrong with a start's distance from the cameras, or None."""
     t = start.T_world_obj[:3, 3]
     away = float(np.linalg.norm(cameras - t, axis=1).min())
-    if away <= config.far * depth_m:
+    if away <= FAR * depth_m:
         return None
-    guess = float(np.linalg.norm(cameras - t / config.factor, axis=1).min())
+    guess = float(np.linalg.norm(cameras - t / FACTOR, axis=1).min())
     would = " Divided by 1000 it would be among what they see: it is in millimetres." if (
-        guess <= config.far * depth_m) else ""  # fmt: skip
+        guess <= FAR * depth_m) else ""  # fmt: skip
     return (
         f"the start of object {model.obj_id} '{model.name}' (instance {start.instance}) is at "
         f"{', '.join(f'{v:.4g}' for v in t)} m, {away:.4g} m from the nearest camera, and the "

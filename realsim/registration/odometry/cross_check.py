@@ -25,12 +25,7 @@ from realsim.registration.odometry.faults import (
     find_faults,
     noise_of,
 )
-from realsim.registration.odometry.mismatch import (
-    Mismatch,
-    MismatchConfig,
-    find_mismatches,
-    has_failed,
-)
+from realsim.registration.odometry.mismatch import Mismatch, find_mismatches, has_failed
 from realsim.registration.odometry.pairs import (
     AboveTableConfig,
     Edge,
@@ -105,7 +100,6 @@ class CheckConfig:
 
     clouds: AboveTableConfig = field(default_factory=AboveTableConfig)
     pairs: PairConfig = field(default_factory=PairConfig)
-    mismatch: MismatchConfig = field(default_factory=MismatchConfig)
     faults: FaultConfig = field(default_factory=FaultConfig)
     further: int = 2
     """More pairs for a view that a pair makes suspect."""
@@ -280,13 +274,13 @@ def _examine(clouds: Sequence[ViewCloud], claimed: Array, config: CheckConfig) -
     angles = view_angles(claimed, aim, config.pairs.zoom_deg)
     everyone = list(range(len(claimed)))
     edges = _measure_pairs(meter, claimed, angles, everyone, config)
-    mismatches, poses = find_mismatches(meter, claimed, edges, angles, config.mismatch)
+    mismatches, poses = find_mismatches(meter, claimed, edges, angles)
     Ts = claimed[np.maximum(poses, 0)]
     kept = [k for k in everyone if poses[k] >= 0]
     if mismatches:
         angles = view_angles(Ts, aim, config.pairs.zoom_deg)
         edges = _measure_pairs(meter, Ts, angles, kept, config)
-    trusted = [e for e in edges if not has_failed(e, config.mismatch)]
+    trusted = [e for e in edges if not has_failed(e)]
     faults, mended = find_faults(Ts, trusted, aim, config.faults)
     noise = noise_of(differences(mended, trusted), config.faults)
     paired = {k for e in trusted for k in (e.first, e.second)}
@@ -321,7 +315,7 @@ def _measure_pairs(
     large = (1e3 * np.linalg.norm(r[:, 3:], axis=1) > config.faults.least_mm) | (
         np.degrees(np.linalg.norm(r[:, :3], axis=1)) > config.faults.least_deg
     )
-    odd = [e for e, big in zip(edges, large, strict=True) if big or has_failed(e, config.mismatch)]
+    odd = [e for e, big in zip(edges, large, strict=True) if big or has_failed(e)]
     doubted = sorted({k for e in odd for k in (e.first, e.second)})
     if len(doubted) > config.further_share * len(kept):
         return edges

@@ -38,25 +38,21 @@ FIXED = 1e-6
 """Sigma of the first view's place [m] and turn [rad], which the table fixes as well."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class GraphConfig:
-    """How much the measurements are believed."""
-
-    pair_mm: float = 0.3
-    """Sigma of a pair's shift along each axis at 0 degrees [mm]; in simulation a pair of 6 to 12
-    degrees is wrong by 0.3 mm in all, one of 20 to 35 by 0.6."""
-    pair_deg: float = 0.04
-    """Sigma of its turn about each axis [deg]."""
-    per_deg: float = 0.05
-    """Both grow by this part for each degree between the views."""
-    table_mm: float = 0.4
-    """Sigma of the height of a view over its own table plane [mm]."""
-    table_deg: float = 0.06
-    """Sigma of its roll and pitch against it [deg]."""
-    cauchy: float = 2.0
-    """Whitened length from which a pair counts less: a wrong loop must not bend the path."""
-    inflation: float = 2.0
-    """Sigmas are enlarged by this: pairs of one view share its depth errors."""
+PAIR_MM = 0.3
+"""Sigma of a pair's shift along each axis at 0 degrees [mm]; in simulation a pair of 6 to 12
+degrees is wrong by 0.3 mm in all, one of 20 to 35 by 0.6."""
+PAIR_DEG = 0.04
+"""Sigma of its turn about each axis [deg]."""
+PER_DEG = 0.05
+"""Both grow by this part for each degree between the views."""
+TABLE_MM = 0.4
+"""Sigma of the height of a view over its own table plane [mm]."""
+TABLE_DEG = 0.06
+"""Sigma of its roll and pitch against it [deg]."""
+CAUCHY = 2.0
+"""Whitened length from which a pair counts less: a wrong loop must not bend the path."""
+INFLATION = 2.0
+"""Sigmas are enlarged by this: pairs of one view share its depth errors."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -72,9 +68,8 @@ class Graph:
 
 
 def optimise_poses(
-    Ts_world_cam: Array, edges: Sequence[Edge], levelled: Sequence[bool], angles: Array,
-    config: GraphConfig,
-) -> Graph:  # fmt: skip
+    Ts_world_cam: Array, edges: Sequence[Edge], levelled: Sequence[bool], angles: Array
+) -> Graph:
     """Return the poses that fit all pairs and the table best, with their covariances.
 
     Args:
@@ -83,7 +78,6 @@ def optimise_poses(
         edges: measured pairs.
         levelled: (F,) whether the view saw the table, so that its height, roll and pitch are good.
         angles: (F, F) how different the views are [deg].
-        config: settings.
     """
     import gtsam
 
@@ -94,13 +88,13 @@ def optimise_poses(
         values.insert(k, pose3_from_T(T))
         if not levelled[k]:
             continue
-        model = noise.Gaussian.Covariance(_of_table(T, FIXED if k == 0 else FREE, config))
+        model = noise.Gaussian.Covariance(_of_table(T, FIXED if k == 0 else FREE))
         graph.add(gtsam.PriorFactorPose3(k, pose3_from_T(T), model))
     for e in edges:
-        grown = 1.0 + config.per_deg * float(angles[e.first, e.second])
-        sigmas = grown * np.repeat([np.radians(config.pair_deg), 1e-3 * config.pair_mm], 3)
+        grown = 1.0 + PER_DEG * float(angles[e.first, e.second])
+        sigmas = grown * np.repeat([np.radians(PAIR_DEG), 1e-3 * PAIR_MM], 3)
         model = noise.Robust.Create(
-            noise.mEstimator.Cauchy.Create(config.cauchy), noise.Diagonal.Sigmas(sigmas)
+            noise.mEstimator.Cauchy.Create(CAUCHY), noise.Diagonal.Sigmas(sigmas)
         )
         graph.add(
             gtsam.BetweenFactorPose3(e.first, e.second, pose3_from_T(e.T_first_second), model)
@@ -114,18 +108,18 @@ def optimise_poses(
     ]  # fmt: skip
     return Graph(
         Ts_world_cam=Ts,
-        covariances=config.inflation**2 * C,
+        covariances=INFLATION**2 * C,
         residuals=np.stack(r) if r else np.zeros((0, 6)),
     )
 
 
-def _of_table(T_world_cam: Array, free: float, config: GraphConfig) -> Array:
+def _of_table(T_world_cam: Array, free: float) -> Array:
     """Return the covariance (6, 6) of the camera's right twist that its table plane leaves.
 
     In the world's twist it is diagonal; T exp(xi) = exp(Ad xi) T maps it to the camera's. `free` is
     the sigma of the place on the table and of the turn about its normal.
     """
-    tilt, height = np.radians(config.table_deg), 1e-3 * config.table_mm
+    tilt, height = np.radians(TABLE_DEG), 1e-3 * TABLE_MM
     # Turned under the camera, so that a tilt does not count as a change of height as well.
     below = se3.from_translation([*T_world_cam[:2, 3], 0.0])
     sigmas = np.array([tilt, tilt, free, free, free, height])
@@ -144,7 +138,6 @@ class HandHeldConfig:
         default_factory=lambda: PairConfig(fit=FitConfig(convergence=1e-5, max_iterations=300))
     )
     """Aligned to the end: what is left undone points back to the guess, and adds up on the way."""
-    graph: GraphConfig = field(default_factory=GraphConfig)
     key_deg: float = 16.0
     """A view this far from the last key view becomes one [deg]; drift grows with their number, and
     at 8 degrees the path turned 0.7 degrees too far in simulation instead of 0.1 to 0.7."""
@@ -222,9 +215,9 @@ def hand_held_poses(
     )
     levelled = tuple(c.normal is not None for c in clouds)
     angles = view_angles(Ts, aim, config.pairs.zoom_deg)
-    Ts = optimise_poses(Ts, path.edges, levelled, angles, config.graph).Ts_world_cam
+    Ts = optimise_poses(Ts, path.edges, levelled, angles).Ts_world_cam
     loops = _loops(path, Ts, view_angles(Ts, aim, config.pairs.zoom_deg))
-    graph = optimise_poses(Ts, [*path.edges, *loops], levelled, angles, config.graph)
+    graph = optimise_poses(Ts, [*path.edges, *loops], levelled, angles)
     r = graph.residuals if len(graph.residuals) else np.zeros((1, 6))
     return HandHeld(
         Ts_world_cam=graph.Ts_world_cam,

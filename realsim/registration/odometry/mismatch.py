@@ -15,35 +15,30 @@ from realsim.geometry import se3
 from realsim.registration.odometry.faults import differences
 from realsim.registration.odometry.pairs import Edge, PairMeter
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class MismatchConfig:
-    """From when an image is taken for another view's."""
-
-    least_overlap: float = 0.6
-    """An alignment with less overlap has failed: right ones have 0.78 or more in simulation, wrong
-    ones 0.6 at most."""
-    gross_mm: float = 10.0
-    """A difference beyond this is no inaccuracy [mm]."""
-    gross_deg: float = 2.0
-    """A turn beyond this is no inaccuracy [deg]."""
-    suspect_share: float = 0.6
-    """A view is suspect if this share of its pairs failed or differ grossly."""
-    references: int = 3
-    """Views around a pose that an image put there is compared with."""
-    reach_deg: float = 40.0
-    """Such views are at most this far away [deg]."""
-    fits_factor: float = 1.6
-    """An image fits a pose if its distance to what is seen there is at most so many times that of
-    aligned pairs (unaligned right ones: 1.05 times)."""
-    better_factor: float = 0.75
-    """Greatest ratio of that distance to the distance at the image's own pose."""
-    shifts: tuple[int, ...] = (1, -1, 2, -2)
-    """Shifts of one list against the other that are tried."""
-    least_shifted: int = 3
-    """Views after a shift at least: fewer are images mixed up one by one."""
-    most_pairs: int = 400
-    """Pairs that a shift is tried on at most."""
+LEAST_OVERLAP = 0.6
+"""An alignment with less overlap has failed: right ones have 0.78 or more in simulation, wrong
+ones 0.6 at most."""
+GROSS_MM = 10.0
+"""A difference beyond this is no inaccuracy [mm]."""
+GROSS_DEG = 2.0
+"""A turn beyond this is no inaccuracy [deg]."""
+SUSPECT_SHARE = 0.6
+"""A view is suspect if this share of its pairs failed or differ grossly."""
+REFERENCES = 3
+"""Views around a pose that an image put there is compared with."""
+REACH_DEG = 40.0
+"""Such views are at most this far away [deg]."""
+FITS_FACTOR = 1.6
+"""An image fits a pose if its distance to what is seen there is at most so many times that of
+aligned pairs (unaligned right ones: 1.05 times)."""
+BETTER_FACTOR = 0.75
+"""Greatest ratio of that distance to the distance at the image's own pose."""
+SHIFTS = (1, -1, 2, -2)
+"""Shifts of one list against the other that are tried."""
+LEAST_SHIFTED = 3
+"""Views after a shift at least: fewer are images mixed up one by one."""
+MOST_PAIRS = 400
+"""Pairs that a shift is tried on at most."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -57,29 +52,28 @@ class Mismatch:
     """The view whose pose it fits; of a shift, how many poses ahead."""
 
 
-def has_failed(edge: Edge, config: MismatchConfig) -> bool:
+def has_failed(edge: Edge) -> bool:
     """Return whether a pair could not be aligned."""
-    return edge.overlap < config.least_overlap
+    return edge.overlap < LEAST_OVERLAP
 
 
-def suspects(Ts_world_cam: Array, edges: Sequence[Edge], config: MismatchConfig) -> list[int]:
+def suspects(Ts_world_cam: Array, edges: Sequence[Edge]) -> list[int]:
     """Return the places of views most of whose pairs failed or differ grossly."""
     r = differences(Ts_world_cam, edges)
     total, bad = np.zeros(len(Ts_world_cam)), np.zeros(len(Ts_world_cam))
     for e, x in zip(edges, r, strict=True):
-        gross = np.linalg.norm(x[3:]) * 1e3 > config.gross_mm or (
-            np.degrees(np.linalg.norm(x[:3])) > config.gross_deg
+        gross = np.linalg.norm(x[3:]) * 1e3 > GROSS_MM or (
+            np.degrees(np.linalg.norm(x[:3])) > GROSS_DEG
         )
         for k in (e.first, e.second):
             total[k] += 1
-            bad[k] += has_failed(e, config) or gross
-    return np.flatnonzero((total > 0) & (bad >= config.suspect_share * total)).tolist()
+            bad[k] += has_failed(e) or gross
+    return np.flatnonzero((total > 0) & (bad >= SUSPECT_SHARE * total)).tolist()
 
 
 def find_mismatches(
     meter: PairMeter, Ts_world_cam: Array, edges: Sequence[Edge], angles: Array,
-    config: MismatchConfig,
-) -> tuple[tuple[Mismatch, ...], Int64]:  # fmt: skip
+    ) -> tuple[tuple[Mismatch, ...], Int64]:  # fmt: skip
     """Return the images at wrong poses, and the pose (F,) that fits each; -1 = none is left.
 
     Args:
@@ -87,21 +81,20 @@ def find_mismatches(
         Ts_world_cam: (F, 4, 4) claimed.
         edges: all pairs as measured.
         angles: (F, F) how different the views are [deg].
-        config: settings.
     """
     n = len(Ts_world_cam)
     own = np.arange(n)
-    doubted = suspects(Ts_world_cam, edges, config)
-    aligned = [e.distance_m for e in edges if not has_failed(e, config)]
+    doubted = suspects(Ts_world_cam, edges)
+    aligned = [e.distance_m for e in edges if not has_failed(e)]
     if not doubted or not aligned:
         return (), own
-    fits = config.fits_factor * float(np.median(aligned))
-    single, single_poses = _singles(doubted, meter, Ts_world_cam, angles, fits, config)
+    fits = FITS_FACTOR * float(np.median(aligned))
+    single, single_poses = _singles(doubted, meter, Ts_world_cam, angles, fits)
     if single and all(m.kind == "swapped" for m in single) and 2 * len(single) == len(doubted):
         return single, single_poses
     # Every view after a shift is off, but on a regular path by the same motion: its neighbours
     # agree, so a single suspect is enough to ask.
-    shifted = _shift(meter, Ts_world_cam, edges, fits, config)
+    shifted = _shift(meter, Ts_world_cam, edges, fits)
     if shifted is None:
         return single, single_poses
     poses = own + np.where(own >= shifted.place, shifted.other, 0)
@@ -110,12 +103,11 @@ def find_mismatches(
 
 def _singles(
     doubted: Sequence[int], meter: PairMeter, Ts: Array, angles: Array, fits: float,
-    config: MismatchConfig,
-) -> tuple[tuple[Mismatch, ...], Int64]:  # fmt: skip
+    ) -> tuple[tuple[Mismatch, ...], Int64]:  # fmt: skip
     """Return the doubted images that fit other poses, one by one, and every view's pose (F,)."""
     poses = np.arange(len(Ts))
     for k in doubted:
-        poses[k] = _best_pose(k, doubted, meter, Ts, angles, fits, config)
+        poses[k] = _best_pose(k, doubted, meter, Ts, angles, fits)
     found: list[Mismatch] = []
     for k in doubted:
         q = int(poses[k])
@@ -127,53 +119,46 @@ def _singles(
 
 def _best_pose(
     k: int, doubted: Sequence[int], meter: PairMeter, Ts: Array, angles: Array, fits: float,
-    config: MismatchConfig,
-) -> int:  # fmt: skip
+    ) -> int:  # fmt: skip
     """Return the place of the pose that image k fits: its own unless another is much better."""
     n = len(Ts)
-    near = [k + s for s in config.shifts if 0 <= k + s < n]
-    own = _misfit(k, k, doubted, meter, Ts, angles, config)
-    costs = {
-        q: _misfit(k, q, doubted, meter, Ts, angles, config)
-        for q in sorted({*near, *doubted} - {k})
-    }
+    near = [k + s for s in SHIFTS if 0 <= k + s < n]
+    own = _misfit(k, k, doubted, meter, Ts, angles)
+    costs = {q: _misfit(k, q, doubted, meter, Ts, angles) for q in sorted({*near, *doubted} - {k})}
     if not costs:
         return k
     q = min(costs, key=lambda q: costs[q])
-    return q if costs[q] < min(fits, config.better_factor * own) else k
+    return q if costs[q] < min(fits, BETTER_FACTOR * own) else k
 
 
 def _misfit(
     k: int, q: int, doubted: Sequence[int], meter: PairMeter, Ts: Array, angles: Array,
-    config: MismatchConfig,
-) -> float:  # fmt: skip
+    ) -> float:  # fmt: skip
     """Return the mean distance [m] of image k, put at pose q, to what trusted views see there."""
     around = [
         j
         for j in np.argsort(angles[q], kind="stable").tolist()
-        if j not in (k, q) and j not in doubted and angles[q, j] < config.reach_deg
-    ][: config.references]
+        if j not in (k, q) and j not in doubted and angles[q, j] < REACH_DEG
+    ][:REFERENCES]
     if not around:
         return np.inf
     return float(np.mean([meter.agreement(j, k, se3.invert(Ts[j]) @ Ts[q])[1] for j in around]))
 
 
-def _shift(
-    meter: PairMeter, Ts: Array, edges: Sequence[Edge], fits: float, config: MismatchConfig
-) -> Mismatch | None:
+def _shift(meter: PairMeter, Ts: Array, edges: Sequence[Edge], fits: float) -> Mismatch | None:
     """Return from which view on the images fit the poses some places ahead, or None.
 
     With the pairs' distances as claimed (a), with both poses shifted (b) and only the later one's
     (c), a shift from view k on costs: a of pairs before k, b of pairs from k on, c across.
     """
-    few = edges[:: max(1, -(-len(edges) // config.most_pairs))]
+    few = edges[:: max(1, -(-len(edges) // MOST_PAIRS))]
     first = np.array([e.first for e in few])
     second = np.array([e.second for e in few])
     claimed = _distances(meter, Ts, few, 0, 0)
     best: tuple[float, Mismatch] | None = None
-    for s in config.shifts:
+    for s in SHIFTS:
         both, later = _distances(meter, Ts, few, s, s), _distances(meter, Ts, few, 0, s)
-        last = len(Ts) - max(s, 0) - config.least_shifted
+        last = len(Ts) - max(s, 0) - LEAST_SHIFTED
         for k in range(max(0, -s), last + 1):
             cost = np.where(second < k, claimed, np.where(first >= k, both, later))
             # Pairs whose shifted pose is beyond the end of the list say nothing.
@@ -182,9 +167,7 @@ def _shift(
                 continue
             saved = float(np.sum(claimed[touched] - cost[touched]))
             after, before = np.mean(cost[touched]), np.mean(claimed[touched])
-            if after < min(fits, config.better_factor * before) and (
-                best is None or saved > best[0]
-            ):
+            if after < min(fits, BETTER_FACTOR * before) and (best is None or saved > best[0]):
                 best = saved, Mismatch(kind="shifted", place=k, other=s)
     return None if best is None else best[1]
 

@@ -28,7 +28,7 @@ from realsim.registration.search.height_grid import GridConfig, HeightGrid, heig
 from realsim.registration.search.matching import MatchConfig, match_templates
 from realsim.registration.search.near_symmetry import NearSymmetryConfig, near_symmetries
 from realsim.registration.search.peel import ExchangeConfig, PeelConfig
-from realsim.registration.search.polish import ContrastConfig, PolishConfig
+from realsim.registration.search.polish import ContrastConfig
 from realsim.registration.search.records import Region, Wanted
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import Canvas, ScoreConfig, make_canvas, without_far
@@ -85,8 +85,6 @@ class FindConfig:
     """What is unsure is sought again."""
     exchange: ExchangeConfig = field(default_factory=ExchangeConfig)
     """Objects in each other's places."""
-    polish: PolishConfig = field(default_factory=PolishConfig)
-    """Every point belongs to one object."""
     contrast: ContrastConfig = field(default_factory=ContrastConfig)
     """Near-symmetric poses against each other."""
 

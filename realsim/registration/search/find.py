@@ -138,7 +138,7 @@ def _finish(
 
     def polish() -> list[Candidate]:
         pairs = list(zip(soughts, chosen, strict=True))
-        out = polish_poses(bench.canvas, bench.fused.fine, pairs, bench.config.polish, refine)
+        out = polish_poses(bench.canvas, bench.fused.fine, pairs, refine)
         bench.watch.lap("polish")
         return out
 

@@ -39,18 +39,14 @@ NOBODY = -1
 """Owner of a point that is near to no object."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PolishConfig:
-    """How points are shared out."""
-
-    reach_m: float = 0.005
-    """A point further than this from every surface belongs to nobody [m]."""
-    rounds: int = 2
-    """Times that points are shared out and objects fitted."""
-    least_points: int = 60
-    """Fewer own points leave an object where it is."""
-    kept_gain: float = 0.97
-    """Share of the rendered gain that must remain."""
+REACH_M = 0.005
+"""A point further than this from every surface belongs to nobody [m]."""
+ROUNDS = 2
+"""Times that points are shared out and objects fitted."""
+LEAST_POINTS = 60
+"""Fewer own points leave an object where it is."""
+KEPT_GAIN = 0.97
+"""Share of the rendered gain that must remain."""
 
 
 def owners(cloud: Cloud, soughts: Sequence[Sought], Ts: Sequence[Array], reach_m: float) -> Int64:
@@ -104,7 +100,6 @@ def polish_poses(
     canvas: Canvas,
     cloud: Cloud,
     placed: Sequence[tuple[Sought, Candidate]],
-    config: PolishConfig,
     refine: CandidateConfig,
 ) -> list[Candidate]:
     """Return the placed objects fitted to their own points.
@@ -113,16 +108,15 @@ def polish_poses(
         canvas: where poses are rendered.
         cloud: fine points above the table.
         placed: models and poses.
-        config: settings.
         refine: stages and constants of the fit.
     """
     now = [c for _, c in placed]
     soughts = [s for s, _ in placed]
-    for _ in range(config.rounds):
-        owner = owners(cloud, soughts, [c.T_world_obj for c in now], config.reach_m)
+    for _ in range(ROUNDS):
+        owner = owners(cloud, soughts, [c.T_world_obj for c in now], REACH_M)
         for n, sought in enumerate(soughts):
             own = np.flatnonzero(owner == n)
-            if len(own) < config.least_points:
+            if len(own) < LEAST_POINTS:
                 continue
             if len(own) > refine.fine_points:
                 own = own[np.linspace(0, len(own) - 1, refine.fine_points).astype(np.int64)]
@@ -133,7 +127,7 @@ def polish_poses(
             new = candidate(sought, canvas, T, now[n].source, True)
             buffer = compose(canvas.table, [c.rendered for k, c in enumerate(now) if k != n])
             before = score(canvas, now[n].rendered, buffer).gain
-            if score(canvas, new.rendered, buffer).gain >= config.kept_gain * before:
+            if score(canvas, new.rendered, buffer).gain >= KEPT_GAIN * before:
                 now[n] = new
     return now
 

@@ -26,26 +26,22 @@ RAYS = 1200
 """Rays of each template, over its box."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class HeightMapConfig:
-    """How a cloud becomes a map of heights."""
-
-    least_cell_m: float = 0.002
-    """Least edge of a cell [m]: clouds are averaged on voxels of about this size."""
-    coarse_cell_m: float = 0.005
-    """Edge of the cells on which the object is told from leftovers of the table [m]: wider than the
-    gaps in a measured surface."""
-    cells: int = 2500
-    """Cells that the box of the footprint is divided into at most."""
-    percentile: float = 85.0
-    """Percentile of a cell's heights that counts: walls put lower points into it, flying pixels
-    higher ones."""
-    top_cells: int = 3
-    """The height of the object is that of so many highest cells at least: one may be a fault."""
-    least_island: float = 0.1
-    """Connected areas smaller than this share of the largest are leftovers of the table."""
-    least_cells: int = 12
-    """With fewer cells there is no shape to compare."""
+LEAST_CELL_M = 0.002
+"""Least edge of a cell [m]: clouds are averaged on voxels of about this size."""
+COARSE_CELL_M = 0.005
+"""Edge of the cells on which the object is told from leftovers of the table [m]: wider than the
+gaps in a measured surface."""
+CELLS = 2500
+"""Cells that the box of the footprint is divided into at most."""
+PERCENTILE = 85.0
+"""Percentile of a cell's heights that counts: walls put lower points into it, flying pixels
+higher ones."""
+TOP_CELLS = 3
+"""The height of the object is that of so many highest cells at least: one may be a fault."""
+LEAST_ISLAND = 0.1
+"""Connected areas smaller than this share of the largest are leftovers of the table."""
+LEAST_CELLS = 12
+"""With fewer cells there is no shape to compare."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -92,27 +88,27 @@ class Template:
     """For the report."""
 
 
-def height_map(points: Array, config: HeightMapConfig) -> HeightMap:
+def height_map(points: Array) -> HeightMap:
     """Return the map of points (N, 3) in the table's frame [m].
 
     Raises:
         DegenerateError: the points cover too few cells to show a shape.
     """
     above = points[points[:, 2] > 0]
-    if len(above) < config.least_cells:
+    if len(above) < LEAST_CELLS:
         raise DegenerateError(
             f"{len(above)} of {len(points)} points lie above the table; at least "
-            f"{config.least_cells} are needed. Is the plane the object's, and its normal up?"
+            f"{LEAST_CELLS} are needed. Is the plane the object's, and its normal up?"
         )
-    above = above[_of_the_object(above, config)]
+    above = above[_of_the_object(above)]
     low, high = above[:, :2].min(0), above[:, :2].max(0)
-    cell = max(config.least_cell_m, float(np.sqrt(np.prod(high - low) / config.cells)))
+    cell = max(LEAST_CELL_M, float(np.sqrt(np.prod(high - low) / CELLS)))
     origin = above[:, :2].min(0) - cell
     index = np.floor((above[:, :2] - origin) / cell).astype(np.int64)
     shape = index.max(0) + 2
-    heights = _percentiles(index @ [shape[1], 1], above[:, 2], int(np.prod(shape)), config)
-    heights = _without_islands(_filled(heights.reshape(shape)), config.least_island)
-    return _described(heights, origin, cell, config)
+    heights = _percentiles(index @ [shape[1], 1], above[:, 2], int(np.prod(shape)))
+    heights = _without_islands(_filled(heights.reshape(shape)), LEAST_ISLAND)
+    return _described(heights, origin, cell)
 
 
 def make_templates(
@@ -151,29 +147,29 @@ def make_templates(
     return found
 
 
-def _of_the_object(above: Array, config: HeightMapConfig) -> Mask:
+def _of_the_object(above: Array) -> Mask:
     """Return which points (N, 3) stand on the largest connected areas, (N,).
 
     Leftovers of the table far away must not set the size of the cells.
     """
     low, high = np.percentile(above[:, :2], [1, 99], axis=0)
-    reach = 1.5 * (high - low) + config.coarse_cell_m
+    reach = 1.5 * (high - low) + COARSE_CELL_M
     inside = np.all(np.abs(above[:, :2] - 0.5 * (low + high)) < reach, axis=1)
     # The box may still be metres wide; it never has more cells than this.
-    cell = max(config.coarse_cell_m, float(reach.max()) / 200)
+    cell = max(COARSE_CELL_M, float(reach.max()) / 200)
     index = np.floor((above[:, :2] - 0.5 * (low + high) + reach) / cell).astype(np.int64)
     index = np.where(inside[:, None], index, 0)
     marked = np.zeros(index.max(0) + 1)
     marked[tuple(index[inside].T)] = 1.0
-    return inside & (_without_islands(marked, config.least_island)[tuple(index.T)] > 0)
+    return inside & (_without_islands(marked, LEAST_ISLAND)[tuple(index.T)] > 0)
 
 
-def _percentiles(keys: Int64, z: Array, n: int, config: HeightMapConfig) -> Array:
+def _percentiles(keys: Int64, z: Array, n: int) -> Array:
     """Return the percentile (n,) of the heights with each key, 0 where there is none."""
     order = np.lexsort((z, keys))
     first = np.searchsorted(keys[order], np.arange(n + 1))
     counts = np.diff(first)
-    rank = np.ceil(config.percentile / 100 * counts).astype(np.int64) - 1
+    rank = np.ceil(PERCENTILE / 100 * counts).astype(np.int64) - 1
     pick = np.clip(first[:-1] + rank, 0, len(z) - 1)
     return np.where(counts > 0, z[order][pick], 0.0)
 
@@ -205,18 +201,18 @@ def _without_islands(heights: Array, least_share: float) -> Array:
     return np.where((counts >= least_share * counts.max())[labels], heights, 0.0)
 
 
-def _described(heights: Array, origin: Array, cell: float, config: HeightMapConfig) -> HeightMap:
+def _described(heights: Array, origin: Array, cell: float) -> HeightMap:
     """Return the map with the figures of its footprint."""
     used = np.argwhere(heights > 0)
-    if len(used) < config.least_cells:
+    if len(used) < LEAST_CELLS:
         raise DegenerateError(
             f"the points above the table cover {len(used)} cells of {1e3 * cell:.1f} mm; at least "
-            f"{config.least_cells} are needed to compare shapes."
+            f"{LEAST_CELLS} are needed to compare shapes."
         )
     xy = origin + (used + 0.5) * cell
     center, spread = _center_and_spread(xy)
     z = np.sort(heights[heights > 0])
-    top = float(z[-min(config.top_cells, len(z))])
+    top = float(z[-min(TOP_CELLS, len(z))])
     return HeightMap(
         heights=heights,
         origin=origin,

@@ -16,7 +16,6 @@ from realsim.records import SupportPlane
 from realsim.registration.evidence import Cloud
 from realsim.scanning.scale.height_maps import (
     HeightMap,
-    HeightMapConfig,
     Template,
     height_map,
     make_templates,
@@ -51,8 +50,6 @@ class StartsConfig:
     """What a resting pose of probability 1 % loses; one of 10 % loses half of it."""
     resting: RestingConfig = field(default_factory=RestingConfig)
     """How the mesh may stand."""
-    height_map: HeightMapConfig = field(default_factory=HeightMapConfig)
-    """How the cloud is mapped."""
     shape_error: float = 0.025
     """Error of the mesh's outline as a share of its size, 1-sigma: generated meshes have 2 % RMS.
     It says how well height, area and widths must agree on one scale."""
@@ -106,7 +103,7 @@ def find_starts(
         DegenerateError: the points are too few, or do not lie above the plane.
     """
     points = se3.transform(se3.invert(plane.T_world_table), cloud.points)
-    measured = height_map(points, config.height_map)
+    measured = height_map(points)
     found = _scanned(measured, _templates(shape, config), shape, config)
     if not found:
         raise DegenerateError("no placement of the mesh on the table resembles the points.")
