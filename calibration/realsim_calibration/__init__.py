@@ -15,7 +15,6 @@ from realsim_calibration.faults.gates import GateConfig
 from realsim_calibration.fit.board_pose import BoardPose, estimate_board_pose
 from realsim_calibration.fit.closed_forms import (
     CLOSED_FORMS,
-    MotionConfig,
     check_observable,
     daniilidis,
     park,
@@ -50,7 +49,6 @@ __all__ = [
     "IntrinsicsConfig",
     "JointConfig",
     "LiveCalibration",
-    "MotionConfig",
     "PosePairs",
     "TargetDetection",
     "calibrate",
