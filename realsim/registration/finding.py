@@ -212,8 +212,8 @@ def seek_objects(task: SceneTask, asked: list[Wanted] | None) -> FoundObjects:
         near = [w for w in asked or () if w.T_start is not None]
         if asked is None:
             raise DegenerateError(
-                f"no table was found: {intake.no_plane} Without one, objects can only be "
-                "registered from rough poses; name them with their poses."
+                f"no table was found: {intake.no_plane.rstrip('.')}. Without one, objects can only "
+                "be registered from rough poses; name them with their poses."
             )
         found = _objects_near(task, near)
         return replace(found, not_placed=(*found.not_placed, *missing))

@@ -47,6 +47,7 @@ from realsim.registration.near_rivals import Duel, duels, duels_by_print
 from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.registration.registered import (
     Registration,
+    finding_report,
     is_wrong,
     missing_report,
     with_rejected,
@@ -193,7 +194,9 @@ def _fit_many(
     many = register_many(intake, found.bodies, _starts(found), intake.plane, config, task.tick.each)
     rules = config.second_look
     looked = intake
-    wanted = [task.models[w.obj_id] for w in asked] or [b.model for b in found.bodies]
+    # Of what nobody named, a model may have been laid into one place many times.
+    found_models = {b.model.obj_id: b.model for b in found.bodies}
+    wanted = [task.models[w.obj_id] for w in asked] or list(found_models.values())
     if many.plane is not None and not is_beside_objects(
         many, found.bodies, many.plane, wanted, rules
     ):
@@ -396,7 +399,7 @@ def _registration(
         "search": found.report,
         "single_view": single_report,
         "not_placed": missing_report(missing),
-        "findings": [{"kind": f.kind, "words": f.words} for f in findings],
+        "findings": finding_report(findings),
         "kinematics": None if task.kinematics is None else task.kinematics.as_json(),
         **fit.report,
         "objects": [

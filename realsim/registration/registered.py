@@ -89,15 +89,22 @@ def without_inventions(result: Registration) -> Registration:
         for i in sorted(set(counts) - found)
     )
 
+    def is_of_them(finding: Defect) -> bool:
+        of = set(getattr(finding, "instances", ()))
+        return bool(of) and of <= gone
+
+    findings = tuple(f for f in result.findings if not is_of_them(f))
+
     def kept(scene: Scene) -> Scene:
         return replace(scene, objects=tuple(o for o in scene.objects if o.instance not in gone))
 
     return replace(
         result, scene=kept(result.scene), single_view=kept(result.single_view),
         seen={v: {i: p for i, p in of.items() if i not in gone} for v, of in result.seen.items()},
-        not_placed=(*result.not_placed, *lost),
+        not_placed=(*result.not_placed, *lost), findings=findings,
         report={
             **result.report,
+            "findings": finding_report(findings),
             "objects": [r for r in result.report["objects"] if r["instance"] not in gone],
             "not_placed": [*result.report.get("not_placed", []), *missing_report(lost)],
             "rejected_places": {str(i): n for i, n in sorted(counts.items())},
@@ -108,3 +115,8 @@ def without_inventions(result: Registration) -> Registration:
 def missing_report(missing: Sequence[NotPlaced]) -> list[dict[str, Any]]:
     """Return what was not placed, and why, as JSON values."""
     return [{"obj_id": n.obj_id, "instance": n.instance, "reason": n.reason} for n in missing]
+
+
+def finding_report(findings: Sequence[Defect]) -> list[dict[str, Any]]:
+    """Return what is wrong with views or with the scene, as JSON values."""
+    return [{"kind": f.kind, "words": f.words} for f in findings]

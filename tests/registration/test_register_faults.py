@@ -14,6 +14,7 @@ from realsim.geometry.metrics import mssd_symmetric
 from realsim.geometry.parts import part
 from realsim.records import Mesh, ObjectModel, ObjectPose
 from realsim.registration.evidence import DepthFrame
+from realsim.registration.judging.scene_checks import SceneFinding
 from realsim.registration.register import Registration, RegistrationConfig, register_scene
 from realsim.registration.registered import is_wrong, without_inventions
 from realsim.registration.search.records import Wanted
@@ -178,7 +179,12 @@ def test_what_nobody_named_and_was_rejected_is_told_and_stays_out_of_the_scene()
     # The second place of a model that is there as well; the first of one that is not.
     bad[1] = replace(bad[1], obj_id=rest[0].obj_id)
     scene_ = replace(asked.scene, objects=(*bad, *rest))
-    kept = without_inventions(replace(asked, scene=scene_))
+    said = tuple(
+        SceneFinding(kind="not in the scene", words="gone", instances=(o.instance,))
+        for o in (first, rest[0])
+    )
+    kept = without_inventions(replace(asked, scene=scene_, findings=said))
+    assert kept.findings == said[1:] and len(kept.report["findings"]) == 1
     left = {o.instance for o in rest}
     assert {o.instance for o in kept.scene.objects} == left
     assert {o.instance for o in kept.single_view.objects} <= left

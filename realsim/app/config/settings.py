@@ -168,4 +168,4 @@ def _shown(value: Any) -> str:
 
 def _perhaps(name: str, names: list[str]) -> str:
     close = get_close_matches(name, names, n=2)
-    return f"; did you mean {' or '.join(close)}?" if close else ""
+    return f" (did you mean {' or '.join(close)}?)" if close else ""

@@ -150,7 +150,7 @@ def _head(file: ConfigFile) -> dict[str, Any]:
             close = get_close_matches(key, KEYS, n=1)
             raise InputError(
                 f"{file.place(('campaign',), key)}: [campaign] has no key '{key}'"
-                f"{f'; did you mean {close[0]}?' if close else ''}. Its keys are: "
+                f"{f' (did you mean {close[0]}?)' if close else ''}. Its keys are: "
                 f"{', '.join(KEYS)}."
             )
         is_right = (
