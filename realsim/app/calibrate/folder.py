@@ -40,6 +40,7 @@ from realsim_calibration import (
     prove_reading,
 )
 from realsim_calibration.calibrate import require_given_camera
+from realsim_calibration.fit.closed_forms import MIN_VIEWS
 from realsim_calibration.inputs.layouts import MADE_OF
 from realsim_calibration.results import Clock
 
@@ -154,7 +155,7 @@ def read_views(request: FolderRequest, console: Console) -> FolderViews:
     write_text(request.out / MADE_OF, made_of(request.images))
     detections = find_in_images(folder.images, target, request.out, console)
     require_target(folder, detections, target)
-    require_views(folder, detections, CalibrationConfig().hand_eye.motion.min_views)
+    require_views(folder, detections, MIN_VIEWS)
     warn_of_pictures(folder, detections, target, console)
     camera = _camera_of(request.intrinsics)
     require_one_size(folder.labels, detections, camera, request.intrinsics)
