@@ -79,9 +79,9 @@ def _compared(session: Path, out: Path) -> tuple[int, int, float, float]:
             [poses[s.instance] @ s.Ts_obj_pads[s.good & executed(s)] for s in grasps.sets]
         )
         places, rotations = load_grasp(out, folder, image)
-        for T in Ts:
+        for T in Ts if len(places) else ():
             far = np.linalg.norm(places - T[:3, 3], axis=1) * 1e3
-            nearest = np.flatnonzero(far <= max(NEAR_MM, far.min(initial=np.inf)))
+            nearest = np.flatnonzero(far <= max(NEAR_MM, far.min()))
             # Fingers may meet at one point from several sides: of those, the one turned least.
             approach = _degrees(rotations[nearest, :, 0], T[:3, 2])
             closing = _degrees(rotations[nearest, :, 1], T[:3, 1])

@@ -23,8 +23,6 @@ from realsim.geometry import se3
 
 HALF_TURN = np.radians(175.0)
 """Pairs that turn further are left out: near 180 deg the sign of the axis is decided by noise."""
-
-
 MIN_VIEWS = 3
 """Two motions about different axes need three poses."""
 MIN_TURN_DEG = 2.0

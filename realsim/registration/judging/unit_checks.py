@@ -13,9 +13,9 @@ OBJECT_M = (0.003, 2.0)
 SHARE_OF_DEPTH = (0.003, 3.0)
 """Least and greatest diagonal as a share of the median distance at which it would be seen: 2 px
 wide, or wider than the image."""
-FAR = 20.0
+FAR_DEPTHS = 20.0
 """A start further from all cameras than this many times the depth they measure is no start."""
-FACTOR = 1000.0
+UNIT_FACTOR = 1000.0
 """The factor that is suspected."""
 
 
@@ -53,7 +53,7 @@ def _mesh_words(model: ObjectModel, depth_m: float) -> str | None:
     high = min(OBJECT_M[1], SHARE_OF_DEPTH[1] * depth_m)
     if low <= size <= high:
         return None
-    guess = size / FACTOR if size > high else size * FACTOR
+    guess = size / UNIT_FACTOR if size > high else size * UNIT_FACTOR
     would = f" {guess:.3g} m would fit: millimetres and metres were mixed up." if (
         low <= guess <= high) else ""  # fmt: skip
     return (
@@ -69,11 +69,11 @@ def _start_words(
     """Return what is wrong with a start's distance from the cameras, or None."""
     t = start.T_world_obj[:3, 3]
     away = float(np.linalg.norm(cameras - t, axis=1).min())
-    if away <= FAR * depth_m:
+    if away <= FAR_DEPTHS * depth_m:
         return None
-    guess = float(np.linalg.norm(cameras - t / FACTOR, axis=1).min())
+    guess = float(np.linalg.norm(cameras - t / UNIT_FACTOR, axis=1).min())
     would = " Divided by 1000 it would be among what they see: it is in millimetres." if (
-        guess <= FAR * depth_m) else ""  # fmt: skip
+        guess <= FAR_DEPTHS * depth_m) else ""  # fmt: skip
     return (
         f"the start of object {model.obj_id} '{model.name}' (instance {start.instance}) is at "
         f"{', '.join(f'{v:.4g}' for v in t)} m, {away:.4g} m from the nearest camera, and the "

@@ -36,8 +36,6 @@ FREE = 1.0
 """Sigma of what the table does not tell (place on it [m] and turn about its normal [rad])."""
 FIXED = 1e-6
 """Sigma of the first view's place [m] and turn [rad], which the table fixes as well."""
-
-
 PAIR_MM = 0.3
 """Sigma of a pair's shift along each axis at 0 degrees [mm]; in simulation a pair of 6 to 12
 degrees is wrong by 0.3 mm in all, one of 20 to 35 by 0.6."""

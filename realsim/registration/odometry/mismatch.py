@@ -72,8 +72,8 @@ def suspects(Ts_world_cam: Array, edges: Sequence[Edge]) -> list[int]:
 
 
 def find_mismatches(
-    meter: PairMeter, Ts_world_cam: Array, edges: Sequence[Edge], angles: Array,
-    ) -> tuple[tuple[Mismatch, ...], Int64]:  # fmt: skip
+    meter: PairMeter, Ts_world_cam: Array, edges: Sequence[Edge], angles: Array
+) -> tuple[tuple[Mismatch, ...], Int64]:
     """Return the images at wrong poses, and the pose (F,) that fits each; -1 = none is left.
 
     Args:
@@ -102,8 +102,8 @@ def find_mismatches(
 
 
 def _singles(
-    doubted: Sequence[int], meter: PairMeter, Ts: Array, angles: Array, fits: float,
-    ) -> tuple[tuple[Mismatch, ...], Int64]:  # fmt: skip
+    doubted: Sequence[int], meter: PairMeter, Ts: Array, angles: Array, fits: float
+) -> tuple[tuple[Mismatch, ...], Int64]:
     """Return the doubted images that fit other poses, one by one, and every view's pose (F,)."""
     poses = np.arange(len(Ts))
     for k in doubted:
@@ -118,8 +118,8 @@ def _singles(
 
 
 def _best_pose(
-    k: int, doubted: Sequence[int], meter: PairMeter, Ts: Array, angles: Array, fits: float,
-    ) -> int:  # fmt: skip
+    k: int, doubted: Sequence[int], meter: PairMeter, Ts: Array, angles: Array, fits: float
+) -> int:
     """Return the place of the pose that image k fits: its own unless another is much better."""
     n = len(Ts)
     near = [k + s for s in SHIFTS if 0 <= k + s < n]
@@ -132,8 +132,8 @@ def _best_pose(
 
 
 def _misfit(
-    k: int, q: int, doubted: Sequence[int], meter: PairMeter, Ts: Array, angles: Array,
-    ) -> float:  # fmt: skip
+    k: int, q: int, doubted: Sequence[int], meter: PairMeter, Ts: Array, angles: Array
+) -> float:
     """Return the mean distance [m] of image k, put at pose q, to what trusted views see there."""
     around = [
         j

@@ -94,11 +94,7 @@ def select(
 
 
 def select_any(
-    canvas: Canvas,
-    pool: Sequence[Candidate],
-    config: SelectionConfig,
-    first: Sequence[int] = (),
-    clash: Clash | None = None,
+    canvas: Canvas, pool: Sequence[Candidate], config: SelectionConfig, clash: Clash | None = None
 ) -> Selection:
     """Return as many poses of the pool as the images support, of whatever objects.
 
@@ -106,7 +102,6 @@ def select_any(
         canvas: where the poses were rendered.
         pool: poses of all objects that may be there.
         config: settings.
-        first: poses that are chosen already.
         clash: tells whether two poses of the pool cannot both be; None = never.
     """
     everything = Slot(choices=frozenset(range(len(pool))))
@@ -116,7 +111,7 @@ def select_any(
             return False
         return clash is None or not any(clash(n, k) for k in others)
 
-    chosen: list[int | None] = list(first)
+    chosen: list[int | None] = []
     for _ in range(config.sweeps):
         before = sorted(c for c in chosen if c is not None)
         while not chosen or chosen[-1] is not None:

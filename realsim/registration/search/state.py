@@ -38,12 +38,12 @@ class Search:
             self.told(f"{words}{name}")
 
     def choose(self, first: Sequence[int | None] | None = None) -> Selection:
-        """Return the joint choice; `first` is what was chosen before."""
+        """Return the joint choice; `first` is what was chosen before, of wanted objects."""
         canvas, config = self.bench.canvas, self.bench.config.selection
         self.say(f"choosing among {len(self.pool)} poses")
         if self.wanted is None:
             # A new pose of a large object can stand for several small ones: all compete again.
-            chosen = select_any(canvas, self.pool, config, clash=self._clash)
+            chosen = select_any(canvas, self.pool, config, self._clash)
         else:
             slots = [Slot(choices=frozenset(c)) for c in self.choices]
             chosen = select(canvas, self.pool, slots, config, first)
