@@ -3,14 +3,14 @@
 from pathlib import Path
 
 from realsim.app.console import Console
-from realsim.app.options import SESSIONS, Where, command, many, options, rare
+from realsim.app.options import SESSIONS, Has, Where, command, many, options, rare
 
 
 @command(
     "annotate", "realsim annotate demo/session", "realsim annotate demo/session --maps all --json"
 )
 @SESSIONS
-@options(maps="instance,depth")
+@options(maps=Has("", "  [instance,depth, and those that are there]"))
 @many(1, "; of several sessions, sessions at a time")
 @rare(no_depth_check=False)
 def annotate_command(

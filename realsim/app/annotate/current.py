@@ -42,7 +42,8 @@ def annotate_session(
     Args:
         store: the session.
         console: where progress is shown.
-        maps: 'all', 'none' or a list of maps; '' = instances and exact depth.
+        maps: 'all', 'none' or a list of maps; '' = instances, exact depth, and those that are there:
+            a map that somebody made is made anew, not lost.
         workers: who computes frames.
         check_depth: whether what the measured depth shows in front of an object leaves its mask.
 
@@ -53,14 +54,17 @@ def annotate_session(
     from realsim_sim_bridge.annotation.annotate import annotate
     from realsim_sim_bridge.annotation.config import (
         DEFAULT_MAPS,
+        MAPS,
         AnnotationConfig,
         OccluderConfig,
+        checked_maps,
         maps_of,
     )
     from realsim_sim_bridge.synthetic.scene import load_surroundings
     from realsim_sim_bridge.synthetic.write import exact_annotation
 
-    chosen = maps_of(maps) if maps else DEFAULT_MAPS
+    there = (name for name in MAPS if any(store.path(f"labels/{name}").glob("*.png")))
+    chosen = maps_of(maps) if maps else checked_maps((*DEFAULT_MAPS, *there))
     config = AnnotationConfig(maps=chosen, occluder=OccluderConfig(is_on=check_depth))
     surroundings = load_surroundings(store)
     if surroundings is not None:  # a synthetic session: everything is known
@@ -86,7 +90,7 @@ def annotate_session(
     for name, camera in cameras.items():
         write(f" of {name}", camera, wrong[name])
     summary = write("", store, damaged)
-    asked = {"maps": maps, "check_depth": check_depth}
+    asked = {"maps": ",".join(chosen) or "none", "check_depth": check_depth}
     note(store, "annotate", console, request=asked, config=config, inputs=MADE_FROM)
     return summary
 
