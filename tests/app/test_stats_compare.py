@@ -1,18 +1,25 @@
 """Two releases of a data set: what differs is told, and what is the same is not."""
 
 import json
+import shutil
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from labelled_scenes import SceneInMemory, labelled_scene
+from realsim import images
 from realsim.app.cli import commands
 from realsim.app.stats.compare import diff_scenes
 from realsim.formats.bop.root_files import write_bop_models
 from realsim.formats.bop.writing import write_bop_scene
 from realsim.formats.export_folder import ExportFolder
+from realsim.formats.graspnet.collision_labels import write_collision_labels
+from realsim.formats.graspnet.grasp_labels import GraspLabels, write_grasp_labels
+from realsim.formats.graspnet.write_plan import GraspnetWriteConfig
+from realsim.formats.graspnet.writing import write_graspnet_scene
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from tried_grasps import tried_set
@@ -65,7 +72,7 @@ def test_scenes_frames_objects_and_motions_are_told(releases):
     assert (added["scene"], added["state"]) == ("000009", "added")
     assert (kept["frames"], kept["frames_added"], kept["frames_lost"]) == (2, 0, 1)
     (motion,) = kept["moved"]
-    assert motion["obj_id"] == 1
+    assert motion["object"] == "tall"
     assert motion["mm"] == pytest.approx(2.0, abs=1e-6)
     assert motion["deg"] == pytest.approx(0.5, abs=1e-6)
     assert [row["state"] for row in compared(old, new)] == ["kept", "lost"]
@@ -76,6 +83,7 @@ def test_a_release_is_the_same_as_itself(releases):
         assert row["frames"] == 3 and row["state"] == "kept"
         assert not (row["moved"] or row["objects_added"] or row["objects_lost"])
         assert not (row["frames_added"] or row["frames_lost"])
+        assert not (row["cameras_changed"] or row["images_changed"] or row["masks_changed"])
 
 
 def test_grasps_are_added_lost_and_changed(tmp_path):
@@ -101,3 +109,128 @@ def test_grasps_are_added_lost_and_changed(tmp_path):
     assert (found.grasps_lost, found.grasps_added) == (2, 2)
     assert (found.grasps_changed, found.grasps_kept) == (1, 7)
     assert not found.is_same
+
+
+# --- what is easily overlooked -----------------------------------------------------------------
+
+
+def changed_copy(releases, tmp_path, change):
+    """Return what --compare says of a copy of a release in which one thing was changed."""
+    copy = tmp_path / "copy"
+    shutil.copytree(releases[0], copy)
+    change(copy / "train/000003")
+    (row,) = compared(copy, releases[0])
+    return row
+
+
+def edit(file, change):
+    content = json.loads(file.read_text())
+    change(content)
+    file.write_text(json.dumps(content))
+
+
+def repaint(file):
+    image = images.read_image(file).copy()
+    image[7, 9] = 255 - image[7, 9]
+    file.write_bytes(images.png_bytes(image))
+
+
+def test_a_moved_camera_and_another_focal_length_are_told(releases, tmp_path):
+    def shift(rows):
+        rows["1"]["cam_t_w2c"][0] += 5.0
+        rows["2"]["cam_K"][0] += 1.0
+
+    row = changed_copy(releases, tmp_path, lambda f: edit(f / "scene_camera.json", shift))
+    assert row["cameras_changed"] == 2
+    assert row["images_changed"] == row["masks_changed"] == 0 and not row["moved"]
+
+
+def test_other_pixels_are_told_and_another_packing_is_not(releases, tmp_path):
+    def repaint_all(folder):
+        repaint(folder / "rgb/000000.png")
+        repaint(folder / "depth/000001.png")
+        repaint(folder / "mask_visib/000002_000001.png")
+        file = folder / "rgb/000002.png"
+        bgr = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        before = file.read_bytes()
+        cv2.imwrite(str(file), bgr, [cv2.IMWRITE_PNG_COMPRESSION, 0])
+        assert file.read_bytes() != before
+
+    row = changed_copy(releases, tmp_path, repaint_all)
+    assert (row["images_changed"], row["masks_changed"]) == (2, 1)
+
+
+def test_renumbered_models_are_the_same_objects(releases, tmp_path):
+    def renumber(folder):
+        new = {1: 4, 7: 2, 30: 9}
+
+        def ids(rows):
+            for row in (o for many in rows.values() for o in many):
+                row["obj_id"] = new[row["obj_id"]]
+
+        edit(folder / "scene_gt.json", ids)
+        models = folder.parents[1] / "models"
+        info = json.loads((models / "models_info.json").read_text())
+        info = {str(new[int(k)]): row for k, row in info.items()}
+        (models / "models_info.json").write_text(json.dumps(info))
+        for file in [models / f"obj_{k:06d}.ply" for k in new]:
+            file.rename(file.with_suffix(".was"))
+        for k, n in new.items():
+            (models / f"obj_{k:06d}.was").rename(models / f"obj_{n:06d}.ply")
+
+    row = changed_copy(releases, tmp_path, renumber)
+    assert not (row["objects_added"] or row["objects_lost"] or row["moved"])
+
+
+@pytest.mark.parametrize(
+    ("name", "by"), [("widths_m", 0.01), ("scores", 0.3), ("base_scores", 0.25)]
+)
+def test_a_width_or_a_score_alone_is_a_change(tmp_path, name, by):
+    plain = labelled_scene(tmp_path / "s", [0])
+    before = tried_set(np.random.default_rng(3), 6, obj_id=7, instance=1, measures=("p_hold",))
+    before = replace(before, **{name: np.full(6, 0.02 if name == "widths_m" else 0.5)})
+    values = getattr(before, name).copy()
+    values[2] += by
+    scenes = []
+    for s in (before, replace(before, **{name: values})):
+        of = WithGrasps(folder=plain.folder, frames=plain.frames, masks=plain.masks)
+        of.tried = SceneGrasps(sets=(s,))
+        scenes.append(of)
+    found = diff_scenes("s", *scenes)
+    assert (found.grasps_changed, found.grasps_kept) == (1, 5)
+
+
+def test_labels_of_graspnets_format_are_compared(tmp_path):
+    scene = labelled_scene(tmp_path / "s", [0])
+    for name in ("old", "new"):
+        export = ExportFolder.begin(tmp_path / name, {})
+        write_graspnet_scene(scene, export, GraspnetWriteConfig())
+        export.finish({})
+    index = [[0, 3, 1, 2], [0, 5, 0, 0], [1, 3, 1, 2]]
+    labels = GraspLabels(
+        points=np.array([[0.01, 0.0, 0.02], [0.0, 0.01, 0.02]]), index=np.array(index, np.int32),
+        angles_rad=np.zeros(3, np.float32), depths_m=np.full(3, 0.02, np.float32),
+        openings_m=np.full(3, 0.05, np.float32), friction=np.full(3, 0.4, np.float32),
+        collision=np.zeros(3, np.bool_),
+    )  # fmt: skip
+    write_grasp_labels(tmp_path / "old/grasp_label/006_labels.npz", labels)
+    other = replace(labels, friction=np.array([0.4, 0.2, 0.4], np.float32))
+    write_grasp_labels(tmp_path / "new/grasp_label/006_labels.npz", other.rows(np.arange(2)))
+    (row,) = compared(tmp_path / "new", tmp_path / "old")
+    assert (row["grasps_lost"], row["grasps_added"]) == (1, 0)
+    assert (row["grasps_changed"], row["grasps_kept"]) == (1, 1)
+    write_collision_labels(
+        tmp_path / "new/collision_label/scene_0003/collision_labels.npz",
+        [(labels, np.zeros(3, np.bool_))],
+    )
+    (row,) = compared(tmp_path / "new", tmp_path / "old")
+    assert row["files_changed"] == ["collision_label/scene_0003/collision_labels.npz"]
+
+
+def test_two_data_sets_without_a_scene_in_common_are_told_so(releases, tmp_path):
+    other = labelled_scene(tmp_path / "c", [0])
+    other.number, other.name = 9, "train-000009"
+    written(tmp_path / "other", other)
+    words = [str(w) for w in ("stats", tmp_path / "other", "--compare", releases[0])]
+    result = CliRunner().invoke(commands, words, catch_exceptions=False)
+    assert "no scene is in both: 000009 beside 000003" in result.output

@@ -42,7 +42,7 @@ def annotate_session(
     Args:
         store: the session.
         console: where progress is shown.
-        maps: 'all', 'none' or a list of maps; '' = instances, exact depth, and those that are there:
+        maps: 'all', 'none' or a list of maps; '' = instances, exact depth, and what is there:
             a map that somebody made is made anew, not lost.
         workers: who computes frames.
         check_depth: whether what the measured depth shows in front of an object leaves its mask.

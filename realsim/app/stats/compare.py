@@ -1,28 +1,36 @@
 """`realsim stats NEW --compare OLD`: what two releases of a data set differ in, scene by scene."""
 
+from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from realsim import images
 from realsim.app.console import Console
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.sources import SourceScene, source_scenes
-from realsim.arrays import Array
-from realsim.formats.labelled_scene import LabelledScene
+from realsim.arrays import Array, Int64
+from realsim.formats.bop.labelled import BopLabelledScene, read_models_info
+from realsim.formats.graspnet.grasp_labels import read_grasp_labels
+from realsim.formats.graspnet.labelled import GraspnetLabelledScene
+from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
+from realsim.formats.session_scene import SessionScene
 from realsim.geometry import se3
 from realsim.records import GraspSet
 
 MOVED_MM, MOVED_DEG = 1e-3, 1e-3
 """A pose that differs by less is the same: files round."""
 SAME_GRASP_M, SAME_GRASP_DEG = 1e-4, 0.1
-"""Grasps of one thing that differ by less are one grasp."""
+"""Grasps of one thing that differ by less are one grasp; widths that differ by less are one."""
 CHANGED = 0.01
-"""Labels of one grasp that differ by more have changed."""
-Thing = tuple[int, int]
-"""Object id, and instance or place among its like."""
+"""Scores and labels of one grasp that differ by more have changed."""
+CHANGED_PX = 1e-3
+"""Intrinsics that differ by more have changed."""
+Thing = tuple[str, int]
+"""Name of the model, or its id where a release has no names; instance, or place among its like."""
 
 
 @dataclass(kw_only=True, slots=True)
@@ -41,38 +49,40 @@ class SceneDiff:
         default_factory=dict[Thing, tuple[float, float]]
     )
     """Greatest motion over the frames [mm], [deg]."""
+    cameras_changed: int = 0
+    """Frames whose camera stands elsewhere or has other intrinsics."""
+    images_changed: int = 0
+    """Frames with another colour or depth image."""
+    masks_changed: int = 0
+    """Frames with another mask."""
     grasps_added: int = 0
     grasps_lost: int = 0
     grasps_changed: int = 0
+    """Grasps with another label, score or width."""
     grasps_kept: int = 0
+    files_changed: list[str] = field(default_factory=list[str])
+    """Files of further labels that differ."""
 
     @property
     def is_same(self) -> bool:
         """Whether nothing differs."""
-        counts = (self.frames_added, self.frames_lost, self.grasps_added, self.grasps_lost,
-                  self.grasps_changed)  # fmt: skip
-        things = (self.objects_added, self.objects_lost, self.moved)
-        return self.state == "kept" and not any(counts) and not any(things)
+        found = asdict(self)
+        same = ("scene", "state", "frames", "grasps_kept")
+        return self.state == "kept" and not any(v for k, v in found.items() if k not in same)
 
     def row(self) -> dict[str, Any]:
         """Return plain JSON values."""
         moved = [
-            {"obj_id": i, "instance": k, "mm": mm, "deg": deg}
-            for (i, k), (mm, deg) in sorted(self.moved.items())
+            {"object": name, "instance": k, "mm": mm, "deg": deg}
+            for (name, k), (mm, deg) in sorted(self.moved.items())
         ]
-        names = ("scene", "state", "frames", "frames_added", "frames_lost", "grasps_added",
-                 "grasps_lost", "grasps_changed", "grasps_kept")  # fmt: skip
-        return {name: getattr(self, name) for name in names} | {
-            "objects_added": [list(t) for t in self.objects_added],
-            "objects_lost": [list(t) for t in self.objects_lost],
-            "moved": moved,
-        }
+        return asdict(self) | {"moved": moved}
 
 
 def compare_releases(
     new: Sequence[Path], old: Path, console: Console
 ) -> dict[str, list[dict[str, Any]]]:
-    """Show what scenes, frames, objects, poses and grasps of two releases differ in, and return it.
+    """Show what two releases differ in, from scenes to masks and grasps, and return it.
 
     Args:
         new: sessions, folders of them, BOP or GraspNet data sets.
@@ -92,9 +102,16 @@ def compare_releases(
             diffs.append(diff_scenes(name, before[name].open(), after[name].open()))
     console.table(
         f"{', '.join(p.name for p in new)} since {old.name}",
-        ("scene", "state", "frames", "objects", "moved", "at most [mm]", "[deg]", "grasps"),
+        ("scene", "state", "frames", "objects", "moved", "at most [mm]", "[deg]", "grasps",
+         "other cameras", "images", "masks", "files"),
         [_shown(d) for d in diffs],
-    )
+    )  # fmt: skip
+    if not after.keys() & before.keys():
+        console.warn(
+            f"no scene is in both: {', '.join(sorted(after)[:4])} beside "
+            f"{', '.join(sorted(before)[:4])}. Scenes are matched by number and camera; give two "
+            "releases of one data set."
+        )
     same = sum(d.is_same for d in diffs)
     console.say(f"{same} of {len(diffs)} scenes are the same.")
     return {"comparison": [d.row() for d in diffs]}
@@ -109,53 +126,169 @@ def _by_name(sources: tuple[Path, ...]) -> dict[str, SourceScene]:
 
 
 def diff_scenes(name: str, old: LabelledScene, new: LabelledScene) -> SceneDiff:
-    """Return what one scene differs in: frames by number, things by id and instance."""
+    """Return what one scene differs in: frames by number, things by model and instance."""
     shared = sorted(set(old.indices) & set(new.indices))
     found = SceneDiff(
         scene=name, frames=len(shared), frames_added=len(set(new.indices) - set(shared)),
         frames_lost=len(set(old.indices) - set(shared)),
     )  # fmt: skip
+    names = (_names(old), _names(new))
+    if not all(names):
+        names = ({}, {})
     before, after = set[Thing](), set[Thing]()
     for index in shared:
-        Ts_old, Ts_new = _poses(old, index), _poses(new, index)
-        before |= Ts_old.keys()
-        after |= Ts_new.keys()
-        for thing in Ts_old.keys() & Ts_new.keys():
-            off = se3.invert(Ts_old[thing]) @ Ts_new[thing]
-            mm, deg = 1e3 * float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
+        a, b = old.frame(index), new.frame(index)
+        rows_old, rows_new = _rows(a, names[0]), _rows(b, names[1])
+        before |= rows_old.keys()
+        after |= rows_new.keys()
+        both = rows_old.keys() & rows_new.keys()
+        for thing in both:
+            T_old, T_new = (
+                f.objects[rows[thing]].T_cam_obj for f, rows in ((a, rows_old), (b, rows_new))
+            )
+            mm, deg = _moved(T_old, T_new)
             if mm > MOVED_MM or deg > MOVED_DEG:
                 worst = found.moved.get(thing, (0.0, 0.0))
                 found.moved[thing] = (max(mm, worst[0]), max(deg, worst[1]))
+        found.cameras_changed += _is_other_camera(a, b)
+        found.images_changed += _is_other(old.colour_file(index), new.colour_file(index)) or (
+            _is_other(old.depth_file(index), new.depth_file(index))
+        )
+        found.masks_changed += any(
+            _is_other_mask(old, new, index, (rows_old[t], rows_new[t])) for t in both
+        )
     found.objects_added, found.objects_lost = sorted(after - before), sorted(before - after)
-    _grasps(found, old, new)
+    if isinstance(old, GraspnetLabelledScene) and isinstance(new, GraspnetLabelledScene):
+        _label_files(found, old, new)
+    else:
+        _grasps(found, _sets(old, names[0]), _sets(new, names[1]))
     return found
 
 
-def _poses(scene: LabelledScene, index: int) -> dict[Thing, Array]:
-    poses: dict[Thing, Array] = {}
-    for o in scene.frame(index).objects:
-        place = sum(i == o.obj_id for i, _ in poses)
-        poses[o.obj_id, place if o.instance is None else o.instance] = o.T_cam_obj
-    return poses
+def _names(scene: LabelledScene) -> dict[int, str]:
+    """Return the names of the models by id; {} where they do not tell models apart."""
+    if isinstance(scene, BopLabelledScene):
+        rows = scene.models_info()
+    elif isinstance(scene, SessionScene):
+        rows = read_models_info(scene.store.folder / "models")
+    else:
+        return {}
+    names = {i: str(row.get("name", i)) for i, row in rows.items()}
+    return names if len(set(names.values())) == len(names) else {}
 
 
-def _grasps(found: SceneDiff, old: LabelledScene, new: LabelledScene) -> None:
-    sets = [
-        {} if grasps is None else {(s.obj_id, s.instance): s for s in grasps.sets}
-        for grasps in (old.grasps(), new.grasps())
+def _rows(frame: LabelledFrame, names: dict[int, str]) -> dict[Thing, int]:
+    """Return the place of each thing in a frame's objects."""
+    rows: dict[Thing, int] = {}
+    like = defaultdict[str, int](int)
+    for k, o in enumerate(frame.objects):
+        name = names.get(o.obj_id, str(o.obj_id))
+        rows[name, like[name] if o.instance is None else o.instance] = k
+        like[name] += 1
+    return rows
+
+
+def _moved(T_old: Array, T_new: Array) -> tuple[float, float]:
+    """Return how far a pose is from another [mm], [deg]."""
+    off = se3.invert(T_old) @ T_new
+    return 1e3 * float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
+
+
+def _is_other_camera(old: LabelledFrame, new: LabelledFrame) -> bool:
+    a, b = old.intrinsics, new.intrinsics
+    if (a.width, a.height) != (b.width, b.height) or old.depth_unit_m != new.depth_unit_m:
+        return True
+    if not np.allclose(a.K, b.K, rtol=0, atol=CHANGED_PX) or not np.array_equal(
+        a.distortion, b.distortion
+    ):
+        return True
+    Ts = (old.T_world_cam, new.T_world_cam)
+    if Ts[0] is None or Ts[1] is None:
+        return Ts[0] is not Ts[1]
+    mm, deg = _moved(Ts[0], Ts[1])
+    return mm > MOVED_MM or deg > MOVED_DEG
+
+
+def _is_other(old: Path | None, new: Path | None) -> bool:
+    """Return whether two images differ in a pixel, however they are packed."""
+    if old is None or new is None:
+        return old is not new
+    if old.read_bytes() == new.read_bytes():
+        return False
+    return not np.array_equal(images.read_image(old), images.read_image(new))
+
+
+def _is_other_mask(
+    old: LabelledScene, new: LabelledScene, index: int, rows: tuple[int, int]
+) -> bool:
+    for visible in (True, False):
+        a, b = (s.mask(index, k, visible=visible) for s, k in zip((old, new), rows, strict=True))
+        if (a is None) != (b is None) or (
+            a is not None and b is not None and not np.array_equal(a, b)
+        ):
+            return True
+    return False
+
+
+def _label_files(found: SceneDiff, old: GraspnetLabelledScene, new: GraspnetLabelledScene) -> None:
+    """Compare the labels of GraspNet's format: grasps by point, view, angle and depth."""
+    roots = [s.ref.folder.parents[2] for s in (old, new)]
+    for number in sorted({*old.object_numbers, *new.object_numbers}):
+        files = [r / f"grasp_label/{number:03d}_labels.npz" for r in roots]
+        if not any(f.is_file() for f in files):
+            continue
+        a, b = (_label_rows(f) for f in files)
+        _, i, j = np.intersect1d(a[0], b[0], assume_unique=True, return_indices=True)
+        changed = int(np.any(a[1][i] != b[1][j], axis=1).sum())
+        found.grasps_lost += len(a[0]) - len(i)
+        found.grasps_added += len(b[0]) - len(j)
+        found.grasps_changed += changed
+        found.grasps_kept += len(i) - changed
+    further = [f"collision_label/scene_{old.number:04d}/collision_labels.npz"]
+    pairs = [(name, [r / name for r in roots]) for name in further]
+    pairs += [
+        (f"rect/{k:04d}.npy", [s.ref.folder / f"rect/{k:04d}.npy" for s in (old, new)])
+        for k in sorted(set(old.indices) & set(new.indices))
     ]
-    for thing in sets[0].keys() | sets[1].keys():
-        before, after = sets[0].get(thing), sets[1].get(thing)
+    for name, files in pairs:
+        a, b = (f.read_bytes() if f.is_file() else b"" for f in files)
+        if a != b:
+            found.files_changed.append(name)
+
+
+def _label_rows(file: Path) -> tuple[Int64, Array]:
+    """Return the candidates of a label file: numbers (N,), and what is said of them (N, 6)."""
+    if not file.is_file():
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 6))
+    labels = read_grasp_labels(file, friction_at_most=2.0, with_collision=True)
+    said = (labels.openings_m, labels.friction, labels.collision)
+    points = labels.points[labels.index[:, 0]]
+    return labels.numbers, np.column_stack([*said, points]).astype(np.float64)
+
+
+def _sets(scene: LabelledScene, names: dict[int, str]) -> dict[Thing, GraspSet]:
+    grasps = scene.grasps()
+    sets = () if grasps is None else grasps.sets
+    return {(names.get(s.obj_id, str(s.obj_id)), s.instance): s for s in sets}
+
+
+def _grasps(found: SceneDiff, old: dict[Thing, GraspSet], new: dict[Thing, GraspSet]) -> None:
+    for thing in old.keys() | new.keys():
+        before, after = old.get(thing), new.get(thing)
         a, b = (0 if s is None else len(s) for s in (before, after))
         pairs = [] if before is None or after is None else _same(before, after)
         found.grasps_lost += a - len(pairs)
         found.grasps_added += b - len(pairs)
-        if before is not None and after is not None:
-            labels = [(before.labels[i], after.labels[j]) for i, j in pairs]
-            changed = sum(not np.isclose(x, y, rtol=0, atol=CHANGED, equal_nan=True)
-                          for x, y in labels)  # fmt: skip
-            found.grasps_changed += changed
-            found.grasps_kept += len(pairs) - changed
+        if before is not None and after is not None and pairs:
+            i, j = np.array(pairs).T
+            changed = ~np.isclose(
+                before.widths_m[i], after.widths_m[j], rtol=0, atol=SAME_GRASP_M, equal_nan=True
+            )
+            for name in ("labels", "scores", "base_scores", "reachable"):
+                x, y = (np.asarray(getattr(s, name), np.float64) for s in (before, after))
+                changed |= ~np.isclose(x[i], y[j], rtol=0, atol=CHANGED, equal_nan=True)
+            found.grasps_changed += int(changed.sum())
+            found.grasps_kept += int((~changed).sum())
 
 
 def _same(before: GraspSet, after: GraspSet) -> list[tuple[int, int]]:
@@ -178,6 +311,9 @@ def _same(before: GraspSet, after: GraspSet) -> list[tuple[int, int]]:
 
 
 def _shown(d: SceneDiff) -> list[object]:
+    if d.state != "kept":
+        return [d.scene, d.state, *[""] * 10]
+
     def change(added: int, lost: int, kept: int | str = "") -> str:
         parts = [f"+{added}"] * bool(added) + [f"-{lost}"] * bool(lost)
         return " ".join([str(kept)] * (kept != "") + parts) or "-"
@@ -189,4 +325,5 @@ def _shown(d: SceneDiff) -> list[object]:
         d.scene, d.state, change(d.frames_added, d.frames_lost, d.frames),
         change(len(d.objects_added), len(d.objects_lost)), len(d.moved), f"{mm:.3f}", f"{deg:.3f}",
         f"{grasps} changed {d.grasps_changed}" if d.grasps_changed else grasps,
+        d.cameras_changed, d.images_changed, d.masks_changed, len(d.files_changed),
     ]  # fmt: skip

@@ -88,12 +88,19 @@ class GraspLabels:
         most = np.array([len(points), *GRID])
         if n and (self.index.min() < 0 or np.any(self.index.max(axis=0) >= most)):
             raise InputError(f"labels: an index is outside {tuple(most.tolist())}.")
-        if np.any(np.diff(_flat(self.index)) <= 0):
+        if np.any(np.diff(self.numbers) <= 0):
             raise InputError("labels: the candidates must be sorted by index, each there once.")
 
     def __len__(self) -> int:
         """Return the number of candidates."""
         return len(self.friction)
+
+    @property
+    def numbers(self) -> Int64:
+        """(N,) one number for point, view, angle and depth of each candidate; increasing."""
+        return self.index.astype(np.int64) @ np.array(
+            [VIEWS * ANGLES * DEPTHS, ANGLES * DEPTHS, DEPTHS, 1], dtype=np.int64
+        )
 
     def rows(self, rows: NDArray[Any]) -> "GraspLabels":
         """Return some of the candidates, by increasing numbers or a mask (N,)."""
@@ -310,10 +317,3 @@ def _block_rows(labels: GraspLabels) -> Iterator[tuple[int, slice]]:
     for first in range(0, len(labels.points), BLOCK):
         low, high = np.searchsorted(labels.index[:, 0], [first, first + BLOCK])
         yield first, slice(int(low), int(high))
-
-
-def _flat(index: Int32) -> Int64:
-    """Return one number (N,) for point, view, angle and depth (N, 4)."""
-    return index.astype(np.int64) @ np.array(
-        [VIEWS * ANGLES * DEPTHS, ANGLES * DEPTHS, DEPTHS, 1], dtype=np.int64
-    )
