@@ -15,7 +15,9 @@ from click.testing import CliRunner
 from realsim.app.cli import commands
 from realsim.app.pipeline import chain
 from realsim.app.pipeline import run as pipeline_run
+from realsim.app.pipeline.campaign import read_campaign
 from realsim.app.pipeline.chain import SCENE, Ended
+from realsim.app.pipeline.page import page_of, verdicts_of
 from realsim.errors import InputError
 from typed_commands import realsim
 
@@ -64,6 +66,32 @@ def test_a_folder_of_something_else_is_not_filled(tmp_path):
     result = run(written(tmp_path, HEAD + SCENES + EXPORT))
     assert "holds something else" in str(result.exception)
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["mine.txt"]
+
+
+def test_the_folder_of_another_campaign_is_not_filled(tmp_path):
+    path = written(tmp_path, HEAD + SCENES + EXPORT)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/campaign.json").write_text('{"campaign": "../other.toml", "scenes": 2}')
+    before = (tmp_path / "out/campaign.json").read_bytes()
+    assert "is of another campaign, ../other.toml" in str(run(path).exception)
+    assert (tmp_path / "out/campaign.json").read_bytes() == before
+
+
+def test_what_a_person_has_to_look_at_is_on_the_page(tmp_path):
+    campaign = read_campaign(written(tmp_path, HEAD + SCENES + EXPORT), commands)
+    scene = tmp_path / "out/scenes/scene_000000"
+    (scene / "registration").mkdir(parents=True)
+    objects = [{"verdict": "accepted"}, {"verdict": "accepted"}]
+    (scene / "registration/scene.json").write_text(json.dumps({"objects": objects}))
+    end = Ended(stage="annotate", words=(), code=0, wall_s=1, cpu_s=1, peak_mb=1, told="")
+    state = pipeline_run.SceneState(name="scene_000000", folder=scene, ends=(end,))
+    result = pipeline_run.PipelineResult(scenes=[state], stages=("annotate",))
+    for missing, told in (([], "Done"), ([{"instance": 3}], "objects of 1 need a look")):
+        report = {"not_placed": missing}
+        (scene / "registration/report.json").write_text(json.dumps(report))
+        page = page_of(campaign, result).encode().decode()
+        assert told in page and ("1 not placed" in page) == bool(missing)
+    assert verdicts_of(state) == {"accepted": 2, "not placed": 1}
 
 
 def document(out):

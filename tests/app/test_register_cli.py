@@ -147,6 +147,36 @@ def test_views_and_models_that_take_part_are_chosen(session: Path) -> None:
     assert both.wanted is None and len(both.models) == 2 and len(both.views) == 8
 
 
+def test_models_that_are_not_sought_are_named(session: Path, tmp_path: Path) -> None:
+    mug, wedge = (part(n).obj_id for n in ("mug", "wedge"))
+    others = {mug: replace(models_of()[mug], name="jug"), 77: replace(models_of()[mug], obj_id=77)}
+    save_models(tmp_path / "lib", others)
+    next(session.glob(f"models/obj_{wedge:06d}.ply")).unlink()
+    request = RegisterRequest(find_all=True, library=tmp_path / "lib")
+    inputs = read_inputs(SessionStore.open(session), request)
+    assert sorted(inputs.models) == sorted([mug, 77]) and inputs.models[mug].name == "mug"
+    clash, lost = inputs.models_out
+    assert f"model {mug} of the library, 'jug', is not used" in clash
+    assert lost.endswith(f"without a mesh, which are not sought: {wedge}.")
+    save_models(tmp_path / "own", {mug: models_of()[mug]})
+    again = read_inputs(SessionStore.open(session), replace(request, library=tmp_path / "own"))
+    assert len(again.models_out) == 1 and again.key != inputs.key
+
+
+def test_a_scene_that_no_registration_made_is_kept(
+    registered: tuple[Path, Result], tmp_path: Path
+) -> None:
+    folder = copy_of(registered[0], tmp_path / "s")
+    exact = (folder / "registration/scene.json").read_bytes()
+    (folder / "stages/register.json").unlink()
+    again = run(folder)
+    assert again.exit_code == 0, again.output
+    assert (folder / "registration/earlier/scene_001.json").read_bytes() == exact
+    (folder / "stages/register.json").unlink()  # and the same once more: it is kept once
+    assert run(folder).exit_code == 0
+    assert len(list((folder / "registration/earlier").iterdir())) == 1
+
+
 def test_the_key_changes_with_everything_that_matters(session: Path) -> None:
     store = SessionStore.open(session)
     base = RegisterRequest(objects=("mug",))

@@ -33,13 +33,19 @@ PAGES = ("scenes/index.html", "stats/statistics.html")
 """Pages of the generator and of the statistics."""
 
 
-def verdicts_of(scene: "SceneState") -> dict[str, int]:
-    """Return how many objects of a registered scene have which verdict."""
+TO_LOOK_AT = {"doubtful", "rejected", "not placed"}
+"""What a person has to look at."""
+
+
+def verdicts_of(scene: "SceneState") -> Counter[str]:
+    """Return how many objects of a registered scene have which verdict, or are not placed."""
     try:
         found: Any = read_object(scene.folder / "registration/scene.json")["objects"]
-        return dict(Counter(str(o["verdict"]) for o in found))
+        counts = Counter(str(o["verdict"]) for o in found)
+        missing = read_object(scene.folder / "registration/report.json").get("not_placed", ())
+        return counts + Counter({"not placed": len(missing)})
     except (InputError, KeyError, TypeError):
-        return {}
+        return Counter()
 
 
 def page_of(campaign: Campaign, result: "PipelineResult") -> Page:
@@ -55,13 +61,18 @@ def page_of(campaign: Campaign, result: "PipelineResult") -> Page:
         page.verdict("bad", f"{len(failed)} failed", "the other scenes went on",
                      rows=[[Cell(name, "bad"), why] for name, why in failed.items()])  # fmt: skip
     elif total and done == total:
-        page.verdict("good", "Done", f"{total} scenes went through all stages")
+        unsure = sum(bool(TO_LOOK_AT & set(verdicts_of(s))) for s in result.scenes)
+        told = f"{total} scenes went through all stages"
+        if unsure:
+            page.verdict("warn", "Done", f"{told}; objects of {unsure} need a look")
+        else:
+            page.verdict("good", "Done", told)
     else:
         page.verdict("off", "Under way", f"{done} of {total} scenes went through all stages")
     ends = [e for s in result.scenes for e in s.ends] + result.of_all
     page.cards([
         (f"{done} of {total}", "scenes done"),
-        (duration(sum(e.cpu_s for e in ends)), "CPU time"),
+        (duration(sum(e.cpu_s for e in ends)), "CPU time of each command's last run"),
         (f"{max((e.peak_mb for e in ends), default=0):.0f} MB", "largest memory of a process"),
     ])  # fmt: skip
     page.section("Stages")
@@ -108,7 +119,7 @@ def _row(campaign: Campaign, result: "PipelineResult", scene: "SceneState") -> l
     ends = {e.stage: e for e in scene.ends}
     verdicts = verdicts_of(scene)
     told = ", ".join(f"{n} {word}" for word, n in sorted(verdicts.items()))
-    kind = "warn" if {"doubtful", "rejected"} & set(verdicts) else "good"
+    kind = "warn" if TO_LOOK_AT & set(verdicts) else "good"
     return [
         Cell(scene.name),
         *(_cell(campaign, scene, ends.get(name)) for name in result.stages),

@@ -1,9 +1,11 @@
 """A campaign as it runs: first its scenes, then each one's stages, then what is made of all."""
 
+import os
 import shutil
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +17,12 @@ from realsim.errors import InputError, RealsimError
 from realsim.many import Outcome, PoolConfig, Task, Worked, open_pool, run_many
 from realsim.store.atomic import storing, write_bytes, write_json
 from realsim.store.lock import only_run_in
-from realsim.untrusted.own_json import read_own, to_json
+from realsim.untrusted.own_json import read_object, read_own, to_json
 
 SCENES, RECORDS, LOGS = "scenes", "records", "logs"
 DOCUMENT, PAGE = "campaign.json", "campaign.html"
+CAMPAIGN = "campaign"
+"""Key of the document: the campaign's file."""
 RESTART = "--restart"
 RENEWED_S = 10.0
 """Least time between two writings of the page [s]."""
@@ -110,6 +114,7 @@ def run_pipeline(
             for state in [_known(campaign, name, place)]
         ]
         result.kept = sum(result.is_done(s) for s in result.scenes)
+        _write(campaign, result)
         _run_scenes(campaign, where, console, result)
         done = [s for s in result.scenes if result.is_done(s)]
         if not result.failed or without_failed:
@@ -177,18 +182,20 @@ def show_plan(campaign: Campaign, console: Console) -> None:
 
 def show_pipeline(campaign: Campaign, result: PipelineResult, console: Console) -> None:
     """Print what became of a campaign."""
-    from realsim.app.pipeline.page import STAGE_HEADER, stage_rows, verdicts_of
+    from realsim.app.pipeline.page import STAGE_HEADER, TO_LOOK_AT, stage_rows, verdicts_of
 
     ends = [e for s in result.scenes for e in s.ends] + result.of_all
     rows = stage_rows(result.stages, ends)
     console.table(f"Campaign {campaign.file.name}", STAGE_HEADER, rows)
     for name, why in result.failed.items():
         console.warn(f"{name}: {why}")
-    verdicts = sum((Counter(verdicts_of(s)) for s in result.scenes), Counter[str]())
-    if {"doubtful", "rejected"} & set(verdicts):
+    verdicts = sum((verdicts_of(s) for s in result.scenes), Counter[str]())
+    if TO_LOOK_AT & set(verdicts):
         told = ", ".join(f"{n} {word}" for word, n in sorted(verdicts.items()))
         console.warn(f"objects: {told}; `realsim review` shows those that need a person.")
     done = sum(result.is_done(s) for s in result.scenes)
+    if campaign.first is not None and campaign.first.stage in result.failed:
+        console.warn(f"{campaign.first.stage} failed: the scenes below are those of earlier runs.")
     console.say(f"{done} of {len(result.scenes)} scenes done, {result.kept} of them before")
     if result.waiting:
         console.warn(
@@ -215,9 +222,22 @@ def _own_folder(campaign: Campaign) -> Path:
             "folder, or one of an earlier run."
         )
     out.mkdir(parents=True, exist_ok=True)
+    of = _said_from(campaign)
     if not (out / DOCUMENT).is_file():
-        write_json(out / DOCUMENT, {"scenes": 0})
+        write_json(out / DOCUMENT, {CAMPAIGN: of, "scenes": 0})
+    with suppress(InputError):  # damaged: it is written anew
+        of = read_object(out / DOCUMENT).get(CAMPAIGN, of)
+    if of != _said_from(campaign):
+        raise InputError(
+            f"{campaign.file}: out = '{out}' is of another campaign, {of}; its results and page "
+            "would be mixed with this one's. Give another folder, or go on with that file."
+        )
     return out
+
+
+def _said_from(campaign: Campaign) -> str:
+    """Return a campaign's file as it is reached from OUT: both may be moved together."""
+    return os.path.relpath(campaign.file.resolve(), campaign.out.resolve())
 
 
 def _make_scenes(
@@ -361,7 +381,7 @@ def _write(campaign: Campaign, result: PipelineResult) -> None:
     """Write the campaign's document and page."""
     from realsim.app.pipeline.page import page_of
 
-    write_json(campaign.out / DOCUMENT, result.told)
+    write_json(campaign.out / DOCUMENT, {CAMPAIGN: _said_from(campaign)} | result.told)
     write_bytes(campaign.out / PAGE, page_of(campaign, result).encode())
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from realsim.app.register.results import STAGE_FILE
 from realsim.app.reviewed import damage_words, review_of
 from realsim.errors import InputError
 from realsim.geometry import se3
@@ -140,6 +141,14 @@ def _wanted(row: Row, models: Mapping[int, ObjectModel]) -> Wanted:
         radius_m=row["radius_m"], R_world_obj=T[:3, :3].copy(), turn_deg=row["turn_deg"],
     )  # fmt: skip
     return Wanted(obj_id=obj_id, instance=row["instance"], region=region, T_start=T)
+
+
+def is_precious(store: SessionStore) -> bool:
+    """Return whether the present scene was reviewed, or is not a registration's (a generated one).
+
+    A registration can be made again.
+    """
+    return bool(review_of(store).standing) or not store.has(STAGE_FILE)
 
 
 def keep_earlier(store: SessionStore) -> str | None:

@@ -57,6 +57,8 @@ class RegisterInputs:
     """Cameras that stand still, by name."""
     fixed_out: tuple[str, ...]
     """Why others take no part."""
+    models_out: tuple[str, ...]
+    """Which models that were given are not sought, and why."""
 
     def settings(self) -> dict[str, Any]:
         """Return every setting in force, but for where things are kept between runs."""
@@ -88,7 +90,7 @@ def read_inputs(
         InputError: nothing says what is there, an unknown model, no depth, no camera poses.
         UnitError: a start is in other units than metres.
     """
-    available = _available(store, request)
+    available, models_out = _available(store, request)
     claimed = _claimed(store, request, tick)
     wanted = _wanted(store, request, available)
     if wanted is not None and not wanted:
@@ -115,26 +117,45 @@ def read_inputs(
         {str(k): claimed[k].tolist() for k in sorted(claimed)}, list(views),
         _image_hashes(store, views), str(store.session.intrinsics),
         store.extra.get("gravity_up_world"), *(f.key for f in fixed.values()),
+        *models_out,
     )  # fmt: skip
     return RegisterInputs(
         models=available, wanted=wanted, claimed=claimed, views=views, left_out=left_out,
         config=config, key=key, fixed=fixed, fixed_out=tuple(fixed_out),
+        models_out=models_out,
     )  # fmt: skip
 
 
 # --- models and what is wanted ----------------------------------------------------------------
 
 
-def _available(store: SessionStore, request: RegisterRequest) -> dict[int, ObjectModel]:
-    """Return all models that can be spoken of: the session's own before the library's."""
-    from realsim.formats.bop.models import load_models
+def _available(
+    store: SessionStore, request: RegisterRequest
+) -> tuple[dict[int, ObjectModel], tuple[str, ...]]:
+    """Return all models that can be spoken of, the session's own before the library's.
 
-    models: dict[int, ObjectModel] = {}
-    if request.library is not None:
-        models |= load_models(request.library)
-    if (store.folder / "models").is_dir() or not models:
-        models |= session_models(store)
-    return models
+    And in words which others were given.
+    """
+    from realsim.formats.bop.models import load_models
+    from realsim.models.library_files import read_info
+
+    library = {} if request.library is None else load_models(request.library)
+    folder = store.folder / "models"
+    if library and not folder.is_dir():
+        return library, ()
+    own = session_models(store)
+    out = [
+        f"model {i} of the library, '{m.name}', is not used: the session's model {i} is "
+        f"'{own[i].name}'. Give one of them another id."
+        for i, m in sorted(library.items()) if i in own and own[i].name != m.name
+    ]  # fmt: skip
+    lost = (
+        sorted(read_info(folder).keys() - own.keys() - library.keys()) if request.find_all else ()
+    )
+    if lost:
+        ids = ", ".join(map(str, lost))
+        out.append(f"models_info.json lists models without a mesh, which are not sought: {ids}.")
+    return library | own, tuple(out)
 
 
 def _check_solids(models: Mapping[int, ObjectModel]) -> None:

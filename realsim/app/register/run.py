@@ -13,6 +13,7 @@ from realsim.app.register.files import costs_of, finish_interrupted, remark_of, 
 from realsim.app.register.from_review import (
     REVIEW_FILE,
     instances_ever,
+    is_precious,
     keep_earlier,
     moved_since_accepted,
     review_starts,
@@ -103,10 +104,9 @@ def run_register(
             console.say(f"models {', '.join(map(str, copied))} copied from {request.library}")
     with console.stage("register", "pictures and page"):
         pictures = _pictures(store, result, models)
-        if review_of(store).standing:
-            kept = keep_earlier(store)
-            if kept is not None:
-                console.say(f"the scene that was reviewed stays in {kept}")
+        kept = keep_earlier(store) if is_precious(store) else None
+        if kept is not None:
+            console.say(f"the scene that was there stays in {kept}")
         write_result(store, result, models, pictures)
         if starts is not None:
             store.write_json(REVIEW_FILE, starts.to_json())
@@ -188,7 +188,10 @@ def as_registered(
     """Return what a registration found with what was asked of it."""
     seen = found.seen or seen_at_their_word(found, inputs.models, intrinsics)
     remarks = [Remark(view=k, kind="left_out", words=why) for k, why in inputs.left_out]
-    remarks += [Remark(view=None, kind="left_out", words=why) for why in inputs.fixed_out]
+    remarks += [
+        Remark(view=None, kind="left_out", words=why)
+        for why in (*inputs.fixed_out, *inputs.models_out)
+    ]
     remarks += [remark_of(f) for f in found.findings]
     asked = {
         "method": request.method,
