@@ -87,6 +87,15 @@ def test_a_finished_scene_is_kept_and_a_view_that_is_missing_is_made_again(
     result = _run(out, *SMALL, "--scenes", "1")
     assert "kept" in result.output
     assert _content(out) == before
+    # What a registration made of the labels is not told as what was generated.
+    labels = out / "scene_000000/scene_gt_info.json"
+    rows = json.loads(labels.read_text())
+    rows["0"][0]["visib_fract"] = 0.123
+    labels.write_text(json.dumps(rows))
+    written = {n: (out / n).read_bytes() for n in ("dataset.json", "index.html")}
+    assert _run(out, *SMALL, "--scenes", "1").exit_code == 0
+    assert {n: (out / n).read_bytes() for n in written} == written
+    shutil.copyfile(dataset / "scene_000000/scene_gt_info.json", labels)
     for name in ("rgb/000001.png", "annotations/000001.json"):
         (out / "scene_000000" / name).unlink()
     result = _run(out, *SMALL, "--scenes", "1")

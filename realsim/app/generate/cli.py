@@ -45,11 +45,12 @@ def generate_command(
 
     Exit codes: 0 done, 1 a scene could not be made, 2 bad input.
     """
-    from realsim.app.generate.page import write_page, write_sheet
+    from realsim.app.generate.page import PAGE_FILE, SHEET_FILE, write_page, write_sheet
     from realsim.app.generate.run import generate
     from realsim.app.generate.tables import (
         dataset_of,
         finished_layouts,
+        kept_dataset,
         notes_of,
         show,
         summary_of,
@@ -62,14 +63,17 @@ def generate_command(
     request = _request(**options)
     outcome = generate(out, scenes, request, where, console)
     layouts = finished_layouts(out, scenes, request)
-    dataset = dataset_of(out, request, layouts)
-    with storing(out, "the data set's tables and pictures"):
-        write_dataset(out, dataset)
-        sheet = write_sheet(out, layouts, request.views.count)
-        page = write_page(
-            out, layouts, request.views.count, tables_of(out, dataset), summary_of(dataset),
-            notes_of(dataset, outcome),
-        )  # fmt: skip
+    sheet, page = out / SHEET_FILE, out / PAGE_FILE
+    dataset = kept_dataset(out, request, layouts) if page.is_file() and not outcome.made else None
+    if dataset is None:
+        dataset = dataset_of(out, request, layouts)
+        with storing(out, "the data set's tables and pictures"):
+            sheet = write_sheet(out, layouts, request.views.count)
+            page = write_page(
+                out, layouts, request.views.count, tables_of(out, dataset), summary_of(dataset),
+                notes_of(dataset, outcome),
+            )  # fmt: skip
+            write_dataset(out, dataset)
     note(out, "generate", console, request={"scenes": scenes}, config=request.told)
     show(out, dataset, outcome, console)
     if sheet is not None:

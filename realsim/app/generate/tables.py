@@ -10,6 +10,7 @@ from realsim.app.console import Console
 from realsim.app.generate.request import GenerateRequest
 from realsim.app.generate.run import GenerateOutcome
 from realsim.app.generate.scene import is_finished, load_layout, stored_costs
+from realsim.errors import InputError
 from realsim.store import atomic, provenance
 from realsim.untrusted.own_json import read_object
 from realsim_sim_bridge.table_scenes.sample import Layout
@@ -68,6 +69,22 @@ def dataset_of(out: Path, request: GenerateRequest, layouts: list[Layout]) -> di
         ],
         "statistics": statistics(layouts, [x for v in seen for x in v], request.views.count),
     }  # fmt: skip
+
+
+def kept_dataset(
+    out: Path, request: GenerateRequest, layouts: list[Layout]
+) -> dict[str, Any] | None:
+    """Return dataset.json of the same scenes, if it is there: it speaks of them as they were made.
+
+    A scene's labels are others once it was registered.
+    """
+    try:
+        kept = read_object(out / DATASET_FILE)
+        names = [str(row["name"]) for row in kept["scenes"]]
+    except (InputError, KeyError, TypeError):
+        return None
+    same = kept.get("key") == request.key and names == [scene_name(x.number) for x in layouts]
+    return kept if same else None
 
 
 def statistics(layouts: list[Layout], seen: list[float], views: int) -> dict[str, Any]:
