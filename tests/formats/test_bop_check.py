@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from plain_meshes import box
-from realsim.formats.bop.check import Sheet, check_bop_scene
+from realsim.formats.bop.check import Sheet, check_bop_scene, check_info
 from realsim.formats.bop.check_poses import pose_findings, silhouette
 from realsim.formats.bop.layout import SceneLayout
 from realsim.formats.bop.opening import open_labelled_bop
 from realsim.geometry import se3
 from realsim.geometry.camera import project
-from realsim.records import CameraIntrinsics
+from realsim.records import CameraIntrinsics, Mesh
 from realsim_sim_bridge.annotation.annotate import AnnotationConfig, annotate
 from tests.support import synthetic_scenes
 from tests.support.bop_scenes import edit, write_boxes
@@ -107,3 +107,41 @@ def test_a_bar_that_the_border_cuts_agrees_with_its_own_silhouette(tmp_path):
     sheet = Sheet(SceneLayout(folder=tmp_path), 0, 0, 1)
     pose_findings(wider, mask, mask, None, 0.015, sheet)
     assert [f.what for f in sheet.findings] == ["pose and box"]
+
+
+def angle(leg_x):
+    """Return an L: a bar along the upper border and a leg down from it at x [m]."""
+    bar, leg = box((0.3, 0.03, 0.01)), box((0.03, 0.36, 0.01))
+    vertices = [
+        m.vertices + np.array(t) for m, t in ((bar, (-0.2, -0.16, 0.0)), (leg, (leg_x, 0.0, 0.0)))
+    ]
+    faces = [bar.faces, leg.faces + len(bar.vertices)]
+    return Mesh(vertices=np.concatenate(vertices), faces=np.concatenate(faces))
+
+
+def test_a_hollow_that_the_border_leaves_is_not_filled(tmp_path):
+    # The leg is beyond the border: its hull is in the image where nothing is.
+    intrinsics = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
+    T = se3.from_translation([0.0, 0.0, 0.5])
+    mesh, mask = angle(-0.33), np.zeros((240, 320), np.uint8)
+    uv = project(intrinsics, se3.transform(T, mesh.vertices))
+    for triangle in np.rint(uv).astype(np.int32)[mesh.faces]:
+        cv2.fillConvexPoly(mask, triangle, 1)
+    for leg_x, findings in ((-0.33, []), (-0.2, ["pose and box"])):
+        sheet = Sheet(SceneLayout(folder=tmp_path), 0, 0, 1)
+        shape = silhouette(intrinsics, T, angle(leg_x))
+        pose_findings(shape, mask > 0, mask > 0, None, 0.015, sheet)
+        assert [f.what for f in sheet.findings] == findings
+
+
+def test_a_box_may_end_where_bops_tools_cut_it(tmp_path):
+    intrinsics = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
+    T = se3.from_translation([0.0, 0.5, 0.5])
+    shape = silhouette(intrinsics, T, box((0.05, 1.0, 0.01)))
+    x0, y0, x1, y1 = (float(v) for v in shape.box)
+    assert 2 * 240 - 1 < y1
+    for end, agrees in ((y1, True), (2 * 240 - 1, True), (1.8 * 240, False)):
+        info = {"bbox_obj": [x0, y0, x1 - x0, end - y0], "px_count_visib": 40}
+        sheet = Sheet(SceneLayout(folder=tmp_path), 0, 0, 1)
+        check_info(info, None, None, None, shape, sheet)
+        assert (not sheet.findings) == agrees

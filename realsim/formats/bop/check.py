@@ -215,17 +215,17 @@ def check_info(
     elif inside and whole is not None:
         compare("bbox_obj", list(bbox_of(whole)))
     if shape is not None and shape.box is not None and count_visible:
-        off = _box_difference(info["bbox_obj"], shape.box)
-        agree = off is not None and off <= BOX_PX
+        offs = [_box_difference(info["bbox_obj"], b) for b in (shape.box, shape.drawn_box)]
+        agree = any(off is not None and off <= BOX_PX for off in offs)
         x0, y0, x1, y1 = (float(v) for v in shape.box)
         found = [round(v, 1) for v in (x0, y0, x1 - x0, y1 - y0)]
         compare("bbox_obj", f"{found} of projected vertices", agree=agree)
 
 
-def _box_difference(said: Any, box: Array) -> float | None:
+def _box_difference(said: Any, box: Array | None) -> float | None:
     """Return the greatest difference of a side of x, y, w, h to x0, y0, x1, y1; None = no box."""
     try:
         x, y, w, h = (float(v) for v in said)
     except (TypeError, ValueError):
         return None
-    return float(np.abs(np.array([x, y, x + w, y + h]) - box).max())
+    return None if box is None else float(np.abs(np.array([x, y, x + w, y + h]) - box).max())

@@ -1,11 +1,11 @@
 """A pose held against masks and depth by the projected vertices of its model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from realsim.arrays import Array, Array32, Mask
+from realsim.arrays import Array, Array32, Int32, Mask
 from realsim.formats.bop.labels import bbox_of
 from realsim.geometry import se3
 from realsim.geometry.camera import project, turning_radius
@@ -46,6 +46,18 @@ class Silhouette:
     nearest_m: float
     """Least depth of a vertex [m]."""
     farthest_m: float
+    intrinsics: CameraIntrinsics
+    corners: Array
+    """(V, 3) vertices in the camera [m]."""
+    faces: Int32
+
+    @property
+    def drawn_box(self) -> Array | None:
+        """The box where BOP's own tools cut it: they draw on a canvas of three by three images."""
+        if self.box is None:
+            return None
+        low = -np.array([self.intrinsics.width, self.intrinsics.height])
+        return np.clip(self.box, np.tile(low, 2), np.tile(-2 * low - 1, 2))
 
 
 def silhouette(intrinsics: CameraIntrinsics, T_cam_obj: Array, mesh: Mesh) -> Silhouette:
@@ -55,9 +67,11 @@ def silhouette(intrinsics: CameraIntrinsics, T_cam_obj: Array, mesh: Mesh) -> Si
     corners = se3.transform(T_cam_obj, hull_vertices(mesh.vertices))
     z = corners[:, 2]
     nearest, farthest = float(z.min()), float(z.max())
+
     nowhere = Silhouette(
-        box=None, is_inside=False, hull=None, nearest_m=nearest, farthest_m=farthest
-    )
+        box=None, is_inside=False, hull=None, nearest_m=nearest, farthest_m=farthest,
+        intrinsics=intrinsics, corners=se3.transform(T_cam_obj, mesh.vertices), faces=mesh.faces,
+    )  # fmt: skip
     if nearest <= 0:
         return nowhere
     radius = np.linalg.norm(corners[:, :2] / z[:, None], axis=1)
@@ -73,13 +87,8 @@ def silhouette(intrinsics: CameraIntrinsics, T_cam_obj: Array, mesh: Mesh) -> Si
     filled: Any = cv2.fillConvexPoly(canvas, np.rint(outline).astype(np.int32), 1)
     kernel = np.ones((2 * GROWN_PX + 1, 2 * GROWN_PX + 1), np.uint8)
     grown: Any = cv2.dilate(filled, kernel)
-    return Silhouette(
-        box=box,
-        is_inside=bool(np.all(box[:2] >= 0) and np.all(box[2:] <= size - 1)),
-        hull=np.asarray(grown) > 0,
-        nearest_m=nearest,
-        farthest_m=farthest,
-    )
+    inside = bool(np.all(box[:2] >= 0) and np.all(box[2:] <= size - 1))
+    return replace(nowhere, box=box, is_inside=inside, hull=np.asarray(grown) > 0)
 
 
 def pose_findings(
@@ -113,6 +122,8 @@ def pose_findings(
         )
     if whole is not None and shape.box is not None and pixels >= SMALLEST_PX:
         overlap = _overlap(_visible_box(shape), whole)
+        if overlap < FILLED and not shape.is_inside:  # what is cut off may be a hollow of the hull
+            overlap = max(overlap, _overlap(_shown_box(shape), whole))
         sheet.compare(
             "scene_gt",
             "pose and box",
@@ -160,6 +171,21 @@ def _visible_box(shape: Silhouette) -> Array:
     return np.concatenate([
         np.where(low > 0, low + GROWN_PX, low), np.where(high < border, high - GROWN_PX, high)
     ]).astype(np.float64)  # fmt: skip
+
+
+def _shown_box(shape: Silhouette) -> Array:
+    """Return the box [px] of a model's pixels, drawn face by face."""
+    import cv2
+
+    width, height = shape.intrinsics.width, shape.intrinsics.height
+    drawn, limit = np.zeros((height, width), np.uint8), 4.0 * max(width, height)
+    uv = np.clip(project(shape.intrinsics, shape.corners), -limit, limit)
+    for triangle in np.rint(uv).astype(np.int32)[shape.faces]:
+        cv2.fillConvexPoly(drawn, triangle, 1)
+    if not drawn.any():
+        return np.full(4, -1.0)
+    x, y, w, h = bbox_of(drawn > 0)
+    return np.array([x, y, x + w, y + h], dtype=np.float64)
 
 
 def _overlap(box: Array, mask: Mask) -> float:
