@@ -109,7 +109,7 @@ def test_what_cannot_be_made_again_is_said(copy: Path, tmp_path: Path) -> None:
         ((copy, "school"), "holds no stages/school.json"),
         ((tmp_path / "none",), "is no folder"),
         ((tmp_path, "school"), "is no session"),
-        ((tmp_path,), "holds no provenance.json"),
+        ((tmp_path,), "neither session.json nor provenance.json"),
     ):
         result = realsim("reproduce", *words)
         assert isinstance(result.exception, InputError), result.output
@@ -127,7 +127,8 @@ def test_a_school_and_an_export_are_made_again(tmp_path: Path) -> None:
     session, out = registered(tmp_path / "s"), tmp_path / "out"
     assert realsim("school", session, *QUICK).exit_code == 0
     assert realsim("export", session, "--to", "hdf5", "--out", out, "--quiet").exit_code == 0
-    for words in ((session, "school"), (out,)):
+    shutil.copytree(out, tmp_path / "renamed")
+    for words in ((session, "school"), (out,), (tmp_path / "renamed",)):
         result = realsim("reproduce", *words, "--workers", 1, "--json")
         assert result.exit_code == 0, (result.output, result.exception)
         assert json.loads(result.stdout)["equal"]

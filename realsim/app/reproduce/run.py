@@ -3,15 +3,18 @@
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from realsim.app.console import Console
+from realsim.app.export.croissant import CROISSANT_FILE
 from realsim.app.reproduce.compare import FileDifference, compare_folders
 from realsim.errors import InputError
 from realsim.store import SessionStore, provenance
 from realsim.store.provenance import Provenance, Run
+from realsim.untrusted.own_json import read_object
 
 ROOM = 1.2
 """Free space that is asked for, in units of what is copied."""
@@ -89,6 +92,11 @@ def _read(folder: Path, stage: str, is_session: bool) -> tuple[Provenance, Run]:
     if stage and not is_session:
         raise InputError(f"'{folder}' is no session and has one record; leave '{stage}' away.")
     name = provenance.file_of(stage) if stage else provenance.FOLDER_FILE
+    if not is_session and not (folder / name).is_file():
+        raise InputError(
+            f"'{folder}' is no session and no export: it holds neither session.json nor {name}. "
+            "Give a session with a stage, or the folder of an export."
+        )
     if not (folder / name).is_file():
         raise InputError(
             f"'{folder}' holds no {name}, so it is not known what its result was made of. Results "
@@ -174,10 +182,19 @@ def _export(folder: Path, request: dict[str, Any], place: Path, console: Console
         copy = place / "sources" / str(k) / source.resolve().name
         _copy(source, copy)
         copies.append(copy)
-    out = place / "out" / folder.resolve().name
+    out = place / "out" / _title(folder)
     request["sources"] = tuple(copies)
     run_export(ExportRequest(**request), out, console)
     return out
+
+
+def _title(folder: Path) -> str:
+    """Return what an export's folder was called when it was made: its card says it."""
+    with suppress(InputError):
+        name = read_object(folder / CROISSANT_FILE).get("name")
+        if isinstance(name, str) and name == Path(name).name:
+            return name
+    return folder.resolve().name
 
 
 def _copy(folder: Path, copy: Path) -> None:
