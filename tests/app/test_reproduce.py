@@ -122,6 +122,18 @@ def test_what_cannot_be_made_again_is_said(copy: Path, tmp_path: Path) -> None:
     assert "from-review" in refused and "realsim register" in refused
 
 
+def test_the_card_of_an_export_names_what_has_no_label(copy: Path, tmp_path: Path) -> None:
+    file = copy / "registration/report.json"
+    report = json.loads(file.read_text())
+    report["not_placed"] = [{"obj_id": 9, "instance": 4, "reason": "hidden in all views"}]
+    file.write_text(json.dumps(report))
+    done = realsim("export", copy, "--to", "bop", "--out", tmp_path / "out", "--quiet")
+    assert done.exit_code == 0, (done.output, done.exception)
+    card = " ".join((tmp_path / "out/README.md").read_text().split())
+    assert "object 9 (instance 4) is not placed and has no label" in card
+    assert "hidden in all views" in card
+
+
 @pytest.mark.slow
 def test_a_school_and_an_export_are_made_again(tmp_path: Path) -> None:
     session, out = registered(tmp_path / "s"), tmp_path / "out"

@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -266,15 +267,24 @@ def trust_in(scene: SourceScene) -> SceneTrust:
     return SceneTrust(
         verdicts=verdicts,
         pose_sigma_mm=float(np.median(sigmas)) if sigmas else None,
-        findings=tuple(_findings(store)),
+        findings=tuple(_findings(store, {o.instance for o in judged.objects})),
         instances=len(judged.objects),
     )
 
 
-def _findings(store: SessionStore) -> list[str]:
+def _findings(store: SessionStore, labelled: set[int]) -> list[str]:
+    """Return what registration found out, and what has no label in a scene of these instances."""
     from realsim.app.upgrade.scene import registration_notes
 
-    return registration_notes(store) if store.has("registration/report.json") else []
+    if not store.has("registration/report.json"):
+        return []
+    missing: Any = store.read_json("registration/report.json").get("not_placed", ())
+    return registration_notes(store) + [
+        f"object {n['obj_id']} (instance {n['instance']}) is not placed and has no label, though "
+        f"the images may show it: {n['reason']}"
+        for n in missing
+        if n["instance"] not in labelled
+    ]
 
 
 def licence_files(sources: tuple[Path, ...]) -> dict[str, Path]:
