@@ -49,7 +49,7 @@ def open_session(folder: Path) -> SessionStore:
         hint = f" Did you mean {', '.join(str(folder / n) for n in inner)}?" if inner else ""
         raise InputError(
             f"'{folder}' holds no session.json, so it is not a session.{hint} Give a folder that "
-            "`realsim demo` or `realsim upgrade` has filled, such as demo/session."
+            "`realsim demo`, `capture`, `import`, `generate` or `upgrade` has filled."
         )
     return SessionStore.open(folder)
 

@@ -87,7 +87,7 @@ def require_address(address: str) -> tuple[str, int]:
     """Return host and port of a cluster that may be joined.
 
     Raises:
-        InputError: it is no address, or this machine has no token to show.
+        InputError: it is no address, nobody's, or this machine has no token to show.
     """
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or "/" in address:
@@ -95,6 +95,13 @@ def require_address(address: str) -> tuple[str, int]:
             f"'{address}' is no address of a Ray cluster; HOST:PORT of its head node is accepted, "
             "as `ray start --head` told it, such as 192.168.0.10:6379, or `local`."
         )
+    try:
+        socket.getaddrinfo(host, int(port))
+    except OSError as error:
+        raise InputError(
+            f"'{address}': no machine of the name '{host}' is known here ({error.strerror}); give "
+            "the name or number that `ray start --head` told."
+        ) from error
     has_token = any(os.environ.get(name) for name in TOKEN_SOURCES)
     has_token = has_token or (Path.home() / TOKEN_FILE).is_file()
     if os.environ.get("RAY_AUTH_MODE", "token").lower() != "token" or not has_token:

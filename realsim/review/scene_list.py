@@ -73,7 +73,8 @@ def sessions_under(folders: Sequence[Path]) -> list[Path]:
         if not inside:
             raise InputError(
                 f"'{folder}' holds no {SESSION_FILE}, nor does a folder in it, so there is nothing "
-                "to review. Give a folder that `realsim demo` or `realsim upgrade` has filled."
+                "to review. Give a folder that `realsim demo`, `capture`, `import`, `generate` or "
+                "`upgrade` has filled."
             )
         found += inside
     once: dict[Path, Path] = {}

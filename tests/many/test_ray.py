@@ -51,6 +51,11 @@ def test_what_is_no_address_is_named():
             open_pool(PoolConfig(address=address)),
         ):
             pass
+    with (
+        pytest.raises(InputError, match="no machine of the name 'nowhere.invalid' is known"),
+        open_pool(PoolConfig(address="nowhere.invalid:6379")),
+    ):
+        pass
 
 
 def test_a_cluster_is_not_joined_without_a_token(monkeypatch, tmp_path):

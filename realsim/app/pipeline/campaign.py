@@ -212,8 +212,8 @@ def _places(file: ConfigFile, patterns: Sequence[str], source: str) -> list[Path
             here = [p for p in here if p.is_dir()]
         if not here:
             raise InputError(
-                f"{file.place(('campaign',), source)}: '{pattern}' names nothing beside "
-                f"{file.path.parent.resolve()}."
+                f"{file.place(('campaign',), source)}: '{pattern}' names nothing "
+                f"that is there; it is looked for from {file.path.parent.resolve()}."
             )
         found += [p for p in here if p not in found]
     if source != "generate" and not found:

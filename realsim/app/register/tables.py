@@ -233,7 +233,7 @@ def show_registered(
 ) -> None:
     """Print everything about a registration, worst first."""
     if result.scene.objects:
-        title = f"Objects of {result.scene.name}: {summary_line(result)}"
+        title = f"Objects of {folder.resolve().name}: {summary_line(result)}"
         console.table(title, OBJECT_HEADER, object_rows(result, models))
     if result.not_placed:
         console.table("Not placed", MISSING_HEADER, missing_rows(result, models))
