@@ -182,6 +182,25 @@ def test_renumbered_models_are_the_same_objects(releases, tmp_path):
     assert not (row["objects_added"] or row["objects_lost"] or row["moved"])
 
 
+def test_another_instance_of_the_same_model_is_the_same_object(tmp_path):
+    plain = labelled_scene(tmp_path / "s", [0, 1])
+
+    def with_instances(*numbers):
+        scene = SceneInMemory(folder=plain.folder, frames=dict(plain.frames), masks=plain.masks)
+        return scene.change_frames(
+            objects=lambda f: tuple(
+                replace(o, instance=n) for o, n in zip(f.objects, numbers, strict=True)
+            )
+        )
+
+    found = diff_scenes("s", with_instances(0, 1, 2), with_instances(5, 1, 9))
+    assert found.is_same
+    fewer = with_instances(5, 1, 9)
+    fewer.change_frames(objects=lambda f: f.objects[:2])
+    found = diff_scenes("s", with_instances(0, 1, 2), fewer)
+    assert found.objects_lost == [("30", 2)] and not found.objects_added and not found.moved
+
+
 @pytest.mark.parametrize(
     ("name", "by"), [("widths_m", 0.01), ("scores", 0.3), ("base_scores", 0.25)]
 )

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from realsim import images
+from realsim.app.annotate.current import is_annotated, what_is_stale
 from realsim.app.console import Console
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.sources import SourceScene, source_scenes
+from realsim.app.stages import open_session
 from realsim.arrays import Array, Int64
 from realsim.formats.bop.labelled import BopLabelledScene, read_models_info
 from realsim.formats.graspnet.grasp_labels import read_grasp_labels
@@ -98,6 +100,8 @@ def compare_releases(
         if name not in after or name not in before:
             diffs.append(SceneDiff(scene=name, state="added" if name in after else "lost"))
             continue
+        for stale in filter(None, map(_stale_words, (after[name], before[name]))):
+            console.warn(stale)
         with console.stage("compare", name):
             diffs.append(diff_scenes(name, before[name].open(), after[name].open()))
     console.table(
@@ -125,6 +129,18 @@ def _by_name(sources: tuple[Path, ...]) -> dict[str, SourceScene]:
     return dict(zip(names, scenes, strict=True))
 
 
+def _stale_words(scene: SourceScene) -> str:
+    """Return what is to be done where a session's labels are not those of its scene."""
+    if scene.kind != "session":
+        return ""
+    store = open_session(scene.folder)
+    why = what_is_stale(store) if is_annotated(store) else ""
+    return why and (
+        f"the labels of {scene.folder} are older than its scene ({why}), and it is they that are "
+        f"compared. `realsim annotate {scene.folder}` computes them anew."
+    )
+
+
 def diff_scenes(name: str, old: LabelledScene, new: LabelledScene) -> SceneDiff:
     """Return what one scene differs in: frames by number, things by model and instance."""
     shared = sorted(set(old.indices) & set(new.indices))
@@ -135,12 +151,14 @@ def diff_scenes(name: str, old: LabelledScene, new: LabelledScene) -> SceneDiff:
     names = (_names(old), _names(new))
     if not all(names):
         names = ({}, {})
-    before, after = set[Thing](), set[Thing]()
-    for index in shared:
-        a, b = old.frame(index), new.frame(index)
-        rows_old, rows_new = _rows(a, names[0]), _rows(b, names[1])
-        before |= rows_old.keys()
-        after |= rows_new.keys()
+    frames = [(i, old.frame(i), new.frame(i)) for i in shared]
+    rows_of_old = [_rows(a, names[0]) for _, a, _ in frames]
+    rows_of_new = [_rows(b, names[1]) for _, _, b in frames]
+    before, after = (set[Thing]().union(*rows) for rows in (rows_of_old, rows_of_new))
+    called = _counterparts(before, after)
+    before = {called.get(t, t) for t in before}
+    for (index, a, b), rows, rows_new in zip(frames, rows_of_old, rows_of_new, strict=True):
+        rows_old = {called.get(t, t): k for t, k in rows.items()}
         both = rows_old.keys() & rows_new.keys()
         for thing in both:
             T_old, T_new = (
@@ -161,8 +179,18 @@ def diff_scenes(name: str, old: LabelledScene, new: LabelledScene) -> SceneDiff:
     if isinstance(old, GraspnetLabelledScene) and isinstance(new, GraspnetLabelledScene):
         _label_files(found, old, new)
     else:
-        _grasps(found, _sets(old, names[0]), _sets(new, names[1]))
+        tried = {called.get(t, t): s for t, s in _sets(old, names[0]).items()}
+        _grasps(found, tried, _sets(new, names[1]))
     return found
+
+
+def _counterparts(before: set[Thing], after: set[Thing]) -> dict[Thing, Thing]:
+    """Return old thing -> new thing where only the instance differs, in the order of instances."""
+    called: dict[Thing, Thing] = {}
+    for name in {name for name, _ in before}:
+        lost = sorted(t for t in before - after if t[0] == name)
+        called |= zip(lost, sorted(t for t in after - before if t[0] == name), strict=False)
+    return called
 
 
 def _names(scene: LabelledScene) -> dict[int, str]:
