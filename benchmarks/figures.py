@@ -29,6 +29,10 @@ import numpy as np
 
 from realsim.app.console import Console
 
+# Where Python may not keep what it has compiled, each process that is measured compiles its
+# libraries anew, for 4 CPU s: nobody's machine is like that.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).resolve().parents[2] / "shared/data"))
 """Folder of the real data."""
 
