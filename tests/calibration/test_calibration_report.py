@@ -5,7 +5,6 @@ import dataclasses
 import math
 import re
 from collections.abc import Callable
-from html.parser import HTMLParser
 from pathlib import Path
 
 import cv2
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 
 import board_depth
+from page_tags import Tags
 from realsim.records import Check
 from realsim.records.depth_bias import DepthBias
 from realsim_calibration.lens.intrinsics import calibrate_intrinsics
@@ -59,40 +59,14 @@ def paths(report: HandEyeReport, tmp_path_factory: pytest.TempPathFactory) -> li
     )  # fmt: skip
 
 
-class Outline(HTMLParser):
-    """Collects tags and checks that they are closed in order."""
-
-    VOID = ("meta", "img", "br", "hr", "link", "input")
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.words: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.words.append(data)
-
-
-def outline(path: Path) -> Outline:
-    parser = Outline()
-    parser.feed(path.read_text(encoding="utf-8"))
-    assert parser.open == []
-    return parser
+def outline(path: Path) -> Tags:
+    return Tags(path.read_text(encoding="utf-8"))
 
 
 @pytest.mark.slow
 def test_the_page_is_one_file(paths: list[Path]) -> None:
     assert paths[0].name == PAGE_NAME
-    for tag, attributes in outline(paths[0]).tags:
+    for tag, attributes in outline(paths[0]).seen:
         assert tag not in ("link", "iframe", "object", "embed")
         assert (attributes.get("src") or "data:").startswith("data:")
     assert "url(" not in paths[0].read_text() and "@import" not in paths[0].read_text()
@@ -100,7 +74,7 @@ def test_the_page_is_one_file(paths: list[Path]) -> None:
 
 @pytest.mark.slow
 def test_the_pictures_in_the_page_are_those_beside_it(paths: list[Path]) -> None:
-    shown = [a["src"] or "" for tag, a in outline(paths[0]).tags if tag == "img" and "src" in a]
+    shown = [a["src"] or "" for tag, a in outline(paths[0]).seen if tag == "img" and "src" in a]
     beside = [p.read_bytes() for p in paths[1:]]
     assert [base64.b64decode(s.partition(",")[2]) for s in shown] == beside
     assert {p for p in paths[0].parent.iterdir()} == set(paths)  # nothing half-written

@@ -1,47 +1,17 @@
 import json
-import shutil
-import tempfile
-from contextlib import contextmanager
 from dataclasses import replace
-from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pose_rows import all_readings, folder, random_poses
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_calibration.inputs import ROTATIONS, PoseReading, read_pose_file, reading_from_text
-
-
-@contextmanager
-def folder():
-    path = Path(tempfile.mkdtemp())
-    try:
-        yield path
-    finally:
-        shutil.rmtree(path)
-
-
-def all_readings():
-    for rotation, length, inverted, first in product(
-        ROTATIONS, ("m", "mm"), (False, True), (True, False)
-    ):
-        plain = PoseReading(
-            rotation=rotation, length_unit=length, inverted=inverted, position_first=first
-        )
-        yield plain
-        if plain.has_angles:
-            yield replace(plain, angle_unit="deg")
-
+from realsim_calibration.inputs import ROTATIONS, read_pose_file, reading_from_text
 
 READINGS = list(all_readings())
-
-
-def random_poses(seed, n):
-    return se3.random_transform(np.random.default_rng(seed), n, spread=0.5)
 
 
 # --- every reading in every layout --------------------------------------------------------------

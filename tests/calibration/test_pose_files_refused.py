@@ -1,26 +1,13 @@
 import io
-import shutil
-import tempfile
-from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pose_rows import folder
 from realsim.errors import InputError
 from realsim_calibration.inputs import read_pose_file
-
-
-@contextmanager
-def folder():
-    path = Path(tempfile.mkdtemp())
-    try:
-        yield path
-    finally:
-        shutil.rmtree(path)
-
 
 # --- what is refused ---------------------------------------------------------------------------
 

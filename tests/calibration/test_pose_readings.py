@@ -1,30 +1,10 @@
-from dataclasses import replace
-from itertools import product
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from pose_rows import all_readings, random_poses
 from realsim.errors import InputError, NotRigidError, UnitError
-from realsim.geometry import se3
-from realsim_calibration.inputs import EULER_ORDERS, ROTATIONS, PoseReading, reading_from_text
-
-
-def all_readings():
-    for rotation, length, inverted, first in product(
-        ROTATIONS, ("m", "mm"), (False, True), (True, False)
-    ):
-        plain = PoseReading(
-            rotation=rotation, length_unit=length, inverted=inverted, position_first=first
-        )
-        yield plain
-        if plain.has_angles:
-            yield replace(plain, angle_unit="deg")
-
-
-def random_poses(seed, n):
-    return se3.random_transform(np.random.default_rng(seed), n, spread=0.5)
-
+from realsim_calibration.inputs import EULER_ORDERS, PoseReading, reading_from_text
 
 # --- readings -----------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 from realsim.errors import InputError
 from realsim.formats.colmap.model import PARAMETERS, find_model, read_model
@@ -94,14 +95,7 @@ def test_the_text_by_hand(tmp_path):
     (tmp_path / "images").mkdir()
     cv2.imwrite(str(tmp_path / "images/a.png"), rgb_of(0)[..., ::-1])
     source = open_colmap(tmp_path, metres_per_unit=2.0)
-    w, x, y, z = q
-    R = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    R = Rotation.from_quat([*q[1:], q[0]]).as_matrix()
     T = next(source.frames()).T_world_cam
     np.testing.assert_allclose(T[:3, :3], R.T, atol=1e-12)
     np.testing.assert_allclose(T[:3, 3], 2.0 * (-R.T @ t), atol=1e-12)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
+from scipy.spatial.transform import Rotation
 
 from realsim.errors import InputError
 from realsim.formats.grasps.isaac_grasp import write_isaac_grasp
@@ -47,14 +48,8 @@ def test_the_quaternion_is_scalar_first_and_turns_the_right_way(tmp_path):
     assert data["gripper_frame_link"] == "panda_hand"
     for row in np.flatnonzero(labelled(s)):
         entry = data["grasps"][f"grasp_{row}"]
-        w, (x, y, z) = entry["orientation"]["w"], entry["orientation"]["xyz"]
-        R = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        q = [*entry["orientation"]["xyz"], entry["orientation"]["w"]]
+        R = Rotation.from_quat(q).as_matrix()
         np.testing.assert_allclose(R, s.Ts_obj_grasp[row, :3, :3], atol=1e-14)
 
 

@@ -8,6 +8,7 @@ import json
 import h5py
 import numpy as np
 from ruamel.yaml import YAML
+from scipy.spatial.transform import Rotation
 
 from realsim.formats.graspit.grasps import read_grasp_file
 from realsim.formats.graspnet.grasp_group import grasp_group, read_grasp_group, write_grasp_group
@@ -71,16 +72,9 @@ class IsaacGrasp:
 
     def raw(self, path):
         rows = YAML(typ="safe").load(path)["grasps"].values()
-        w = np.array([r["orientation"]["w"] for r in rows])
-        x, y, z = np.array([r["orientation"]["xyz"] for r in rows]).T
-        R = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        return from_rt(R.transpose(2, 0, 1), np.array([r["position"] for r in rows]))
+        q = [[*r["orientation"]["xyz"], r["orientation"]["w"]] for r in rows]
+        R = Rotation.from_quat(q).as_matrix()
+        return from_rt(R, np.array([r["position"] for r in rows]))
 
 
 class GraspGroupNpy:

@@ -4,12 +4,13 @@ from html.parser import HTMLParser
 
 
 class Tags(HTMLParser):
-    """Collects the tags and checks that they close."""
+    """Collects the tags and the words between them; checks that the tags close in order."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
         self.open: list[str] = []
         self.seen: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
         self.feed(text)
         assert self.open == []
 
@@ -20,3 +21,6 @@ class Tags(HTMLParser):
 
     def handle_endtag(self, tag: str) -> None:
         assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
