@@ -10,12 +10,15 @@ Tests that only read use the folder as it is. A test that writes takes a copy:
 - `table_views`: rendered depth of a mug and a wedge, eight views of 320x240, models, nothing
   registered (registered_sessions.table_session).
 - `registered_session`: the same with a registration that is the truth.
+- `few_views`, `registered_few`: the same two with four views.
+- `weak_school`: two things whose grasps a weak hand tried; some hold, some slip, some are lost.
 - `demo_session`: a whole `realsim demo` of six views, two objects, eight grasps each: captured,
   calibrated, registered, schooled, annotated, reported. It costs about 50 CPU s: for slow tests.
 """
 
 import os
 import sys
+from functools import partial
 from pathlib import Path
 
 if sys.dont_write_bytecode:
@@ -53,16 +56,30 @@ def table_views(run_folder: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def registered_session(run_folder: Path, table_views: Path) -> Path:
-    def make(folder: Path) -> None:
-        from realsim.app.register.files import write_result
-        from realsim.store import SessionStore
-        from registered_sessions import models_of, registered_by_hand
-        from shared_sessions import copy_of
+    from registered_sessions import registered_copy
 
-        store = SessionStore.open(copy_of(table_views, folder))
-        write_result(store, registered_by_hand(store), models_of(), {})
+    return once(run_folder, "registered_session", partial(registered_copy, table_views))
 
-    return once(run_folder, "registered_session", make)
+
+@pytest.fixture(scope="session")
+def few_views(run_folder: Path) -> Path:
+    from registered_sessions import table_session
+
+    return once(run_folder, "few_views", partial(table_session, views=4))
+
+
+@pytest.fixture(scope="session")
+def registered_few(run_folder: Path, few_views: Path) -> Path:
+    from registered_sessions import registered_copy
+
+    return once(run_folder, "registered_few", partial(registered_copy, few_views))
+
+
+@pytest.fixture(scope="session")
+def weak_school(run_folder: Path) -> Path:
+    from school_sessions import tried_weakly
+
+    return once(run_folder, "weak_school", tried_weakly)
 
 
 @pytest.fixture(scope="session")

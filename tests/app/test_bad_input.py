@@ -6,10 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from realsim.app import cli
 from realsim.errors import RealsimError
+from typed_commands import invoked
 from upgradable_datasets import bop_dataset
 
 
@@ -20,9 +19,7 @@ def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def upgrade(dataset: Path, out: Path, *more: str) -> tuple[int, str]:
     """Run `realsim upgrade` in this process; return the exit code of main() and the text."""
-    done = CliRunner().invoke(
-        cli.commands, ["upgrade", str(dataset), "--out", str(out), "--quiet", *more]
-    )
+    done = invoked("upgrade", dataset, "--out", out, "--quiet", *more)
     if done.exception is not None and isinstance(done.exception, RealsimError):
         return 2, str(done.exception)
     if done.exception is not None and not isinstance(done.exception, SystemExit):

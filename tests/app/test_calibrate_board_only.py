@@ -2,18 +2,17 @@
 
 import json
 import shutil
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
 from file_trees import bytes_of
+from photographed_boards import photograph
 from realsim.app.calibrate.run import require_no_bag
 from realsim.app.calibrate.session import keep_board
-from realsim.app.cli import commands
-from realsim.arrays import Array, UInt8
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession, TagBoard, View
@@ -21,49 +20,12 @@ from realsim.store import SessionStore, load_hand_eye
 from realsim.store.atomic import json_bytes
 from realsim_calibration.targets.target_file import target_to_json
 from stored_sessions import flip
+from typed_commands import invoked
 
 CAMERA = CameraIntrinsics(width=640, height=400, fx=440.0, fy=440.0, cx=319.5, cy=199.5)
 BOARD = TagBoard(rows=3, columns=4, tag_size_m=0.04, gap_m=0.01)
 T_EE_CAM = se3.from_rt(se3.exp_so3([0.02, -0.03, 0.9]), [0.01, -0.065, 0.035])
 VIEWS = 12
-MODULES, TEXTURE, FINE = 8, 10, 2
-"""Modules of a tag with its border, texture pixels a module, supersampling."""
-
-
-@cache
-def printed_sheet() -> tuple[UInt8, float, int]:
-    """Return the sheet, its pixels per metre, and the width of its margin [pixels]."""
-    from cv2 import aruco
-
-    tag = MODULES * TEXTURE
-    per_m, margin = tag / BOARD.tag_size_m, tag // 2
-    pitch = round((BOARD.tag_size_m + BOARD.gap_m) * per_m)
-    width, height = (round(v * per_m) + 2 * margin for v in BOARD.size_m)
-    sheet = np.full((height, width), 215, np.uint8)
-    dictionary = aruco.getPredefinedDictionary(aruco.DICT_APRILTAG_36h11)
-    for k, number in enumerate(BOARD.ids):
-        row, column = divmod(k, BOARD.columns)
-        y, x = margin + row * pitch, margin + column * pitch
-        marker = aruco.generateImageMarker(dictionary, int(number), MODULES)
-        large = np.kron(marker, np.ones((TEXTURE, TEXTURE), np.uint8))
-        sheet[y : y + tag, x : x + tag] = np.where(large > 0, 215, 30)
-    return sheet, per_m, margin
-
-
-def photograph(T_cam_board: Array, rng: np.random.Generator) -> UInt8:
-    """Return a picture (H, W, 3) of the board on grey."""
-    import cv2
-
-    sheet, per_m, margin = printed_sheet()
-    to_sheet = np.array([[per_m, 0, margin - 0.5], [0, per_m, margin - 0.5], [0, 0, 1.0]])
-    half = (FINE - 1) / 2
-    finer = np.array([[FINE, 0, half], [0, FINE, half], [0, 0, 1.0]])
-    H = finer @ CAMERA.K @ T_cam_board[:3, [0, 1, 3]] @ np.linalg.inv(to_sheet)
-    size = (CAMERA.width * FINE, CAMERA.height * FINE)
-    fine = cv2.warpPerspective(sheet, H, size, flags=cv2.INTER_LINEAR, borderValue=(120.0,))
-    image = cv2.resize(fine, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA)
-    noisy = image + rng.normal(scale=1.5, size=image.shape)
-    return np.repeat(np.clip(np.rint(noisy), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def hand_poses(rng: np.random.Generator) -> tuple[Array, Array]:
@@ -90,14 +52,14 @@ def board_views(folder: Path, **header: str) -> Path:
     depth = np.zeros((CAMERA.height, CAMERA.width), np.uint16)
     for k, (hand, T_cam_board) in enumerate(zip(*hand_poses(rng), strict=True)):
         view = View(index=k, T_base_ee=hand, time_s=float(k))
-        store.add_view(view, photograph(T_cam_board, rng), depth_counts=depth)
+        store.add_view(view, photograph(CAMERA, [(BOARD, T_cam_board)], rng), depth_counts=depth)
     store.close()
     (folder / "calibration/board.json").write_bytes(json_bytes(target_to_json(BOARD)))
     return folder
 
 
 def calibrate(folder: Path, *options: str) -> Result:
-    return CliRunner().invoke(commands, ["calibrate", str(folder), *options])
+    return invoked("calibrate", folder, *options)
 
 
 @pytest.fixture(scope="module")

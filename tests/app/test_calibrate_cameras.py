@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
+from photographed_boards import photograph
 from realsim.app.calibrate.folder import MADE_OF, made_of
-from realsim.app.cli import commands
 from realsim.app.register.config import load_depth_bias
-from realsim.arrays import Array, UInt8
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
@@ -25,6 +25,7 @@ from realsim_calibration.cameras.files import read_cameras
 from realsim_calibration.exports.calibration_file import read_calibration
 from realsim_calibration.inputs import load_image
 from realsim_calibration.targets.target_file import target_to_json
+from typed_commands import invoked, refused
 
 CAMERA = CameraIntrinsics(width=640, height=480, fx=520.0, fy=520.0, cx=319.5, cy=239.5)
 TABLE = TagBoard(rows=3, columns=4, tag_size_m=0.04, gap_m=0.01)
@@ -38,51 +39,11 @@ FIXED = {
 }
 BIAS = DepthBias(offset_per_m=0.02)
 """Bias of a fixed camera's depth."""
-VIEWS, MODULES, TEXTURE, SUPER = 8, 8, 8, 2
+VIEWS = 8
 MISPLACED = (
     ("wrist=hand,left=fixed", "--held-board", "table", "board 'held' is on the table (give it"),
     ("left=fixed,right=fixed", "--board", "held", "board 'table' is in the hand (give it"),
 )
-
-
-def sheet_of(board: TagBoard) -> tuple[UInt8, float, int]:
-    """Return a board's sheet, its pixels per metre, and its margin [pixels]."""
-    from cv2 import aruco
-
-    tag = MODULES * TEXTURE
-    per_m, margin = tag / board.tag_size_m, tag // 2
-    pitch = round((board.tag_size_m + board.gap_m) * per_m)
-    width, height = (round(v * per_m) + 2 * margin for v in board.size_m)
-    sheet = np.full((height, width), 215, np.uint8)
-    dictionary = aruco.getPredefinedDictionary(aruco.DICT_APRILTAG_36h11)
-    for k, number in enumerate(board.ids):
-        row, column = divmod(k, board.columns)
-        y, x = margin + row * pitch, margin + column * pitch
-        large = np.kron(aruco.generateImageMarker(dictionary, int(number), MODULES),
-                        np.ones((TEXTURE, TEXTURE), np.uint8))  # fmt: skip
-        sheet[y : y + tag, x : x + tag] = np.where(large > 0, 215, 30)
-    return sheet, per_m, margin
-
-
-def photograph(boards: list[tuple[TagBoard, Array]], rng: np.random.Generator) -> UInt8:
-    """Return a picture (H, W, 3) of boards at T_cam_board, the later ones in front."""
-    import cv2
-
-    half = (SUPER - 1) / 2
-    finer = np.array([[SUPER, 0, half], [0, SUPER, half], [0, 0, 1.0]])
-    size = (CAMERA.width * SUPER, CAMERA.height * SUPER)
-    picture = np.full(size[::-1], 120, np.uint8)
-    for board, T in boards:
-        if T[2, 2] < 0.3 or T[2, 3] < 0.1:
-            continue
-        sheet, per_m, margin = sheet_of(board)
-        to_sheet = np.array([[per_m, 0, margin - 0.5], [0, per_m, margin - 0.5], [0, 0, 1.0]])
-        H = finer @ CAMERA.K @ T[:3, [0, 1, 3]] @ np.linalg.inv(to_sheet)
-        drawn = cv2.warpPerspective(sheet, H, size, flags=cv2.INTER_LINEAR)
-        picture = np.where(drawn > 0, drawn, picture).astype(np.uint8)
-    grey = cv2.resize(picture, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA)
-    noisy = np.clip(grey + rng.normal(scale=1.5, size=grey.shape), 0, 255)
-    return np.repeat(noisy.astype(np.uint8)[..., None], 3, -1)
 
 
 def hands(rng: np.random.Generator) -> Array:
@@ -116,7 +77,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
             seen = [(TABLE, to_cam @ Z_TABLE)]
             if name != "wrist":
                 seen.append((HELD, to_cam @ hand @ Z_HELD))
-            cv2.imwrite(str(folder / name / f"{k:03d}.png"), photograph(seen, rng))
+            cv2.imwrite(str(folder / name / f"{k:03d}.png"), photograph(CAMERA, seen, rng))
     (folder / "arm.csv").write_text("\n".join(rows) + "\n")
     for name, board in (("table", TABLE), ("held", HELD)):
         write_json(folder.parent / f"{name}.json", target_to_json(board))
@@ -128,10 +89,7 @@ def run(source: Path, out: Path, *more: str, cameras: str = "wrist=hand,left=fix
     boards = ["--board", str(source.parent / "table.json")]
     if not any(m.startswith("--held") for m in more):
         boards += ["--held-board", str(source.parent / "held.json")]
-    return CliRunner().invoke(
-        commands,
-        ["calibrate", str(source), "--cameras", cameras, *boards, "--out", str(out), *more],
-    )
+    return invoked("calibrate", source, "--cameras", cameras, *boards, "--out", out, *more)
 
 
 def refusal(result: Result) -> str:
@@ -145,7 +103,7 @@ def test_cameras_without_an_arm_get_all_their_files(photos: Path, tmp_path: Path
     fixed = ["--cameras", "left=fixed,right=fixed", "--out", str(tmp_path / "out")]
     (tmp_path / "out/wrist/exports").mkdir(parents=True)
     (tmp_path / "out" / MADE_OF).write_text(made_of(photos))
-    result = CliRunner().invoke(commands, ["calibrate", str(photos), *fixed, *held])
+    result = invoked("calibrate", photos, *fixed, *held)
     assert result.exit_code in {0, 1}, result.output
     page = (tmp_path / "out/cameras_report.html").read_text()
     assert re.search("in camera .{,5}left.{,5} its place is known to", page)
@@ -270,24 +228,10 @@ def test_a_board_that_is_said_to_be_elsewhere_is_named(
             numbers = [*T[:3, 3], *se3.log_so3(T[:3, :3])]
             rows.append(f"{k:03d}.png," + ",".join(f"{v:.9f}" for v in numbers))
         poses.write_text("\n".join(rows) + "\n")
-    board = [option, str(photos.parent / f"{file}.json")]
-    out = str(photos.parent / "refused")  # the points found are noted there
-    said = refusal(
-        CliRunner().invoke(
-            commands,
-            [
-                "calibrate",
-                str(photos),
-                "--cameras",
-                cameras,
-                *board,
-                "--out",
-                out,
-                "--poses",
-                str(poses),
-            ],
-        )
-    )
+    board = (option, photos.parent / f"{file}.json")
+    out = photos.parent / "refused"  # the points found are noted there
+    given = ("--cameras", cameras, *board, "--out", out, "--poses", poses)
+    said = refused("calibrate", photos, *given)
     assert "contradict the robot" in said and words in said
 
 
@@ -364,11 +308,8 @@ def test_board_views_of_a_session(photos: Path, tmp_path: Path) -> None:
         own.add_view(View(index=k), load_image(photos / "left/000.png"), depth)
     write_json(tmp_path / "session/calibration/board.json", target_to_json(TABLE))
     held = str(photos.parent / "held.json")
-    result = CliRunner().invoke(
-        commands,
-        ["calibrate", str(tmp_path / "session"), "--cameras",
-         "wrist=hand,left=fixed,right=fixed", "--held-board", held],
-    )  # fmt: skip
+    cameras = ("--cameras", "wrist=hand,left=fixed,right=fixed")
+    result = invoked("calibrate", tmp_path / "session", *cameras, "--held-board", held)
     assert result.exit_code in {0, 1}, result.output
     found = read_cameras(tmp_path / "session/calibration/cameras/cameras.json")
     off = se3.invert(FIXED["left"]) @ found.camera("left").T

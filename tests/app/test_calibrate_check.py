@@ -6,17 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
-from realsim.app.cli import commands
 from realsim.app.register.files import write_result
 from realsim.arrays import Array
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import HandEye
 from realsim.store import SessionStore, save_hand_eye
 from registered_sessions import CAMERA, models_of, registered_by_hand, table_session
 from shared_sessions import copy_of
+from typed_commands import invoked, refused
 
 SLIP = np.array([0.004, -0.006, 0.002, 0.003, -0.001, 0.002])
 
@@ -29,7 +28,7 @@ def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def check(folder: Path, *options: str) -> Result:
-    return CliRunner().invoke(commands, ["calibrate", str(folder), "--check", *options])
+    return invoked("calibrate", folder, "--check", *options)
 
 
 def registered(pristine: Path, folder: Path, slip: Array) -> Path:
@@ -70,8 +69,7 @@ def test_what_cannot_be_checked_is_bad_input(pristine: Path, tmp_path: Path) -> 
         (tmp_path, "not a session"),
         (copy_of(pristine, tmp_path / "s"), "run `realsim register"),
     ):
-        done = check(folder)
-        assert isinstance(done.exception, InputError) and words in str(done.exception)
+        assert words in refused("calibrate", folder, "--check")
 
 
 def test_the_calibration_that_lies_there_now_is_checked(pristine: Path, tmp_path: Path) -> None:
@@ -111,5 +109,4 @@ def test_the_calibration_that_lies_there_now_is_checked(pristine: Path, tmp_path
 def test_options_that_would_not_be_looked_at_are_refused(
     pristine: Path, tmp_path: Path, options: list[str], words: str
 ) -> None:
-    done = CliRunner().invoke(commands, ["calibrate", str(pristine), *options])
-    assert isinstance(done.exception, InputError) and words in str(done.exception)
+    assert words in refused("calibrate", pristine, *options)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
 from realsim.app.calibrate.clock import (
     arm_at,
@@ -15,7 +15,6 @@ from realsim.app.calibrate.clock import (
     pair_pose_logs,
     read_logs,
 )
-from realsim.app.cli import commands
 from realsim.app.console import Console
 from realsim.arrays import Array
 from realsim.errors import InputError
@@ -25,6 +24,7 @@ from realsim.records import CameraIntrinsics, Chessboard
 from realsim_calibration import BoardView, detection_of, solve_pose_pairs
 from realsim_calibration.exports import read_calibration
 from realsim_calibration.results import Clock
+from typed_commands import invoked
 
 X_TRUE = se3.exp([0.1, -0.2, 0.7, 0.03, -0.05, 0.08])
 Z_TRUE = se3.from_rt(np.diag([1.0, -1, -1]), [0.4, 0.05, 0.0])
@@ -61,8 +61,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def calibrate(folder: Path, out: Path, *more: str) -> Result:
-    given = ["calibrate", str(folder), "--poses", "robot.csv", "--board-poses", "board.csv"]
-    return CliRunner().invoke(commands, [*given, "--out", str(out), *more])
+    given = ("--poses", "robot.csv", "--board-poses", "board.csv")
+    return invoked("calibrate", folder, *given, "--out", out, *more)
 
 
 def test_two_logs_are_joined_by_their_offset(logs: Path) -> None:

@@ -5,16 +5,15 @@ import shutil
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from pictured_folders import X, Z, pictures, save_pictures
 from pictured_targets import CAMERA, TARGETS, truth
 from realsim.app.calibrate.folder import FolderRequest, read_views, require_free_results
-from realsim.app.cli import commands
 from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_calibration import calibrate
+from typed_commands import invoked
 
 BOARD = "chessboard:7x6,square=20mm"
 
@@ -120,8 +119,8 @@ def test_results_that_are_half_replaced_have_no_page(tmp_path):
     (out / "calibrated_of.json").write_text(json.dumps({"images": str(tmp_path)}))
     (out / "calibration_report.html").write_text("of the earlier run")
     (out / "exports").write_text("no folder: nothing can be written in it")
-    words = [tmp_path, "--poses", "hand.json", "--board-poses", tmp_path / "board.json"]
-    done = CliRunner().invoke(commands, ["calibrate", *map(str, words), "--out", str(out)])
+    poses = ("--poses", "hand.json", "--board-poses", tmp_path / "board.json")
+    done = invoked("calibrate", tmp_path, *poses, "--out", out)
     assert isinstance(done.exception, OSError), done.output
     assert not (out / "calibration_report.html").exists()
 

@@ -5,12 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
 from realsim.app import cli
 from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.store import SessionStore
 from realsim.store.lock import only_run_in
+from typed_commands import invoked
 
 CAMERA = CameraIntrinsics(width=40, height=30, fx=40, fy=40, cx=19.5, cy=14.5)
 
@@ -29,7 +30,7 @@ def session(tmp_path: Path) -> Path:
 
 
 def run(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(cli.commands, ["check", *map(str, arguments)])
+    return invoked("check", *arguments)
 
 
 def main(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> object:

@@ -7,7 +7,6 @@ from typing import Any
 
 import click
 import pytest
-from click.testing import CliRunner
 
 from realsim.app.cli import commands
 from realsim.app.command import default_of, settable, spelling, walk
@@ -17,7 +16,7 @@ from realsim.app.config.template import template, toml_value
 from realsim.app.option_values import Numbers
 from realsim.app.outputs import OutputFile
 from realsim.errors import InputError
-from typed_commands import realsim
+from typed_commands import finished, realsim
 
 EVERY = walk(commands)
 
@@ -50,9 +49,7 @@ def refusal(text: str) -> str:
 
 
 def show(*args: str) -> dict[str, Any]:
-    result = CliRunner().invoke(commands, [*args, "--json"], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return json.loads(result.stdout)
+    return json.loads(finished(*args, "--json").stdout)
 
 
 def in_force(command: str, option: str, *before: str) -> tuple[Any, str]:
@@ -113,8 +110,7 @@ def views_of_a_run(*more: str) -> int | str:
     assert command is not None
     kept, command.callback = command.callback, lambda **options: seen.append(options["views"])
     try:
-        result = CliRunner().invoke(commands, ["register", "s", *more], catch_exceptions=False)
-        assert result.exit_code == 0, result.output
+        finished("register", "s", *more)
     finally:
         command.callback = kept
     return seen[0]

@@ -8,17 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from realsim.app import cli
 from realsim.app.check.dataset import checked_scenes
+from typed_commands import finished, invoked, realsim
 from upgradable_datasets import bop_dataset, graspnet_dataset
 
 SCENE = "test/000001"
-
-
-def check(folder: Path, *more: str) -> Result:
-    return CliRunner().invoke(cli.commands, ["check", str(folder), *more])
 
 
 @pytest.fixture(scope="module")
@@ -67,9 +62,7 @@ SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
 
 
 def test_exact_labels_agree(pristine: Path) -> None:
-    result = check(pristine)
-    assert result.exit_code == 0, result.output
-    assert "1 of 1 scenes agree" in result.output
+    assert "1 of 1 scenes agree" in finished("check", pristine).output
     (found,) = checked_scenes(pristine)
     assert [o.name for o in found.objects] == ["box", "wedge"]
     for o in found.objects:
@@ -84,15 +77,14 @@ def test_what_was_spoiled_is_named(case: str, pristine: Path, tmp_path: Path) ->
     shutil.copytree(pristine, root)
     spoil, told = SPOILED[case]
     spoil(root)
-    result = check(root)
+    result = invoked("check", root)
     assert result.exit_code == 1, result.output
     assert told in " ".join(result.output.split())
 
 
 def test_a_graspnet_tree_agrees_up_to_its_four_decimals(tmp_path: Path) -> None:
     root = graspnet_dataset(tmp_path / "dataset")
-    result = check(root)
-    assert result.exit_code == 0, result.output
+    finished("check", root)
     (found,) = checked_scenes(root)
     for o in found.objects:
         assert o.mask_iou is None, "GraspNet has no whole silhouettes"
@@ -100,8 +92,6 @@ def test_a_graspnet_tree_agrees_up_to_its_four_decimals(tmp_path: Path) -> None:
         assert o.depth_mm is not None and abs(o.depth_mm) < 1.0
 
 
-def test_a_data_set_is_not_repaired(pristine: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr("sys.argv", ["realsim", "check", str(pristine), "--repair"])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    assert end.value.code == 2 and "only sessions are repaired" in capsys.readouterr().err
+def test_a_data_set_is_not_repaired(pristine: Path) -> None:
+    done = realsim("check", pristine, "--repair")
+    assert done.returncode == 2 and "only sessions are repaired" in done.stderr

@@ -7,15 +7,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from realsim.app import cli
 from realsim.app.check.agreement import AgreementConfig, ObjectAgreement, SceneAgreement
 from realsim.app.check.checksums import check_checksums, checksum_list
 from realsim.app.check.dataset import checked_scenes
 from realsim.app.check.tally import MaskOverlap, Tally, agreement_of
 from realsim.errors import InputError
 from tests.support.bop_scenes import edit, write_boxes
+from typed_commands import finished, invoked
 
 IMAGES = (1, 5, 9, 13, 17, 21)
 CONFIG = AgreementConfig()
@@ -39,10 +38,6 @@ def checked(scene: Path) -> SceneAgreement:
 
 def faulty(found: SceneAgreement) -> dict[int, ObjectAgreement]:
     return {o.obj_id: o for o in found.objects if o.faults}
-
-
-def check(folder: Path, *more: str) -> Result:
-    return CliRunner().invoke(cli.commands, ["check", str(folder), *more])
 
 
 def test_sound_images_give_no_finding(scene: Path) -> None:
@@ -102,14 +97,18 @@ def test_a_hand_in_front_is_no_damage(scene: Path) -> None:
 
 def test_table_json_and_exit_code_say_the_same(scene: Path) -> None:
     edit(scene / "scene_gt.json", lambda rows: rows["9"][1]["cam_t_m2c"].__setitem__(0, 400.0))
-    result = check(scene, "--json")
+    result = invoked("check", scene, "--json")
     told = json.loads(result.output)
     assert result.exit_code == 1 and told["agrees"] is False and told["checksums"] is None
     by_id = {o["obj_id"]: o["faults"] for o in told["scenes"][0]["objects"]}
     # Also what the format's own check finds of an object stands with the object.
     assert any(f.startswith("scene_gt.json, image 9, object 1 (id 7)") for f in by_id[7])
     assert any("stands" in f for f in by_id[7])
-    table = [line for line in check(scene).output.splitlines() if "│" in line and " 7 " in line]
+    table = [
+        line
+        for line in invoked("check", scene).output.splitlines()
+        if "│" in line and " 7 " in line
+    ]
     assert table and table[0].rstrip(" │").endswith("no")
 
 
@@ -158,20 +157,20 @@ def summed(root: Path) -> Path:
 def test_files_are_held_against_their_checksums(scene: Path) -> None:
     root = summed(scene.parents[1])
     for folder in (root, scene.parent, scene):
-        told = json.loads(check(folder, "--json").output)
+        told = json.loads(invoked("check", folder, "--json").output)
         assert told["agrees"] and told["checksums"]["listed"] > 0
     colour = scene / "rgb/000009.png"
     colour.write_bytes(colour.read_bytes() + b"\0")
     (scene / "rgb/000013.png").unlink()
-    result = check(scene, "--json")
+    result = invoked("check", scene, "--json")
     report = json.loads(result.output)["checksums"]
     assert result.exit_code == 1
     assert report["changed"] == ["test/000003/rgb/000009.png"]
     assert report["missing"] == ["test/000003/rgb/000013.png"]
-    shown = " ".join(check(root).output.split())
+    shown = " ".join(invoked("check", root).output.split())
     assert "rgb/000009.png: other bytes" in shown and "rgb/000013.png: the file is" in shown
     # What lies beside the given folder is not its matter.
-    assert check(root / "models").exit_code == 0
+    finished("check", root / "models")
 
 
 @pytest.mark.parametrize("line", ["a" * 64 + "  ../secret", "no sum"])

@@ -5,43 +5,30 @@ import re
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from realsim.app.demonstrations import run as demonstrations
-from realsim.app.demonstrations.cli import demonstrations_command
 from realsim.app.demonstrations.run import DemonstrationRequest, open_source
-from realsim.errors import InputError
 from realsim_sim_bridge.demonstrations.lerobot_episodes import (
     GOAL,
     LeRobotDemonstrations,
     episode_columns,
 )
-from school_sessions import registered, tried_weakly
+from school_sessions import registered
+from typed_commands import finished, invoked
+from typed_commands import refused as refused_by
 
 SMALL = ("--fps", "4", "--width", "64", "--height", "48", "--limit", "3", "--quiet",
          "--episodes-per-file", "2")  # fmt: skip
 
 
-def demonstrate(*args):
-    return CliRunner().invoke(demonstrations_command, [str(a) for a in args])
-
-
 def refused(*args):
-    result = demonstrate(*args)
-    assert isinstance(result.exception, InputError), (result.output, result.exception)
-    return str(result.exception)
+    return refused_by("demonstrations", *args)
 
 
 @pytest.fixture(scope="module")
-def school(tmp_path_factory):
-    return tried_weakly(tmp_path_factory.mktemp("weak") / "session")
-
-
-@pytest.fixture(scope="module")
-def written(school, tmp_path_factory):
+def written(weak_school, tmp_path_factory):
     out = tmp_path_factory.mktemp("out") / "demos"
-    result = demonstrate(school, "--out", out, *SMALL)
-    assert result.exception is None, result.output
+    finished("demonstrations", weak_school, "--out", out, *SMALL)
     return out
 
 
@@ -52,12 +39,12 @@ def files_of(folder):
 
 
 @pytest.mark.slow
-def test_what_is_streamed_is_what_is_written(school, written):
+def test_what_is_streamed_is_what_is_written(weak_school, written):
     import av
     import pyarrow.parquet as pq
 
     request = DemonstrationRequest(fps=4, width=64, height=48, limit=3)
-    source = open_source(school, request, demonstrations.Console(quiet=True))
+    source = open_source(weak_school, request, demonstrations.Console(quiet=True))
     chosen = demonstrations.chosen_attempts(source, request)
     table = [r for f in sorted(written.glob("data/*/*.parquet"))
              for r in pq.read_table(f).to_pylist()]  # fmt: skip
@@ -104,7 +91,7 @@ def test_page_checksums_and_card_are_there(written):
 
 @pytest.mark.slow
 def test_an_interrupted_export_goes_on_and_gives_the_same_bytes(
-    school, written, tmp_path, monkeypatch
+    weak_school, written, tmp_path, monkeypatch
 ):
     asked, real = [], LeRobotDemonstrations.episode
 
@@ -116,26 +103,28 @@ def test_an_interrupted_export_goes_on_and_gives_the_same_bytes(
 
     with monkeypatch.context() as patch:
         patch.setattr(LeRobotDemonstrations, "episode", dying)
-        assert demonstrate(school, "--out", tmp_path / "demos", *SMALL).exit_code != 0
+        assert (
+            invoked("demonstrations", weak_school, "--out", tmp_path / "demos", *SMALL).exit_code
+            != 0
+        )
     other = (*SMALL[:1], "6", *SMALL[2:])
-    assert "another request" in refused(school, "--out", tmp_path / "demos", *other)
+    assert "another request" in refused(weak_school, "--out", tmp_path / "demos", *other)
 
     def counting(self, k):
         asked.append(k)
         return real(self, k)
 
     monkeypatch.setattr(LeRobotDemonstrations, "episode", counting)
-    result = demonstrate(school, "--out", tmp_path / "demos", *SMALL)
-    assert result.exception is None, result.output
+    finished("demonstrations", weak_school, "--out", tmp_path / "demos", *SMALL)
     assert asked == [0, 1, 2]
     assert files_of(tmp_path / "demos") == files_of(written)
-    assert "finished export" in refused(school, "--out", written)
+    assert "finished export" in refused(weak_school, "--out", written)
 
 
 @pytest.mark.slow
-def test_two_processes_write_the_same_bytes(school, written, tmp_path):
-    result = demonstrate(school, "--out", tmp_path / "demos", *SMALL[:-1], "2", "--workers", "2")
-    assert result.exception is None, result.output
+def test_two_processes_write_the_same_bytes(weak_school, written, tmp_path):
+    options = (*SMALL[:-1], "2", "--workers", "2")
+    finished("demonstrations", weak_school, "--out", tmp_path / "demos", *options)
     other, one = files_of(tmp_path / "demos"), files_of(written)
     data = [n for n in one if n.startswith(("data/", "videos/", "meta/", "realsim/"))]
     assert data
@@ -143,23 +132,25 @@ def test_two_processes_write_the_same_bytes(school, written, tmp_path):
 
 
 @pytest.mark.slow
-def test_requests_that_cannot_be_are_refused(school, tmp_path):
+def test_requests_that_cannot_be_are_refused(weak_school, tmp_path):
     out = ("--out", tmp_path / "demos")
-    assert "INSTANCE:GRASP" in refused(school, *out, "--grasp", "first")
-    assert "no grasp 77" in refused(school, *out, "--grasp", "0:77")
-    assert "even numbers" in refused(school, *out, "--width", "65")
-    assert "--view 3" in refused(school, *out, "--view", "3")
-    assert "no hand-eye calibration" in refused(school, *out, "--hand-eye")
-    assert "inside" in refused(school, "--out", school / "demos")
-    assert "weighs" in refused(school, *out, "--weighed", "cube=0.5", "--limit", "1")
+    assert "INSTANCE:GRASP" in refused(weak_school, *out, "--grasp", "first")
+    assert "no grasp 77" in refused(weak_school, *out, "--grasp", "0:77")
+    assert "even numbers" in refused(weak_school, *out, "--width", "65")
+    assert "--view 3" in refused(weak_school, *out, "--view", "3")
+    assert "no hand-eye calibration" in refused(weak_school, *out, "--hand-eye")
+    assert "inside" in refused(weak_school, "--out", weak_school / "demos")
+    assert "weighs" in refused(weak_school, *out, "--weighed", "cube=0.5", "--limit", "1")
 
 
 @pytest.mark.slow
-def test_a_grasp_that_the_arm_does_not_reach_is_refused_with_its_reason(school, tmp_path):
+def test_a_grasp_that_the_arm_does_not_reach_is_refused_with_its_reason(weak_school, tmp_path):
     request = DemonstrationRequest()
-    source = open_source(school, request, demonstrations.Console(quiet=True))
+    source = open_source(weak_school, request, demonstrations.Console(quiet=True))
     none = source.not_attempted[0]
-    words = refused(school, "--out", tmp_path / "d", "--grasp", f"{none.instance}:{none.grasp}")
+    words = refused(
+        weak_school, "--out", tmp_path / "d", "--grasp", f"{none.instance}:{none.grasp}"
+    )
     assert none.why in words
 
 

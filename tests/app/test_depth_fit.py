@@ -5,14 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from realsim.app.cli import commands
 from realsim.errors import InputError
 from realsim.images import depth_counts, png_bytes
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.stereo import StereoConfig
+from typed_commands import finished, invoked
 
 CAMERA = CameraIntrinsics(width=400, height=300, fx=380, fy=380, cx=199.5, cy=149.5)
 UNIT = 1e-4
@@ -35,13 +34,9 @@ def walls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def fit(*args: object) -> Result:
-    return CliRunner().invoke(commands, ["depth-fit", *map(str, args)])
-
-
 def refusal(*args: object) -> str:
     """Return the message of a run that has to be refused as the user's mistake."""
-    result = fit(*args)
+    result = invoked("depth-fit", *args)
     assert result.exit_code != 0
     assert isinstance(result.exception, InputError | SystemExit), result.exception
     return str(result.exception) + result.output
@@ -49,8 +44,7 @@ def refusal(*args: object) -> str:
 
 def test_a_folder_gives_a_sensor_that_is_what_it_was(walls: Path, tmp_path: Path) -> None:
     out = tmp_path / "sensor.json"
-    result = fit(walls, "--out", out, "--quiet")
-    assert result.exit_code == 0, result.output
+    result = finished("depth-fit", walls, "--out", out, "--quiet")
     found = DepthSensorModel.load(out)
     assert found.disparity_noise_px == pytest.approx(0.06, rel=0.05)
     assert found.depth_unit_m == UNIT and found.baseline_m == 0.018
@@ -65,8 +59,8 @@ def test_a_folder_gives_a_sensor_that_is_what_it_was(walls: Path, tmp_path: Path
 @pytest.mark.slow
 def test_the_stereo_camera_is_fitted_to_the_same_folder(walls: Path, tmp_path: Path) -> None:
     out = tmp_path / "stereo.json"
-    result = fit(walls, "--simulator", "stereo", "--out", out, "--quiet", "--only-views", "0-1")
-    assert result.exit_code == 0, result.output
+    options = ("--simulator", "stereo", "--only-views", "0-1", "--quiet")
+    result = finished("depth-fit", walls, *options, "--out", out)
     config = StereoConfig.load(out)
     frames = json.loads(out.read_text())["fit"]["frames"]
     assert len(frames) == 2 and config != StereoConfig()
@@ -120,8 +114,8 @@ def test_counts_in_arrays_are_taken_with_the_kinds_own_focal_length(tmp_path: Pa
     seen = model.measure(exact, camera, np.random.default_rng(0))
     np.save(tmp_path / "depth.npy", depth_counts(seen, UNIT))
     (tmp_path / "color.png").write_bytes(png_bytes(np.zeros((480, 640, 3), np.uint8)))
-    result = fit(tmp_path, "--out", tmp_path / "sensor.json", "--quiet")
-    assert result.exit_code == 0 and "386.3 px, is taken" in result.output, result.output
+    result = finished("depth-fit", tmp_path, "--out", tmp_path / "sensor.json", "--quiet")
+    assert "386.3 px, is taken" in result.output
     found = DepthSensorModel.load(tmp_path / "sensor.json")
     assert found.disparity_noise_px == pytest.approx(0.06, rel=0.1)
     assert found.whole_pixel_gain == pytest.approx(model.whole_pixel_gain, abs=0.1)

@@ -7,12 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from labelled_scenes import INTRINSICS, MODELS, labelled_scene
 from realsim import images
-from realsim.app.cli import commands
-from realsim.errors import InputError
 from realsim.formats.bop.models import load_models
 from realsim.formats.bop.opening import open_labelled_bop
 from realsim.formats.bop.root_files import write_bop_models, write_bop_root
@@ -21,22 +18,7 @@ from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspnet.annotations import read_objects
 from realsim.geometry.metrics import mask_iou
 from realsim.store import SessionStore
-
-
-def run(*args):
-    return CliRunner().invoke(commands, [str(a) for a in args], catch_exceptions=True)
-
-
-def done(*args):
-    result = run(*args)
-    assert result.exit_code == 0, (result.output, result.exception)
-    return result.output
-
-
-def refused(*args):
-    result = run(*args)
-    assert isinstance(result.exception, InputError), (result.output, result.exception)
-    return str(result.exception)
+from typed_commands import finished, refused
 
 
 def written_bop(folder, scene, **config):
@@ -83,8 +65,8 @@ def assert_same_scene(first, second):
 
 
 def test_bop_to_the_store_and_back_is_the_same_to_the_last_digit(bop, tmp_path):
-    done("import", bop, tmp_path / "session", "--quiet")
-    done("export", tmp_path / "session", "--to", "bop", "--out", tmp_path / "again", "--quiet")
+    finished("import", bop, tmp_path / "session", "--quiet")
+    finished("export", tmp_path / "session", "--to", "bop", "--out", tmp_path / "again", "--quiet")
     assert_same_scene(bop, tmp_path / "again")
     for name in ("models/obj_000007.ply", "models/models_info.json"):
         assert (bop / name).is_file() and (tmp_path / "again" / name).is_file()
@@ -93,9 +75,9 @@ def test_bop_to_the_store_and_back_is_the_same_to_the_last_digit(bop, tmp_path):
 def test_graspnet_to_the_store_and_back_keeps_every_digit_of_the_format(bop, tmp_path):
     first, second = tmp_path / "graspnet", tmp_path / "again"
     table = ("--table-is-world", "--quiet")
-    done("export", bop, "--to", "graspnet", "--out", first, *table)
-    done("import", first, tmp_path / "session", "--quiet")
-    done("export", tmp_path / "session", "--to", "graspnet", "--out", second, "--quiet")
+    finished("export", bop, "--to", "graspnet", "--out", first, *table)
+    finished("import", first, tmp_path / "session", "--quiet")
+    finished("export", tmp_path / "session", "--to", "graspnet", "--out", second, "--quiet")
     for part in ("annotations", "label", "depth", "rgb"):
         files = sorted(first.glob(f"scenes/*/*/{part}/*"))
         assert len(files) == 4
@@ -119,7 +101,7 @@ def test_sources_that_number_their_objects_alike_share_one_count(bop, tmp_path):
     mesh = models[changed].mesh
     models[changed] = replace(models[changed], mesh=replace(mesh, vertices=1.25 * mesh.vertices))
     other = written_bop(tmp_path / "other", replace(scene, models_by_id=models))
-    done("export", bop, other, "--to", "bop", "--out", tmp_path / "both", "--quiet")
+    finished("export", bop, other, "--to", "bop", "--out", tmp_path / "both", "--quiet")
     written = load_models(tmp_path / "both/models")
     assert set(written) == {*models, max(models) + 1}
     grown = written[max(models) + 1].mesh.vertices
@@ -133,7 +115,7 @@ def test_sources_that_number_their_objects_alike_share_one_count(bop, tmp_path):
 
 
 def test_labels_that_came_along_become_starts_and_are_never_overwritten(bop, tmp_path):
-    first = done("import", bop, tmp_path / "session", "--quiet")
+    first = finished("import", bop, tmp_path / "session", "--quiet").output
     store = SessionStore.open(tmp_path / "session")
     starts = store.read_json("registration/starts.json")["starts"]
     scene = open_labelled_bop(bop)
@@ -142,16 +124,16 @@ def test_labels_that_came_along_become_starts_and_are_never_overwritten(bop, tmp
         np.testing.assert_allclose(start["T_world_obj"], frame.T_world_cam @ o.T_cam_obj, atol=1e-9)
     before = (tmp_path / "session/imported/scene_gt.json").read_bytes()
     assert store.verify() == []
-    done("import", bop, tmp_path / "session", "--quiet")
+    finished("import", bop, tmp_path / "session", "--quiet")
     assert (tmp_path / "session/imported/scene_gt.json").read_bytes() == before
-    bare = done("import", bop, tmp_path / "bare", "--no-depth", "--quiet")
+    bare = finished("import", bop, tmp_path / "bare", "--no-depth", "--quiet").output
     assert "refines" in first and "refines" not in bare and "register` needs" in bare
 
 
 def test_the_sums_and_counts_on_the_card_are_those_of_the_folder(bop, tmp_path):
     (tmp_path / "s").mkdir()
     out = tmp_path / "out"
-    done("export", bop, "--to", "bop", "--out", out, "--licence", "CC BY 4.0", "--quiet")
+    finished("export", bop, "--to", "bop", "--out", out, "--licence", "CC BY 4.0", "--quiet")
     card = (out / "README.md").read_text()
     assert "| images and labels | CC BY 4.0 |" in card
     assert "| object models | not stated" in card
@@ -198,7 +180,7 @@ def masks_of(root, index, k, kind="mask_visib"):
 
 
 def test_bop_is_what_a_pinhole_reader_renders_of_its_poses(bent, tmp_path):
-    done("export", bent, "--to", "bop", "--out", tmp_path / "plain", "--quiet")
+    finished("export", bent, "--to", "bop", "--out", tmp_path / "plain", "--quiet")
     row = json.loads(next(tmp_path.glob("plain/*/*/scene_camera.json")).read_text())["0"]
     assert "cam_distortion" not in row and row["cam_K"] == INTRINSICS.K.ravel().tolist()
     ideal = labelled_scene(tmp_path / "ideal", [0, 1, 2])  # cast by the ideal camera
@@ -221,12 +203,14 @@ def test_bop_is_what_a_pinhole_reader_renders_of_its_poses(bent, tmp_path):
 
 def test_a_lens_that_is_kept_says_what_it_costs(bent, tmp_path):
     card = "README.md"
-    done("export", bent, "--to", "bop", "--out", tmp_path / "raw", "--keep-distortion", "--quiet")
+    finished(
+        "export", bent, "--to", "bop", "--out", tmp_path / "raw", "--keep-distortion", "--quiet"
+    )
     assert_same_scene(bent, tmp_path / "raw")
     said = (tmp_path / "raw" / card).read_text()
     assert "the lens is kept" in said and "visible masks compared have an IoU below 0.99" in said
     args = ("export", bent, "--to", "graspnet", "--table-is-world", "--quiet", "--out")
-    done(*args, tmp_path / "g")
+    finished(*args, tmp_path / "g")
     assert "the lens is kept" not in (tmp_path / "g" / card).read_text()
     # The straight edge of a box is straight again: its mask is that of an ideal camera.
     ideal = labelled_scene(tmp_path / "ideal", [0, 1, 2])
@@ -242,7 +226,7 @@ def test_masks_of_objects_without_a_mesh_are_resampled_and_said_to_be(bent, tmp_
     bare = shutil.copytree(bent, tmp_path / "bare")
     for name in ("models", "models_eval"):
         shutil.rmtree(bare / name)
-    done("export", bare, "--to", "bop", "--out", tmp_path / "out", "--quiet")
+    finished("export", bare, "--to", "bop", "--out", tmp_path / "out", "--quiet")
     assert "[1, 7, 30] have resampled masks" in (tmp_path / "out/README.md").read_text()
     ideal = labelled_scene(tmp_path / "ideal", [0, 1, 2])
     assert mask_iou(masks_of(tmp_path / "out", 0, 1), ideal.masks[0, 1, True]) > 0.95
@@ -252,9 +236,9 @@ def test_cameras_go_out_and_come_back(bop, tmp_path):
     before = open_labelled_bop(bop)
     for target, options in (("colmap", ("--scale", "1")), ("nerfstudio", ())):
         out = tmp_path / target
-        done("export", bop, "--to", target, "--out", out, "--quiet")
+        finished("export", bop, "--to", target, "--out", out, "--quiet")
         scene = next(p for p in out.iterdir() if p.is_dir())
-        done("import", scene, tmp_path / f"{target}_session", *options, "--quiet")
+        finished("import", scene, tmp_path / f"{target}_session", *options, "--quiet")
         views = SessionStore.open(tmp_path / f"{target}_session").session.views
         assert len(views) == len(before.indices)
         for v, i in zip(views, before.indices, strict=True):
@@ -267,10 +251,10 @@ def test_labels_that_are_no_reference_say_so_wherever_they_go(bop, tmp_path):
     rough = shutil.copytree(bop, tmp_path / "rough")
     for file in rough.glob("*/*/scene_gt.json"):
         file.rename(file.with_name("scene_gt_approximate.json"))
-    result = run("import", rough, tmp_path / "session", "--quiet")
-    assert result.exit_code == 0 and "only a rough start" in " ".join(result.output.split())
+    result = finished("import", rough, tmp_path / "session", "--quiet")
+    assert "only a rough start" in " ".join(result.output.split())
     for source, out in ((tmp_path / "session", "a"), (rough, "b")):
-        done("export", source, "--to", "bop", "--out", tmp_path / out, "--quiet")
+        finished("export", source, "--to", "bop", "--out", tmp_path / out, "--quiet")
         assert "only a rough start" in (tmp_path / out / "README.md").read_text()
 
 
@@ -278,7 +262,7 @@ def test_an_import_makes_up_no_camera_pose_for_the_data_set(bop, tmp_path):
     scene = labelled_scene(tmp_path / "images", [4])
     scene.change_frames(T_world_cam=None)
     written_bop(tmp_path / "bop", scene)
-    done("import", tmp_path / "bop", tmp_path / "session", "--quiet")
-    done("export", tmp_path / "session", "--to", "bop", "--out", tmp_path / "again", "--quiet")
+    finished("import", tmp_path / "bop", tmp_path / "session", "--quiet")
+    finished("export", tmp_path / "session", "--to", "bop", "--out", tmp_path / "again", "--quiet")
     assert_same_scene(tmp_path / "bop", tmp_path / "again")
     assert "cam_R_w2c" not in next(tmp_path.glob("again/*/*/scene_camera.json")).read_text()

@@ -2,26 +2,15 @@
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from realsim.app.annotate.current import annotate_session
-from realsim.app.cli import commands
 from realsim.app.console import Console
-from realsim.errors import InputError
 from realsim.formats.graspnet.grasp_group import read_grasp_group
 from realsim.formats.session_scene import open_session_scene
 from realsim.store import SessionStore, load_grasps, load_scene, save_grasps
 from synthetic_scenes import captured_session
 from tried_grasps import tried_set
-
-
-def run(*args):
-    return CliRunner().invoke(commands, [str(a) for a in args])
-
-
-def done(*args):
-    result = run(*args)
-    assert result.exit_code == 0, (result.output, result.exception)
+from typed_commands import finished, refused
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +24,7 @@ def session(tmp_path_factory):
 
 
 def test_grasps_of_a_frame_are_in_its_camera(session, tmp_path):
-    done("export", session, "--to", "grasp-group", "--out", tmp_path / "out", "--quiet")
+    finished("export", session, "--to", "grasp-group", "--out", tmp_path / "out", "--quiet")
     sets = load_grasps(SessionStore.open(session))
     scene = open_session_scene(SessionStore.open(session))
     for index in scene.indices:
@@ -53,9 +42,9 @@ def test_grasps_of_a_frame_are_in_its_camera(session, tmp_path):
 
 
 def test_grasps_are_of_sessions(session, tmp_path):
-    done("export", session, "--to", "bop", "--out", tmp_path / "bop", "--quiet")
-    result = run("export", tmp_path / "bop", "--to", "hdf5", "--out", tmp_path / "o")
-    assert isinstance(result.exception, InputError) and "is no session" in str(result.exception)
+    finished("export", session, "--to", "bop", "--out", tmp_path / "bop", "--quiet")
+    hdf5 = ("--to", "hdf5", "--out", tmp_path / "o")
+    assert "is no session" in refused("export", tmp_path / "bop", *hdf5)
     assert not (tmp_path / "o").exists()
-    result = run("export", session, "--to", "hdf5", "--out", tmp_path / "o", "--least-score", "0.5")
-    assert "says nothing of realsim HDF5" in str(result.exception)
+    said = refused("export", session, *hdf5, "--least-score", "0.5")
+    assert "says nothing of realsim HDF5" in said

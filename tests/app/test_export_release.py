@@ -6,15 +6,14 @@ import tarfile
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from labelled_scenes import labelled_scene
 from realsim import images
-from realsim.app.cli import commands
 from realsim.formats.bop.labels import mask_of
 from realsim.formats.bop.root_files import write_bop_models, write_bop_root
 from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
 from realsim.formats.export_folder import ExportFolder
+from typed_commands import finished
 
 
 @pytest.fixture(scope="module")
@@ -26,9 +25,8 @@ def release(tmp_path_factory):
     write_bop_models(scene.models(), folder)
     write_bop_root(folder, name="three boxes")
     folder.finish({})
-    words = ("export", home / "source", "--to", "bop", "--shards", "--out", home / "out", "--quiet")
-    result = CliRunner().invoke(commands, [str(w) for w in words], catch_exceptions=False)
-    assert result.exit_code == 0
+    to = ("--to", "bop", "--shards", "--out", home / "out")
+    finished("export", home / "source", *to, "--quiet")
     return home / "out"
 
 

@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from realsim.app.cli import commands
-from realsim.errors import InputError
 from realsim.formats.graspit.scene import read_graspit_scene
 from school_sessions import registered, scene
+from typed_commands import finished, refused
 
 
 @pytest.fixture(scope="module")
@@ -16,9 +14,7 @@ def session(tmp_path_factory):
 
 
 def exported(session, target, out):
-    args = ["export", session, "--to", target, "--out", out, "--quiet"]
-    result = CliRunner().invoke(commands, [str(a) for a in args])
-    assert result.exit_code == 0, (result.output, result.exception)
+    finished("export", session, "--to", target, "--out", out, "--quiet")
     return out / "scene_000007"
 
 
@@ -45,7 +41,5 @@ def test_the_authors_scene_is_read_back(session, tmp_path):
 
 
 def test_a_scene_without_views_is_no_data_set(session, tmp_path):
-    args = ["export", session, "--to", "bop", "--out", tmp_path / "o"]
-    result = CliRunner().invoke(commands, [str(a) for a in args])
-    assert isinstance(result.exception, InputError) and "no views" in str(result.exception)
+    assert "no views" in refused("export", session, "--to", "bop", "--out", tmp_path / "o")
     assert not (tmp_path / "o").exists()

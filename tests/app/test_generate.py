@@ -10,10 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
-from realsim.app.generate.cli import generate_command
-from realsim.errors import InputError
+from typed_commands import finished, invoked, refused
 
 SMALL = ("--views", "2", "--size", "160x90", "--objects", "2-3", "--seed", "5", "--workers", "1",
          "--depth", "disparity", "--quiet")  # fmt: skip
@@ -29,13 +28,11 @@ UNREPEATED = (
 
 
 def _run(out: Path, *arguments: str) -> Result:
-    return CliRunner().invoke(generate_command, [str(out), *arguments])
+    return invoked("generate", out, *arguments)
 
 
 def _refusal(out: Path, *arguments: str) -> str:
-    result = _run(out, *SMALL, *arguments)
-    assert isinstance(result.exception, InputError), result.output
-    return str(result.exception)
+    return refused("generate", out, *SMALL, *arguments)
 
 
 def _content(folder: Path) -> dict[str, str]:
@@ -51,8 +48,7 @@ def _content(folder: Path) -> dict[str, str]:
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("generate") / "out"
-    result = _run(out, *SMALL, "--scenes", "1")
-    assert result.exit_code == 0, result.output + repr(result.exception)
+    finished("generate", out, *SMALL, "--scenes", "1")
     return out
 
 
@@ -84,8 +80,7 @@ def test_a_finished_scene_is_kept_and_a_view_that_is_missing_is_made_again(
     out = tmp_path / "copy"
     shutil.copytree(dataset, out)
     before = _content(out)
-    result = _run(out, *SMALL, "--scenes", "1")
-    assert "kept" in result.output
+    assert "kept" in _run(out, *SMALL, "--scenes", "1").output
     assert _content(out) == before
     # What a registration made of the labels is not told as what was generated.
     labels = out / "scene_000000/scene_gt_info.json"
@@ -93,14 +88,12 @@ def test_a_finished_scene_is_kept_and_a_view_that_is_missing_is_made_again(
     rows["0"][0]["visib_fract"] = 0.123
     labels.write_text(json.dumps(rows))
     written = {n: (out / n).read_bytes() for n in ("dataset.json", "index.html")}
-    assert _run(out, *SMALL, "--scenes", "1").exit_code == 0
+    finished("generate", out, *SMALL, "--scenes", "1")
     assert {n: (out / n).read_bytes() for n in written} == written
     shutil.copyfile(dataset / "scene_000000/scene_gt_info.json", labels)
     for name in ("rgb/000001.png", "annotations/000001.json"):
         (out / "scene_000000" / name).unlink()
-    result = _run(out, *SMALL, "--scenes", "1")
-    assert result.exit_code == 0, result.output + repr(result.exception)
-    assert "made" in result.output
+    assert "made" in finished("generate", out, *SMALL, "--scenes", "1").output
     # The list of views is only ever added to: the view that was taken again is there twice.
     lines = "scene_000000/robot.jsonl"
     assert {k: v for k, v in _content(out).items() if k != lines} == {
@@ -120,12 +113,10 @@ def test_a_run_that_is_killed_goes_on_to_the_bytes_that_seed_and_number_make(
             time.sleep(0.02)
         process.kill()
     assert process.returncode == -signal.SIGKILL
-    result = _run(out, *arguments, "--workers", "2")
-    assert result.exit_code == 0, result.output + repr(result.exception)
+    finished("generate", out, *arguments, "--workers", "2")
     assert _content(out / "scene_000000") == _content(dataset / "scene_000000")
     more = shutil.copytree(dataset, tmp_path / "more")  # the other tests' dataset keeps its scene
-    result = _run(more, *arguments)
-    assert result.exit_code == 0, result.output + repr(result.exception)
+    finished("generate", more, *arguments)
     assert _content(out) == _content(more)
 
 

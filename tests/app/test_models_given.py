@@ -3,10 +3,8 @@
 import shutil
 
 import pytest
-from click.testing import CliRunner
 
 from labelled_scenes import MODELS, labelled_scene
-from realsim.app.cli import commands
 from realsim.app.console import Console
 from realsim.app.school.inputs import SchoolRequest, read_inputs
 from realsim.app.upgrade.dataset import UpgradeConfig, open_scene, scenes_of
@@ -15,6 +13,7 @@ from realsim.errors import InputError
 from realsim.formats.bop.models import load_models, save_models
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
+from typed_commands import finished, refused
 
 
 @pytest.fixture(scope="module")
@@ -34,10 +33,6 @@ def frame(tmp_path_factory):
     return image
 
 
-def run(*args):
-    return CliRunner().invoke(commands, [str(a) for a in args], catch_exceptions=True)
-
-
 def school_of(frame, out, models):
     return read_inputs(frame, out, SchoolRequest(models=models), Console(quiet=True))
 
@@ -48,25 +43,23 @@ def upgrade_of(frame, models):
 
 
 def test_every_command_says_what_to_give(frame, tmp_path):
-    imported = run("import", frame, tmp_path / "s", "--quiet")
-    said = " ".join(imported.output.split())
-    assert imported.exit_code == 0 and "register" in said
+    said = " ".join(finished("import", frame, tmp_path / "s", "--quiet").output.split())
+    assert "register" in said
     for ask in (lambda: school_of(frame, tmp_path / "o", None), lambda: upgrade_of(frame, None)):
         with pytest.raises(InputError) as error:
             ask()
         assert "000, 006, 029" in str(error.value) and "--models FOLDER" in str(error.value)
     assert "000, 006, 029" in said and "--models FOLDER" in said
-    wrong = run("import", frame, tmp_path / "t", "--models", frame, "--quiet").exception
-    assert isinstance(wrong, InputError) and "none of them" in str(wrong)
+    wrong = refused("import", frame, tmp_path / "t", "--models", frame, "--quiet")
+    assert "none of them" in wrong
     assert not (tmp_path / "t").exists()
 
 
 @pytest.mark.parametrize("layout", ["as_graspnet", "as_bop"])
 def test_meshes_that_are_given_go_through_all_commands(frame, tmp_path, layout):
     models, session = frame.parent / layout, tmp_path / "s"
-    assert run("import", frame, session, "--quiet").exit_code == 0
-    again = run("import", frame, session, "--models", models, "--quiet")
-    assert again.exit_code == 0, (again.output, again.exception)
+    finished("import", frame, session, "--quiet")
+    finished("import", frame, session, "--models", models, "--quiet")
     assert load_models(session / "models").keys() == MODELS.keys()
     tried = school_of(frame, tmp_path / "o", models)
     assert sorted(o.obj_id for o in tried.scene.objects) == sorted(MODELS)

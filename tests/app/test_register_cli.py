@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
 from realsim.app import stages
-from realsim.app.cli import commands
 from realsim.app.console import Console
 from realsim.app.register.config import RegisterRequest, config_of, load_depth_bias
 from realsim.app.register.inputs import read_inputs
@@ -25,24 +24,15 @@ from realsim.registration.odometry.hand_held import HandHeldConfig, hand_held_po
 from realsim.store import SessionStore
 from registered_sessions import models_of, table_session, true_poses
 from shared_sessions import copy_of
+from typed_commands import finished, invoked, refused
 
 QUIET = Console(quiet=True)
 
 
-def run(*args: object) -> Result:
-    """Run the command in this process."""
-    return CliRunner().invoke(commands, ["register", *map(str, args), "--quiet"])
-
-
 @pytest.fixture(scope="module")
-def few(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return table_session(tmp_path_factory.mktemp("few") / "s", views=4).folder
-
-
-@pytest.fixture(scope="module")
-def registered(few: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
+def registered(few_views: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
     """A session of four views registered from rough starts, and what the command said."""
-    folder = copy_of(few, tmp_path_factory.mktemp("registered") / "s")
+    folder = copy_of(few_views, tmp_path_factory.mktemp("registered") / "s")
     store = SessionStore.open(folder)
     off = se3.exp(np.array([0.1, -0.1, 0.15, 0.006, -0.004, 0.005]))
     starts = [
@@ -50,7 +40,7 @@ def registered(few: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
         for o in true_poses()
     ]
     stages.save_starts(store, starts, "test")
-    return folder, run(folder)
+    return folder, invoked("register", folder, "--quiet")
 
 
 @pytest.fixture
@@ -81,17 +71,16 @@ def test_objects_are_found_and_everything_is_written(registered: tuple[Path, Res
 
 
 def test_a_second_run_computes_nothing_and_starts_from_the_claimed_cameras(
-    registered: tuple[Path, Result], few: Path
+    registered: tuple[Path, Result], few_views: Path
 ) -> None:
     folder, first = registered
     store = SessionStore.open(folder)
-    claimed = cameras_now(SessionStore.open(few))
+    claimed = cameras_now(SessionStore.open(few_views))
     assert all(np.array_equal(claimed_cameras(store)[k], claimed[k]) for k in claimed)
     refined = cameras_now(store)
     assert not np.array_equal(refined[0], claimed[0])
     before = {p: p.stat().st_mtime_ns for p in folder.rglob("*.json")}
-    again = run(folder)
-    assert again.output == first.output
+    assert invoked("register", folder, "--quiet").output == first.output
     assert {p: p.stat().st_mtime_ns for p in folder.rglob("*.json")} == before
     # A calibration that sets the same claims again does not undo the refinement.
     store.set_cameras(store.session.intrinsics, claimed)
@@ -101,10 +90,8 @@ def test_a_second_run_computes_nothing_and_starts_from_the_claimed_cameras(
 
 
 def test_nothing_said_names_the_three_ways(session: Path) -> None:
-    error = run(session).exception
-    assert isinstance(error, InputError)
-    for way in ("--object", "starts.json", "--find-all"):
-        assert way in str(error)
+    said = refused("register", session)
+    assert all(way in said for way in ("--object", "starts.json", "--find-all"))
     assert not (session / "registration").exists()
 
 
@@ -118,22 +105,21 @@ def test_nothing_said_names_the_three_ways(session: Path) -> None:
     ],
 )
 def test_what_cannot_be_used_is_named(session: Path, options: list[str], words: str) -> None:
-    error = run(session, *options).exception
-    assert isinstance(error, InputError) and words in str(error)
+    assert words in refused("register", session, *options)
 
 
 def test_a_flat_model_is_named_and_stays_out_of_the_session(session: Path, tmp_path: Path) -> None:
     corners = np.array([[0.0, 0, 0], [0.09, 0, 0], [0.09, 0.06, 0], [0, 0.06, 0]])
     sheet = Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
     save_models(tmp_path / "lib", {50: ObjectModel(obj_id=50, name="sheet", mesh=sheet)})
-    error = run(session, "--library", tmp_path / "lib", "--object", 50).exception
-    assert isinstance(error, InputError) and "object 50" in str(error) and "flat" in str(error)
+    said = refused("register", session, "--library", tmp_path / "lib", "--object", 50)
+    assert "object 50" in said and "flat" in said
     assert not list(session.glob("models/*000050*"))
 
 
 def test_a_wrong_number_of_views_is_refused(session: Path) -> None:
     for views in ("0", "-3", "some", "1.5"):
-        result = run(session, "--object", "mug", "--views", views)
+        result = invoked("register", session, "--object", "mug", "--views", views)
         assert result.exit_code == 2 and views in result.output
 
 
@@ -169,11 +155,10 @@ def test_a_scene_that_no_registration_made_is_kept(
     folder = copy_of(registered[0], tmp_path / "s")
     exact = (folder / "registration/scene.json").read_bytes()
     (folder / "stages/register.json").unlink()
-    again = run(folder)
-    assert again.exit_code == 0, again.output
+    finished("register", folder, "--quiet")
     assert (folder / "registration/earlier/scene_001.json").read_bytes() == exact
     (folder / "stages/register.json").unlink()  # and the same once more: it is kept once
-    assert run(folder).exit_code == 0
+    finished("register", folder, "--quiet")
     assert len(list((folder / "registration/earlier").iterdir())) == 1
 
 

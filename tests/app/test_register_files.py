@@ -22,21 +22,15 @@ from realsim.app.register.results import (
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectPose, bop_units
 from realsim.store import SessionStore
-from registered_sessions import models_of, registered_by_hand, table_session
+from registered_sessions import models_of, registered_by_hand
 from shared_sessions import copy_of
 
 MODELS = models_of()
 
 
-@pytest.fixture(scope="module")
-def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A session of four views whose cameras are a little off."""
-    return table_session(tmp_path_factory.mktemp("files") / "s", views=4).folder
-
-
 @pytest.fixture
-def store(pristine: Path, tmp_path: Path) -> SessionStore:
-    return SessionStore.open(copy_of(pristine, tmp_path / "s"))
+def store(few_views: Path, tmp_path: Path) -> SessionStore:
+    return SessionStore.open(copy_of(few_views, tmp_path / "s"))
 
 
 def moved(result: Registered, by_m: float) -> Registered:
@@ -133,12 +127,12 @@ def state_of(store: SessionStore, paths: list[str]) -> dict[str, bytes]:
 
 
 def test_a_kill_between_any_two_files_leaves_the_old_or_the_new_state(
-    pristine: Path, tmp_path: Path
+    few_views: Path, tmp_path: Path
 ) -> None:
     states: list[dict[str, bytes]] = []
     seen: set[int] = set()
     for n in range(40):
-        store = SessionStore.open(copy_of(pristine, folder := tmp_path / str(n)))
+        store = SessionStore.open(copy_of(few_views, folder := tmp_path / str(n)))
         old = registered_by_hand(store)
         new = moved(old, 0.01)
         paths = list(documents(old, store, MODELS))

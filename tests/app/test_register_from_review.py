@@ -5,22 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
 from realsim.app import stages
-from realsim.app.register.cli import register_command
 from realsim.geometry import se3
 from realsim.records import ObjectPose
 from realsim.review import journal
 from realsim.review.corrections import decision_on
 from realsim.store import SessionStore, load_scene
 from shared_sessions import copy_of
+from typed_commands import finished, invoked, refused
 
 OFF = se3.exp(np.array([0.05, -0.05, 0.1, 0.004, -0.003, 0.005]))
-
-
-def run(*args: object) -> Result:
-    return CliRunner().invoke(register_command, [*map(str, args), "--quiet"])
 
 
 @pytest.fixture
@@ -36,9 +31,10 @@ def say(store: SessionStore, action: journal.Action, placed: ObjectPose | None, 
 
 
 def test_without_a_review_the_command_says_how_to_get_one(session: SessionStore) -> None:
-    result = run(session.folder, "--from-review")
-    assert "journal is empty" in str(result.exception) and "realsim review" in str(result.exception)
-    assert "leave --object" in str(run(session.folder, "--from-review", "--object", "1").exception)
+    said = refused("register", session.folder, "--from-review")
+    assert "journal is empty" in said and "realsim review" in said
+    both = refused("register", session.folder, "--from-review", "--object", "1")
+    assert "leave --object" in both
 
 
 def test_moved_rejected_and_excluded_are_what_comes_out(session: SessionStore) -> None:
@@ -48,8 +44,7 @@ def test_moved_rejected_and_excluded_are_what_comes_out(session: SessionStore) -
     move = say(session, "move", first, pose=first.T_world_obj @ OFF, how="gizmo")
     reject = say(session, "reject", second, comment="it is gone")
     exclude = say(session, "exclude", None, view=2, comment="blurred")
-    result = run(session.folder, "--from-review", "--json")
-    assert result.exit_code == 0, result.output
+    result = finished("register", session.folder, "--from-review", "--json", "--quiet")
     said = json.loads(result.stdout[result.stdout.index("{") :])
     assert {o["instance"] for o in said["objects"]} == {
         o.instance for o in before.objects if o.instance != second.instance
@@ -68,7 +63,7 @@ def test_moved_rejected_and_excluded_are_what_comes_out(session: SessionStore) -
     assert set(kept["applied"]) == {move.id, reject.id, exclude.id}
     assert SessionStore.open(session.folder).verify() == []
     scene = session.path("registration/scene.json").read_bytes()
-    assert run(session.folder, "--from-review").exit_code == 0
+    finished("register", session.folder, "--from-review", "--quiet")
     assert session.path("registration/scene.json").read_bytes() == scene
     assert len(list(session.path("registration/earlier").iterdir())) == 1
     assert stages.registered_views(session) == [0, 1, 3, 4, 5, 6, 7]
@@ -103,7 +98,7 @@ def test_an_acceptance_outlives_a_registration_to_the_same_place_and_no_other(
     say(session, "reject", ObjectPose(obj_id=1, instance=77, T_world_obj=np.eye(4)))
     with session.path(journal.JOURNAL_FILE).open("ab") as file:
         file.write(b'{"torn\n')
-    result = run(session.folder, "--from-review", "--json")
+    result = invoked("register", session.folder, "--from-review", "--json", "--quiet")
     words = [f["words"] for f in json.loads(result.stdout[result.stdout.index("{") :])["findings"]]
     told = [w for w in words if f"instance {second.instance} was accepted by ada" in w]
     assert len(told) == 1 and "look at it again" in told[0]
@@ -122,7 +117,7 @@ def test_a_swap_to_an_object_without_a_model_is_refused_before_anything_is_writt
     first = load_scene(session).objects[0]
     before = session.path("registration/scene.json").read_bytes()
     say(session, "swap", first, pose=first.T_world_obj, obj_id=999)
-    assert "999" in str(run(session.folder, "--from-review").exception)
+    assert "999" in refused("register", session.folder, "--from-review")
     assert session.path("registration/scene.json").read_bytes() == before
     assert not session.path("registration/earlier").exists()
 
@@ -130,5 +125,5 @@ def test_a_swap_to_an_object_without_a_model_is_refused_before_anything_is_writt
 def test_a_journal_of_damage_alone_is_not_taken_for_none(session: SessionStore) -> None:
     session.path("review").mkdir()
     session.path(journal.JOURNAL_FILE).write_bytes(b"\x00\xff\n\x01\n")
-    said = str(run(session.folder, "--from-review").exception)
+    said = refused("register", session.folder, "--from-review")
     assert "line 1, 2 of" in said and "empty" not in said

@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,15 +18,14 @@ from realsim.geometry import camera, se3
 from realsim.geometry.parts import part
 from realsim.records import CameraIntrinsics, ObjectPose
 from realsim.store import SessionStore
-from registered_sessions import CAMERA, models_of, registered_by_hand, table_session
+from registered_sessions import CAMERA, models_of, registered_by_hand
 
 MODELS = models_of()
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> SessionStore:
-    """A session of four views whose cameras are a little off."""
-    return table_session(tmp_path_factory.mktemp("pictures") / "s", views=4)
+def store(few_views: Path) -> SessionStore:
+    return SessionStore.open(few_views)
 
 
 @pytest.fixture(scope="module")

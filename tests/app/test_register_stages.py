@@ -16,14 +16,7 @@ from realsim.app.stages import judged_scene, registered_views
 from realsim.records import CaptureSession, Mesh, View
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore, atomic
-from registered_sessions import (
-    CAMERA,
-    models_of,
-    registered_by_hand,
-    table_session,
-    true_cameras,
-    true_poses,
-)
+from registered_sessions import CAMERA, models_of, registered_by_hand, true_cameras, true_poses
 from shared_sessions import copy_of
 
 MODELS = models_of()
@@ -31,15 +24,9 @@ VIEWS = 5
 QUIET = Console(quiet=True)
 
 
-@pytest.fixture(scope="module")
-def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A session of four views whose cameras are a little off."""
-    return table_session(tmp_path_factory.mktemp("stages") / "s", views=4).folder
-
-
 @pytest.fixture
-def store(pristine: Path, tmp_path: Path) -> SessionStore:
-    return SessionStore.open(copy_of(pristine, tmp_path / "s"))
+def store(few_views: Path, tmp_path: Path) -> SessionStore:
+    return SessionStore.open(copy_of(few_views, tmp_path / "s"))
 
 
 def test_views_that_were_left_out_get_no_labels_and_are_named(store: SessionStore) -> None:

@@ -5,12 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from realsim import CameraIntrinsics, InputError, Mesh
 from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
-from realsim.app.render.cli import render_command
 from realsim.app.render.compare import label_ids, rim_distances_px
 from realsim.app.render.light import linear_of, neutral_environment, upright
 from realsim.app.render.request import RenderRequest, resized
@@ -21,6 +19,7 @@ from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.photo import PhotoRenderer
 from realsim.store import SessionStore, save_scene
 from synthetic_scenes import INTRINSICS, MODELS, captured_session, rejected, two_boxes
+from typed_commands import finished
 
 QUIET = Console(quiet=True)
 
@@ -76,11 +75,9 @@ def the_result_is_a_sound_session_with_sheet_and_page(real, twin):
 def test_new_views_see_the_objects_at_the_asked_size(real, tmp_path):
     model = DepthSensorModel.noiseless()
     (tmp_path / "fit.json").write_text(json.dumps(model.document()))
-    arguments = [str(real.folder), "--views", "2", "--size", "120x100", "--radius", "0.3-0.4",
-                 "--material", "table=cork", "--depth-model", str(tmp_path / "fit.json"),
-                 "--workers", "1", "--quiet", "--out", str(tmp_path / "new")]  # fmt: skip
-    result = CliRunner().invoke(render_command, arguments, catch_exceptions=False)
-    assert result.exit_code == 0
+    finished("render", real.folder, "--views", "2", "--size", "120x100", "--radius", "0.3-0.4",
+             "--material", "table=cork", "--depth-model", tmp_path / "fit.json",
+             "--workers", "1", "--quiet", "--out", tmp_path / "new")  # fmt: skip
     store = SessionStore.open(tmp_path / "new")
     assert (store.session.intrinsics.width, store.session.intrinsics.height) == (120, 100)
     center = np.mean([o.T_world_obj[:3, 3] for o in two_boxes().objects], axis=0)

@@ -6,10 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from realsim.app.register.files import write_result
-from realsim.app.report.cli import report_command
 from realsim.app.report.compare import (
     Difference,
     ObjectDifference,
@@ -24,6 +22,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from registered_sessions import models_of, registered_by_hand, table_session
+from typed_commands import finished, invoked, refused
 
 SHIFT_M = 0.004
 
@@ -154,19 +153,17 @@ def test_what_is_no_report_is_refused(tmp_path: Path) -> None:
 
 
 def test_exit_codes_and_json_of_a_comparison(folders: dict[str, Path], tmp_path: Path) -> None:
-    runner = CliRunner()
-    a, b = str(folders["a"]), str(folders["b"])
-    done = runner.invoke(report_command, [a, b, "--quiet"])
-    assert (done.exit_code, done.stdout) == (0, "")
-    done = runner.invoke(report_command, [a, b, "--json", "--quiet", "--fail-if-worse"])
+    a, b = folders["a"], folders["b"]
+    assert finished("report", a, b, "--quiet").stdout == ""
+    done = invoked("report", a, b, "--json", "--quiet", "--fail-if-worse")
     assert done.exit_code == 1 and "registration.views_used" in done.stderr
     document = json.loads(done.stdout)
     assert document["failed"] and len(document["sessions"]) == 2
     out = tmp_path / "c.html"
-    done = runner.invoke(report_command, [b, b, "--out", str(out), "--fail-if-worse"])
-    assert done.exit_code == 0 and out.is_file() and "every figure is the same" in done.stdout
-    for arguments in ([a, "--fail-if-worse"], [a, b, "--truth", str(tmp_path)]):
-        assert isinstance(runner.invoke(report_command, arguments).exception, InputError)
+    done = finished("report", b, b, "--out", out, "--fail-if-worse")
+    assert out.is_file() and "every figure is the same" in done.stdout
+    refused("report", a, "--fail-if-worse")
+    refused("report", a, b, "--truth", tmp_path)
 
 
 def test_a_difference_within_two_sigmas_is_noise() -> None:

@@ -7,12 +7,10 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from page_tags import Tags
 from realsim import CaptureSession
 from realsim.app.register.files import write_result
-from realsim.app.report.cli import report_command
 from realsim.app.report.section import Section
 from realsim.app.report.session import page_of, report_of, write_report
 from realsim.app.report.summary import Report, write_summary
@@ -20,7 +18,9 @@ from realsim.pages import Page
 from realsim.review import journal
 from realsim.store import SessionStore, load_scene, save_grasps
 from registered_sessions import CAMERA, models_of, registered_by_hand, table_session
+from shared_sessions import copy_of
 from tried_grasps import tried_set
+from typed_commands import invoked
 
 HOSTILE = '<script>alert("x")</script>'
 STAGES = (
@@ -39,11 +39,9 @@ def registered(tmp_path_factory: pytest.TempPathFactory) -> SessionStore:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> SessionStore:
+def store(registered_few: Path, tmp_path: Path) -> SessionStore:
     """The same kind of session, to be changed."""
-    store = table_session(tmp_path / "s", views=2)
-    write_result(store, registered_by_hand(store), models_of(), {})
-    return SessionStore.open(store.folder)
+    return SessionStore.open(copy_of(registered_few, tmp_path / "s"))
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +78,7 @@ def test_a_report_does_not_count_the_record_of_the_one_before_and_exit_codes_tel
     rules = ("--fail-on", "registration.accepted<2", "--fail-on", "registration.accepted<1")
     read = []
     for more in ((), ("--json", "--quiet", *rules)):
-        done = CliRunner().invoke(report_command, [str(store.folder), *more])
+        done = invoked("report", store.folder, *more)
         read.append((store.folder / "reports" / "report.json").read_bytes())
     assert (store.folder / "stages" / "report.json").is_file() and read[0] == read[1]
     assert done.exit_code == 1 and "registration.accepted" in done.stderr

@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 
-from realsim.app.report.cli import report_command
 from realsim.app.report.session import write_report
 from realsim.app.report.sources import read_stored
-from realsim.errors import InputError
 from registered_sessions import models_of, registered_by_hand, table_session
+from typed_commands import refused
 
 
 @pytest.fixture(scope="module")
@@ -69,13 +67,11 @@ def test_a_damaged_field_is_named_with_its_file(
     good, bad = tmp_path / "good.json", tmp_path / "bad.json"
     good.write_text(json.dumps(document))
     bad.write_text(json.dumps(damaged))
-    done = CliRunner().invoke(report_command, [str(good), str(bad), "--quiet"])
-    assert isinstance(done.exception, InputError), done.output
-    assert "bad.json" in str(done.exception) and named in str(done.exception)
+    said = refused("report", good, bad, "--quiet")
+    assert "bad.json" in said and named in said
 
 
 def test_a_stored_report_that_is_missing_is_told_as_a_file(tmp_path: Path) -> None:
-    for arguments in (["x.json"], ["x.json", "x.json"]):
-        done = CliRunner().invoke(report_command, [str(tmp_path / a) for a in arguments])
-        assert isinstance(done.exception, InputError)
-        assert "x.json' is not there" in str(done.exception)
+    missing = tmp_path / "x.json"
+    for given in ((missing,), (missing, missing)):
+        assert "x.json' is not there" in refused("report", *given)

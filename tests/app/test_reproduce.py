@@ -6,30 +6,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 from threadpoolctl import threadpool_limits
 
-from realsim.app.cli import commands
 from realsim.app.reproduce.compare import compare_folders
-from realsim.errors import InputError
 from realsim.store import atomic, provenance
-from registered_sessions import table_session
 from school_sessions import QUICK, registered
-
-
-def realsim(*words: object) -> Result:
-    """Run the command line in this process."""
-    return CliRunner().invoke(commands, [str(w) for w in words])
+from shared_sessions import copy_of
+from typed_commands import finished, invoked, refused
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(few_views: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session registered and annotated with one thread of BLAS and OpenMP."""
-    folder = table_session(tmp_path_factory.mktemp("made") / "s", views=4).folder
+    folder = copy_of(few_views, tmp_path_factory.mktemp("made") / "s")
     with threadpool_limits(1):
         for words in (("register", folder, "--object", "mug"), ("annotate", folder)):
-            result = realsim(*words, "--workers", 1, "--quiet")
-            assert result.exit_code == 0, (result.output, result.exception)
+            finished(*words, "--workers", 1, "--quiet")
     return folder
 
 
@@ -57,8 +49,7 @@ def test_a_record_names_versions_settings_inputs_and_command(made: Path) -> None
 def test_a_session_is_made_again_with_other_threads_and_left_alone(made: Path, stage: str) -> None:
     before = {p: p.stat().st_mtime_ns for p in made.rglob("*")}
     with threadpool_limits(2):
-        result = realsim("reproduce", made, stage, "--workers", 2, "--json")
-    assert result.exit_code == 0, (result.output, result.exception)
+        result = finished("reproduce", made, stage, "--workers", 2, "--json")
     told = json.loads(result.stdout)
     assert told["equal"] and told["files"] > 20 and told["differing"] == []
     assert before == {p: p.stat().st_mtime_ns for p in made.rglob("*")}
@@ -73,7 +64,7 @@ def test_what_differs_is_named_with_its_size(copy: Path) -> None:
     path.write_text(json.dumps(value))
     mask = next((copy / "mask").glob("*.png"))
     mask.unlink()
-    result = realsim("reproduce", copy, "annotate", "--workers", 1, "--json")
+    result = invoked("reproduce", copy, "annotate", "--workers", 1, "--json")
     assert result.exit_code == 1, (result.output, result.exception)
     rows = {r["path"]: r["words"] for r in json.loads(result.stdout)["differing"]}
     assert set(rows) == {"annotations/000001.json", f"mask/{mask.name}"}
@@ -86,10 +77,9 @@ def test_changed_inputs_are_named(copy: Path) -> None:
     model.write_bytes(model.read_bytes() + b"\n")
     (copy / "review").mkdir(exist_ok=True)
     (copy / "review/journal.jsonl").write_text("")
-    result = realsim("reproduce", copy, "register")
-    assert isinstance(result.exception, InputError)
-    assert "2 inputs" in str(result.exception) and f"models/{model.name}: " in str(result.exception)
-    assert "review/journal.jsonl: (nothing)" in str(result.exception)
+    said = refused("reproduce", copy, "register")
+    assert "2 inputs" in said and f"models/{model.name}: " in said
+    assert "review/journal.jsonl: (nothing)" in said
 
 
 def test_other_versions_are_told_and_it_goes_on(copy: Path) -> None:
@@ -97,7 +87,7 @@ def test_other_versions_are_told_and_it_goes_on(copy: Path) -> None:
     record = json.loads(path.read_text())
     record["versions"]["numpy"] = "1.0"
     path.write_text(json.dumps(record))
-    result = realsim("reproduce", copy, "annotate", "--workers", 1, "--json")
+    result = invoked("reproduce", copy, "annotate", "--workers", 1, "--json")
     told = json.loads(result.stdout)
     assert told["other_versions"][0].startswith("numpy 1.0 -> ")
     assert [r["path"] for r in told["differing"]] == ["stages/annotate.json"]
@@ -111,15 +101,13 @@ def test_what_cannot_be_made_again_is_said(copy: Path, tmp_path: Path) -> None:
         ((tmp_path, "school"), "is no session"),
         ((tmp_path,), "neither session.json nor provenance.json"),
     ):
-        result = realsim("reproduce", *words)
-        assert isinstance(result.exception, InputError), result.output
-        assert told in str(result.exception)
+        assert told in refused("reproduce", *words)
     path = copy / provenance.file_of("register")
     record = json.loads(path.read_text())
     record["request"]["from_review"] = True
     path.write_text(json.dumps(record))
-    refused = str(realsim("reproduce", copy, "register").exception)
-    assert "from-review" in refused and "realsim register" in refused
+    said = refused("reproduce", copy, "register")
+    assert "from-review" in said and "realsim register" in said
 
 
 def test_the_card_of_an_export_names_what_has_no_label(copy: Path, tmp_path: Path) -> None:
@@ -127,8 +115,7 @@ def test_the_card_of_an_export_names_what_has_no_label(copy: Path, tmp_path: Pat
     report = json.loads(file.read_text())
     report["not_placed"] = [{"obj_id": 9, "instance": 4, "reason": "hidden in all views"}]
     file.write_text(json.dumps(report))
-    done = realsim("export", copy, "--to", "bop", "--out", tmp_path / "out", "--quiet")
-    assert done.exit_code == 0, (done.output, done.exception)
+    finished("export", copy, "--to", "bop", "--out", tmp_path / "out", "--quiet")
     card = " ".join((tmp_path / "out/README.md").read_text().split())
     assert "object 9 (instance 4) is not placed and has no label" in card
     assert "hidden in all views" in card
@@ -137,12 +124,11 @@ def test_the_card_of_an_export_names_what_has_no_label(copy: Path, tmp_path: Pat
 @pytest.mark.slow
 def test_a_school_and_an_export_are_made_again(tmp_path: Path) -> None:
     session, out = registered(tmp_path / "s"), tmp_path / "out"
-    assert realsim("school", session, *QUICK).exit_code == 0
-    assert realsim("export", session, "--to", "hdf5", "--out", out, "--quiet").exit_code == 0
+    finished("school", session, *QUICK)
+    finished("export", session, "--to", "hdf5", "--out", out, "--quiet")
     shutil.copytree(out, tmp_path / "renamed")
     for words in ((session, "school"), (out,), (tmp_path / "renamed",)):
-        result = realsim("reproduce", *words, "--workers", 1, "--json")
-        assert result.exit_code == 0, (result.output, result.exception)
+        result = finished("reproduce", *words, "--workers", 1, "--json")
         assert json.loads(result.stdout)["equal"]
     listed = (out / "SHA256SUMS").read_text()
     assert " provenance.json\n" in listed and "run.json" not in listed

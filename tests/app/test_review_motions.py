@@ -17,7 +17,7 @@ from realsim_sim_bridge.arm.reach_config import base_on_table, grasping_arm, hom
 from realsim_sim_bridge.demonstrations.lerobot_episodes import LeRobotDemonstrations
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of
 from realsim_sim_bridge.demonstrations.source import DemonstrationSource
-from school_sessions import WEAK, refused, registered, run, tried_weakly
+from school_sessions import WEAK, refused, registered, run
 
 CLOSE = PHASES.index("close")
 SAME = 1e-5
@@ -25,18 +25,13 @@ SAME = 1e-5
 
 
 @pytest.fixture(scope="module")
-def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tried_weakly(tmp_path_factory.mktemp("motions") / "session")
+def stored(weak_school: Path) -> tuple[SceneGrasps, dict[int, ObjectModel]]:
+    return stored_grasps(weak_school)
 
 
 @pytest.fixture(scope="module")
-def stored(school: Path) -> tuple[SceneGrasps, dict[int, ObjectModel]]:
-    return stored_grasps(school)
-
-
-@pytest.fixture(scope="module")
-def motions(school: Path) -> SessionMotions:
-    return SessionMotions.of_session(school, with_arm=False)
+def motions(weak_school: Path) -> SessionMotions:
+    return SessionMotions.of_session(weak_school, with_arm=False)
 
 
 def attempts(grasps: SceneGrasps) -> list[tuple[int, int]]:
@@ -148,10 +143,10 @@ def test_a_grasp_without_a_trajectory_shows_the_approach_and_says_so(
 
 @pytest.mark.slow
 def test_arm_and_hand_are_drawn_where_the_kinematics_have_them(
-    school: Path, stored: tuple[SceneGrasps, dict[int, ObjectModel]]
+    weak_school: Path, stored: tuple[SceneGrasps, dict[int, ObjectModel]]
 ) -> None:
     instance, row = attempts(stored[0])[0]
-    motion = SessionMotions.of_session(school).motion(instance, row)
+    motion = SessionMotions.of_session(weak_school).motion(instance, row)
     assert motion is not None
     assert len(motion.link_meshes) == 11, "links 0 to 7, hand, two fingers"
     assert motion.arm_links == 8

@@ -5,10 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
 from realsim.app.annotate.current import annotate_session, what_is_stale
-from realsim.app.cli import commands
 from realsim.app.console import Console
 from realsim.app.register.config import RegisterRequest
 from realsim.app.register.results import claimed_cameras, load_cameras, load_registered
@@ -26,6 +24,7 @@ from realsim.store import SessionStore, load_scene
 from realsim.store.cameras import camera_folder, camera_folders, open_cameras, session_of_camera
 from registered_sessions import models_of, table_session, true_poses
 from shared_sessions import copy_of
+from typed_commands import finished, invoked, refused
 
 CAMERA = CameraIntrinsics(
     width=300, height=260, fx=330.0, fy=331.0, cx=148.0, cy=131.0, distortion=np.array([-0.08])
@@ -68,13 +67,8 @@ def registered(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def exported(registered: Path) -> Path:
     out = registered.parent / "bop"
-    result = call("export", registered, "--to", "bop", "--out", out)
-    assert result.exit_code == 0, result.output
+    finished("export", registered, "--to", "bop", "--out", out)
     return out
-
-
-def call(*words: object) -> Result:
-    return CliRunner().invoke(commands, [str(w) for w in words])
 
 
 def test_register_takes_the_fixed_camera_and_leaves_it_where_it_stands(registered: Path) -> None:
@@ -145,26 +139,24 @@ def test_bop_has_a_suffix_for_every_camera_and_is_read_back(exported: Path) -> N
 
 def test_one_camera_is_chosen_by_its_name(registered: Path, tmp_path: Path) -> None:
     words = ("export", registered, "--to", "bop", "--camera-name")
-    result = call(*words, "left", "--out", tmp_path / "o")
-    assert result.exit_code == 0, result.output
+    finished(*words, "left", "--out", tmp_path / "o")
     assert [ref.camera for ref in find_scenes(tmp_path / "o")] == [""]
-    wrong = call(*words, "top", "--out", tmp_path / "p")
-    assert "'top'" in str(wrong.exception) and "wrist, left" in str(wrong.exception)
+    wrong = refused(*words, "top", "--out", tmp_path / "p")
+    assert "'top'" in wrong and "wrist, left" in wrong
 
 
 def test_formats_of_one_camera_say_what_stays_out(registered: Path, tmp_path: Path) -> None:
-    result = call("export", registered, "--to", "nerfstudio", "--out", tmp_path / "o")
-    assert result.exit_code == 0, result.output
-    assert "left stay" in result.output
+    done = finished("export", registered, "--to", "nerfstudio", "--out", tmp_path / "o")
+    assert "left stay" in done.output
     frames = json.loads(next((tmp_path / "o").glob("*/transforms.json")).read_text())["frames"]
     assert len(frames) == 6
 
 
 def test_check_looks_at_every_camera(registered: Path, tmp_path: Path) -> None:
     folder = copy_of(registered, tmp_path / "s")
-    assert call("check", folder).exit_code == 0
+    finished("check", folder)
     (folder / "cameras/left/depth/000001.png").unlink()
-    result = call("check", folder, "--json")
+    result = invoked("check", folder, "--json")
     assert result.exit_code == 1
     with pytest.raises(InputError, match=r"cameras/left' is not as it was captured: depth/000001"):
         run_register(SessionStore.open(folder), QUIET, RegisterRequest())
@@ -181,14 +173,12 @@ def test_a_camera_is_never_taken_for_its_session(registered: Path, tmp_path: Pat
         open_session(left)
     export = ("export", left, "--to", "bop", "--out", tmp_path / "o")
     for words in (("register", left), ("annotate", left), export, ("stats", left)):
-        result = call(*words)
-        assert "further camera" in str(result.exception), words
+        assert "further camera" in refused(*words), words
     # A session that lost everything of its own is not replaced by what it holds.
     for name in ("session.json", "session.begun.json", "robot.jsonl", "manifest.jsonl",
                  "scene_camera.json"):  # fmt: skip
         (folder / name).unlink()
-    result = call("export", folder, "--to", "bop", "--out", tmp_path / "o")
-    assert "own files are lost" in str(result.exception)
+    assert "own files are lost" in refused("export", folder, "--to", "bop", "--out", tmp_path / "o")
 
 
 def test_a_camera_added_later_makes_labels_stale(registered: Path, tmp_path: Path) -> None:

@@ -8,17 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from realsim.app.annotate.current import annotate_session
-from realsim.app.cli import commands
 from realsim.app.console import Console
 from realsim.app.stats.collect import session_facts
 from realsim.app.stats.statistics import all_rows, same_content, statistics_of
-from realsim.errors import InputError
 from realsim.records import GraspSet
 from realsim.store import load_scene, save_grasps, save_scene
 from synthetic_scenes import captured_session
+from typed_commands import finished, refused
 
 QUIET = Console(quiet=True)
 #        (score, base score, reachable, closes at)
@@ -107,10 +105,7 @@ def test_copies_are_told(session, tmp_path):
 
 def test_tables_and_page_say_the_same(session, tmp_path):
     out = tmp_path / "out"
-    result = CliRunner().invoke(
-        commands, ["stats", str(session), "--out", str(out), "--quiet"], catch_exceptions=False
-    )
-    assert result.exit_code == 0
+    finished("stats", session, "--out", out, "--quiet")
     document = json.loads((out / "statistics.json").read_text())
     with (out / "statistics.csv").open(newline="") as file:
         table = {row["property"]: row["here"] for row in csv.DictReader(file)}
@@ -129,18 +124,13 @@ def test_a_damaged_session_of_many_is_named_and_left_out(session, tmp_path):
         shutil.copytree(session, tmp_path / name)
     (tmp_path / "b/session.json").write_text("{")
     (tmp_path / "b/session.begun.json").unlink()
-    result = CliRunner().invoke(commands, ["stats", str(tmp_path), "--quiet"])
-    assert result.exit_code == 0 and "b is left out" in result.output.replace("\n", " ")
+    result = finished("stats", tmp_path, "--quiet")
+    assert "b is left out" in result.output.replace("\n", " ")
     assert "│ 7 " in result.output or " 7 │" in result.output
 
 
 def test_what_is_no_session_is_refused(session, tmp_path):
-    def refused(*args):
-        result = CliRunner().invoke(commands, ["stats", *map(str, args)])
-        assert isinstance(result.exception, InputError), result.output
-        return str(result.exception)
-
-    assert "holds no session" in refused(tmp_path)
-    assert "given twice" in refused(session, session)
+    assert "holds no session" in refused("stats", tmp_path)
+    assert "given twice" in refused("stats", session, session)
     (tmp_path / "file").write_text("")
-    assert "is a file" in refused(session, "--out", tmp_path / "file")
+    assert "is a file" in refused("stats", session, "--out", tmp_path / "file")

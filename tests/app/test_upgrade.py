@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
-from realsim.app.upgrade.cli import upgrade_command
 from realsim.app.upgrade.dataset import UpgradeConfig, scenes_of
 from realsim.app.upgrade.outcome import Outcome, decide
 from realsim.app.upgrade.source import told_apart, world_starts
@@ -25,6 +24,7 @@ from realsim.registration.photo import PhotoConfig, Picture, shifted
 from realsim.rendering.casting.pixel_caster import PixelCaster
 from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore
+from typed_commands import invoked
 from upgradable_datasets import (
     CAMERA,
     NAMES,
@@ -46,8 +46,7 @@ PAINTS = np.array([[200, 40, 40], [40, 60, 190], [120, 120, 110]], np.uint8)
 
 
 def upgrade(dataset: Path, out: Path, *more: str) -> Result:
-    arguments = [str(dataset), "--out", str(out), "--quiet", *GRASPS, *more]
-    return CliRunner().invoke(upgrade_command, arguments)
+    return invoked("upgrade", dataset, "--out", out, "--quiet", *GRASPS, *more)
 
 
 def failed_with(dataset: Path, out: Path, *more: str) -> str:

@@ -52,7 +52,7 @@ def test_what_is_no_address_is_named():
         ):
             pass
     with (
-        pytest.raises(InputError, match="no machine of the name 'nowhere.invalid' is known"),
+        pytest.raises(InputError, match=r"no machine of the name 'nowhere\.invalid' is known"),
         open_pool(PoolConfig(address="nowhere.invalid:6379")),
     ):
         pass

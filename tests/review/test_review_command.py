@@ -8,15 +8,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
 from realsim import InputError
-from realsim.app.review.cli import review_command
 from realsim.app.review.run import ReviewRequest, open_all, write_page
 from realsim.review.reviewed_session import ReviewedSession
 from realsim.review.server import counted
 from realsim.store import SessionStore
 from tests.support.reviewed_boxes import boxes_session
+from typed_commands import refused
 
 MAIN = "from realsim.app.cli import main; main()"
 
@@ -72,10 +71,7 @@ def test_where_the_static_page_cannot_be_is_told_before_anything_is_read(tmp_pat
         (tmp_path, f"{tmp_path}' is a folder"),
         (tmp_path / "no/page.html", f"{tmp_path / 'no'}) for --static is not there"),
     ):
-        done = CliRunner().invoke(
-            review_command, [str(tmp_path / "no session"), "--static", str(path)]
-        )
-        assert isinstance(done.exception, InputError) and words in str(done.exception)
+        assert words in refused("review", tmp_path / "no session", "--static", path)
 
 
 def test_a_session_that_was_moved_is_told_at_the_end_and_its_decisions_counted(

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from realsim.app.register.files import write_result
 from realsim.app.register.results import CameraChange, Registered, Remark
 from realsim.arrays import Array
 from realsim.formats.bop.models import save_models
@@ -23,6 +24,7 @@ from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.registration.search.records import NotPlaced
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore
+from shared_sessions import copy_of
 
 CAMERA = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
 NAMES = ("mug", "wedge")
@@ -138,3 +140,10 @@ def registered_by_hand(store: SessionStore, *, left_out: int | None = None) -> R
             },
         },
     )  # fmt: skip
+
+
+def registered_copy(folder: Path, to: Path) -> SessionStore:
+    """Return a copy of a session of `table_session` that is registered by hand."""
+    store = SessionStore.open(copy_of(folder, to))
+    write_result(store, registered_by_hand(store), models_of(), {})
+    return store

@@ -3,10 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-from click.testing import CliRunner, Result
+from click.testing import Result
 
-from realsim.app.school.cli import school_command
-from realsim.errors import InputError
+import typed_commands
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.parts import part
@@ -25,14 +24,12 @@ T_WORLD_TABLE = se3.from_rt(se3.exp_so3(np.array([0.0, 0.0, 0.4])), [0.3, 0.1, 0
 
 def run(*args: object) -> Result:
     """Run the group in this process."""
-    return CliRunner().invoke(school_command, [str(a) for a in args])
+    return typed_commands.invoked("school", *args)
 
 
 def refused(*args: object) -> str:
     """Return what the group refuses the arguments with."""
-    result = run(*args)
-    assert isinstance(result.exception, InputError), result.output
-    return str(result.exception)
+    return typed_commands.refused("school", *args)
 
 
 def scene() -> Scene:
@@ -64,9 +61,8 @@ def registered(folder: Path) -> Path:
     return folder
 
 
-def tried_weakly(folder: Path, grasps: int = 8) -> Path:
+def tried_weakly(folder: Path) -> Path:
     """Write a registered session whose grasps a weak hand tried: some hold, some slip."""
     registered(folder)
-    result = run("run", folder, *WEAK, "--grasps", grasps)
-    assert result.exception is None, result.output
+    typed_commands.finished("school", folder, *WEAK, "--grasps", 14)
     return folder

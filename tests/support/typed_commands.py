@@ -1,7 +1,8 @@
 """Commands as they are typed, run in this process: an interpreter that starts costs more than most.
 
-The whole of `realsim.app.cli.main` runs, so that exit codes and messages are those of the program.
-Laws about the process itself (kills, terminals, what is imported) start one.
+- `realsim`: the whole of `realsim.app.cli.main`, so that exit codes and messages are those of the
+  program. Laws about the process itself (kills, terminals, what is imported) start one.
+- `invoked`, `finished`, `refused`: the command alone, which says what it raised.
 """
 
 import contextlib
@@ -9,6 +10,10 @@ import io
 import subprocess
 import sys
 import traceback
+
+from click.testing import CliRunner, Result
+
+from realsim.errors import InputError
 
 
 def realsim(*words: object) -> "subprocess.CompletedProcess[str]":
@@ -30,3 +35,24 @@ def realsim(*words: object) -> "subprocess.CompletedProcess[str]":
         finally:
             sys.argv = argv
     return subprocess.CompletedProcess(typed, code, said.getvalue(), complained.getvalue())
+
+
+def invoked(*words: object) -> Result:
+    """Return how the command `realsim WORDS...` ended; what it raised is its `exception`."""
+    from realsim.app.cli import commands
+
+    return CliRunner().invoke(commands, [str(w) for w in words])
+
+
+def finished(*words: object) -> Result:
+    """Return how a command ended that has to end with 0."""
+    result = invoked(*words)
+    assert result.exit_code == 0, (result.output, result.exception)
+    return result
+
+
+def refused(*words: object) -> str:
+    """Return why a command was refused, which has to be the user's mistake."""
+    result = invoked(*words)
+    assert isinstance(result.exception, InputError), (result.output, result.exception)
+    return str(result.exception)

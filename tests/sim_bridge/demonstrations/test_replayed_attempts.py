@@ -33,14 +33,14 @@ def lost(all_of_them):
     return [d for d in all_of_them if "lost" in d.outcome.failure or "touch" in d.outcome.failure]
 
 
-def test_an_attempt_tells_its_p_hold(school):
-    grasps, models = stored_grasps(school)
+def test_an_attempt_tells_its_p_hold(weak_school):
+    grasps, models = stored_grasps(weak_school)
     told = [
         replace(s, measures={"p_hold": np.arange(len(s)) / len(s), "safety": np.ones((len(s), 4))})
         for s in grasps.sets
     ]
     known = DemonstrationSource(
-        replace(grasps, sets=tuple(told)), models, cameras=(), cache=school / "grasps/cache"
+        replace(grasps, sets=tuple(told)), models, cameras=(), cache=weak_school / "grasps/cache"
     )
     d = known[0]
     count = next(len(s) for s in told if s.instance == d.name.instance)
@@ -53,8 +53,8 @@ def lowest_m(d, k):
     return float(se3.transform(d.motion.Ts_table_obj[k], mesh.vertices)[:, 2].min())
 
 
-def test_every_attempt_is_there_and_ends_as_it_is_stored(source, all_of_them, school):
-    grasps = stored_grasps(school)[0]
+def test_every_attempt_is_there_and_ends_as_it_is_stored(source, all_of_them, weak_school):
+    grasps = stored_grasps(weak_school)[0]
     assert len(all_of_them) == len(source) == sum(len(t) for t in grasps.trajectories.values())
     for d in all_of_them:
         assert d.outcome.agrees, d.name
@@ -93,10 +93,10 @@ def test_a_lost_object_falls_onto_the_table_and_stays_there(lost):
         assert min(lowest_m(d, k) for k in range(len(m))) > -4e-3
 
 
-def test_nothing_jumps(school):
-    grasps, models = stored_grasps(school)
+def test_nothing_jumps(weak_school):
+    grasps, models = stored_grasps(weak_school)
     fast = DemonstrationSource(
-        grasps, models, DemonstrationConfig(rate_hz=100), cache=school / "grasps/cache"
+        grasps, models, DemonstrationConfig(rate_hz=100), cache=weak_school / "grasps/cache"
     )
     for d in fast:
         m = d.motion
@@ -106,10 +106,10 @@ def test_nothing_jumps(school):
         assert np.abs(np.diff(m.joints_rad, axis=0)).max() * 100 < 5.0
 
 
-def test_half_the_rate_is_every_second_step(school, source):
-    grasps, models = stored_grasps(school)
+def test_half_the_rate_is_every_second_step(weak_school, source):
+    grasps, models = stored_grasps(weak_school)
     slow = DemonstrationSource(
-        grasps, models, DemonstrationConfig(rate_hz=10), cache=school / "grasps/cache"
+        grasps, models, DemonstrationConfig(rate_hz=10), cache=weak_school / "grasps/cache"
     )
     for k in (1, 4):
         a, b = slow[k].motion, source[k].motion
@@ -137,8 +137,8 @@ def test_a_grasp_without_an_attempt_is_refused_with_its_reason(source):
         assert source.number_of(name.instance, name.grasp) == k
 
 
-def test_a_scene_that_was_moved_or_weighed_since_is_refused(school):
-    grasps, models = stored_grasps(school)
+def test_a_scene_that_was_moved_or_weighed_since_is_refused(weak_school):
+    grasps, models = stored_grasps(weak_school)
     moved = {i: T @ se3.from_translation([0.01, 0, 0]) for i, T in grasps.Ts_world_obj.items()}
     with pytest.raises(InputError, match=r"moved by 10\.0 mm"):
         DemonstrationSource(replace(grasps, Ts_world_obj=moved), models)[0]
@@ -148,8 +148,8 @@ def test_a_scene_that_was_moved_or_weighed_since_is_refused(school):
         DemonstrationSource(grasps, cut)[0]
 
 
-def test_grasps_that_do_not_say_how_they_were_tried_are_refused(school):
-    grasps, models = stored_grasps(school)
+def test_grasps_that_do_not_say_how_they_were_tried_are_refused(weak_school):
+    grasps, models = stored_grasps(weak_school)
     bare = tuple(replace(s, parameters={}) for s in grasps.sets)
     with pytest.raises(InputError, match="do not say what they were tried with"):
         DemonstrationSource(replace(grasps, sets=bare), models)
