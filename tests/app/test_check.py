@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from click.testing import Result
 
-from realsim.app import cli
 from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.store import SessionStore
 from realsim.store.lock import only_run_in
-from typed_commands import invoked
+from typed_commands import invoked, realsim
 
 CAMERA = CameraIntrinsics(width=40, height=30, fx=40, fy=40, cx=19.5, cy=14.5)
 
@@ -31,13 +30,6 @@ def session(tmp_path: Path) -> Path:
 
 def run(*arguments: str | Path) -> Result:
     return invoked("check", *arguments)
-
-
-def main(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> object:
-    monkeypatch.setattr("sys.argv", ["realsim", "check", *map(str, arguments)])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    return end.value.code
 
 
 def test_a_sound_session_ends_with_0(session: Path) -> None:
@@ -70,15 +62,14 @@ def test_damage_ends_with_1_and_a_repair_takes_it_out(session: Path) -> None:
     assert run(session, "--decode").exit_code == 0
 
 
-def test_what_is_no_session_ends_with_2(
-    session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(monkeypatch, session / "rgb") == 2
-    assert "is not a session" in capsys.readouterr().err
-    assert main(monkeypatch, session.parent) == 2
-    assert "Did you mean" in capsys.readouterr().err
-    assert main(monkeypatch, session / "nowhere") == 2
-    assert "is not a session" in capsys.readouterr().err
+def test_what_is_no_session_ends_with_2(session: Path) -> None:
+    for folder, told in (
+        (session / "rgb", "is not a session"),
+        (session.parent, "Did you mean"),
+        (session / "nowhere", "is not a session"),
+    ):
+        done = realsim("check", folder)
+        assert done.returncode == 2 and told in done.stderr
 
 
 def test_files_without_a_checksum_are_named_and_those_of_others_explained(session: Path) -> None:
@@ -101,10 +92,8 @@ def test_files_without_a_checksum_are_named_and_those_of_others_explained(sessio
     assert json.loads(run(session, "--json").output)["files_without_checksum"] == []
 
 
-def test_a_running_capture_is_not_repaired(
-    session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_running_capture_is_not_repaired(session: Path) -> None:
     with only_run_in(session):
-        assert main(monkeypatch, session, "--repair") == 2
-        assert "another run is working" in capsys.readouterr().err
+        done = realsim("check", session, "--repair")
+        assert done.returncode == 2 and "another run is working" in done.stderr
         assert run(session).exit_code == 0

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from file_trees import bytes_of
 from realsim.app.demonstrations import run as demonstrations
 from realsim.app.demonstrations.run import DemonstrationRequest, open_source
 from realsim_sim_bridge.demonstrations.lerobot_episodes import (
@@ -33,9 +34,7 @@ def written(weak_school, tmp_path_factory):
 
 
 def files_of(folder):
-    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
-            for p in sorted(folder.rglob("*"))
-            if p.is_file() and not p.name.endswith(".run.json")}  # fmt: skip
+    return {k: v for k, v in bytes_of(folder).items() if not k.endswith(".run.json")}
 
 
 @pytest.mark.slow

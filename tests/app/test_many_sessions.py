@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 
+from file_trees import bytes_of
 from synthetic_scenes import captured_session
 from typed_commands import finished, invoked, refused
 
@@ -19,11 +20,7 @@ def sessions(tmp_path_factory):
 
 
 def labels(session):
-    return {
-        p.relative_to(session).as_posix(): p.read_bytes()
-        for kind in ("mask/*.png", "annotations/*.json")
-        for p in sorted(session.glob(kind))
-    }
+    return bytes_of(session, "mask/*.png", "annotations/*.json")
 
 
 def test_each_session_is_done_and_the_one_that_fails_is_named(sessions, tmp_path):

@@ -1,52 +1,27 @@
 """`realsim plan`, `plan-show`, `plan-convert`: what they write, and what they refuse."""
 
 import json
-import sys
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from given_plans import plan_through
-from realsim.app.cli import main
 from realsim.formats.graspnet.cameras import read_camera_poses
 from realsim.geometry import se3
 from realsim.robots.arm import UR5E
 from realsim_capture_plans.plan_files.exported import table_frame
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan
+from typed_commands import realsim
 
 HOME = np.array([0.0, -1.9, 1.9, -1.57, -1.57, 0.0])
 CENTER = np.array([0.40, 0.1, 0.05])
 
 
-@dataclass(frozen=True)
-class Done:
-    code: int
-    out: str
-    err: str
-
-
-@pytest.fixture
-def realsim(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> Callable[..., Done]:
-    """Run the command line in this process, in an empty folder."""
+@pytest.fixture(autouse=True)
+def _in_an_empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-
-    def run(*args: object) -> Done:
-        monkeypatch.setattr(sys, "argv", ["realsim", *map(str, args)])
-        code = 0
-        try:
-            main()
-        except SystemExit as stop:
-            code = stop.code if isinstance(stop.code, int) else 1
-        text = capsys.readouterr()
-        return Done(code, text.out, text.err)
-
-    return run
 
 
 def a_plan(n: int = 3) -> CapturePlan:
@@ -57,19 +32,19 @@ def a_plan(n: int = 3) -> CapturePlan:
     return plan
 
 
-def test_a_plan_is_made_and_written(realsim: Callable[..., Done]) -> None:
+def test_a_plan_is_made_and_written() -> None:
     done = realsim(
         "plan", "--views", 4, "--quiet", "--out", "a.json", "--arm", "ur5e", "--no-pictures"
     )
-    assert done.code == 0, done.err
+    assert done.returncode == 0, done.stderr
     plan = load_plan("a.json")
     assert len(plan) == 4 and plan.robot == "UR5e" and plan.kind == "hemisphere"
     assert plan.center_world == pytest.approx([0.40, 0.0, 0.05])
     assert plan.metrics["colliding_legs"] == 0
-    assert plan.content_hash[:12] in done.out and "good" in done.out
+    assert plan.content_hash[:12] in done.stdout and "good" in done.stdout
     before = Path("a.json").read_bytes()
     again = realsim("plan", "--views", 4, "--quiet", "--out", "a.json")
-    assert again.code == 2 and "--overwrite" in again.err
+    assert again.returncode == 2 and "--overwrite" in again.stderr
     assert Path("a.json").read_bytes() == before
 
 
@@ -87,57 +62,57 @@ def test_a_plan_is_made_and_written(realsim: Callable[..., Done]) -> None:
     ],
 )
 def test_what_cannot_be_planned_is_one_paragraph(
-    args: list[str], says: str, realsim: Callable[..., Done], tmp_path: Path
+    args: list[str], says: str, tmp_path: Path
 ) -> None:
     done = realsim("plan", "--quiet", *args)
-    assert done.code == 2 and says in done.err
-    assert "Traceback" not in done.err
+    assert done.returncode == 2 and says in done.stderr
+    assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_plan_is_shown(realsim: Callable[..., Done]) -> None:
+def test_a_plan_is_shown() -> None:
     save_plan(a_plan(), "p.json")
     done = realsim("plan-show", "p.json", "--no-pictures")
-    assert done.code == 0, done.err
-    assert a_plan().content_hash[:12] in done.out and "0, always" in done.out
-    assert realsim("plan-show", "shipped:nowhere").code == 2
+    assert done.returncode == 0, done.stderr
+    assert a_plan().content_hash[:12] in done.stdout and "0, always" in done.stdout
+    assert realsim("plan-show", "shipped:nowhere").returncode == 2
     done = realsim("plan-show", "q.json")
-    assert done.code == 2 and "no plan at q.json" in done.err
+    assert done.returncode == 2 and "no plan at q.json" in done.stderr
 
 
-def test_a_plan_that_collides_ends_with_1_and_is_named(realsim: Callable[..., Done]) -> None:
+def test_a_plan_that_collides_ends_with_1_and_is_named() -> None:
     plan = a_plan()
     rows = np.stack([plan.home, plan.home + np.eye(6)[1], plan.home])
     header = ",".join(f"q{j}_rad" for j in range(1, 7))
     Path("p.csv").write_text("\n".join([header, *(",".join(map(repr, q)) for q in rows.tolist())]))
     where = ("--arm", "UR5", "--center", "0.4,0.1,0.05")
     done = realsim("plan-convert", "p.csv", "p.json", *where)
-    assert done.code == 1 and "view 0 -> view 1" in done.err and "table" in done.err
+    assert done.returncode == 1 and "view 0 -> view 1" in done.stderr and "table" in done.stderr
     assert load_plan("p.json").metrics["colliding_legs"] == 2
     done = realsim("plan-convert", "p.json", "p.script")
-    assert done.code == 1 and "NOT FREE: view 0 -> view 1" in Path("p.script").read_text()
+    assert done.returncode == 1 and "NOT FREE: view 0 -> view 1" in Path("p.script").read_text()
     assert 'popup("2 moves' in Path("p.script").read_text()
-    assert realsim("plan-show", "p.json", "--no-pictures").code == 1
+    assert realsim("plan-show", "p.json", "--no-pictures").returncode == 1
 
 
-def test_a_plan_goes_out_and_comes_back(realsim: Callable[..., Done]) -> None:
+def test_a_plan_goes_out_and_comes_back() -> None:
     plan = a_plan()
     save_plan(plan, "p.json")
     for dest in ("p.csv", "p.script", "folder", "copy.json"):
         done = realsim("plan-convert", "p.json", dest)
-        assert done.code == 0 and dest in done.out, done.err
+        assert done.returncode == 0 and dest in done.stdout, done.stderr
         done = realsim("plan-convert", "p.json", dest)
-        assert done.code == 2 and "--overwrite" in done.err
-        assert realsim("plan-convert", "p.json", dest, "--overwrite").code == 0
+        assert done.returncode == 2 and "--overwrite" in done.stderr
+        assert realsim("plan-convert", "p.json", dest, "--overwrite").returncode == 0
     assert load_plan("copy.json").content_hash == plan.content_hash
     assert "def realsim_plan():" in Path("p.script").read_text()
     Ts = table_frame(plan) @ read_camera_poses("folder")
     assert np.abs(Ts - plan.Ts_base_cam).max() < 1e-12
     done = realsim("plan-convert", "p.csv", "back.json", "--arm", "UR5", "--center", "0.4,0.1,0")
-    assert done.code == 0, done.err
+    assert done.returncode == 0, done.stderr
     assert np.array_equal(load_plan("back.json").joints, plan.joints)
     done = realsim("plan-convert", "p.csv", "b.json", "--arm", "UR5e", "--center", "0.4,0.1,0")
-    assert done.code == 2 and "of this robot" in done.err and not Path("b.json").exists()
+    assert done.returncode == 2 and "of this robot" in done.stderr and not Path("b.json").exists()
 
 
 @pytest.mark.parametrize(
@@ -152,9 +127,7 @@ def test_a_plan_goes_out_and_comes_back(realsim: Callable[..., Done]) -> None:
         (["other.json", "q.json", "--arm", "UR5"], "path of another robot"),
     ],
 )
-def test_what_cannot_be_converted_is_one_paragraph(
-    args: list[str], says: str, realsim: Callable[..., Done]
-) -> None:
+def test_what_cannot_be_converted_is_one_paragraph(args: list[str], says: str) -> None:
     save_plan(a_plan(), "p.json")
     row = ",".join(map(repr, HOME.tolist()))
     Path("bare.csv").write_text(f"q1,q2,q3,q4,q5,q6\n{row}\n{row}\n")
@@ -169,5 +142,5 @@ def test_what_cannot_be_converted_is_one_paragraph(
     Path("other.json").write_text(json.dumps({"joints": q.tolist(), "cart_pose": poses}))
     before = sorted(p.name for p in Path().iterdir())
     done = realsim("plan-convert", *args)
-    assert done.code == 2 and says in done.err, done.err
+    assert done.returncode == 2 and says in done.stderr, done.stderr
     assert sorted(p.name for p in Path().iterdir()) == before

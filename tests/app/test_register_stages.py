@@ -13,10 +13,9 @@ from realsim.app.register.files import documents, write_result
 from realsim.app.register.results import NEXT_FILE, SCENE_FILE, cameras_now
 from realsim.app.report.session import write_report
 from realsim.app.stages import judged_scene, registered_views
-from realsim.records import CaptureSession, Mesh, View
-from realsim.rendering.labels import LabelRenderer, PlacedMesh
+from realsim.records import CaptureSession, View
 from realsim.store import SessionStore, atomic
-from registered_sessions import CAMERA, models_of, registered_by_hand, true_cameras, true_poses
+from registered_sessions import CAMERA, models_of, registered_by_hand, table_renderer, true_cameras
 from shared_sessions import copy_of
 
 MODELS = models_of()
@@ -66,10 +65,7 @@ def coloured(folder: Path, shift_px: int, *, blank: bool = False) -> SessionStor
     camera = replace(CAMERA, width=640, height=480, fx=600.0, fy=600.0, cx=320.0, cy=240.0)
     session = CaptureSession(name="colour", intrinsics=camera, views=(), depth_unit_m=1e-4)
     store = SessionStore.create(folder, session)
-    corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
-    table = Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
-    placed = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in true_poses()]
-    renderer = LabelRenderer([*placed, PlacedMesh(-1, table, np.eye(4))])
+    renderer = table_renderer()
     for k, T in enumerate(true_cameras(VIEWS)):
         labels = renderer.render(camera, T)
         grey = np.where(labels.ids >= 0, 200, 90).astype(np.uint8)

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from realsim.app import cli
 from realsim.formats.bop.models import load_models, save_models
 from realsim.geometry.mesh import save_ply
 from realsim.geometry.parts import part
@@ -49,29 +48,18 @@ def imported(
     return library, realsim("scan", "import", meshes / "wedge.ply", *words)
 
 
-@pytest.fixture
-def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+def run(*words: object) -> tuple[int, str, str]:
     """Run a command line; return its exit code and what it printed on stdout and stderr."""
-
-    def call(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["realsim", *map(str, words)])
-        code = 0
-        try:
-            cli.main()
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        out = capfd.readouterr()
-        return code, " ".join(out.out.split()), " ".join(out.err.split())
-
-    return call
+    done = realsim(*words)
+    return done.returncode, " ".join(done.stdout.split()), " ".join(done.stderr.split())
 
 
-def scan_import(run, meshes: Path, library: Path, *words: object):
+def scan_import(meshes: Path, library: Path, *words: object):
     files = [meshes / w if isinstance(w, str) and "." in w and w[0] != "-" else w for w in words]
     return run("scan", "import", *files, "--library", library, "--no-parts", "--quiet")
 
 
-def test_a_mesh_is_imported_listed_shown_and_checked(run, imported, tmp_path: Path):
+def test_a_mesh_is_imported_listed_shown_and_checked(imported, tmp_path: Path):
     library = Path(shutil.copytree(imported[0], tmp_path / "models"))
     out = " ".join(imported[1].stdout.split())
     assert imported[1].returncode == 0
@@ -91,9 +79,9 @@ def test_a_mesh_is_imported_listed_shown_and_checked(run, imported, tmp_path: Pa
     assert code == 1 and json.loads(out)["findings"][0]["kind"] == "changed"
 
 
-def test_a_mesh_without_scale_waits_for_one(run, meshes: Path, tmp_path: Path):
+def test_a_mesh_without_scale_waits_for_one(meshes: Path, tmp_path: Path):
     library = tmp_path / "m"
-    code, out, _ = scan_import(run, meshes, library, "wedge.ply", "--unit", "none")
+    code, out, _ = scan_import(meshes, library, "wedge.ply", "--unit", "none")
     assert code == 0 and "realsim scan scale wedge SESSION" in out
     assert json.loads((library / "models_info.json").read_text()) == {}
     assert sorted(p.name for p in (library / "unscaled/wedge").iterdir()) == [
@@ -107,13 +95,13 @@ def test_a_mesh_without_scale_waits_for_one(run, meshes: Path, tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_a_scaled_model_is_one_row_with_the_mark_of_its_source(run, meshes: Path, tmp_path: Path):
+def test_a_scaled_model_is_one_row_with_the_mark_of_its_source(meshes: Path, tmp_path: Path):
     library = tmp_path / "m"
-    scan_import(run, meshes, library, "wedge.ply", "--unit", "none")
+    scan_import(meshes, library, "wedge.ply", "--unit", "none")
     note = ScaleNote(scale=1e-3, sigma_percent=0.3, verdict="doubtful", reasons=("two scales.",))
     ModelLibrary.open(library).promote("wedge", note, PrepareConfig(with_parts=False))
-    scan_import(run, meshes, library, "box.ply", "--unit", "mm")
-    scan_import(run, meshes, library, "box.ply", "--unit", "none")
+    scan_import(meshes, library, "box.ply", "--unit", "mm")
+    scan_import(meshes, library, "box.ply", "--unit", "none")
     listed = run("scan", "list", library)[1]
     # The box has its scale from its file: the box without one is another mesh.
     assert "2 models and 1 unscaled mesh in" in listed and "wedge (*)" in listed
@@ -138,8 +126,8 @@ def test_a_scaled_model_is_one_row_with_the_mark_of_its_source(run, meshes: Path
         (["wedge.ply", "box.ply", "--unit", "mm", "--name", "x"], "of one model"),
     ],
 )
-def test_bad_input_is_named_and_leaves_nothing(run, meshes, tmp_path, words, said: str):
-    code, out, err = scan_import(run, meshes, tmp_path / "m", *words)
+def test_bad_input_is_named_and_leaves_nothing(meshes, tmp_path, words, said: str):
+    code, out, err = scan_import(meshes, tmp_path / "m", *words)
     assert code == 2 and said in err and out == ""
     assert not (tmp_path / "m/models_info.json").exists() or not load_entries(tmp_path / "m")
 
@@ -148,19 +136,19 @@ def load_entries(library: Path) -> list[str]:
     return [e.name for e in ModelLibrary.open(library).entries()]
 
 
-def test_nothing_is_replaced_unasked(run, imported, meshes: Path, tmp_path: Path):
+def test_nothing_is_replaced_unasked(imported, meshes: Path, tmp_path: Path):
     library = Path(shutil.copytree(imported[0], tmp_path / "m"))
     before = (library / "obj_000001.ply").read_bytes()
-    code, _, err = scan_import(run, meshes, library, "box.ply", "--unit", "mm", "--name", "wedge")
+    code, _, err = scan_import(meshes, library, "box.ply", "--unit", "mm", "--name", "wedge")
     assert code == 2 and "--overwrite" in err
     assert (library / "obj_000001.ply").read_bytes() == before
     words = ("box.ply", "--unit", "mm", "--name", "wedge", "--overwrite")
-    assert scan_import(run, meshes, library, *words)[0] == 0
+    assert scan_import(meshes, library, *words)[0] == 0
     assert load_entries(library) == ["wedge"]
     assert (library / "obj_000001.ply").read_bytes() != before
 
 
-def test_a_bop_folder_is_completed(run, tmp_path: Path):
+def test_a_bop_folder_is_completed(tmp_path: Path):
     save_models(tmp_path / "bop/models", {1: part("box"), 8: part("wedge")})
     code, out, _ = run("scan", "list", tmp_path / "bop/models")
     assert code == 0 and "scan complete" in out
@@ -177,10 +165,10 @@ def test_a_bop_folder_is_completed(run, tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_what_a_person_should_look_at_ends_with_1(run, meshes: Path, tmp_path: Path):
-    code, out, _ = scan_import(run, meshes, tmp_path / "m", "open.ply", "--unit", "mm")
+def test_what_a_person_should_look_at_ends_with_1(meshes: Path, tmp_path: Path):
+    code, out, _ = scan_import(meshes, tmp_path / "m", "open.ply", "--unit", "mm")
     assert code == 1 and "open (object 1): doubtful" in out and "LOOK: open:" in out
-    code, out, err = scan_import(run, meshes, tmp_path / "m", "wrong side.ply", "flat.ply",
+    code, out, err = scan_import(meshes, tmp_path / "m", "wrong side.ply", "flat.ply",
                                  "--unit", "mm")  # fmt: skip
     assert code == 2 and "wrong_side (object 2): accepted" in out and "repaired:" in out
     # One bad mesh does not keep the others out.

@@ -18,11 +18,10 @@ from realsim.formats.bop.opening import open_labelled_bop
 from realsim.formats.bop.scene import find_scenes, read_scene
 from realsim.geometry import se3
 from realsim.images import read_grey
-from realsim.records import CameraIntrinsics, CaptureSession, Mesh, View
-from realsim.rendering.labels import LabelRenderer, PlacedMesh
+from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.store import SessionStore, load_scene
 from realsim.store.cameras import camera_folder, camera_folders, open_cameras, session_of_camera
-from registered_sessions import models_of, table_session, true_poses
+from registered_sessions import table_renderer, table_session, true_poses
 from shared_sessions import copy_of
 from typed_commands import finished, invoked, refused
 
@@ -36,11 +35,7 @@ QUIET = Console(quiet=True)
 
 def add_fixed(session: SessionStore, name: str, *, posed: bool = True) -> SessionStore:
     """Add a fixed camera that is said to stand 2.4 mm and 0.2 deg beside where it does."""
-    models = models_of()
-    square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
-    table = Mesh(vertices=square, faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
-    placed = [PlacedMesh(o.instance, models[o.obj_id].mesh, o.T_world_obj) for o in true_poses()]
-    seen = LabelRenderer([*placed, PlacedMesh(-1, table, np.eye(4))]).render(CAMERA, T_TRUE)
+    seen = table_renderer().render(CAMERA, T_TRUE)
     rgb = np.where((seen.ids >= 0)[..., None], 190, 80).astype(np.uint8).repeat(3, -1)
     header = CaptureSession(name=name, intrinsics=CAMERA, views=(), depth_unit_m=2e-4)
     store = SessionStore.create(camera_folder(session.folder, name), header)
@@ -99,9 +94,7 @@ def test_register_takes_the_fixed_camera_and_leaves_it_where_it_stands(registere
 
 def test_labels_of_the_fixed_camera_are_those_of_the_scene(registered: Path) -> None:
     left = open_cameras(SessionStore.open(registered))["left"]
-    truth = LabelRenderer(
-        [PlacedMesh(o.instance, models_of()[o.obj_id].mesh, o.T_world_obj) for o in true_poses()]
-    ).render(CAMERA, T_TRUE)
+    truth = table_renderer().render(CAMERA, T_TRUE)
     for k, o in enumerate(true_poses()):
         mask = read_grey(left.path(f"mask_visib/000002_{k:06d}.png")) > 0
         real = truth.ids == o.instance

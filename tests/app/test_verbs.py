@@ -9,6 +9,7 @@ import click
 import pytest
 
 import realsim as rs
+from file_trees import bytes_of
 from realsim.app.cli import commands
 from realsim.app.command import walk
 from realsim.app.verbs import run
@@ -34,8 +35,7 @@ def typed(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 def files(folder: Path) -> dict[str, bytes]:
     """Return the bytes of every file but the record of a run, which has its time and its folder."""
-    found = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_file()}
-    kept = {name: p.read_bytes() for name, p in found.items() if not name.startswith("stages/")}
+    kept = {k: v for k, v in bytes_of(folder).items() if not k.startswith("stages/")}
     sums = [s for s in kept.pop("manifest.jsonl", b"").splitlines() if b'"path": "stages/' not in s]
     return kept | {"manifest.jsonl": b"\n".join(sums)}
 

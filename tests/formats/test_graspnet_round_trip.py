@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from file_trees import bytes_of
 from labelled_scenes import MODELS, TABLE, labelled_scene
 from realsim import images
 from realsim.errors import InputError
@@ -44,8 +45,7 @@ def tree(source, tmp_path_factory):
 
 
 def tree_bytes(folder):
-    files = [p for p in folder.rglob("*") if p.is_file() and ".export" not in p.parts]
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in files}
+    return {k: v for k, v in bytes_of(folder).items() if ".export" not in k.split("/")}
 
 
 def test_a_tree_written_again_is_the_same_byte_by_byte(tree, tmp_path):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from file_trees import bytes_of
+from plain_meshes import textured_wedge
 from realsim.errors import InputError
 from realsim.formats.bop.models import load_models, save_models
 from realsim.geometry.mesh import diameter, mass_properties
@@ -34,13 +35,6 @@ def made(name: str) -> PreparedModel:
     if name not in MADE:
         MADE[name] = prepare_mesh(part(name).mesh, CONFIG)
     return MADE[name]
-
-
-def textured() -> Mesh:
-    mesh = part("wedge").mesh
-    image = np.random.default_rng(3).integers(0, 255, (16, 8, 3), dtype=np.uint8)
-    uv = (mesh.vertices[:, :2] - mesh.bounds[0, :2]) / mesh.extent[:2]
-    return replace(mesh, colors=None, uv=uv, texture=image)
 
 
 @pytest.fixture
@@ -75,7 +69,7 @@ def test_a_model_comes_back_as_it_went_in(library: ModelLibrary, name: str):
 
 
 def test_a_texture_comes_back_bit_for_bit(library: ModelLibrary):
-    mesh = textured()
+    mesh = textured_wedge()
     library.add(prepare_mesh(mesh, CONFIG), "painted")
     back = library.load("painted").model.mesh
     assert np.array_equal(back.texture, mesh.texture)
@@ -145,7 +139,7 @@ def test_ids_are_given_once_and_never_changed(library: ModelLibrary):
 
 
 def test_replacing_leaves_nothing_of_the_old_model(library: ModelLibrary):
-    library.add(prepare_mesh(textured(), CONFIG), "old", picture=b"old")
+    library.add(prepare_mesh(textured_wedge(), CONFIG), "old", picture=b"old")
     assert (library.folder / "obj_000001.png").is_file()
     plain = prepare_mesh(part("box").mesh, replace(CONFIG, with_parts=False))
     library.add(plain, "new", obj_id=1, overwrite=True)

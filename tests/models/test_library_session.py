@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from file_trees import bytes_of
+from plain_meshes import textured_wedge
 from realsim.errors import InputError
 from realsim.formats.bop.models import load_models, save_models
 from realsim.geometry.parts import part
@@ -14,17 +15,9 @@ from realsim.models.library import ModelLibrary
 from realsim.models.library_prepare import PrepareConfig, prepare_mesh, prepare_unscaled
 from realsim.models.library_records import ScaleNote
 from realsim.models.library_session import copy_models, known_solids
-from realsim.records import Mesh
 from realsim.untrusted.own_json import to_json
 
 BARE = PrepareConfig(with_parts=False)
-
-
-def textured() -> Mesh:
-    mesh = part("wedge").mesh
-    image = np.random.default_rng(3).integers(0, 255, (16, 8, 3), dtype=np.uint8)
-    uv = (mesh.vertices[:, :2] - mesh.bounds[0, :2]) / mesh.extent[:2]
-    return replace(mesh, colors=None, uv=uv, texture=image)
 
 
 @pytest.fixture
@@ -39,7 +32,7 @@ def library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModelLibrary:
 
 def test_promoting_equals_importing_at_that_size(library: ModelLibrary):
     scale = 0.37
-    mesh = textured()
+    mesh = textured_wedge()
     raw = replace(mesh, vertices=mesh.vertices / scale)
     library.add_unscaled(prepare_unscaled(raw, BARE), "scan", picture=b"p")
     with pytest.raises(InputError, match="without metric scale: `realsim scan scale scan"):

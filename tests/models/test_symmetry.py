@@ -18,13 +18,10 @@ from realsim.models.symmetry import SymmetryConfig, find_symmetries, with_found_
 from realsim.models.symmetry_search import closed, group, turn
 from realsim.records import Mesh, ObjectModel
 from realsim.scanning.simulated import distorted
+from trimesh_solids import solid
 
 PHI = (1 + math.sqrt(5)) / 2
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
-
-
-def solid(shape):
-    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
 
 
 def hull(points, size_m=0.05):

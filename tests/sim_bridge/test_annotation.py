@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from file_trees import annotation_of
 from plain_meshes import box
 from realsim import (
     CameraIntrinsics,
@@ -89,25 +90,6 @@ def make_session(folder: Path) -> SessionStore:
     return store
 
 
-def snapshot(store: SessionStore) -> dict[str, bytes]:
-    """Return the bytes of everything the annotation writes."""
-    found = {}
-    for pattern in (
-        "mask*/*",
-        "labels/*/*",
-        "annotations/*",
-        "annotations/*/*",
-        "grasps/views/*",
-        "scene_gt*",
-    ):
-        found |= {
-            str(p.relative_to(store.folder)): p.read_bytes()
-            for p in store.folder.glob(pattern)
-            if p.is_file()
-        }
-    return found
-
-
 @pytest.fixture(scope="module")
 def annotated(tmp_path_factory: pytest.TempPathFactory) -> SessionStore:
     store = make_session(tmp_path_factory.mktemp("s") / "boxes")
@@ -150,13 +132,13 @@ def test_grasps_of_a_view_are_the_objects_grasps_in_its_camera(annotated: Sessio
 
 
 def test_again_is_skipped_and_changes_nothing(annotated: SessionStore) -> None:
-    before = snapshot(annotated)
+    before = annotation_of(annotated.folder)
     calls: list[tuple[int, int]] = []
     again = annotate(
         annotated, SCENE, MODELS, GRASPS, progress=lambda done, total: calls.append((done, total))
     )
     assert again.skipped == 3 and calls == [(3, 3)]
-    assert snapshot(annotated) == before
+    assert annotation_of(annotated.folder) == before
 
 
 class Killed(Exception):
@@ -184,7 +166,7 @@ def test_going_back_after_a_kill_leaves_no_foreign_masks(
 ) -> None:
     store = make_session(tmp_path / "s")
     annotate(store, SCENE, MODELS, GRASPS)
-    before = snapshot(store)
+    before = annotation_of(store.folder)
 
     write_bytes = SessionStore.write_bytes
 
@@ -197,9 +179,9 @@ def test_going_back_after_a_kill_leaves_no_foreign_masks(
         patch.setattr(SessionStore, "write_bytes", killed)
         with pytest.raises(Killed):
             annotate(store, moved(SCENE), MODELS, GRASPS)
-    assert snapshot(store) != before
+    assert annotation_of(store.folder) != before
     assert annotate(store, SCENE, MODELS, GRASPS).skipped == 2
-    assert snapshot(store) == before
+    assert annotation_of(store.folder) == before
 
 
 def test_a_rejected_object_leaves_and_takes_its_masks_along(tmp_path: Path) -> None:

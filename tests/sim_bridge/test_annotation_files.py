@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from file_trees import annotation_of
 from realsim import (
     CameraIntrinsics,
     CaptureSession,
@@ -81,20 +82,8 @@ def make_session(folder: Path, size: tuple[int, int] | None = None) -> SessionSt
 
 
 def written(store: SessionStore) -> dict[str, bytes]:
-    patterns = (
-        "mask*/*",
-        "labels/*/*",
-        "annotations/*",
-        "annotations/*/*",
-        "grasps/*/*",
-        "scene_gt*",
-    )
-    return {
-        str(p.relative_to(store.folder)): p.read_bytes()
-        for pattern in patterns
-        for p in store.folder.glob(pattern)
-        if p.is_file() and "coco" not in p.name  # it carries the date of the session
-    }
+    """Return what was written but for the file that carries the date of the session."""
+    return {k: v for k, v in annotation_of(store.folder).items() if "coco" not in k}
 
 
 @pytest.fixture(scope="module")

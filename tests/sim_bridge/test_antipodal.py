@@ -9,7 +9,7 @@ import trimesh
 from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim_sim_bridge.grasping.antipodal import CandidateConfig, RaySurface, antipodal_pairs
-from trimesh_solids import solid
+from trimesh_solids import cup, solid
 
 CONFIG = CandidateConfig(surface_points=500)
 
@@ -18,10 +18,6 @@ def pairs_of(mesh, config=CONFIG, max_width=0.078, seed=0):
     counts = {}
     rng = np.random.default_rng(seed)
     return antipodal_pairs(RaySurface(mesh), config, max_width, rng, counts), counts
-
-
-def cup():
-    return solid(trimesh.creation.annulus(0.028, 0.032, 0.08, sections=96))
 
 
 def sphere(radius=0.03):

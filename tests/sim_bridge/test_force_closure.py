@@ -19,17 +19,13 @@ from realsim_sim_bridge.grasping.force_closure import (
     largest_balls,
 )
 from realsim_sim_bridge.grasping.pad_contacts import pad_contacts
-from trimesh_solids import solid
+from trimesh_solids import cup, solid, wedge
 
 HAND = find_hand()
 
 
 def box(*size):
     return solid(trimesh.creation.box(size or (0.05, 0.05, 0.05)))
-
-
-def cup():
-    return solid(trimesh.creation.annulus(0.028, 0.032, 0.08, sections=96))
 
 
 def moved(mesh, T):
@@ -41,15 +37,6 @@ def grasps(mesh, limit=80, seed=0):
     config, rng = CandidateConfig(surface_points=200), np.random.default_rng(seed)
     found = sample_candidates(mesh, T, Surroundings(), config, HAND, rng, limit)
     return found.Ts_obj_grasp, found.openings_m
-
-
-def wedge(half_angle, length=0.06, thin=0.01):
-    """Return a wedge that grows along x, its slopes facing +y and -y, open at +-half_angle."""
-    end = thin + length * np.tan(half_angle)
-    x = np.array([-length / 2, length / 2])
-    outline = np.array([[x[0], -thin], [x[1], -end], [x[1], end], [x[0], thin]])
-    corners = np.concatenate([np.c_[outline, np.full(4, z)] for z in (-0.02, 0.02)])
-    return solid(trimesh.convex.convex_hull(corners))
 
 
 def random_contacts(n, seed):
@@ -121,7 +108,7 @@ def test_the_lever_of_a_pad_on_a_flat_face_is_that_of_an_evenly_loaded_patch():
 
 @pytest.mark.parametrize("angle_deg", [15, 40])
 def test_a_wedge_closes_from_the_tangent_of_its_half_angle_on(angle_deg):
-    mesh, tangent = wedge(np.radians(angle_deg)), np.tan(np.radians(angle_deg))
+    mesh, tangent = wedge(np.radians(angle_deg), 0.06, 0.01, 0.02), np.tan(np.radians(angle_deg))
     T, opening = np.eye(4)[None], np.array([0.08])
     for friction, closes in ((tangent - 0.001, False), (tangent + 0.001, True)):
         closure = force_closure(mesh, T, opening, ClosureConfig(friction=friction))

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from file_trees import bytes_of
 from realsim.errors import InputError
 from realsim.many import WorkerDiedError, open_pool
 from realsim_sim_bridge.school import recompute_scores, run_school, run_school_results
@@ -223,7 +224,7 @@ def test_another_config_is_refused_field_by_field(finished):
     other = dataclasses.replace(
         CONFIG, seed=4, slip=dataclasses.replace(CONFIG.slip, physics=physics)
     )
-    before = {p: p.read_bytes() for p in finished.iterdir() if p.is_file()}
+    before = bytes_of(finished, "*")
     with pytest.raises(InputError) as caught:
         run(finished, other)
     lines = str(caught.value).splitlines()[1:-1]
@@ -233,7 +234,7 @@ def test_another_config_is_refused_field_by_field(finished):
         "config.slip.physics.friction: 1.0 -> 0.5",
     ]
     assert "--restart" in str(caught.value) and "another folder" in str(caught.value)
-    assert before == {p: p.read_bytes() for p in finished.iterdir() if p.is_file()}
+    assert before == bytes_of(finished, "*")
 
 
 def test_another_mesh_pose_or_object_is_refused(finished):

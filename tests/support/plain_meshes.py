@@ -1,4 +1,4 @@
-"""Boxes and balls of a few triangles."""
+"""Boxes and balls of a few triangles, and a wedge with a texture."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from realsim.geometry.mesh import box_mesh
+from realsim.geometry.parts import part
 from realsim.records import Mesh
 
 
@@ -28,3 +29,11 @@ def ball(radius: float, rings: int = 16) -> Mesh:
     q = i * m + j
     faces = np.concatenate([np.stack([q, q + m, k + m], -1), np.stack([q, k + m, k], -1)])
     return Mesh(vertices=radius * xyz, faces=faces)
+
+
+def textured_wedge() -> Mesh:
+    """The wedge of the shipped parts, painted with noise from above."""
+    mesh = part("wedge").mesh
+    image = np.random.default_rng(3).integers(0, 255, (16, 8, 3), dtype=np.uint8)
+    uv = (mesh.vertices[:, :2] - mesh.bounds[0, :2]) / mesh.extent[:2]
+    return replace(mesh, colors=None, uv=uv, texture=image)

@@ -59,6 +59,15 @@ def true_cameras(views: int, *, posed: bool = True) -> list[Array]:
     return out
 
 
+def table_renderer() -> LabelRenderer:
+    """Return what renders the objects on the table, a square metre of the plane z = 0."""
+    models = models_of()
+    corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
+    table = Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
+    placed = [PlacedMesh(o.instance, models[o.obj_id].mesh, o.T_world_obj) for o in true_poses()]
+    return LabelRenderer([*placed, PlacedMesh(-1, table, np.eye(4))])
+
+
 def table_session(
     folder: Path,
     views: int = 8,
@@ -76,12 +85,7 @@ def table_session(
         seed: of these errors.
         posed: False leaves the cameras' poses out, as of a camera led by hand.
     """
-    rng = np.random.default_rng(seed)
-    models = models_of()
-    corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
-    table = Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
-    placed = [PlacedMesh(o.instance, models[o.obj_id].mesh, o.T_world_obj) for o in true_poses()]
-    renderer = LabelRenderer([*placed, PlacedMesh(-1, table, np.eye(4))])
+    rng, renderer = np.random.default_rng(seed), table_renderer()
     session = CaptureSession(name="two objects", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
     store = SessionStore.create(folder, session, {"gravity_up_world": [0, 0, 1]})
     for k, T in enumerate(true_cameras(views, posed=posed)):
@@ -90,7 +94,7 @@ def table_session(
         twist = rng.normal(size=6) * np.repeat(sigma, 3)
         claimed = T @ se3.exp(twist) if posed else None
         store.add_view(View(index=k, T_world_cam=claimed), rgb, labels.depth_m)
-    save_models(store.folder / "models", models)
+    save_models(store.folder / "models", models_of())
     return store
 
 

@@ -29,3 +29,8 @@ def wedge(half_angle: float, length: float = 0.04, thin: float = 0.008, half_hei
     outline = np.array([[x[0], -thin], [x[1], -end], [x[1], end], [x[0], thin]])
     corners = np.concatenate([np.c_[outline, np.full(4, z)] for z in (-half_height, half_height)])
     return solid(trimesh.convex.convex_hull(corners))
+
+
+def cup(sections=96) -> Mesh:
+    """Return a tube along z, 80 mm high, with walls of 4 mm."""
+    return solid(trimesh.creation.annulus(0.028, 0.032, 0.08, sections=sections))
