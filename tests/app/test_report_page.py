@@ -23,10 +23,10 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 @pytest.fixture(scope="module")
-def pages(registered_session: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def pages(registered_few: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The report and the annotation's page of a registered session."""
     folder = tmp_path_factory.mktemp("pages")
-    store = SessionStore.open(copy_of(registered_session, folder / "s"))
+    store = SessionStore.open(copy_of(registered_few, folder / "s"))
     run_annotate(store.folder, Console(quiet=True), maps="all", workers=1, check_depth=True)
     comparison = folder / "comparison.html"
     sources = sources_of([store.folder, store.folder])

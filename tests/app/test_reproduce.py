@@ -20,7 +20,7 @@ def made(few_views: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session registered and annotated with one thread of BLAS and OpenMP."""
     folder = copy_of(few_views, tmp_path_factory.mktemp("made") / "s")
     with threadpool_limits(1):
-        for words in (("register", folder, "--object", "mug"), ("annotate", folder)):
+        for words in (("register", folder, "--object", "wedge"), ("annotate", folder)):
             finished(*words, "--workers", 1, "--quiet")
     return folder
 
@@ -34,7 +34,7 @@ def copy(made: Path, tmp_path: Path) -> Path:
 
 def test_a_record_names_versions_settings_inputs_and_command(made: Path) -> None:
     record, run = provenance.read(made, "register")
-    assert record.request["objects"] == ["mug"]
+    assert record.request["objects"] == ["wedge"]
     assert record.config["refine"] and record.versions["open3d-cpu"][0].isdigit()
     assert {"python", "platform", "realsim"} <= set(record.versions)
     for name in ("rgb/000002.png", "depth/000000.png", "robot.jsonl"):

@@ -93,8 +93,8 @@ def test_a_plan_is_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert [p.suffix for p in made.pictures] == [".png"] * len(made.pictures) and made.pictures
 
 
-def test_labels_are_the_commands(tmp_path: Path, registered_session: Path) -> None:
-    by_command, by_verb = (copy_of(registered_session, tmp_path / n) for n in ("a", "b"))
+def test_labels_are_the_commands(tmp_path: Path, registered_few: Path) -> None:
+    by_command, by_verb = (copy_of(registered_few, tmp_path / n) for n in ("a", "b"))
     session = rs.open(by_verb)
     assert session.value.views and "views with a camera pose" in session._repr_html_()
     made = rs.annotate(session, maps="none", quiet=True)

@@ -20,7 +20,7 @@ from realsim import CaptureSession, InputError, local_pages
 from realsim.local_pages import Door
 from realsim.review import ReviewServer
 from realsim.store import SessionStore
-from tests.support.review_browser import SMALL
+from tests.support.review_browser import serving
 from tests.support.reviewed_boxes import boxes_session
 
 SOCKET = Subprotocol(f"{viser.__name__}-v{viser.__version__}")
@@ -34,19 +34,15 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SessionStore:
 
 @pytest.fixture(scope="module")
 def server(store: SessionStore) -> Iterator[ReviewServer]:
-    review = ReviewServer(store, port=0, config=SMALL)
-    review.start()
-    yield review
-    review.stop()
+    with serving(store) as review:
+        yield review
 
 
 @pytest.fixture(scope="module")
 def locked(store: SessionStore) -> Iterator[ReviewServer]:
     """Return a server that asks for a token, listening on all interfaces."""
-    review = ReviewServer(store, host="0.0.0.0", port=0, token=TOKEN, config=SMALL)
-    review.start()
-    yield review
-    review.stop()
+    with serving(store, host="0.0.0.0", token=TOKEN) as review:
+        yield review
 
 
 def port_of(server: ReviewServer) -> int:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from file_trees import bytes_of
 from realsim import InputError, ObjectPose
 from realsim.geometry import se3
 from realsim.review import journal, scene_list
@@ -97,8 +98,7 @@ def test_sessions_are_found_below_a_folder_and_once(tmp_path: Path) -> None:
 
 
 def test_decisions_change_the_journal_and_no_other_file(session: ReviewedSession) -> None:
-    files = [p for p in session.store.folder.rglob("*") if p.is_file()]
-    before = {p: p.read_bytes() for p in files}
+    before = bytes_of(session.store.folder)
     session.decide("reject", seen(session, 3), "ada", comment="it floats")
     assert seen(session, 3).verdict == "rejected" and seen(session, 0).verdict == "accepted"
     assert [r.is_decided for r in session.rows()] == [False, True]
@@ -111,7 +111,8 @@ def test_decisions_change_the_journal_and_no_other_file(session: ReviewedSession
     session.mark_symmetric(TALL, "z:4", "ada")
     actions = [e.action for e in session.standing.state.entries]
     assert actions == ["reject", "undo", "move", "swap", "exclude", "symmetric"]
-    assert {p: p.read_bytes() for p in files} == before
+    after = bytes_of(session.store.folder)
+    assert {name: after[name] for name in before} == before
     moved = session.rows()[1]
     assert moved.is_changed and moved.name == "spare" and moved.verdict == "unchecked"
     assert len(session.model(TALL).symmetries) == 4

@@ -31,7 +31,7 @@ from realsim.review.window.place import Place
 from realsim.review.window.window import Window
 from realsim.store import SessionStore, save_grasps, save_scene
 from realsim.store.session_store import rgb_path
-from tests.support.review_browser import SMALL
+from tests.support.review_browser import serving
 from tests.support.reviewed_boxes import MODELS, SCENE, boxes_session, grasp_set
 
 SOCKET = Subprotocol(f"{viser.__name__}-v{viser.__version__}")
@@ -94,14 +94,10 @@ class Page:
 
 @contextmanager
 def opened(store: SessionStore) -> Generator[Page]:
-    server = ReviewServer(store, port=0, reviewer="ada", config=SMALL)
-    server.start()
-    address = server.url.replace("http", "ws")
-    try:
+    with serving(store, reviewer="ada") as server:
+        address = server.url.replace("http", "ws")
         with connect(address, subprotocols=[SOCKET], max_size=None, ping_interval=None) as line:
             yield Page(server, line)
-    finally:
-        server.stop()
 
 
 @pytest.fixture

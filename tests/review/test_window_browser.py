@@ -22,6 +22,7 @@ from tests.support.review_browser import (
     ReviewPage,
     needs_chromium,
     review_browser,
+    serving,
 )
 from tests.support.reviewed_boxes import boxes_session
 
@@ -36,20 +37,11 @@ def browser() -> Iterator[ReviewBrowser]:
         yield opened
 
 
-@pytest.fixture(scope="module")
-def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return boxes_session(tmp_path_factory.mktemp("window") / "boxes").folder
-
-
 @pytest.fixture
-def server(original: Path, tmp_path: Path) -> Iterator[ReviewServer]:
+def server(tmp_path: Path) -> Iterator[ReviewServer]:
     """Return a server of a session that nobody has judged, for a reviewer without a name."""
-    shutil.copytree(original, tmp_path / "boxes")
-    store = SessionStore.open(tmp_path / "boxes")
-    review = ReviewServer(store, port=0, config=SMALL)
-    review.start()
-    yield review
-    review.stop()
+    with serving(boxes_session(tmp_path / "boxes")) as review:
+        yield review
 
 
 def lines(server: ReviewServer) -> list[Entry]:
@@ -82,9 +74,7 @@ def test_a_scene_of_any_up_is_framed_at_once_and_a_link_shows_the_same(
     store = SessionStore.open(tmp_path / "tilted")
     turned = se3.from_rt(se3.exp_so3(np.array([2.2, 0.4, 0.0])), np.array([0.5, 0.0, 0.0]))
     save_scene(store, replace(load_scene(store), plane=SupportPlane(T_world_table=turned)))
-    tilted = ReviewServer(store, port=0, config=SMALL)
-    tilted.start()
-    try:
+    with serving(store) as tilted:
         with browser.page(tilted.url, width=1280, height=800) as page:
             page.wait_for("objects judged", "computed:")
             page.wait_until(lambda: _scene_share(page) > 0.02, "the scene in the middle")
@@ -98,8 +88,6 @@ def test_a_scene_of_any_up_is_framed_at_once_and_a_link_shows_the_same(
         with browser.page(link, width=1280, height=800) as page:
             page.wait_for("\u25b6 0 tall", "Leave this view out")
             page.wait_until(lambda: "tab=Views" in page.page.url, "the tab")
-    finally:
-        tilted.stop()
 
 
 PANELS = """[...document.querySelectorAll('[data-dock-window], .mantine-Paper-root')]

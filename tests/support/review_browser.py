@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike
 
 from realsim.arrays import Rgb
 from realsim.geometry import se3
+from realsim.review import ReviewServer
 from realsim.review.content.config import SceneConfig
+from realsim.store import SessionStore
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 ARGS = (
@@ -240,6 +242,17 @@ class ReviewBrowser:
             assert opened.errors == []
         finally:
             context.close()
+
+
+@contextmanager
+def serving(store: SessionStore, **options: Any) -> Generator[ReviewServer]:
+    """Serve a session's review, small and on a free port, for as long as the block lasts."""
+    server = ReviewServer(store, port=0, config=SMALL, **options)
+    server.start()
+    try:
+        yield server
+    finally:
+        server.stop()
 
 
 @contextmanager
