@@ -71,24 +71,20 @@ class Hint:
     """None = anywhere."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class HintConfig:
-    """How hints become regions."""
-
-    start_radius_m: float = 0.045
-    """How far an object may be from a pose given without accuracy [m]: 1.5 times 30 mm."""
-    start_turn_deg: float = 38.0
-    """How far it may be turned from there [deg]: nearly twice 20 deg."""
-    click_reach_px: int = 2
-    """Depth at a click is the median of the valid pixels up to so far from it (5 x 5)."""
-    slack_m: float = 0.010
-    """Regions are larger by this [m]: cameras are off by millimetres, people by a few pixels."""
-    above_m: float = 0.005
-    """In boxes and masks points higher over the table than this are the object's [m]."""
-    least_points: int = 20
-    """With fewer such points all measured ones are taken: flat things do not rise above it."""
-    least_slope: float = 0.3
-    """Sine of the flattest ray to the table that tells a place; flatter ones miss it by far."""
+START_RADIUS_M = 0.045
+"""How far an object may be from a pose given without accuracy [m]: 1.5 times 30 mm."""
+START_TURN_DEG = 38.0
+"""How far it may be turned from there [deg]: nearly twice 20 deg."""
+CLICK_REACH_PX = 2
+"""Depth at a click is the median of the valid pixels up to so far from it (5 x 5)."""
+SLACK_M = 0.010
+"""Regions are larger by this [m]: cameras are off by millimetres, people by a few pixels."""
+ABOVE_M = 0.005
+"""In boxes and masks points higher over the table than this are the object's [m]."""
+LEAST_POINTS = 20
+"""With fewer such points all measured ones are taken: flat things do not rise above it."""
+LEAST_SLOPE = 0.3
+"""Sine of the flattest ray to the table that tells a place; flatter ones miss it by far."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -101,9 +97,7 @@ class HintScene:
     plane: SupportPlane | None = None
 
 
-def region_of(
-    hint: Hint, model: ObjectModel, scene: HintScene, config: HintConfig
-) -> Region | None:
+def region_of(hint: Hint, model: ObjectModel, scene: HintScene) -> Region | None:
     """Return where the middle of the object may be; None = anywhere.
 
     Raises:
@@ -117,9 +111,9 @@ def region_of(
         T = where.T_world_obj
         return Region(
             center_world=T[:3, :3] @ model.mesh.bounds.mean(0) + T[:3, 3],
-            radius_m=config.start_radius_m if where.radius_m is None else where.radius_m,
+            radius_m=START_RADIUS_M if where.radius_m is None else where.radius_m,
             R_world_obj=T[:3, :3].copy(),
-            turn_deg=config.start_turn_deg if where.turn_deg is None else where.turn_deg,
+            turn_deg=START_TURN_DEG if where.turn_deg is None else where.turn_deg,
         )
     name = f"object {hint.obj_id} (instance {hint.instance})"
     if where.view not in scene.frames:
@@ -128,21 +122,21 @@ def region_of(
             f"the hint of {name} names view {where.view}; there are {len(known)} views with depth "
             f"and a camera pose: {_shortened(known)}."
         )
-    inside, middle = _pixels(where, scene.intrinsics, name, config)
+    inside, middle = _pixels(where, scene.intrinsics, name)
     depth = scene.frames[where.view].depth_m
     measured = inside & (depth > 0) & np.isfinite(depth)
     if np.any(measured):
-        return _from_depth(where, measured, model, scene, config)
+        return _from_depth(where, measured, model, scene)
     if scene.plane is None:
         raise InputError(
             f"the hint of {name} is of no use: no depth is measured there in view {where.view}, "
             "and no table was found to guess it from. Give another view, or a rough pose."
         )
-    return _from_table(where.view, middle, model, scene, config, name)
+    return _from_table(where.view, middle, model, scene, name)
 
 
 def _pixels(
-    where: Click | Box | Marked, camera: CameraIntrinsics, name: str, config: HintConfig
+    where: Click | Box | Marked, camera: CameraIntrinsics, name: str
 ) -> tuple[Mask, tuple[float, float]]:
     """Return the pixels (H, W) that a hint speaks of, and their middle (column, row).
 
@@ -167,7 +161,7 @@ def _pixels(
             raise InputError(f"the click of {name} is at pixel ({u:g}, {v:g}); {size}.")
         j, i = (int(np.clip(np.rint(x), 0, n - 1)) for x, n in
                 ((u, camera.width), (v, camera.height)))  # fmt: skip
-        r = config.click_reach_px
+        r = CLICK_REACH_PX
         inside[max(0, i - r) : i + r + 1, max(0, j - r) : j + r + 1] = True
         return inside, (u, v)
     x, y, w, h = where.xywh
@@ -182,11 +176,7 @@ def _pixels(
 
 
 def _from_depth(
-    where: Click | Box | Marked,
-    measured: Mask,
-    model: ObjectModel,
-    scene: HintScene,
-    config: HintConfig,
+    where: Click | Box | Marked, measured: Mask, model: ObjectModel, scene: HintScene
 ) -> Region:
     """Return the region behind the surface that is measured at the pixels.
 
@@ -208,19 +198,19 @@ def _from_depth(
         T_cam_table = None
         if scene.plane is not None:
             T_cam_table = se3.invert(frame.T_world_cam) @ scene.plane.T_world_table
-        surface, near, far = _middle_of(p, radius, T_cam_table, config)
+        surface, near, far = _middle_of(p, radius, T_cam_table)
         # A box holds what stands before and behind the object as well.
         spread = 0.5 * (far - near) if isinstance(where, Box) else 0.0
     behind = surface / np.linalg.norm(surface)
     center = se3.transform(frame.T_world_cam, surface + half * behind)[0]
     return Region(
         center_world=_raised(center, half, scene.plane),
-        radius_m=float(np.hypot(radius, half)) + spread + config.slack_m,
+        radius_m=float(np.hypot(radius, half)) + spread + SLACK_M,
     )
 
 
 def _middle_of(
-    points: Array, radius: float, T_cam_table: Array | None, config: HintConfig
+    points: Array, radius: float, T_cam_table: Array | None
 ) -> tuple[Array, float, float]:
     """Return the middle (3,) of those points (N, 3) that may be the object's, and their depths.
 
@@ -230,8 +220,8 @@ def _middle_of(
     """
     if T_cam_table is not None:
         height = se3.transform(se3.invert(T_cam_table), points)[:, 2]
-        above = points[height > config.above_m]
-        points = above if len(above) >= config.least_points else points
+        above = points[height > ABOVE_M]
+        points = above if len(above) >= LEAST_POINTS else points
     middle = np.median(points, axis=0)
     near = points[np.linalg.norm(points - middle, axis=1) < 2.0 * radius]
     near = near if len(near) else points
@@ -240,12 +230,7 @@ def _middle_of(
 
 
 def _from_table(
-    view: int,
-    pixel: tuple[float, float],
-    model: ObjectModel,
-    scene: HintScene,
-    config: HintConfig,
-    name: str,
+    view: int, pixel: tuple[float, float], model: ObjectModel, scene: HintScene, name: str
 ) -> Region:
     """Return the region where a pixel's ray passes over the table, for things without depth.
 
@@ -264,7 +249,7 @@ def _from_table(
     ray /= np.linalg.norm(ray)
     up = plane.T_world_table[:3, 2]
     slope = float(-ray @ up)
-    if not slope > config.least_slope / 3:
+    if not slope > LEAST_SLOPE / 3:
         raise InputError(
             f"the hint of {name} is of no use: no depth is measured there in view {view}, and its "
             "ray does not come down to the table. Give a view from further above."
@@ -272,10 +257,9 @@ def _from_table(
     half, radius = _half_size(model)
     eye_height = float((T[:3, 3] - plane.T_world_table[:3, 3]) @ up)
     middle = T[:3, 3] + ray * ((eye_height - radius) / slope)
-    along = radius / max(slope, config.least_slope)
+    along = radius / max(slope, LEAST_SLOPE)
     return Region(
-        center_world=_raised(middle, half, plane),
-        radius_m=float(np.hypot(along, radius)) + config.slack_m,
+        center_world=_raised(middle, half, plane), radius_m=float(np.hypot(along, radius)) + SLACK_M
     )
 
 

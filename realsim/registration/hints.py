@@ -39,7 +39,6 @@ from realsim.registration.hint_regions import (
     Box,
     Click,
     Hint,
-    HintConfig,
     HintScene,
     Marked,
     RoughPose,
@@ -52,7 +51,7 @@ from realsim.store import SessionStore
 from realsim.untrusted.own_json import read_object
 
 __all__ = [
-    "Box", "Click", "Hint", "HintConfig", "HintScene", "Marked", "RoughPose", "Where",
+    "Box", "Click", "Hint", "HintScene", "Marked", "RoughPose", "Where",
     "parse_object", "parse_objects", "read_hints", "read_starts", "region_of",
     "wanted_objects",
 ]  # fmt: skip
@@ -257,7 +256,7 @@ def _rigid(values: ArrayLike, label: str) -> Array:
 
 
 def wanted_objects(
-    hints: Sequence[Hint], models: Mapping[int, ObjectModel], scene: HintScene, config: HintConfig
+    hints: Sequence[Hint], models: Mapping[int, ObjectModel], scene: HintScene
 ) -> list[Wanted]:
     """Return what is wanted: each hint's object with its region and, of a rough pose, the pose.
 
@@ -268,7 +267,7 @@ def wanted_objects(
         Wanted(
             obj_id=h.obj_id,
             instance=h.instance,
-            region=region_of(h, models[h.obj_id], scene, config),
+            region=region_of(h, models[h.obj_id], scene),
             T_start=h.where.T_world_obj if isinstance(h.where, RoughPose) else None,
         )
         for h in hints
@@ -308,7 +307,7 @@ def _wanted_in(
                 "depth and a camera pose."
             )
     scene = HintScene(intrinsics=camera, frames=frames, plane=plane)
-    return wanted_objects(hints, models, scene, HintConfig())
+    return wanted_objects(hints, models, scene)
 
 
 def _table(camera: CameraIntrinsics, frames: Sequence[DepthFrame], up: Any) -> SupportPlane | None:

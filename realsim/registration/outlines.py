@@ -1,91 +1,24 @@
 """Outlines in a depth image, edges in a colour image, and how often these fall on those."""
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
 from realsim.arrays import Array, Array32, UInt8
 from realsim.compiled import njit
 
-
-def _stretches() -> tuple[float, ...]:
-    """Return the factors that depth is stretched by: about +-2 % apart, from 0.7 to 1.45."""
-    return tuple(float(s) for s in np.exp(np.arange(-18, 19) * 0.02))
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class AlignmentConfig:
-    """How outlines are compared with edges. Pixels are those of an image `work_width_px` wide."""
-
-    work_width_px: int = 640
-    """Images are reduced to about this width: finer edges are noise."""
-    jump_m: float = 0.015
-    """Depth differences beyond this are outlines [m]; plus `jump_share` of the depth."""
-    jump_share: float = 0.02
-    """Noise and slopes grow with depth."""
-    gap_px: int = 12
-    """Depth that is missing over less than this beside an outline is the stereo camera's shadow:
-    the nearer side of the gap is the outline."""
-    run_px: int = 8
-    """Outlines are at least so long."""
-    reach_px: int = 24
-    """Shifts up to this are tried, along both axes."""
-    step_px: int = 3
-    """Steps of the shifts while stretches are tried, too."""
-    stretches: tuple[float, ...] = field(default_factory=_stretches)
-    """Factors that depth is stretched by about the middle, along each axis: a colour lens of 69
-    deg against a depth lens of 87 deg is 0.72."""
-    near_px: float = 1.5
-    """An outline counts exp(-d^2 / 2 near^2) at distance d from an edge."""
-    wide_px: float = 3.0
-    """The same while stretches are tried, in coarser steps."""
-    edge_share: float = 0.08
-    """The strongest edges of the colour image, so large a share of its pixels, are used."""
-    points: int = 1200
-    """Outline pixels used at most; a third of them while stretches are tried."""
-    least_points: int = 150
-    """With fewer outlines nothing is said: an empty table has none."""
-    confidence: float = 5.0
-    """The best shift stands out by at least so many robust standard deviations of all shifts."""
-    vote_px: float = 3.0
-    """Views whose own best shifts lie within this of the common one vote for it; by chance one in
-    70 does."""
-    vote_share: float = 0.5
-    """With the votes of this share of the views, and three at least, a shift is sure."""
-    stretch_confidence: float = 7.0
-    """The same of the best stretch: a thousand times more are tried."""
-    aligned_px: float = 5.5
-    """A best shift up to this is aligned: published, aligned data lies up to 5 px off (YCB-Video
-    2.5 px along y, GraspNet's Kinect 2.3 px, an F200 mapped onto its colour image 4.9 px)."""
-    wrong_px: float = 6.0
-    """Outlines this far off, in the mean over the image, are said to be not aligned."""
-    stretch_gain: float = 1.15
-    """A stretch is believed if it is so many times better than the best shift without one."""
-    agree_share: float = 0.75
-    """A view agrees with all of them if their best is worth this share of its own best."""
-    gain: float = 1.3
-    """A stretch or shift is believed if outlines lie on edges so many times as often beyond chance
-    as they do unmoved."""
-    few_confidence: float = 3.4
-    """Least confidence of the best shift in one or two views, which cannot vote. The values from
-    here to `few_resized_gain` were set on five frames of YCB-Video (aligned, shifted, stretched),
-    15 of an F200 and ten resized ones of a UR5e's camera."""
-    few_stretch_confidence: float = 3.9
-    """Least confidence of the best stretch: misaligned frames 4.0 to 7.7, an aligned one 3.3."""
-    few_share: float = 0.3
-    """Least share of outlines that lie on edges beyond chance."""
-    few_gain: float = 2.0
-    """Least ratio of that share to the unmoved one: 2.2 to 5 where depth was moved or stretched,
-    1.05 to 1.41 where it was not."""
-    few_stretch_gain: float = 1.5
-    """Least ratio of a stretch to the best shift: 1.7 to 12; aligned frames have up to 1.17."""
-    few_resized_gain: float = 1.2
-    """The same ratio for a stretch that is a resize from 4:3 to 16:9 or back: 1.2 to 2."""
-    seed: int = 0
-    """Seed of the choice of outline pixels."""
+JUMP_M = 0.015
+"""Depth differences beyond this are outlines [m]; plus `JUMP_SHARE` of the depth."""
+JUMP_SHARE = 0.02
+"""Noise and slopes grow with depth."""
+GAP_PX = 12
+"""Depth that is missing over less than this beside an outline is the stereo camera's shadow:
+the nearer side of the gap is the outline."""
+RUN_PX = 8
+"""Outlines are at least so long."""
+EDGE_SHARE = 0.08
+"""The strongest edges of the colour image, so large a share of its pixels, are used."""
 
 
-def outlines_of(depth_m: Array32, config: AlignmentConfig) -> Array32:
+def outlines_of(depth_m: Array32) -> Array32:
     """Return outline points (N, 3): x, y, and 0 where depth jumps along x, 1 along y."""
     import cv2
 
@@ -96,11 +29,11 @@ def outlines_of(depth_m: Array32, config: AlignmentConfig) -> Array32:
         # Column of the last measured pixel before each one: gaps are stepped over.
         last = np.maximum.accumulate(np.where(z > 0, columns, -1), axis=1)
         before = np.concatenate([np.full((len(z), 1), -1), last[:, :-1]], axis=1)
-        i, j = np.nonzero((z > 0) & (before >= 0) & (columns - before <= config.gap_px))
+        i, j = np.nonzero((z > 0) & (before >= 0) & (columns - before <= GAP_PX))
         b = before[i, j]
         here, there = z[i, j], z[i, b]
         jump = np.abs(here - there)
-        keep = jump > config.jump_m + config.jump_share * np.minimum(here, there)
+        keep = jump > JUMP_M + JUMP_SHARE * np.minimum(here, there)
         i, j, b = i[keep], j[keep], b[keep]
         # The border of the nearer of the two, half a pixel outside of it.
         x = np.where(here[keep] < there[keep], j - 0.5, b + 0.5)
@@ -108,7 +41,7 @@ def outlines_of(depth_m: Array32, config: AlignmentConfig) -> Array32:
         mask[i, np.ceil(x).astype(np.int64)] = 1
         _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
         # Noise jumps here and there, outlines run on.
-        long = np.asarray(stats)[:, cv2.CC_STAT_HEIGHT] >= config.run_px
+        long = np.asarray(stats)[:, cv2.CC_STAT_HEIGHT] >= RUN_PX
         keep = long[np.asarray(labels, dtype=np.int64)[i, np.ceil(x).astype(np.int64)]]
         i, x = i[keep], x[keep]
         xy = (x, i) if axis == 0 else (i, x)
@@ -125,7 +58,7 @@ def _without_pinholes(depth_m: Array32) -> Array:
     return z
 
 
-def edge_distance(rgb: UInt8, factor: int, config: AlignmentConfig) -> Array32:
+def edge_distance(rgb: UInt8, factor: int) -> Array32:
     """Return the distance (2, H, W) to the nearest colour edge along x and along y [px]."""
     import cv2
 
@@ -143,7 +76,7 @@ def edge_distance(rgb: UInt8, factor: int, config: AlignmentConfig) -> Array32:
         a, b = np.roll(g, 1, axis=1 - axis), np.roll(g, -1, axis=1 - axis)
         crest = (g >= a) & (g > b)
         values = g[crest]
-        n = int(0.5 * config.edge_share * g.size)
+        n = int(0.5 * EDGE_SHARE * g.size)
         least = np.partition(values, -n)[-n] if n < len(values) else 0.0
         edges = crest & (g >= max(float(least), 1.0))
         out[axis] = cv2.distanceTransform((~edges).astype(np.uint8), cv2.DIST_L2, 3)

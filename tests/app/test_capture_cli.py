@@ -16,7 +16,7 @@ from realsim.interop import import_pyrealsense2
 from realsim.records import CaptureSession
 from realsim.robots.arm import UR5, UR5E, find_arm
 from realsim.store import SessionStore
-from realsim_capture_plans.capturing.contact_sheet import SheetConfig, contact_sheet
+from realsim_capture_plans.capturing import contact_sheet as sheets
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
 from realsim_capture_plans.plan_files.plan_json import save_plan
@@ -212,13 +212,14 @@ def test_the_plan_of_a_franka_drives_a_franka(tmp_path: Path) -> None:
         server.close()
 
 
-def test_the_head_of_a_contact_sheet_is_whole() -> None:
+def test_the_head_of_a_contact_sheet_is_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     """Everything that is written shows: as much ink as on a sheet wide enough for one line."""
     title = "single_depth_color_640x480, D405 130322273305"
     n = 4
-    narrow = contact_sheet({}, {}, n, title, (640, 480), SheetConfig(largest_cell_px=80))
-    wide = contact_sheet({}, {}, n, title, (640, 480),
-                         SheetConfig(largest_cell_px=80, least_width_px=2000))  # fmt: skip
+    monkeypatch.setattr(sheets, "LARGEST_CELL_PX", 80)
+    narrow = sheets.contact_sheet({}, {}, n, title, (640, 480))
+    monkeypatch.setattr(sheets, "LEAST_WIDTH_PX", 2000)
+    wide = sheets.contact_sheet({}, {}, n, title, (640, 480))
     cells = 2 * 60
     head, one_line = narrow[:-cells], wide[:-cells]
     assert one_line.shape[0] == 46 < head.shape[0] and head.shape[1] == 480

@@ -11,14 +11,13 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
-from realsim.registration.depth_alignment import AlignmentConfig, check_alignment, pooled_alignment
+from realsim.registration.depth_alignment import check_alignment, pooled_alignment
 from table_faults import seen_instances
 from table_scenes import small_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("REALSIM_DATA", ROOT.parent / "shared" / "data"))
 SCENES = DATA / "scenes"
-CONFIG = AlignmentConfig()
 
 
 def warped(depth, sx=1.0, sy=1.0, dx=0.0, dy=0.0):
@@ -50,13 +49,13 @@ def checked(source, n, warp):
     """The check of one pair of a source, its depth warped; each is made once."""
     camera, pairs = source()
     rgb, depth = pairs[n]
-    return check_alignment(rgb, warped(depth, **dict(warp)), camera, CONFIG)
+    return check_alignment(rgb, warped(depth, **dict(warp)), camera)
 
 
 def pooled(source, *which, **warp):
     """The check of the pairs of a source together, or of some of them."""
     pairs, warp = which or range(len(source()[1])), tuple(sorted(warp.items()))
-    return pooled_alignment([checked(source, n, warp) for n in pairs], CONFIG)
+    return pooled_alignment([checked(source, n, warp) for n in pairs])
 
 
 def test_simulated_depth_is_aligned():
@@ -92,24 +91,24 @@ def test_one_view_is_enough_to_name_a_resized_or_moved_depth():
 
 def test_a_bare_table_says_nothing():
     camera, pairs = painted()
-    found = check_alignment(pairs[0][0], np.full((360, 640), 0.4, np.float32), camera, CONFIG)
+    found = check_alignment(pairs[0][0], np.full((360, 640), 0.4, np.float32), camera)
     assert found.kind == "unknown" and "0 pixels of outlines" in found.words
-    assert pooled_alignment([found], CONFIG).kind == "unknown"
+    assert pooled_alignment([found]).kind == "unknown"
 
 
 def test_another_size_is_named_at_once():
     camera, pairs = painted()
-    found = check_alignment(pairs[0][0], pairs[0][1][:, :600], camera, CONFIG)
+    found = check_alignment(pairs[0][0], pairs[0][1][:, :600], camera)
     assert found.kind == "other_size" and "600x360" in found.words and "640x360" in found.words
-    assert pooled_alignment([found], CONFIG).kind == "other_size"
+    assert pooled_alignment([found]).kind == "other_size"
 
 
 def test_senseless_images_are_errors():
     camera, pairs = painted()
     with pytest.raises(InputError, match="8-bit"):
-        check_alignment(pairs[0][0][..., 0], pairs[0][1], camera, CONFIG)
+        check_alignment(pairs[0][0][..., 0], pairs[0][1], camera)
     with pytest.raises(InputError, match="at least one"):
-        pooled_alignment([], CONFIG)
+        pooled_alignment([])
 
 
 # --- real data --------------------------------------------------------------------------------
@@ -152,6 +151,6 @@ def test_one_real_view_tells_resized_depth_from_aligned():
         metres = (counts / 1000).astype(np.float32)
         depth = cv2.resize(metres, (1920, 1080), interpolation=cv2.INTER_NEAREST)
         lens = CameraIntrinsics(width=1920, height=1080, fx=1350, fy=1350, cx=959.5, cy=539.5)
-        found = pooled_alignment([check_alignment(rgb, depth, lens, CONFIG)], CONFIG)
+        found = pooled_alignment([check_alignment(rgb, depth, lens)])
         named += found.kind == "not_aligned" and "stretched by 1.00 in x and 1." in found.words
     assert named == 3

@@ -9,11 +9,11 @@ import pytest
 from realsim.errors import InputError, NotRigidError, UnitError
 from realsim.geometry import se3
 from realsim.records import CaptureSession, SupportPlane, View
+from realsim.registration.hint_regions import SLACK_M
 from realsim.registration.hints import (
     Box,
     Click,
     Hint,
-    HintConfig,
     HintScene,
     Marked,
     RoughPose,
@@ -26,7 +26,6 @@ from realsim.store import SessionStore
 from table_faults import seen_instances
 from table_scenes import part_models, small_scene
 
-CONFIG = HintConfig()
 TABLE = SupportPlane(T_world_table=np.eye(4))
 
 
@@ -58,7 +57,7 @@ def radius_of(model):
 
 
 def check_region(hint, model, scene, pose):
-    region = region_of(hint, model, scene, CONFIG)
+    region = region_of(hint, model, scene)
     assert region is not None
     gap = float(np.linalg.norm(region.center_world - middle_of(pose, model)))
     assert gap <= region.radius_m
@@ -72,9 +71,9 @@ def test_any_click_on_an_object_leads_to_it():
         for i in rng.integers(0, len(rows), 4):
             click = Click(view=view, pixel=(float(columns[i]), float(rows[i])))
             hint = Hint(obj_id=pose.obj_id, instance=pose.instance, where=click)
-            region = region_of(hint, model, scene, CONFIG)
+            region = region_of(hint, model, scene)
             assert region is not None and region.R_world_obj is None
-            assert region.radius_m < 1.5 * radius_of(model) + CONFIG.slack_m
+            assert region.radius_m < 1.5 * radius_of(model) + SLACK_M
             gap = np.linalg.norm(region.center_world - middle_of(pose, model))
             # At an outline the 5 x 5 pixels may lie on what is behind.
             count += gap > region.radius_m
@@ -113,7 +112,7 @@ def test_without_depth_the_table_tells():
         hint = Hint(obj_id=pose.obj_id, instance=0, where=click)
         check_region(hint, model, blind, pose)
         with pytest.raises(InputError, match="no depth is measured"):
-            region_of(hint, model, HintScene(intrinsics=scene.intrinsics, frames=frames), CONFIG)
+            region_of(hint, model, HintScene(intrinsics=scene.intrinsics, frames=frames))
     assert len(scene_.truth) == 6
 
 
@@ -133,7 +132,6 @@ def test_places_that_cannot_be_meant_are_errors(where, words):
     with pytest.raises(InputError, match=words):
         region_of(
             Hint(obj_id=pose.obj_id, instance=0, where=where), scene.models[pose.obj_id], hints,
-            CONFIG,
         )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.scanning.scale.config import ScaleConfig
 from realsim.scanning.scale.result import Similarity
 from realsim.scanning.scale.shape import ScanShape, make_shape
-from realsim.scanning.scale.starts import StartsConfig, find_starts
+from realsim.scanning.scale.starts import MOST, find_starts
 from realsim.scanning.simulated import ScanLabConfig, distorted, scan_views, standing
 
 FACTOR = 0.37
@@ -30,7 +30,6 @@ SMALL = ScanLabConfig(
     sensor=DepthSensorModel(disparity_noise_px=0.03, quantum_px=1 / 80, edge_jump_px=0.4),
 )  # fmt: skip
 TABLE = SupportPlane(T_world_table=np.eye(4))
-CONFIG = StartsConfig()
 
 
 class Case(NamedTuple):
@@ -93,7 +92,7 @@ def _is_right(start: Similarity, case: Case) -> bool:
 
 
 def _found(case: Case) -> list[Similarity]:
-    return find_starts(case.given, case.cloud, TABLE, CONFIG)
+    return find_starts(case.given, case.cloud, TABLE)
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +121,7 @@ def test_starts_are_few_and_sorted_and_each_stands_on_the_table(
     mug: Case, mug_starts: list[Similarity]
 ) -> None:
     assert any(_is_right(s, mug) for s in mug_starts[:8])
-    assert 1 < len(mug_starts) <= CONFIG.most
+    assert 1 < len(mug_starts) <= MOST
     scores = [s.score for s in mug_starts]
     assert scores == sorted(scores, reverse=True)
     assert len({(s.scale, s.T_world_obj.tobytes()) for s in mug_starts}) == len(mug_starts)
@@ -134,7 +133,7 @@ def test_starts_are_few_and_sorted_and_each_stands_on_the_table(
 def test_starts_move_with_the_world(mug: Case, mug_starts: list[Similarity]) -> None:
     G = se3.random_transform(np.random.default_rng(2))
     cloud = _seen_from_above(se3.transform(G, mug.cloud.points))
-    moved = find_starts(mug.given, cloud, SupportPlane(T_world_table=G), CONFIG)
+    moved = find_starts(mug.given, cloud, SupportPlane(T_world_table=G))
     assert moved[0].scale == pytest.approx(mug_starts[0].scale, rel=0.01)
     expected = se3.transform(G, _placed(mug_starts[0], mug.given))
     assert np.abs(_placed(moved[0], mug.given) - expected).max() < 0.003
@@ -143,10 +142,10 @@ def test_starts_move_with_the_world(mug: Case, mug_starts: list[Similarity]) -> 
 def test_points_below_the_plane_are_named(mug: Case) -> None:
     flipped = SupportPlane(T_world_table=se3.from_rt(np.diag([1.0, -1, -1]), np.zeros(3)))
     with pytest.raises(DegenerateError, match="above the table"):
-        find_starts(mug.given, mug.cloud, flipped, CONFIG)
+        find_starts(mug.given, mug.cloud, flipped)
     few = mug.cloud.select(np.arange(len(mug.cloud.points)) < 5)
     with pytest.raises(DegenerateError, match="5 of 5"):
-        find_starts(mug.given, few, TABLE, CONFIG)
+        find_starts(mug.given, few, TABLE)
 
 
 @pytest.mark.slow

@@ -15,13 +15,7 @@ from realsim.arrays import Array, Mask
 from realsim.geometry import se3
 from realsim.geometry.camera import project, undistort
 from realsim.geometry.robust import mad_sigma, tukey_weights
-from realsim_calibration.depth.board import (
-    BoardAreaConfig,
-    DepthBoardView,
-    DepthSetup,
-    PosedBoard,
-    board_poses,
-)
+from realsim_calibration.depth.board import DepthBoardView, DepthSetup, PosedBoard, board_poses
 
 POSE_STEP = 1e-5
 """Step of the numerical derivatives by the pose [rad, m]: errors of 1e-9 relative."""
@@ -29,6 +23,19 @@ WINDOW_PX = 50.0
 """Pixels that share one matching window's noise."""
 FIT_STEPS = 8
 """Rounds of reweighting in the plane fit; the weights settle in five."""
+SHRINK = 0.08
+"""Share of the target's area border that is left out on each side: matching windows smear
+depth over edges by a few pixels."""
+MAX_PIXELS = 4000
+"""Pixels used per view; neighbours share one matching window, so more add nothing."""
+MIN_PIXELS = 150
+"""Fewest valid depth pixels: about four windows of independent noise."""
+MIN_VALID_SHARE = 0.3
+"""Least share of the target's area that has depth: glare or no texture beyond that."""
+MIN_INLIER_SHARE = 0.6
+"""Least share of the valid pixels that lie on one surface: else something is in front."""
+TUKEY_SIGMAS = 4.685
+"""Cut of the robust plane fit: 95 % efficient for normal noise, blind to flying pixels."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -90,15 +97,15 @@ class BoardDepth:
         return float(np.linalg.norm(self.slope_sd) / np.linalg.norm(n))
 
 
-def measure_board(view: DepthBoardView, setup: DepthSetup, config: BoardAreaConfig) -> BoardDepth:
+def measure_board(view: DepthBoardView, setup: DepthSetup) -> BoardDepth:
     """Return measured and predicted inverse depth of one view.
 
     A planar pose and its mirror twin are both tried; the one whose tilt the depth confirms is kept.
     """
-    poses = board_poses(view, setup, config)
+    poses = board_poses(view, setup)
     if isinstance(poses, str):
         return _unused(view, poses)
-    found = [_measure(view, pose, setup, config) for pose in poses]
+    found = [_measure(view, pose, setup) for pose in poses]
     return min(found, key=lambda d: (d.reason != "", d.tilt_error_rad))
 
 
@@ -113,7 +120,7 @@ def _unused(view: DepthBoardView, reason: str) -> BoardDepth:
     )  # fmt: skip
 
 
-def _outline(view: DepthBoardView, setup: DepthSetup, shrink: float) -> Array:
+def _outline(view: DepthBoardView, setup: DepthSetup) -> Array:
     """Return the corners (k, 2) of the convex hull of the seen points, shrunk [m]."""
     from scipy.spatial import ConvexHull
 
@@ -122,7 +129,7 @@ def _outline(view: DepthBoardView, setup: DepthSetup, shrink: float) -> Array:
     places = setup.places(points)[:, :2]
     corners = places[ConvexHull(places).vertices]
     centre = (corners.max(0) + corners.min(0)) / 2
-    return centre + (1 - 2 * shrink) * (corners - centre)
+    return centre + (1 - 2 * SHRINK) * (corners - centre)
 
 
 def _inside(xy: Array, corners: Array) -> Mask:
@@ -133,7 +140,7 @@ def _inside(xy: Array, corners: Array) -> Mask:
 
 
 def _board_pixels(
-    outline: Array, pose: PosedBoard, setup: DepthSetup, most: int
+    outline: Array, pose: PosedBoard, setup: DepthSetup
 ) -> tuple[Array, Array, Array]:
     """Return pixels (p, 2) on the target, their rays (p, 2) and predicted inverse depth (p,)."""
     T_depth_board = se3.invert(setup.T_color_depth) @ pose.T
@@ -143,7 +150,7 @@ def _board_pixels(
     if not np.all(np.isfinite(uv)):
         return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
     low, high = np.clip(np.floor(uv.min(0)), 0, last), np.clip(np.ceil(uv.max(0)), 0, last)
-    stride = max(1, int(np.sqrt(np.prod(high - low + 1) / most)))
+    stride = max(1, int(np.sqrt(np.prod(high - low + 1) / MAX_PIXELS)))
     u, v = np.meshgrid(*(np.arange(a, b + 1, stride) for a, b in zip(low, high, strict=True)))
     pixels = np.stack([u.ravel(), v.ravel()], -1)
     rays, valid = undistort(setup.depth, pixels)
@@ -168,7 +175,7 @@ def _inverse_image(depth: NDArray[np.floating], pixels: Array) -> tuple[Array, f
     return mean, float(np.sqrt(np.median(np.var(inverse[:, always], axis=0, ddof=1))))
 
 
-def robust_plane(xy: Array, values: Array, cut: float) -> tuple[Array, float]:
+def robust_plane(xy: Array, values: Array) -> tuple[Array, float]:
     """Return the weights (n,) of values (n,) about their plane over xy (n, 2), and sigma.
 
     Starts from least absolute values, then Tukey's biweight with the scale from the median
@@ -184,33 +191,31 @@ def robust_plane(xy: Array, values: Array, cut: float) -> tuple[Array, float]:
         if step < FIT_STEPS:
             weights = 1.0 / np.maximum(r, sigma)
         else:
-            weights = tukey_weights(np.square(r / (cut * sigma)))
+            weights = tukey_weights(np.square(r / (TUKEY_SIGMAS * sigma)))
         root = np.sqrt(weights)
         c = np.linalg.lstsq(root[:, None] * A, root * values, rcond=None)[0]
     return weights, sigma
 
 
-def _measure(
-    view: DepthBoardView, pose: PosedBoard, setup: DepthSetup, config: BoardAreaConfig
-) -> BoardDepth:
+def _measure(view: DepthBoardView, pose: PosedBoard, setup: DepthSetup) -> BoardDepth:
     """Return measured and predicted inverse depth for one pose of the target."""
-    outline = _outline(view, setup, config.shrink)
-    pixels, rays, w = _board_pixels(outline, pose, setup, config.max_pixels)
-    if len(pixels) < config.min_pixels:
+    outline = _outline(view, setup)
+    pixels, rays, w = _board_pixels(outline, pose, setup)
+    if len(pixels) < MIN_PIXELS:
         return _unused(view, f"the target covers only {len(pixels)} pixels of the depth image")
     m, temporal = _inverse_image(view.depth_m, pixels)
     known = np.isfinite(m)
     share = float(known.mean())
-    if known.sum() < config.min_pixels or share < config.min_valid_share:
+    if known.sum() < MIN_PIXELS or share < MIN_VALID_SHARE:
         return _unused(
             view, f"only {int(known.sum())} of {len(m)} depth pixels on the target have a value"
         )
     pixels, rays, w, m = pixels[known], rays[known], w[known], m[known]
     # The ratio, not the difference: a wrong unit must not look like a steep plane.
     ratio = float(np.median(w) / np.median(m))
-    weights, sigma = robust_plane(rays - rays.mean(0), w / ratio - m, config.tukey_sigmas)
+    weights, sigma = robust_plane(rays - rays.mean(0), w / ratio - m)
     inliers = float(np.mean(weights > 0))
-    if inliers < config.min_inlier_share:
+    if inliers < MIN_INLIER_SHARE:
         return _unused(
             view, f"only {inliers:.0%} of the depth pixels on the target lie on one surface"
         )

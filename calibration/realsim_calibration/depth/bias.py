@@ -140,7 +140,7 @@ def estimate_depth_bias(
     setup = _setup(target, shape, intrinsics, depth_intrinsics, T_color_depth)
     ordered = sorted(views, key=lambda v: v.index)
     _check_sizes(ordered, setup, depth_intrinsics is None)
-    measured = [measure_board(v, setup, config.area) for v in ordered]
+    measured = [measure_board(v, setup) for v in ordered]
     used = [d for d in measured if not d.reason]
     if used:
         refuse_unit(used)

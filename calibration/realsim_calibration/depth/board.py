@@ -16,6 +16,14 @@ from realsim_calibration.views import TargetDetection
 
 NEWTON_STEPS = 4
 """A lift of millimetres over a decimetre converges in two."""
+MIN_POINTS = 4
+"""Fewest detected points of a planar pose."""
+MIN_CORNER_SD_PX = 0.05
+"""Least 1-sigma of a detected point [px]: corners are not better than that, whatever the
+residuals of one view say."""
+TWIN_RATIO = 2.0
+"""The mirror twin of a planar pose is considered up to this many times the reprojection; the
+measured tilt decides."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -55,33 +63,6 @@ class DepthBoardView:
     def label(self) -> str:
         """The name, or the index where there is none."""
         return self.name or str(self.index)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class BoardAreaConfig:
-    """Which depth pixels of a view count, and when a view is good enough."""
-
-    shrink: float = 0.08
-    """Share of the target's area border that is left out on each side: matching windows smear
-    depth over edges by a few pixels."""
-    max_pixels: int = 4000
-    """Pixels used per view; neighbours share one matching window, so more add nothing."""
-    min_pixels: int = 150
-    """Fewest valid depth pixels: about four windows of independent noise."""
-    min_valid_share: float = 0.3
-    """Least share of the target's area that has depth: glare or no texture beyond that."""
-    min_inlier_share: float = 0.6
-    """Least share of the valid pixels that lie on one surface: else something is in front."""
-    tukey_sigmas: float = 4.685
-    """Cut of the robust plane fit: 95 % efficient for normal noise, blind to flying pixels."""
-    min_points: int = 4
-    """Fewest detected points of a planar pose."""
-    min_corner_sd_px: float = 0.05
-    """Least 1-sigma of a detected point [px]: corners are not better than that, whatever the
-    residuals of one view say."""
-    twin_ratio: float = 2.0
-    """The mirror twin of a planar pose is considered up to this many times the reprojection; the
-    measured tilt decides."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -155,15 +136,13 @@ class PosedBoard:
     """(6, 6) of the right perturbation of T [rad, m]."""
 
 
-def board_poses(
-    view: DepthBoardView, setup: DepthSetup, config: BoardAreaConfig
-) -> list[PosedBoard] | str:
+def board_poses(view: DepthBoardView, setup: DepthSetup) -> list[PosedBoard] | str:
     """Return the target's pose and perhaps its twin, or why there is none."""
     if view.detection is None:
         points = setup.places(setup.target.points_board)
         T, C = view.T_cam_board, view.covariance
         assert T is not None
-        sd = config.min_corner_sd_px
+        sd = MIN_CORNER_SD_PX
         return [
             PosedBoard(
                 T=T, points=points, sd_px=sd, covariance=np.zeros((6, 6)) if C is None else C
@@ -176,7 +155,7 @@ def board_poses(
             f"{detection.image_size[1]}, the colour camera has {camera.width}x{camera.height}. "
             "Give the intrinsics of the resolution at which the images were taken."
         )
-    if len(detection) < config.min_points:
+    if len(detection) < MIN_POINTS:
         return f"only {len(detection)} points of the target were found"
     drawn = detection.points(setup.target)
     points = setup.places(drawn)
@@ -188,9 +167,9 @@ def board_poses(
         return "no pose of the target in front of the camera fits its points"
     poses: list[PosedBoard] = []
     for rms, T in found:
-        if rms > config.twin_ratio * found[0][0]:
+        if rms > TWIN_RATIO * found[0][0]:
             break
-        sd = max(rms / np.sqrt(2.0), config.min_corner_sd_px)
+        sd = max(rms / np.sqrt(2.0), MIN_CORNER_SD_PX)
         C = view.covariance
         if C is None:
             J = pose_jacobian(T, points, camera)[0]

@@ -1,7 +1,7 @@
 """The robust fit of a depth camera's scale and offset over views, and errors common to them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from realsim.geometry import se3
 from realsim.geometry.camera import projection_jacobian
 from realsim.records import CameraIntrinsics
 from realsim_calibration.depth.area import BoardDepth
-from realsim_calibration.depth.board import BoardAreaConfig, DepthSetup, pose_jacobian
+from realsim_calibration.depth.board import DepthSetup, pose_jacobian
 
 ROUNDS = 15
 """Rounds of reweighting views; five are typical."""
@@ -22,7 +22,6 @@ SMALL = 1e-3
 class DepthBiasConfig:
     """Priors, limits and what is known of the camera and the board."""
 
-    area: BoardAreaConfig = field(default_factory=BoardAreaConfig)
     min_views: int = 4
     """Fewest usable views: two parameters, and something left to judge them by."""
     min_range_ratio: float = 1.3

@@ -6,7 +6,7 @@ the camera's own axes. What it says is explained by what is missing in the motio
 axis, distance, places in the image.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +16,6 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_calibration.faults.frame_fit import (
     MIN_VIEWS,
-    FitConfig,
     FrameFit,
     fit_frames,
     hand_side,
@@ -30,34 +29,27 @@ UNKNOWN_MM = 1e3
 """A 1-sigma beyond this is written "not known at all" [mm]."""
 OPTICAL = 0.98
 """An axis is the optical one where its z is at least this."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class MotionCheckConfig:
-    """What motion is enough, and what errors the views are expected to have."""
-
-    expected_mm: float = 1.0
-    """Error of the board's place in a view, 1-sigma per axis [mm]: robot and board pose."""
-    expected_deg: float = 0.1
-    """Error of its angle, 1-sigma per axis [deg]."""
-    ratio_sd: float = 0.003
-    """How well the board's size is known, relative: printers are off by this much."""
-    least_turn_deg: float = 2.0
-    """RMS turn about an axis below which the hand does not turn about it [deg]."""
-    small_turn_deg: float = 10.0
-    """RMS turn about the second axis below which the turns are called small [deg]."""
-    least_roll_deg: float = 60.0
-    """Range of roll about the optical axis that is advised [deg]."""
-    least_spread: float = 0.1
-    """Spread of the board's middle over the views, as the tangent of the angle off the axis, below
-    which it always stands in the same place of the image: a tenth of the focal length."""
-    same_pose_mm: float = 0.5
-    """Poses nearer than this add nothing to each other [mm]."""
-    same_pose_deg: float = 0.1
-    """The same for the angle [deg]."""
-    bad_mm: float = 2.0
-    """A 1-sigma of the camera's place beyond this is worth a sentence [mm]."""
-    fit: FitConfig = field(default_factory=FitConfig)
+EXPECTED_MM = 1.0
+"""Error of the board's place in a view, 1-sigma per axis [mm]: robot and board pose."""
+EXPECTED_DEG = 0.1
+"""Error of its angle, 1-sigma per axis [deg]."""
+RATIO_SD = 0.003
+"""How well the board's size is known, relative: printers are off by this much."""
+LEAST_TURN_DEG = 2.0
+"""RMS turn about an axis below which the hand does not turn about it [deg]."""
+SMALL_TURN_DEG = 10.0
+"""RMS turn about the second axis below which the turns are called small [deg]."""
+LEAST_ROLL_DEG = 60.0
+"""Range of roll about the optical axis that is advised [deg]."""
+LEAST_SPREAD = 0.1
+"""Spread of the board's middle over the views, as the tangent of the angle off the axis, below
+which it always stands in the same place of the image: a tenth of the focal length."""
+SAME_POSE_MM = 0.5
+"""Poses nearer than this add nothing to each other [mm]."""
+SAME_POSE_DEG = 0.1
+"""The same for the angle [deg]."""
+BAD_MM = 2.0
+"""A 1-sigma of the camera's place beyond this is worth a sentence [mm]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -82,7 +74,6 @@ def check_motion(
     Ts_base_ee: ArrayLike,
     Ts_cam_board: ArrayLike,
     middle: ArrayLike = (0.0, 0.0, 0.0),
-    config: MotionCheckConfig | None = None,
     *,
     eye_in_hand: bool = True,
 ) -> MotionCheck:
@@ -92,13 +83,11 @@ def check_motion(
         Ts_base_ee: (n, 4, 4) hand poses of right conventions [m].
         Ts_cam_board: (n, 4, 4) board poses [m].
         middle: (3,) the board's middle in its frame [m].
-        config: what is enough.
         eye_in_hand: whether the camera sits in the hand.
 
     Raises:
         InputError: fewer than three views, or stacks of different lengths.
     """
-    config = config or MotionCheckConfig()
     T, C = np.asarray(Ts_base_ee, dtype=np.float64), np.asarray(Ts_cam_board, dtype=np.float64)
     if len(T) != len(C) or len(T) < MIN_VIEWS:
         raise InputError(
@@ -108,13 +97,13 @@ def check_motion(
     m = np.asarray(middle, dtype=np.float64)
     rms, axes = principal_turns(relative(se3.invert(C)).turns)
     turns, axes = np.degrees(rms), axes.T
-    fit = fit_frames(hand_side(T, eye_in_hand), C, m, config.fit)
-    sd_deg, sd_mm = _best_sd(hand_side(T, eye_in_hand), C, m, fit, config)
+    fit = fit_frames(hand_side(T, eye_in_hand), C, m)
+    sd_deg, sd_mm = _best_sd(hand_side(T, eye_in_hand), C, m, fit)
     roll = _range_deg(np.arctan2(C[:, 1, 0], C[:, 0, 0]))
-    identical = _identical(T, config)
+    identical = _identical(T)
     found = [
-        *_turn_sentences(turns, axes, roll, sd_mm, config),
-        *_place_sentences(C, m, config),
+        *_turn_sentences(turns, axes, roll, sd_mm),
+        *_place_sentences(C, m),
         *_identical_sentences(identical, len(T)),
     ]
     return MotionCheck(
@@ -123,21 +112,19 @@ def check_motion(
     )  # fmt: skip
 
 
-def _best_sd(
-    A: Array, C: Array, m: Array, fit: FrameFit, config: MotionCheckConfig
-) -> tuple[Array, Array]:
+def _best_sd(A: Array, C: Array, m: Array, fit: FrameFit) -> tuple[Array, Array]:
     """Return the 1-sigma of X about [deg] and along [mm] the camera's axes; infinite = unknown."""
     q = C[:, :3, :3] @ m + C[:, :3, 3]
     s = fit.length_ratio
     z = fit.Z[:3, 3] + s * fit.Z[:3, :3] @ m
     given = (A, C[:, :3, :3], q, fit.X[:3, :3], fit.Z[:3, :3], fit.X[:3, 3], z)
     J, _ = linearise(*(np.ascontiguousarray(v) for v in given), s=s)
-    sd = np.array([np.radians(config.expected_deg)] * 3 + [s * 1e-3 * config.expected_mm] * 3)
+    sd = np.array([np.radians(EXPECTED_DEG)] * 3 + [s * 1e-3 * EXPECTED_MM] * 3)
     Jw = (J / sd[:, None]).reshape(-1, 13)
     H = Jw.T @ Jw
-    H[12, 12] += 1.0 / (s * config.ratio_sd) ** 2
+    H[12, 12] += 1.0 / (s * RATIO_SD) ** 2
     # In units of the expected errors a direction without information is a null vector.
-    unit = np.array([np.radians(1.0)] * 6 + [1e-3 * s] * 6 + [s * config.ratio_sd])
+    unit = np.array([np.radians(1.0)] * 6 + [1e-3 * s] * 6 + [s * RATIO_SD])
     values, vectors = np.linalg.eigh(H * unit[:, None] * unit)
     inverse = vectors @ np.diag(1.0 / np.maximum(values, UNSEEN)) @ vectors.T
     covariance = inverse * unit[:, None] * unit
@@ -153,11 +140,11 @@ def _range_deg(angles: Array) -> float:
     return float(360.0 - np.diff(np.append(turned, turned[0] + 360.0)).max())
 
 
-def _identical(T: Array, config: MotionCheckConfig) -> tuple[tuple[int, int], ...]:
+def _identical(T: Array) -> tuple[tuple[int, int], ...]:
     i, j = np.triu_indices(len(T), 1)
     step = relative(T)
-    near = np.linalg.norm(step.Ts[:, :3, 3], axis=-1) < 1e-3 * config.same_pose_mm
-    near &= np.linalg.norm(step.turns, axis=-1) < np.radians(config.same_pose_deg)
+    near = np.linalg.norm(step.Ts[:, :3, 3], axis=-1) < 1e-3 * SAME_POSE_MM
+    near &= np.linalg.norm(step.turns, axis=-1) < np.radians(SAME_POSE_DEG)
     return tuple((int(a), int(b)) for a, b in zip(i[near], j[near], strict=True))
 
 
@@ -167,18 +154,16 @@ def _place(axis: str, sd: float) -> str:
     return f"the camera's place along its {axis} can be known to +-{sd:.1f} mm only"
 
 
-def _turn_sentences(
-    turns: Array, axes: Array, roll: float, sd_mm: Array, config: MotionCheckConfig
-) -> list[str]:
+def _turn_sentences(turns: Array, axes: Array, roll: float, sd_mm: Array) -> list[str]:
     """Return what is missing in the turns."""
     worst = int(np.argmax(sd_mm))
     consequence = _place("xyz"[worst], float(sd_mm[worst]))
-    if turns[0] < config.least_turn_deg:
+    if turns[0] < LEAST_TURN_DEG:
         return [
             f"The hand moves without turning (RMS {turns[0]:.2f} deg): {consequence}. Add views "
             "that tilt it by 20 deg or more about two axes and roll it about the optical axis."
         ]
-    if turns[1] < config.least_turn_deg:
+    if turns[1] < LEAST_TURN_DEG:
         axis = axes[0] * np.sign(axes[0][np.argmax(np.abs(axes[0]))])
         text = ", ".join(f"{v:.2f}" for v in axis)
         name = "its optical axis" if axis[2] > OPTICAL else f"one axis, [{text}] of the camera,"
@@ -187,27 +172,27 @@ def _turn_sentences(
             f"next): {consequence}. Add views that tilt it by 20 deg or more about another axis."
         ]
     found: list[str] = []
-    if turns[1] < config.small_turn_deg:
+    if turns[1] < SMALL_TURN_DEG:
         found.append(
             f"The turns are small (RMS {turns[0]:.1f} and {turns[1]:.1f} deg about two axes): "
             f"{consequence}. Turn the hand by 20 to 45 deg."
         )
-    if roll < config.least_roll_deg:
+    if roll < LEAST_ROLL_DEG:
         found.append(
             f"There is little roll about the optical axis (range {roll:.0f} deg): "
-            f"{consequence}. Roll the hand by {config.least_roll_deg:g} deg or more between views."
+            f"{consequence}. Roll the hand by {LEAST_ROLL_DEG:g} deg or more between views."
         )
-    if not found and sd_mm[worst] > config.bad_mm:
+    if not found and sd_mm[worst] > BAD_MM:
         found.append(f"With these views {consequence}. Add views, from other distances too.")
     return found
 
 
-def _place_sentences(C: Array, m: Array, config: MotionCheckConfig) -> list[str]:
+def _place_sentences(C: Array, m: Array) -> list[str]:
     """Return whether the board always stands in the same place of the image."""
     q = C[:, :3, :3] @ m + C[:, :3, 3]
     seen = q[:, :2] / np.maximum(q[:, 2:], 1e-9)
     spread = float(np.max(np.ptp(seen, axis=0)))
-    if spread >= config.least_spread:
+    if spread >= LEAST_SPREAD:
         return []
     return [
         f"The board is always in the same place of the image (its middle moves by {spread:.3f} "

@@ -13,12 +13,11 @@ from realsim_calibration.inputs.folder import (
 from realsim_calibration.inputs.image_files import ImageListing, list_images, load_image
 from realsim_calibration.inputs.pairing import Pairing, pair
 from realsim_calibration.inputs.pose_file import read_pose_file
-from realsim_calibration.inputs.raw_poses import RawPoses, ReadingRanges, Said, listed_readings
+from realsim_calibration.inputs.raw_poses import RawPoses, Said, listed_readings
 from realsim_calibration.inputs.readings import (
     EULER_ORDERS,
     ROTATIONS,
     PoseReading,
-    RotationTolerance,
     reading_from_text,
 )
 
@@ -31,8 +30,6 @@ __all__ = [
     "Pairing",
     "PoseReading",
     "RawPoses",
-    "ReadingRanges",
-    "RotationTolerance",
     "Said",
     "list_images",
     "listed_readings",

@@ -13,10 +13,10 @@ from realsim.geometry.se3 import RIGID_TOLERANCE
 from realsim.records.checked_arrays import frozen
 from realsim_calibration.inputs.readings import (
     EULER_ORDERS,
+    MATRIX_TOLERANCE,
     AngleUnit,
     LengthUnit,
     PoseReading,
-    RotationTolerance,
     both_directions,
 )
 
@@ -25,25 +25,19 @@ ANGLE_ROTATIONS: tuple[str, ...] = ("rotation_vector", *(f"euler_{o}" for o in E
 QUATERNIONS = ("quaternion_xyzw", "quaternion_wxyz")
 MATRICES = ("matrix", "matrix_column_major")
 FULL_TURN = 2 * np.pi
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ReadingRanges:
-    """From which numbers a unit or a format is beyond doubt."""
-
-    metres_below: float = 5.0
-    """A median distance below it is in metres: 5 mm would put the hand inside its own base."""
-    millimetres_above: float = 20.0
-    """A median distance above it is in millimetres: 20 m is beyond every arm."""
-    tiny_rad: float = 0.2
-    """If no angle exceeds it, radians and degrees both mean a hand that hardly turns."""
-    most_deg: float = 720.0
-    """Beyond it a number is no angle."""
-    share: float = 0.8
-    """Share of the rows that must pass a test for the format to be admitted; the others are named
-    as bad rows when the reading is applied."""
-    same_place_m: float = 1e-3
-    """Three poses and more within this distance of the base are a unit taken wrongly."""
+METRES_BELOW = 5.0
+"""A median distance below it is in metres: 5 mm would put the hand inside its own base."""
+MILLIMETRES_ABOVE = 20.0
+"""A median distance above it is in millimetres: 20 m is beyond every arm."""
+TINY_RAD = 0.2
+"""If no angle exceeds it, radians and degrees both mean a hand that hardly turns."""
+MOST_DEG = 720.0
+"""Beyond it a number is no angle."""
+SHARE = 0.8
+"""Share of the rows that must pass a test for the format to be admitted; the others are named
+as bad rows when the reading is applied."""
+SAME_PLACE_M = 1e-3
+"""Three poses and more within this distance of the base are a unit taken wrongly."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -136,7 +130,6 @@ class RawPoses:
             InputError: the file says otherwise, or a row cannot be a pose; the rows are named.
             UnitError: all poses come to lie within a millimetre of the base, or beyond all reach.
         """
-        limits = ReadingRanges()
         if self.said.position_first is not None:
             reading = replace(reading, position_first=self.said.position_first)
         contradiction = self.contradiction(reading)
@@ -152,7 +145,7 @@ class RawPoses:
         flat = replace(reading, inverted=False)
         t = flat.apply(self.values, rows=self.where)[:, :3, 3]
         away = float(np.max(np.abs(t), initial=0.0))
-        if len(T) >= 3 and 0 < away < limits.same_place_m:
+        if len(T) >= 3 and 0 < away < SAME_PLACE_M:
             raise UnitError(
                 f"{self.path}: read as '{reading}' all {len(T)} poses lie within "
                 f"{1e3 * away:.3g} mm of the origin. Are the lengths already in metres?"
@@ -184,12 +177,7 @@ def listed_readings(readings: Sequence[PoseReading], most: int = 10) -> str:
 
 
 def possible_readings(
-    values: Array,
-    said: Said,
-    *,
-    name: str,
-    rows: Sequence[str],
-    ranges: ReadingRanges | None = None,
+    values: Array, said: Said, *, name: str, rows: Sequence[str]
 ) -> tuple[tuple[PoseReading, ...], tuple[str, ...]]:
     """Return every reading that the names and the numbers admit, and the reasons in words.
 
@@ -198,12 +186,10 @@ def possible_readings(
         said: what the file says of them.
         name: the file, for messages.
         rows: what the rows are called.
-        ranges: from where on a unit is beyond doubt.
 
     Raises:
         InputError: no reading fits; the message says what was tried and what it met.
     """
-    limits = ranges or ReadingRanges()
     finite = np.isfinite(values).all(axis=1)
     if not finite.any():
         raise InputError(f"{name}: all {len(values)} poses hold NaN or infinite numbers.")
@@ -218,12 +204,12 @@ def possible_readings(
         ):
             continue
         reading = PoseReading(rotation=kind, position_first=first)
-        problem = _rotation_problem(reading, usable, names, limits)
+        problem = _rotation_problem(reading, usable, names)
         if problem:
             refused.append(problem)
             continue
-        angles, why_angle = _angle_units(reading, usable, said, limits)
-        lengths, why_length = _length_units(reading, usable, said, limits)
+        angles, why_angle = _angle_units(reading, usable, said)
+        lengths, why_length = _length_units(reading, usable, said)
         if not angles:
             refused.append(why_angle)
             continue
@@ -249,12 +235,10 @@ def _kinds(width: int, said: Said) -> tuple[str, ...]:
     return by_width if said.rotations is None else said.rotations
 
 
-def _rotation_problem(
-    reading: PoseReading, values: Array, names: Sequence[str], limits: ReadingRanges
-) -> str:
+def _rotation_problem(reading: PoseReading, values: Array, names: Sequence[str]) -> str:
     """Return why too few rows are rotations in this reading; empty where they are."""
     good = reading.fits(values)
-    if np.mean(good) >= limits.share:
+    if np.mean(good) >= SHARE:
         return ""
     k = int(np.flatnonzero(~good)[0])
     kind = reading.rotation + ("" if reading.position_first else " before the position")
@@ -278,7 +262,7 @@ def _split(reading: PoseReading, values: Array) -> tuple[Array, Array]:
 
 
 def _angle_units(
-    reading: PoseReading, values: Array, said: Said, limits: ReadingRanges
+    reading: PoseReading, values: Array, said: Said
 ) -> tuple[tuple[AngleUnit, ...], str]:
     """Return the units that the angles admit, and why."""
     if not reading.has_angles:
@@ -290,15 +274,15 @@ def _angle_units(
         size = np.abs(angles).max(axis=1)
     largest = float(size.max())
     degrees = np.mean(size > 2 * FULL_TURN) >= 0.5
-    if np.mean(size > limits.most_deg) > 1 - limits.share:
-        return (), f"Not angles: most rows hold numbers beyond {limits.most_deg:g}."
+    if np.mean(size > MOST_DEG) > 1 - SHARE:
+        return (), f"Not angles: most rows hold numbers beyond {MOST_DEG:g}."
     if said.angle_unit is not None:
         why = (
             f"The names state rad, and the largest angle is {largest:.4g}, beyond two turns. If "
             f"these are degrees, give --reading, such as {replace(reading, angle_unit='deg')}."
         )
         return (said.angle_unit,), why if said.angle_unit == "rad" and degrees else ""
-    if limits.tiny_rad <= largest <= FULL_TURN * (1 + 1e-3):
+    if TINY_RAD <= largest <= FULL_TURN * (1 + 1e-3):
         return ("rad",), f"The largest angle is {largest:.4g}, at most a turn: radians."
     if degrees:
         return ("deg",), f"The largest angle is {largest:.4g}, beyond two turns in rad: degrees."
@@ -306,16 +290,16 @@ def _angle_units(
 
 
 def _length_units(
-    reading: PoseReading, values: Array, said: Said, limits: ReadingRanges
+    reading: PoseReading, values: Array, said: Said
 ) -> tuple[tuple[LengthUnit, ...], str]:
     """Return the units that the positions admit, and why."""
     if said.length_unit is not None:
         return (said.length_unit,), ""
     t = _split(reading, values)[0]
     median = float(np.median(np.sqrt(np.sum(t * t, axis=1))))
-    if median < limits.metres_below:
+    if median < METRES_BELOW:
         return ("m",), f"The median distance is {median:.4g}: metres."
-    if median > limits.millimetres_above:
+    if median > MILLIMETRES_ABOVE:
         return ("mm",), f"The median distance is {median:.4g}: millimetres."
     return ("m", "mm"), f"The median distance is {median:.4g}: m or mm is left open."
 
@@ -325,7 +309,7 @@ def rounding_note(values: Array, reading: PoseReading) -> str:
     finite = values[np.isfinite(values).all(axis=1)]
     R = _split(reading, finite)[1].reshape(-1, 3, 3)
     off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
-    error = float(off[off <= RotationTolerance().matrix].max(initial=0.0))
+    error = float(off[off <= MATRIX_TOLERANCE].max(initial=0.0))
     if error <= RIGID_TOLERANCE:
         return ""
     return (

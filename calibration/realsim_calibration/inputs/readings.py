@@ -51,18 +51,12 @@ _ACCEPTED = (
     "the base seen from the tool, 'rotation_first' if the position comes last. Example: "
     "rotvec,mm,inverted"
 )
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class RotationTolerance:
-    """How far stored rotations may be from exact ones before a row is refused."""
-
-    quaternion: float = 5e-3
-    """Largest deviation of a quaternion's length from 1: three printed decimals give 1e-3."""
-    matrix: float = 2e-3
-    """Largest entry of |R^T R - 1|: three printed decimals (0.03 deg) give 1.7e-3."""
-    last_row: float = 1e-6
-    """Largest deviation of a 4x4 matrix's last row from 0 0 0 1, which is never measured."""
+QUATERNION_TOLERANCE = 5e-3
+"""Largest deviation of a quaternion's length from 1: three printed decimals give 1e-3."""
+MATRIX_TOLERANCE = 2e-3
+"""Largest entry of |R^T R - 1|: three printed decimals (0.03 deg) give 1.7e-3."""
+LAST_ROW_TOLERANCE = 1e-6
+"""Largest deviation of a 4x4 matrix's last row from 0 0 0 1, which is never measured."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -116,19 +110,13 @@ class PoseReading:
         return ",".join(words)
 
     def apply(
-        self,
-        raw: ArrayLike,
-        *,
-        rows: Sequence[str] | None = None,
-        tolerance: RotationTolerance | None = None,
-        reach_m: float = 100.0,
+        self, raw: ArrayLike, *, rows: Sequence[str] | None = None, reach_m: float = 100.0
     ) -> Array:
         """Return T_base_ee (n, 4, 4) [m] of rows of numbers (n, k), exactly rigid.
 
         Args:
             raw: (n, 6), (n, 7), (n, 12) or (n, 16) numbers, or one row.
             rows: what the rows are called in messages ("line 12"); else "row 0", "row 1", ...
-            tolerance: what is accepted as a rotation.
             reach_m: distance beyond which a position is no robot's [m].
 
         Raises:
@@ -137,8 +125,7 @@ class PoseReading:
             UnitError: positions beyond any robot's reach.
         """
         values, names = self._checked(raw, rows)
-        limits = tolerance or RotationTolerance()
-        R, t = self._parts(values, names, limits)
+        R, t = self._parts(values, names)
         if self.length_unit == "mm":
             t = t / 1000.0
         away: Array = np.sqrt(np.sum(t * t, axis=-1))
@@ -157,9 +144,8 @@ class PoseReading:
         T = se3.from_rt(R, t)
         return se3.invert(T) if self.inverted else T
 
-    def fits(self, raw: ArrayLike, *, tolerance: RotationTolerance | None = None) -> NDArray[Any]:
+    def fits(self, raw: ArrayLike) -> NDArray[Any]:
         """Return (n,) whether each row of (n, k) numbers is a pose in this reading."""
-        limits = tolerance or RotationTolerance()
         values = np.atleast_2d(np.asarray(raw, dtype=np.float64))
         good: Mask = np.all(np.isfinite(values), axis=1)
         safe = np.where(good[:, None], values, 0.0)
@@ -167,16 +153,16 @@ class PoseReading:
             return good
         if self.rotation.startswith("quaternion"):
             q = safe[:, 3:] if self.position_first else safe[:, :-3]
-            return good & (np.abs(np.sqrt(np.sum(q * q, axis=1)) - 1) <= limits.quaternion)
+            return good & (np.abs(np.sqrt(np.sum(q * q, axis=1)) - 1) <= QUATERNION_TOLERANCE)
         if safe.shape[1] == 16:
             T = safe.reshape(-1, 4, 4)
             T = np.swapaxes(T, 1, 2) if self.rotation == "matrix_column_major" else T
-            good = good & (np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) <= limits.last_row)
+            good = good & (np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) <= LAST_ROW_TOLERANCE)
             R = T[:, :3, :3]
         else:
             R = (safe[:, 3:] if self.position_first else safe[:, :-3]).reshape(-1, 3, 3)
         error = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
-        return good & (error <= limits.matrix) & (np.linalg.det(R) > 0)
+        return good & (error <= MATRIX_TOLERANCE) & (np.linalg.det(R) > 0)
 
     def numbers(self, Ts: ArrayLike, *, width: int | None = None) -> Array:
         """Return the rows (n, k) that `apply` turns into the poses (n, 4, 4) [m].
@@ -231,15 +217,13 @@ class PoseReading:
             )
         return values, names
 
-    def _parts(
-        self, values: Array, names: Sequence[str], limits: RotationTolerance
-    ) -> tuple[Array, Array]:
+    def _parts(self, values: Array, names: Sequence[str]) -> tuple[Array, Array]:
         """Return rotations (n, 3, 3) and positions (n, 3) in the file's unit."""
         if values.shape[1] == 16:
             T = values.reshape(-1, 4, 4)
             T = np.swapaxes(T, 1, 2) if self.rotation == "matrix_column_major" else T
-            _check_last_row(T, names, limits)
-            return _orthonormal(T[:, :3, :3], names, limits), T[:, :3, 3]
+            _check_last_row(T, names)
+            return _orthonormal(T[:, :3, :3], names), T[:, :3, 3]
         split = 3 if self.position_first else values.shape[1] - 3
         first, second = values[:, :split], values[:, split:]
         t, r = (first, second) if self.position_first else (second, first)
@@ -250,7 +234,7 @@ class PoseReading:
             return _from_angles(a, self.rotation.removeprefix("euler_")), t
         if self.rotation.startswith("quaternion"):
             length = np.linalg.norm(r, axis=-1)
-            bad = np.abs(length - 1) > limits.quaternion
+            bad = np.abs(length - 1) > QUATERNION_TOLERANCE
             if bad.any():
                 k = int(np.flatnonzero(bad)[0])
                 raise NotRigidError(
@@ -262,7 +246,7 @@ class PoseReading:
             return se3.from_quaternion_wxyz(wxyz), t
         R = r.reshape(-1, 3, 3)
         R = np.swapaxes(R, 1, 2) if self.rotation == "matrix_column_major" else R
-        return _orthonormal(R, names, limits), t
+        return _orthonormal(R, names), t
 
 
 def reading_from_text(text: str) -> PoseReading:
@@ -315,10 +299,10 @@ def _listed(names: Sequence[str], bad: Mask, most: int = 8) -> str:
     return ", ".join(chosen[:most]) + more + f" ({len(chosen)} of {len(bad)})"
 
 
-def _check_last_row(T: Array, names: Sequence[str], limits: RotationTolerance) -> None:
+def _check_last_row(T: Array, names: Sequence[str]) -> None:
     """Raise unless every matrix ends in 0 0 0 1."""
     off = np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1)
-    bad = off > limits.last_row
+    bad = off > LAST_ROW_TOLERANCE
     if bad.any():
         k = int(np.flatnonzero(bad)[0])
         raise NotRigidError(
@@ -327,22 +311,22 @@ def _check_last_row(T: Array, names: Sequence[str], limits: RotationTolerance) -
         )
 
 
-def _orthonormal(R: Array, names: Sequence[str], limits: RotationTolerance) -> Array:
+def _orthonormal(R: Array, names: Sequence[str]) -> Array:
     """Return the nearest rotations, those that are exact untouched; rows that are none raise."""
     det = np.linalg.det(R)
     error = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
-    mirrored = (det < 0) & (error <= limits.matrix)
+    mirrored = (det < 0) & (error <= MATRIX_TOLERANCE)
     if mirrored.any():
         raise NotRigidError(
             f"{_listed(names, mirrored)}: the matrix is mirrored (determinant -1); a rotation has "
             "+1. One axis has the wrong sign, or a left-handed tool wrote it."
         )
-    bad = error > limits.matrix
+    bad = error > MATRIX_TOLERANCE
     if bad.any():
         k = int(np.flatnonzero(bad)[0])
         raise NotRigidError(
             f"{_listed(names, bad)}: the 3x3 part is not a rotation ({names[k]}: R^T R is off the "
-            f"identity by {error[k]:.2g}, at most {limits.matrix:g} is accepted; determinant "
+            f"identity by {error[k]:.2g}, at most {MATRIX_TOLERANCE:g} is accepted; determinant "
             f"{det[k]:.4g}). Delete these poses with their images, or correct the numbers."
         )
     U, _, Vt = np.linalg.svd(R)

@@ -1,7 +1,6 @@
 """All views of a session on one picture, in the order in which they are taken."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,29 +13,23 @@ if TYPE_CHECKING:
 
 Colour = tuple[int, int, int]
 SHEET_FILE = "reports/contact_sheet.png"
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SheetConfig:
-    """How the sheet is laid out."""
-
-    width_px: int = 2560
-    """Width of the sheet: 256 views are then 16 columns of 160 pixels, in which objects and
-    tags can be told apart."""
-    largest_cell_px: int = 320
-    """Widest cell: a dozen views need no more."""
-    frame_px: int = 4
-    """Width of a noted view's frame."""
-    least_width_px: int = 480
-    """Least width of the sheet: under it a head line of a few words does not fit."""
-    head_px: int = 46
-    """Height of a head of one line."""
-    line_px: int = 30
-    """Height of each further line of the head."""
-    text_scale: float = 0.8
-    """Size of the head's letters (OpenCV's font scale)."""
-    least_text_scale: float = 0.5
-    """A title too long for a line is written smaller, down to this; then it is broken."""
+WIDTH_PX = 2560
+"""Width of the sheet: 256 views are then 16 columns of 160 pixels, in which objects and
+tags can be told apart."""
+LARGEST_CELL_PX = 320
+"""Widest cell: a dozen views need no more."""
+FRAME_PX = 4
+"""Width of a noted view's frame."""
+LEAST_WIDTH_PX = 480
+"""Least width of the sheet: under it a head line of a few words does not fit."""
+HEAD_PX = 46
+"""Height of a head of one line."""
+LINE_PX = 30
+"""Height of each further line of the head."""
+TEXT_SCALE = 0.8
+"""Size of the head's letters (OpenCV's font scale)."""
+LEAST_TEXT_SCALE = 0.5
+"""A title too long for a line is written smaller, down to this; then it is broken."""
 
 
 PAPER, INK, PALE, STRIP = (250, 250, 248), (30, 30, 30), (215, 215, 212), (40, 40, 40)
@@ -63,11 +56,11 @@ class Thumbnails:
         self.images[k] = np.asarray(small, dtype=np.uint8)
 
 
-def cell_size(n: int, image_size: tuple[int, int], config: SheetConfig) -> tuple[int, int, int]:
+def cell_size(n: int, image_size: tuple[int, int]) -> tuple[int, int, int]:
     """Return (columns, cell width, cell height) for n views of (width, height) pixels."""
     w, h = image_size
     columns = max(1, int(np.ceil(np.sqrt(n))))
-    cell = min(config.largest_cell_px, config.width_px // columns)
+    cell = min(LARGEST_CELL_PX, WIDTH_PX // columns)
     return columns, cell, max(1, round(cell * h / w))
 
 
@@ -77,7 +70,6 @@ def contact_sheet(
     n: int,
     title: str,
     image_size: tuple[int, int],
-    config: SheetConfig | None = None,
 ) -> Image:
     """Return the sheet (H, W, 3): view numbers, amber frames round noted views, blue corners on
     those taken again, grey cells for those that are missing.
@@ -88,10 +80,8 @@ def contact_sheet(
         n: views of the plan.
         title: the head line.
         image_size: (width, height) of the camera's images.
-        config: the layout.
     """  # noqa: D205 - the first sentence needs two lines
-    config = config or SheetConfig()
-    columns, w, h = cell_size(n, image_size, config)
+    columns, w, h = cell_size(n, image_size)
     rows = -(-n // columns)
     noted = sum(bool(entries.get(k, {}).get("notes")) for k in images)
     again = sum(bool(entries.get(k, {}).get("retaken")) for k in images)
@@ -102,33 +92,33 @@ def contact_sheet(
         (f"{again} taken again", BLUE if again else INK),
         (f"{n - len(images)} missing", RED if n > len(images) else INK),
     ]
-    width = max(columns * w, config.least_width_px)
-    lines = _head_lines(parts, width - 2 * MARGIN, config)
-    head = config.head_px + (len(lines) - 1) * config.line_px
+    width = max(columns * w, LEAST_WIDTH_PX)
+    lines = _head_lines(parts, width - 2 * MARGIN)
+    head = HEAD_PX + (len(lines) - 1) * LINE_PX
     sheet = np.full((head + rows * h, width, 3), PAPER, dtype=np.uint8)
     for k in range(n):
         y, x = head + k // columns * h, k % columns * w
         cell = sheet[y : y + h, x : x + w]
         entry = entries.get(k, {})
-        _fill_cell(cell, k, images.get(k), entry, config)
+        _fill_cell(cell, k, images.get(k), entry)
     for i, line in enumerate(lines):
         x = MARGIN
         for text, colour, scale in line:
-            at = (x, config.head_px - 16 + i * config.line_px)
+            at = (x, HEAD_PX - 16 + i * LINE_PX)
             x += _write(sheet, text, at, colour, scale) + GAP
     return sheet
 
 
 def _head_lines(
-    parts: Sequence[tuple[str, Colour]], width: int, config: SheetConfig
+    parts: Sequence[tuple[str, Colour]], width: int
 ) -> list[list[tuple[str, Colour, float]]]:
     """Return (text, colour, scale) of every line of a head of so many pixels; nothing is cut."""
     lines: list[list[tuple[str, Colour, float]]] = [[]]
     left = width
     for whole, colour in parts:
-        scale = config.text_scale
+        scale = TEXT_SCALE
         if (size := _text_width(whole, scale)) > width:
-            scale = max(config.least_text_scale, scale * (width - 2) / size)
+            scale = max(LEAST_TEXT_SCALE, scale * (width - 2) / size)
         for text in _broken(whole, width, scale):
             size = _text_width(text, scale)
             if lines[-1] and size > left:
@@ -163,9 +153,7 @@ def _plain(text: str) -> str:
     return text.encode("ascii", errors="replace").decode()
 
 
-def _fill_cell(
-    cell: UInt8, k: int, image: Image | None, entry: Mapping[str, Any], config: SheetConfig
-) -> None:
+def _fill_cell(cell: UInt8, k: int, image: Image | None, entry: Mapping[str, Any]) -> None:
     """Draw one view into its cell (h, w, 3)."""
     h, w = cell.shape[:2]
     scale = max(0.42, w / 400)
@@ -177,7 +165,7 @@ def _fill_cell(
         cell[:] = image
         cell[0], cell[:, 0] = PAPER, PAPER
         if entry.get("notes"):
-            f = config.frame_px
+            f = FRAME_PX
             cell[:f], cell[-f:], cell[:, :f], cell[:, -f:] = AMBER, AMBER, AMBER, AMBER
             _label(cell, _first_words(entry["notes"][0]), (f + 1, h - f - 3), AMBER, scale)
         if entry.get("retaken") or entry.get("earlier"):
@@ -230,7 +218,7 @@ def write_contact_sheet(
     """
     camera = store.session.intrinsics
     size = (camera.width, camera.height)
-    _, w, h = cell_size(n, size, SheetConfig())
+    _, w, h = cell_size(n, size)
     thumbnails = Thumbnails((w, h))
     if taken is not None and taken.cell == (w, h):
         thumbnails.images.update(taken.images)

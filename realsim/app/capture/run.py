@@ -28,12 +28,7 @@ from realsim_capture_plans.capturing.capture import (
     check_views,
     dry_run,
 )
-from realsim_capture_plans.capturing.contact_sheet import (
-    SheetConfig,
-    Thumbnails,
-    cell_size,
-    write_contact_sheet,
-)
+from realsim_capture_plans.capturing.contact_sheet import Thumbnails, cell_size, write_contact_sheet
 from realsim_capture_plans.capturing.operator import LineOperator, Operator
 from realsim_capture_plans.devices.interfaces import Arm, DepthCamera, DeviceError
 from realsim_capture_plans.planning.record import CapturePlan
@@ -151,7 +146,7 @@ def _carry_out(
     config, store, target, lab, fixed = work
     intrinsics = camera.intrinsics
     size = (intrinsics.width, intrinsics.height)
-    taken = Thumbnails(cell_size(len(plan), size, SheetConfig())[1:])
+    taken = Thumbnails(cell_size(len(plan), size)[1:])
     try:
         with _operator(request, f"{request.out}   {arm.name}, {camera.name}", console) as operator:
             job = CaptureJob(

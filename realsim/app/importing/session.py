@@ -22,12 +22,7 @@ from realsim.records import CaptureSession, View
 from realsim.store.lock import only_run_in
 from realsim.store.session_store import SESSION_FILE, SessionStore
 from realsim.untrusted.own_json import to_json
-from realsim_capture_plans.capturing.contact_sheet import (
-    SheetConfig,
-    Thumbnails,
-    cell_size,
-    write_contact_sheet,
-)
+from realsim_capture_plans.capturing.contact_sheet import Thumbnails, cell_size, write_contact_sheet
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -206,7 +201,7 @@ def _opened(folder: Path, source: FrameSource, key: str) -> SessionStore:
 def _thumbnails(source: FrameSource) -> Thumbnails:
     """Return an empty set of small pictures for the contact sheet of so many frames."""
     camera = source.intrinsics
-    _, w, h = cell_size(len(source), (camera.width, camera.height), SheetConfig())
+    _, w, h = cell_size(len(source), (camera.width, camera.height))
     return Thumbnails((w, h))
 
 

@@ -22,24 +22,20 @@ def colour_remark(store: SessionStore, views: Sequence[int]) -> Remark | None:
         views: numbers of views with depth.
     """
     from realsim.registration.depth_alignment import (
-        AlignmentConfig,
         AlignmentFinding,
         check_alignment,
         pooled_alignment,
     )
 
-    config = AlignmentConfig()
     pick = np.unique(np.linspace(0, len(views) - 1, VIEWS).round().astype(int)) if views else ()
     findings: list[AlignmentFinding] = []
     for index in (views[k] for k in pick):
         rgb = store.rgb(index)
         if rgb.min() < rgb.max():  # else no colour was recorded
-            findings.append(
-                check_alignment(rgb, store.depth_m(index), store.session.intrinsics, config)
-            )
+            findings.append(check_alignment(rgb, store.depth_m(index), store.session.intrinsics))
     if not findings:
         return None
-    found = pooled_alignment(findings, config)
+    found = pooled_alignment(findings)
     return (
         None if found.kind in QUIET_KINDS else Remark(view=None, kind=found.kind, words=found.words)
     )

@@ -40,27 +40,21 @@ MEANING: dict[Kind, str] = {
 }
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 LENGTH = rf"({NUMBER})\s*([a-z]*)"
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class MeasureConfig:
-    """How much a measured length is believed."""
-
-    sigma_m: float = 0.0005
-    """1-sigma of a length given without one [m]. A caliper reads 0.02 mm, but on a rounded or soft
-    body the jaws sit where the hand puts them: repeats differ by about half a millimetre."""
-    agree_z: float = 2.6
-    """Two figures agree when they differ by less than this many of their joint sigmas: one right
-    pair in a hundred is called wrong."""
-    least_m: float = 0.002
-    """Shorter lengths [m] are typing errors: nothing that a gripper grasps is so small."""
-    greatest_m: float = 3.0
-    """Longer ones [m] are: nothing on a table is so large."""
-    largest_sigma: float = 0.2
-    """A sigma beyond this share of the length is a typing error: it would check nothing."""
-    typo_tolerance: float = 0.05
-    """A wrong unit is named when the ratio is within this of its factor; the factors lie further
-    apart, and no fit that is worth comparing is off by more."""
+SIGMA_M = 0.0005
+"""1-sigma of a length given without one [m]. A caliper reads 0.02 mm, but on a rounded or soft
+body the jaws sit where the hand puts them: repeats differ by about half a millimetre."""
+AGREE_Z = 2.6
+"""Two figures agree when they differ by less than this many of their joint sigmas: one right
+pair in a hundred is called wrong."""
+LEAST_M = 0.002
+"""Shorter lengths [m] are typing errors: nothing that a gripper grasps is so small."""
+GREATEST_M = 3.0
+"""Longer ones [m] are: nothing on a table is so large."""
+LARGEST_SIGMA = 0.2
+"""A sigma beyond this share of the length is a typing error: it would check nothing."""
+TYPO_TOLERANCE = 0.05
+"""A wrong unit is named when the ratio is within this of its factor; the factors lie further
+apart, and no fit that is worth comparing is off by more."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -95,7 +89,7 @@ class LengthScale:
     """1-sigma of it [metres per unit]."""
 
 
-def parse_measurement(text: str, config: MeasureConfig | None = None) -> Measurement:
+def parse_measurement(text: str) -> Measurement:
     """Return the measurement of a text such as 'longest=120.4mm' or 'height=95mm+-0.3mm'.
 
     Two points are written 'between 0,0,0 0.3,0,1=95mm'.
@@ -104,7 +98,6 @@ def parse_measurement(text: str, config: MeasureConfig | None = None) -> Measure
         InputError: no such kind, points that are none, or no length.
         UnitError: a number without a unit, or a length that no object on a table has.
     """
-    config = config or MeasureConfig()
     name, equals, rest = text.partition("=")
     words = name.split()
     if not equals or not words:
@@ -121,28 +114,28 @@ def parse_measurement(text: str, config: MeasureConfig | None = None) -> Measure
     value_m, unit = _length(value, text)
     if len(more) > 1:
         raise InputError(f"'{text}' has several '+-'; one length and one sigma are expected.")
-    sigma_m = _length(more[0], text, unit)[0] if more else config.sigma_m
-    if not config.least_m <= value_m <= config.greatest_m:
+    sigma_m = _length(more[0], text, unit)[0] if more else SIGMA_M
+    if not LEAST_M <= value_m <= GREATEST_M:
         raise UnitError(
-            f"'{text}' says {value_m:.4g} m; between {1e3 * config.least_m:g} mm and "
-            f"{config.greatest_m:g} m is accepted. Is the unit right?"
+            f"'{text}' says {value_m:.4g} m; between {1e3 * LEAST_M:g} mm and "
+            f"{GREATEST_M:g} m is accepted. Is the unit right?"
         )
-    if not 0 < sigma_m <= config.largest_sigma * value_m:
+    if not 0 < sigma_m <= LARGEST_SIGMA * value_m:
         raise InputError(
             f"'{text}' has a sigma of {1e3 * sigma_m:.4g} mm on {1e3 * value_m:.4g} mm; more than "
-            f"0 and at most {100 * config.largest_sigma:g} % of the length is accepted."
+            f"0 and at most {100 * LARGEST_SIGMA:g} % of the length is accepted."
         )
     return Measurement(kind=kind, value_m=value_m, sigma_m=sigma_m, points=points)
 
 
-def parse_length(text: str, config: MeasureConfig | None = None) -> float:
+def parse_length(text: str) -> float:
     """Return a plain length such as '90mm' [m].
 
     Raises:
         InputError: it is no length.
         UnitError: no unit, or no object on a table is of that size.
     """
-    return parse_measurement(f"longest={text}", config).value_m
+    return parse_measurement(f"longest={text}").value_m
 
 
 def _length(text: str, whole: str, unit: str = "") -> tuple[float, str]:
@@ -276,38 +269,36 @@ def weighted(scales: Sequence[float], sigmas: Sequence[float]) -> tuple[float, f
 
 
 def scale_from(
-    mesh: Mesh, measurements: Sequence[Measurement], config: MeasureConfig | None = None
+    mesh: Mesh, measurements: Sequence[Measurement]
 ) -> tuple[float, float, tuple[LengthScale, ...]]:
     """Return scale and sigma [metres per unit] by measurements alone, and what each says.
 
     Raises:
         InputError: there is none, or they contradict each other; the odd one is named.
     """
-    config = config or MeasureConfig()
     if not measurements:
         raise InputError(
             "a scale by measurement needs at least one length, such as longest=120.4mm."
         )
     each = tuple(scale_of(mesh, m) for m in measurements)
-    fault = contradiction(each, config)
+    fault = contradiction(each)
     if fault:
         raise InputError(fault)
     scale, sigma = weighted([e.scale for e in each], [e.sigma for e in each])
     return scale, sigma, each
 
 
-def contradiction(each: Sequence[LengthScale], config: MeasureConfig | None = None) -> str:
+def contradiction(each: Sequence[LengthScale]) -> str:
     """Return what is wrong among several measurements, '' when they agree with each other."""
-    config = config or MeasureConfig()
-    if _worst_pair(each) <= config.agree_z:
+    if _worst_pair(each) <= AGREE_Z:
         return ""
     found = "; ".join(f"{e.measurement.text} gives {e.scale:.6g} m per unit" for e in each)
     rests = [[e for e in each if e is not odd] for odd in each]
-    alone = [k for k, rest in enumerate(rests) if _worst_pair(rest) <= config.agree_z]
+    alone = [k for k, rest in enumerate(rests) if _worst_pair(rest) <= AGREE_Z]
     if len(each) > 2 and len(alone) == 1:
         odd, rest = each[alone[0]], rests[alone[0]]
         mean, _ = weighted([e.scale for e in rest], [e.sigma for e in rest])
-        guess = typo(odd.scale / mean, config)
+        guess = typo(odd.scale / mean)
         return (
             f"the measured lengths contradict each other: {found}. The odd one is "
             f"'{odd.measurement.text}': the others say {1e3 * mean * odd.length:.4g} mm there"
@@ -318,7 +309,7 @@ def contradiction(each: Sequence[LengthScale], config: MeasureConfig | None = No
             f"the measured lengths contradict each other: {found}. No single one is to blame: "
             "measure them again."
         )
-    guess = typo(each[0].scale / each[1].scale, config)
+    guess = typo(each[0].scale / each[1].scale)
     return (
         f"the measured lengths contradict each other: {found}{'' if not guess else f' ({guess})'}. "
         "Which one is wrong cannot be told: measure again, or measure a third length."
@@ -347,10 +338,9 @@ TYPO_FACTORS: tuple[tuple[float, str], ...] = (
 """measured / true length of the usual slips, and how they are named."""
 
 
-def typo(ratio: float, config: MeasureConfig | None = None) -> str:
+def typo(ratio: float) -> str:
     """Return which slip of the unit a ratio measured / true looks like, '' for none."""
-    tolerance = (config or MeasureConfig()).typo_tolerance
     for factor, text in TYPO_FACTORS:
-        if abs(ratio / factor - 1) <= tolerance:
+        if abs(ratio / factor - 1) <= TYPO_TOLERANCE:
             return text
     return ""

@@ -10,10 +10,10 @@ from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim.scanning.scale.measured import (
+    AGREE_Z,
     KINDS,
     MEANING,
     LengthScale,
-    MeasureConfig,
     Measurement,
     contradiction,
     length_of,
@@ -68,30 +68,26 @@ def shape_error_m(fit: ScaleFit) -> float:
     return 1e-3 * TO_SIGMA * float(np.median(np.abs(seen - np.median(seen))))
 
 
-def compare(
-    fit: ScaleFit, mesh: Mesh, measurement: Measurement, config: MeasureConfig | None = None
-) -> MeasuredCheck:
+def compare(fit: ScaleFit, mesh: Mesh, measurement: Measurement) -> MeasuredCheck:
     """Return whether a measured length agrees with a fit.
 
     Args:
         fit: the scale from the depth images.
         mesh: the mesh it is of, in its own unit.
         measurement: what was measured. A 'height' is out of the table, as the object stands.
-        config: how much a measured length is believed.
     """
-    config = config or MeasureConfig()
     alone = scale_of(mesh, measurement, as_it_stands(fit), shape_error_m(fit))
     ratio = alone.scale / fit.scale
     z = (alone.scale - fit.scale) / float(np.hypot(alone.sigma, fit.sigma))
     fitted_mm, percent = 1e3 * alone.length * fit.scale, 100 * (ratio - 1)
-    agrees = abs(z) <= config.agree_z
+    agrees = abs(z) <= AGREE_Z
     said = f"measured {1e3 * measurement.value_m:.4g} mm, fitted {fitted_mm:.4g} mm"
     how = f"{percent:+.2f} %, {abs(z):.1f} sigma" if abs(percent) < 100 else f"{ratio:.3g} times"
     text = f"{measurement.kind}: {said} ({how})"
     if agrees:
         text += ": they agree."
     else:
-        hint = typo(ratio, config) or _other_kind(fit, mesh, measurement, config)
+        hint = typo(ratio) or _other_kind(fit, mesh, measurement)
         text += f": they do not agree.{' ' + hint[0].upper() + hint[1:] if hint else ''}"
     return MeasuredCheck(
         measurement=measurement, length=alone.length, scale=alone.scale, sigma=alone.sigma,
@@ -99,7 +95,7 @@ def compare(
     )  # fmt: skip
 
 
-def _other_kind(fit: ScaleFit, mesh: Mesh, measurement: Measurement, config: MeasureConfig) -> str:
+def _other_kind(fit: ScaleFit, mesh: Mesh, measurement: Measurement) -> str:
     """Return which other length of the mesh the measured one would fit, '' for none."""
     fitting: list[str] = []
     for kind in KINDS:
@@ -111,26 +107,22 @@ def _other_kind(fit: ScaleFit, mesh: Mesh, measurement: Measurement, config: Mea
         except DegenerateError:  # flat along that axis: it was not measured there
             continue
         z = (alone.scale - fit.scale) / float(np.hypot(alone.sigma, fit.sigma))
-        if abs(z) <= config.agree_z:
+        if abs(z) <= AGREE_Z:
             fitting.append(f"'{kind}' ({MEANING[kind]})")
     return f"it would agree as {' or '.join(fitting)}." if fitting else ""
 
 
 def with_measurements(
-    fit: ScaleFit,
-    mesh: Mesh,
-    measurements: Sequence[Measurement],
-    config: MeasureConfig | None = None,
+    fit: ScaleFit, mesh: Mesh, measurements: Sequence[Measurement]
 ) -> tuple[ScaleFit, tuple[MeasuredCheck, ...]]:
     """Return the fit with measured lengths taken in, and how each compares with the fit alone.
 
     Where all agree, scale and pose become the mean by inverse variance. Where one does not, the
     scale stays as it was fitted, an accepted fit becomes doubtful, and both figures are named.
     """
-    config = config or MeasureConfig()
     if not measurements:
         return fit, ()
-    checks = tuple(compare(fit, mesh, m, config) for m in measurements)
+    checks = tuple(compare(fit, mesh, m) for m in measurements)
     R_up, shape_m = as_it_stands(fit), shape_error_m(fit)
     each = [
         LengthScale(
@@ -141,7 +133,7 @@ def with_measurements(
         )
         for m, c in zip(measurements, checks, strict=True)
     ]
-    between = contradiction([scale_of(mesh, m, R_up, shape_m) for m in measurements], config)
+    between = contradiction([scale_of(mesh, m, R_up, shape_m) for m in measurements])
     faults = [*(c.text for c in checks if not c.agrees), *([between] if between else [])]
     if faults:
         verdict = "doubtful" if fit.verdict == "accepted" else fit.verdict

@@ -21,7 +21,7 @@ from realsim.scanning.scale.evidence import ScanEvidence
 from realsim.scanning.scale.outlines import COLUMNS, add_outside
 from realsim.scanning.scale.result import Similarity
 from realsim.scanning.scale.shape import INNER_EXTENT, ScanShape, mirrored
-from realsim.scanning.scale.starts import StartsConfig, find_starts, starts_near
+from realsim.scanning.scale.starts import find_starts, starts_near
 from realsim.scanning.scale.state import (
     PATCHES,
     SIMILARITY,
@@ -97,7 +97,7 @@ def hypotheses(
     found: list[Hypothesis] = []
     if start is not None:
         inner = from_given(shape, start)
-        near = starts_near(inner, StartsConfig(), rng)
+        near = starts_near(inner, rng)
         few, half = config.search.near_first, config.search.half_turns
         # Half turns always: a mug with its handle on the wrong side explains much. But a box stays
         # as it was given, and does not turn over for a little noise.
@@ -110,14 +110,14 @@ def hypotheses(
             more = _fitted(shape, evidence, near[few:-half], config)
             found = _distinct([*found, *more], shape, config)
     if not found or found[0].gain < config.search.least_gain:
-        anew = find_starts(shape, evidence.cloud, evidence.plane, StartsConfig())
+        anew = find_starts(shape, evidence.cloud, evidence.plane)
         if size_m is not None:
             reach = np.log(config.search.size_factor)
             like = [a for a in anew if abs(np.log(a.scale * INNER_EXTENT / size_m)) < reach]
             anew = like or anew
         anew = anew[: config.search.starts]
         if len(anew) < config.search.few_starts:
-            anew += [s for a in anew for s in starts_near(a, StartsConfig(), rng)[1:3]]
+            anew += [s for a in anew for s in starts_near(a, rng)[1:3]]
         found = _distinct([*found, *_fitted(shape, evidence, anew, config)], shape, config)
     return found
 
