@@ -12,7 +12,7 @@ from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Check, Chessboard, Target
-from realsim_calibration.checks import own_lens_check
+from realsim_calibration.checks import FOCAL_SHARE, own_lens_check
 from realsim_calibration.fit.joint_solve import JointConfig
 from realsim_calibration.hand_eye import HandEyeConfig, calibrate_hand_eye_report
 from realsim_calibration.lens.fit import IntrinsicsConfig
@@ -129,7 +129,7 @@ def calibrate(
         raise
     if lens is not None:  # no camera was given, so nothing is said of one
         both = (lens.covariance + report.intrinsics_covariance)[2:4, 2:4]
-        own = own_lens_check(camera, report.intrinsics, both, hand_eye.checks)
+        own = own_lens_check(camera, report.intrinsics, both)
         checks = tuple(own if c.name == "given camera" else c for c in report.checks)
         report = replace(report, checks=checks)
     return Calibration(hand_eye=report, lens=lens)
@@ -166,7 +166,7 @@ def require_given_camera(
     own = lens.intrinsics
     sd = float(np.sqrt(max(lens.covariance[0, 0], lens.covariance[1, 1]))) / own.fx
     off = float(np.sqrt(given.fx * given.fy / (own.fx * own.fy))) - 1
-    if abs(off) < max(config.hand_eye.checks.focal[1], CAMERA_SIGMAS * sd):
+    if abs(off) < max(FOCAL_SHARE[1], CAMERA_SIGMAS * sd):
         return
     raise InputError(
         f"the given camera has a focal length of {np.sqrt(given.fx * given.fy):.1f} px, and the "

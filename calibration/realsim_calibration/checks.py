@@ -1,7 +1,6 @@
 """What a person should know of a hand-eye calibration: verdicts, each with a sentence of advice."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -12,44 +11,37 @@ from realsim_calibration.faults.hypotheses import option_of, size_name
 from realsim_calibration.results import HandEyeReport
 
 Verdict = Literal["good", "warn", "bad", "unknown"]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CheckConfig:
-    """From which value on a figure is worth a warning, and from which it is bad."""
-
-    views: tuple[int, int] = (12, 5)
-    """Used views: fewer let the covariance rest on too few of them."""
-    rejected_share: tuple[float, float] = (0.15, 0.4)
-    """Share of views that were dropped."""
-    roll_deg: tuple[float, float] = (60.0, 20.0)
-    """Range of camera roll: without roll the error was 2 to 6 times larger in simulation."""
-    sigma_mm: tuple[float, float] = (1.0, 3.0)
-    """1-sigma of the camera's place, for this arm as it moves here."""
-    sigma_deg: tuple[float, float] = (0.1, 0.4)
-    """1-sigma of the camera's direction: 0.1 deg is 0.7 mm at 0.4 m."""
-    unseen_mm: tuple[float, float] = (2.0, 6.0)
-    """Board's place predicted without the view: a UR5e's own errors leave 1 to 2 mm."""
-    optimism: tuple[float, float] = (1.6, 3.0)
-    """Unseen over seen error: beyond, the fit follows single views."""
-    scale: tuple[float, float] = (0.003, 0.02)
-    """A board size that is off by this share is a misprint; by more, another board."""
-    scale_sigmas: float = 3.0
-    """It must be off by this many sigma as well."""
-    unseen_px: tuple[float, float] = (1.5, 6.0)
-    """Unseen views; good real sets reach 0.3 to 1.1 px."""
-    focal: tuple[float, float] = (0.01, 0.03)
-    """Focal length against the given camera's: factory values are within 0.5 %."""
-    warp_mm: tuple[float, float] = (0.5, 3.0)
-    """Lift of the board's border: glue the print to something flatter."""
-    robot_deg: tuple[float, float] = (0.1, 0.5)
-    """RMS rotation error of the robot's poses."""
-    robot_mm: tuple[float, float] = (1.0, 4.0)
-    """RMS position error of the robot's poses."""
-    joint_offset_deg: tuple[float, float] = (0.05, 0.3)
-    """Zero error of a joint: beyond, the controller's kinematics are nominal, not calibrated."""
-    lens_sigmas: float = 4.0
-    """A lens term this many prior sigma away from the given camera is another camera."""
+# From the first value on a figure is worth a warning, from the second on it is bad.
+USED_VIEWS = (12, 5)
+"""Used views: fewer let the covariance rest on too few of them."""
+REJECTED_SHARE = (0.15, 0.4)
+"""Share of views that were dropped."""
+ROLL_DEG = (60.0, 20.0)
+"""Range of camera roll: without roll the error was 2 to 6 times larger in simulation."""
+SIGMA_MM = (1.0, 3.0)
+"""1-sigma of the camera's place, for this arm as it moves here."""
+SIGMA_DEG = (0.1, 0.4)
+"""1-sigma of the camera's direction: 0.1 deg is 0.7 mm at 0.4 m."""
+UNSEEN_MM = (2.0, 6.0)
+"""Board's place predicted without the view: a UR5e's own errors leave 1 to 2 mm."""
+OPTIMISM = (1.6, 3.0)
+"""Unseen over seen error: beyond, the fit follows single views."""
+BOARD_SCALE = (0.003, 0.02)
+"""A board size that is off by this share is a misprint; by more, another board."""
+SCALE_SIGMAS = 3.0
+"""It must be off by this many sigma as well."""
+UNSEEN_PX = (1.5, 6.0)
+"""Unseen views; good real sets reach 0.3 to 1.1 px."""
+FOCAL_SHARE = (0.01, 0.03)
+"""Focal length against the given camera's: factory values are within 0.5 %."""
+WARP_MM = (0.5, 3.0)
+"""Lift of the board's border: glue the print to something flatter."""
+ROBOT_DEG = (0.1, 0.5)
+"""RMS rotation error of the robot's poses."""
+ROBOT_MM = (1.0, 4.0)
+"""RMS position error of the robot's poses."""
+JOINT_OFFSET_DEG = (0.05, 0.3)
+"""Zero error of a joint: beyond, the controller's kinematics are nominal, not calibrated."""
 
 
 def _verdict(value: float, limits: tuple[float, float], *, high_is_bad: bool = True) -> Verdict:
@@ -69,20 +61,20 @@ def roll_range_deg(Ts_cam_board: Sequence[Array]) -> float:
     return float(360.0 - gaps.max())
 
 
-def hand_eye_checks(report: HandEyeReport, config: CheckConfig) -> tuple[Check, ...]:
+def hand_eye_checks(report: HandEyeReport) -> tuple[Check, ...]:
     """Return every check of a hand-eye calibration."""
     return (
-        _views(report, config),
-        _roll(report, config),
-        _sigma(report, config),
-        *_absolute(report, config),
-        _held_out(report, config),
-        _optimism(report, config),
-        _scale(report, config),
-        _flatness(report, config),
-        _robot(report, config),
+        _views(report),
+        _roll(report),
+        _sigma(report),
+        *_absolute(report),
+        _held_out(report),
+        _optimism(report),
+        _scale(report),
+        _flatness(report),
+        _robot(report),
         *_stretched(report),
-        *_arm(report, config),
+        *_arm(report),
     )
 
 
@@ -90,10 +82,10 @@ def _advice(verdict: Verdict, text: str) -> str:
     return "" if verdict == "good" else text
 
 
-def _views(r: HandEyeReport, c: CheckConfig) -> Check:
+def _views(r: HandEyeReport) -> Check:
     used, given = len(r.used), len(r.views)
-    verdict = _verdict(used, c.views, high_is_bad=False)
-    share = _verdict(1 - used / given, c.rejected_share)
+    verdict = _verdict(used, USED_VIEWS, high_is_bad=False)
+    share = _verdict(1 - used / given, REJECTED_SHARE)
     worst: Verdict = max(verdict, share, key=["good", "unknown", "warn", "bad"].index)
     gone = [v for v in r.views if not v.used]
     empty = sum(not len(v.uv) for v in gone)
@@ -111,23 +103,23 @@ def _views(r: HandEyeReport, c: CheckConfig) -> Check:
     )  # fmt: skip
 
 
-def _roll(r: HandEyeReport, c: CheckConfig) -> Check:
-    verdict = _verdict(r.roll_range_deg, c.roll_deg, high_is_bad=False)
+def _roll(r: HandEyeReport) -> Check:
+    verdict = _verdict(r.roll_range_deg, ROLL_DEG, high_is_bad=False)
     axis = float(1e3 * np.sqrt(r.place_covariance[5, 5]))
     return Check(
         name="roll",
         verdict=verdict,
         sentence=f"the camera rolls through {r.roll_range_deg:.0f} deg about its optical axis; its "
         f"place along that axis is known to +-{axis:.2f} mm.",
-        advice=_advice(verdict, f"Roll the hand by {c.roll_deg[0]:g} deg or more between views: it "
+        advice=_advice(verdict, f"Roll the hand by {ROLL_DEG[0]:g} deg or more between views: it "
                        "improves the result more than further views do."),
         value=r.roll_range_deg,
         unit="deg",
     )  # fmt: skip
 
 
-def _sigma(r: HandEyeReport, c: CheckConfig) -> Check:
-    verdicts = (_verdict(r.here_mm, c.sigma_mm), _verdict(r.here_deg, c.sigma_deg))
+def _sigma(r: HandEyeReport) -> Check:
+    verdicts = (_verdict(r.here_mm, SIGMA_MM), _verdict(r.here_deg, SIGMA_DEG))
     worst: Verdict = max(verdicts, key=["good", "unknown", "warn", "bad"].index)
     return Check(
         name="uncertainty",
@@ -140,11 +132,11 @@ def _sigma(r: HandEyeReport, c: CheckConfig) -> Check:
     )  # fmt: skip
 
 
-def _absolute(r: HandEyeReport, c: CheckConfig) -> tuple[Check, ...]:
+def _absolute(r: HandEyeReport) -> tuple[Check, ...]:
     """Return the check of X for another arm or a drawing: told, it never decides."""
     if r.X_here_covariance is None:
         return ()
-    known = r.sigma_mm <= c.sigma_mm[0] and r.sigma_deg <= c.sigma_deg[0]
+    known = r.sigma_mm <= SIGMA_MM[0] and r.sigma_deg <= SIGMA_DEG[0]
     remedies = [
         ""
         if isinstance(r.robot_map, ArmErrorMap)
@@ -190,8 +182,8 @@ def _stretched(r: HandEyeReport) -> tuple[Check, ...]:
     )
 
 
-def _held_out(r: HandEyeReport, c: CheckConfig) -> Check:
-    verdicts = (_verdict(r.held_out_mm, c.unseen_mm), _verdict(r.held_out_px, c.unseen_px))
+def _held_out(r: HandEyeReport) -> Check:
+    verdicts = (_verdict(r.held_out_mm, UNSEEN_MM), _verdict(r.held_out_px, UNSEEN_PX))
     verdict: Verdict = max(verdicts, key=["good", "unknown", "warn", "bad"].index)
     worst = sorted(r.used, key=lambda v: -v.unseen_px)[:3]
     return Check(
@@ -208,9 +200,9 @@ def _held_out(r: HandEyeReport, c: CheckConfig) -> Check:
     )  # fmt: skip
 
 
-def _optimism(r: HandEyeReport, c: CheckConfig) -> Check:
+def _optimism(r: HandEyeReport) -> Check:
     ratio = r.held_out_px / max(r.seen_px, 1e-9)
-    verdict = _verdict(ratio, c.optimism)
+    verdict = _verdict(ratio, OPTIMISM)
     return Check(
         name="overfitting",
         verdict=verdict,
@@ -221,15 +213,15 @@ def _optimism(r: HandEyeReport, c: CheckConfig) -> Check:
     )  # fmt: skip
 
 
-def _scale(r: HandEyeReport, c: CheckConfig) -> Check:
+def _scale(r: HandEyeReport) -> Check:
     b = r.board
     sd = float(b.sd[0])
     off = abs(b.scale - 1)
     if sd == 0:
         said = "these data cannot measure the board's size: the size given was used."
         return Check(name="board size", verdict="unknown", sentence=said)
-    verdict = _verdict(off, c.scale)
-    if verdict == "bad" and off <= c.scale_sigmas * sd:
+    verdict = _verdict(off, BOARD_SCALE)
+    if verdict == "bad" and off <= SCALE_SIGMAS * sd:
         verdict = "warn"
     return Check(
         name="board size",
@@ -243,10 +235,10 @@ def _scale(r: HandEyeReport, c: CheckConfig) -> Check:
     )  # fmt: skip
 
 
-def _flatness(r: HandEyeReport, c: CheckConfig) -> Check:
+def _flatness(r: HandEyeReport) -> Check:
     if not np.any(r.board.sd[2:]):
         return Check(name="board flatness", verdict="unknown", sentence="the board was held flat.")
-    verdict = _verdict(r.board.warp_mm, c.warp_mm)
+    verdict = _verdict(r.board.warp_mm, WARP_MM)
     return Check(
         name="board flatness",
         verdict=verdict,
@@ -258,19 +250,17 @@ def _flatness(r: HandEyeReport, c: CheckConfig) -> Check:
     )
 
 
-def given_camera_check(f_given: float, f_fitted: float, config: CheckConfig) -> Check:
+def given_camera_check(f_given: float, f_fitted: float) -> Check:
     """Return the check of a camera that was given against the one that the views show."""
     return _focal_check(
-        f_given, f_fitted, config, "given camera",
+        f_given, f_fitted, "given camera",
         "the views show a focal length of {:.1f} px, the given camera has {:.1f} px ({:+.1f} %).",
         "Check that it is the camera, resolution and focus of these images, or leave the camera "
         "out to calibrate the lens from these views.",
     )  # fmt: skip
 
 
-def own_lens_check(
-    alone: CameraIntrinsics, fitted: CameraIntrinsics, covariance: Array, config: CheckConfig
-) -> Check:
+def own_lens_check(alone: CameraIntrinsics, fitted: CameraIntrinsics, covariance: Array) -> Check:
     """Return the check of a lens from the views alone against the one that the poses agree with.
 
     `covariance` (2, 2) is that of the difference of the principal points, as if they were apart.
@@ -280,7 +270,7 @@ def own_lens_check(
     sigmas = float(np.sqrt(step @ np.linalg.pinv(covariance) @ step))
     px = float(np.linalg.norm(step))
     return _focal_check(
-        f_alone, f_fitted, config, "focal length with poses",
+        f_alone, f_fitted, "focal length with poses",
         "with the robot's poses the views show a focal length of {:.1f} px, without them {:.1f} px "
         f"({{:+.1f}} %). The principal points lie {px:.1f} px apart, {sigmas:.1f} combined sigma, "
         "of which a tilt of the camera and the tangential distortion take up a part.",
@@ -291,11 +281,11 @@ def own_lens_check(
 
 
 def _focal_check(
-    f_before: float, f_fitted: float, config: CheckConfig, name: str, sentence: str, advice: str,
+    f_before: float, f_fitted: float, name: str, sentence: str, advice: str,
     moved: float = 0.0,
 ) -> Check:  # fmt: skip
     off = f_fitted / f_before - 1
-    verdict = _verdict(max(abs(off), moved), config.focal)
+    verdict = _verdict(max(abs(off), moved), FOCAL_SHARE)
     return Check(
         name=name,
         verdict=verdict,
@@ -305,11 +295,11 @@ def _focal_check(
     )
 
 
-def _robot(r: HandEyeReport, c: CheckConfig) -> Check:
+def _robot(r: HandEyeReport) -> Check:
     errors = np.array([v.robot_error for v in r.used])
     deg = float(np.degrees(np.sqrt(np.mean(np.sum(errors[:, :3] ** 2, -1)))))
     mm = float(1e3 * np.sqrt(np.mean(np.sum(errors[:, 3:] ** 2, -1))))
-    verdicts = (_verdict(deg, c.robot_deg), _verdict(mm, c.robot_mm))
+    verdicts = (_verdict(deg, ROBOT_DEG), _verdict(mm, ROBOT_MM))
     worst: Verdict = max(verdicts, key=["good", "unknown", "warn", "bad"].index)
     if r.robot_map is None:
         kind = "no map of it predicts unseen views better"
@@ -328,12 +318,12 @@ def _robot(r: HandEyeReport, c: CheckConfig) -> Check:
     )  # fmt: skip
 
 
-def _arm(r: HandEyeReport, c: CheckConfig) -> tuple[Check, ...]:
+def _arm(r: HandEyeReport) -> tuple[Check, ...]:
     if r.joint_offsets is None:
         return ()
     inner = np.degrees(r.joint_offsets[1:5])
     value = float(np.abs(inner[:, 0]).max())
-    verdict = _verdict(value, c.joint_offset_deg)
+    verdict = _verdict(value, JOINT_OFFSET_DEG)
     text = ", ".join(f"{k + 2}: {o:+.3f}+-{s:.3f}" for k, (o, s) in enumerate(inner))
     return (
         Check(

@@ -140,10 +140,10 @@ def _report(
         checks=(),
         information=solution.information,
     )
-    checks = screened.checks + hand_eye_checks(report, config.checks)
+    checks = screened.checks + hand_eye_checks(report)
     if config.joint.focal_sd > 0:
         given, fitted = (float(np.sqrt(c.fx * c.fy)) for c in (intrinsics0, report.intrinsics))
-        checks = (*checks, given_camera_check(given, fitted, config.checks))
+        checks = (*checks, given_camera_check(given, fitted))
     return replace(report, checks=checks)
 
 

@@ -11,7 +11,7 @@ from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Check, Target
-from realsim_calibration.checks import CheckConfig, roll_range_deg
+from realsim_calibration.checks import roll_range_deg
 from realsim_calibration.faults.consequences import (
     SINGLE_VIEWS,
     check_of,
@@ -51,7 +51,6 @@ class HandEyeConfig:
     joint: JointConfig = field(default_factory=JointConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     robot: RobotErrorConfig = field(default_factory=RobotErrorConfig)
-    checks: CheckConfig = field(default_factory=CheckConfig)
     robot_map: bool = True
     """Whether maps of the robot's error are tried."""
     min_points: int = 8

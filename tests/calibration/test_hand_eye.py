@@ -7,7 +7,7 @@ from realsim.errors import DegenerateError, InputError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim_calibration import JointConfig
-from realsim_calibration.checks import CheckConfig, own_lens_check
+from realsim_calibration.checks import own_lens_check
 from realsim_calibration.detect.drawings import DRAWN
 from realsim_calibration.fit.board_pose import estimate_board_pose
 from realsim_calibration.hand_eye import (
@@ -213,9 +213,9 @@ def test_a_view_without_tags_and_a_repeated_index_are_handled(simulate):
 def test_principal_points_apart_are_told(simulate):
     lens = simulate(0, views=4).intrinsics0
     moved = replace(lens, cx=lens.cx + 9.0)
-    check = own_lens_check(lens, moved, 4.0 * np.eye(2), CheckConfig())
+    check = own_lens_check(lens, moved, 4.0 * np.eye(2))
     assert "9.0 px apart, 4.5 combined sigma" in check.sentence and check.verdict == "warn"
-    assert own_lens_check(lens, lens, np.eye(2), CheckConfig()).verdict == "good"
+    assert own_lens_check(lens, lens, np.eye(2)).verdict == "good"
 
 
 def test_board_pose_keeps_the_twin_apart(simulate):

@@ -13,7 +13,7 @@ from realsim.app.console import Console
 from realsim.geometry import se3
 from realsim.records import TagBoard, View
 from realsim_calibration import BoardView, HandEyeConfig, HandEyeReport, calibrate_hand_eye_report
-from realsim_calibration.checks import CheckConfig, hand_eye_checks
+from realsim_calibration.checks import hand_eye_checks
 from realsim_calibration.exports import (
     FrameNames,
     calibration_text,
@@ -107,13 +107,13 @@ def test_the_absolute_sigma_is_nowhere_the_smaller_one(share: float) -> None:
 
 def test_verdict_follows_this_arm_and_the_other_sigma_is_told() -> None:
     report = replace(calibrated(), X_covariance=np.eye(6) * 0.05**2)
-    checks = {c.name: c for c in hand_eye_checks(report, CheckConfig())}
+    checks = {c.name: c for c in hand_eye_checks(report)}
     assert checks["uncertainty"].verdict in ("good", "warn")
     told = checks["uncertainty elsewhere"]
     assert told.verdict == "unknown" and "joint angles" in told.advice
     assert "50.00 mm" in told.sentence
     worse = replace(report, X_here_covariance=np.eye(6) * 0.05**2)
-    checks = {c.name: c for c in hand_eye_checks(worse, CheckConfig())}
+    checks = {c.name: c for c in hand_eye_checks(worse)}
     assert checks["uncertainty"].verdict == "bad"
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from realsim.robots.arm import UR5, find_arm
-from realsim_capture_plans.capturing.checks import CheckConfig, sharpness
+from realsim_capture_plans.capturing.checks import SHARPNESS_OF_MEDIAN, sharpness
 from realsim_capture_plans.capturing.look import SettleConfig, until_still
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError
 from realsim_capture_plans.lab.devices import SimulatedArm
@@ -70,11 +70,11 @@ def test_sharpness_falls_with_every_blur_and_not_with_contrast() -> None:
         noisy = np.clip(soft + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
         values.append(sharpness(noisy))
     assert np.all(np.diff(values) < 0)
-    assert values[2] < CheckConfig().sharpness_of_median * values[0]
+    assert values[2] < SHARPNESS_OF_MEDIAN * values[0]
     faint = np.clip(120 + 0.5 * (image.astype(float) - 120), 0, 255).astype(np.uint8)
     assert sharpness(faint) == pytest.approx(values[0], rel=0.1)
     assert sharpness(np.ascontiguousarray(image.transpose(1, 0, 2))) == pytest.approx(
         values[0], rel=0.05
     )
     moved = cv2.filter2D(image, -1, np.full((1, 11), 1 / 11, np.float32))
-    assert sharpness(moved) < CheckConfig().sharpness_of_median * values[0]
+    assert sharpness(moved) < SHARPNESS_OF_MEDIAN * values[0]

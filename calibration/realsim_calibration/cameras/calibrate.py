@@ -37,7 +37,12 @@ from realsim_calibration.cameras.solve import (
     without_arm,
 )
 from realsim_calibration.cameras.start import Start, board_poses, find_start
-from realsim_calibration.checks import given_camera_check, hand_eye_checks, roll_range_deg
+from realsim_calibration.checks import (
+    FOCAL_SHARE,
+    given_camera_check,
+    hand_eye_checks,
+    roll_range_deg,
+)
 from realsim_calibration.faults.consequences import drawings_check
 from realsim_calibration.fit.joint_solve import JointConfig
 from realsim_calibration.fit.view_system import camera_record
@@ -73,7 +78,7 @@ def calibrate_cameras(
         # A board said to move that stands still tells no lens: then that is the cause to name.
         require_motion(rig, board_poses(rig, _rough_lenses(rig), config.hand_eye)[0])
         raise
-    require_lenses(rig, own, config.hand_eye.checks.focal[0])
+    require_lenses(rig, own, FOCAL_SHARE[0])
     require_motion(rig, board_poses(rig, lenses, config.hand_eye)[0])
     start = find_start(rig, lenses, config.hand_eye, arm)
     rows = sorted({s.instant for s in start.rig.sightings})
@@ -324,7 +329,7 @@ def _camera(
         information=inverse(known),
     )  # fmt: skip
     checks = [check for camera_of, check in start.checks if camera_of == c]
-    told = hand_eye_checks(report, config.hand_eye.checks)
+    told = hand_eye_checks(report)
     if not problem.arm_used:
         told = armless_checks(told, report, "" if c == 0 else rig.cameras[0].name)
     checks += [
@@ -335,7 +340,7 @@ def _camera(
         given, fitted = (
             float(np.sqrt(i.fx * i.fy)) for i in (camera.intrinsics0, report.intrinsics)
         )
-        checks.append(given_camera_check(given, fitted, config.hand_eye.checks))
+        checks.append(given_camera_check(given, fitted))
     return replace(report, checks=tuple(checks))
 
 

@@ -1,6 +1,6 @@
 """Find the inner corners of a ChArUco board: markers say which, the saddles say where."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,32 +15,24 @@ from realsim_calibration.detect.homography import (
 )
 from realsim_calibration.detect.images import gray_image, size_of
 from realsim_calibration.detect.markers import TWO_BOARDS, decode_markers, several_boards
-from realsim_calibration.detect.saddles import OUTSIDE, SaddleConfig, Saddles, refine_saddles
+from realsim_calibration.detect.saddles import OUTSIDE, Saddles, refine_saddles
 from realsim_calibration.views import TargetDetection
 
 REASONS_TOLD = 6
 """Corners named one by one in `rejected`; the rest is counted."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CharucoConfig:
-    """When a ChArUco corner is good enough to calibrate with."""
-
-    saddles: SaddleConfig = field(default_factory=SaddleConfig)
-    """How corners are measured."""
-    layout_share: float = 0.5
-    """Furthest that a marker's corner may lie from where the others put it, in marker sides."""
-    min_markers: int = 2
-    """Least number of markers that agree: one alone may be chance."""
-    agreeing_share: float = 0.7
-    """Least share of the markers that must agree: of a wrong layout a skewed map explains half."""
-    near_markers: int = 6
-    """A corner is expected where the map of so many nearest markers puts it: few, so that the
-    lens does not bend the map."""
-    near_corners: int = 8
-    """A corner without a readable marker is expected where so many found ones put it."""
-    min_points: int = 4
-    """Fewer corners give no pose."""
+LAYOUT_SHARE = 0.5
+"""Furthest that a marker's corner may lie from where the others put it, in marker sides."""
+MIN_MARKERS = 2
+"""Least number of markers that agree: one alone may be chance."""
+AGREEING_SHARE = 0.7
+"""Least share of the markers that must agree: of a wrong layout a skewed map explains half."""
+NEAR_MARKERS = 6
+"""A corner is expected where the map of so many nearest markers puts it: few, so that the
+lens does not bend the map."""
+NEAR_CORNERS = 8
+"""A corner without a readable marker is expected where so many found ones put it."""
+MIN_POINTS = 4
+"""Fewer corners give no pose."""
 
 
 def charuco_markers(board: CharucoBoard) -> Array:
@@ -59,37 +51,32 @@ def white_parity(board: CharucoBoard) -> int:
 
 
 def find_charuco(
-    rgb: UInt8,
-    board: CharucoBoard,
-    config: CharucoConfig | None = None,
-    *,
-    intrinsics: CameraIntrinsics | None = None,
+    rgb: UInt8, board: CharucoBoard, *, intrinsics: CameraIntrinsics | None = None
 ) -> TargetDetection:
     """Return the inner corners of a ChArUco board that are seen next to a decoded marker.
 
     Raises:
         InputError: the image is not 8 bit, or the dictionary is not known.
     """
-    config = config or CharucoConfig()
     gray = gray_image(rgb)
     ids, quads = decode_markers(gray, board.dictionary)
-    good, quads, rejected = markers_on_board(ids, quads, board, config)
+    good, quads, rejected = markers_on_board(ids, quads, board)
     ids, quads = ids[good], quads[good]
     if not len(ids):
         return _nothing(gray, rejected)
-    point_ids, start, arms = _expected(ids, quads, board, config)
+    point_ids, start, arms = _expected(ids, quads, board)
     uv, sd = np.full((2, len(board.points_board), 2), np.nan)
     tried: dict[int, str] = {}
     # What was found says where corners without a readable marker must be, and so on outwards.
     while len(point_ids):
-        found = _refined(gray, (point_ids, start, arms), board, (config, intrinsics))
+        found = _refined(gray, (point_ids, start, arms), board, intrinsics)
         tried |= dict(zip(point_ids.tolist(), found.faults, strict=True))
         uv[point_ids[found.good]] = found.uv[found.good]
         sd[point_ids[found.good], 0] = found.sd_px[found.good]
-        point_ids, start, arms = _beside(uv, tried, board, config)
+        point_ids, start, arms = _beside(uv, tried, board)
     rejected += _told({k: fault for k, fault in tried.items() if fault and fault != OUTSIDE})
     good = np.flatnonzero(np.isfinite(uv[:, 0]))
-    if len(good) < config.min_points:
+    if len(good) < MIN_POINTS:
         return _nothing(gray, [*rejected, f"{len(good)} corners are too few"])
     return TargetDetection(
         point_ids=good,
@@ -113,14 +100,14 @@ def _refined(
     gray: UInt8,
     expected: tuple[Int64, Array, Array],
     board: CharucoBoard,
-    how: tuple[CharucoConfig, CameraIntrinsics | None],
+    intrinsics: CameraIntrinsics | None,
 ) -> Saddles:
     """Return expected corners (numbers, places, arms) as they are measured."""
     point_ids, start, arms = expected
     row, column = np.divmod(point_ids, board.columns - 1)
     dark = (row + column) % 2 != white_parity(board)
     clear = (board.square_m - board.marker_m) / 2 / board.square_m
-    return refine_saddles(gray, start, arms, dark, clear, how[0].saddles, how[1])
+    return refine_saddles(gray, start, arms, dark, clear, intrinsics)
 
 
 def _told(faults: dict[int, str]) -> list[str]:
@@ -133,7 +120,7 @@ def _told(faults: dict[int, str]) -> list[str]:
 
 
 def markers_on_board(
-    ids: Int64, quads: Array, board: CharucoBoard, config: CharucoConfig
+    ids: Int64, quads: Array, board: CharucoBoard
 ) -> tuple[Mask, Array, list[str]]:
     """Return which markers (n,) lie on the board, all corners as it counts them, and faults."""
     known = charuco_markers(board)
@@ -145,13 +132,13 @@ def markers_on_board(
     usable = ours & ~twice
     if several_boards(ids[ours]):
         return np.zeros(len(ids), dtype=bool), quads, [TWO_BOARDS, *rejected]
-    if usable.sum() < config.min_markers:
+    if usable.sum() < MIN_MARKERS:
         if usable.any():
             rejected.append(f"{int(usable.sum())} marker alone may be chance")
         return np.zeros(len(ids), dtype=bool), quads, rejected
     side = np.linalg.norm(quads - np.roll(quads, -1, axis=1), axis=-1)
-    limit = config.layout_share * float(np.median(side[usable]))
-    least = max(config.min_markers, int(np.ceil(config.agreeing_share * usable.sum())))
+    limit = LAYOUT_SHARE * float(np.median(side[usable]))
+    least = max(MIN_MARKERS, int(np.ceil(AGREEING_SHARE * usable.sum())))
     # Some generators print the codes turned on the page; the grid says by how much.
     for roll in (0, 2, 1, 3):
         turned = np.roll(quads, roll, axis=1)
@@ -205,9 +192,7 @@ def _remedy(
     return ". Are rows, columns, square and marker size right?"
 
 
-def _expected(
-    ids: Int64, quads: Array, board: CharucoBoard, config: CharucoConfig
-) -> tuple[Int64, Array, Array]:
+def _expected(ids: Int64, quads: Array, board: CharucoBoard) -> tuple[Int64, Array, Array]:
     """Return the inner corners next to a marker, where to expect them, and their arms [px]."""
     known = charuco_markers(board)[ids]
     middle = known.mean(1)
@@ -218,23 +203,21 @@ def _expected(
         distance = np.linalg.norm(middle - p, axis=-1)
         if distance.min() > side:
             continue
-        near = np.argsort(distance)[: config.near_markers]
+        near = np.argsort(distance)[:NEAR_MARKERS]
         near = near[distance[near] < 3 * side]
         places.append((k, fit_homography(known[near].reshape(-1, 2), quads[near].reshape(-1, 2))))
     return _starts(places, board)
 
 
-def _beside(
-    uv: Array, tried: dict[int, str], board: CharucoBoard, config: CharucoConfig
-) -> tuple[Int64, Array, Array]:
+def _beside(uv: Array, tried: dict[int, str], board: CharucoBoard) -> tuple[Int64, Array, Array]:
     """Return corners not tried yet beside those found (uv, NaN where not), as `_expected` does."""
     places: list[tuple[int, Array]] = []
     found = np.flatnonzero(np.isfinite(uv[:, 0]))
     known = board.points_board[:, :2]
     for k in np.setdiff1d(np.arange(len(uv)), list(tried)):
         distance = np.linalg.norm(known[found] - known[k], axis=-1) / board.square_m
-        near = found[np.argsort(distance)[: config.near_corners]]
-        if len(near) < config.near_corners or distance.min() > 1.5:
+        near = found[np.argsort(distance)[:NEAR_CORNERS]]
+        if len(near) < NEAR_CORNERS or distance.min() > 1.5:
             continue
         # Points on one line say nothing about what lies beside it.
         if np.linalg.matrix_rank(known[near] - known[near].mean(0), tol=0.5 * board.square_m) < 2:

@@ -7,7 +7,7 @@ from realsim.records import CameraIntrinsics
 from realsim.records.targets import Chessboard
 from realsim_calibration.detect.edges import bilinear
 from realsim_calibration.detect.images import gray_image, size_of
-from realsim_calibration.detect.saddles import SaddleConfig, Saddles, grid_arms, refine_saddles
+from realsim_calibration.detect.saddles import Saddles, grid_arms, refine_saddles
 from realsim_calibration.views import TargetDetection
 
 MIN_PART = (3, 3)
@@ -16,10 +16,6 @@ SLOW_SEARCH_PX = 1000
 """Larger pictures are shrunk before the search that takes long on clutter."""
 LINE_SHARE = 0.6
 """Share of a line that must be corners for it to be part of a chessboard."""
-
-
-SADDLES = SaddleConfig()
-"""How corners are measured."""
 SEARCH_PX = 1600
 """Larger images are searched at this width or height first; corners are always measured in the
 full image."""
@@ -78,7 +74,6 @@ def _measured(gray: UInt8, grid: Array, intrinsics: CameraIntrinsics | None) -> 
         grid_arms(grid).reshape(-1, 4, 2),
         ((r + c) % 2 == 0) == dark,
         1.0,
-        SADDLES,
         intrinsics,
     )
 

@@ -1,7 +1,7 @@
 """Find a whole grid of dots, number it, and measure where the dots' middles are seen."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,19 +19,13 @@ BIAS_ROUNDS = 2
 """Map, bias, map without bias: the second bias differs from the third by 1e-4 px."""
 MIN_CUBIC = 30
 """Dots from which the ten terms of a cubic are taken; fewer follow the noise."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CirclesConfig:
-    """When a circle grid is good enough to calibrate with."""
-
-    large_area: float = 1.6
-    """Least area of the large origin dot in others' areas."""
-    max_misfit: float = 0.25
-    """Furthest that a dot may lie from where one map of the plane puts it, in pitches: the lens
-    bends a grid by less, a wrong lattice is off by more."""
-    min_share: float = 0.7
-    """Least share of the dots that must be measurable."""
+LARGE_AREA = 1.6
+"""Least area of the large origin dot in others' areas."""
+MAX_MISFIT = 0.25
+"""Furthest that a dot may lie from where one map of the plane puts it, in pitches: the lens
+bends a grid by less, a wrong lattice is off by more."""
+MIN_SHARE = 0.7
+"""Least share of the dots that must be measurable."""
 
 
 def grid_nodes(grid: CircleGrid) -> tuple[Int64, list[Int64]]:
@@ -52,11 +46,7 @@ def grid_nodes(grid: CircleGrid) -> tuple[Int64, list[Int64]]:
 
 
 def find_circles(
-    rgb: UInt8,
-    grid: CircleGrid,
-    config: CirclesConfig | None = None,
-    *,
-    intrinsics: CameraIntrinsics | None = None,
+    rgb: UInt8, grid: CircleGrid, *, intrinsics: CameraIntrinsics | None = None
 ) -> TargetDetection:
     """Return the middles of a circle grid that is seen as a whole, dark dots or bright ones.
 
@@ -67,11 +57,10 @@ def find_circles(
     Raises:
         InputError: the image is not 8 bit.
     """
-    config = config or CirclesConfig()
     gray = gray_image(rgb)
     reasons: list[str] = []
     for image in (gray, 255 - gray):
-        detection, reason = _of_one_shade(image, grid, config, intrinsics)
+        detection, reason = _of_one_shade(image, grid, intrinsics)
         if detection is not None:
             return detection
         reasons.append(reason)
@@ -91,7 +80,7 @@ def _dots_told(reason: str) -> int:
 
 
 def _of_one_shade(
-    gray: UInt8, grid: CircleGrid, config: CirclesConfig, intrinsics: CameraIntrinsics | None
+    gray: UInt8, grid: CircleGrid, intrinsics: CameraIntrinsics | None
 ) -> tuple[TargetDetection | None, str]:
     """Return the grid of dark dots, or why there is none."""
     middles, axes = find_blobs(gray)
@@ -111,17 +100,17 @@ def _of_one_shade(
     if second and second[0].seen == total:
         return None, "two equal circle grids are in view: cover one"
     board = grid.points_board[:, :2]
-    points, reason = _numbered(laid, middles, axes, board, (grid, config))
+    points, reason = _numbered(laid, middles, axes, board, grid)
     if points is None:
         mirror = lay_pattern(lattice, *grid_nodes(grid), mirrored=True)
         if grid.large_origin and mirror and mirror[0].seen == total:
-            other, _ = _numbered(mirror, middles, axes, board, (grid, config))
+            other, _ = _numbered(mirror, middles, axes, board, grid)
             if other is not None:
                 reason = "the large dot is at the wrong corner: is the picture mirrored?"
         return None, reason
     middles, axes = middles[points], axes[points]
     dots = refine_dots(gray, middles, axes, _gaps(middles, axes))
-    return _measured(gray, dots, grid, config, intrinsics)
+    return _measured(gray, dots, grid, intrinsics)
 
 
 def _best_fit(
@@ -156,14 +145,9 @@ def _partly(lattice: dict[tuple[int, int], int], laid: list[Laid], grid: CircleG
 
 
 def _numbered(
-    laid: list[Laid],
-    middles: Array,
-    axes: Array,
-    board: Array,
-    how: tuple[CircleGrid, CirclesConfig],
+    laid: list[Laid], middles: Array, axes: Array, board: Array, grid: CircleGrid
 ) -> tuple[Int64 | None, str]:
     """Return the point of every dot, or why none of the numberings will do."""
-    grid, config = how
     best: tuple[float, Int64] | None = None
     ratios: list[float] = []
     for one in laid:
@@ -171,7 +155,7 @@ def _numbered(
         H = fit_homography(board, uv)
         misfit = np.linalg.norm(apply_homography(H, board) - uv, axis=-1).max()
         step = float(np.linalg.norm(apply_homography(H, board[0] + _right(grid)) - uv[0]))
-        if misfit > config.max_misfit * step:
+        if misfit > MAX_MISFIT * step:
             continue
         # A dot's area on the board: the image's, over the map's derivative.
         w = np.concatenate([board, np.ones((len(board), 1))], -1) @ H[2]
@@ -186,10 +170,10 @@ def _numbered(
             best = (score, one.points)
     if best is None:
         return None, "the dots do not lie on one flat grid"
-    if grid.large_origin and best[0] < config.large_area:
+    if grid.large_origin and best[0] < LARGE_AREA:
         return None, (
             f"no dot that can be the first is larger than the others (its area is "
-            f"{max(ratios):.2f} of theirs, at least {config.large_area:g} is expected): is "
+            f"{max(ratios):.2f} of theirs, at least {LARGE_AREA:g} is expected): is "
             "large_origin right?"
         )
     return best[1], ""
@@ -209,16 +193,12 @@ def _gaps(middles: Array, axes: Array) -> Array:
 
 
 def _measured(
-    gray: UInt8,
-    dots: Dots,
-    grid: CircleGrid,
-    config: CirclesConfig,
-    intrinsics: CameraIntrinsics | None,
+    gray: UInt8, dots: Dots, grid: CircleGrid, intrinsics: CameraIntrinsics | None
 ) -> tuple[TargetDetection | None, str]:
     """Return the detection, the bias of the ellipses' middles taken out."""
     good = np.array([not f for f in dots.faults], dtype=bool)
     faults = tuple(f"dot {k}: {f}" for k, f in enumerate(dots.faults) if f)
-    if good.mean() < config.min_share:
+    if good.mean() < MIN_SHARE:
         return None, f"{int(good.sum())} of {len(good)} dots could be measured; {faults[0]}"
     board = grid.points_board[:, :2]
     ids = np.flatnonzero(good)

@@ -9,9 +9,9 @@ from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim_calibration.detect.blur import blur_reason
-from realsim_calibration.detect.charuco import CharucoConfig, find_charuco
+from realsim_calibration.detect.charuco import find_charuco
 from realsim_calibration.detect.chessboard import find_chessboard
-from realsim_calibration.detect.circles import CirclesConfig, find_circles
+from realsim_calibration.detect.circles import find_circles
 from realsim_calibration.detect.drawings import drawing_reason
 from realsim_calibration.detect.images import gray_image, size_of
 from realsim_calibration.detect.tags import DetectionConfig, TagDetections, detect_tags
@@ -27,10 +27,6 @@ class FindConfig:
 
     tags: DetectionConfig = field(default_factory=DetectionConfig)
     """Boards of AprilTags."""
-    charuco: CharucoConfig = field(default_factory=CharucoConfig)
-    """ChArUco boards."""
-    circles: CirclesConfig = field(default_factory=CirclesConfig)
-    """Grids of dots."""
 
 
 def find_target(
@@ -82,11 +78,11 @@ def _points(
             detect_tags(gray, target, config.tags, intrinsics=intrinsics), target, size_of(gray)
         )
     if isinstance(target, CharucoBoard):
-        return find_charuco(gray, target, config.charuco, intrinsics=intrinsics)
+        return find_charuco(gray, target, intrinsics=intrinsics)
     if isinstance(target, Chessboard):
         return find_chessboard(gray, target, intrinsics=intrinsics)
     assert isinstance(target, CircleGrid)
-    return find_circles(gray, target, config.circles, intrinsics=intrinsics)
+    return find_circles(gray, target, intrinsics=intrinsics)
 
 
 def tag_points(

@@ -8,7 +8,7 @@ they do to its opposite the other way round, so the crossing is unbiased. Intege
 centres.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,46 +28,38 @@ NO_PATTERN_PX = 1e3
 """Distance of the next edge behind a chessboard's edge: beyond any profile [px]."""
 OUTSIDE = "outside the image"
 """The fault of a corner that is not in view: nothing is wrong with it."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SaddleConfig:
-    """How the arms of a chessboard corner are measured, and when the corner is good enough."""
-
-    passes: int = 3
-    """Resample about the refined lines this often; the first start is up to 2 px off."""
-    profiles: int = 14
-    """Gray profiles per arm."""
-    samples: int = 15
-    """Samples per profile, about every half pixel."""
-    half_window_px: float = 3.5
-    """Longest reach of a profile to either side [px]: 2 sigma of a strong blur."""
-    min_half_window_px: float = 1.5
-    """Shortest reach [px]; below it the start's own error leaves the window."""
-    clear_share: float = 0.8
-    """Reach of a profile in widths of the uniform band beside the edge."""
-    arm_share: float = 0.45
-    """Length of an arm in squares: beyond the middle the neighbour's blur comes closer."""
-    max_arm_px: float = 24.0
-    """Longest arm [px]: over 48 px a line bends by 0.01 px under a usual lens, not more."""
-    cut_blurs: float = 1.2
-    """Distance of the first profile's end from the other line, in blurs."""
-    min_cut_px: float = 1.0
-    """Least distance of the first profile from the corner [px]."""
-    independent_px: float = 1.3
-    """Profiles closer than this share their noise [px]; enters the predicted error alone."""
-    min_contrast: float = 15.0
-    """Least step across every arm [gray levels of 255]: three times a strong noise."""
-    max_residual_px: float = 0.5
-    """Largest scatter of edge points about the lines [px]."""
-    min_inlier_share: float = 0.45
-    """Least share of the profiles of a line that must carry it."""
-    max_move_share: float = 0.2
-    """Furthest from the start, in squares: a corner further off belongs to something else."""
-    min_sine: float = 0.17
-    """Least sine of the angle at which the lines cross: 10 deg."""
-    lines: EdgeConfig = field(default_factory=EdgeConfig)
-    """The outlier rule of the line fit."""
+PASSES = 3
+"""Resample about the refined lines this often; the first start is up to 2 px off."""
+PROFILES = 14
+"""Gray profiles per arm."""
+SAMPLES = 15
+"""Samples per profile, about every half pixel."""
+HALF_WINDOW_PX = 3.5
+"""Longest reach of a profile to either side [px]: 2 sigma of a strong blur."""
+MIN_HALF_WINDOW_PX = 1.5
+"""Shortest reach [px]; below it the start's own error leaves the window."""
+CLEAR_SHARE = 0.8
+"""Reach of a profile in widths of the uniform band beside the edge."""
+ARM_SHARE = 0.45
+"""Length of an arm in squares: beyond the middle the neighbour's blur comes closer."""
+MAX_ARM_PX = 24.0
+"""Longest arm [px]: over 48 px a line bends by 0.01 px under a usual lens, not more."""
+CUT_BLURS = 1.2
+"""Distance of the first profile's end from the other line, in blurs."""
+MIN_CUT_PX = 1.0
+"""Least distance of the first profile from the corner [px]."""
+INDEPENDENT_PX = 1.3
+"""Profiles closer than this share their noise [px]; enters the predicted error alone."""
+MIN_CONTRAST = 15.0
+"""Least step across every arm [gray levels of 255]: three times a strong noise."""
+MAX_RESIDUAL_PX = 0.5
+"""Largest scatter of edge points about the lines [px]."""
+MIN_INLIER_SHARE = 0.45
+"""Least share of the profiles of a line that must carry it."""
+MAX_MOVE_SHARE = 0.2
+"""Furthest from the start, in squares: a corner further off belongs to something else."""
+MIN_SINE = 0.17
+"""Least sine of the angle at which the lines cross: 10 deg."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -109,7 +101,6 @@ def refine_saddles(
     arms: Array,
     dark: Mask,
     clear: float = 1.0,
-    config: SaddleConfig | None = None,
     intrinsics: CameraIntrinsics | None = None,
 ) -> Saddles:
     """Return the corners where four squares meet, to a few hundredths of a pixel.
@@ -122,10 +113,8 @@ def refine_saddles(
         dark: (n,) whether the square between +x and +y is the dark one.
         clear: width of the uniform band beside an edge, in squares (less where markers sit in the
             white squares).
-        config: how arms are measured, and when a corner is good.
         intrinsics: with them, lines are fitted in undistorted coordinates.
     """
-    config = config or SaddleConfig()
     start = np.asarray(start, dtype=np.float64).reshape(-1, 2)
     if not len(start):
         return Saddles(uv=start, sd_px=np.zeros(0), blur_px=np.zeros(0), faults=())
@@ -136,16 +125,16 @@ def refine_saddles(
     # The band beside an arm is as wide as the neighbouring arms reach across it.
     across = np.abs(_cross(toward, np.roll(arms, -1, axis=1)))
     band = clear * np.minimum(across, np.roll(across, 2, axis=1))
-    reach = np.clip(config.clear_share * band, config.min_half_window_px, config.half_window_px)
-    length = np.minimum(config.arm_share * length, config.max_arm_px)
+    reach = np.clip(CLEAR_SHARE * band, MIN_HALF_WINDOW_PX, HALF_WINDOW_PX)
+    length = np.minimum(ARM_SHARE * length, MAX_ARM_PX)
     uv, blur = start, None
     measured = None
-    for _ in range(config.passes):
-        measured = _measure(image, (uv, toward, length, reach), dark, blur, (config, intrinsics))
+    for _ in range(PASSES):
+        measured = _measure(image, (uv, toward, length, reach), dark, blur, intrinsics)
         uv, toward, blur = measured.uv, measured.toward, measured.blur
     assert measured is not None
     square = np.linalg.norm(arms, axis=-1).min(-1)
-    faults = _faults(measured, start, square, gray.shape, config)
+    faults = _faults(measured, start, square, gray.shape)
     return Saddles(uv=measured.uv, sd_px=measured.sd, blur_px=measured.blur, faults=faults)
 
 
@@ -154,18 +143,17 @@ def _measure(
     where: tuple[Array, Array, Array, Array],
     dark: Mask,
     blur: Array | None,
-    how: tuple[SaddleConfig, CameraIntrinsics | None],
+    intrinsics: CameraIntrinsics | None,
 ) -> _Pass:
     """Run one pass: profiles across the arms, edge points, two lines, their crossing."""
-    config, intrinsics = how
     uv, toward, length, reach = where
-    s, foot = _feet(uv, toward, length, reach, blur, config)
+    s, foot = _feet(uv, toward, length, reach, blur)
     # From dark to bright: away from the next arm where the square up to it is the dark one.
     side = np.stack([-toward[..., 1], toward[..., 0]], -1)
     side = side * np.sign(_cross(toward, np.roll(toward, -1, axis=1)))[..., None]
     flip = dark[:, None] ^ (np.arange(4) % 2 == 1)
     side = np.where(flip[..., None], -side, side)
-    t = np.linspace(-1.0, 1.0, config.samples) * reach[..., None]
+    t = np.linspace(-1.0, 1.0, SAMPLES) * reach[..., None]
     profiles = bilinear(
         image, foot[..., None, :] + t[..., None, :, None] * side[..., None, None, :]
     )
@@ -178,10 +166,10 @@ def _measure(
     points = np.concatenate([points[:, :2], points[:, 2:]], axis=2)
     seen = np.concatenate([seen[:, :2], seen[:, 2:]], axis=2)
     s = np.concatenate([s[:, :2], -s[:, 2:]], axis=2)
-    center, normal, weight, rms = fit_lines(straighten(intrinsics, points), seen, config.lines)
+    center, normal, weight, rms = fit_lines(straighten(intrinsics, points), seen, EdgeConfig())
     met, sine = line_intersections(center[:, 0], normal[:, 0], center[:, 1], normal[:, 1])
-    met = np.clip(met, uv - 2 * config.half_window_px, uv + 2 * config.half_window_px)
-    variance = _variance(s, weight, rms, config)
+    met = np.clip(met, uv - 2 * HALF_WINDOW_PX, uv + 2 * HALF_WINDOW_PX)
+    variance = _variance(s, weight, rms)
     return _Pass(
         uv=bend(intrinsics, met),
         toward=_turned(toward, met, normal, length, intrinsics),
@@ -195,15 +183,15 @@ def _measure(
 
 
 def _feet(
-    uv: Array, toward: Array, length: Array, reach: Array, blur: Array | None, config: SaddleConfig
+    uv: Array, toward: Array, length: Array, reach: Array, blur: Array | None
 ) -> tuple[Array, Array]:
     """Return positions along the arms (n, 4, m) and the profiles' feet (n, 4, m, 2) [px]."""
-    sine = np.maximum(np.abs(_cross(toward, np.roll(toward, -1, axis=1))), config.min_sine)
+    sine = np.maximum(np.abs(_cross(toward, np.roll(toward, -1, axis=1))), MIN_SINE)
     cosine = np.sqrt(np.maximum(1 - sine**2, 0.0))
     blurred = np.ones(len(uv)) if blur is None else blur
-    cut = (reach * cosine + config.cut_blurs * blurred[:, None]) / sine
-    cut = np.minimum(np.maximum(cut, config.min_cut_px), 0.5 * length)
-    share = np.linspace(0.0, 1.0, config.profiles)
+    cut = (reach * cosine + CUT_BLURS * blurred[:, None]) / sine
+    cut = np.minimum(np.maximum(cut, MIN_CUT_PX), 0.5 * length)
+    share = np.linspace(0.0, 1.0, PROFILES)
     s = cut[..., None] + (length - cut)[..., None] * share
     return s, uv[:, None, None, :] + s[..., None] * toward[:, :, None, :]
 
@@ -222,23 +210,21 @@ def _turned(
     return np.where(((out * toward).sum(-1) > np.cos(np.pi / 6))[..., None], out, toward)
 
 
-def _variance(s: Array, weight: Array, rms: Array, config: SaddleConfig) -> Array:
+def _variance(s: Array, weight: Array, rms: Array) -> Array:
     """Return the variance (n, 2) of the two lines' offsets at the corner [px^2].
 
     r^2 (1/k + mean^2 / sum (s - mean)^2) for k independent points with scatter r; profiles closer
     than `independent_px` count as less than one.
     """
     spacing = np.abs(s[..., 1] - s[..., 0])
-    k = weight.sum(-1) * np.minimum(1.0, spacing / config.independent_px)
+    k = weight.sum(-1) * np.minimum(1.0, spacing / INDEPENDENT_PX)
     k = np.maximum(k, 1.0)
     mean = (weight * s).sum(-1) / np.maximum(weight.sum(-1), 1.0)
     spread = (weight * (s - mean[..., None]) ** 2).sum(-1) / np.maximum(weight.sum(-1), 1.0)
     return rms**2 / k * (1 + mean**2 / np.maximum(spread, 1e-9))
 
 
-def _faults(
-    found: _Pass, start: Array, square: Array, shape: tuple[int, ...], config: SaddleConfig
-) -> tuple[str, ...]:
+def _faults(found: _Pass, start: Array, square: Array, shape: tuple[int, ...]) -> tuple[str, ...]:
     """Return why each corner cannot be used, '' where it can."""
     faults: list[str] = []
     moved = np.linalg.norm(found.uv - start, axis=-1)
@@ -248,14 +234,14 @@ def _faults(
         # Written as "is it good", so that a NaN is a fault.
         checks = (
             (inside, OUTSIDE),
-            (found.contrast[k] >= config.min_contrast,
-             f"low contrast: {found.contrast[k]:.0f} levels (at least {config.min_contrast:g})"),
-            (found.sine[k] >= config.min_sine, "seen too obliquely"),
-            (found.share[k] >= config.min_inlier_share,
+            (found.contrast[k] >= MIN_CONTRAST,
+             f"low contrast: {found.contrast[k]:.0f} levels (at least {MIN_CONTRAST:g})"),
+            (found.sine[k] >= MIN_SINE, "seen too obliquely"),
+            (found.share[k] >= MIN_INLIER_SHARE,
              f"covered or broken: {found.share[k]:.0%} of its edges fit"),
-            (found.rms[k] <= config.max_residual_px,
-             f"edges scatter by {found.rms[k]:.2f} px (at most {config.max_residual_px:g})"),
-            (moved[k] <= config.max_move_share * square[k],
+            (found.rms[k] <= MAX_RESIDUAL_PX,
+             f"edges scatter by {found.rms[k]:.2f} px (at most {MAX_RESIDUAL_PX:g})"),
+            (moved[k] <= MAX_MOVE_SHARE * square[k],
              f"lies {moved[k]:.1f} px from where the board expects it"),
         )  # fmt: skip
         faults.append(next((reason for good, reason in checks if not good), ""))

@@ -6,7 +6,7 @@ import numpy as np
 
 from realsim.arrays import Array, Int64, UInt8
 from realsim.records import CharucoBoard
-from realsim_calibration.detect.charuco import CharucoConfig, markers_on_board
+from realsim_calibration.detect.charuco import AGREEING_SHARE, markers_on_board
 from realsim_calibration.detect.chessboard import largest_chessboard
 from realsim_calibration.detect.ellipses import find_blobs
 from realsim_calibration.detect.images import gray_image
@@ -49,8 +49,6 @@ SIZE_SPREAD = 0.35
 DARK = 40
 """A picture is too dark where 99 % of it is below this level of 255: a tenth of its range and
 less is left to tell black from white."""
-
-
 USUAL_MARKER = 0.7
 """Edge of a ChArUco board's markers, in squares: 0.6 to 0.85 are in use."""
 LEAST_SQUARES, MOST_SQUARES = 3, 40
@@ -147,14 +145,14 @@ def _markers(gray: UInt8) -> tuple[str, float]:
 
 def _layout(dictionary: str, ids: Int64, quads: Array) -> str:
     """Return the ChArUco board whose last markers these may be, as a clause; empty where none."""
-    config, squares = CharucoConfig(), range(LEAST_SQUARES, MOST_SQUARES)
+    squares = range(LEAST_SQUARES, MOST_SQUARES)
     for rows, columns, legacy in product(squares, squares, (False, True)):
         if rows * columns // 2 != ids.max() + 1:
             continue
         board = CharucoBoard(rows=rows, columns=columns, square_m=1.0, marker_m=USUAL_MARKER,
                              dictionary=dictionary, legacy=legacy)  # fmt: skip
-        lie = markers_on_board(ids, quads, board, config)[0]
-        if lie.sum() >= config.agreeing_share * len(ids):
+        lie = markers_on_board(ids, quads, board)[0]
+        if lie.sum() >= AGREEING_SHARE * len(ids):
             return f", which lie as on charuco:{columns}x{rows}{',legacy' * legacy}"
     return ""
 

@@ -5,7 +5,7 @@ found from one half of its corners; the other half is predicted, and the other w
 errors always prefer the largest model; this does not.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from realsim_calibration.lens.bundle import (
     points_in_camera,
     refine_poses,
 )
+from realsim_calibration.lens.fit import IntrinsicsConfig
 from realsim_calibration.lens.models import MODELS
 from realsim_calibration.lens.start import is_line
 
@@ -29,22 +30,8 @@ TINY_PX2 = 1e-20
 """Perfect corners have errors of rounding only, which have no logarithm worth comparing [px^2]."""
 HALF_POINTS = 4
 """Corners that each half of a view needs for a pose."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ChoiceConfig:
-    """How models are compared."""
-
-    steps: int = 3
-    """Solver steps of a fold's lens, after one Newton step from the lens of all views."""
-    margin_se: float = 1.0
-    """Standard errors that the smallest acceptable model may be worse than the best."""
-    worth: float = 0.01
-    """Least relative gain in mean square error that a larger model must bring: among six models
-    one beats the others by a standard error now and then by luck."""
-    pose_tolerance: float = 1e-3
-    """Predicted decrease [sigma^2] at which a left-out view's pose is found."""
-    solver: SolverConfig = field(default_factory=SolverConfig)
+POSE_TOLERANCE = 1e-3
+"""Predicted decrease [sigma^2] at which a left-out view's pose is found."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -137,14 +124,16 @@ def _without(fit: LensFit, train: Mask) -> State:
     return fit.state.moved(step)
 
 
-def held_out_errors(fit: LensFit, obs: Observations, folds: Int64, config: ChoiceConfig) -> Array:
+def held_out_errors(
+    fit: LensFit, obs: Observations, folds: Int64, config: IntrinsicsConfig
+) -> Array:
     """Return the mean squared error [px^2] of every view (views,), its lens from other folds.
 
     NaN where a view is too small, infinite where the others do not determine the model.
     """
     errors = np.full(obs.views, np.nan)
-    quick = replace(config.solver, max_iterations=config.steps)
-    posing = replace(config.solver, tolerance=config.pose_tolerance)
+    quick = replace(config.solver, max_iterations=config.fold_steps)
+    posing = replace(config.solver, tolerance=POSE_TOLERANCE)
     for fold in range(int(folds.max()) + 1):
         test = folds == fold
         try:
@@ -165,7 +154,7 @@ def score_models(
     fits: dict[str, tuple[LensFit, tuple[tuple[str, str], ...]]],
     obs: Observations,
     folds: Int64,
-    config: ChoiceConfig,
+    config: IntrinsicsConfig,
 ) -> tuple[ModelScore, ...]:
     """Return the table of models (given smallest first), with the chosen one marked.
 

@@ -42,7 +42,8 @@ class IntrinsicsConfig:
     margin_se: float = 1.0
     """Standard errors that the smallest acceptable model may be worse than the best."""
     worth: float = 0.01
-    """Least relative gain in mean square error on unseen views that a larger model must bring."""
+    """Least relative gain in mean square error on unseen views that a larger model must bring:
+    among six models one beats the others by a standard error now and then by luck."""
     least_scored_views: int = 5
     """Views from which on a choice by unseen views means something; below it `few_views_model`."""
     few_views_model: str = "k1 k2"

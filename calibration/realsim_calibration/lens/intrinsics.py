@@ -19,13 +19,7 @@ from realsim.records import CameraIntrinsics, Target
 from realsim_calibration.fit.view_system import camera_record, camera_vector
 from realsim_calibration.lens.bundle import CAMERA_TERMS, LensFit, Observations, Prior, adjust
 from realsim_calibration.lens.checks import intrinsics_checks
-from realsim_calibration.lens.choice import (
-    ChoiceConfig,
-    ModelScore,
-    fold_of_views,
-    halves,
-    score_models,
-)
+from realsim_calibration.lens.choice import ModelScore, fold_of_views, halves, score_models
 from realsim_calibration.lens.covariance import global_covariance
 from realsim_calibration.lens.coverage import GOOD_TILT_DEG, measure_coverage
 from realsim_calibration.lens.fit import (
@@ -209,14 +203,8 @@ def _choose_model(
     keep = fold_of_views(obs, parts) == 0
     some = obs.only_views(keep)
     folds = fold_of_views(some, min(config.folds, some.views))
-    choice = ChoiceConfig(
-        steps=config.fold_steps,
-        worth=config.worth,
-        margin_se=config.margin_se,
-        solver=config.solver,
-    )
     fits = {name: (c.fit.only_views(keep, obs), c.refused) for name, c in candidates.items()}
-    table = score_models(fits, some, folds, choice)
+    table = score_models(fits, some, folds, config)
     return next((s.model for s in table if s.chosen), order[0]), table
 
 

@@ -57,7 +57,7 @@ def capture(
     settings = CaptureConfig(settle_s=settle_s) if config is None else config
     job = CaptureJob(progress=progress) if job is None else job
     check_views(plan, [*(job.views or ()), *job.retake])
-    state = check_arm(plan, arm, settings.checks)
+    state = check_arm(plan, arm)
     _check_session(plan, camera, store)
     log = CaptureLog(store)
     first = next((e for e in log.entries if e.get("event") == "begun"), None)
@@ -87,7 +87,7 @@ def dry_run(
     """
     job = CaptureJob() if job is None else job
     check_views(plan, job.views or ())
-    check_arm(plan, arm, config.checks)
+    check_arm(plan, arm)
     looker = Looker(plan, arm, camera, config, board_check=job.board_check)
     return Run(plan, arm, camera, config, looker, CaptureLog(None), job, None).carry_out()
 

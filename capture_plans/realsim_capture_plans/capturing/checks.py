@@ -1,7 +1,7 @@
 """Is this view good? What is measured of every frame, and what it is judged by.
 
-Every check is a small function of measured numbers; its threshold stands in `CheckConfig` with
-its reason. Sharpness, brightness and depth are judged against the views of the same session that
+Every check is a small function of measured numbers; its threshold stands above with its
+reason. Sharpness, brightness and depth are judged against the views of the same session that
 were accepted before, so that nobody has to know absolute numbers for a lens and a scene.
 
 A `fault` is a frame that is never stored (black, frozen, taken while the arm moved). A `doubt` is
@@ -34,46 +34,40 @@ EDGE_SHARE = 0.9995
 and every scene has some."""
 LEAST_PIXELS = 57_600
 """Images smaller than 320x180 have fewer than 20 such pixels: their sharpness is not judged."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CheckConfig:
-    """When a frame counts, when it is taken again."""
-
-    motion_mm: float = 0.2
-    """Greatest motion of the flange during an exposure [mm]: a third of a pixel at 0.35 m."""
-    motion_deg: float = 0.05
-    """Greatest turn of the flange during an exposure [deg]: half a pixel of a D405."""
-    least_brightness: float = 4.0
-    """Mean grey value (0-255) below which the image counts as black: lens cap, light off."""
-    least_depth_share: float = 0.02
-    """Share of pixels with depth below which the depth counts as missing."""
-    sharpness_of_median: float = 0.75
-    """Least sharpness, as a share of the session's median. Sharp views of one scene lie between
-    0.85 and 1.15, a blur of 1.5 px (sigma) at 0.5-0.65, motion by 8 px at 0.3-0.55."""
-    brightness_of_median: float = 0.6
-    """Least brightness as a share of the session's median, and its inverse the greatest: a lamp
-    that went out, an exposure that has not settled. Shadow of the arm takes 20 %."""
-    saturated_share: float = 0.25
-    """Greatest share of pixels at the upper end: beyond it texture and tags are burnt out."""
-    saturated_value: int = 250
-    """Value (0-255) of any channel from which a pixel counts as saturated."""
-    depth_of_median: float = 0.6
-    """Least depth fill in the middle of the image, as a share of the session's median. Views of
-    one scene lie between 0.8 and 1.05; a projector off, glare or a hand in the view is below."""
-    least_history: int = 4
-    """Accepted views before anything is judged against their median."""
-    pose_mm: float = 0.5
-    """Greatest distance between the controller's flange pose and the plan's chain [mm]: five
-    times a UR5's repeatability; an uncalibrated chain is 1 to 5 mm off."""
-    pose_deg: float = 0.05
-    """Greatest angle between the two [deg]."""
-    wrong_arm_mm: float = 30.0
-    """Distance from which the arm is another model: no factory calibration is 30 mm, a UR5e taken
-    for a UR5 is 64 mm off."""
-    tool_mm: float = 0.01
-    """Greatest change of the controller's tool offset during a session [mm]: it is a setting and
-    does not drift."""
+MOTION_MM = 0.2
+"""Greatest motion of the flange during an exposure [mm]: a third of a pixel at 0.35 m."""
+MOTION_DEG = 0.05
+"""Greatest turn of the flange during an exposure [deg]: half a pixel of a D405."""
+LEAST_BRIGHTNESS = 4.0
+"""Mean grey value (0-255) below which the image counts as black: lens cap, light off."""
+LEAST_DEPTH_SHARE = 0.02
+"""Share of pixels with depth below which the depth counts as missing."""
+SHARPNESS_OF_MEDIAN = 0.75
+"""Least sharpness, as a share of the session's median. Sharp views of one scene lie between
+0.85 and 1.15, a blur of 1.5 px (sigma) at 0.5-0.65, motion by 8 px at 0.3-0.55."""
+BRIGHTNESS_OF_MEDIAN = 0.6
+"""Least brightness as a share of the session's median, and its inverse the greatest: a lamp
+that went out, an exposure that has not settled. Shadow of the arm takes 20 %."""
+SATURATED_SHARE = 0.25
+"""Greatest share of pixels at the upper end: beyond it texture and tags are burnt out."""
+SATURATED_VALUE = 250
+"""Value (0-255) of any channel from which a pixel counts as saturated."""
+DEPTH_OF_MEDIAN = 0.6
+"""Least depth fill in the middle of the image, as a share of the session's median. Views of
+one scene lie between 0.8 and 1.05; a projector off, glare or a hand in the view is below."""
+LEAST_HISTORY = 4
+"""Accepted views before anything is judged against their median."""
+POSE_MM = 0.5
+"""Greatest distance between the controller's flange pose and the plan's chain [mm]: five
+times a UR5's repeatability; an uncalibrated chain is 1 to 5 mm off."""
+POSE_DEG = 0.05
+"""Greatest angle between the two [deg]."""
+WRONG_ARM_MM = 30.0
+"""Distance from which the arm is another model: no factory calibration is 30 mm, a UR5e taken
+for a UR5 is 64 mm off."""
+TOOL_MM = 0.01
+"""Greatest change of the controller's tool offset during a session [mm]: it is a setting and
+does not drift."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -109,7 +103,7 @@ class Measured:
         return {name: round(float(getattr(self, name)), 4) for name in self.__slots__}
 
 
-def measured(frame: Frame, config: CheckConfig) -> Measured:
+def measured(frame: Frame) -> Measured:
     """Return the numbers of a frame; 4 ms of CPU at 1280x720."""
     few = np.ascontiguousarray(frame.rgb[::STRIDE, ::STRIDE])
     # Three maxima of planes take a twentieth of one along the last axis.
@@ -120,7 +114,7 @@ def measured(frame: Frame, config: CheckConfig) -> Measured:
     return Measured(
         sharpness=sharpness(frame.rgb),
         brightness=float(few.mean()),
-        saturated=float(np.mean(brightest >= config.saturated_value)),
+        saturated=float(np.mean(brightest >= SATURATED_VALUE)),
         depth_share=float(depth.mean()),
         depth_fill=float(middle.mean()),
     )
@@ -166,30 +160,30 @@ def _steepest(grey: NDArray[Any]) -> list[float]:
     return found
 
 
-def check_still(before: ArmState, after: ArmState, config: CheckConfig) -> Check:
+def check_still(before: ArmState, after: ArmState) -> Check:
     """Did the flange stand still during the exposure?"""
     moved = se3.invert(before.T_base_ee) @ after.T_base_ee
     mm = 1e3 * float(np.linalg.norm(moved[:3, 3]))
     deg = float(np.degrees(se3.angle(moved)))
-    wrong = mm > config.motion_mm or deg > config.motion_deg
+    wrong = mm > MOTION_MM or deg > MOTION_DEG
     reason = f"the flange moved {mm:.2f} mm, {deg:.3f} deg during the exposure" if wrong else ""
     return Check(
         name="still", mark="fault" if wrong else "good", value=f"{mm:.2f} mm", reason=reason
     )
 
 
-def check_exposure(now: Measured, earlier: Sequence[Measured], config: CheckConfig) -> Check:
+def check_exposure(now: Measured, earlier: Sequence[Measured]) -> Check:
     """Is the image neither black nor burnt out, and as bright as the others?"""
     mark: Mark = "good"
     reason = ""
-    usual = _median([m.brightness for m in earlier], config)
-    if now.brightness < config.least_brightness:
+    usual = _median([m.brightness for m in earlier])
+    if now.brightness < LEAST_BRIGHTNESS:
         mark, reason = "fault", f"the image is black (mean {now.brightness:.1f} of 255)"
-    elif now.saturated > config.saturated_share:
+    elif now.saturated > SATURATED_SHARE:
         mark = "doubt"
         reason = f"{100 * now.saturated:.0f} % of the pixels are saturated: less light or exposure"
     elif usual is not None and not (
-        config.brightness_of_median <= now.brightness / usual <= 1 / config.brightness_of_median
+        BRIGHTNESS_OF_MEDIAN <= now.brightness / usual <= 1 / BRIGHTNESS_OF_MEDIAN
     ):
         mark = "doubt"
         reason = (
@@ -199,14 +193,14 @@ def check_exposure(now: Measured, earlier: Sequence[Measured], config: CheckConf
     return Check(name="exposure", mark=mark, value=f"{now.brightness:.0f}", reason=reason)
 
 
-def check_sharpness(now: Measured, earlier: Sequence[Measured], config: CheckConfig) -> Check:
+def check_sharpness(now: Measured, earlier: Sequence[Measured]) -> Check:
     """Is the image as sharp as the others?"""
-    usual = _median([m.sharpness for m in earlier], config)
+    usual = _median([m.sharpness for m in earlier])
     value = f"{now.sharpness:.2f}" if now.sharpness > 0 else "-"
     if usual is None or usual <= 0:
         return Check(name="sharpness", mark="good", value=value)
     share = now.sharpness / usual
-    wrong = share < config.sharpness_of_median
+    wrong = share < SHARPNESS_OF_MEDIAN
     reason = f"blurred: {100 * share:.0f} % of the other views' sharpness" if wrong else ""
     return Check(
         name="sharpness",
@@ -216,14 +210,14 @@ def check_sharpness(now: Measured, earlier: Sequence[Measured], config: CheckCon
     )
 
 
-def check_depth(now: Measured, earlier: Sequence[Measured], config: CheckConfig) -> Check:
+def check_depth(now: Measured, earlier: Sequence[Measured]) -> Check:
     """Is there depth, and as much in the middle of the image as in the others?"""
     mark: Mark = "good"
     reason = ""
-    usual = _median([m.depth_fill for m in earlier], config)
-    if now.depth_share < config.least_depth_share:
+    usual = _median([m.depth_fill for m in earlier])
+    if now.depth_share < LEAST_DEPTH_SHARE:
         mark, reason = "fault", f"only {100 * now.depth_share:.1f} % of the pixels have depth"
-    elif usual is not None and now.depth_fill < config.depth_of_median * usual:
+    elif usual is not None and now.depth_fill < DEPTH_OF_MEDIAN * usual:
         mark = "doubt"
         reason = (
             f"depth fills {100 * now.depth_fill:.0f} % of the image's middle, in the other views "
@@ -280,10 +274,10 @@ def pose_gap(state: ArmState, T_base_ee: Array) -> tuple[float, float]:
     return 1e3 * float(np.linalg.norm(gap[:3, 3])), float(np.degrees(se3.angle(gap)))
 
 
-def check_pose(state: ArmState, T_base_ee: Array, config: CheckConfig) -> Check:
+def check_pose(state: ArmState, T_base_ee: Array) -> Check:
     """Does the plan's chain put the flange where the controller says it is?"""
     mm, deg = pose_gap(state, T_base_ee)
-    wrong = mm > config.pose_mm or deg > config.pose_deg
+    wrong = mm > POSE_MM or deg > POSE_DEG
     reason = (
         f"the controller's flange pose is {mm:.1f} mm, {deg:.2f} deg from the plan's chain: give "
         "the controller's calibration.conf when the plan is made. The poses stored are the "
@@ -296,12 +290,12 @@ def check_pose(state: ArmState, T_base_ee: Array, config: CheckConfig) -> Check:
     )
 
 
-def check_tool(state: ArmState, T_ee_tcp: Array, config: CheckConfig) -> Check:
+def check_tool(state: ArmState, T_ee_tcp: Array) -> Check:
     """Is the controller's tool offset what it was at the first view?"""
     change = se3.invert(T_ee_tcp) @ state.T_ee_tcp
     mm = 1e3 * float(np.linalg.norm(change[:3, 3]))
     deg = float(np.degrees(se3.angle(change)))
-    wrong = mm > config.tool_mm or deg > config.motion_deg
+    wrong = mm > TOOL_MM or deg > MOTION_DEG
     reason = (
         f"the controller's tool offset changed by {mm:.1f} mm, {deg:.2f} deg since the first view; "
         "the flange poses stored do not depend on it, programs at the pendant do"
@@ -313,6 +307,6 @@ def check_tool(state: ArmState, T_ee_tcp: Array, config: CheckConfig) -> Check:
     )
 
 
-def _median(values: Sequence[float], config: CheckConfig) -> float | None:
+def _median(values: Sequence[float]) -> float | None:
     """Return the median of earlier views, None as long as there are too few."""
-    return float(np.median(values)) if len(values) >= config.least_history else None
+    return float(np.median(values)) if len(values) >= LEAST_HISTORY else None

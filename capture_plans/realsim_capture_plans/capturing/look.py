@@ -12,7 +12,7 @@ from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
 from realsim.robots.arm import known_chains
 from realsim_capture_plans.capturing import checks
-from realsim_capture_plans.capturing.checks import Check, CheckConfig, Earlier, Measured
+from realsim_capture_plans.capturing.checks import WRONG_ARM_MM, Check, Earlier, Measured
 from realsim_capture_plans.devices.interfaces import (
     Arm,
     ArmState,
@@ -104,8 +104,6 @@ class CaptureConfig:
     """Speed and acceleration of the moves as a share of the plan's."""
     still: SettleConfig = field(default_factory=SettleConfig)
     """When the arm counts as standing."""
-    checks: CheckConfig = field(default_factory=CheckConfig)
-    """When a frame is good."""
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -249,16 +247,15 @@ class Looker:
         self, before: ArmState, after: ArmState, frame: Frame, image_size: tuple[int, int]
     ) -> tuple[tuple[Check, ...], Measured]:
         """Return every check of a frame, faults of the devices first, and its numbers."""
-        limits = self._config.checks
         size = checks.check_size(frame, image_size)
-        numbers = checks.measured(frame, limits)
+        numbers = checks.measured(frame)
         found = [
             size,
-            checks.check_still(before, after, limits),
-            checks.check_exposure(numbers, self._history, limits),
+            checks.check_still(before, after),
+            checks.check_exposure(numbers, self._history),
             checks.check_clock(frame, after, self._before),
-            checks.check_sharpness(numbers, self._history, limits),
-            checks.check_depth(numbers, self._history, limits),
+            checks.check_sharpness(numbers, self._history),
+            checks.check_depth(numbers, self._history),
         ]
         if self._board_check is not None and all(c.mark != "fault" for c in found):
             said = self._board_check(frame.rgb)
@@ -270,11 +267,10 @@ class Looker:
 
     def _warn_once(self, state: ArmState) -> None:
         """Compare the controller with the plan's chain and with its own first tool offset."""
-        limits = self._config.checks
-        found = [checks.check_pose(state, self._plan.chain.forward(state.joints), limits)]
+        found = [checks.check_pose(state, self._plan.chain.forward(state.joints))]
         if self._tool is None:
             self._tool = state.T_ee_tcp
-        found.append(checks.check_tool(state, self._tool, limits))
+        found.append(checks.check_tool(state, self._tool))
         for check in found:
             if check.mark != "good" and check.name not in self._warned:
                 self._warned.add(check.name)
@@ -287,7 +283,7 @@ class Looker:
         return shot
 
 
-def check_arm(plan: CapturePlan, arm: Arm, config: CheckConfig) -> ArmState:
+def check_arm(plan: CapturePlan, arm: Arm) -> ArmState:
     """Return the arm's state if it is the arm that the plan was made for.
 
     Raises:
@@ -309,11 +305,11 @@ def check_arm(plan: CapturePlan, arm: Arm, config: CheckConfig) -> ArmState:
         )
     state = arm.state()
     gap_mm, _ = checks.pose_gap(state, plan.chain.forward(state.joints))
-    if gap_mm > config.wrong_arm_mm:
+    if gap_mm > WRONG_ARM_MM:
         alike = known_chains(len(state.joints)).items()
         gaps = {n: checks.pose_gap(state, c.forward(state.joints))[0] for n, c in alike}
         likely = min(gaps, key=lambda name: gaps[name])
-        hint = f" It moves like a {likely}." if gaps[likely] < config.wrong_arm_mm else ""
+        hint = f" It moves like a {likely}." if gaps[likely] < WRONG_ARM_MM else ""
         raise InputError(
             f"the plan's {plan.robot} would have its flange {gap_mm:.0f} mm from where the "
             f"controller of {arm.name} says it is (a factory calibration explains 5 mm).{hint} "

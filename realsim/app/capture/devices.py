@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from realsim.errors import InputError, RealsimError
 from realsim.records import Target
 from realsim.robots.arm import find_arm
-from realsim_capture_plans.capturing.checks import CheckConfig
 from realsim_capture_plans.capturing.look import check_arm
 from realsim_capture_plans.devices.interfaces import Arm, DepthCamera, DeviceError
 from realsim_capture_plans.planning.record import CapturePlan
@@ -63,7 +62,7 @@ def _simulated(request: "CaptureRequest", plan: CapturePlan, target: Target | No
     from realsim_capture_plans.lab import LabConfig, SimulatedLab
 
     lab = SimulatedLab(LabConfig(seed=request.seed, arm=plan.robot, n_objects=request.objects))
-    check_arm(plan, lab.arm, CheckConfig())
+    check_arm(plan, lab.arm)
     if target is None:
         lab.place_objects()
     else:
@@ -89,7 +88,7 @@ def _real(
     try:
         real_arm = _arm(request.robot_host, plan)
         stack.callback(real_arm.close)
-        check_arm(plan, real_arm, CheckConfig())
+        check_arm(plan, real_arm)
         arm = real_arm
     except RealsimError as error:
         troubles.append(error)
