@@ -54,6 +54,11 @@ def _verdict(value: float, limits: tuple[float, float], *, high_is_bad: bool = T
     return "warn" if sign * value > sign * limits[0] else "good"
 
 
+def _worst(*verdicts: Verdict) -> Verdict:
+    """Return the worst of some verdicts."""
+    return max(verdicts, key=["good", "unknown", "warn", "bad"].index)
+
+
 def roll_range_deg(Ts_cam_board: Sequence[Array]) -> float:
     """Return the range of camera roll about the optical axis [deg]: 360 less the largest gap."""
     angles = np.sort(np.degrees([np.arctan2(T[1, 0], T[0, 0]) for T in Ts_cam_board]) % 360.0)
@@ -84,9 +89,9 @@ def _advice(verdict: Verdict, text: str) -> str:
 
 def _views(r: HandEyeReport) -> Check:
     used, given = len(r.used), len(r.views)
-    verdict = _verdict(used, USED_VIEWS, high_is_bad=False)
-    share = _verdict(1 - used / given, REJECTED_SHARE)
-    worst: Verdict = max(verdict, share, key=["good", "unknown", "warn", "bad"].index)
+    worst = _worst(
+        _verdict(used, USED_VIEWS, high_is_bad=False), _verdict(1 - used / given, REJECTED_SHARE)
+    )
     gone = [v for v in r.views if not v.used]
     empty = sum(not len(v.uv) for v in gone)
     names = "; dropped: " + ", ".join(v.label for v in gone[:6]) if gone else ""
@@ -119,8 +124,7 @@ def _roll(r: HandEyeReport) -> Check:
 
 
 def _sigma(r: HandEyeReport) -> Check:
-    verdicts = (_verdict(r.here_mm, SIGMA_MM), _verdict(r.here_deg, SIGMA_DEG))
-    worst: Verdict = max(verdicts, key=["good", "unknown", "warn", "bad"].index)
+    worst = _worst(_verdict(r.here_mm, SIGMA_MM), _verdict(r.here_deg, SIGMA_DEG))
     return Check(
         name="uncertainty",
         verdict=worst,
@@ -183,8 +187,7 @@ def _stretched(r: HandEyeReport) -> tuple[Check, ...]:
 
 
 def _held_out(r: HandEyeReport) -> Check:
-    verdicts = (_verdict(r.held_out_mm, UNSEEN_MM), _verdict(r.held_out_px, UNSEEN_PX))
-    verdict: Verdict = max(verdicts, key=["good", "unknown", "warn", "bad"].index)
+    verdict = _worst(_verdict(r.held_out_mm, UNSEEN_MM), _verdict(r.held_out_px, UNSEEN_PX))
     worst = sorted(r.used, key=lambda v: -v.unseen_px)[:3]
     return Check(
         name="held-out error",
@@ -299,8 +302,7 @@ def _robot(r: HandEyeReport) -> Check:
     errors = np.array([v.robot_error for v in r.used])
     deg = float(np.degrees(np.sqrt(np.mean(np.sum(errors[:, :3] ** 2, -1)))))
     mm = float(1e3 * np.sqrt(np.mean(np.sum(errors[:, 3:] ** 2, -1))))
-    verdicts = (_verdict(deg, ROBOT_DEG), _verdict(mm, ROBOT_MM))
-    worst: Verdict = max(verdicts, key=["good", "unknown", "warn", "bad"].index)
+    worst = _worst(_verdict(deg, ROBOT_DEG), _verdict(mm, ROBOT_MM))
     if r.robot_map is None:
         kind = "no map of it predicts unseen views better"
     elif isinstance(r.robot_map, ArmErrorMap):

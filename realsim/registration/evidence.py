@@ -146,17 +146,27 @@ class Evidence:
     """The stride that was used [px]."""
 
 
-def check_frames(frames: Sequence[DepthFrame], intrinsics: CameraIntrinsics) -> list[DepthFrame]:
+def in_order(frames: Sequence[DepthFrame]) -> list[DepthFrame]:
     """Return the frames in the order of their numbers.
 
     Raises:
-        InputError: there is none, two have the same number, or an image is not the camera's.
+        InputError: there is none, or two have the same number.
     """
     if not frames:
         raise InputError("no depth frames were given; registration needs at least one.")
     ordered = sorted(frames, key=lambda f: f.index)
     if len({f.index for f in ordered}) != len(ordered):
         raise InputError("two depth frames have the same number; view numbers must be unique.")
+    return ordered
+
+
+def check_frames(frames: Sequence[DepthFrame], intrinsics: CameraIntrinsics) -> list[DepthFrame]:
+    """Return the frames in the order of their numbers.
+
+    Raises:
+        InputError: there is none, two have the same number, or an image is not the camera's.
+    """
+    ordered = in_order(frames)
     for f in ordered:
         check_depth(f.depth_m, intrinsics)
     return ordered
@@ -176,7 +186,6 @@ def gather(
     frames: Sequence[DepthFrame],
     bodies: Sequence[Body],
     config: EvidenceConfig,
-    progress: Callable[[int, int], None] | None = None,
 ) -> Evidence:
     """Return the points of all frames near each object's start, and around the objects.
 
@@ -185,13 +194,12 @@ def gather(
         frames: depth images with poses.
         bodies: the objects at their start poses.
         config: settings.
-        progress: called with (frames done, frames).
     """
     noise = measure_noise(frames, config)
     stride = _stride(intrinsics, frames, bodies, config)
     near: list[list[Cloud]] = [[] for _ in bodies]
     support: list[Array] = []
-    for n, frame in enumerate(frames):
+    for frame in frames:
         cloud = _frame_cloud(intrinsics, frame, stride, noise, config)
         around = np.zeros(len(cloud.points), dtype=bool)
         on_object = np.zeros(len(cloud.points), dtype=bool)
@@ -205,8 +213,6 @@ def gather(
             kept.append(cloud.select(inside))
             on_object[close[d < 0.5 * config.reach_m]] = True
         support.append(cloud.points[around & ~on_object][::2])
-        if progress is not None:
-            progress(n + 1, len(frames))
     return Evidence(
         noise=noise,
         near=tuple(join_clouds(clouds) for clouds in near),

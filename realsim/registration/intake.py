@@ -18,6 +18,7 @@ from realsim.registration.evidence import (
     DepthNoise,
     average_cloud,
     correct_frame,
+    in_order,
     measure_noise,
     read_frame,
     without_table,
@@ -98,11 +99,7 @@ def take_in(
         InputError: there is no frame, two have the same number, an image is not the camera's, or
             no view is left.
     """
-    if not frames:
-        raise InputError("no depth frames were given; registration needs at least one.")
-    ordered = sorted(frames, key=lambda f: f.index)
-    if len({f.index for f in ordered}) != len(ordered):
-        raise InputError("two depth frames have the same number; view numbers must be unique.")
+    ordered = in_order(frames)
     if not config.bias.is_none:
         ordered = [correct_frame(f, f.T_world_cam, config.bias) for f in ordered]
     check_depth(ordered[0].depth_m, intrinsics)

@@ -20,7 +20,8 @@ from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import Mesh, ObjectModel, ObjectPose
 from realsim.records.depth_bias import DepthBias
-from realsim.registration.odometry.hand_held import HandHeldConfig, hand_held_poses
+from realsim.registration.odometry.hand_held import hand_held_poses
+from realsim.registration.views import SampleConfig
 from realsim.store import SessionStore
 from registered_sessions import models_of, table_session, true_poses
 from shared_sessions import copy_of
@@ -248,7 +249,7 @@ def test_hand_held_cameras_are_found_once_and_kept(tmp_path: Path) -> None:
     request = RegisterRequest(objects=("mug", "wedge"), hand_held=True)
     inputs = read_inputs(store, request)
     depths = [store.depth_m(k) for k in range(5)]
-    found = hand_held_poses(store.session.intrinsics, depths, HandHeldConfig())
+    found = hand_held_poses(store.session.intrinsics, depths, SampleConfig())
     for k, T in enumerate(found.Ts_world_cam):
         np.testing.assert_allclose(inputs.claimed[k], T, atol=1e-12)
     again = SessionStore.open(store.folder)

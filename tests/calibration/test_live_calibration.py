@@ -24,12 +24,7 @@ from hand_views import (
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Check, Target
-from realsim_calibration.planning.live_calibration import (
-    LiveCalibration,
-    LiveConfig,
-    WatchConfig,
-    watch_folder,
-)
+from realsim_calibration.planning.live_calibration import LiveCalibration, LiveConfig, watch_folder
 from realsim_calibration.planning.next_view import board_geometry
 from realsim_calibration.planning.view_proposals import ViewLimits
 from realsim_calibration.results import HandEyeReport
@@ -231,7 +226,7 @@ def test_a_folder_is_watched_until_done(tmp_path: Path) -> None:
     live = running(LiveConfig(sigma_mm=100, sigma_deg=10, min_views_to_stop=8, stable_share=2.0,
                               limits=FEW_PROPOSALS))  # fmt: skip
     statuses = list(
-        watch_folder(tmp_path, live, read_view, config=WatchConfig(idle_s=30.0), sleep=sleep,
+        watch_folder(tmp_path, live, read_view, idle_s=30.0, sleep=sleep,
                      clock=lambda: time[0])
     )  # fmt: skip
     assert len(statuses) == 9
@@ -251,7 +246,7 @@ def test_a_silent_folder_ends_and_a_missing_one_is_refused(tmp_path: Path) -> No
         raise AssertionError("there is nothing to read")
 
     (tmp_path / "alone.png").write_bytes(b"image")
-    quiet = watch_folder(tmp_path, running(), no_view, config=WatchConfig(idle_s=5.0),
+    quiet = watch_folder(tmp_path, running(), no_view, idle_s=5.0,
                          sleep=sleep, clock=lambda: time[0])  # fmt: skip
     assert list(quiet) == [] and time[0] >= 5.0
     with pytest.raises(InputError, match="not a folder"):

@@ -7,14 +7,14 @@ import pytest
 
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
-from realsim.registration.odometry.hand_held import HandHeldConfig, hand_held_poses
+from realsim.registration.odometry.hand_held import hand_held_poses
 from realsim.registration.simulated import DEPTH_UNIT_M, render_depth
 from realsim.registration.simulated_lab import table_square
 from realsim.registration.views import SampleConfig
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from table_scenes import small_scene
 
-CONFIG = HandHeldConfig(sample=SampleConfig(stride=1))
+SAMPLE = SampleConfig(stride=1)
 VIEWS = 12
 
 
@@ -39,7 +39,7 @@ def led_by_hand():
 @lru_cache(maxsize=1)
 def found():
     intrinsics, depths, _ = led_by_hand()
-    return hand_held_poses(intrinsics, depths, CONFIG)
+    return hand_held_poses(intrinsics, depths, SAMPLE)
 
 
 def test_poses_are_good_enough_for_the_joint_refinement():
@@ -72,7 +72,7 @@ def test_a_missing_piece_of_the_way_is_named():
     intrinsics, depths, _ = led_by_hand()
     turned = [*depths[:4], depths[4][::-1, ::-1].copy()]
     with pytest.raises(InputError, match="view 4 cannot be placed"):
-        hand_held_poses(intrinsics, turned, CONFIG)
+        hand_held_poses(intrinsics, turned, SAMPLE)
 
 
 def test_without_a_table_there_is_no_ground():
@@ -80,4 +80,4 @@ def test_without_a_table_there_is_no_ground():
     rng = np.random.default_rng(0)
     wild = rng.uniform(0.2, 0.6, depths[0].shape).astype(np.float32)
     with pytest.raises((DegenerateError, InputError), match="view 0"):
-        hand_held_poses(intrinsics, [wild, depths[1]], CONFIG)
+        hand_held_poses(intrinsics, [wild, depths[1]], SAMPLE)

@@ -21,8 +21,6 @@ SEARCH_PX = 1600
 full image."""
 MIN_SHARE = 0.7
 """Least share of the corners that must be measurable; fewer mean glare or a wrong grid."""
-LOOK_FOR_TWINS = True
-"""Search once more beside the board found: of two equal boards neither can be trusted."""
 TWIN_SQUARE_PX = 28.0
 """For that search the picture is halved until squares like those found are narrower; OpenCV
 finds squares of 8 px, so a twin may stand 1.7 times as far away at least."""
@@ -122,10 +120,10 @@ def _whole(gray: UInt8, board: Chessboard) -> tuple[Array | None, str]:
             f"the picture shows a chessboard of {max(grid.shape[:2])}x{min(grid.shape[:2])} inner "
             f"corners, not of {board.columns}x{board.rows}: correct rows and columns"
         )
-    if LOOK_FOR_TWINS:
-        other = largest_chessboard(*_for_twins(_covered(gray, grid), grid))
-        if other is not None and other.shape[:2] in shapes:
-            return None, "two equal chessboards are in view: cover one"
+    # Search once more beside the board found: of two equal boards neither can be trusted.
+    other = largest_chessboard(*_for_twins(_covered(gray, grid), grid))
+    if other is not None and other.shape[:2] in shapes:
+        return None, "two equal chessboards are in view: cover one"
     if grid.shape[:2] != (board.rows, board.columns):
         grid = grid.transpose(1, 0, 2)
     return grid, ""

@@ -5,7 +5,7 @@ long and straight: each is measured in a few dozen gray profiles, and the corner
 meet. Integer pixels are pixel centres throughout; nothing is shifted by half a pixel.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,32 +22,28 @@ LINE_STEPS = 4
 """Reweighted line fits; the inliers of straight edges no longer change after three."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class EdgeConfig:
-    """How tag edges are measured."""
-
-    passes: int = 3
-    """Resample about the refined lines this often; the first start is up to 1 px off."""
-    profiles: int = 28
-    """Gray profiles per side; closer than 1.3 px they share their noise."""
-    samples: int = 15
-    """Samples per profile, about every half pixel."""
-    half_window_px: float = 3.5
-    """Longest reach of a profile to either side [px]: 2 sigma of a strong blur (1.7 px)."""
-    min_half_window_px: float = 1.8
-    """Shortest reach [px]; below it the start's own error leaves the window."""
-    inner_share: float = 1.0
-    """Reach of a profile in widths of the black border: what lies behind is modelled, not clean."""
-    clear_share: float = 0.7
-    """Reach of a profile in widths of the white gap, behind which the next tag begins."""
-    corner_cut_px: float = 2.5
-    """Stretch at the ends of a side that is not sampled [px]: blur rounds the corner there."""
-    corner_cut_share: float = 0.06
-    """The same as a share of the side; the larger of the two counts."""
-    outlier_sigmas: float = 3.0
-    """Edge points further than this many robust standard deviations off the line are dropped."""
-    residual_floor_px: float = 0.02
-    """Least robust standard deviation [px]; keeps perfect images from dropping good points."""
+PASSES = 3
+"""Resample about the refined lines this often; the first start is up to 1 px off."""
+PROFILES = 28
+"""Gray profiles per side; closer than 1.3 px they share their noise."""
+SAMPLES = 15
+"""Samples per profile, about every half pixel."""
+HALF_WINDOW_PX = 3.5
+"""Longest reach of a profile to either side [px]: 2 sigma of a strong blur (1.7 px)."""
+MIN_HALF_WINDOW_PX = 1.8
+"""Shortest reach [px]; below it the start's own error leaves the window."""
+INNER_SHARE = 1.0
+"""Reach of a profile in widths of the black border: what lies behind is modelled, not clean."""
+CLEAR_SHARE = 0.7
+"""Reach of a profile in widths of the white gap, behind which the next tag begins."""
+CORNER_CUT_PX = 2.5
+"""Stretch at the ends of a side that is not sampled [px]: blur rounds the corner there."""
+CORNER_CUT_SHARE = 0.06
+"""The same as a share of the side; the larger of the two counts."""
+OUTLIER_SIGMAS = 3.0
+"""Edge points further than this many robust standard deviations off the line are dropped."""
+RESIDUAL_FLOOR_PX = 0.02
+"""Least robust standard deviation [px]; keeps perfect images from dropping good points."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -72,8 +68,8 @@ def refine_quads(
     gray: UInt8,
     quads: Array,
     clear: tuple[float, float],
-    config: EdgeConfig,
     intrinsics: CameraIntrinsics | None = None,
+    corner_cut_px: float = CORNER_CUT_PX,
 ) -> RefinedQuads:
     """Return the corners of dark quadrilaterals on white, to a few hundredths of a pixel.
 
@@ -81,19 +77,18 @@ def refine_quads(
         gray: (H, W) image.
         quads: (n, 4, 2) rough corners, clockwise as seen [px].
         clear: widths of the uniform band inside and outside the edge, in units of the edge.
-        config: how edges are measured.
         intrinsics: with them, lines are fitted in undistorted coordinates. Without, an edge bent
             by the lens is taken for straight: 60 px long at the border of a k1 = -0.1 lens it
             sags by about 0.05 px.
+        corner_cut_px: least stretch at the ends of a side that is not sampled [px].
     """
     image = gray.astype(np.float64)
     corners = np.array(quads, dtype=np.float64)
-    coarse = replace(config, profiles=config.profiles // 2)
-    measured = _measure(image, corners, None, clear, (coarse, intrinsics))
-    for k in range(1, config.passes):
-        last = config if k == config.passes - 1 else coarse
-        blur = measured.sharpness_px
-        measured = _measure(image, measured.corners_px, blur, clear, (last, intrinsics))
+    how = (intrinsics, corner_cut_px)
+    measured = _measure(image, corners, None, clear, PROFILES // 2, how)
+    for k in range(1, PASSES):
+        profiles, blur = PROFILES if k == PASSES - 1 else PROFILES // 2, measured.sharpness_px
+        measured = _measure(image, measured.corners_px, blur, clear, profiles, how)
     return measured
 
 
@@ -102,22 +97,22 @@ def _measure(
     corners: Array,
     blur: Array | None,
     clear: tuple[float, float],
-    how: tuple[EdgeConfig, CameraIntrinsics | None],
+    profiles: int,
+    how: tuple[CameraIntrinsics | None, float],
 ) -> RefinedQuads:
     """Run one pass: profiles across the sides of `corners`, edge points, lines, intersections."""
-    config, intrinsics = how
-    start, along, outward, s, depth = _sides(corners, config)
-    reach = np.minimum(config.inner_share * clear[0], config.clear_share * clear[1]) * depth
-    reach = np.clip(reach, config.min_half_window_px, config.half_window_px)
-    t = np.linspace(-1.0, 1.0, config.samples) * reach[..., None]
+    intrinsics, corner_cut_px = how
+    start, along, outward, s, depth = _sides(corners, profiles, corner_cut_px)
+    reach = np.minimum(INNER_SHARE * clear[0], CLEAR_SHARE * clear[1]) * depth
+    reach = np.clip(reach, MIN_HALF_WINDOW_PX, HALF_WINDOW_PX)
+    t = np.linspace(-1.0, 1.0, SAMPLES) * reach[..., None]
     foot = start[..., None, :] + s[..., None] * along[..., None, :]
     where = foot[..., None, :] + t[..., None, :, None] * outward[..., None, None, :]
-    profiles = bilinear(image, where)
-    shift, step, blur = fit_blurred_steps(t, profiles, clear[0] * depth, blur)
+    shift, step, blur = fit_blurred_steps(t, bilinear(image, where), clear[0] * depth, blur)
     seen = (np.abs(shift) < 0.9 * reach[..., None]) & (step > 0.3 * np.median(step, -1)[..., None])
     points = foot + shift[..., None] * outward[..., None, :]
     ideal = straighten(intrinsics, points)
-    center, normal, weight, rms = fit_lines(ideal, seen, config)
+    center, normal, weight, rms = fit_lines(ideal, seen)
     met, sine = line_intersections(np.roll(center, 1, 1), np.roll(normal, 1, 1), center, normal)
     met = bend(intrinsics, met)
     return RefinedQuads(
@@ -130,7 +125,9 @@ def _measure(
     )
 
 
-def _sides(corners: Array, config: EdgeConfig) -> tuple[Array, Array, Array, Array, Array]:
+def _sides(
+    corners: Array, profiles: int, corner_cut_px: float
+) -> tuple[Array, Array, Array, Array, Array]:
     """Return start, direction, outward normal, profile feet (n, 4, m) and depth (n, 4) of sides."""
     start, end = corners, np.roll(corners, -1, axis=1)
     length = np.maximum(np.linalg.norm(end - start, axis=-1), 1e-9)
@@ -138,9 +135,9 @@ def _sides(corners: Array, config: EdgeConfig) -> tuple[Array, Array, Array, Arr
     outward = np.stack([along[..., 1], -along[..., 0]], -1)
     opposite = (np.roll(corners, -2, axis=1) + np.roll(corners, -3, axis=1)) / 2
     depth = np.abs(np.sum((opposite - start) * outward, -1))
-    cut = np.maximum(config.corner_cut_px, config.corner_cut_share * length)
+    cut = np.maximum(corner_cut_px, CORNER_CUT_SHARE * length)
     cut = np.minimum(cut, 0.35 * length)
-    share = np.linspace(0.0, 1.0, config.profiles)
+    share = np.linspace(0.0, 1.0, profiles)
     s = cut[..., None] + (length - 2 * cut)[..., None] * share
     return start, along, outward, s, depth
 
@@ -227,13 +224,12 @@ def _gauss_newton(t: Array, gray: Array, border: Array, p: Array, *, free_blur: 
     return p
 
 
-def fit_lines(points: Array, usable: Mask, config: EdgeConfig) -> tuple[Array, Array, Array, Array]:
+def fit_lines(points: Array, usable: Mask) -> tuple[Array, Array, Array, Array]:
     """Return total-least-squares lines through edge points, outliers dropped.
 
     Args:
         points: (..., m, 2) edge points [px].
         usable: (..., m) points that may carry the line.
-        config: the outlier rule.
 
     Returns:
         A point (..., 2) on the line, its unit normal (..., 2), weights (..., m) 0 or 1, and the
@@ -253,8 +249,8 @@ def fit_lines(points: Array, usable: Mask, config: EdgeConfig) -> tuple[Array, A
         ranked = np.sort(np.where(usable, np.abs(distance), np.inf), axis=-1)
         half = (usable.sum(-1, keepdims=True) // 2).clip(max=usable.shape[-1] - 1)
         median = np.take_along_axis(ranked, half, axis=-1)[..., 0]
-        scale = np.maximum(MAD_TO_SIGMA * median, config.residual_floor_px)
-        inside = np.abs(distance) <= config.outlier_sigmas * scale[..., None]
+        scale = np.maximum(MAD_TO_SIGMA * median, RESIDUAL_FLOOR_PX)
+        inside = np.abs(distance) <= OUTLIER_SIGMAS * scale[..., None]
         weight = (usable & inside).astype(np.float64)
     rms = np.sqrt((weight * distance**2).sum(-1) / np.maximum(weight.sum(-1) - 2, 1.0))
     return center, normal, weight, rms

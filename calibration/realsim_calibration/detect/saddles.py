@@ -15,7 +15,6 @@ import numpy as np
 from realsim.arrays import Array, Mask, UInt8
 from realsim.records import CameraIntrinsics
 from realsim_calibration.detect.edges import (
-    EdgeConfig,
     bend,
     bilinear,
     fit_blurred_steps,
@@ -166,7 +165,7 @@ def _measure(
     points = np.concatenate([points[:, :2], points[:, 2:]], axis=2)
     seen = np.concatenate([seen[:, :2], seen[:, 2:]], axis=2)
     s = np.concatenate([s[:, :2], -s[:, 2:]], axis=2)
-    center, normal, weight, rms = fit_lines(straighten(intrinsics, points), seen, EdgeConfig())
+    center, normal, weight, rms = fit_lines(straighten(intrinsics, points), seen)
     met, sine = line_intersections(center[:, 0], normal[:, 0], center[:, 1], normal[:, 1])
     met = np.clip(met, uv - 2 * HALF_WINDOW_PX, uv + 2 * HALF_WINDOW_PX)
     variance = _variance(s, weight, rms)

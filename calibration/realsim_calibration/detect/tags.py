@@ -6,7 +6,7 @@ OpenCV's detector finds and decodes the quads; their corners are then measured a
 pixel off that in both axes).
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +15,7 @@ from realsim.arrays import Array, Int64, UInt8
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, TagBoard
 from realsim.records.targets import TAG_CELLS
-from realsim_calibration.detect.edges import EdgeConfig, RefinedQuads, refine_quads
+from realsim_calibration.detect.edges import CORNER_CUT_PX, RefinedQuads, refine_quads
 from realsim_calibration.detect.images import gray_image
 from realsim_calibration.detect.markers import (
     FAMILY_DICTIONARY,
@@ -33,8 +33,6 @@ WEAK_FAMILIES = ("tag16h5",)
 class DetectionConfig:
     """When a tag is good enough to calibrate with."""
 
-    edges: EdgeConfig = field(default_factory=EdgeConfig)
-    """How the tags' edges are measured."""
     max_blur_px: float = 2.0
     """Largest sigma of the edges' blur [px]: the profiles reach 3.5 px, beyond it they see no
     plateau and corners drift by half a pixel."""
@@ -184,13 +182,13 @@ def _measured(
     if not len(ids):
         return TagDetections(ids=ids, corners_px=corners)
     clear = (border / (TAG_CELLS[board.family] + 2 * (border - 1)), board.gap_m / board.tag_size_m)
-    edges, limits = config.edges, config
+    cut_px, limits = CORNER_CUT_PX, config
     if board.corner_squares:
-        edges = replace(edges, corner_cut_px=max(edges.corner_cut_px, config.square_cut_px))
+        cut_px = max(cut_px, config.square_cut_px)
         side = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)))
         most = max(config.max_move_px, config.square_move_share * side)
         limits = replace(config, max_move_px=most)
-    refined = refine_quads(gray, corners, clear, edges, intrinsics)
+    refined = refine_quads(gray, corners, clear, intrinsics, cut_px)
     reasons = [_fault(refined, corners, k, gray.shape, limits) for k in range(len(ids))]
     good = np.array([not r for r in reasons], dtype=bool)
     return TagDetections(

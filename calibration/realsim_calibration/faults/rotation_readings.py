@@ -13,7 +13,7 @@ coincide.
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import permutations
@@ -231,6 +231,20 @@ def vote(forms: Array, G: Array, voters: int | None = None) -> tuple[Array, floa
     return forms[np.arange(n), chord[best].argmin(-1)], float(np.sqrt(cost[best]))
 
 
+def _mistaken(R: Array, scale: float) -> Iterator[tuple[Convention, Convention, Array]]:
+    """Yield the convention E that rotations were decoded by, F that was meant, and E's numbers.
+
+    With a scale it is the unit that was mistaken, of angles only: F is E.
+    """
+    families = (three_number_conventions(), four_number_conventions())
+    for family in families if scale == 1.0 else families[:1]:
+        for E in family:
+            numbers = E.encode(R) * scale
+            for F in family if scale == 1.0 else (E,):
+                if F is not E or scale != 1.0:
+                    yield E, F, numbers
+
+
 def reread(R: Array, t_A: Array, D: Array, scale: float = 1.0) -> list[Reread]:
     """Return the pairs of conventions whose votes agree best, the best first.
 
@@ -242,16 +256,8 @@ def reread(R: Array, t_A: Array, D: Array, scale: float = 1.0) -> list[Reread]:
     """
     bases = base_rotations(t_A, D)
     found: list[Reread] = []
-    for family in (three_number_conventions(), four_number_conventions()):
-        if scale != 1.0 and family[0].decode is se3.from_quaternion_wxyz:
-            continue
-        for E in family:
-            numbers = E.encode(R) * scale
-            for F in family if scale == 1.0 else (E,):
-                if F is E and scale == 1.0:
-                    continue
-                forms = F.decode(numbers)
-                found.append(_best_vote(forms, bases, D, F.name, E.name))
+    for E, F, numbers in _mistaken(R, scale):
+        found.append(_best_vote(F.decode(numbers), bases, D, F.name, E.name))
     if scale == 1.0:
         transposed = np.swapaxes(R, -1, -2)[:, None]
         found.append(_best_vote(transposed, bases, D, "matrices column by column",
@@ -275,17 +281,11 @@ def every_reading(R: Array, scale: float = 1.0) -> list[Reread]:
     For poses whose positions do not fix the base's rotation well enough for a vote.
     """
     found: list[Reread] = []
-    families = (three_number_conventions(), four_number_conventions())
-    for family in families if scale == 1.0 else families[:1]:
-        for E in family:
-            numbers = E.encode(R) * scale
-            for F in family if scale == 1.0 else (E,):
-                if F is E and scale == 1.0:
-                    continue
-                Rs = F.decode(usual_form(F if scale == 1.0 else E, numbers))
-                if all(np.abs(Rs - other.Rs).max() > 1e-9 for other in found):
-                    found.append(Reread(name=f"{F.name}, not {E.name}", meant=F.name,
-                                        read_as=E.name, Rs=Rs, agreement=1.0))  # fmt: skip
+    for E, F, numbers in _mistaken(R, scale):
+        Rs = F.decode(usual_form(F, numbers))
+        if all(np.abs(Rs - other.Rs).max() > 1e-9 for other in found):
+            found.append(Reread(name=f"{F.name}, not {E.name}", meant=F.name, read_as=E.name,
+                                Rs=Rs, agreement=1.0))  # fmt: skip
     return found
 
 

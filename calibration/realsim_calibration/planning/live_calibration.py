@@ -314,28 +314,20 @@ class LiveCalibration:
 # ---- a folder that fills
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class WatchConfig:
-    """How a folder is watched."""
-
-    image_suffixes: tuple[str, ...] = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-    pose_suffixes: tuple[str, ...] = (".json", ".yaml", ".yml", ".txt", ".csv")
-    poll_s: float = 0.5
-    """Time between two looks [s]: less than an arm needs to move."""
-    idle_s: float = 600.0
-    """Time without a new pair after which watching ends [s]; infinite = never."""
-    stop_when_done: bool = True
-    """Whether watching ends with the calibration."""
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+POSE_SUFFIXES = (".json", ".yaml", ".yml", ".txt", ".csv")
+POLL_S = 0.5
+"""Time between two looks [s]: less than an arm needs to move."""
+IDLE_S = 600.0
+"""Time without a new pair after which watching ends [s]."""
 
 
-def find_pairs(folder: Path, config: WatchConfig) -> list[tuple[Path, Path]]:
+def find_pairs(folder: Path) -> list[tuple[Path, Path]]:
     """Return (image, pose) files of the same stem, in the natural order of their names."""
     files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
-    poses = {p.stem: p for p in files if p.suffix.lower() in config.pose_suffixes}
+    poses = {p.stem: p for p in files if p.suffix.lower() in POSE_SUFFIXES}
     pairs = [
-        (p, poses[p.stem])
-        for p in files
-        if p.suffix.lower() in config.image_suffixes and p.stem in poses
+        (p, poses[p.stem]) for p in files if p.suffix.lower() in IMAGE_SUFFIXES and p.stem in poses
     ]
     return sorted(pairs, key=lambda pair: (len(pair[0].stem), pair[0].stem))
 
@@ -345,8 +337,7 @@ def watch_folder(
     live: LiveCalibration,
     read_view: Callable[[int, Path, Path], BoardView],
     *,
-    config: WatchConfig | None = None,
-    pairs: Callable[[Path, WatchConfig], Sequence[tuple[Path, Path]]] = find_pairs,
+    idle_s: float = IDLE_S,
     sleep: Callable[[float], None] = time.sleep,
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[LiveStatus]:
@@ -360,8 +351,7 @@ def watch_folder(
         folder: where images and poses appear.
         live: the calibration that they are added to.
         read_view: makes a view of (number, image, pose file); raises InputError for a bad file.
-        config: file names and times.
-        pairs: finds (image, pose) files; another one reads other layouts.
+        idle_s: time without a new pair after which watching ends [s]; infinite = never.
         sleep: waits [s].
         clock: time [s].
 
@@ -370,15 +360,15 @@ def watch_folder(
     """
     from dataclasses import replace
 
-    folder, config = Path(folder), config or WatchConfig()
+    folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; make it, or check the path.")
     done: set[Path] = set()
     sizes: dict[Path, tuple[int, int]] = {}
-    last, number = clock(), len(live.views)
+    last = clock()
     number = max((v.index for v in live.views), default=-1) + 1
-    while clock() - last <= config.idle_s:
-        for image, pose in pairs(folder, config):
+    while clock() - last <= idle_s:
+        for image, pose in find_pairs(folder):
             if image in done:
                 continue
             size = (image.stat().st_size, pose.stat().st_size)
@@ -395,6 +385,6 @@ def watch_folder(
                 note = f"{image.name} was not used: {error}"
                 status = replace(live.status, note=note, sentence=f"{note} {live.status.sentence}")
             yield status
-            if status.stop and config.stop_when_done:
+            if status.stop:
                 return
-        sleep(config.poll_s)
+        sleep(POLL_S)

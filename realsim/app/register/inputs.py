@@ -293,7 +293,8 @@ def _claimed(
 
 def _hand_held(store: SessionStore, tick: "Tick | None") -> dict[int, Array]:
     """Return the cameras of a capture without a robot, in the frame of its table."""
-    from realsim.registration.odometry.hand_held import HandHeldConfig, hand_held_poses
+    from realsim.registration.odometry.hand_held import hand_held_poses
+    from realsim.registration.views import SampleConfig
 
     indices = [v.index for v in store.session.views if store.has_depth(v.index)]
     if not indices:
@@ -303,7 +304,7 @@ def _hand_held(store: SessionStore, tick: "Tick | None") -> dict[int, Array]:
         depths.append(store.depth_m(index))
         if tick is not None:
             tick(done, len(indices))
-    found = hand_held_poses(store.session.intrinsics, depths, HandHeldConfig())
+    found = hand_held_poses(store.session.intrinsics, depths, SampleConfig())
     # As the session would give them back: a rotation is made orthonormal when a view is made.
     views = [View(index=k, T_world_cam=T) for k, T in zip(indices, found.Ts_world_cam, strict=True)]
     placed = {v.index: v.T_world_cam for v in views if v.T_world_cam is not None}

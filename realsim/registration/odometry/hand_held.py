@@ -7,7 +7,7 @@ best of it all. The result is a start for the joint refinement, good to about 2 
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,6 +51,26 @@ CAUCHY = 2.0
 """Whitened length from which a pair counts less: a wrong loop must not bend the path."""
 INFLATION = 2.0
 """Sigmas are enlarged by this: pairs of one view share its depth errors."""
+CLOUDS = AboveTableConfig()
+PAIRS = PairConfig(fit=FitConfig(convergence=1e-5, max_iterations=300))
+"""Aligned to the end: what is left undone points back to the guess, and adds up on the way."""
+KEY_DEG = 16.0
+"""A view this far from the last key view becomes one [deg]; drift grows with their number, and
+at 8 degrees the path turned 0.7 degrees too far in simulation instead of 0.1 to 0.7."""
+KEY_OVERLAP = 0.8
+"""Overlap with the last key view below which a view becomes one."""
+LEAST_OVERLAP = 0.6
+"""A view that overlaps less with those before it cannot be placed; wrong alignments have 0.6
+at most in simulation."""
+SAME_TABLE_DEG = 15.0
+"""A plane that is tilted more than this against the predicted table is another thing's [deg];
+hands turn less between two views."""
+LOOP_DEG = 35.0
+"""Key views at most this far apart are aligned if they do not follow each other [deg]."""
+LOOPS = 3
+"""Number of other views that are tried for each key view."""
+SEED = 0
+"""Seed of the random search for the table."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -125,36 +145,6 @@ def _of_table(T_world_cam: Array, free: float) -> Array:
     return A @ np.diag(np.square(sigmas)) @ A.T
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class HandHeldConfig:
-    """How a hand-held capture is put together."""
-
-    sample: SampleConfig = field(default_factory=SampleConfig)
-    noise: EvidenceConfig = field(default_factory=EvidenceConfig)
-    clouds: AboveTableConfig = field(default_factory=AboveTableConfig)
-    pairs: PairConfig = field(
-        default_factory=lambda: PairConfig(fit=FitConfig(convergence=1e-5, max_iterations=300))
-    )
-    """Aligned to the end: what is left undone points back to the guess, and adds up on the way."""
-    key_deg: float = 16.0
-    """A view this far from the last key view becomes one [deg]; drift grows with their number, and
-    at 8 degrees the path turned 0.7 degrees too far in simulation instead of 0.1 to 0.7."""
-    key_overlap: float = 0.8
-    """Overlap with the last key view below which a view becomes one."""
-    least_overlap: float = 0.6
-    """A view that overlaps less with those before it cannot be placed; wrong alignments have 0.6
-    at most in simulation."""
-    same_table_deg: float = 15.0
-    """A plane that is tilted more than this against the predicted table is another thing's [deg];
-    hands turn less between two views."""
-    loop_deg: float = 35.0
-    """Key views at most this far apart are aligned if they do not follow each other [deg]."""
-    loops: int = 3
-    """Number of other views that are tried for each key view."""
-    seed: int = 0
-    """Seed of the random search for the table."""
-
-
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class HandHeld:
     """Where a hand-held camera was; z = 0 of the world is the table, its origin near the things."""
@@ -188,14 +178,14 @@ class HandHeld:
 
 
 def hand_held_poses(
-    intrinsics: CameraIntrinsics, depths: Sequence[Array32], config: HandHeldConfig
+    intrinsics: CameraIntrinsics, depths: Sequence[Array32], sample: SampleConfig
 ) -> HandHeld:
     """Return the camera's poses from its depth images alone.
 
     Args:
         intrinsics: the camera.
         depths: (H, W) each, along z [m], 0 = none, in the order in which they were taken.
-        config: settings.
+        sample: how images are thinned out.
 
     Raises:
         InputError: a view overlaps too little with those before it, or holds nothing above the
@@ -203,8 +193,8 @@ def hand_held_poses(
         DegenerateError: the first view sees no table.
     """
     began = time.process_time()
-    clouds = _clouds(intrinsics, depths, config)
-    path = _Path(clouds, config)
+    clouds = _clouds(intrinsics, depths, sample)
+    path = _Path(clouds)
     for k in range(1, len(clouds)):
         path.add(k)
     Ts, clouds = np.stack(path.poses), path.clouds
@@ -212,9 +202,9 @@ def hand_held_poses(
         [se3.transform(T, c.source).mean(0) for T, c in zip(Ts, clouds, strict=True)], 0
     )
     levelled = tuple(c.normal is not None for c in clouds)
-    angles = view_angles(Ts, aim, config.pairs.zoom_deg)
+    angles = view_angles(Ts, aim, PAIRS.zoom_deg)
     Ts = optimise_poses(Ts, path.edges, levelled, angles).Ts_world_cam
-    loops = _loops(path, Ts, view_angles(Ts, aim, config.pairs.zoom_deg))
+    loops = _loops(path, Ts, view_angles(Ts, aim, PAIRS.zoom_deg))
     graph = optimise_poses(Ts, [*path.edges, *loops], levelled, angles)
     r = graph.residuals if len(graph.residuals) else np.zeros((1, 6))
     return HandHeld(
@@ -230,29 +220,29 @@ def hand_held_poses(
 
 
 def _clouds(
-    intrinsics: CameraIntrinsics, depths: Sequence[Array32], config: HandHeldConfig
+    intrinsics: CameraIntrinsics, depths: Sequence[Array32], sample: SampleConfig
 ) -> list[ViewCloud]:
     """Return every view split into its table and what stands on it."""
     frames = check_frames(
         [DepthFrame(index=k, depth_m=d, T_world_cam=np.eye(4)) for k, d in enumerate(depths)],
         intrinsics,
     )
-    noise = measure_noise(frames, config.noise)
-    rng = np.random.default_rng(config.seed)
+    noise = measure_noise(frames, EvidenceConfig())
+    rng = np.random.default_rng(SEED)
     clouds: list[ViewCloud] = []
     for frame in frames:
-        points = sample_view(intrinsics, frame, noise, config.sample)
-        cloud = view_cloud(points, None, config.clouds, rng)
+        points = sample_view(intrinsics, frame, noise, sample)
+        cloud = view_cloud(points, None, CLOUDS, rng)
         if frame.index == 0 and cloud.normal is None:
             raise DegenerateError(
                 "view 0 sees no table: no plane carries at least "
-                f"{100 * config.clouds.least_share:.0f} % of its points. The first view of a "
+                f"{100 * CLOUDS.least_share:.0f} % of its points. The first view of a "
                 "hand-held capture has to show the table; look down on it from 30 to 50 cm."
             )
-        if cloud.normal is not None and len(cloud.source) < config.clouds.least_points:
+        if cloud.normal is not None and len(cloud.source) < CLOUDS.least_points:
             raise InputError(
                 f"view {frame.index} holds only {len(cloud.source)} averaged points above the "
-                f"table; at least {config.clouds.least_points} are needed. Leave the view out, or "
+                f"table; at least {CLOUDS.least_points} are needed. Leave the view out, or "
                 "keep the things on the table in the picture."
             )
         clouds.append(cloud)
@@ -262,11 +252,10 @@ def _clouds(
 class _Path:
     """The views one after the other, each placed by the key view before it."""
 
-    def __init__(self, clouds: Sequence[ViewCloud], config: HandHeldConfig) -> None:
+    def __init__(self, clouds: Sequence[ViewCloud]) -> None:
         """Begin with the first view, over the table."""
         self.clouds = list(clouds)
-        self.config = config
-        self.meter = PairMeter(self.clouds, config.pairs)
+        self.meter = PairMeter(self.clouds, PAIRS)
         first = self.clouds[0]
         assert first.normal is not None  # checked when the clouds were made
         T_cam_table = plane_frame(first.normal, first.offset, first.target)
@@ -282,13 +271,13 @@ class _Path:
         self._doubt_table(k, moved)
         best = self._try(k, self.keys[-1], moved)
         for reference, guess in ((k - 1, moved), (self.keys[-1], self.poses[-1])):
-            if best.overlap < self.config.key_overlap:
+            if best.overlap < KEY_OVERLAP:
                 other = self._try(k, reference, guess)
                 best = other if other.overlap > best.overlap else best
-        if best.overlap < self.config.least_overlap:
+        if best.overlap < LEAST_OVERLAP:
             raise InputError(
                 f"view {k} cannot be placed: only {100 * best.overlap:.0f} % of its points fit "
-                f"view {best.first} ({100 * self.config.least_overlap:.0f} % are needed). The "
+                f"view {best.first} ({100 * LEAST_OVERLAP:.0f} % are needed). The "
                 "camera moved too far between them, or something on the table was moved; take "
                 "views in steps of at most 6 degrees, or leave this one out."
             )
@@ -299,10 +288,10 @@ class _Path:
         before = [j for j in self.keys[-2:] if j != best.first]
         for j in before:
             edge = self._try(k, j, T)
-            if edge.overlap >= self.config.least_overlap:
+            if edge.overlap >= LEAST_OVERLAP:
                 self.edges.append(edge)
         turned = np.degrees(se3.angle(relative(np.stack(self.poses), self.keys[-1], k)))
-        if turned > self.config.key_deg or best.overlap < self.config.key_overlap:
+        if turned > KEY_DEG or best.overlap < KEY_OVERLAP:
             self.keys.append(k)
 
     def _try(self, k: int, reference: int, T_world_cam: Array) -> Edge:
@@ -321,26 +310,26 @@ class _Path:
         if normal is None:
             return
         tilt = np.degrees(np.arccos(np.clip(T_world_cam[2, :3] @ normal, -1.0, 1.0)))
-        if tilt > self.config.same_table_deg:
+        if tilt > SAME_TABLE_DEG:
             # PairMeter keeps this very list.
             self.clouds[k] = replace(self.clouds[k], normal=None)
 
 
 def _loops(path: _Path, Ts: Array, angles: Array) -> list[Edge]:
     """Return pairs of key views that see the same but do not follow each other."""
-    config, known = path.config, {(e.first, e.second) for e in path.edges}
+    known = {(e.first, e.second) for e in path.edges}
     found: list[Edge] = []
     for place, k in enumerate(path.keys):
         earlier = np.array(path.keys[: max(place - 1, 0)], dtype=np.int64)
         near = earlier[np.argsort(angles[k, earlier], kind="stable")] if len(earlier) else earlier
         tried = 0
         for j in near.tolist():
-            if tried == config.loops or angles[j, k] > config.loop_deg:
+            if tried == LOOPS or angles[j, k] > LOOP_DEG:
                 break
             if (j, k) in known:
                 continue
             tried += 1
             edge = path.meter.measure(j, k, relative(Ts, j, k))
-            if edge.overlap >= config.least_overlap:
+            if edge.overlap >= LEAST_OVERLAP:
                 found.append(edge)
     return found
