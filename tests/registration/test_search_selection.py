@@ -55,8 +55,7 @@ def slots() -> list[Slot]:
     """One per object; the two wedges share theirs."""
     _, pool, ids = material()
     return [
-        Slot(choices=frozenset(n for n, i in enumerate(ids) if i == pool[k].obj_id))
-        for k in range(len(NAMES))
+        frozenset(n for n, i in enumerate(ids) if i == pool[k].obj_id) for k in range(len(NAMES))
     ]
 
 
@@ -73,7 +72,7 @@ def test_the_right_poses_are_chosen():
 
 def test_two_of_one_model_never_share_a_pose():
     canvas, pool, _ = material()
-    only = [Slot(choices=frozenset([1])), Slot(choices=frozenset([1]))]
+    only = [frozenset([1]), frozenset([1])]
     got = select(canvas, pool, only, CONFIG)
     assert sorted(map(str, got.chosen)) == ["1", "None"]
 
@@ -89,7 +88,7 @@ def test_wrong_poses_alone_are_refused():
     canvas, pool, _ = material()
     got = select_any(canvas, pool[4:], CONFIG)
     assert all(s is not None and s.per_cell >= CONFIG.least_per_cell_unknown for s in got.scores)
-    empty = select(canvas, pool, [Slot(choices=frozenset())], CONFIG)
+    empty = select(canvas, pool, [frozenset()], CONFIG)
     assert empty.chosen == (None,)
     assert empty.scores == (None,)
 
@@ -105,5 +104,5 @@ def test_two_that_stand_in_each_others_places_change_them():
     assert select_pair(canvas, pool, pair, (here, None), others, CONFIG) == (mug, gear)
     assert select_pair(canvas, pool, pair, (mug, gear), others, CONFIG) is None
     # One of which there is no acceptable pose cannot have the other's place.
-    alone = (Slot(choices=frozenset([here])), slots()[gear])
+    alone = (frozenset([here]), slots()[gear])
     assert select_pair(canvas, pool, alone, (None, gear), others, CONFIG) is None

@@ -15,6 +15,8 @@ from realsim.arrays import Array32
 from realsim.registration.search.candidates import Candidate
 from realsim.registration.search.scoring import Canvas, Score, compose, score
 
+Slot = frozenset[int]
+"""A place for one object: the poses of the pool that it may have."""
 Clash = Callable[[int, int], bool]
 """Tells of two poses of the pool whether they cannot both be."""
 Good = Callable[[Score, int, Iterable[int]], bool]
@@ -47,14 +49,6 @@ class SelectionConfig:
     pair_shortlist: int = 6
     """Where two objects are chosen together, so many best poses of one are tried with all of the
     other."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Slot:
-    """A place for one object."""
-
-    choices: frozenset[int]
-    """Poses of the pool that it may have."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -104,7 +98,7 @@ def select_any(
         config: settings.
         clash: tells whether two poses of the pool cannot both be; None = never.
     """
-    everything = Slot(choices=frozenset(range(len(pool))))
+    everything = frozenset(range(len(pool)))
 
     def good(s: Score, n: int, others: Iterable[int]) -> bool:
         if not _accepted(s, pool[n], config.least_per_cell_unknown, config):
@@ -149,7 +143,7 @@ def _fill(
     """Fill the open slots greedily."""
     while True:
         open_slots = [n for n, c in enumerate(chosen) if c is None]
-        free = set[int]().union(*(slots[n].choices for n in open_slots)) - set(chosen)
+        free = set[int]().union(*(slots[n] for n in open_slots)) - set(chosen)
         buffer = buffer_of(canvas, pool, chosen)
         placed = [c for c in chosen if c is not None]
         best, at = 0.0, None
@@ -163,8 +157,8 @@ def _fill(
         if at is None:
             return
         # Of slots that may have it, the one with the fewest other choices.
-        fitting = [n for n in open_slots if at in slots[n].choices]
-        chosen[min(fitting, key=lambda n: (len(slots[n].choices), n))] = at
+        fitting = [n for n in open_slots if at in slots[n]]
+        chosen[min(fitting, key=lambda n: (len(slots[n]), n))] = at
 
 
 def _ascend(
@@ -185,7 +179,7 @@ def _ascend(
             best, at = 0.0, None
             if now is not None and good(s := score(canvas, pool[now].rendered, buffer), now, taken):
                 best, at = s.gain + config.better, now
-            for k in sorted(slot.choices - taken):
+            for k in sorted(slot - taken):
                 s = score(canvas, pool[k].rendered, buffer)
                 if s.gain > best and good(s, k, taken):
                     best, at = s.gain, k
@@ -232,10 +226,10 @@ def select_pair(
             filled = compose(filled, [pool[c].rendered])
     best: tuple[int, int] | None = None
     for first in (0, 1):
-        ranked = _ranked(canvas, pool, slots[first].choices, buffer, config)
+        ranked = _ranked(canvas, pool, slots[first], buffer, config)
         for gain, n in ranked[: config.pair_shortlist]:
             with_it = compose(buffer, [pool[n].rendered])
-            others = slots[1 - first].choices - {n}
+            others = slots[1 - first] - {n}
             for more, k in _ranked(canvas, pool, others, with_it, config)[:1]:
                 if gain + more > now:
                     now, best = gain + more, (n, k) if first == 0 else (k, n)

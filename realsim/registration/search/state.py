@@ -13,7 +13,7 @@ from realsim.registration.search.candidates import Candidate, Fused, Sought, ins
 from realsim.registration.search.polish import owners
 from realsim.registration.search.records import Region, Wanted
 from realsim.registration.search.scoring import compose
-from realsim.registration.search.selection import Selection, Slot, select, select_any, select_pair
+from realsim.registration.search.selection import Selection, select, select_any, select_pair
 
 
 @dataclass(eq=False, kw_only=True)
@@ -45,7 +45,7 @@ class Search:
             # A new pose of a large object can stand for several small ones: all compete again.
             chosen = select_any(canvas, self.pool, config, self._clash)
         else:
-            slots = [Slot(choices=frozenset(c)) for c in self.choices]
+            slots = [frozenset(c) for c in self.choices]
             chosen = select(canvas, self.pool, slots, config, first)
         self.bench.watch.lap("select")
         return chosen
@@ -199,8 +199,8 @@ def exchange_places(search: Search, selection: Selection) -> Selection:
         rest = [c for n, c in enumerate(selection.chosen) if c is not None and n not in (u, v)]
         buffer = compose(search.bench.canvas.table, [search.pool[c].rendered for c in rest])
         _seek(search, (u, v), selection, buffer, rng)
-        slots = (Slot(choices=frozenset(search.choices[u] - set(rest))),
-                 Slot(choices=frozenset(search.choices[v] - set(rest))))  # fmt: skip
+        taken = set(rest)
+        slots = (frozenset(search.choices[u] - taken), frozenset(search.choices[v] - taken))
         now = (selection.chosen[u], selection.chosen[v])
         better = select_pair(
             search.bench.canvas, search.pool, slots, now, buffer, search.bench.config.selection
