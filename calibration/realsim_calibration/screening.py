@@ -261,7 +261,7 @@ def _start(
 ) -> tuple[list[Candidate], tuple[Array, Array], tuple[tuple[str, float], ...], dict[int, str]]:
     """Return the views that pass the pixel gate, the best closed form, all of them, the others."""
     rejected: dict[int, str] = {}
-    tried = _closed_forms(candidates, C, intrinsics, config)
+    tried = _closed_forms(candidates, C, intrinsics)
     for _ in range(config.gate_rounds):
         bad = px_gate(_best(tried)[2], config.gates)
         if not bad:
@@ -269,14 +269,14 @@ def _start(
         rejected |= {candidates[k].view.index: reason for k, reason in bad.items()}
         keep = [k for k in range(len(candidates)) if k not in bad]
         candidates, C = [candidates[k] for k in keep], C[keep]
-        tried = _closed_forms(candidates, C, intrinsics, config)
+        tried = _closed_forms(candidates, C, intrinsics)
     X, Z, _ = _best(tried)
     starts = tuple((name, float(np.sqrt(np.mean(px**2)))) for name, (_, _, px) in tried.items())
     return candidates, (X, Z), starts, rejected
 
 
 def _closed_forms(
-    candidates: list[Candidate], C: Array, intrinsics: CameraIntrinsics, config: HandEyeConfig
+    candidates: list[Candidate], C: Array, intrinsics: CameraIntrinsics
 ) -> dict[str, tuple[Array, Array, Array]]:
     """Return (X, Z, px per view) of every closed form."""
     A, _ = stacks(candidates)

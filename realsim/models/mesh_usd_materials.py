@@ -35,14 +35,13 @@ def triangles_of(counts: Int64, holes: Sequence[int]) -> tuple[Int64, Int64]:
 
 
 def corner_values(
-    primvars: Any, name: str, counts: Int64, indices: Int64, face: Int64, corners: Int64
+    primvars: Any, name: str, indices: Int64, face: Int64, corners: Int64
 ) -> Array | None:
     """Return a primvar's values (T, 3, D) at the corners of triangles, or None if there is none.
 
     Args:
         primvars: the mesh's UsdGeom.PrimvarsAPI.
         name: of the primvar.
-        counts: (F,) corners per polygon.
         indices: (C,) vertex of every corner.
         face: (T,) polygon of every triangle.
         corners: (T, 3) corners of every triangle.

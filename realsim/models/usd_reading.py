@@ -325,7 +325,7 @@ class _Reader:
                 faces=indices[mine].astype(np.int32),
                 color=material.color,
             )
-            uv = corner_values(primvars, material.uv_name, counts, indices, face_of[rows], mine)
+            uv = corner_values(primvars, material.uv_name, indices, face_of[rows], mine)
             if material.image is not None and uv is not None:
                 yield self._materials.textured(piece, uv, material)
                 continue
@@ -333,7 +333,7 @@ class _Reader:
                 self._notes.append(
                     f"'{prim.GetPath()}' has a texture but no '{material.uv_name}': left out."
                 )
-            colors = corner_values(primvars, "displayColor", counts, indices, face_of[rows], mine)
+            colors = corner_values(primvars, "displayColor", indices, face_of[rows], mine)
             if colors is not None and material.color is None:
                 piece = vertex_colors_of(piece, colors)
             yield replace(joined_corners(piece), name=piece.name)

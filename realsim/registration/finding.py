@@ -139,10 +139,7 @@ def wanted_objects(
 
 
 def in_units(
-    models: Mapping[int, ObjectModel],
-    asked: list[Wanted] | None,
-    intake: Intake,
-    config: RegistrationConfig,
+    models: Mapping[int, ObjectModel], asked: list[Wanted] | None, intake: Intake
 ) -> tuple[list[Wanted] | None, list[NotPlaced]]:
     """Return what can be sought, and what is off by a factor of a thousand."""
     depths = [np.median(v.points[:, 2]) for v in intake.views if len(v.points)]
@@ -165,7 +162,7 @@ def in_units(
 
 
 def models_in_units(
-    models: Mapping[int, ObjectModel], intake: Intake, config: RegistrationConfig
+    models: Mapping[int, ObjectModel], intake: Intake
 ) -> tuple[Mapping[int, ObjectModel], list[NotPlaced]]:
     """Return the models that are sought if nothing is named, and those off by a thousand.
 
@@ -175,7 +172,7 @@ def models_in_units(
         InputError: no model is left.
     """
     all_ = [Wanted(obj_id=i, instance=i) for i in models]
-    kept, refused = in_units(models, all_, intake, config)
+    kept, refused = in_units(models, all_, intake)
     if not kept:
         raise InputError(f"none of the {len(models)} models can be sought: {refused[0].reason}")
     left = {w.obj_id: models[w.obj_id] for w in kept or ()}

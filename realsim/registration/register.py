@@ -118,9 +118,9 @@ def register_scene(  # noqa: PLR0913 - the inputs, and two ways to follow them
     tick = Ticker(progress, len(frames) + 2 * sought + config.refine.rounds + 3, told)
     up = None if gravity_up_world is None else np.asarray(gravity_up_world, dtype=np.float64)
     intake = take_in(intrinsics, frames, config, up, tick, fixed)
-    asked, refused = in_units(models, asked, intake, config)
+    asked, refused = in_units(models, asked, intake)
     if asked is None:
-        models, refused = models_in_units(models, intake, config)
+        models, refused = models_in_units(models, intake)
     kinematics = None
     if config.odometry:
         kinematics, why_not = check_odometry(intake, config)

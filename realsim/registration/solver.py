@@ -283,7 +283,7 @@ def solve_pose(
     for stage in stages:
         for _ in range(stage.steps):
             taken += 1
-            sums, H, b = _linearised(body, data, T, stage, config)
+            sums, H, b = _linearised(body, data, T, stage)
             if sums.used < LEAST_POINTS:
                 break
             if free_space is not None:
@@ -325,7 +325,7 @@ class _Sums(NamedTuple):
 
 
 def _linearised(
-    body: Body, cloud: tuple[Array, Array, Array], T: Array, stage: Stage, config: SolverConfig
+    body: Body, cloud: tuple[Array, Array, Array], T: Array, stage: Stage
 ) -> tuple[_Sums, Array, Array]:
     """Return the sums at pose T, and the upper normal matrix (6, 6) and right side (6,)."""
     H, b = np.zeros((6, 6)), np.zeros(6)

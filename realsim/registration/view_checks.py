@@ -151,7 +151,7 @@ def _odd_views(held: HeldViews, offs: dict[int, str], config: ViewCheckConfig) -
     shares = np.zeros(n)
     for round_ in range(config.rounds):
         shares = np.array([
-            contradiction(held, k, _sound_partners(held, k, bad, config), config) for k in range(n)
+            contradiction(held, k, _sound_partners(held, k, bad), config) for k in range(n)
         ])  # fmt: skip
         usual, spread = _middle(shares.tolist())
         limit = max(config.partly_share, usual + config.spreads * spread)
@@ -166,9 +166,7 @@ def _odd_views(held: HeldViews, offs: dict[int, str], config: ViewCheckConfig) -
     return [_Odd(k=k, share=float(shares[k]), off=offs.get(k, "")) for k in sorted(bad)]
 
 
-def _sound_partners(
-    held: HeldViews, k: int, bad: set[int], config: ViewCheckConfig
-) -> Sequence[int]:
+def _sound_partners(held: HeldViews, k: int, bad: set[int]) -> Sequence[int]:
     """Return the partners of view k that are not bad, topped up with the nearest sound views."""
     mine = [int(j) for j in held.partners[k]]
     sound = [j for j in mine if j not in bad]

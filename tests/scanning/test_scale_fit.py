@@ -8,7 +8,6 @@ import pytest
 from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import Mesh
-from realsim.registration.evidence import DepthFrame
 from realsim.registration.refinement.equations import BIAS, HAND_EYE_AT
 from realsim.scanning.scale.config import SampleConfig, ScaleConfig
 from realsim.scanning.scale.joint import joint_fit
@@ -21,6 +20,7 @@ from scanned_objects import (
     evidence_of,
     fit_of,
     fitted,
+    in_world,
     joined,
     rough_start,
     scaled,
@@ -37,10 +37,6 @@ from scanned_objects import (
 
 def z_of(fit: ScaleFit) -> float:
     return (fit.scale - UNIT_M) / fit.sigma
-
-
-def in_world(frames: tuple[DepthFrame, ...], W: Array) -> tuple[DepthFrame, ...]:
-    return tuple(replace(f, T_world_cam=W @ f.T_world_cam) for f in frames)
 
 
 def placed_vertices(fit: ScaleFit, mesh: Mesh) -> Array:

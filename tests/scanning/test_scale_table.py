@@ -14,7 +14,7 @@ from realsim.records import Mesh, SupportPlane
 from realsim.registration.evidence import DepthFrame, EvidenceConfig, measure_noise
 from realsim.scanning.scale.config import TableConfig
 from realsim.scanning.scale.table import Footprint, find_object, find_table
-from scanned_objects import LAB, Scanned, block, joined, real_mesh, scanned_mesh, shifted
+from scanned_objects import LAB, Scanned, block, in_world, joined, real_mesh, scanned_mesh, shifted
 
 CONFIG = TableConfig()
 SMALL = replace(LAB, views=6, width=320, height=180, focal_px=162.0)
@@ -51,10 +51,6 @@ def object_of(
     noise = measure_noise(frames, EvidenceConfig())
     plane = table_of(known, frames)
     return find_object(known.views.intrinsics, frames, plane, noise, CONFIG, at)
-
-
-def in_world(frames: tuple[DepthFrame, ...], T: Array) -> tuple[DepthFrame, ...]:
-    return tuple(replace(f, T_world_cam=T @ f.T_world_cam) for f in frames)
 
 
 def test_the_plane_is_found_whatever_the_world_is():

@@ -59,6 +59,11 @@ class Scanned:
         return Similarity(scale=UNIT_M, T_world_obj=self.T_world_obj, source="truth")
 
 
+def in_world(frames: tuple[DepthFrame, ...], W: Array) -> tuple[DepthFrame, ...]:
+    """The frames of a scene that stands elsewhere in the world."""
+    return tuple(replace(f, T_world_cam=W @ f.T_world_cam) for f in frames)
+
+
 @lru_cache(maxsize=64)
 def scanned(name: str, lab: str = "lab", seed: int = 0, views: int = 10) -> Scanned:
     """Return views of an object by its name; `lab` is one of LABS."""

@@ -205,8 +205,7 @@ def _report(
     A = np.tile(np.eye(4), (len(rig.instants), 1, 1))
     A[rows] = state.A @ se3.exp(state.errors)
     cameras = tuple(
-        _camera(rig, c, start, rows, solution, views, config, own[c])
-        for c in range(len(rig.cameras))
+        _camera(rig, c, start, rows, solution, views, own[c]) for c in range(len(rig.cameras))
     )
     report = CamerasReport(
         rig=rig,
@@ -248,7 +247,7 @@ def _sighting(
 
 def _camera(
     rig: Rig, c: int, start: Start, rows: list[int], solution: RigSolution,
-    views: tuple[SightingReport, ...], config: CalibrationConfig, own: CameraIntrinsics | None,
+    views: tuple[SightingReport, ...], own: CameraIntrinsics | None,
 ) -> HandEyeReport:  # fmt: skip
     """Return one camera's calibration as that of a camera alone.
 

@@ -153,12 +153,10 @@ def require_motion(rig: Rig, C: dict[int, Array]) -> None:
             that is somewhere else.
     """
     pairs = _turns(rig, C)
-    wrong = _contradictions(rig, pairs, rig)
+    wrong = _contradictions(pairs, rig)
     if not wrong:
         return
-    explained = [
-        text for text, other in _alternatives(rig) if not _contradictions(rig, pairs, other)
-    ]
+    explained = [text for text, other in _alternatives(rig) if not _contradictions(pairs, other)]
     first = min(wrong)
     camera, board = rig.cameras[first[0]], rig.boards[first[1]]
     hand, seen = pairs[first]
@@ -196,7 +194,7 @@ def _turns(rig: Rig, C: dict[int, Array]) -> dict[tuple[int, int], tuple[Array, 
 
 
 def _contradictions(
-    rig: Rig, pairs: dict[tuple[int, int], tuple[Array, Array]], said: Rig
+    pairs: dict[tuple[int, int], tuple[Array, Array]], said: Rig
 ) -> list[tuple[int, int]]:
     """Return the (camera, board) whose turns contradict what is said of them."""
     wrong: list[tuple[int, int]] = []

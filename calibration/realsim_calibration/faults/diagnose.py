@@ -320,10 +320,10 @@ def _sound(
         f"{_mm(given)}. {scale}"
     )
     none = replace(given, fault="none", sentence=text)
-    return none if nominal is None else _with_tool(p, none, nominal, config)
+    return none if nominal is None else _with_tool(p, none, nominal)
 
 
-def _with_tool(p: Poses, none: Hypothesis, nominal: Array, config: DiagnosisConfig) -> Hypothesis:
+def _with_tool(p: Poses, none: Hypothesis, nominal: Array) -> Hypothesis:
     """Return what the nominal kinematics add to sound poses."""
     offset = tool_offset(p.T, nominal)
     fault: Fault = "none"

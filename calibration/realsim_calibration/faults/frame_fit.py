@@ -136,6 +136,11 @@ def fit_frames(
     return _refine(A, C[:, :3, :3], q, (Rx, Rz, linear), m, config)
 
 
+def mean_transform(Ts: Array) -> Array:
+    """Return the mean (4, 4) of transforms (n, 4, 4), its translation the median."""
+    return se3.from_rt(se3.mean_rotation(Ts[:, :3, :3]), np.median(Ts[:, :3, 3], 0))
+
+
 def mismatch(fit: FrameFit, A: ArrayLike, C: ArrayLike, config: FitConfig) -> Array:
     """Return the error (k, l) of k hand poses with l board poses through frames already known."""
     A, C = np.asarray(A, dtype=np.float64), np.asarray(C, dtype=np.float64)

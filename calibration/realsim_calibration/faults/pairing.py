@@ -19,6 +19,7 @@ from realsim_calibration.faults.frame_fit import (
     FitConfig,
     FrameFit,
     fit_frames,
+    mean_transform,
     mismatch,
 )
 
@@ -299,15 +300,11 @@ def _carried(
         seen[:, :3, 3] *= fit.length_ratio
         if frame == "X":
             places = se3.invert(A) @ fit.Z @ se3.invert(seen)
-            step = _mean(places[:start]) @ se3.invert(_mean(places[start:]))
+            step = mean_transform(places[:start]) @ se3.invert(mean_transform(places[start:]))
             hands = np.concatenate([A[:start], A[start:] @ se3.invert(step)])
         else:
             places = A @ fit.X @ seen
-            step = _mean(places[:start]) @ se3.invert(_mean(places[start:]))
+            step = mean_transform(places[:start]) @ se3.invert(mean_transform(places[start:]))
             hands = np.concatenate([A[:start], step @ A[start:]])
         fit = fit_frames(hands, C, middle, FIT)
     return step, fit
-
-
-def _mean(Ts: Array) -> Array:
-    return se3.from_rt(se3.mean_rotation(Ts[:, :3, :3]), np.median(Ts[:, :3, 3], 0))

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_calibration.faults.frame_fit import FitConfig, fit_frames
+from realsim_calibration.faults.frame_fit import FitConfig, fit_frames, mean_transform
 
 LEAST_MM = 5.0
 """Offsets below this are the nominal kinematics' own error [mm]: real arms show 1 to 3."""
@@ -97,9 +97,9 @@ def _simplest(A: Array, N: Array) -> tuple[Array, tuple[Array, ...], Int64, Arra
     # Typical cases first, each with an exact base: a tool, the base turned by 180 deg, then any.
     models: list[tuple[Array, tuple[Array, ...], Int64]] = [
         (I4, (I4,), one),
-        (I4, (_middle(se3.invert(N) @ A),), one),
-        (turn, (_middle(se3.invert(turn @ N) @ A),), one),
-        (_middle(A @ se3.invert(N)), (I4,), one),
+        (I4, (mean_transform(se3.invert(N) @ A),), one),
+        (turn, (mean_transform(se3.invert(turn @ N) @ A),), one),
+        (mean_transform(A @ se3.invert(N)), (I4,), one),
         (L, (E,), one),
     ]
     for base in (I4, turn):
@@ -119,11 +119,6 @@ def _simplest(A: Array, N: Array) -> tuple[Array, tuple[Array, ...], Int64, Arra
     return next(model for cost, model in results if cost <= limit)
 
 
-def _middle(Ts: Array) -> Array:
-    """Return the mean transform, its translation the median."""
-    return se3.from_rt(se3.mean_rotation(Ts[:, :3, :3]), np.median(Ts[:, :3, 3], 0))
-
-
 def _groups(Ts: Array) -> tuple[tuple[Array, ...], Int64]:
     """Return the different transforms among (n, 4, 4) and which one each view has."""
     groups = np.full(len(Ts), -1)
@@ -136,7 +131,7 @@ def _groups(Ts: Array) -> tuple[tuple[Array, ...], Int64]:
         near &= np.linalg.norm(step[:, :3], axis=-1) < np.radians(2 * LEAST_DEG)
         members = near & (groups < 0)
         groups[members] = len(offsets)
-        offsets.append(_middle(Ts[members]))
+        offsets.append(mean_transform(Ts[members]))
     return tuple(offsets), groups.astype(np.int64)
 
 

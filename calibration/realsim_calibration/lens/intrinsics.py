@@ -79,7 +79,7 @@ def calibrate_intrinsics(
     chosen = candidates[model]
     # What the lens may do where there are no corners is what the wider model would do there.
     wider = candidates[REFERENCE] if _is_wider(REFERENCE, model, candidates) else chosen
-    report = _report(corners, target, chosen, wider, config)
+    report = _report(corners, target, chosen, wider)
     report = replace(report, held_out=scores, start=how)
     return replace(report, checks=intrinsics_checks(report, prior, start))
 
@@ -209,7 +209,7 @@ def _choose_model(
 
 
 def _report(
-    corners: Corners, target: Target, chosen: Candidate, wider: Candidate, config: IntrinsicsConfig
+    corners: Corners, target: Target, chosen: Candidate, wider: Candidate
 ) -> IntrinsicsReport:
     """Return the report; the table, the start and the checks are left out."""
     obs, fit, cov = corners.obs, chosen.fit, chosen.covariance

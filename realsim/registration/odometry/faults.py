@@ -208,7 +208,7 @@ def _gravest(
             if found is None:
                 continue
             gain, twist = found
-            fault = _size_of(kind, k, Ts, twist, aim)
+            fault = _size_of(kind, k, twist, aim)
             if (best is None or gain > best[0]) and _size(fault, noise, config) > config.nuisance:
                 best = gain, fault
     if best is None:
@@ -280,7 +280,7 @@ def _mount_or_world(
         found = _fit_fault(kind, fault.place, Ts, edges, r, later, noise, _lenient(config))
         if found is not None:
             gain, twist = found
-            costs[kind] = (gain, _size_of(kind, fault.place, Ts, twist, aim))
+            costs[kind] = (gain, _size_of(kind, fault.place, twist, aim))
     if not costs:
         return fault
     ordered = sorted(costs.values(), key=lambda c: -c[0])
@@ -299,7 +299,7 @@ def _lenient(config: FaultConfig) -> FaultConfig:
     return replace(config, least_gain=-np.inf, explained_share=0.0)
 
 
-def _size_of(kind: Kind | str, k: int, Ts: Array, twist: Array, aim: Array) -> PoseFault:
+def _size_of(kind: Kind | str, k: int, twist: Array, aim: Array) -> PoseFault:
     """Return a fault with its size [mm, deg]."""
     T = se3.exp(twist)
     deg = float(np.degrees(se3.angle(T)))

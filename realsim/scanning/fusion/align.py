@@ -82,7 +82,7 @@ def aligned(
     lost: list[ViewCorrection] = []
     used = list(frames)
     while True:
-        result, state, wrong = _rounds(intrinsics, used, region, noise, config)
+        result, wrong = _rounds(intrinsics, used, region, noise, config)
         if not wrong:
             break
         for number, why, correction in wrong:
@@ -96,7 +96,6 @@ def aligned(
                 f"{', '.join(str(i) for i, _ in left_out)}). Did the object move between the "
                 "views, or do the poses belong to other images?"
             )
-    del state
     corrections = sorted([*result.corrections, *lost], key=lambda c: c.index)
     return replace(result, corrections=tuple(corrections), left_out=tuple(sorted(left_out)))
 
@@ -107,7 +106,7 @@ def _rounds(
     region: Region,
     noise: DepthNoise,
     config: FusionConfig,
-) -> tuple[Alignment, PoseState, list[tuple[int, str, ViewCorrection]]]:
+) -> tuple[Alignment, list[tuple[int, str, ViewCorrection]]]:
     """Run the rounds with these views; also return the views that do not agree."""
     low, high = volume_box(region, config)
     wide = np.array([TABLE_MARGIN_M, TABLE_MARGIN_M, 0.0])
@@ -147,7 +146,7 @@ def _rounds(
         },
     )  # fmt: skip
     wrong = _wrong(state, matched, corrections, config) if config.refine else []
-    return result, state, wrong
+    return result, wrong
 
 
 def _tilted(plane: Array) -> Array:
