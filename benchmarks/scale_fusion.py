@@ -184,7 +184,7 @@ def _one(
     ]
     truth = transformed(mesh, T_world_obj)
     seen = _seen(truth, views.Ts_world_cam, rng)
-    fused = fuse_object(views.intrinsics, frames, None, FusionConfig())
+    fused = fuse_object(views.intrinsics, frames, FusionConfig())
     judged = fused.mesh.vertices[fused.measured]
     figures = _score(truth, seen, fused.mesh, judged)
     error = np.abs(_signed_mm(truth, judged)) / 1e3

@@ -152,16 +152,9 @@ class DistanceField:
         """Return the signed distance (N,) of points (N, 3) [m], mapped by T first if given."""
         return self._sampled(points, T_obj_points)[0]
 
-    def distance_gradient(
-        self, points: ArrayLike, T_obj_points: ArrayLike | None = None
-    ) -> tuple[Array, Array]:
-        """Return the signed distance (N,) [m] and its gradient (N, 3) in the mesh's frame.
-
-        Args:
-            points: (N, 3) [m].
-            T_obj_points: (4, 4) from the points' frame to the mesh's; None = the same.
-        """
-        return self._sampled(points, T_obj_points)
+    def distance_gradient(self, points: ArrayLike) -> tuple[Array, Array]:
+        """Return the signed distance (N,) [m] of points (N, 3) [m], and its gradient (N, 3)."""
+        return self._sampled(points, None)
 
     def _sampled(self, points: ArrayLike, T: ArrayLike | None) -> tuple[Array, Array]:
         p = np.ascontiguousarray(np.asarray(points, dtype=np.float64).reshape(-1, 3))

@@ -40,7 +40,7 @@ def ball_frames() -> tuple[FusionFrame, ...]:
 @cache
 def fused_ball() -> FusedObject:
     """The ball, fused at the true poses."""
-    return fuse_object(CAMERA, ball_frames(), None, AS_GIVEN)
+    return fuse_object(CAMERA, ball_frames(), AS_GIVEN)
 
 
 @cache
@@ -62,7 +62,7 @@ def lab_scan(views: int = 12):
 def fused_bunny() -> FusedObject:
     """The bunny of the lab, with refined poses."""
     _, camera, frames, _ = lab_scan()
-    return fuse_object(camera, frames, None, FusionConfig())
+    return fuse_object(camera, frames, FusionConfig())
 
 
 def errors_mm(fused: FusedObject, truth: Mesh) -> Array:
@@ -93,7 +93,7 @@ def test_a_sphere_has_its_radius_and_is_closed() -> None:
 
 @pytest.mark.slow
 def test_a_box_has_its_size() -> None:
-    fused = fuse_object(CAMERA, exact_frames((brick(),), CAMERA), None, AS_GIVEN)
+    fused = fuse_object(CAMERA, exact_frames((brick(),), CAMERA), AS_GIVEN)
     local = fused.mesh.vertices @ se3.exp_so3([0, 0, 0.4])
     # Every end face is more than 4 % of the measured area: these percentiles lie on them.
     low, high = np.percentile(local[fused.measured][:, :2], [2, 98], axis=0)
@@ -119,7 +119,7 @@ def test_what_was_on_the_table_is_invented_and_flat() -> None:
 def test_the_mesh_moves_with_the_world() -> None:
     T = se3.from_rt(se3.exp_so3([0.3, -0.2, 1.1]), [0.4, -0.7, 0.2])
     moved = [replace(f, T_world_cam=T @ f.T_world_cam) for f in ball_frames()]
-    fused = fuse_object(CAMERA, moved, None, AS_GIVEN)
+    fused = fuse_object(CAMERA, moved, AS_GIVEN)
     back = se3.transform(se3.invert(T), fused.mesh.vertices)
     radii = np.linalg.norm(back[fused.measured] - [0, 0, RADIUS], axis=1)
     assert np.median(radii) == pytest.approx(RADIUS, abs=1e-4)
@@ -129,7 +129,7 @@ def test_the_mesh_moves_with_the_world() -> None:
 
 
 def test_the_order_of_the_frames_does_not_matter_and_twice_is_the_same() -> None:
-    again = fuse_object(CAMERA, ball_frames()[::-1], None, AS_GIVEN)
+    again = fuse_object(CAMERA, ball_frames()[::-1], AS_GIVEN)
     assert again.mesh.vertices.tobytes() == fused_ball().mesh.vertices.tobytes()
     assert again.mesh.faces.tobytes() == fused_ball().mesh.faces.tobytes()
     assert again.sigma_m.tobytes() == fused_ball().sigma_m.tobytes()
@@ -162,7 +162,7 @@ def test_a_view_with_a_wrong_pose_is_left_out_by_name() -> None:
     truth, camera, frames, _ = lab_scan()
     off = se3.from_rt(se3.exp_so3([0.0, 0.03, 0.0]), [0.012, 0.0, 0.004])
     wrong = [replace(f, T_world_cam=f.T_world_cam @ off) if f.index == 7 else f for f in frames]
-    fused = fuse_object(camera, wrong, None, FusionConfig(rounds=2))
+    fused = fuse_object(camera, wrong, FusionConfig(rounds=2))
     assert [c.index for c in fused.corrections if not c.used] == [7]
     assert any("view 7 was left out" in note for note in fused.notes)
     assert np.median(np.abs(errors_mm(fused, truth))) < 0.6

@@ -36,7 +36,7 @@ def good() -> tuple[FusionFrame, ...]:
 
 
 def fuse(frames: list[FusionFrame] | tuple[FusionFrame, ...], config: FusionConfig = CONFIG):
-    return fuse_object(CAMERA, frames, None, config)
+    return fuse_object(CAMERA, frames, config)
 
 
 def test_no_depth_and_too_few_frames_are_named() -> None:

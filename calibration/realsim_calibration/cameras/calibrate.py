@@ -98,7 +98,7 @@ def calibrate_cameras(
         problem = RigProblem(used, lenses, joints, believed)
         solution = solve_rig(problem, without_arm(solution.state, doubted), config.hand_eye, arm,
                              known)  # fmt: skip
-    return _report(rig, start, rows, solution, config, own)
+    return _report(rig, start, rows, solution, own)
 
 
 def _only_instants(rig: Rig, rows: Sequence[int]) -> Rig:
@@ -187,7 +187,7 @@ def _own_lens(
 
 
 def _report(
-    rig: Rig, start: Start, rows: list[int], solution: RigSolution, config: CalibrationConfig,
+    rig: Rig, start: Start, rows: list[int], solution: RigSolution,
     own: Sequence[CameraIntrinsics | None],
 ) -> CamerasReport:  # fmt: skip
     """Return everything that is known of the calibration."""

@@ -13,7 +13,7 @@ import numpy as np
 from realsim.arrays import Array, Mask
 from realsim.geometry import se3
 from realsim.geometry.mesh import vertex_normals
-from realsim.records import CameraIntrinsics, Mesh, SupportPlane, Verdict
+from realsim.records import CameraIntrinsics, Mesh, Verdict
 from realsim.scanning.fusion.align import Alignment, aligned, cut_height, volume_box
 from realsim.scanning.fusion.evidence import (
     Crops,
@@ -58,17 +58,13 @@ LEFT_OUT_SHARE = 0.25
 
 
 def fuse_object(
-    intrinsics: CameraIntrinsics,
-    frames: Sequence[FusionFrame],
-    plane: SupportPlane | None,
-    config: FusionConfig,
+    intrinsics: CameraIntrinsics, frames: Sequence[FusionFrame], config: FusionConfig
 ) -> FusedObject:
     """Return the mesh of the one object on the table, in world, with what it is worth.
 
     Args:
         intrinsics: of the depth camera.
         frames: at least three; their order does not matter.
-        plane: the table in world, or None to find it in the depth.
         config: settings.
 
     Raises:
@@ -80,7 +76,7 @@ def fuse_object(
     usable, notes = checked_frames(frames, intrinsics)
     noise = measured_noise(usable, config)
     config = fitted_to_noise(usable, noise, config)
-    region = find_region(intrinsics, usable, plane, noise, config)
+    region = find_region(intrinsics, usable, noise, config)
     alignment = aligned(intrinsics, usable, region, noise, config)
     low, high = volume_box(region, config)
     cell = _voxel(low, high, config)

@@ -54,11 +54,10 @@ class Region:
 def find_region(
     intrinsics: CameraIntrinsics,
     frames: Sequence[FusionFrame],
-    plane: SupportPlane | None,
     noise: DepthNoise,
     config: FusionConfig,
 ) -> Region:
-    """Return the plane (found if not given) and the box of what stands on it.
+    """Return the plane and the box of what stands on it.
 
     Raises:
         DegenerateError: no plane was found.
@@ -69,8 +68,7 @@ def find_region(
         near, far = config.depth_limits_m
         raise InputError(f"no depth lies within {near} to {far} m; is the unit of the depth right?")
     cameras = np.stack([f.T_world_cam for f in frames])
-    if plane is None:
-        plane = _found_plane(points, depths, cameras, noise, config)
+    plane = _found_plane(points, depths, cameras, noise, config)
     T_table_world = se3.invert(plane.T_world_table)
     focus = _focus(cameras, plane)
     local = se3.transform(T_table_world, points)

@@ -64,7 +64,7 @@ def _fused(inputs: SfmInputs, result: SfmResult, at_m: tuple[float, float] | Non
             continue
         index = int(Path(name).stem)
         frames.append(FusionFrame(index=index, depth_m=depth, T_world_cam=T, rgb=store.rgb(index)))
-    return fuse_object(result.geometry.intrinsics, frames, None, FusionConfig(at_m=at_m))
+    return fuse_object(result.geometry.intrinsics, frames, FusionConfig(at_m=at_m))
 
 
 def _write_dense(fused: "FusedObject", out: Path) -> None:
