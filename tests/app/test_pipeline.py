@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -47,9 +48,11 @@ def written(folder, text):
         (HEAD + SCENES + EXPORT.replace("to", "two"), "line 11: [export] has no option 'two'"),
         (HEAD + SCENES + EXPORT + 'out = "x"\n', "a campaign sets --out itself"),
         (HEAD + SCENES + EXPORT + "[register]\n", "[register] has no effect"),
+        (HEAD + SCENES, "[export] needs `to`"),
+        (HEAD.replace(', "export"', "") + SCENES + EXPORT, "[export] has no effect"),
         (HEAD + EXPORT, "says nowhere where its scenes come from"),
         (HEAD + 'sessions = ["a*"]\n' + SCENES + EXPORT, "says twice"),
-        (HEAD + 'sessions = ["a*"]\n' + EXPORT, "'a*' names nothing"),
+        (HEAD + 'sessions = ["a*"]\n' + EXPORT, "'a*' names no session"),
         (HEAD.replace('"out"', "3") + SCENES, "a folder in quotes"),
     ],
 )
@@ -136,6 +139,29 @@ def whole(tmp_path_factory):
 
 
 @pytest.mark.slow
+def test_results_that_are_gone_or_of_others_are_seen_and_nobodys_files_are_removed(whole, tmp_path):
+    path, out = tmp_path / whole[0].name, tmp_path / "out"
+    shutil.copytree(whole[1], out)
+    written(tmp_path, HEAD + SCENES + EXPORT)
+    # Of one scene the labels' record is lost, the other was labelled again with other maps.
+    (out / "scenes/scene_000000/stages/annotate.json").unlink()
+    assert realsim("annotate", out / "scenes/scene_000001", "--maps", "none").returncode == 0
+    (out / "export/NOTES.md").write_text("mine")
+    card = out / "export/README.md"
+    card.write_text(card.read_text() + "and mine")
+    with no_interpreters():
+        result = run(path)
+    assert result.exit_code == 0, result.output
+    told = " ".join(result.output.split())
+    assert "scene_000000: its result of annotate is gone; it is made again" in told
+    assert "scene_000001: annotate was run on it outside this campaign" in told
+    assert (out / "scenes/scene_000000/stages/annotate.json").is_file()
+    assert sorted(p.name for p in (out / "export.kept").iterdir()) == ["NOTES.md", "README.md"]
+    assert (out / "export.kept/README.md").read_text().endswith("and mine")
+    assert exported(out).keys() == whole[2].keys() and not (out / "export.before").exists()
+
+
+@pytest.mark.slow
 def test_a_scene_that_fails_is_listed_the_others_go_on_and_only_it_is_done_again(whole):
     path, out, _ = whole
     # One scene's poses are damaged, and it has to be done again.
@@ -167,7 +193,7 @@ def test_a_scene_that_fails_is_listed_the_others_go_on_and_only_it_is_done_again
         photograph.write_bytes(photograph.read_bytes()[:100])
         assert run(path).exit_code == 1
     told = document(out)
-    assert told["done"] == 2 and list(told["failed"]) == ["generate"]
+    assert told["done"] == 2 and list(told["failed"]) == ["export"]
     assert "scenes/scene_000000/rgb/000000.png" in (out / "campaign.html").read_text()
 
 

@@ -54,7 +54,7 @@ def checksum_list(folder: Path) -> Path | None:
     folder = folder.resolve()
     for home in (folder, *folder.parents[:ABOVE]):
         path = home / SUMS_FILE
-        if path.is_file() and next(_listed(path, folder), None) is not None:
+        if path.is_file() and next(listed_sums(path, folder), None) is not None:
             return path
     return None
 
@@ -73,7 +73,7 @@ def check_checksums(
         InputError: the list is none, or names files outside its folder.
     """
     folder = folder.resolve()
-    listed = list(_listed(path, folder))
+    listed = list(listed_sums(path, folder))
     changed: list[str] = []
     missing: list[str] = []
     for k, (relative, digest) in enumerate(listed):
@@ -89,7 +89,7 @@ def check_checksums(
     )
 
 
-def _listed(path: Path, folder: Path) -> Iterator[tuple[str, str]]:
+def listed_sums(path: Path, folder: Path) -> Iterator[tuple[str, str]]:
     """Yield (path beside the list, checksum) of every listed file below a folder."""
     prefix = folder.relative_to(path.parent.resolve()).parts
     with path.open(encoding="utf-8", errors="surrogateescape", newline="\n") as lines:

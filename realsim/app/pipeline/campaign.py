@@ -107,7 +107,7 @@ def read_campaign(path: Path, root: Group) -> Campaign:
         name: _step(file, root, commands, tables, name)
         for name in ("generate", "import", *OF_A_SCENE, "stats")
     }
-    _require_used(file, tables, stages, source)
+    _require_used(file, tables | ({"export": exports} if exports else {}), stages, source)
     of_all = [
         step
         for name in stages
@@ -118,6 +118,11 @@ def read_campaign(path: Path, root: Group) -> Campaign:
             else [steps[name]]
         )
     ]
+    if "export" in stages and not all(isinstance(e, dict) and "to" in e for e in several):
+        raise InputError(
+            f"{file.place(('export',))}: an [export] needs `to`, the format to write, such as "
+            'to = "bop"; `realsim export --help` lists them.'
+        )
     if len(several) > 1:
         numbers = iter(range(1, len(several) + 1))
         of_all = [
@@ -209,11 +214,12 @@ def _places(file: ConfigFile, patterns: Sequence[str], source: str) -> list[Path
         absolute = file.path.parent / pattern
         here = sorted(Path(absolute.anchor or ".").glob(str(absolute.relative_to(absolute.anchor))))
         if source == "sessions":
-            here = [p for p in here if p.is_dir()]
+            here = [p for p in here if (p / "session.json").is_file()]
         if not here:
+            wanted = "session" if source == "sessions" else "file or folder"
             raise InputError(
-                f"{file.place(('campaign',), source)}: '{pattern}' names nothing "
-                f"that is there; it is looked for from {file.path.parent.resolve()}."
+                f"{file.place(('campaign',), source)}: '{pattern}' names no {wanted} that is "
+                f"there; it is looked for from {file.path.parent.resolve()}."
             )
         found += [p for p in here if p not in found]
     if source != "generate" and not found:

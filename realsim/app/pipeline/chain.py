@@ -8,10 +8,12 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import BinaryIO
+
+from realsim.store import provenance
 
 PROGRAM = (sys.executable, "-c", "from realsim.app.pipeline.chain import child; child()")
 PR_SET_PDEATHSIG = 1
@@ -51,6 +53,8 @@ class Ended:
     """Largest memory of one process [MB]."""
     told: str
     """Why it failed, in its own words."""
+    result: str = ""
+    """sha256 of the record that the stage left in the scene; empty = it leaves none."""
 
     @property
     def is_done(self) -> bool:
@@ -79,7 +83,14 @@ def run_chain(
         ends.append(end)
         if not end.is_done:
             break
-    return tuple(ends)
+    # At the end: a later stage may renew what an earlier one recorded.
+    return tuple(replace(e, result=result_of(scene, e.stage) if e.is_done else "") for e in ends)
+
+
+def result_of(scene: Path, stage: str) -> str:
+    """Return the sha256 of the record that a stage left in a scene; empty = there is none."""
+    record = scene / provenance.file_of(stage)
+    return provenance.sha256_of(record) if record.is_file() else ""
 
 
 def run_command(command: Command, scene: Path, folder: Path, log: Path) -> Ended:

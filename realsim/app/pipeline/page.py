@@ -15,7 +15,7 @@ from realsim.pages.page import Cell
 from realsim.pages.pictures import spread
 from realsim.untrusted.own_json import read_object
 
-STAGE_HEADER = ("stage", "done", "to look at", "failed", "CPU", "longest", "peak MB")
+STAGE_HEADER = ("stage", "done", "a check failed", "failed", "CPU", "longest", "peak MB")
 if TYPE_CHECKING:
     from realsim.app.pipeline.run import PipelineResult, SceneState
 

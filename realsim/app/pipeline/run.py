@@ -7,14 +7,18 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
 
+from realsim.app.check.checksums import listed_sums
 from realsim.app.console import Console
 from realsim.app.pipeline.campaign import Campaign, Step
-from realsim.app.pipeline.chain import SCENE, Command, Ended, run_chain, run_command
+from realsim.app.pipeline.chain import SCENE, Command, Ended, result_of, run_chain, run_command
 from realsim.errors import InputError, RealsimError
+from realsim.formats.export_folder import FINISHED, SUMS_FILE
 from realsim.many import Outcome, PoolConfig, Task, Worked, open_pool, run_many
+from realsim.store import provenance
 from realsim.store.atomic import storing, write_bytes, write_json
 from realsim.store.lock import only_run_in
 from realsim.untrusted.own_json import read_object, read_own, to_json
@@ -24,6 +28,8 @@ DOCUMENT, PAGE = "campaign.json", "campaign.html"
 CAMPAIGN = "campaign"
 """Key of the document: the campaign's file."""
 RESTART = "--restart"
+OWN_FILES = (SUMS_FILE, FINISHED, provenance.FOLDER_FILE, "provenance.run.json")
+"""Files of an export that its list of checksums does not name."""
 RENEWED_S = 10.0
 """Least time between two writings of the page [s]."""
 LEAST_FREE_MB = 200
@@ -38,6 +44,8 @@ class SceneState:
     folder: Path
     ends: tuple[Ended, ...] = ()
     """How each command that ran ended."""
+    note: str = ""
+    """What was found of its results that this campaign did not leave so."""
 
     @property
     def failure(self) -> Ended | None:
@@ -114,6 +122,9 @@ def run_pipeline(
             for state in [_known(campaign, name, place)]
         ]
         result.kept = sum(result.is_done(s) for s in result.scenes)
+        for scene in result.scenes:
+            if scene.note:
+                console.warn(f"{scene.name}: {scene.note}")
         _write(campaign, result)
         _run_scenes(campaign, where, console, result)
         done = [s for s in result.scenes if result.is_done(s)]
@@ -147,7 +158,41 @@ def _run_of_all(
             result.of_all.append(_run(campaign, step, words, where.processes))
             write_json(record, to_json(result.of_all[-1:]))
             if result.of_all[-1].is_done and before.is_dir():
-                shutil.rmtree(before)
+                kept = _take_away(before, out)
+                if kept is not None:
+                    console.warn(
+                        f"files in the earlier {out.name} that no command wrote, or that were "
+                        f"changed since, stay in {kept}."
+                    )
+
+
+def _take_away(before: Path, new: Path) -> Path | None:
+    """Remove what an earlier run wrote into a folder; return where the rest stays, if there is any.
+
+    Args:
+        before: the folder, moved aside.
+        new: the same as it was made anew.
+    """
+    sums = before / SUMS_FILE
+    written = dict(listed_sums(sums, before.resolve())) if sums.is_file() else {}
+    for path in [p for p in before.rglob("*") if p.is_file()]:
+        name = path.relative_to(before).as_posix()
+        if name in written:
+            is_own = written[name] == provenance.sha256_of(path)
+        else:
+            is_own = name in OWN_FILES or (not written and (new / name).is_file())
+        if is_own:
+            path.unlink()
+    for folder in sorted((p for p in before.rglob("*") if p.is_dir()), reverse=True):
+        with suppress(OSError):  # not empty
+            folder.rmdir()
+    if not any(before.iterdir()):
+        before.rmdir()
+        return None
+    names = (f"{new.name}.kept{f'_{k}' if k > 1 else ''}" for k in count(1))
+    kept = next(p for p in map(new.with_name, names) if not p.exists())
+    before.rename(kept)
+    return kept
 
 
 def scenes_of(campaign: Campaign) -> list[tuple[str, Path]]:
@@ -199,8 +244,8 @@ def show_pipeline(campaign: Campaign, result: PipelineResult, console: Console) 
     console.say(f"{done} of {len(result.scenes)} scenes done, {result.kept} of them before")
     if result.waiting:
         console.warn(
-            f"{' and '.join(result.waiting)} wait for the scenes that failed; `--without-failed` "
-            "takes the others."
+            f"not begun, because something failed: {', '.join(result.waiting)}. "
+            "`--without-failed` takes the scenes that are done."
         )
     console.say(f"page      {campaign.out / PAGE}")
     if result.failed:
@@ -272,6 +317,7 @@ def _run_scenes(
     """Take scenes through their stages, as many at a time as there are workers."""
     place = {s.name: k for k, s in enumerate(result.scenes)}
     due = [s for s in result.scenes if not result.is_done(s) and s.folder.is_dir()]
+    kept = {s.name: tuple(takewhile(lambda e: e.is_done, s.ends)) for s in due}
     total, ended, written = len(due), 0, time.monotonic()
     share = max(1, where.processes // max(1, total))
     commands = [_command(step, [SCENE], share) for step in campaign.of_a_scene]
@@ -281,15 +327,17 @@ def _run_scenes(
             _require_room(campaign.out)
             log = _log(campaign, s.name)
             record = _ends(campaign.out / RECORDS / f"{s.name}.json")
-            args = (_anew(commands, campaign.of_a_scene, record), Worked(s.folder.resolve()),
-                    _folder(campaign), log)  # fmt: skip
+            left = _anew(commands, campaign.of_a_scene, record)[len(kept[s.name]) :]
+            args = (left, Worked(s.folder.resolve()), _folder(campaign), log)
             yield Task(name=s.name, fn=run_chain, args=args)
 
     def keep(outcome: Outcome) -> None:
         nonlocal ended, written
         ended += 1
         k = place[outcome.task.name]
-        ends: tuple[Ended, ...] = outcome.value or (_lost(outcome),)
+        ends: tuple[Ended, ...] = (
+            *kept[outcome.task.name], *(outcome.value or (_lost(outcome),))
+        )  # fmt: skip
         write_json(campaign.out / RECORDS / f"{outcome.task.name}.json", to_json(ends))
         result.scenes[k] = replace(result.scenes[k], ends=ends)
         if time.monotonic() - written > RENEWED_S:  # a thousand scenes have a long page
@@ -342,7 +390,19 @@ def _known(campaign: Campaign, name: str, place: Path) -> SceneState:
     ends = _ends(campaign.out / RECORDS / f"{name}.json")
     commands = [_command(step, [SCENE], 1) for step in campaign.of_a_scene]
     same = _same(commands, ends)
-    return replace(scene, ends=ends[: same.index(False)] if False in same else ends[: len(same)])
+    ends = ends[: same.index(False)] if False in same else ends[: len(same)]
+    for k, end in enumerate(ends):
+        now = result_of(place, end.stage) if end.result else ""
+        if end.result and not now:
+            note = f"its result of {end.stage} is gone; it is made again, with what follows it."
+            return replace(scene, ends=ends[:k], note=note)
+        if now != end.result:
+            note = (
+                f"{end.stage} was run on it outside this campaign; that result stays, and what "
+                "follows is done again."
+            )
+            return replace(scene, ends=(*ends[:k], replace(end, result=now)), note=note)
+    return replace(scene, ends=ends)
 
 
 def _ends(record: Path) -> tuple[Ended, ...]:
