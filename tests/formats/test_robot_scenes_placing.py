@@ -9,7 +9,7 @@ import placed_scenes
 from realsim.errors import InputError
 from realsim.formats.robot_scenes.mesh_obj import look_of
 from realsim.formats.robot_scenes.placed_scene import RigidBody, file_name, seen_from, unique_names
-from realsim.formats.robot_scenes.placing import PlacingConfig, place_scene
+from realsim.formats.robot_scenes.placing import TABLE_MARGIN_M, place_scene
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 
@@ -38,7 +38,7 @@ def test_gravity_and_table_follow_the_plane_wherever_the_world_is():
 
 
 def test_the_table_carries_all_objects_with_its_margin():
-    scene = placed_scenes.placed_scene(table_margin_m=0.2)
+    scene = placed_scenes.placed_scene()
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for o in scene.objects:
         at = se3.invert(scene.table.T_world_table) @ o.T_world_obj
@@ -46,7 +46,7 @@ def test_the_table_carries_all_objects_with_its_margin():
         low, high = np.minimum(low, points[:, :2].min(0)), np.maximum(high, points[:, :2].max(0))
         assert abs(points[:, 2].min()) < 1e-12
     half = np.array(scene.table.size_m) / 2
-    assert np.allclose(low, -half + 0.2) and np.allclose(high, half - 0.2)
+    assert np.allclose(low, -half + TABLE_MARGIN_M) and np.allclose(high, half - TABLE_MARGIN_M)
 
 
 def test_an_object_without_known_matter_has_its_hull_and_its_density_and_a_note_says_so():
@@ -119,4 +119,3 @@ def test_colours_of_vertices_become_a_texture_of_the_faces_mean_colours():
     shown = look.texture[((1 - at[:, 1]) * height).astype(int), (at[:, 0] * width).astype(int)]
     wanted = np.rint(model.mesh.colors[model.mesh.faces].mean(axis=1))
     assert np.array_equal(shown, wanted)
-    assert PlacingConfig().friction == 1.0

@@ -10,7 +10,7 @@ import pytest
 from realsim import CameraIntrinsics, GraspSet, InputError, View
 from realsim.geometry import camera, depth, se3
 from realsim.rendering import overlay
-from realsim.review.content.config import GripperDrawing, SceneConfig
+from realsim.review.content.config import SceneConfig
 from realsim.review.content.content import SceneContent
 from realsim.review.content.views import Region, region_of, strided
 from realsim.review.drawing import grasp_drawing
@@ -219,7 +219,7 @@ def test_a_moved_object_takes_its_grasps_out_of_sight(shown: SceneContent) -> No
 
 
 def test_the_gripper_is_as_wide_as_the_grasp() -> None:
-    vertices, faces = grasp_drawing.gripper_mesh(GripperDrawing())
+    vertices, faces = grasp_drawing.gripper_mesh()
     assert len(faces) <= 24 and faces.max() < len(vertices)
     rng = np.random.default_rng(1)
     for width in rng.uniform(0.01, 0.1, 5):

@@ -16,7 +16,6 @@ from realsim.review.replaying.grasp_replay import (
     GraspMotion,
     HandApproach,
     Motions,
-    ReplayConfig,
     ReplayPlayer,
     hand_approach,
 )
@@ -189,8 +188,7 @@ def test_another_grasp_ends_the_thread_of_the_one_before(server: viser.ViserServ
 
 def test_a_browser_that_is_gone_ends_the_replay(server: viser.ViserServer) -> None:
     there = [True]
-    config = ReplayConfig(rate_hz=50.0)
-    player = player_of(server, Given(carried(60.0, 5.0)), config=config, connected=lambda: there[0])
+    player = player_of(server, Given(carried(60.0, 5.0)), connected=lambda: there[0])
     player.show(0, 0)
     assert player.playing
     there[0] = False

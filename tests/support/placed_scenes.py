@@ -1,11 +1,13 @@
 """A scene for engines: two brackets (not symmetric, coloured), a textured box, a turned table."""
 
+from dataclasses import replace
+
 import numpy as np
 import trimesh
 
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.robot_scenes.placed_scene import SceneCamera
-from realsim.formats.robot_scenes.placing import Matter, PlacingConfig, place_scene
+from realsim.formats.robot_scenes.placing import Matter, place_scene
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
 
@@ -74,12 +76,13 @@ def registered():
     return scene, {1: one, 2: two}, {1: matter}
 
 
-def placed_scene(**config):
+def placed_scene():
     view = SceneCamera(
         name="view_0", intrinsics=CAMERA, T_world_cam=se3.look_at([0.5, -0.5, 1.2], [0.5, 0.1, 0.7])
     )
-    config = PlacingConfig(friction=FRICTION, **config)
-    return place_scene(*registered(), config, cameras=[view])
+    scene = place_scene(*registered(), cameras=[view])
+    bodies = {i: replace(body, friction=FRICTION) for i, body in scene.bodies.items()}
+    return replace(scene, bodies=bodies)
 
 
 def corners(body):

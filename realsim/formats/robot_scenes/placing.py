@@ -1,7 +1,7 @@
 """A registered scene put together with its matter, so that an engine can take it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,6 +21,13 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 from realsim.records import ObjectModel, Scene, names_of
 
+FRICTION = 1.0
+"""Coulomb coefficient of an object on the table; 1 is that of Robot School's worlds."""
+TABLE_MARGIN_M = 0.5
+"""The table reaches so far beyond the objects [m]: what is knocked over stays on it."""
+TABLE_THICKNESS_M = 0.05
+"""[m]: thick enough that no fast object passes through it in a step."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Matter:
@@ -35,27 +42,10 @@ class Matter:
     """Corners (V, 3) of its convex parts [m]."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PlacingConfig:
-    """What a registered scene does not tell."""
-
-    friction: float = 1.0
-    """Coulomb coefficient of an object on the table; 1 is that of Robot School's worlds."""
-    frictions: Mapping[int, float] = field(default_factory=dict[int, float])
-    """By object id, instead of `friction`."""
-    table_margin_m: float = 0.5
-    """The table reaches so far beyond the objects [m]: what is knocked over stays on it."""
-    table_thickness_m: float = 0.05
-    """[m]: thick enough that no fast object passes through it in a step."""
-    gravity: float = GRAVITY
-    """[m/s^2] along the table's normal, into the table."""
-
-
 def place_scene(
     scene: Scene,
     models: Mapping[int, ObjectModel],
     matter: Mapping[int, Matter] | None = None,
-    config: PlacingConfig | None = None,
     *,
     cameras: Sequence[SceneCamera] = (),
 ) -> PlacedScene:
@@ -66,13 +56,12 @@ def place_scene(
         models: by object id.
         matter: by object id. An object without it gets the mass of its model's density and
             collides as its hull, and a note says so.
-        config: friction, table, gravity.
         cameras: to be written too.
 
     Raises:
         InputError: no plane, no objects, an object without a model, or a flat mesh.
     """
-    config, matter = config or PlacingConfig(), matter or {}
+    matter = matter or {}
     if scene.plane is None:
         raise InputError(
             f"scene '{scene.name}' has no supporting plane, so neither the table nor the direction "
@@ -88,8 +77,7 @@ def place_scene(
         )
     notes: list[str] = []
     bodies = {
-        i: _body(models[i], matter.get(i), config, notes)
-        for i in sorted({o.obj_id for o in scene.objects})
+        i: _body(models[i], matter.get(i), notes) for i in sorted({o.obj_id for o in scene.objects})
     }
     names = unique_names({o.instance: models[o.obj_id].name for o in scene.objects})
     objects = tuple(
@@ -103,24 +91,21 @@ def place_scene(
         name=scene.name,
         bodies=bodies,
         objects=objects,
-        table=_table(T_world_table, objects, bodies, config),
-        gravity=-config.gravity * T_world_table[:3, 2],
+        table=_table(T_world_table, objects, bodies),
+        gravity=-GRAVITY * T_world_table[:3, 2],
         cameras=tuple(cameras),
         notes=tuple(notes),
     )
 
 
-def _body(
-    model: ObjectModel, known: Matter | None, config: PlacingConfig, notes: list[str]
-) -> RigidBody:
-    friction = config.frictions.get(model.obj_id, config.friction)
+def _body(model: ObjectModel, known: Matter | None, notes: list[str]) -> RigidBody:
     if known is not None:
         return RigidBody(
             model=model,
             mass_kg=known.mass_kg,
             center_of_mass=known.center_of_mass,
             inertia=known.inertia,
-            friction=friction,
+            friction=FRICTION,
             parts=tuple(
                 convex_part(p, f"part {k} of object '{model.name}'")
                 for k, p in enumerate(known.parts)
@@ -140,15 +125,12 @@ def _body(
         mass_kg=solid.mass_kg,
         center_of_mass=solid.center_of_mass,
         inertia=solid.inertia,
-        friction=friction,
+        friction=FRICTION,
     )
 
 
 def _table(
-    T_world_table: Array,
-    objects: tuple[PlacedObject, ...],
-    bodies: Mapping[int, RigidBody],
-    config: PlacingConfig,
+    T_world_table: Array, objects: tuple[PlacedObject, ...], bodies: Mapping[int, RigidBody]
 ) -> TableBox:
     """Return a box under all objects, its top in the plane."""
     T_table_world = se3.invert(T_world_table)
@@ -158,9 +140,9 @@ def _table(
     ]
     low = np.min([p.min(axis=0) for p in points], axis=0)
     high = np.max([p.max(axis=0) for p in points], axis=0)
-    middle, size = (low + high) / 2.0, high - low + 2.0 * config.table_margin_m
+    middle, size = (low + high) / 2.0, high - low + 2.0 * TABLE_MARGIN_M
     return TableBox(
         T_world_table=T_world_table @ se3.from_translation([middle[0], middle[1], 0.0]),
         size_m=(float(size[0]), float(size[1])),
-        thickness_m=config.table_thickness_m,
+        thickness_m=TABLE_THICKNESS_M,
     )

@@ -8,7 +8,7 @@ is given.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,7 @@ from realsim.rendering.depth_sensors.fit_resimulated import (
     whole_pixel_gain,
 )
 from realsim.rendering.depth_sensors.model import DepthSensorModel
-from realsim.rendering.depth_sensors.plane import PlaneConfig, PlaneView, find_plane
+from realsim.rendering.depth_sensors.plane import PlaneView, find_plane
 from realsim.rendering.depth_sensors.plane_faults import (
     Estimate,
     HoleCount,
@@ -48,21 +48,11 @@ from realsim.rendering.depth_sensors.statistics import Step, disparity_step
 
 HEAVY_TAILS = 1.15
 """Typical noise that differs by more than this factor from the standard deviation's."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DepthFitConfig:
-    """How a depth sensor is fitted."""
-
-    plane: PlaneConfig = field(default_factory=PlaneConfig)
-    """How each frame's plane is found."""
-    least_tiles: int = 8
-    """Tiles of 64 px that all planes together must fill: with fewer the spread between them says
-    nothing about the uncertainty."""
-    distance_ratio: float = 1.3
-    """Farthest over nearest plane, from which on the law of noise and distance is checked."""
-    seed: int = 0
-    """Seed of the simulation that shows how often neighbours are equal without resampling."""
+LEAST_TILES = 8
+"""Tiles of 64 px that all planes together must fill: with fewer the spread between them says
+nothing about the uncertainty."""
+DISTANCE_RATIO = 1.3
+"""Farthest over nearest plane, from which on the law of noise and distance is checked."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -114,7 +104,7 @@ class FittedDepthModel:
         }
 
 
-def fit_depth_model(  # noqa: PLR0913 - what can be known of frames, each optional
+def fit_depth_model(
     frames: Sequence[ArrayLike],
     intrinsics: CameraIntrinsics,
     profile_: DepthProfile | str,
@@ -123,7 +113,6 @@ def fit_depth_model(  # noqa: PLR0913 - what can be known of frames, each option
     regions: Sequence[Mask | None] | None = None,
     truths: Sequence[ArrayLike] | None = None,
     names: Sequence[str] | None = None,
-    config: DepthFitConfig | None = None,
     tick: Callable[[int, int], None] | None = None,
 ) -> FittedDepthModel:
     """Return the parameters of a depth sensor from frames of a plane.
@@ -136,13 +125,11 @@ def fit_depth_model(  # noqa: PLR0913 - what can be known of frames, each option
         regions: (H, W) each, where to look for the plane; None = everywhere.
         truths: (H, W) exact depth [m] each (from a board, or a registered table), for the bias.
         names: of the frames, for messages.
-        config: how to fit.
         tick: called with (done, total) after each frame's plane, and at the end.
 
     Raises:
         InputError: no frames, sizes or units that do not fit, or a frame without a plane.
     """
-    config = config or DepthFitConfig()
     kind = profile(profile_) if isinstance(profile_, str) else profile_
     unit = kind.depth_unit_m if unit_m is None else unit_m
     names = names or [f"frame {k}" for k in range(len(frames))]
@@ -153,13 +140,13 @@ def fit_depth_model(  # noqa: PLR0913 - what can be known of frames, each option
         planes.append(
             find_plane(
                 depth, intrinsics, kind.baseline_m, region=None if regions is None else regions[k],
-                config=config.plane, name=names[k],
+                name=names[k],
             )
         )  # fmt: skip
         _require_in_reach(planes[-1].distance_m, kind, unit, names[k])
         if tick:
             tick(k + 1, len(depths) + 1)
-    fit = _of_planes(depths, planes, intrinsics, kind, unit, names, truths, config)
+    fit = _of_planes(depths, planes, intrinsics, kind, unit, names, truths)
     if tick:
         tick(len(depths) + 1, len(depths) + 1)
     return fit
@@ -193,7 +180,6 @@ def _of_planes(
     unit: float,
     names: Sequence[str],
     truths: Sequence[ArrayLike] | None,
-    config: DepthFitConfig,
 ) -> FittedDepthModel:
     """Return the fit to planes that were found in their frames."""
     fB = intrinsics.fx * kind.baseline_m
@@ -218,8 +204,8 @@ def _of_planes(
             f"the surfaces are not flat to the noise: only what is faster than {trend:.0f} px "
             "was taken for noise. A flatter wall says more."
         )
-    found |= _noise_estimates(shape, spread, shown, step, rounding, len(sums.products), config)
-    found["distance_exponent"] = _distance_law(shown, config)
+    found |= _noise_estimates(shape, spread, shown, step, rounding, len(sums.products))
+    found["distance_exponent"] = _distance_law(shown)
     holes = count_holes(planes)
     found |= blobs_of(planes) | grazing_of(holes)
     found |= bands | {"warp_px": warp_of(planes)}
@@ -228,7 +214,7 @@ def _of_planes(
     )
     found["bias_px"] = _bias(planes, truths, fB)
     found |= edges_of(depths, intrinsics, DepthSensorModel.from_profile(kind))
-    model, more = _as_simulated(depths, planes, intrinsics, kind, unit, found, config.seed)
+    model, more = _as_simulated(depths, planes, intrinsics, kind, unit, found)
     notes += more
     notes += [f"{name}: {e.note}" for name, e in found.items() if e.note]
     return FittedDepthModel(
@@ -244,7 +230,6 @@ def _as_simulated(
     kind: DepthProfile,
     unit: float,
     found: dict[str, Estimate],
-    seed: int,
 ) -> tuple[DepthSensorModel, list[str]]:
     """Return the model, and notes, after comparing the frames with a simulation of their planes.
 
@@ -252,7 +237,7 @@ def _as_simulated(
     """
     notes: list[str] = []
     model = _model(kind, unit, found)
-    ratio, wider = typical_noise(depths, planes, intrinsics, model, seed)
+    ratio, wider = typical_noise(depths, planes, intrinsics, model)
     found["correlation_px"] = scaled(found["correlation_px"], wider)
     found |= {n: scaled(found[n], ratio) for n in ("disparity_noise_px", "slow_noise_px")}
     model = _model(kind, unit, found)
@@ -262,7 +247,7 @@ def _as_simulated(
             f"the places have {ratio:.2f} x what the standard deviation says, and the model has "
             "what they have."
         )
-    pitch = resampling_pitch(depths, planes, intrinsics, model, unit, seed)
+    pitch = resampling_pitch(depths, planes, intrinsics, model, unit)
     found["native_pitch_px"] = pitch
     return replace(model, native_pitch_px=pitch.value if pitch.determined else 1.0), notes
 
@@ -316,13 +301,12 @@ def _noise_estimates(
     step: Step,
     rounding: float,
     tiles: int,
-    config: DepthFitConfig,
 ) -> dict[str, Estimate]:
     """Return the noise's size, radius and aspect, and those of its slow part."""
     note = ""
-    if spread is None or tiles < config.least_tiles:
+    if spread is None or tiles < LEAST_TILES:
         note = (
-            f"the planes fill only {tiles} squares of 64 px; {config.least_tiles} are needed to "
+            f"the planes fill only {tiles} squares of 64 px; {LEAST_TILES} are needed to "
             "know the noise and its uncertainty. Go nearer, or add frames."
         )
     u = spread or NoiseShape(
@@ -375,11 +359,11 @@ def _step_estimate(step: Step, kind: DepthProfile) -> dict[str, Estimate]:
     return {"quantum_px": Estimate(kind.quantum_px, float("inf"), False, note)}
 
 
-def _distance_law(frames: Sequence[FrameFit], config: DepthFitConfig) -> Estimate:
+def _distance_law(frames: Sequence[FrameFit]) -> Estimate:
     """Return k of sigma_z ~ z^k: 2 + the slope of ln sigma_d over ln z."""
     z = np.array([f.distance_m for f in frames])
     s = np.array([f.sigma_px for f in frames])
-    if z.max() / z.min() < config.distance_ratio or len(z) < 2:
+    if z.max() / z.min() < DISTANCE_RATIO or len(z) < 2:
         return Estimate(
             2.0, float("inf"), False,
             f"the planes lie at {z.min():.2f} to {z.max():.2f} m: one distance only. That noise "

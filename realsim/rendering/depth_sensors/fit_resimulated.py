@@ -35,13 +35,15 @@ LEAST_COLUMN, LATTICE = 60, 0.3
 LEAST_PITCH = 1.15
 """A smaller pitch is none: rounding and noise make a few neighbours equal, too."""
 
+SEED = 0
+"""Seed of the simulation of the frames' planes."""
+
 
 def typical_noise(
     depths: Sequence[NDArray[Any]],
     planes: Sequence[PlaneView],
     intrinsics: CameraIntrinsics,
     model: DepthSensorModel,
-    seed: int,
 ) -> tuple[float, float]:
     """Return factors of the noise and of its radius that give the model what small windows have.
 
@@ -54,7 +56,7 @@ def typical_noise(
         tried = replace(model, correlation_px=radius * model.correlation_px)
         ratios: list[list[float]] = []
         for depth, plane in list(zip(depths, planes, strict=True))[:MOST_FRAMES]:
-            simulated = _resimulated(tried, plane, intrinsics, seed)
+            simulated = _resimulated(tried, plane, intrinsics)
             on = plane.mask & (simulated > 0)
             ratios.append([
                 local_noise(np.where(on, depth, 0), intrinsics, model.baseline_m, on, w).median_px
@@ -123,12 +125,12 @@ def scaled(estimate: Estimate, ratio: float) -> Estimate:
 
 
 def _resimulated(
-    model: DepthSensorModel, plane: PlaneView, intrinsics: CameraIntrinsics, seed: int
+    model: DepthSensorModel, plane: PlaneView, intrinsics: CameraIntrinsics
 ) -> Array32:
     """Return what the model makes of a plane that was found."""
     exact = np.where(plane.area, intrinsics.fx * model.baseline_m / plane.disparity, 0)
     plain = replace(model, occlusion=False, bias_px=0.0)
-    return plain.measure(np.nan_to_num(exact), intrinsics, np.random.default_rng(seed))
+    return plain.measure(np.nan_to_num(exact), intrinsics, np.random.default_rng(SEED))
 
 
 def resampling_pitch(
@@ -137,7 +139,6 @@ def resampling_pitch(
     intrinsics: CameraIntrinsics,
     model: DepthSensorModel,
     unit_m: float,
-    seed: int,
 ) -> Estimate:
     """Return over how many pixels one measurement is repeated.
 
@@ -154,7 +155,7 @@ def resampling_pitch(
             continue
         for _ in range(4):
             tried = replace(model, native_pitch_px=max(pitch, 1.0))
-            simulated = _resimulated(tried, plane, intrinsics, seed)
+            simulated = _resimulated(tried, plane, intrinsics)
             share = _equal_share(simulated, plane.mask & (simulated > 0), unit_m)
             pitch = float(np.clip(pitch * (1 - share) / max(1 - real, 1e-3), 1.0, 10.0))
         found.append(pitch)

@@ -19,27 +19,21 @@ from realsim.rendering.depth_sensors.statistics import require_metres
 BENT_SHARE = 0.35
 """Pixels between one and two tolerances from the best plane, as a share of those within one, from
 which on the surface is bent: a sphere has half as many, noise one in 16 000."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PlaneConfig:
-    """How the plane of a picture is looked for."""
-
-    trials: int = 300
-    """Triples of pixels tried: with one measured pixel in four on the plane, 300 miss it with a
-    probability of 1 %."""
-    samples: int = 20_000
-    """Pixels that judge a triple."""
-    tolerance_px: float = 1.0
-    """Residual of a plane's pixel at first [px]; afterwards four times the measured spread."""
-    least_share: float = 0.05
-    """Share of the picture that a plane must fill to say anything."""
-    rim_px: int = 4
-    """Pixels near anything else that are left out: edges smear [px]."""
-    closing_px: int = 15
-    """Holes up to twice this width belong to the plane [px]."""
-    seed: int = 0
-    """Seed of the triples."""
+TRIALS = 300
+"""Triples of pixels tried: with one measured pixel in four on the plane, 300 miss it with a
+probability of 1 %."""
+SAMPLES = 20_000
+"""Pixels that judge a triple."""
+TOLERANCE_PX = 1.0
+"""Residual of a plane's pixel at first [px]; afterwards four times the measured spread."""
+LEAST_SHARE = 0.05
+"""Share of the picture that a plane must fill to say anything."""
+RIM_PX = 4
+"""Pixels near anything else that are left out: edges smear [px]."""
+CLOSING_PX = 15
+"""Holes up to twice this width belong to the plane [px]."""
+SEED = 0
+"""Seed of the triples."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -73,7 +67,6 @@ def find_plane(
     baseline_m: float,
     *,
     region: Mask | None = None,
-    config: PlaneConfig | None = None,
     name: str = "the depth picture",
 ) -> PlaneView:
     """Return the plane that most pixels lie on.
@@ -83,13 +76,11 @@ def find_plane(
         intrinsics: the camera.
         baseline_m: of the sensor [m].
         region: (H, W) where to look; None = everywhere.
-        config: how to look.
         name: what to call the picture in messages.
 
     Raises:
         InputError: wrong unit or size, or no plane in the picture.
     """
-    config = config or PlaneConfig()
     depth = require_metres(depth_m, name)
     require_same_size(depth, intrinsics, name)
     rays = ray_table(intrinsics)
@@ -97,15 +88,15 @@ def find_plane(
     looked = known if region is None else known & region
     fB = intrinsics.fx * baseline_m
     d = np.where(known, fB / np.where(known, depth, 1), 0).astype(np.float32)
-    p, tolerance = _consensus(rays[looked].astype(np.float64), d[looked], config, name)
+    p, tolerance = _consensus(rays[looked].astype(np.float64), d[looked], name)
     plane = (rays @ p.astype(np.float32)).astype(np.float32)
     away = d - plane
     on = looked & (np.abs(away) <= tolerance)
-    area, mask = _extent(on, known & (np.abs(away) > tolerance), config)
-    least = config.least_share * depth.size
+    area, mask = _extent(on, known & (np.abs(away) > tolerance))
+    least = LEAST_SHARE * depth.size
     if mask.sum() < least:
         raise InputError(
-            f"{name} shows no plane that fills {100 * config.least_share:.0f} % of it: the largest "
+            f"{name} shows no plane that fills {100 * LEAST_SHARE:.0f} % of it: the largest "
             f"has {int(mask.sum())} of {depth.size} pixels. Frames of a wall or a bare table are "
             "taken; a mask of the plane's region helps where other things are in view."
         )
@@ -116,27 +107,27 @@ def find_plane(
         disparity=np.where(plane > 0, plane, np.nan).astype(np.float32),
         residual=residual,
         area=area,
-        holes=_holes(area, known, known & (np.abs(away) > tolerance), plane, config),
+        holes=_holes(area, known, known & (np.abs(away) > tolerance), plane),
         angle_deg=_angle(rays, p),
         distance_m=float(np.median(depth[mask])),
     )
 
 
-def _consensus(rays: Array, d: Array32, config: PlaneConfig, name: str) -> tuple[Array, float]:
+def _consensus(rays: Array, d: Array32, name: str) -> tuple[Array, float]:
     """Return p of d = p . ray that most samples (N, 3), (N,) agree with, and their tolerance."""
-    rng = np.random.default_rng(config.seed)
+    rng = np.random.default_rng(SEED)
     if len(d) < 1000:
         raise InputError(
             f"{name} has {len(d)} measured pixels where the plane is looked for; 1000 or more say "
             "something."
         )
-    chosen = rng.choice(len(d), min(len(d), config.samples), replace=False)
+    chosen = rng.choice(len(d), min(len(d), SAMPLES), replace=False)
     A, y = rays[chosen], d[chosen].astype(np.float64)
-    tolerance = min(config.tolerance_px, 0.05 * float(np.median(y)))
+    tolerance = min(TOLERANCE_PX, 0.05 * float(np.median(y)))
     best: Array = np.zeros(3)
     most = -1
     judge_A, judge_y = A[:4000], y[:4000]
-    for triple in rng.integers(len(y), size=(config.trials, 3)):
+    for triple in rng.integers(len(y), size=(TRIALS, 3)):
         if abs(np.linalg.det(A[triple])) < 1e-9:
             continue
         p = np.asarray(np.linalg.solve(A[triple], y[triple]), np.float64)
@@ -156,15 +147,15 @@ def _consensus(rays: Array, d: Array32, config: PlaneConfig, name: str) -> tuple
     return best, tolerance
 
 
-def _extent(on: Mask, other: Mask, config: PlaneConfig) -> tuple[Mask, Mask]:
+def _extent(on: Mask, other: Mask) -> tuple[Mask, Mask]:
     """Return the area of the greatest connected plane with its holes, and its sure pixels."""
     import cv2
 
     core = cv2.morphologyEx(on.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     # Single noisy pixels are no other thing; a thing has a body.
     body = cv2.morphologyEx(other.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    near = _within(core > 0, config.closing_px)
-    closed = ~_within(~near, config.closing_px) & ~_within(body > 0, config.rim_px)
+    near = _within(core > 0, CLOSING_PX)
+    closed = ~_within(~near, CLOSING_PX) & ~_within(body > 0, RIM_PX)
     count, parts, stats, _ = cv2.connectedComponentsWithStats(closed.astype(np.uint8))
     if count < 2:
         return np.zeros_like(on), np.zeros_like(on)
@@ -181,7 +172,7 @@ def _within(mask: Mask, radius_px: int) -> Mask:
     return np.asarray(cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)) <= radius_px
 
 
-def _holes(area: Mask, known: Mask, other: Mask, plane: Array32, config: PlaneConfig) -> Mask:
+def _holes(area: Mask, known: Mask, other: Mask, plane: Array32) -> Mask:
     """Return the unmeasured pixels of the area that no thing before the plane explains.
 
     A hole that touches another thing may be its shadow; and the band at the left, as wide as the
@@ -193,7 +184,7 @@ def _holes(area: Mask, known: Mask, other: Mask, plane: Array32, config: PlaneCo
     parts = np.asarray(found, np.int64)
     body = cv2.morphologyEx(other.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     explained = np.zeros(count, dtype=bool)
-    explained[np.unique(parts[_within(np.asarray(body) > 0, config.rim_px + 2)])] = True
+    explained[np.unique(parts[_within(np.asarray(body) > 0, RIM_PX + 2)])] = True
     covered = np.arange(area.shape[1]) >= plane
     return area & ~known & covered & ~explained[parts]
 

@@ -1,20 +1,8 @@
 """How much of a scene the review shows, and of what size."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from realsim.errors import InputError
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class GripperDrawing:
-    """Size of the drawn gripper; the fingers' distance is the grasp's own width."""
-
-    finger_m: float = 0.035
-    """Length of the fingers [m]; about that of a two-finger gripper's pads."""
-    stem_m: float = 0.03
-    """Length of the bar behind the fingers that shows the approach [m]."""
-    bar_m: float = 0.002
-    """Thickness of palm and stem [m]: a pixel or two where a whole table is in view."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -56,8 +44,6 @@ class SceneConfig:
     """How far about the objects the cloud is shown [m]: enough to see what they stand on."""
     grid_m: float = 1.2
     """Edge of the table's grid [m]."""
-    gripper: GripperDrawing = field(default_factory=GripperDrawing)
-    """How a grasp is drawn."""
 
     def __post_init__(self) -> None:
         """Check that every size is positive, and that the coarse level is no more than is shown."""

@@ -13,7 +13,6 @@ from realsim.geometry import camera, se3
 from realsim.records import STAGES, GraspSet
 from realsim.rendering.overlay import evenly_ranked
 from realsim.review.content import quick_png
-from realsim.review.content.config import GripperDrawing
 from realsim.store.session_store import depth_path
 
 if TYPE_CHECKING:
@@ -21,6 +20,12 @@ if TYPE_CHECKING:
 
 BARS = 3
 """Sides of a bar: the fewest that can be seen from everywhere."""
+FINGER_M = 0.035
+"""Length of the drawn fingers [m]; about that of a two-finger gripper's pads."""
+STEM_M = 0.03
+"""Length of the bar behind the fingers that shows the approach [m]."""
+BAR_M = 0.002
+"""Thickness of palm and stem [m]: a pixel or two where a whole table is in view."""
 FINGER_SHARE = 0.04
 """Thickness of a finger, as a share of the width: it grows with it, since one mesh is scaled."""
 LEAST_WIDTH_M = 0.002
@@ -166,19 +171,18 @@ def linear_rgb(rgb: Rgb) -> Rgb:
     return np.rint(255.0 * linear).astype(np.uint8)
 
 
-def gripper_mesh(drawing: GripperDrawing) -> tuple[Array32, NDArray[np.uint32]]:
+def gripper_mesh() -> tuple[Array32, NDArray[np.uint32]]:
     """Return the gripper of width 1 as vertices (24, 3) in its grasp frame and faces (24, 3).
 
     Two fingers, palm and stem, each a bar of three sides. Scaled along y by a grasp's width it is
     that grasp: the fingers' inner sides are then so far apart.
     """
-    bar, back = drawing.bar_m, -drawing.finger_m
-    share = FINGER_SHARE
+    back, share = -FINGER_M, FINGER_SHARE
     bars = [
-        _bar([0.0, -0.5 - share / 2, back], [0, 0, 1], drawing.finger_m, [bar, share]),
-        _bar([0.0, 0.5 + share / 2, back], [0, 0, 1], drawing.finger_m, [bar, share]),
-        _bar([0.0, -0.5 - share, back], [0, 1, 0], 1 + 2 * share, [bar, bar]),
-        _bar([0.0, 0.0, back - drawing.stem_m], [0, 0, 1], drawing.stem_m, [bar, share]),
+        _bar([0.0, -0.5 - share / 2, back], [0, 0, 1], FINGER_M, [BAR_M, share]),
+        _bar([0.0, 0.5 + share / 2, back], [0, 0, 1], FINGER_M, [BAR_M, share]),
+        _bar([0.0, -0.5 - share, back], [0, 1, 0], 1 + 2 * share, [BAR_M, BAR_M]),
+        _bar([0.0, 0.0, back - STEM_M], [0, 0, 1], STEM_M, [BAR_M, share]),
     ]
     vertices = np.concatenate(bars)
     k = np.arange(BARS)

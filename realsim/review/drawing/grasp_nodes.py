@@ -10,7 +10,6 @@ from realsim.arrays import Array, Rows
 from realsim.interop import viser_wxyz_position
 from realsim.records import GraspSet
 from realsim.rendering.overlay import grasp_rgb
-from realsim.review.content.config import SceneConfig
 from realsim.review.drawing.grasp_drawing import gripper_mesh, gripper_scales, linear_rgb
 
 NAME = "/grasps"
@@ -19,9 +18,9 @@ NAME = "/grasps"
 class GraspNodes:
     """The grasps drawn in one scene."""
 
-    def __init__(self, api: viser.SceneApi, config: SceneConfig) -> None:
+    def __init__(self, api: viser.SceneApi) -> None:
         """Draw nothing yet."""
-        self._api, self._config = api, config
+        self._api = api
         self._node: viser.BatchedMeshHandle | None = None
         self.drawn: list[tuple[int, int]] = []
         """Instance and row of every gripper, in the order of the batch."""
@@ -38,7 +37,7 @@ class GraspNodes:
         wxyzs, positions = viser_wxyz_position(np.concatenate(Ts))
         widths = np.concatenate([g.widths_m[rows] for g, rows in found])
         rgb = np.concatenate([grasp_rgb(g, rows) for g, rows in found])
-        vertices, faces = gripper_mesh(self._config.gripper)
+        vertices, faces = gripper_mesh()
         self.drawn = [(g.instance, int(row)) for g, rows in found for row in rows]
         # Off: of two dozen triangles nothing can be left out.
         self._node = self._api.add_batched_meshes_simple(

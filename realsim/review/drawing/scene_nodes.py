@@ -68,7 +68,7 @@ class SceneNodes:
         self._grid: viser.GridHandle | None = None
         self._box: viser.LineSegmentsHandle | None = None
         self._cloud = CloudNodes(api, content.cloud, config)
-        self._grasps = GraspNodes(api, config)
+        self._grasps = GraspNodes(api)
         self._on_object: OnInstance = lambda _: None
         self._on_camera: OnInstance = lambda _: None
         # The pieces of the cloud come from a thread of their own while buttons are pressed.

@@ -184,14 +184,10 @@ def hand_approach(
     )
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ReplayConfig:
-    """How a motion is played."""
-
-    rate_hz: float = 20.0
-    """Frames per second: the school looks as often, and a dozen nodes a frame are 30 kB/s."""
-    slider_hz: float = 4.0
-    """How often the slider follows [1/s]: it tells where one is, the scene tells the rest."""
+RATE_HZ = 20.0
+"""Frames per second: the school looks as often, and a dozen nodes a frame are 30 kB/s."""
+SLIDER_HZ = 4.0
+"""How often the slider follows [1/s]: it tells where one is, the scene tells the rest."""
 
 
 class ReplayPlayer:
@@ -203,7 +199,6 @@ class ReplayPlayer:
         gui: viser.GuiApi,
         motions: Motions,
         *,
-        config: ReplayConfig | None = None,
         atomic: Callable[[], contextlib.AbstractContextManager[Any]] = contextlib.nullcontext,
         connected: Callable[[], bool] = lambda: True,
         on_carried: Callable[[int, bool], None] | None = None,
@@ -215,14 +210,13 @@ class ReplayPlayer:
             scene: of the server, or of one client.
             gui: likewise; the controls go into the container that is open.
             motions: where motions come from.
-            config: rates.
             atomic: groups the updates of a frame (`client.atomic`).
             connected: whether the browser is still there; asked before each frame.
             on_carried: told when an object is carried off (instance, True) and stands again
                 (instance, False): the caller may hide the one that stays behind.
             name: of the node under which everything is drawn.
         """
-        self._motions, self._config = motions, config or ReplayConfig()
+        self._motions = motions
         self._atomic, self._connected, self._on_carried = atomic, connected, on_carried
         self._closed: list[Callable[[], None]] = []
         self._nodes = ReplayNodes(scene, name)
@@ -340,7 +334,7 @@ class ReplayPlayer:
 
     def _run(self, motion: GraspMotion, stop: threading.Event) -> None:
         """Play until the end, until it is stopped, or until the browser is gone."""
-        step, last = 1.0 / self._config.rate_hz, time.monotonic()
+        step, last = 1.0 / RATE_HZ, time.monotonic()
         slider_due = 0.0
         while not stop.wait(step):
             if not self._connected():
@@ -354,7 +348,7 @@ class ReplayPlayer:
                 at_end = self._time >= motion.time_s[-1]
                 self._time = min(self._time, float(motion.time_s[-1]))
                 due = at_end or now >= slider_due
-                slider_due = now + 1.0 / self._config.slider_hz if due else slider_due
+                slider_due = now + 1.0 / SLIDER_HZ if due else slider_due
                 self._draw(slider=due)
                 if at_end:
                     self._stop = None

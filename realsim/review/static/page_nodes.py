@@ -102,7 +102,7 @@ def _build(api: Any, content: SceneContent, scene: Scene, size: StaticSize) -> N
     for view in spread(content.shown_views, size.cameras):
         add_frustum(api, f"/cameras/{view.index}", view, content, config)
     _add_objects(api, content, scene, size)
-    _add_grasps(api, content, scene, size, config)
+    _add_grasps(api, content, scene, size)
 
 
 def _add_objects(api: Any, content: SceneContent, scene: Scene, size: StaticSize) -> None:
@@ -134,11 +134,9 @@ def _add_objects(api: Any, content: SceneContent, scene: Scene, size: StaticSize
         )
 
 
-def _add_grasps(
-    api: Any, content: SceneContent, scene: Scene, size: StaticSize, config: SceneConfig
-) -> None:
+def _add_grasps(api: Any, content: SceneContent, scene: Scene, size: StaticSize) -> None:
     """Add the grasps in one node per object and class of the label."""
-    vertices, faces = gripper_mesh(config.gripper)
+    vertices, faces = gripper_mesh()
     for grasps in content.grasp_sets:
         T_world_obj = scene.object(grasps.instance).T_world_obj
         rows = drawn_grasps(grasps, size.grasps)
