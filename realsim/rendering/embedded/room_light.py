@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from realsim.arrays import Array, Array32, Int32, Int64, Mask, UInt8
+from realsim.arrays import Array, Array32, Int32, Int64, Mask, UInt8, UInt16
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.records import Mesh
@@ -43,7 +42,7 @@ class RoomSurfaces(NamedTuple):
     """(F, 3, 3) linear colours of the corners, or their texture coordinates in the first two."""
     density: Array32
     """(F,) texels per metre."""
-    texels: NDArray[np.uint16]
+    texels: UInt16
     """(T, 3) linear texels of all images and their halvings."""
     layout: Int64
     """(G, MOST_HALVINGS, 3) first texel, rows and columns of each halving."""
@@ -93,7 +92,7 @@ def room_surfaces(placed: Sequence[PlacedMesh], gamma: float) -> RoomSurfaces:
     surfaces = [Surface(p, gamma) for p in placed]
     n, first = len(placed), 0
     layout = np.zeros((n, MOST_HALVINGS, 3), np.int64)
-    levels: list[NDArray[np.uint16]] = []
+    levels: list[UInt16] = []
     known: dict[int, int] = {}
     for g, surface in enumerate(surfaces):
         halvings = surface.texture.levels[:MOST_HALVINGS] if surface.texture else []
@@ -146,7 +145,7 @@ def empty_samples(n: int) -> RoomSamples:
 
 @njit(inline="always", error_model="numpy")
 def _texel(
-    z: NDArray[np.uint16], layout: Int64, wraps: bool, at: tuple[int, int, float, float]
+    z: UInt16, layout: Int64, wraps: bool, at: tuple[int, int, float, float]
 ) -> tuple[float, float, float]:
     """Return one halving's colour at texture coordinates, between the texels' centres."""
     g, k, u, v = at
@@ -179,7 +178,7 @@ def _texel(
 @njit(inline="always", error_model="numpy")
 def _painted(
     paint: Array32,
-    images: tuple[NDArray[np.uint16], Int64, int, bool],
+    images: tuple[UInt16, Int64, int, bool],
     place: tuple[int, int, float, float, float],
     footprint: float,
 ) -> tuple[float, float, float]:

@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim import interop
+from realsim.arrays import Array
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
@@ -33,7 +33,6 @@ from realsim_sim_bridge.slip.world import SlipBody, SlipPhysics
 if TYPE_CHECKING:
     from realsim_sim_bridge.slip.engines import BulletSettings
 
-Array = NDArray[np.float64]
 FINGERS = ("left_slide", "right_slide")
 """Joints of the two fingers; the first is at +y."""
 LIFTS = ("left_lift", "right_lift")

@@ -3,16 +3,13 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.world import PadModel
 
 # --- A hand as a URDF for PyBullet: a fixed palm and two fingers that slide along y --------------
 # Those of an arc hang on a link that slides along z, which is put where the arc has it.
-
-
-Array = NDArray[np.float64]
 
 
 def hand_urdf(geometry: Hand, pads: PadModel | None) -> str:

@@ -3,8 +3,8 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.bullet_pair import BulletPair
@@ -23,8 +23,6 @@ from realsim_sim_bridge.slip.world import (
 if TYPE_CHECKING:
     from realsim_sim_bridge.slip.engines import BulletSettings
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 _PLACE, _AXES = np.s_[:3, 3], np.s_[:3, :3]
 
 

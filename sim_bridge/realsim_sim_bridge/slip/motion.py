@@ -15,12 +15,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.geometry import se3
 from realsim.records import STAGES
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -189,10 +187,10 @@ class Loads:
 
     wrenches: Array
     """(N, L, 6) torque about the centre of mass [N m] and force [N]."""
-    stage: NDArray[np.int64]
+    stage: Int64
     """(L,) number in STAGES; 0 = its weight at rest."""
 
-    def about_grasp(self, centers: Array, at: NDArray[np.int64] | None = None) -> Array:
+    def about_grasp(self, centers: Array, at: Int64 | None = None) -> Array:
         """Return wrenches (N, L, 6) about the grasp's origin; `at`: some of each grasp's (N, l).
 
         Args:

@@ -8,14 +8,12 @@ other side of a mug's wall) does not.
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from realsim.arrays import Array
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
-
-Array = NDArray[np.float64]
 
 CLEARANCE_M = 0.004
 """Distance that is left between a finger's face and the object [m]: 20 steps at 0.1 m/s, in which

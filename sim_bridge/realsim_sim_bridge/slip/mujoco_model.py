@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
@@ -32,7 +32,6 @@ from realsim_sim_bridge.slip.world import PadModel, SlipBody, SlipPhysics
 if TYPE_CHECKING:
     from realsim_sim_bridge.slip.engines import MujocoSettings
 
-Array = NDArray[np.float64]
 
 FINGER_NAMES = ("left", "right")
 LIFT_NAMES = ("left_lift", "right_lift")
@@ -75,9 +74,9 @@ class PairModel:
     """What the object stands on while the fingers close; it is off while loads are played."""
     lifting: Array | None
     """(5,) z of the fingers of an arc as a polynomial of y, the constant first; None = a slide."""
-    plain: NDArray[np.int64]
+    plain: Int64
     """(20,) where MuJoCo's own row of state has what a row of `mujoco_state` holds."""
-    lifts: NDArray[np.int64]
+    lifts: Int64
     """(2, F) where it has position and speed of the fingers along z; F = 0 for a slide."""
 
 
@@ -179,7 +178,7 @@ def lock_lifts(model: Any, locked: bool, settings: "MujocoSettings") -> None:
         model.eq_active0[follows] = not locked
 
 
-def _columns(model: Any, lifts: list[Any]) -> dict[str, NDArray[np.int64]]:
+def _columns(model: Any, lifts: list[Any]) -> dict[str, Int64]:
     """Return the fields `plain` and `lifts` of a compiled model."""
     at = [1 + int(joint.qposadr[0]) for joint in lifts]
     speed = [1 + int(model.nq) + int(joint.dofadr[0]) for joint in lifts]

@@ -12,8 +12,8 @@ that is reached, follow from the step alone. Friction creeps at R / (impratio b)
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Int64
 from realsim.errors import InputError
 from realsim_sim_bridge.slip.world import PadModel
 
@@ -73,7 +73,7 @@ def pad_stiffness(model: Any, held: int) -> float:
     return len(spheres) / 2 * k * d / ((1.0 - d) * _inverse_inertia(model, held))
 
 
-def _spheres(model: Any) -> NDArray[np.int64]:
+def _spheres(model: Any) -> Int64:
     """Return the numbers of the pads' geoms."""
     return np.nonzero((model.geom_priority == PAD_PRIORITY) & (model.geom_type == SPHERE))[0]
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.geometry import se3
 from realsim_sim_bridge.slip.mujoco_model import (
     FINGER_NAMES,
@@ -27,8 +27,6 @@ from realsim_sim_bridge.slip.mujoco_model import (
 )
 from realsim_sim_bridge.slip.mujoco_pads import pad_stiffness
 from realsim_sim_bridge.slip.world import Motion, PairStates
-
-Array = NDArray[np.float64]
 
 TIME = 0
 FINGERS = slice(1, 3)
@@ -134,7 +132,7 @@ class Samples:
             times_s=times_s,
         )
 
-    def held(self, last: NDArray[np.int64], pairs: NDArray[np.bool_]) -> "Samples":
+    def held(self, last: Int64, pairs: Mask) -> "Samples":
         """Return them up to the last sample of any pair, some pairs standing still after theirs.
 
         Args:

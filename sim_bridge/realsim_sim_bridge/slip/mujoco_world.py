@@ -11,8 +11,8 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask, Rows
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
@@ -41,8 +41,6 @@ from realsim_sim_bridge.slip.world import (
 if TYPE_CHECKING:
     from realsim_sim_bridge.slip.engines import MujocoSettings
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 MODELS_KEPT = 4
 """Compiled models that an engine keeps; a scene's objects are tested one after the other."""
@@ -266,7 +264,7 @@ class MujocoWorld(HandWorld):
         )[:, None]
         self._open[k] = False
 
-    def _weights(self, stand: Stand, standing: NDArray[np.bool_]) -> Array:
+    def _weights(self, stand: Stand, standing: Mask) -> Array:
         """Return the objects' weights as wrenches (n, 1, 6): see `Stand` for whose."""
         weights = np.zeros((len(standing), 1, 6))
         simulated = float(self._model.body(OBJECT).mass[0])
@@ -293,7 +291,7 @@ class MujocoWorld(HandWorld):
 
     def _run(
         self, k: Rows, steps: int, wrenches: Array | None, sunk_m: Array | None = None
-    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+    ) -> tuple[Array, Array, Mask]:
         """Roll pairs k out and keep where they end.
 
         Args:

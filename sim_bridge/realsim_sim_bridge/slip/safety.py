@@ -8,9 +8,9 @@ engine needs to play it.
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from realsim.arrays import Array, Int32, Mask
 from realsim.geometry import se3
 from realsim.records import STAGES, Mesh
 from realsim.robots.hand import Hand, along_approach
@@ -22,7 +22,6 @@ from realsim_sim_bridge.slip.world import PairStates, SlipBody, SlipPhysics
 if TYPE_CHECKING:
     from realsim_sim_bridge.slip.slip_test import SlipTrial
 
-Array = NDArray[np.float64]
 
 CLEAR_M = 0.003
 """So far outside the pads rays start [m]: a pad's edge may be in what is curved."""
@@ -42,7 +41,7 @@ says otherwise, and the engine has to tell."""
 def hull_surface(body: SlipBody) -> RaySurface:
     """Return the surface of the convex parts, which may overlap."""
     vertices: list[Array] = []
-    faces: list[NDArray[np.int32]] = []
+    faces: list[Int32] = []
     count = 0
     for part in body.parts:
         faces.append(ConvexHull(part).simplices + count)
@@ -99,7 +98,7 @@ def closed_safety(
     return np.where(found < BALANCED, 0.0, found)
 
 
-def resting(body: SlipBody, states: PairStates) -> NDArray[np.bool_]:
+def resting(body: SlipBody, states: PairStates) -> Mask:
     """Return which objects (N,) are at rest in the closed hand."""
     spin, speed = (
         np.linalg.norm(states.twists[:, part], axis=1) for part in (slice(3), slice(3, 6))

@@ -13,13 +13,10 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.records import STAGES, GraspSet
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

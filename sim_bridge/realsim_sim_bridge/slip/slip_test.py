@@ -12,8 +12,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Mask, Rows
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import STAGES
@@ -37,9 +37,6 @@ from realsim_sim_bridge.slip.world import (
     SlipPhysics,
 )
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Rows = NDArray[np.int64]
 CLOSE, LIFT, OSCILLATE, PENDULUM = range(len(STAGES))
 
 

@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-Array = NDArray[np.float64]
+from realsim.arrays import Array
 
 REACH_M = 0.03
 """Neighbours farther from the object are not there [m]: closing fingers shift what they hold in the

@@ -17,8 +17,8 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array, Int64, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh_shape import MassProperties
@@ -29,9 +29,6 @@ from realsim.robots.hand_file import STIFFEST_N_PER_M
 from realsim_sim_bridge.slip.stand import Stand
 
 # --- An object as the physics engines need it ----------------------------------------------------
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -137,12 +134,9 @@ class PadModel:
         """Normal stiffness of one sphere [N/m]."""
         return self.pad_stiffness_n_per_m / len(self.centers_xz())
 
-    def centers_xz(self) -> NDArray[np.float64]:
+    def centers_xz(self) -> Array:
         """Return x and z (S, 2) of the spheres' centres [m], grasp frame."""
         return np.array([[x, z] for x in self.x_m for z in self.z_m])
-
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -251,7 +245,7 @@ class Grips:
     openings_m: Array
     """(K,) distance of the finger faces before closing [m]."""
 
-    def rows(self, rows: NDArray[np.int64] | Mask | slice) -> "Grips":
+    def rows(self, rows: Int64 | Mask | slice) -> "Grips":
         """Return some of them."""
         return rows_of(self, rows)
 
@@ -269,7 +263,7 @@ class PairStates:
     finger_speeds: Array
     """(K, 2) [m/s], positive = opening."""
 
-    def rows(self, rows: NDArray[np.int64] | Mask) -> "PairStates":
+    def rows(self, rows: Int64 | Mask) -> "PairStates":
         """Return some of them."""
         return rows_of(self, rows)
 
@@ -279,7 +273,7 @@ class PairStates:
         shapes = {"Ts_world_body": (4, 4), "twists": (6,), "fingers_m": (2,), "finger_speeds": (2,)}
         return cls(**{name: np.full((count, *shape), np.nan) for name, shape in shapes.items()})
 
-    def set_rows(self, rows: NDArray[np.int64], states: "PairStates") -> None:
+    def set_rows(self, rows: Int64, states: "PairStates") -> None:
         """Put the states of some pairs in the place of these rows."""
         for f in fields(self):
             getattr(self, f.name)[rows] = getattr(states, f.name)
