@@ -14,7 +14,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -182,11 +182,9 @@ class ExportFolder:
             self._append({"piece": piece, "files": {relative: entry}})
         self._done.add(piece)
 
-    def write_json_object(
-        self, relative: str, *, layout: Callable[[Any], str] = json.dumps
-    ) -> None:
+    def write_json_object(self, relative: str) -> None:
         """Write the rows of a document as one JSON object, a line a row."""
-        self.write_document(relative, _object_text(self.rows(relative), layout))
+        self.write_document(relative, _object_text(self.rows(relative)))
 
     def abandon(self) -> None:
         """Take away what this run wrote into a new folder: a refusal leaves no trace.
@@ -276,10 +274,10 @@ def _lines(path: Path) -> Iterator[str]:
             yield from (line for line in file if line.endswith("\n"))
 
 
-def _object_text(rows: Iterable[tuple[str, Any]], layout: Callable[[Any], str]) -> Iterator[str]:
+def _object_text(rows: Iterable[tuple[str, Any]]) -> Iterator[str]:
     yield "{\n"
     for k, (key, value) in enumerate(rows):
-        yield (",\n" if k else "") + f"{json.dumps(key)}: {layout(value)}"
+        yield (",\n" if k else "") + f"{json.dumps(key)}: {json.dumps(value)}"
     yield "\n}\n"
 
 

@@ -58,20 +58,6 @@ def coordinate_counts(points_m: ArrayLike, low_m: ArrayLike, high_m: ArrayLike) 
     return out
 
 
-def coordinates_of(counts: Counts, low_m: ArrayLike, high_m: ArrayLike) -> Array32:
-    """Return points (..., 3) [m] of an object's counts; NaN where there is no object.
-
-    Args:
-        counts: (..., 3) of one object.
-        low_m: (3,) least corner of the model's box [m].
-        high_m: (3,) greatest corner [m].
-    """
-    low, high = np.asarray(low_m, np.float64), np.asarray(high_m, np.float64)
-    points = (low + counts * ((high - low) / FULL)).astype(np.float32)
-    points[~counts.any(axis=-1)] = np.nan
-    return points
-
-
 def normal_counts(normals: Array32) -> Counts:
     """Return unit normals (..., 3) as counts; zero vectors (nothing) become 0 0 0."""
     flat = np.ascontiguousarray(normals).reshape(-1, 3)

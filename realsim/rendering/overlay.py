@@ -140,9 +140,7 @@ def draw_outlines(
     return out
 
 
-def draw_hatched(
-    rgb: Image, mask: Mask, color: Color, spacing_px: int = 0, thickness: int = 2
-) -> Image:
+def draw_hatched(rgb: Image, mask: Mask, color: Color) -> Image:
     """Return the picture with a mask hatched by diagonal lines and outlined.
 
     Hatching tells the region apart from any colour that an object may have, and leaves visible what
@@ -152,15 +150,13 @@ def draw_hatched(
         rgb: (H, W, 3).
         mask: (H, W) what is hatched.
         color: of the lines.
-        spacing_px: from line to line; 0 = 1/72 of the picture's height, at least 8.
-        thickness: width of the lines [px].
     """
     import cv2
 
     out = rgb.copy()
     if not mask.any():
         return out
-    spacing = spacing_px or max(8, rgb.shape[0] // 72)
+    spacing, thickness = max(8, rgb.shape[0] // 72), 2
     rows, columns = np.nonzero(mask)
     line = (rows + columns) % spacing < thickness
     shade = 0.7 * out[rows, columns] + 0.3 * np.array(color)

@@ -176,14 +176,6 @@ class ReviewState:
         """Return the standing lines on this instance, in order."""
         return tuple(e for e in self.standing if e.instance == instance)
 
-    def decision(self, instance: int, subject: str) -> Entry | None:
-        """Return the last standing accept or reject of this pose of this instance."""
-        found = None
-        for e in self.of(instance):
-            if e.subject == subject and e.action in ("accept", "reject"):
-                found = e
-        return found
-
     def comments(self, instance: int) -> tuple[Entry, ...]:
         """Return the standing comments on this instance, on any of its poses."""
         return tuple(e for e in self.of(instance) if e.comment.strip())

@@ -19,6 +19,7 @@ from realsim.formats.graspnet.grasp_group import (
 )
 from realsim.formats.graspnet.grasp_labels import GraspLabels, read_grasp_labels, write_grasp_labels
 from realsim.formats.graspnet.rect import rect_bytes, rect_grasps
+from realsim.formats.grasps.scene_grasps import untried_set
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.records.grasps import MEASURES
@@ -209,10 +210,12 @@ def test_labels_are_read_as_graspnets_own_loader_reads_them(tmp_path):
         R = matrix_as_documented(-frame.views()[v], angle)
         rows.append([1.1 - mu, width, 0.02, depth, *R.ravel(), *points[p], 4])
     np.save(tmp_path / "theirs.npy", np.array(rows, dtype=np.float32))
-    ours = grasp_group(
-        [read_grasp_labels(path, friction_at_most=0.4).as_set(5)], {0: np.eye(4)},
-        scores="friction", depth_m=0.0,
+    few = read_grasp_labels(path, friction_at_most=0.4)
+    known = untried_set(
+        few.Ts_obj_grasp(), obj_id=5, measures={"closure_friction": few.friction.astype(float)},
+        parameters={"openings_m": few.openings_m.tolist(), "depths_m": [0.0] * len(few)},
     )  # fmt: skip
+    ours = grasp_group([known], {0: np.eye(4)}, scores="friction")
     theirs = read_grasp_group(tmp_path / "theirs.npy")
     assert len(ours) == len(theirs) > 10
     np.testing.assert_allclose(ours.Ts_a_grasp, theirs.Ts_a_grasp, rtol=0, atol=1e-6)

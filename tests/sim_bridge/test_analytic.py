@@ -116,11 +116,10 @@ def test_the_choice_is_free_spread_and_of_every_level(of_box):
     labels = of_box[1]
     rng = np.random.default_rng(1)
     few = labels.rows(select_rows(labels, 60, rng))
-    s = few.as_set(3, 2, file="grasp_label/002_labels.npz")
-    assert len(s) == 60 and (s.obj_id, s.instance) == (3, 2) and np.isnan(s.scores).all()
+    assert len(few) == 60
     rows = select_rows(labels, 60, np.random.default_rng(1))
-    np.testing.assert_array_equal(s.parameters["label_index"], labels.index[rows])
-    np.testing.assert_array_equal(s.measures["closure_friction"], labels.friction[rows])
+    np.testing.assert_array_equal(few.index, labels.index[rows])
+    np.testing.assert_array_equal(few.friction, labels.friction[rows])
     assert not labels.collision[rows].any()
     there = np.unique(labels.friction[~labels.collision])
     shares = [np.sum(labels.friction[rows] == f) for f in there]
@@ -144,9 +143,10 @@ def standing(mesh):
 
 def test_given_grasps_keep_their_contacts_and_their_friction(of_box):
     mesh, labels = of_box
-    s = labels.rows(select_rows(labels, 80, np.random.default_rng(0))).as_set(1)
+    given = labels.rows(select_rows(labels, 80, np.random.default_rng(0)))
+    Ts = given.Ts_obj_grasp()
     found, rows = given_candidates(
-        mesh, standing(mesh), Surroundings(), s.Ts_obj_grasp, CandidateConfig(), HAND
+        mesh, standing(mesh), Surroundings(), Ts, CandidateConfig(), HAND
     )
     counts = found.counts
     taken = ("without_contacts", "too_near", "too_wide", "hand_in_table", "hand_in_object",
@@ -157,14 +157,12 @@ def test_given_grasps_keep_their_contacts_and_their_friction(of_box):
         mesh, found.Ts_obj_grasp, found.openings_m, ClosureConfig(levels=FEW.levels), HAND,
         contact_depths_m=found.contact_depths_m,
     )  # fmt: skip
-    same = np.abs(closure.closure_friction - s.measures["closure_friction"][rows]) < 1e-6
+    same = np.abs(closure.closure_friction - given.friction[rows]) < 1e-6
     assert same.mean() > 0.95
     middle = closure.axis_contacts.points.mean(axis=1)
     off = np.sum((middle - found.Ts_obj_grasp[:, :3, 3]) * found.Ts_obj_grasp[:, :3, 1], axis=1)
     assert np.abs(off).max() < 1e-6  # both fingers touch at once
-    np.testing.assert_allclose(
-        found.Ts_obj_grasp[:, :3, :3], s.Ts_obj_grasp[rows, :3, :3], atol=1e-12
-    )
+    np.testing.assert_allclose(found.Ts_obj_grasp[:, :3, :3], Ts[rows, :3, :3], atol=1e-12)
 
 
 def test_labels_that_stand_are_those_the_hand_can_take(of_box):
@@ -173,8 +171,8 @@ def test_labels_that_stand_are_those_the_hand_can_take(of_box):
     config, rng = CandidateConfig(), np.random.default_rng(0)
     found = standing_labels(labels, mesh, T, Surroundings(), config, HAND, rng)
     assert 20 < len(found) < (~labels.collision).sum() and not found.collision.any()
-    s = found.rows(select_rows(found, 40, rng)).as_set(1)
-    again, rows = given_candidates(mesh, T, Surroundings(), s.Ts_obj_grasp, config, HAND)
-    assert len(rows) == len(s) == 40
+    Ts = found.rows(select_rows(found, 40, rng)).Ts_obj_grasp()
+    again, rows = given_candidates(mesh, T, Surroundings(), Ts, config, HAND)
+    assert len(rows) == len(Ts) == 40
     lowest = np.min((T @ again.Ts_obj_grasp)[:, 2, 3])
     assert lowest > 0 and again.counts["hand_in_table"] == 0

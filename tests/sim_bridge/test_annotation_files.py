@@ -130,8 +130,8 @@ def test_object_coordinates_project_to_their_own_pixels(done: SessionStore, view
     }
     for k, e in enumerate(part(done, view)["objects"]):
         seen = mask(done, "mask_visib", view, k)
-        b = boxes[e["instance"]]
-        points = label_maps.coordinates_of(counts[seen], b["low"], b["high"])
+        low, high = (np.array(boxes[e["instance"]][end]) for end in ("low", "high"))
+        points = low + counts[seen] * ((high - low) / 65535)
         uv = camera.project(CAMERA, se3.transform(np.array(e["T_cam_obj"]), points))
         rows, columns = np.nonzero(seen)
         np.testing.assert_allclose(uv, np.stack([columns, rows], -1), atol=0.02)

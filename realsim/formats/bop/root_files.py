@@ -1,7 +1,7 @@
 """The files of a BOP data set beside its scenes: models, cameras, targets, a description."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -28,8 +28,6 @@ def write_bop_models(
     folder: ExportFolder,
     *,
     infos: Mapping[int, Mapping[str, Any]] | None = None,
-    evaluation: bool = True,
-    progress: Callable[[], None] | None = None,
 ) -> None:
     """Write models/ and models_eval/.
 
@@ -41,8 +39,6 @@ def write_bop_models(
         folder: the export.
         infos: the source's rows of models_info.json: their numbers are kept where they hold, and
             so are keys that are not known here.
-        evaluation: whether models_eval/ is written.
-        progress: called once per model.
     """
     rows: dict[str, Json] = {}
     for obj_id in sorted(models):
@@ -51,16 +47,12 @@ def write_bop_models(
         rows[str(obj_id)] = kept_info(info_of(model), (infos or {}).get(obj_id))
         if not folder.has(piece):
             files: dict[str, Any] = {f"{MODELS}/{k}": v for k, v in model_files(model).items()}
-            if evaluation:
-                bare = replace(model.mesh, colors=None, uv=None, texture=None)
-                files[f"{MODELS_EVAL}/{model_file(obj_id)}"] = ply_bytes(bare, "mm")
+            bare = replace(model.mesh, colors=None, uv=None, texture=None)
+            files[f"{MODELS_EVAL}/{model_file(obj_id)}"] = ply_bytes(bare, "mm")
             folder.write_piece(piece, files)
-        if progress is not None:
-            progress()
     text = json.dumps(rows, indent=1, allow_nan=False) + "\n"
     folder.write_document(f"{MODELS}/{INFO_FILE}", [text])
-    if evaluation:
-        folder.write_document(f"{MODELS_EVAL}/{INFO_FILE}", [text])
+    folder.write_document(f"{MODELS_EVAL}/{INFO_FILE}", [text])
 
 
 def kept_info(computed: Json, source: Mapping[str, Any] | None) -> Json:

@@ -130,11 +130,7 @@ class GraspGroup:
 
 
 def grasp_group(
-    sets: Sequence[GraspSet],
-    Ts_a_obj: Mapping[int, Array],
-    *,
-    scores: Scores = "school",
-    depth_m: float = DEPTH_M,
+    sets: Sequence[GraspSet], Ts_a_obj: Mapping[int, Array], *, scores: Scores = "school"
 ) -> GraspGroup:
     """Return the grasps of a scene in one frame; those without a label are left out.
 
@@ -144,12 +140,11 @@ def grasp_group(
         scores: "school": p_hold, of sets without it the score, 0 to 1; "friction": 1.1 -
             closure_friction, as graspnetAPI makes it of labels, of grasps that close below 1.1;
             "tried": 1.1 - `held_friction`, of grasps that held.
-        depth_m: of all grasps whose set's parameters have no depths_m.
 
     Raises:
         InputError: a set's object has no pose, or its grasps have no width.
     """
-    groups = [_group_of(s, Ts_a_obj, scores, depth_m) for s in sets]
+    groups = [_group_of(s, Ts_a_obj, scores) for s in sets]
     kept = np.concatenate([np.zeros(0, np.bool_), *(~np.isnan(_value(s, scores)) for s in sets)])
     known = {k: np.concatenate([np.zeros(0), *(g.known[k] for g in groups)]) for k in OWN}
     measured = [k for k in MEASURES if any(k in s.measures for s in sets)]
@@ -191,15 +186,12 @@ def _value(grasps: GraspSet, scores: Scores) -> Array:
     return np.where(friction < MOST_FRICTION, MOST_FRICTION - friction, np.nan)
 
 
-def _group_of(
-    grasps: GraspSet, Ts_a_obj: Mapping[int, Array], scores: Scores, depth_m: float
-) -> GraspGroup:
+def _group_of(grasps: GraspSet, Ts_a_obj: Mapping[int, Array], scores: Scores) -> GraspGroup:
     if grasps.instance not in Ts_a_obj:
         raise InputError(
             f"the object of instance {grasps.instance} has no pose; there are poses of: "
             f"{', '.join(map(str, sorted(Ts_a_obj))) or 'none'}."
         )
-    nothing = np.full(len(grasps), np.nan)
     value = _value(grasps, scores)
     rows = np.flatnonzero(~np.isnan(value))
     openings = _stored(grasps, "openings_m", grasps.widths_m)[rows]
@@ -213,7 +205,7 @@ def _group_of(
         scores=value[rows],
         openings_m=openings,
         heights_m=np.full(len(rows), HEIGHT_M),
-        depths_m=_stored(grasps, "depths_m", nothing + depth_m, depth_m)[rows],
+        depths_m=_stored(grasps, "depths_m", np.full(len(grasps), DEPTH_M))[rows],
         obj_ids=np.full(len(rows), grasps.obj_id, dtype=np.int64),
         known={
             "instance": np.full(len(rows), float(grasps.instance)), "row": rows.astype(np.float64),
@@ -223,12 +215,12 @@ def _group_of(
     )  # fmt: skip
 
 
-def _stored(grasps: GraspSet, name: str, other: Array, fill: float = np.nan) -> Array:
+def _stored(grasps: GraspSet, name: str, other: Array) -> Array:
     """Return a number a grasp out of a set's parameters, else the other (N,)."""
     stored = grasps.parameters.get(name)
     if isinstance(stored, list) and np.shape(stored) == (len(grasps),):  # pyright: ignore[reportUnknownArgumentType]
         return np.array(stored, dtype=np.float64)
-    return np.where(np.isnan(other), fill, other)
+    return other
 
 
 # --- files ------------------------------------------------------------------------------------

@@ -31,8 +31,6 @@ from realsim.formats.graspnet.gripper_frame import (
     label_poses,
 )
 from realsim.formats.graspnet.npz_blocks import NpzArray, opened, write_blocks
-from realsim.formats.grasps.scene_grasps import untried_set
-from realsim.records import GraspSet
 from realsim.records.checked_arrays import frozen
 
 GRID = (VIEWS, ANGLES, DEPTHS)
@@ -111,26 +109,6 @@ class GraspLabels:
         """Return the grasps (N, 4, 4) [m], frame `grasp`."""
         point, view = self.index[:, 0], self.index[:, 1]
         return label_poses(self.points[point], view, self.angles_rad, self.depths_m)
-
-    def as_set(self, obj_id: int, instance: int = 0, *, file: str = "") -> GraspSet:
-        """Return the candidates as a set that physics has not tried.
-
-        Args:
-            obj_id: realsim's id: GraspNet's number + 1.
-            instance: of the object.
-            file: where the labels came from.
-        """
-        grasps = untried_set(
-            self.Ts_obj_grasp(),
-            obj_id=obj_id,
-            instance=instance,
-            parameters={
-                "source": {"from": "GraspNet labels", "file": file},
-                "label_index": self.index.tolist(),
-                "openings_m": self.openings_m.astype(np.float64).tolist(),
-            },
-        )
-        return replace(grasps, measures={"closure_friction": self.friction.astype(np.float64)})
 
 
 # --- reading ----------------------------------------------------------------------------------

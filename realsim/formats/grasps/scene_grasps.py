@@ -194,8 +194,7 @@ def held(grasps: GraspSet) -> Mask:
 
 def untried_set(
     Ts_obj_grasp: Array, *, obj_id: int, instance: int = 0, widths_m: Array | None = None,
-    parameters: dict[str, Any] | None = None, reason: str = "not tried",
-    measures: dict[str, Array] | None = None,
+    parameters: dict[str, Any] | None = None, measures: dict[str, Array] | None = None,
 ) -> GraspSet:  # fmt: skip
     """Return grasps that came from elsewhere as a set that physics has not tried.
 
@@ -205,7 +204,6 @@ def untried_set(
         instance: of the object.
         widths_m: (N,) [m]; None = not known.
         parameters: where they came from, as plain JSON values.
-        reason: kept for every grasp.
         measures: what the file says of them, by the names of MEASURES.
     """
     n = len(Ts_obj_grasp)
@@ -220,7 +218,7 @@ def untried_set(
         slip_m=nothing,
         slip_rad=nothing,
         reachable=np.zeros(n, dtype=np.bool_),
-        failures=(reason,) * n,
+        failures=("not tried",) * n,
         measures=measures or {},
         parameters=parameters or {},
     )

@@ -52,14 +52,7 @@ def ray_on_mesh(
     return o + t * d if np.isfinite(t) else None
 
 
-def ray_on_cloud(
-    origin: ArrayLike,
-    direction: ArrayLike,
-    points: Array32,
-    *,
-    radius_m: float = CLICK_M,
-    angle_rad: float = CLICK_RAD,
-) -> Array | None:
+def ray_on_cloud(origin: ArrayLike, direction: ArrayLike, points: Array32) -> Array | None:
     """Return the measured point (3,) that a click on a cloud means, in world [m].
 
     Of the points within the cone it is the one with the least t + 3 a, t along the ray and a
@@ -70,8 +63,6 @@ def ray_on_cloud(
         origin: (3,) of the ray in world [m].
         direction: (3,) in world, any length.
         points: (N, 3) in world [m]; points that are not finite are passed over.
-        radius_m: radius of the cone near the eye [m].
-        angle_rad: half angle of the cone farther away [rad].
 
     Returns:
         None if no point lies in the cone.
@@ -83,7 +74,7 @@ def ray_on_cloud(
     p = np.asarray(points)
     if p.ndim != 2 or p.shape[1] != 3:
         raise InputError(f"the cloud has the shape {p.shape}; (N, 3) is accepted.")
-    k = _in_cone(o, d, np.ascontiguousarray(p), float(radius_m), float(np.tan(angle_rad)))
+    k = _in_cone(o, d, np.ascontiguousarray(p), CLICK_M, float(np.tan(CLICK_RAD)))
     return None if k < 0 else p[k].astype(np.float64)
 
 

@@ -34,11 +34,11 @@ def overlay_picture(
     scene: Scene,
     models: Mapping[int, ObjectModel],
     grasp_sets: Sequence[GraspSet],
-    max_grasps: int = 30,
-    *,
-    with_legend: bool = True,
+    max_grasps: int,
 ) -> Rgb:
     """Return the photograph of a view with everything that was annotated on it.
+
+    Colours are explained, and objects out of sight named, in a corner.
 
     Outlines of the visible masks and names have the colour of the verdict; axes are x red, y green,
     z blue; grasps of every object, evenly from its best to its worst, are coloured by p_hold or
@@ -52,16 +52,11 @@ def overlay_picture(
         models: obj_id -> model.
         grasp_sets: the scored grasps.
         max_grasps: grasps drawn in all, shared evenly by the objects.
-        with_legend: whether colours are explained, and objects out of sight named, in a corner.
 
     Raises:
         InputError: the view has no camera pose.
     """
-    return next(
-        overlay_pictures(
-            store, [view_index], scene, models, grasp_sets, max_grasps, with_legend=with_legend
-        )
-    )
+    return next(overlay_pictures(store, [view_index], scene, models, grasp_sets, max_grasps))
 
 
 def overlay_pictures(
@@ -70,9 +65,7 @@ def overlay_pictures(
     scene: Scene,
     models: Mapping[int, ObjectModel],
     grasp_sets: Sequence[GraspSet],
-    max_grasps: int = 30,
-    *,
-    with_legend: bool = True,
+    max_grasps: int,
 ) -> Iterator[Rgb]:
     """Yield the pictures of several views, the scene being prepared once; see `overlay_picture`.
 
@@ -96,9 +89,7 @@ def overlay_pictures(
                               ids, hidden)  # fmt: skip
         picture = _with_grasps(picture, store.session.intrinsics, shown, poses, max_grasps)
         picture = _with_names(picture, objects, models, ids)
-        if with_legend:
-            picture = _with_legend(picture, objects, models, ids, hidden, shown)
-        yield picture
+        yield _with_legend(picture, objects, models, ids, hidden, shown)
 
 
 def _with_scene(

@@ -5,7 +5,7 @@ object, its neighbours and the table, and where the closing fingers are free of 
 each filter took is counted.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -125,9 +125,7 @@ class Stand:
                 Ts[rest[free]] = tried.Ts_obj_grasp[free]
                 openings[rest[free]] = tried.openings_m[free]
                 depths[rest[free]] = tried.contact_depths_m[free]
-        placed = HandPoses(
-            Ts_obj_grasp=Ts, widths_m=poses.widths_m, openings_m=openings, contact_depths_m=depths
-        )
+        placed = replace(poses, Ts_obj_grasp=Ts, openings_m=openings, contact_depths_m=depths)
         return placed, reached
 
     def _stands(self, poses: HandPoses, depth_m: float, margin_m: float) -> HandPoses:
@@ -135,9 +133,7 @@ class Stand:
         depths = depth_m + self._geometry.z_pad(poses.widths_m)
         Ts = along_approach(poses.Ts_obj_grasp, -depths)
         openings = np.minimum(poses.widths_m + 2 * margin_m, self._geometry.max_opening_m)
-        return HandPoses(
-            Ts_obj_grasp=Ts, widths_m=poses.widths_m, openings_m=openings, contact_depths_m=depths
-        )
+        return replace(poses, Ts_obj_grasp=Ts, openings_m=openings, contact_depths_m=depths)
 
     def _outcome(self, poses: HandPoses) -> Int64:
         """Return what stops each hand (N,): the first of table, object, neighbours, or FREE."""

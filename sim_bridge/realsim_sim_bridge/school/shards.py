@@ -9,7 +9,7 @@ from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.cross_check import cross_check
 from realsim_sim_bridge.school.kept_sets import MEASURE, named, of_name
-from realsim_sim_bridge.school.sweep import sweep_margins
+from realsim_sim_bridge.school.sweep import run_sweep
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings, make_engine
 from realsim_sim_bridge.slip.slip_test import Slips, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import Engine
@@ -37,7 +37,8 @@ def shard_measures(
     found = {"force_n": slips.force_n, "duration_s": slips.duration_s, "safety": slips.safety}
     slip, limits, hand = config.slip, config.score, config.hand
     if config.sweep is not None:
-        found |= sweep_margins(trial, slips, slip, limits, hand, engine, config.sweep)
+        swept = run_sweep(trial, slips, slip, limits, hand, engine, config.sweep)
+        found |= swept.measures()
     if config.second_engine is not None:
         second = make_engine(config.second_engine)
         found |= cross_check(trial, slips, slip, limits, hand, second)

@@ -125,7 +125,7 @@ class Sweep:
         }
 
 
-def sweep_margins(
+def run_sweep(
     trial: SlipTrial,
     slips: Slips,
     config: SlipConfig,
@@ -133,8 +133,8 @@ def sweep_margins(
     geometry: Hand,
     engine: Engine,
     sweep: SweepConfig | None = None,
-) -> dict[str, Array]:
-    """Return the measures (N,) of a sweep over the grasps of a trial.
+) -> Sweep:
+    """Return the scores of a trial's grasps at every level that was tried.
 
     Args:
         trial: N grasps of an object.
@@ -145,19 +145,6 @@ def sweep_margins(
         engine: that of the slip test.
         sweep: the levels.
     """
-    return run_sweep(trial, slips, config, limits, geometry, engine, sweep).measures()
-
-
-def run_sweep(
-    trial: SlipTrial,
-    slips: Slips,
-    config: SlipConfig,
-    limits: ScoreLimits,
-    geometry: Hand,
-    engine: Engine,
-    sweep: SweepConfig | None = None,
-) -> Sweep:
-    """Return the scores at every level that was tried; arguments as for `sweep_margins`."""
     sweep = sweep or SweepConfig()
     known = scores_of(slips, limits)
     physics, pads = config.physics, config.physics.pads
