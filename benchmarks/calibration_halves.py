@@ -7,7 +7,6 @@ The leverage bound of 0.9, and CR3 instead of CR2 (ratios of 0.55 to 0.74), were
 cuts of the same sets.
 """
 
-import resource
 import subprocess
 import sys
 import tempfile
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from calibration_real import SOURCES, ImageSet, PoseSet
+from figures import children_cpu_s
 
 from realsim.arrays import Rows
 from realsim.errors import RealsimError
@@ -118,10 +118,9 @@ def run_command(task: Command) -> tuple[int, float]:
                      "--reading", source.reading]  # fmt: skip
         program = str(Path(sys.executable).with_name("realsim"))
         command = [program, "calibrate", *words, "--out", str(Path(place) / "calibration")]
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        before = children_cpu_s()
         code = subprocess.run(command, check=False, capture_output=True).returncode
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return code, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return code, children_cpu_s() - before
 
 
 def _some(images: Path, views: int, to: Path) -> Path:

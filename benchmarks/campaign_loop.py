@@ -9,14 +9,13 @@ upgrade     upgrade_cpu_s     `realsim upgrade` of the YCB-V frames in REALSIM_D
 
 import argparse
 import os
-import resource
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-from figures import Found
+from figures import Found, children_cpu_s
 
 from realsim.compiled import cache_folder
 
@@ -55,7 +54,7 @@ def timed(*words: object) -> tuple[float, float]:
     of the command, no failure of it.
     """
     line = "from realsim.app.cli import main; main()"
-    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+    before, start = children_cpu_s(), time.monotonic()
     with tempfile.TemporaryDirectory() as nothing:
         done = subprocess.run(
             [sys.executable, "-c", line, *map(str, words), "--quiet"], check=False,
@@ -63,6 +62,4 @@ def timed(*words: object) -> tuple[float, float]:
         )  # fmt: skip
     if done.returncode not in (0, 1):
         raise RuntimeError(f"realsim {words[0]} ended with exit code {done.returncode}")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return time.monotonic() - start, cpu_s
+    return time.monotonic() - start, children_cpu_s() - before

@@ -10,7 +10,6 @@ import argparse
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -47,18 +46,10 @@ def school(args: argparse.Namespace) -> Found:
     return found
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class GenerateJob:
-    """Scenes that are made by one node and by two."""
-
-    seed: int
-    quick: bool
-
-
 def generate(args: argparse.Namespace) -> Found:
     """Return what a second node brings the generation of scenes."""
     found = Found()
-    one, two = in_fresh_process(made, GenerateJob(seed=args.seed, quick=args.quick))
+    one, two = in_fresh_process(made, args)
     shares = ", ".join(f"{s:.1f}" for s in two["busy"])
     found.add(
         "ray_two_nodes_generate_ratio", one["longest"] / two["longest"],
@@ -68,15 +59,15 @@ def generate(args: argparse.Namespace) -> Found:
     return found
 
 
-def made(job: GenerateJob) -> tuple[dict[str, Any], dict[str, Any]]:
+def made(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the cost of the scenes on one node and on two."""
     request = GenerateRequest(
-        pool=open_objects(("pybullet",)), seed=job.seed,
+        pool=open_objects(("pybullet",)), seed=args.seed,
         scene=TableSceneConfig(objects=(3, 5), pool=ObjectPoolConfig(hull_only=True)),
-        views=ViewConfig(count=QUICK_VIEWS if job.quick else VIEWS, size=SIZE),
+        views=ViewConfig(count=QUICK_VIEWS if args.quick else VIEWS, size=SIZE),
         rendering=SyntheticConfig(profile="d435", maps=()),
     )  # fmt: skip
-    numbers = range(QUICK_SCENES if job.quick else SCENES)
+    numbers = range(QUICK_SCENES if args.quick else SCENES)
     found: list[dict[str, Any]] = []
     with ray_nodes() as (address, add), tempfile.TemporaryDirectory(prefix="campaign_") as folder:
         for count in (1, 2):

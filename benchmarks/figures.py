@@ -15,6 +15,7 @@ import argparse
 import json
 import os
 import platform
+import resource
 import sys
 import time
 import traceback
@@ -159,6 +160,22 @@ def document_of(
         "notes": found.notes,
         "cases": found.cases,
     }
+
+
+def children_cpu_s() -> float:
+    """Return the CPU time of this process's children that have ended [s]."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def median_of(values: Sequence[float]) -> float:
+    """Return the median; NaN of nothing."""
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+def share_of(hits: Sequence[bool]) -> float:
+    """Return the share that is true; NaN of nothing."""
+    return float(np.mean(hits)) if len(hits) else float("nan")
 
 
 def _keys(figures: Mapping[str, Figure], found: Found) -> list[str]:

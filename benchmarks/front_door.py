@@ -9,14 +9,13 @@ loops that this user's runs have compiled. The other times are the least of five
 
 import argparse
 import os
-import resource
 import subprocess
 import sys
 import tempfile
 from functools import cache
 from pathlib import Path
 
-from figures import Figure, Found, Goal, run
+from figures import Figure, Found, Goal, children_cpu_s, run
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = {
@@ -48,10 +47,9 @@ def bare() -> dict[str, str]:
 
 def cpu_s(*command: str | Path) -> float:
     """Run a command and return what it and its processes cost [s]."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    before = children_cpu_s()
     subprocess.run(command, cwd=CLONE.name, env=bare(), check=True, stdout=subprocess.DEVNULL)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return children_cpu_s() - before
 
 
 def install(_: argparse.Namespace) -> Found:

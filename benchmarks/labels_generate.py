@@ -6,14 +6,13 @@ counts their CPU seconds: dropping, looks, photographs, depth, labels, files.
 
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-from figures import Found
+from figures import Found, children_cpu_s
 from labels import PAPER_FRAMES_PER_GPU_H
 
 SIZE = "1280x720"
@@ -29,11 +28,9 @@ def generate_cost(seed: int, quick: bool) -> Found:
             str(scenes), "--views", str(views), "--size", SIZE, "--seed", str(seed), "--workers",
             "1" if quick else "2", "--quiet", *(("--objects", "4-5") if quick else ()),
         ]  # fmt: skip
-        before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        before, start = children_cpu_s(), time.perf_counter()
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        wall = time.perf_counter() - start
-        cpu = (after.ru_utime + after.ru_stime) - (before.ru_utime + before.ru_stime)
+        wall, cpu = time.perf_counter() - start, children_cpu_s() - before
         out = Path(folder) / "out"
         frames = len(list(out.glob("scene_*/rgb/*.png")))
         size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file())

@@ -60,10 +60,7 @@ def outline_offsets(gray: UInt8, mask: Mask) -> tuple[Array, int]:
 def real_masks(seed: int, quick: bool) -> Found:
     """Return the mean distance of mask outlines from image edges on real frames."""
     found = Found()
-    if not (DATA / "scenes/ycbv_mini").is_dir():
-        found.notes.append(
-            f"no ycbv_mini under {DATA} (set REALSIM_DATA): boundary_px_real not run"
-        )
+    if found.real_data("boundary_px_real", "scenes/ycbv_mini") is None:
         return found
     rows: dict[str, list[Array]] = {"registered": [], "network": [], "registered, shifted": []}
     tried = 0

@@ -22,7 +22,7 @@ from typing import Any
 import blas_threads  # noqa: F401
 import numpy as np
 from registration_calibration_fit import DISTORTED, fitted, printed, tested
-from scale_shapes import SHAPES
+from registration_cases import library
 
 from realsim.arrays import Array
 from realsim.geometry import se3
@@ -49,13 +49,7 @@ from realsim.registration.judging.surface_residuals import (
     surface_residuals,
 )
 from realsim.registration.search.sameness import make_sameness
-from realsim.registration.simulated import (
-    TableLabConfig,
-    TableScene,
-    scatter_objects,
-    table_scene,
-    with_found_symmetries,
-)
+from realsim.registration.simulated import TableLabConfig, TableScene, scatter_objects, table_scene
 from realsim.registration.solver import SolverConfig, Stage, solve_pose
 from realsim.registration.table_planes import support_checks
 from realsim.registration.verify import VerifyConfig, verify_objects
@@ -87,22 +81,6 @@ class Round:
     noise: DepthNoise
     plane: SupportPlane
     cloud: Cloud
-
-
-def library(folder: Path) -> dict[int, ObjectModel]:
-    """Return the benchmark's 30 objects with the symmetries found in their meshes."""
-    models: dict[int, ObjectModel] = {}
-    for n, (name, mesh) in enumerate(SHAPES.items(), start=1):
-        kept = folder / f"symmetries_{name}.json"
-        model = ObjectModel(obj_id=n, name=name, mesh=mesh())
-        if not kept.is_file():
-            model = with_found_symmetries(model)
-            axes = [[list(a), list(p)] for a, p in model.symmetry_axes]
-            kept.write_text(json.dumps({"discrete": model.symmetries.tolist(), "axes": axes}))
-        found = json.loads(kept.read_text())
-        axes = tuple((tuple(a), tuple(p)) for a, p in found["axes"])
-        models[n] = replace(model, symmetries=np.array(found["discrete"]), symmetry_axes=axes)
-    return models
 
 
 def table(seed: int, models: dict[int, ObjectModel], folder: Path) -> TableScene:

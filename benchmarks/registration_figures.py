@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from figures import Goal
+from figures import Goal, median_of, share_of
 
 LOST_MM = 1000.0
 """Error of an object that was not found [mm]."""
@@ -94,16 +94,8 @@ class Done:
     """Sentences for a person."""
 
 
-def _median(values: Sequence[float]) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
-
-
-def _percentile(values: Sequence[float], percent: float) -> float:
-    return float(np.percentile(values, percent)) if len(values) else float("nan")
-
-
-def _share(hits: Sequence[bool]) -> float:
-    return float(np.mean(hits)) if len(hits) else float("nan")
+def _percentile_90(values: Sequence[float]) -> float:
+    return float(np.percentile(values, 90)) if len(values) else float("nan")
 
 
 def _of(rows: Sequence[Row], part: str) -> list[Row]:
@@ -116,20 +108,20 @@ def figures_of(
 ) -> tuple[dict[str, float], dict[str, str]]:
     """Return the figures of all scenes, and what each was taken over."""
     refined = [r.mssd_mm for r in _of(rows, "refined")]
-    figures = {"mssd_mm_256": _median(refined), "mssd_p90_mm_256": _percentile(refined, 90)}
+    figures = {"mssd_mm_256": median_of(refined), "mssd_p90_mm_256": _percentile_90(refined)}
     over = {"mssd_mm_256": f"{len(refined)} objects"}
     for part in SEARCHED:
         mine = _of(rows, part)
         key = f"{'pile' if part == 'piles' else part}_share_under_3mm"
-        figures[key] = _share([r.right for r in mine])
+        figures[key] = share_of([r.right for r in mine])
         wrong = sum(not r.right for r in mine)
         over[key] = f"{len(mine)} objects, {wrong} not right"
     unknown = [r for r in rows if r.part == "unknown" and r.verdict != "not placed"]
-    figures["false_object_share"] = _share([r.extra for r in unknown])
+    figures["false_object_share"] = share_of([r.extra for r in unknown])
     over["false_object_share"] = f"{len(unknown)} objects found"
     figures |= _sampled(samples)
     biased = [r.mssd_mm for r in _of(rows, "biased")]
-    figures["biased_mssd_mm"] = _median(biased)
+    figures["biased_mssd_mm"] = median_of(biased)
     over["biased_mssd_mm"] = f"{len(biased)} objects"
     _add_flags(rows, figures, over)
     _add_ratios(rows, figures, over)
@@ -140,17 +132,17 @@ def figures_of(
 def _sampled(samples: Mapping[str, Sequence[float]]) -> dict[str, float]:
     """Return the figures of views."""
     return {
-        "reproj_px_before": _median(samples.get("px_before", ())),
-        "reproj_p90_px_before": _percentile(samples.get("px_before", ()), 90),
-        "reproj_px_after": _median(samples.get("px_after", ())),
-        "reproj_p90_px_after": _percentile(samples.get("px_after", ()), 90),
-        "camera_mm_before": _median(samples.get("camera_mm_before", ())),
-        "camera_deg_before": _median(samples.get("camera_deg_before", ())),
-        "camera_mm_after": _median(samples.get("camera_mm_after", ())),
-        "camera_deg_after": _median(samples.get("camera_deg_after", ())),
-        "biased_reproj_px": _median(samples.get("biased_px_after", ())),
-        "biased_camera_mm": _median(samples.get("biased_camera_mm_after", ())),
-        "biased_camera_deg": _median(samples.get("biased_camera_deg_after", ())),
+        "reproj_px_before": median_of(samples.get("px_before", ())),
+        "reproj_p90_px_before": _percentile_90(samples.get("px_before", ())),
+        "reproj_px_after": median_of(samples.get("px_after", ())),
+        "reproj_p90_px_after": _percentile_90(samples.get("px_after", ())),
+        "camera_mm_before": median_of(samples.get("camera_mm_before", ())),
+        "camera_deg_before": median_of(samples.get("camera_deg_before", ())),
+        "camera_mm_after": median_of(samples.get("camera_mm_after", ())),
+        "camera_deg_after": median_of(samples.get("camera_deg_after", ())),
+        "biased_reproj_px": median_of(samples.get("biased_px_after", ())),
+        "biased_camera_mm": median_of(samples.get("biased_camera_mm_after", ())),
+        "biased_camera_deg": median_of(samples.get("biased_camera_deg_after", ())),
     }
 
 
@@ -162,20 +154,20 @@ def _add_flags(rows: Sequence[Row], figures: dict[str, float], over: dict[str, s
     right = [r for r in found if r.right]
     flagged = [r.verdict != "accepted" for r in own]
     false = [r.verdict != "accepted" for r in provoked]
-    figures["wrong_flagged_share"] = _share([*flagged, *false])
+    figures["wrong_flagged_share"] = share_of([*flagged, *false])
     over["wrong_flagged_share"] = f"{len(own)} registered wrong and {len(provoked)} provoked"
-    figures["wrong_flagged_share_registered"] = _share(flagged)
-    figures["wrong_flagged_share_provoked"] = _share(false)
+    figures["wrong_flagged_share_registered"] = share_of(flagged)
+    figures["wrong_flagged_share_provoked"] = share_of(false)
     for kind in PROVOKED:
         mine = [r.verdict != "accepted" for r in provoked if r.part == kind]
         key = f"flagged_share_{kind.replace(' ', '_')}"
-        figures[key] = _share(mine)
+        figures[key] = share_of(mine)
         over[key] = f"{len(mine)}"
-    figures["false_alarm_share"] = _share([r.verdict != "accepted" for r in right])
+    figures["false_alarm_share"] = share_of([r.verdict != "accepted" for r in right])
     over["false_alarm_share"] = f"{len(right)} right"
     for part in (*SEARCHED, "refined"):
         mine = [r.verdict != "accepted" for r in right if r.part == part]
-        figures[f"false_alarm_share_{part}"] = _share(mine)
+        figures[f"false_alarm_share_{part}"] = share_of(mine)
 
 
 def _add_ratios(rows: Sequence[Row], figures: dict[str, float], over: dict[str, str]) -> None:
@@ -184,10 +176,10 @@ def _add_ratios(rows: Sequence[Row], figures: dict[str, float], over: dict[str, 
     for variant in variants:
         mine = _of(rows, variant)
         key = variant.replace(" ", "_")
-        figures[f"{key}_mssd_mm"] = _median([r.mssd_mm for r in mine])
-        figures[f"{key}_adds_mm"] = _median([r.adds_mm for r in mine])
+        figures[f"{key}_mssd_mm"] = median_of([r.mssd_mm for r in mine])
+        figures[f"{key}_adds_mm"] = median_of([r.adds_mm for r in mine])
     refined = _of(rows, "refined")
-    ours = _median([r.mssd_mm for r in refined]), _median([r.adds_mm for r in refined])
+    ours = median_of([r.mssd_mm for r in refined]), median_of([r.adds_mm for r in refined])
     figures["adds_mm_256"] = ours[1]
     for start in ("fine", "rough"):
         keys = [v.replace(" ", "_") for v in variants if v.endswith(start)]
@@ -218,7 +210,7 @@ def per_part(rows: Sequence[Row]) -> list[list[str]]:
             text = ", ".join(wrong[:6]) + (f", {len(wrong) - 6} more" if len(wrong) > 6 else "")
             table.append([
                 part, str(seed), str(len(true)), str(sum(r.right for r in true)),
-                f"{_median([r.mssd_mm for r in true]):.3f}",
-                f"{_percentile([r.mssd_mm for r in true], 90):.3f}", text,
+                f"{median_of([r.mssd_mm for r in true]):.3f}",
+                f"{_percentile_90([r.mssd_mm for r in true]):.3f}", text,
             ])  # fmt: skip
     return table

@@ -32,7 +32,7 @@ from pathlib import Path
 import blas_threads  # noqa: F401
 import numpy as np
 from figures import Figure, Found, Goal, run
-from school_cases import KEEP, cut_shapes
+from school_cases import cut_shapes, keep_option
 
 from realsim.app.console import Console
 from realsim.arrays import Array, Mask
@@ -272,11 +272,6 @@ FIGURES = {
 PARTS = {
     "shelf": shelf, "inverse": inverse, "plans": plans, "school": school, "arc": arc, "demo": demo,
 }  # fmt: skip
-
-
-def keep_option(parser: argparse.ArgumentParser) -> None:
-    """Add where convex parts are kept."""
-    parser.add_argument("--keep", type=Path, default=KEEP, help="folder of convex parts")
 
 
 if __name__ == "__main__":

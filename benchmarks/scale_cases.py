@@ -37,16 +37,12 @@ class Case:
     name: str
     seed: int
     views: ScanViews
-    true_mesh: Mesh
-    """What the lab saw, at its real size [m], in its own axes."""
     given_exact: Mesh
-    """The true mesh in other axes and unknown units."""
+    """What the lab saw, in other axes and unknown units."""
     given_distorted: Mesh
     """The same with a shape error of 2 %."""
     true_scale: float
     """Metres per unit of both given meshes."""
-    T_world_given: Array
-    """(4, 4) true pose of the given meshes, scaled, in world."""
     start_exact: Similarity
     start_distorted: Similarity
 
@@ -88,11 +84,9 @@ def make_case(name: str, seed: int, width: int = FULL_WIDTH) -> Case:
         name=name,
         seed=seed,
         views=views,
-        true_mesh=mesh,
         given_exact=exact,
         given_distorted=other,
         true_scale=scale,
-        T_world_given=T_world_given,
         start_exact=_start(exact, scale, T_world_given, rng),
         start_distorted=_start(other, scale, T_world_given, rng),
     )

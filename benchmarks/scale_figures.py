@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from figures import Figure, Goal
+from figures import Figure, Goal, median_of, share_of
 
 Kind = Literal["exact", "distorted", "cold"]
 KINDS: tuple[Kind, ...] = ("exact", "distorted", "cold")
@@ -76,14 +76,6 @@ class Row:
                 for k, v in values.items()} | {"covered": self.covered}  # fmt: skip
 
 
-def _median(values: Sequence[float]) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
-
-
-def _share(hits: Sequence[bool]) -> float:
-    return float(np.mean(hits)) if len(hits) else float("nan")
-
-
 def figures_of(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, str]]:
     """Return the figures of all fits and rivals, and what each was taken over."""
     by: dict[str, list[Row]] = {}
@@ -93,7 +85,7 @@ def figures_of(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, str]]:
     errors: dict[Kind, list[float]] = {k: [r.error for r in by.get(k, [])] for k in KINDS}
 
     def within(kind: Kind, limit: float) -> float:
-        return _share([e <= limit for e in errors[kind]])
+        return share_of([e <= limit for e in errors[kind]])
 
     wrong = [r for r in cold if r.error > WRONG_PCT]
     right = [r for r in cold if r.error <= WRONG_PCT]
@@ -101,26 +93,26 @@ def figures_of(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, str]]:
     cpu = [r.cpu_s for r in (*exact, *distorted) if np.isfinite(r.cpu_s)]
     judged = [*exact, *distorted, *trusted]
     figures = {
-        "scale_median_pct_exact": _median(errors["exact"]),
+        "scale_median_pct_exact": median_of(errors["exact"]),
         "within1pct_exact": within("exact", 1.0),
         "within2pct_exact": within("exact", 2.0),
         "worst_pct_exact": max(errors["exact"], default=float("nan")),
-        "scale_median_pct_distorted": _median(errors["distorted"]),
+        "scale_median_pct_distorted": median_of(errors["distorted"]),
         "within2pct_distorted": within("distorted", 2.0),
         "worst_pct": max(errors["distorted"], default=float("nan")),
-        "cold_median_pct": _median(errors["cold"]),
+        "cold_median_pct": median_of(errors["cold"]),
         "cold_within2pct": within("cold", 2.0),
-        "cold_flagged_share": _share([r.verdict != "accepted" for r in wrong] or [True]),
-        "false_alarm_share": _share([r.verdict != "accepted" for r in right] or [False]),
-        "cpu_s_per_object": _median(cpu),
+        "cold_flagged_share": share_of([r.verdict != "accepted" for r in wrong] or [True]),
+        "false_alarm_share": share_of([r.verdict != "accepted" for r in right] or [False]),
+        "cpu_s_per_object": median_of(cpu),
         "cpu_s_per_object_max": max(cpu, default=float("nan")),
-        "cpu_s_cold": _median([r.cpu_s for r in cold if np.isfinite(r.cpu_s)]),
-        "interval_coverage": _share([r.covered for r in judged]),
-        "interval_coverage_exact": _share([r.covered for r in exact]),
-        "interval_coverage_distorted": _share([r.covered for r in distorted]),
-        "interval_coverage_cold": _share([r.covered for r in trusted]),
-        "accepted_exact": _share([r.verdict == "accepted" for r in exact]),
-        "accepted_distorted": _share([r.verdict == "accepted" for r in distorted]),
+        "cpu_s_cold": median_of([r.cpu_s for r in cold if np.isfinite(r.cpu_s)]),
+        "interval_coverage": share_of([r.covered for r in judged]),
+        "interval_coverage_exact": share_of([r.covered for r in exact]),
+        "interval_coverage_distorted": share_of([r.covered for r in distorted]),
+        "interval_coverage_cold": share_of([r.covered for r in trusted]),
+        "accepted_exact": share_of([r.verdict == "accepted" for r in exact]),
+        "accepted_distorted": share_of([r.verdict == "accepted" for r in distorted]),
         "failures": float(sum(bool(r.failure) for r in rows)),
     }
     over = {
@@ -133,8 +125,8 @@ def figures_of(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, str]]:
         for kind in ("exact", "distorted"):
             part = [r.error for r in by.get(f"open3d {view}_{kind}", [])]
             key = f"open3d_{view}_median_pct"
-            figures[key if kind == "exact" else f"{key}_distorted"] = _median(part)
-            figures[f"open3d_{view}_within2pct_{kind}"] = _share([e <= 2.0 for e in part])
+            figures[key if kind == "exact" else f"{key}_distorted"] = median_of(part)
+            figures[f"open3d_{view}_within2pct_{kind}"] = share_of([e <= 2.0 for e in part])
             over[key] = "exact shape, as scale_median_pct_exact"
     return figures, over
 

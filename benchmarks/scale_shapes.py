@@ -32,7 +32,7 @@ FOOT_M = 5e-4
 """What is this near to the table touches it [m]."""
 
 
-def _mesh(pieces: Sequence[Array]) -> Mesh:
+def welded(pieces: Sequence[Array]) -> Mesh:
     """Return the welded mesh of pieces (F, 3, 3) [m]."""
     vertices, faces = solids.weld(pieces)
     return Mesh(vertices=vertices, faces=faces)
@@ -48,14 +48,14 @@ def cup() -> Mesh:
     """Return a cup without a handle, 76 x 90 mm, wall 2 mm."""
     profile = [[0.0, 0.0], [0.028, 0.0], [0.038, 0.09], [0.036, 0.09], [0.0262, 0.002], [0, 0.002]]
     cut = solids.cut_profile(profile, [0.015, 0.03, 0.045, 0.06, 0.075])
-    return _mesh([solids.revolve(cut, FACETS)])
+    return welded([solids.revolve(cut, FACETS)])
 
 
 def disc() -> Mesh:
     """Return a disc of 100 x 12 mm."""
     r, h, c = 0.05, 0.012, 0.001
     profile = [[0.0, 0.0], [r - c, 0.0], [r, c], [r, h - c], [r - c, h], [0.0, h]]
-    return _mesh([solids.revolve(profile, FACETS)])
+    return welded([solids.revolve(profile, FACETS)])
 
 
 def torus() -> Mesh:
@@ -63,14 +63,14 @@ def torus() -> Mesh:
     t = np.linspace(0, 2 * np.pi, 49)
     profile = np.stack([0.04 + 0.014 * np.cos(t), 0.014 * np.sin(t)], -1)
     profile[-1] = profile[0]
-    return _mesh([solids.revolve(profile, FACETS)])
+    return welded([solids.revolve(profile, FACETS)])
 
 
 def sphere() -> Mesh:
     """Return a ball of 80 mm."""
     profile = solids.arc((0.0, 0.0), 0.04, -np.pi / 2, np.pi / 2, 48)
     profile[[0, -1], 0] = 0.0
-    return _mesh([solids.revolve(profile, FACETS)])
+    return welded([solids.revolve(profile, FACETS)])
 
 
 def pipe() -> Mesh:
@@ -78,7 +78,7 @@ def pipe() -> Mesh:
     outer, inner, h = 0.02, 0.017, 0.07
     ring = [[inner, h], [inner, -h], [outer, -h], [outer, h], [inner, h]]
     cut = solids.cut_profile(ring, [-0.056, -0.042, -0.028, -0.014, 0, 0.014, 0.028, 0.042, 0.056])
-    return _mesh([solids.revolve(cut, FACETS)])
+    return welded([solids.revolve(cut, FACETS)])
 
 
 def _rings(centers: Array, headings: Array, section: Array, radii: Array) -> list[Array]:
@@ -111,7 +111,7 @@ def pipe2() -> Mesh:
     unit = solids.circle(1.0, 64)
     outside = _rings(centers, headings, unit, np.full(len(centers), 0.015))
     inside = _rings(centers, headings, unit, np.full(len(centers), 0.012))
-    return _mesh([solids.sweep([*outside, *inside[::-1], outside[0]])])
+    return welded([solids.sweep([*outside, *inside[::-1], outside[0]])])
 
 
 def banana() -> Mesh:
@@ -126,7 +126,7 @@ def banana() -> Mesh:
     round5 = 1 + 0.05 * np.cos(5 * turn)
     section = np.stack([round5 * np.cos(turn), round5 * np.sin(turn)], -1)
     rings = _rings(centers, heading, section, radii)
-    return _mesh([solids.sweep(rings), _fan(rings[0])[:, ::-1], _fan(rings[-1])])
+    return welded([solids.sweep(rings), _fan(rings[0])[:, ::-1], _fan(rings[-1])])
 
 
 def _fan(ring: Array) -> Array:
@@ -145,7 +145,7 @@ def motor() -> Mesh:
     plate = solids.rectangle(0.068, 0.06)
     boss, shaft = solids.circle(0.017, FACETS), solids.circle(0.006, 48, (0.006, 0.0))
     z = [0.0, 0.012, 0.046, 0.068, 0.074, 0.081, 0.104]
-    return _mesh([
+    return welded([
         solids.cap(body, (), z[0], up=False),
         solids.wall(body, z[0], body, z[1]),
         solids.cap(bump, (), z[1], up=False),

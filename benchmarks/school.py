@@ -37,11 +37,10 @@ Shares are 0 to 1. Convex parts are cut once and kept in the folder --keep.
 import argparse
 from collections.abc import Callable
 from importlib import import_module
-from pathlib import Path
 
 import blas_threads  # noqa: F401
 from figures import Figure, Found, Goal, run
-from school_cases import KEEP, PAPER_GRASPS_PER_S, cut_shapes
+from school_cases import PAPER_GRASPS_PER_S, cut_shapes, keep_option
 
 RATE = f"paper {PAPER_GRASPS_PER_S:.2f}, a GPU"
 FIGURES = {
@@ -95,11 +94,6 @@ PARTS = {
     "acronym": part("school_acronym:acronym"),
     "scaling": part("school_scaling:scaling"),
 }
-
-
-def keep_option(parser: argparse.ArgumentParser) -> None:
-    """Add where convex parts are kept."""
-    parser.add_argument("--keep", type=Path, default=KEEP, help="folder of convex parts")
 
 
 def extrapolate(found: Found) -> None:

@@ -5,6 +5,7 @@ seconds an object, are kept in a folder. Seeds from 100 on are for the published
 below for development.
 """
 
+import argparse
 import multiprocessing
 import os
 import tempfile
@@ -163,6 +164,11 @@ FEW_POINTS = 250
 KEEP = Path(tempfile.gettempdir()) / "realsim_school_benchmark"
 WIDER_M = 0.01
 """By so much the disc is widened until all objects find room [m]."""
+
+
+def keep_option(parser: argparse.ArgumentParser) -> None:
+    """Add where convex parts are kept."""
+    parser.add_argument("--keep", type=Path, default=KEEP, help="folder of convex parts")
 
 
 @cache

@@ -8,6 +8,7 @@ are, so that the parts fill them well.
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scale_shapes import welded
 
 from realsim.arrays import Array
 from realsim.geometry import parts_solids as solids
@@ -20,15 +21,9 @@ FEWER = 12
 """Around those with slanted or bent walls, which fall into more parts."""
 
 
-def _mesh(pieces: Sequence[Array]) -> Mesh:
-    """Return the welded mesh of pieces (F, 3, 3) [m]."""
-    vertices, faces = solids.weld(pieces)
-    return Mesh(vertices=vertices, faces=faces)
-
-
 def _turned(profile: Sequence[Sequence[float]], facets: int = FACETS) -> Mesh:
     """Return the body that a profile (N, 2) of r and z [m] sweeps about z."""
-    return _mesh([solids.revolve(profile, facets)])
+    return welded([solids.revolve(profile, facets)])
 
 
 def mug() -> Mesh:
@@ -46,7 +41,7 @@ def mug() -> Mesh:
     out = np.hypot(body[..., 0], body[..., 1]).min(axis=1) > radius - 1e-6
     z = middle[:, 2]
     window = ((z > rows[0]) & (z < rows[1])) | ((z > rows[2]) & (z < rows[3]))
-    return _mesh([body[~(first_facet & out & window)], _handle(radius, upper, lower, thick)])
+    return welded([body[~(first_facet & out & window)], _handle(radius, upper, lower, thick)])
 
 
 def _handle(radius: float, upper: float, lower: float, thick: float) -> Array:
@@ -125,7 +120,7 @@ def elbow() -> Mesh:
     steps = [(0.0, -straight), *((t, 0.0) for t in turns), (np.pi / 2, straight)]
     shell = [ring_at(t, s, outside) for t, s in steps]
     hollow = [ring_at(t, s, inside) for t, s in steps]
-    return _mesh([solids.sweep([*shell, *hollow[::-1], shell[0]])])
+    return welded([solids.sweep([*shell, *hollow[::-1], shell[0]])])
 
 
 def gear() -> Mesh:
