@@ -13,7 +13,6 @@ from realsim.formats.folders.depth_evidence import read_counts
 from realsim.formats.folders.source import file_digest
 from realsim.formats.frame_source import SourceFrame
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
-from realsim.records import CameraIntrinsics
 
 SAME_K_PX = 1e-6
 """Camera matrices that differ by less are one camera, written by another program."""
@@ -34,10 +33,13 @@ class LabelledFrames:
             InputError: it has no image, or several cameras, depth units or image sizes.
         """
         self.scene, self._kind = scene, kind
+        self.name = scene.name
+        """The scene's name."""
         frames = [scene.frame(i) for i in scene.indices]
         if not frames:
             raise InputError(f"{scene.name} has no images; there is nothing to import.")
-        self._camera = frames[0].intrinsics
+        self.intrinsics = frames[0].intrinsics
+        """The camera of all images."""
         for frame in frames[1:]:
             _require_same_camera(frames[0], frame, scene.name)
         deep = [f for f in frames if f.depth_unit_m is not None] if use_depth else []
@@ -47,50 +49,28 @@ class LabelledFrames:
                 f"{scene.name} has depth in units of {units_m[0]:g} and {units_m[-1]:g} m, and a "
                 "session has one. Convert it with `realsim export` instead, or import a part."
             )
-        self._unit_m = units_m[0] if units_m else None
+        self.depth_unit_m = units_m[0] if units_m else None
+        """Metres per count; None = no depth."""
         taken = deep if deep else frames
-        self._indices = tuple(f.index for f in taken)
+        self.indices = tuple(f.index for f in taken)
+        """Numbers of the images, in the order of the frames."""
         notes = list(scene.notes)
         if len(taken) < len(frames):
             notes.append(
                 f"{len(frames) - len(taken)} of {len(frames)} images have no depth and were left "
                 "out, their frames are not complete."
             )
-        self._notes = tuple(notes)
-
-    @property
-    def name(self) -> str:
-        """The scene's name."""
-        return self.scene.name
-
-    @property
-    def indices(self) -> tuple[int, ...]:
-        """Numbers of the images, in the order of the frames."""
-        return self._indices
-
-    @property
-    def intrinsics(self) -> CameraIntrinsics:
-        """The camera of all images."""
-        return self._camera
-
-    @property
-    def depth_unit_m(self) -> float | None:
-        """Metres per count; None = no depth."""
-        return self._unit_m
-
-    @property
-    def notes(self) -> tuple[str, ...]:
+        self.notes = tuple(notes)
         """What a person should know."""
-        return self._notes
 
     @property
     def extra(self) -> dict[str, Any]:
         """Where it came from: scene, image numbers, content key."""
         return {
             "kind": self._kind,
-            "path": str(self._colour(self._indices[0]).parent.parent),
+            "path": str(self._colour(self.indices[0]).parent.parent),
             "scene": self.scene.number,
-            "frames": list(self._indices),
+            "frames": list(self.indices),
             "content_key": self._content_key(),
         }
 
@@ -99,7 +79,7 @@ class LabelledFrames:
 
     def _content_key(self) -> str:
         digest = hashlib.sha256()
-        for index in self._indices:
+        for index in self.indices:
             for path in (self._colour(index), self.scene.depth_file(index)):
                 if path is not None:
                     digest.update(file_digest(path, path.name))
@@ -107,7 +87,7 @@ class LabelledFrames:
 
     def __len__(self) -> int:
         """Return the number of images."""
-        return len(self._indices)
+        return len(self.indices)
 
     def frames(self, start: int = 0) -> Iterator[SourceFrame]:
         """Yield the images from place `start` on, in the order of their numbers.
@@ -115,8 +95,8 @@ class LabelledFrames:
         Raises:
             InputError: an image cannot be read; the message names it.
         """
-        for index in self._indices[start:]:
-            deep = self.scene.depth_file(index) if self._unit_m is not None else None
+        for index in self.indices[start:]:
+            deep = self.scene.depth_file(index) if self.depth_unit_m is not None else None
             yield SourceFrame(
                 name=f"image {index} of {self.scene.name}",
                 time_s=float(index),

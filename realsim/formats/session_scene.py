@@ -56,8 +56,17 @@ class SessionScene:
         """Take over a session; see `open_session_scene`."""
         self.store = store
         self._camera, self._images = seen_by
-        self._number, self._split, self._notes = number, split, notes
         self._imported, self._views = imported, dict(views)
+        self.number = number
+        """The scene's number in its data set."""
+        self.split = split
+        """BOP's split."""
+        self.camera = self._camera or ("" if imported is None else imported.camera)
+        """The camera's name, here or in the data set it was imported from; '' = none."""
+        self.indices = tuple(sorted(views))
+        """Numbers of the images."""
+        self.notes = notes
+        """Which views and labels are taken."""
         self._is_annotated = is_annotated
         self._models: dict[int, ObjectModel] | None = None
 
@@ -68,26 +77,6 @@ class SessionScene:
         return own if self._images is self.store else f"{own}-{self._camera}"
 
     @property
-    def number(self) -> int:
-        """The scene's number in its data set."""
-        return self._number
-
-    @property
-    def split(self) -> str:
-        """BOP's split."""
-        return self._split
-
-    @property
-    def camera(self) -> str:
-        """Return the camera's name, here or in the data set it was imported from; '' = none."""
-        return self._camera or ("" if self._imported is None else self._imported.camera)
-
-    @property
-    def indices(self) -> tuple[int, ...]:
-        """Numbers of the images."""
-        return tuple(sorted(self._views))
-
-    @property
     def T_world_table(self) -> Array | None:
         """(4, 4) supporting plane in world, z up [m]; None = not known."""
         if self.store.has("registration/scene.json"):
@@ -95,11 +84,6 @@ class SessionScene:
             if plane is not None:
                 return plane.T_world_table
         return None if self._imported is None else self._imported.T_world_table
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Which views and labels are taken."""
-        return self._notes
 
     @property
     def labels(self) -> Labels:

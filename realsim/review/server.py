@@ -80,7 +80,8 @@ class ReviewServer:
         self._make_motions = motions
         self._motions: dict[int, Motions | None] = {}
         self._sessions = [ReviewedSession(s, k, self._config) for k, s in enumerate(given)]
-        self._remarks = tuple(remarks)
+        self.remarks = tuple(remarks)
+        """What the reviewers should know."""
         self._warned: set[str] = set()
         self._begun = {e.id for s in self._sessions for e in s.standing.state.entries}
         self._server: viser.ViserServer | None = None
@@ -96,11 +97,6 @@ class ReviewServer:
     def sessions(self) -> Sequence[ReviewedSession]:
         """All sessions under review."""
         return self._sessions
-
-    @property
-    def remarks(self) -> Sequence[str]:
-        """What the reviewers should know."""
-        return self._remarks
 
     @property
     def windows(self) -> list[Window]:

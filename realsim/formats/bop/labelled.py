@@ -13,7 +13,6 @@ from typing import Any
 from realsim import images
 from realsim.arrays import Array, Mask
 from realsim.errors import InputError
-from realsim.formats.bop.layout import SceneLayout
 from realsim.formats.bop.models import INFO_FILE, load_models
 from realsim.formats.bop.rows import GroundTruth, Json
 from realsim.formats.bop.run_lengths import decoded
@@ -51,9 +50,26 @@ class SceneContent:
 class BopLabelledScene:
     """A `LabelledScene`; made by `realsim.formats.bop.opening.open_labelled_scene`."""
 
+    T_world_table: Array | None = None
+    """BOP has no table."""
+
     def __init__(self, ref: BopSceneRef, content: SceneContent, notes: Sequence[str]) -> None:
         """Take over what was read and checked."""
         self.ref, self.content = ref, content
+        self.name = ref.name
+        """Split, scene and camera, such as test-000050."""
+        self.number = ref.scene_id
+        """The scene's number; of onboarding folders the object's."""
+        self.split = ref.split
+        """Such as test, train_pbr, onboarding_static."""
+        self.camera = ref.camera
+        """Type of the camera; '' where the scene has one."""
+        self.layout = ref.layout
+        """Names of its files."""
+        self.indices = tuple(content.cameras)
+        """Numbers of the images, increasing."""
+        self.truth = content.truth
+        """All annotations; None = the scene has none."""
         self.notes_found = list(notes)
         self.instances: Mapping[int, tuple[int | None, ...]] = {}
         """Image -> which thing each row is; see `realsim.formats.bop.instances`."""
@@ -61,49 +77,9 @@ class BopLabelledScene:
         self._intrinsics: dict[Any, CameraIntrinsics] = {}
 
     @property
-    def name(self) -> str:
-        """Split, scene and camera, such as test-000050."""
-        return self.ref.name
-
-    @property
-    def number(self) -> int:
-        """The scene's number; of onboarding folders the object's."""
-        return self.ref.scene_id
-
-    @property
-    def split(self) -> str:
-        """Such as test, train_pbr, onboarding_static."""
-        return self.ref.split
-
-    @property
-    def camera(self) -> str:
-        """Type of the camera; '' where the scene has one."""
-        return self.ref.camera
-
-    @property
-    def indices(self) -> tuple[int, ...]:
-        """Numbers of the images, increasing."""
-        return tuple(self.content.cameras)
-
-    @property
-    def T_world_table(self) -> Array | None:
-        """BOP has no table."""
-        return None
-
-    @property
     def notes(self) -> tuple[str, ...]:
         """What a person should know."""
         return tuple(self.notes_found)
-
-    @property
-    def layout(self) -> SceneLayout:
-        """Names of its files."""
-        return self.ref.layout
-
-    @property
-    def truth(self) -> GroundTruth | None:
-        """All annotations; None = the scene has none."""
-        return self.content.truth
 
     def frame(self, index: int) -> LabelledFrame:
         """Return one frame.

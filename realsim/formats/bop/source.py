@@ -15,7 +15,6 @@ from realsim.formats.folders.depth_evidence import read_counts
 from realsim.formats.folders.listing import image_header, shown
 from realsim.formats.folders.source import file_digest, require_one_size
 from realsim.formats.frame_source import SourceFrame
-from realsim.records import CameraIntrinsics
 from realsim.store.session_store import CAMERA_FILE
 
 TYPICAL_DEPTHS = 3
@@ -27,34 +26,18 @@ class BopSource:
 
     def __init__(self, scene: BopScene, indices: Sequence[int], notes: Sequence[str]) -> None:
         """Take over a scene that was checked; see `open_bop`."""
-        self._scene, self._indices, self._notes = scene, tuple(indices), tuple(notes)
-        self._with_depth = any(scene.has_depth(i) for i in self._indices)
-
-    @property
-    def name(self) -> str:
+        self._scene = scene
+        self.name = scene.ref.name
         """Split and scene, such as test-000050."""
-        ref = self._scene.ref
-        return ref.name
-
-    @property
-    def indices(self) -> tuple[int, ...]:
+        self.indices = tuple(indices)
         """Numbers of the images, in the order of the frames."""
-        return self._indices
-
-    @property
-    def intrinsics(self) -> CameraIntrinsics:
+        self.intrinsics = scene.session.intrinsics
         """The camera of all images of the scene."""
-        return self._scene.session.intrinsics
-
-    @property
-    def depth_unit_m(self) -> float | None:
+        with_depth = any(scene.has_depth(i) for i in indices)
+        self.depth_unit_m = scene.session.depth_unit_m if with_depth else None
         """depth_scale / 1000; None where the scene has no depth."""
-        return self._scene.session.depth_unit_m if self._with_depth else None
-
-    @property
-    def notes(self) -> tuple[str, ...]:
+        self.notes = tuple(notes)
         """What was left out and what the scene lacks."""
-        return self._notes
 
     @property
     def extra(self) -> dict[str, Any]:
@@ -63,14 +46,14 @@ class BopSource:
             "kind": "bop",
             "path": str(self._scene.ref.folder),
             "scene": self._scene.ref.scene_id,
-            "frames": [self._scene.color_files[i].name for i in self._indices],
+            "frames": [self._scene.color_files[i].name for i in self.indices],
             "content_key": self._content_key(),
         }
 
     def _content_key(self) -> str:
         scene = self._scene
         digest = hashlib.sha256(scene.ref.layout.document("scene_camera").read_bytes())
-        for i in self._indices:
+        for i in self.indices:
             for path in (scene.color_files[i], scene.depth_files.get(i)):
                 if path is not None:
                     digest.update(file_digest(path, path.name))
@@ -78,7 +61,7 @@ class BopSource:
 
     def __len__(self) -> int:
         """Return the number of images."""
-        return len(self._indices)
+        return len(self.indices)
 
     def frames(self, start: int = 0) -> Iterator[SourceFrame]:
         """Yield the images from place `start` on, in the order of their numbers.
@@ -87,7 +70,7 @@ class BopSource:
             InputError: an image cannot be read; the message names it.
         """
         scene = self._scene
-        for i in self._indices[start:]:
+        for i in self.indices[start:]:
             counts = read_counts(scene.depth_path(i)) if scene.has_depth(i) else None
             yield SourceFrame(
                 name=f"image {i} of {scene.ref.folder}",

@@ -62,8 +62,17 @@ class GraspnetLabelledScene:
     ) -> None:  # fmt: skip
         """Take over what was read; see `open_scene`."""
         self.ref = ref
+        self.name = ref.name
+        """Such as scene_0100-kinect."""
+        self.number = ref.number
+        """The scene's number."""
+        self.split = "train" if ref.number < FIRST_TEST_SCENE else "test"
+        """The data set's own: its scenes 0 to 99 are for training."""
+        self.camera = ref.camera
+        """'kinect' or 'realsense'."""
         self.files = cameras
-        self._indices = indices
+        self.indices = indices
+        """Numbers of the images, increasing."""
         self._instances = instances
         self._notes = notes
         self._models: dict[int, ObjectModel] | None = None
@@ -73,31 +82,6 @@ class GraspnetLabelledScene:
         self._Ts_0_cam = None if poses is None else se3.check_rigid(poses, "camera_poses")
         first = cameras.first
         self._T_world_0 = np.eye(4) if first is None else se3.check_rigid(first, "cam0_wrt_table")
-
-    @property
-    def name(self) -> str:
-        """Such as scene_0100-kinect."""
-        return self.ref.name
-
-    @property
-    def number(self) -> int:
-        """The scene's number."""
-        return self.ref.number
-
-    @property
-    def split(self) -> str:
-        """The data set's own: its scenes 0 to 99 are for training."""
-        return "train" if self.ref.number < FIRST_TEST_SCENE else "test"
-
-    @property
-    def camera(self) -> str:
-        """'kinect' or 'realsense'."""
-        return self.ref.camera
-
-    @property
-    def indices(self) -> tuple[int, ...]:
-        """Numbers of the images, increasing."""
-        return self._indices
 
     @property
     def T_world_table(self) -> Array | None:
@@ -212,10 +196,10 @@ class GraspnetLabelledScene:
         return str(self.ref.folder)
 
     def _require(self, index: int) -> None:
-        if index not in self._indices:
+        if index not in self.indices:
             raise InputError(
-                f"{self} has no image {index}; it has {len(self._indices)}, "
-                f"{self._indices[0]} to {self._indices[-1]}."
+                f"{self} has no image {index}; it has {len(self.indices)}, "
+                f"{self.indices[0]} to {self.indices[-1]}."
             )
 
     def _image_objects(self, index: int) -> ImageObjects:

@@ -27,44 +27,27 @@ COLOUR_FILE, DEPTH_FILE, META_FILE = "color.png", "depth.png", "meta.mat"
 class GraspnetFrame:
     """One image as a LabelledScene of one frame, number 0."""
 
+    number = 0
+    """Nothing tells which scene it is of."""
+    split = "train"
+    """Without splits."""
+    camera = ""
+    """Nothing tells which camera took it."""
+    indices = (0,)
+    """The one image."""
+    T_world_table: Array | None = None
+    """Not known."""
+
     def __init__(
         self, folder: Path, models: Path | None, frame: LabelledFrame, notes: list[str]
     ) -> None:
         """Take over what was read; see `open_graspnet_frame`."""
         self.folder = folder
+        self.name = folder.resolve().name
+        """The folder's."""
         self._models_folder = models
         self._frame = frame
         self._notes = notes
-
-    @property
-    def name(self) -> str:
-        """The folder's."""
-        return self.folder.resolve().name
-
-    @property
-    def number(self) -> int:
-        """0: nothing tells which scene it is of."""
-        return 0
-
-    @property
-    def split(self) -> str:
-        """Without splits."""
-        return "train"
-
-    @property
-    def camera(self) -> str:
-        """'': nothing tells which camera took it."""
-        return ""
-
-    @property
-    def indices(self) -> tuple[int, ...]:
-        """The one image."""
-        return (0,)
-
-    @property
-    def T_world_table(self) -> Array | None:
-        """None: not known."""
-        return None
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -62,33 +62,10 @@ class UndistortedScene:
                 takes a cast a frame.
         """
         self._scene, self._folder, self._counted = scene, folder, counted
+        self.name, self.number, self.split = scene.name, scene.number, scene.split
+        self.camera, self.indices = scene.camera, scene.indices
         self._standing: tuple[list[int], Array, LabelRenderer] | None = None
         self._last: _Cast | None = None
-
-    @property
-    def name(self) -> str:
-        """The scene's name."""
-        return self._scene.name
-
-    @property
-    def number(self) -> int:
-        """The scene's number."""
-        return self._scene.number
-
-    @property
-    def split(self) -> str:
-        """The scene's split."""
-        return self._scene.split
-
-    @property
-    def camera(self) -> str:
-        """The scene's camera."""
-        return self._scene.camera
-
-    @property
-    def indices(self) -> tuple[int, ...]:
-        """Numbers of the images."""
-        return self._scene.indices
 
     @property
     def T_world_table(self) -> Array | None:
