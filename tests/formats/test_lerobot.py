@@ -16,7 +16,7 @@ from realsim.formats.export_folder import ExportFolder
 from realsim.formats.lerobot import episodes as layout
 from realsim.formats.lerobot import spool
 from realsim.formats.lerobot.episodes import LeRobotCamera, LeRobotEpisode, LeRobotFeature
-from realsim.formats.lerobot.writer import LeRobotConfig, write_lerobot
+from realsim.formats.lerobot.writer import write_lerobot
 
 LENGTHS = (3, 7, 4, 1, 5)
 FPS = 10
@@ -82,7 +82,7 @@ class Source:
 
 def write(folder, source=None, per_file=2):
     export = ExportFolder.begin(folder, {"what": "test"})
-    written = write_lerobot(source or Source(), export, LeRobotConfig(episodes_per_file=per_file))
+    written = write_lerobot(source or Source(), export, episodes_per_file=per_file)
     export.finish({})
     return written
 
@@ -294,6 +294,6 @@ def test_encoding_elsewhere_gives_the_same_bytes(folder, tmp_path):
         for k, episode in [(k, spool.encoded(source, k)) for k in numbers]:
             take(k, pickle.loads(pickle.dumps(episode)))
 
-    write_lerobot(source, export, LeRobotConfig(episodes_per_file=2), encode=elsewhere)
+    write_lerobot(source, export, episodes_per_file=2, encode=elsewhere)
     export.finish({})
     assert bytes_of(tmp_path / "set") == bytes_of(folder)

@@ -1,6 +1,7 @@
 """A scene under physics: what rests must rest, and what cannot stand must be named."""
 
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -11,15 +12,15 @@ from realsim.models.library_records import KnownSolid
 from realsim.models.model_records import ConvexParts
 from realsim.models.properties import physical_properties
 from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
+from realsim_sim_bridge.scenes import stable_state, table_world
 from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, Support, known_solids
-from realsim_sim_bridge.scenes.stable_state import HEADERS, StandConfig, stable_state, stand_rows
+from realsim_sim_bridge.scenes.stable_state import HEADERS, stand_rows
 from realsim_sim_bridge.scenes.stand_picture import stand_picture
-from realsim_sim_bridge.scenes.table_world import TableWorld, WorldConfig
+from realsim_sim_bridge.scenes.table_world import TableWorld
 from trimesh_solids import box
 
 SIDE = 0.05
 CUBE = (SIDE, SIDE, SIDE)
-ONE_SECOND = StandConfig(shortest_s=1.0, longest_s=1.0, rest_s=0.25)
 
 
 def cube(obj_id=1, **kwargs):
@@ -40,9 +41,13 @@ def school_scene(*objects, models=None, T_world_table=None, matter=None, support
     return SchoolScene(scene=scene, models=models, solids=solids, supports=supports)
 
 
-def run(scene, config=ONE_SECOND, world_config=None):
-    with TableWorld(scene, world_config) as world:
-        return stable_state(world, config)
+def run(scene, seconds=1.0, friction=1.0):
+    with (
+        patch.multiple(stable_state, SHORTEST_S=seconds, LONGEST_S=seconds),
+        patch.object(table_world, "FRICTION", friction),
+        TableWorld(scene) as world,
+    ):
+        return stable_state.stable_state(world)
 
 
 def verdicts(report):
@@ -82,8 +87,7 @@ def test_a_box_on_a_wedge_slides_just_where_coulomb_says(degrees):
     support = Support(name="slope", T_world_support=T_slope, mesh=slab)
     scene = school_scene(pose, models={1: flat}, supports=(support,))
     seconds = 0.3
-    config = StandConfig(shortest_s=seconds, longest_s=seconds)
-    (stand,) = run(scene, config).objects
+    (stand,) = run(scene, seconds).objects
     expected = 0.5 * 9.81 * seconds**2 * max(0.0, np.sin(angle) - np.cos(angle))
     assert abs(stand.moved_m - expected) < 1e-4 + 0.02 * expected
     assert stand.verdict == ("stands" if degrees < 45 else "falls")
@@ -99,8 +103,8 @@ def test_friction_is_of_the_contact_not_its_square():
     scene = school_scene(
         ObjectPose(obj_id=1, instance=0, T_world_obj=T), models={1: flat}, supports=(support,)
     )
-    assert verdicts(run(scene, world_config=WorldConfig(friction=0.5))) == ["stands"]
-    assert verdicts(run(scene, world_config=WorldConfig(friction=0.3))) == ["falls"]
+    assert verdicts(run(scene, friction=0.5)) == ["stands"]
+    assert verdicts(run(scene, friction=0.3)) == ["falls"]
 
 
 def test_a_heavy_end_shifts_the_centre_of_mass():
@@ -144,7 +148,8 @@ def test_objects_inside_one_another_are_named_in_pairs():
 
 def test_every_parameter_is_read_back_and_a_lost_one_is_an_error(monkeypatch):
     scene = school_scene(place(0, 0, SIDE / 2))
-    with TableWorld(scene, WorldConfig(friction=0.6)) as world:
+    monkeypatch.setattr(table_world, "FRICTION", 0.6)
+    with TableWorld(scene) as world:
         settings = world.settings()
         assert settings["contact_friction"] == pytest.approx(0.6)
         assert settings["iterations"] == 300
@@ -164,7 +169,7 @@ def test_every_parameter_is_read_back_and_a_lost_one_is_an_error(monkeypatch):
 
     monkeypatch.setattr(BulletClient, "__getattr__", forgetful)
     with pytest.raises(RealsimError, match="lateralFriction"):
-        TableWorld(scene, WorldConfig(friction=0.6))
+        TableWorld(scene)
 
 
 def test_blown_up_parts_and_meshes_without_volume_are_named():
@@ -188,8 +193,6 @@ def test_blown_up_parts_and_meshes_without_volume_are_named():
 
 
 def test_bad_input_is_named(tmp_path):
-    with pytest.raises(InputError, match="friction"):
-        WorldConfig(friction=0.0)
     with pytest.raises(InputError, match="does not exist"):
         Support(name="shelf", T_world_support=np.eye(4), urdf=tmp_path / "shelf.urdf")
     with pytest.raises(InputError, match="neither a mesh nor"):

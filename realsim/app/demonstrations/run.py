@@ -269,7 +269,7 @@ def export_demonstrations(
     """
     from realsim.app.demonstrations.page import demonstrations_card, page_file
     from realsim.app.export.card import CARD_FILE
-    from realsim.formats.lerobot.writer import LeRobotConfig, write_lerobot
+    from realsim.formats.lerobot.writer import write_lerobot
     from realsim.store.lock import only_run_in
 
     import_av()
@@ -282,7 +282,7 @@ def export_demonstrations(
         with console.stage("demonstrations", f"{len(episodes)} attempts") as tick:
             encoding = _Encoding(source, request, episodes, where or PoolConfig(workers=1), console)
             written = write_lerobot(
-                episodes, folder, LeRobotConfig(episodes_per_file=request.episodes_per_file),
+                episodes, folder, episodes_per_file=request.episodes_per_file,
                 progress=_counter(tick, len(episodes)), encode=encoding.encode,
             )  # fmt: skip
         with console.stage("page"):

@@ -6,7 +6,6 @@ until its file is full (`spool`), so that a killed export goes on at the next ep
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,34 +43,14 @@ GROUPS = "meta/groups"
 """Rows of the export's own: what is known of each group of episodes."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class LeRobotConfig:
-    """How the files are filled."""
-
-    episodes_per_file: int = 50
-    """Episodes of one Parquet file and one video: of ten seconds each about 20 MB, far below the
-    sizes up to which LeRobot itself fills a file."""
-
-    def __post_init__(self) -> None:
-        """Check the number.
-
-        Raises:
-            InputError: it is not positive.
-        """
-        if not 1 <= self.episodes_per_file <= 10_000:
-            raise InputError(
-                f"{self.episodes_per_file} episodes in a file cannot be; 1 to 10000 is accepted."
-            )
-
-
 Take = Callable[[int, EncodedEpisode], None]
 
 
 def write_lerobot(
     source: LeRobotSource,
     folder: ExportFolder,
-    config: LeRobotConfig | None = None,
     *,
+    episodes_per_file: int = 50,
     progress: Callable[[], None] | None = None,
     encode: Callable[[Sequence[int], Take], None] | None = None,
 ) -> WrittenScene:
@@ -80,18 +59,23 @@ def write_lerobot(
     Args:
         source: the episodes.
         folder: where to; `finish` is called by whoever made it.
-        config: how the files are filled.
+        episodes_per_file: of one Parquet file and one video: 50 of ten seconds each make about
+            20 MB, far below the sizes up to which LeRobot itself fills a file.
         progress: called once an episode.
         encode: given the numbers of the episodes that are missing, hands each on, encoded
             (`spool.encoded`), in their order: the place for other processes. None = one by one.
 
     Raises:
-        InputError: PyAV is not installed, or the source cannot be written.
+        InputError: PyAV is not installed, a file cannot have so many episodes, or the source
+            cannot be written.
     """
-    config = config or LeRobotConfig()
+    if not 1 <= episodes_per_file <= 10_000:
+        raise InputError(
+            f"{episodes_per_file} episodes in a file cannot be; 1 to 10000 is accepted."
+        )
     import_av()
     check_source(source)
-    writer = _Writer(source, folder, config, progress or _silent)
+    writer = _Writer(source, folder, episodes_per_file, progress or _silent)
     missing = writer.begin()
     if encode is None:
         for k in missing:
@@ -112,11 +96,11 @@ class _Writer:
         self,
         source: LeRobotSource,
         folder: ExportFolder,
-        config: LeRobotConfig,
+        episodes_per_file: int,
         progress: Callable[[], None],
     ) -> None:
         self._source, self._folder, self._progress = source, folder, progress
-        self._size = config.episodes_per_file
+        self._size = episodes_per_file
         self._known = {int(key): row for key, row in folder.rows(GROUPS)}
         self._frames = self._written = 0
 

@@ -183,8 +183,9 @@ def _of_planes(
 ) -> FittedDepthModel:
     """Return the fit to planes that were found in their frames."""
     fB = intrinsics.fx * kind.baseline_m
-    on_plane = [np.where(p.mask, d, 0) for p, d in zip(planes, depths, strict=True)]
-    step = _common_step(on_plane, intrinsics, kind.baseline_m, unit)
+    on_plane = np.stack([np.where(p.mask, d, 0) for p, d in zip(planes, depths, strict=True)])
+    # The step that most of the planes show, measured on all of them together.
+    step = disparity_step(on_plane, intrinsics, kind.baseline_m, unit)
     bands = bands_of(planes)
     flat = [without_bands(p, bands) for p in planes]
     sums, trend = steady_sums(flat)
@@ -264,13 +265,6 @@ def _require_equal_lengths(
     for what, given in (("names", names), ("regions", regions), ("true depths", truths)):
         if given is not None and len(given) != len(frames):
             raise InputError(f"there are {len(frames)} frames and {len(given)} {what}.")
-
-
-def _common_step(
-    depths: Sequence[NDArray[Any]], intrinsics: CameraIntrinsics, baseline_m: float, unit_m: float
-) -> Step:
-    """Return the step that most of the planes show, measured on all of them together."""
-    return disparity_step(np.stack(depths), intrinsics, baseline_m, unit_m)
 
 
 def _rounding(step_px: float, unit_m: float, fB: float, planes: Sequence[PlaneView]) -> float:

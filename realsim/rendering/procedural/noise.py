@@ -54,13 +54,7 @@ def smooth(
     return _filtered(rng, np.exp(-0.5 * (fu / waves_u) ** 2) * np.exp(-0.5 * (fv / along_v) ** 2))
 
 
-def fractal(
-    rng: np.random.Generator,
-    n: int,
-    slope: float = 1.8,
-    lowest: float = 1.0,
-    stretch_v: float = 1.0,
-) -> Array32:
+def fractal(rng: np.random.Generator, n: int, slope: float, lowest: float = 1.0) -> Array32:
     """Return clouds: the amplitude falls as frequency^-slope (fractional Brownian surface).
 
     Args:
@@ -68,10 +62,9 @@ def fractal(
         n: side [px].
         slope: 1 = rough, 2.5 = soft.
         lowest: waves per side below which nothing is added.
-        stretch_v: factor of the features' length along v.
     """
     fu, fv = _waves(n)
-    f = np.sqrt(fu**2 + (fv * stretch_v) ** 2)
+    f = np.sqrt(fu**2 + fv**2)
     gain = np.maximum(f, 1e-6) ** np.float32(-slope) * (1 - np.exp(-((f / lowest) ** 4)))
     return _filtered(rng, gain.astype(np.float32))
 

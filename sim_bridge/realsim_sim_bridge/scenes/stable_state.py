@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from realsim.arrays import Array, Mask
-from realsim.errors import InputError, RealsimError
+from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.records import Scene
 from realsim_sim_bridge.scenes.table_world import TABLE, TableWorld
@@ -18,46 +18,35 @@ from realsim_sim_bridge.scenes.table_world import TABLE, TableWorld
 Standing = Literal["stands", "jumps", "falls", "inside another", "floats"]
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class StandConfig:
-    """When an object is said to stand, and how long it is watched."""
-
-    longest_s: float = 3.0
-    """Simulated time at most [s]: a fall from 20 cm takes 0.2, rocking dies within 2."""
-    shortest_s: float = 0.5
-    """Time at least [s]: what stands on its edge takes a while to begin to fall."""
-    rest_s: float = 0.25
-    """Rest has to last so long [s]: a body is slow at the top of its bounce, too."""
-    rest_m_s: float = 0.002
-    """Centres of mass slower than this rest [m/s]: 0.5 mm in the time above."""
-    rest_rad_s: float = 0.02
-    """Greatest turning speed of an object at rest [rad/s]."""
-    stands_m: float = 0.002
-    """What moved no more still stands where it did [m]: poses are not known better."""
-    stands_deg: float = 2.0
-    """What turned no more still stands as it did [deg]."""
-    jump_window_s: float = 0.05
-    """How long after the start a speed counts as a jump [s]: free fall is left out of it."""
-    jump_m_s: float = 0.1
-    """Upward or sideways speed of a jump [m/s]: it lifts a body by 0.5 mm."""
-    sunk_m: float = 0.0005
-    """Penetration from which a speed is put down to it [m]; resting contacts have 0.01 mm."""
-    inside_m: float = 0.003
-    """Penetration from which an object is inside another [m]: more than two poses' errors."""
-    float_m: float = 0.002
-    """Distance to everything from which an object floats [m]."""
-    fell_over_deg: float = 30.0
-    """What turned more has fallen over [deg]."""
-    reach_m: float = 0.1
-    """Distances are looked for up to this [m]."""
-
-    def __post_init__(self) -> None:
-        """Check the times."""
-        if not 0 < self.rest_s <= self.longest_s or self.shortest_s > self.longest_s:
-            raise InputError(
-                f"watching {self.shortest_s:g} to {self.longest_s:g} s for {self.rest_s:g} s of "
-                "rest is impossible; shortest_s and rest_s must fit into longest_s."
-            )
+# When an object is said to stand, and how long it is watched.
+LONGEST_S = 3.0
+"""Simulated time at most [s]: a fall from 20 cm takes 0.2, rocking dies within 2."""
+SHORTEST_S = 0.5
+"""Time at least [s]: what stands on its edge takes a while to begin to fall."""
+REST_S = 0.25
+"""Rest has to last so long [s]: a body is slow at the top of its bounce, too."""
+REST_M_S = 0.002
+"""Centres of mass slower than this rest [m/s]: 0.5 mm in the time above."""
+REST_RAD_S = 0.02
+"""Greatest turning speed of an object at rest [rad/s]."""
+STANDS_M = 0.002
+"""What moved no more still stands where it did [m]: poses are not known better."""
+STANDS_DEG = 2.0
+"""What turned no more still stands as it did [deg]."""
+JUMP_WINDOW_S = 0.05
+"""How long after the start a speed counts as a jump [s]: free fall is left out of it."""
+JUMP_M_S = 0.1
+"""Upward or sideways speed of a jump [m/s]: it lifts a body by 0.5 mm."""
+SUNK_M = 0.0005
+"""Penetration from which a speed is put down to it [m]; resting contacts have 0.01 mm."""
+INSIDE_M = 0.003
+"""Penetration from which an object is inside another [m]: more than two poses' errors."""
+FLOAT_M = 0.002
+"""Distance to everything from which an object floats [m]."""
+FELL_OVER_DEG = 30.0
+"""What turned more has fallen over [deg]."""
+REACH_M = 0.1
+"""Distances are looked for up to this [m]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -129,21 +118,19 @@ def stand_rows(report: StandReport) -> list[tuple[str, ...]]:
     ]
 
 
-def stable_state(world: TableWorld, config: StandConfig | None = None) -> StandReport:
+def stable_state(world: TableWorld) -> StandReport:
     """Let physics run until everything rests, or the time is over, and say what happened.
 
     Args:
         world: as it was built; it is in its final state afterwards.
-        config: settings.
 
     Raises:
         RealsimError: the engine's numbers are no longer finite.
     """
-    config = config or StandConfig()
-    distances = _distances(world, config.reach_m)
+    distances = _distances(world, REACH_M)
     instances = list(world.bodies)
     before, centers = {i: world.pose(i) for i in instances}, world.centers()
-    jump, seconds, resting = _run(world, config)
+    jump, seconds, resting = _run(world)
     moved = np.linalg.norm(world.centers() - centers, axis=1)
     if not np.all(np.isfinite(moved)):
         raise RealsimError(
@@ -165,16 +152,16 @@ def stable_state(world: TableWorld, config: StandConfig | None = None) -> StandR
             turned_deg=float(np.degrees(se3.angle(se3.invert(before[i]) @ after))),
             jump_m_s=float(jump[k]),
             gap_m=min(near.values(), default=float("inf")),
-            into={n: -d for n, d in near.items() if d < -config.sunk_m},
+            into={n: -d for n, d in near.items() if d < -SUNK_M},
             at_rest=bool(resting[k]),
             T_world_before=T_world_table @ before[i],
             T_world_after=T_world_table @ after,
         )
-        verdict, sentence = _judged(stand, float(world.centers()[k, 2]), seconds, config)
+        verdict, sentence = _judged(stand, float(world.centers()[k, 2]), seconds)
         stands.append(replace(stand, verdict=verdict, sentence=sentence))
     return StandReport(
         objects=tuple(stands),
-        inside=_pairs(stands, config),
+        inside=_pairs(stands),
         simulated_s=seconds,
         notes=tuple(world.notes),
         settings=world.settings(),
@@ -194,63 +181,61 @@ def _distances(world: TableWorld, reach_m: float) -> dict[int, dict[str, float]]
     return found
 
 
-def _run(world: TableWorld, config: StandConfig) -> tuple[Array, float, Mask]:
+def _run(world: TableWorld) -> tuple[Array, float, Mask]:
     """Return every object's jump [m/s], the simulated time [s], and whether it rests."""
     jump = np.zeros(len(world.bodies))
     resting = np.zeros(len(world.bodies), dtype=np.bool_)
     quiet = seconds = 0.0
-    for n in range(1, round(config.longest_s / world.dt) + 1):
+    for n in range(1, round(LONGEST_S / world.dt) + 1):
         world.step()
         seconds = n * world.dt
         twists = world.twists()
-        if seconds <= config.jump_window_s:
+        if seconds <= JUMP_WINDOW_S:
             v = twists[:, 3:].copy()
             v[:, 2] = np.maximum(v[:, 2], 0.0)
             jump = np.maximum(jump, np.linalg.norm(v, axis=1))
-        slow = np.linalg.norm(twists[:, 3:], axis=1) < config.rest_m_s
-        resting = slow & (np.linalg.norm(twists[:, :3], axis=1) < config.rest_rad_s)
+        slow = np.linalg.norm(twists[:, 3:], axis=1) < REST_M_S
+        resting = slow & (np.linalg.norm(twists[:, :3], axis=1) < REST_RAD_S)
         quiet = quiet + world.dt if resting.all() else 0.0
-        if seconds >= config.shortest_s and quiet >= config.rest_s:
+        if seconds >= SHORTEST_S and quiet >= REST_S:
             break
     return jump, seconds, resting
 
 
-def _judged(
-    o: ObjectStand, height_m: float, seconds: float, config: StandConfig
-) -> tuple[Standing, str]:
+def _judged(o: ObjectStand, height_m: float, seconds: float) -> tuple[Standing, str]:
     """Return the verdict and the sentence."""
     deepest = max(o.into, key=lambda name: o.into[name], default="")
     depth_mm = 1e3 * o.into.get(deepest, 0.0)
-    others = {n: d for n, d in o.into.items() if n != TABLE and d > config.inside_m}
+    others = {n: d for n, d in o.into.items() if n != TABLE and d > INSIDE_M}
     travel = f"moved by {1e3 * o.moved_m:.1f} mm and turned by {o.turned_deg:.1f} deg"
     end = "" if o.at_rest else f"; after {seconds:.1f} s it still moves"
     if others:
         listed = ", ".join(f"{n} ({1e3 * d:.1f} mm)" for n, d in others.items())
         return "inside another", f"it is inside {listed}; {travel}{end}."
-    if o.into and o.jump_m_s > config.jump_m_s:
+    if o.into and o.jump_m_s > JUMP_M_S:
         return "jumps", (
             f"it starts {depth_mm:.1f} mm inside {deepest} and is thrown out at {o.jump_m_s:.2f} "
             f"m/s; {travel}{end}."
         )
-    if o.gap_m > config.float_m:
-        above = f"{1e3 * o.gap_m:.1f}" if np.isfinite(o.gap_m) else f"over {1e3 * config.reach_m:g}"
+    if o.gap_m > FLOAT_M:
+        above = f"{1e3 * o.gap_m:.1f}" if np.isfinite(o.gap_m) else f"over {1e3 * REACH_M:g}"
         return "floats", f"it hangs {above} mm from everything and drops; {travel}{end}."
-    if o.moved_m <= config.stands_m and o.turned_deg <= config.stands_deg:
+    if o.moved_m <= STANDS_M and o.turned_deg <= STANDS_DEG:
         return "stands", f"{travel}{end}."
     if height_m < 0:
         how = "it fell off the table"
     else:
-        fell_over = o.turned_deg > config.fell_over_deg
+        fell_over = o.turned_deg > FELL_OVER_DEG
         how = f"it {'fell over' if fell_over else 'does not stay where it is'}: {travel}"
     return "falls", f"{how}{end}."
 
 
-def _pairs(stands: list[ObjectStand], config: StandConfig) -> tuple[tuple[str, str, float], ...]:
+def _pairs(stands: list[ObjectStand]) -> tuple[tuple[str, str, float], ...]:
     """Return the pairs that are inside one another, each once; the table is no partner."""
     found: dict[tuple[str, str], float] = {}
     for o in stands:
         for name, depth in o.into.items():
-            if name != TABLE and depth > config.inside_m and (name, o.name) not in found:
+            if name != TABLE and depth > INSIDE_M and (name, o.name) not in found:
                 found[o.name, name] = depth
     deepest_first = sorted(found.items(), key=lambda item: -item[1])
     return tuple((a, b, depth) for (a, b), depth in deepest_first)

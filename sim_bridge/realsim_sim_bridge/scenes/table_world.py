@@ -5,10 +5,8 @@ engine is its principal one, at its centre of mass (`SlipBody.principal_frame`).
 back: `changeDynamics` loses settings without a word (damping and friction in one call, for one).
 """
 
-import math
 import tempfile
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,54 +23,30 @@ from realsim_sim_bridge.scenes.school_scene import SchoolScene, Support
 from realsim_sim_bridge.slip.bullet_shapes import drawn_in
 from realsim_sim_bridge.slip.world import SlipBody
 
-# --- Settings of a scene's world in PyBullet -----------------------------------------------------
+# --- Settings under which a box on a table rests; each is read back from the engine --------------
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class WorldConfig:
-    """Settings under which a box on a table rests; each is read back from the engine."""
-
-    friction: float = 1.0
-    """Coulomb coefficient of every contact; the paper's. Bullet multiplies the two bodies', so each
-    gets its square root."""
-    gravity: float = 9.81
-    """[m/s^2]."""
-    rate_hz: float = 480.0
-    """Steps per second: at 240 a 10 g part under a 2 kg one is pressed out from under it within
-    2 s; at 480 it shifts by 0.2 mm."""
-    iterations: int = 300
-    """Solver iterations a step, which also are for stacks: weight is handed down part by part."""
-    collision_margin_m: float = 0.0005
-    """Bullet's skin around every hull [m], for which the hulls are drawn in (`drawn_in`): contacts
-    rest within it, where normals are right, and a box still stands within 0.01 mm of its place."""
-    table_reach_m: float = 2.0
-    """The table ends so far beyond the outermost object [m]: only what rolls away falls off."""
-    table_depth_m: float = 1.0
-    """Thickness of the table [m]: deeper than anything sinks, so that it is pushed out upwards. A
-    box, not Bullet's infinite plane, on which a resting box starts with 27 mm/s."""
-    fat_ratio: float = 1.10
-    """Convex parts of a larger share of the mesh's volume are named: they meet too early."""
-    thin_ratio: float = 0.90
-    """Convex parts of a smaller share are named: bodies sink into each other."""
-
-    def __post_init__(self) -> None:
-        """Check what would make the physics meaningless."""
-        if not (math.isfinite(self.friction) and self.friction > 0):
-            raise InputError(
-                f"the friction is {self.friction}; a positive Coulomb coefficient is needed (wood "
-                "on wood 0.4, rubber 1). Without friction nothing stands and nothing is held."
-            )
-        if not (math.isfinite(self.gravity) and self.gravity > 0):
-            raise InputError(f"gravity is {self.gravity} m/s^2; a positive number is needed.")
-        if not (self.rate_hz >= 60 and self.iterations >= 1):
-            raise InputError(
-                f"{self.rate_hz} steps a second of {self.iterations} iterations are too coarse; "
-                "at least 60 and 1 are needed (480, 300)."
-            )
-        if not (self.table_reach_m > 0 and self.table_depth_m > 0):
-            raise InputError("the table needs a positive reach and thickness.")
-        if self.collision_margin_m < 0:
-            raise InputError("a collision margin below 0 m is none; 0 is accepted.")
+FRICTION = 1.0
+"""Coulomb coefficient of every contact; the paper's. Bullet multiplies the two bodies', so each
+gets its square root."""
+GRAVITY = 9.81
+"""[m/s^2]."""
+RATE_HZ = 480.0
+"""Steps per second: at 240 a 10 g part under a 2 kg one is pressed out from under it within
+2 s; at 480 it shifts by 0.2 mm."""
+ITERATIONS = 300
+"""Solver iterations a step, which also are for stacks: weight is handed down part by part."""
+COLLISION_MARGIN_M = 0.0005
+"""Bullet's skin around every hull [m], for which the hulls are drawn in (`drawn_in`): contacts
+rest within it, where normals are right, and a box still stands within 0.01 mm of its place."""
+TABLE_REACH_M = 2.0
+"""The table ends so far beyond the outermost object [m]: only what rolls away falls off."""
+TABLE_DEPTH_M = 1.0
+"""Thickness of the table [m]: deeper than anything sinks, so that it is pushed out upwards. A
+box, not Bullet's infinite plane, on which a resting box starts with 27 mm/s."""
+THIN_RATIO, FAT_RATIO = 0.90, 1.10
+"""Convex parts of a smaller share of the mesh's volume are named: bodies sink into each other; of a
+larger: they meet too early."""
 
 
 TABLE = "the table"
@@ -90,22 +64,19 @@ _INFO = {
 class TableWorld:
     """The scene's bodies in an engine of their own; leaving the context frees it."""
 
-    def __init__(
-        self, scene: SchoolScene, config: WorldConfig | None = None, cache: Path | None = None
-    ) -> None:
+    def __init__(self, scene: SchoolScene, cache: Path | None = None) -> None:
         """Build the world.
 
         Args:
             scene: objects, supports and table.
-            config: the engine's settings.
             cache: folder for the convex parts of supports' meshes.
 
         Raises:
             InputError: a URDF that PyBullet cannot read, or a support's mesh that is flat.
             RealsimError: the engine did not take a setting.
         """
-        self.scene, self.config = scene, config or WorldConfig()
-        self.notes: list[str] = _of_solids(scene, self.config)
+        self.scene = scene
+        self.notes: list[str] = _of_solids(scene)
         self.names: dict[int, str] = {}
         """Body number in the engine -> what it is."""
         self.bodies: dict[int, int] = {}
@@ -142,15 +113,15 @@ class TableWorld:
 
     def _set_engine(self) -> None:
         wanted: dict[str, float] = {
-            "fixedTimeStep": 1.0 / self.config.rate_hz,
-            "numSolverIterations": self.config.iterations,
+            "fixedTimeStep": 1.0 / RATE_HZ,
+            "numSolverIterations": ITERATIONS,
             # Substeps multiply motors' forces, and ending early would make bodies depend on others.
             "numSubSteps": 0,
         }
         self._engine.setPhysicsEngineParameter(
             **wanted, deterministicOverlappingPairs=1, solverResidualThreshold=0.0
         )
-        self._engine.setGravity(0.0, 0.0, -self.config.gravity)
+        self._engine.setGravity(0.0, 0.0, -GRAVITY)
         found = self._engine.getPhysicsEngineParameters()
         for name, value in wanted.items():
             _require_taken(name, float(found[name]), value, "the engine")
@@ -159,8 +130,8 @@ class TableWorld:
         T = self.scene.T_table_world
         at = np.array([(T @ o.T_world_obj)[:2, 3] for o in self.scene.scene.objects])
         low, high = at.min(axis=0), at.max(axis=0)
-        reach = (high - low) / 2.0 + self.config.table_reach_m
-        depth = self.config.table_depth_m
+        reach = (high - low) / 2.0 + TABLE_REACH_M
+        depth = TABLE_DEPTH_M
         shape = self._engine.createCollisionShape(
             self._engine.GEOM_BOX, halfExtents=[*reach.tolist(), depth / 2.0]
         )
@@ -188,9 +159,9 @@ class TableWorld:
                 parts = convex_parts(support.mesh, ConvexConfig(), cache)
             except InputError as error:
                 raise InputError(f"the support '{support.name}' is no solid: {error}") from error
-            if not self.config.thin_ratio <= parts.volume_ratio <= self.config.fat_ratio:
+            if not THIN_RATIO <= parts.volume_ratio <= FAT_RATIO:
                 self.notes.append(_blown_up(f"the support '{support.name}'", parts.volume_ratio))
-            cores, margin = drawn_in(list(parts.parts), self.config.collision_margin_m)
+            cores, margin = drawn_in(list(parts.parts), COLLISION_MARGIN_M)
             shape = self._shape(cores, folder / f"support{len(self.statics)}.obj")
             body = self._engine.createMultiBody(0.0, shape, -1, position, xyzw)
             self._engine.changeDynamics(body, -1, collisionMargin=margin)
@@ -209,7 +180,7 @@ class TableWorld:
         T_obj_body, moments = slip_body.principal_frame()
         T_body_obj = se3.invert(T_obj_body)
         parts = [se3.transform(T_body_obj, part) for part in slip_body.parts]
-        cores, margin = drawn_in(parts, self.config.collision_margin_m)
+        cores, margin = drawn_in(parts, COLLISION_MARGIN_M)
         shape = self._shape(cores, folder / f"object{o.instance}.obj")
         T = self.scene.T_table_world @ o.T_world_obj @ T_obj_body
         position, xyzw = interop.pybullet_from_T(T)
@@ -229,7 +200,7 @@ class TableWorld:
 
     def _contact(self) -> dict[str, float]:
         return {
-            "lateralFriction": float(np.sqrt(self.config.friction)),
+            "lateralFriction": float(np.sqrt(FRICTION)),
             "restitution": 0.0,
             "rollingFriction": 0.0,
             "spinningFriction": 0.0,
@@ -256,7 +227,7 @@ class TableWorld:
     @property
     def dt(self) -> float:
         """Time of a step [s]."""
-        return 1.0 / self.config.rate_hz
+        return 1.0 / RATE_HZ
 
     def step(self) -> None:
         """Let one time step pass."""
@@ -312,7 +283,7 @@ def _require_taken(name: str, found: float, wanted: float, of: str) -> None:
         )
 
 
-def _of_solids(scene: SchoolScene, config: WorldConfig) -> list[str]:
+def _of_solids(scene: SchoolScene) -> list[str]:
     """Return what is doubtful about the objects' shapes: no volume, parts too large."""
     notes: list[str] = []
     for obj_id in sorted({o.obj_id for o in scene.scene.objects}):
@@ -323,7 +294,7 @@ def _of_solids(scene: SchoolScene, config: WorldConfig) -> list[str]:
                 f"{solid.matter.volume_of} stands for it ({1e3 * solid.matter.mass_kg:.0f} g). "
                 "Repair it: `realsim scan import`."
             )
-        elif not config.thin_ratio <= solid.parts.volume_ratio <= config.fat_ratio:
+        elif not THIN_RATIO <= solid.parts.volume_ratio <= FAT_RATIO:
             notes.append(_blown_up(name, solid.parts.volume_ratio))
     return notes
 
