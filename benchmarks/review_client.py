@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, cast
 
 import msgspec
+import numpy as np
 import viser
 import zstandard
 from websockets.sync.client import connect
@@ -31,8 +32,8 @@ class Browser:
     received_bytes: int = 0
     messages: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     """Every message so far, arrays left out."""
-    _lengths: dict[int, list[int]] = field(default_factory=dict[int, list[int]])
-    """Bytes of the arrays that came with a message."""
+    _arrays: dict[int, list[bytes]] = field(default_factory=dict[int, list[bytes]])
+    """The arrays that came with a message."""
 
     @staticmethod
     def open(url: str) -> "Browser":
@@ -60,12 +61,17 @@ class Browser:
         length = int.from_bytes(data[8:HEAD_BYTES], "little")
         inner = zstandard.ZstdDecompressor().decompress(data[HEAD_BYTES : HEAD_BYTES + length])
         window = msgspec.msgpack.decode(inner)
+        at, arrays = HEAD_BYTES + length, list[bytes]()
+        for size in window["binaryBufferLengths"]:
+            at += -at % 8
+            arrays.append(data[at : at + size])
+            at += size
         self.messages += window["messages"]
         for message in window["messages"]:
+            self._arrays[id(message)] = arrays
             if message["type"] == "LocalStorageGetItemRequestMessage":  # it keeps nothing
                 said = {"value": None, "error": None, "request_uuid": message["request_uuid"]}
                 self.send({"type": "LocalStorageGetItemResponseMessage"} | said)
-            self._lengths[id(message)] = window["binaryBufferLengths"]
         return True
 
     def until_quiet(self, quiet_s: float, timeout_s: float = 120.0) -> float:
@@ -83,11 +89,14 @@ class Browser:
             self.receive(1.0)
         self.until_quiet(quiet_s)
 
+    def array(self, message: dict[str, Any], key: str, dtype: Any = np.float32) -> np.ndarray:
+        """Return an array of a message, flat."""
+        index = message["props"][key]["__binary_index"]
+        return np.frombuffer(self._arrays[id(message)][index], dtype)
+
     def count(self, message: dict[str, Any], key: str) -> int:
         """Return how many rows of three an array of a message has."""
-        index = message["props"][key]["__binary_index"]
-        dtype_bytes = 4
-        return self._lengths[id(message)][index] // (3 * dtype_bytes)
+        return self.array(message, key).size // 3
 
     def of_type(self, *types: str) -> list[dict[str, Any]]:
         """Return the messages of these types, in order."""

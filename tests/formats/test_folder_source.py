@@ -47,6 +47,11 @@ def make(folder: Path, numbers, colour="rgb_{:04d}.png", depth="depth_{:04d}.png
     return folder
 
 
+def refused(folder: Path, why: str) -> None:
+    with pytest.raises(InputError, match=why):
+        open_folder(folder, CAMERA, choice=MM)
+
+
 def number_of(frame) -> int:
     """Return which frame's pixels these are, and check that all its parts are of that frame."""
     k = next(k for k in range(40) if np.array_equal(frame.rgb, rgb_of(k)))
@@ -145,15 +150,13 @@ def test_rows_without_names_count_only_without_gaps():
 def test_two_images_of_one_name(tmp_path):
     make(tmp_path, [1])
     write(tmp_path, "rgb_0001.jpg", rgb_of(1))
-    with pytest.raises(InputError, match=r"rgb_0001\.jpg and rgb_0001\.png are two images"):
-        open_folder(tmp_path, CAMERA, choice=MM)
+    refused(tmp_path, r"rgb_0001\.jpg and rgb_0001\.png are two images")
 
 
 def test_several_sizes(tmp_path):
     make(tmp_path, range(3))
     write(tmp_path, "rgb_0001.png", rgb_of(1, (60, 80)))
-    with pytest.raises(InputError, match=r"rgb_0001\.png is 80x60"):
-        open_folder(tmp_path, CAMERA, choice=MM)
+    refused(tmp_path, r"rgb_0001\.png is 80x60")
 
 
 def test_no_camera_and_another_camera(tmp_path):
@@ -184,8 +187,7 @@ def test_an_image_that_cannot_be_read_is_named(tmp_path, damage):
     path = tmp_path / "rgb_1.jpg"
     data = path.read_bytes()
     path.write_bytes({"empty": b"", "text": b"hello", "cut": data[: len(data) // 2]}[damage])
-    with pytest.raises(InputError, match=r"rgb_1\.jpg is (not an image|truncated)"):
-        open_folder(tmp_path, CAMERA, choice=MM)
+    refused(tmp_path, r"rgb_1\.jpg is (not an image|truncated)")
 
 
 @pytest.mark.parametrize("ending", ["png", "jpg"])
@@ -195,23 +197,20 @@ def test_an_image_marked_to_be_shown_turned_is_refused(tmp_path, ending):
     exif[0x0112] = 6
     (tmp_path / "rgb_0001.png").unlink()
     Image.fromarray(rgb_of(1)).save(tmp_path / f"rgb_0001.{ending}", exif=exif)
-    with pytest.raises(InputError, match=rf"rgb_0001\.{ending} is marked to be shown turned"):
-        open_folder(tmp_path, CAMERA, choice=MM)
+    refused(tmp_path, rf"rgb_0001\.{ending} is marked to be shown turned")
 
 
 def test_a_picture_of_the_depth_is_no_depth(tmp_path):
     make(tmp_path, range(2))
     write(tmp_path, "depth_0001.png", rgb_of(1))
-    with pytest.raises(InputError, match=r"depth_0001\.png has 8 bits"):
-        open_folder(tmp_path, CAMERA, choice=MM)
+    refused(tmp_path, r"depth_0001\.png has 8 bits")
 
 
 def test_depth_on_other_pixels_needs_a_decision(tmp_path):
     for k in range(3):
         write(tmp_path, f"{k}.jpg", rgb_of(k))
         write(tmp_path, f"{k}.png", depth_of(k, (24, 32)))
-    with pytest.raises(InputError, match=r"32x24 px, the colour images 40x30.*--no-depth"):
-        open_folder(tmp_path, CAMERA, choice=MM)
+    refused(tmp_path, r"32x24 px, the colour images 40x30.*--no-depth")
     source = open_folder(tmp_path, CAMERA, choice=FolderChoice(use_depth=False))
     assert source.depth_unit_m is None and len(source) == 3
     assert all(f.depth_counts is None for f in source.frames())

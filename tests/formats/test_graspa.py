@@ -28,6 +28,11 @@ def trials_of(folder):
     return next(folder.glob("results/*/grasps_data/*/*_grasp.xml"))
 
 
+def refused(folder, why):
+    with pytest.raises(InputError, match=why):
+        read_graspa(folder)
+
+
 def test_what_was_written_is_read(folder):
     Ts, held = box_grasps()
     (box,) = read_graspa(folder)
@@ -67,8 +72,7 @@ def test_boards_and_hands_in_metres_are_refused(folder):
     ):
         read_graspa(folder)
     in_metres(trials_of(folder))
-    with pytest.raises(InputError, match=r"within 2 mm of the board's origin.*in metres"):
-        read_graspa(folder)
+    refused(folder, r"within 2 mm of the board's origin.*in metres")
 
 
 def test_a_planner_without_a_grasp_is_no_trial(folder):
@@ -78,8 +82,7 @@ def test_a_planner_without_a_grasp_is_no_trial(folder):
     assert [obj.name for obj in read_graspa(folder)] == ["gelatin_box"]
     file.unlink()
     trials_of(folder).unlink()
-    with pytest.raises(InputError, match="no trials"):
-        read_graspa(folder)
+    refused(folder, "no trials")
 
 
 ENTITIES = '<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]><grasp_data>&x;</grasp_data>'
@@ -124,20 +127,17 @@ def test_a_bad_file_of_trials_is_named_with_what_is_wrong(folder, text, told):
 @pytest.mark.parametrize("need", ["layouts", "results", "objects"])
 def test_a_missing_folder_is_named(folder, need):
     (folder / need).rename(folder / "elsewhere")
-    with pytest.raises(InputError, match=f"no folder '{need}'"):
-        read_graspa(folder)
+    refused(folder, f"no folder '{need}'")
 
 
 def test_a_bad_board_or_mesh_is_named(folder):
     board, mesh = folder / "layouts/layout_0.xml", folder / "objects/gelatin_box/nontextured.stl"
     good = board.read_text()
     mesh.rename(folder / "nontextured.stl")
-    with pytest.raises(InputError, match=r"gelatin_box.nontextured\.stl is missing"):
-        read_graspa(folder)
+    refused(folder, r"gelatin_box.nontextured\.stl is missing")
     for file in ("../nontextured.xml", "a/../../nontextured.xml", "/nontextured.xml", "a b/c.xml"):
         board.write_text(good.replace("data/objects/YCB/gelatin_box/nontextured.xml", file))
-        with pytest.raises(InputError, match=re.escape(repr(file))):
-            read_graspa(folder)
+        refused(folder, re.escape(repr(file)))
     for text, told in (
         (good.replace("YcbGelatinBox", "YcbPear"), "'YcbGelatinBox' is not on its board.*YcbPear"),
         (good.replace("File>", "Place>"), "no name or no File"),
@@ -145,11 +145,9 @@ def test_a_bad_board_or_mesh_is_named(folder):
         ("<Scene/>", "no ManipulationObject"),
     ):
         board.write_text(text)
-        with pytest.raises(InputError, match=told):
-            read_graspa(folder)
+        refused(folder, told)
     board.unlink()
-    with pytest.raises(InputError, match=r"layout_0\.xml"):
-        read_graspa(folder)
+    refused(folder, r"layout_0\.xml")
 
 
 # --- the real trials ------------------------------------------------------------------------------

@@ -1,17 +1,15 @@
 """The scene's nodes on a real viser server, and what a client of its protocol is sent of them."""
 
+import sys
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, cast
 
-import msgspec
 import numpy as np
 import pytest
 import viser
-import zstandard
-from websockets.sync.client import connect
-from websockets.typing import Subprotocol
 
 from realsim import InputError
 from realsim.geometry import se3
@@ -21,66 +19,17 @@ from realsim.review.drawing.scene_nodes import GraspFilter, SceneNodes
 from realsim.review.placing.ellipsoid import ellipsoid_of
 from tests.support.reviewed_boxes import CAMERAS, SCENE, boxes_session
 
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+
+from review_client import Browser
+
 CONFIG = SceneConfig(
     voxel_m=0.004, coarse_points=200, piece_points=700, shown_points=1000, thumbnail_px=40
 )
-CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": (0.0, 1.0, 0.0, 0.0), "position": (0.0, 0.0, 1.0),
-    "fov": 1.0, "near": 0.01, "far": 100.0, "image_height": 800, "image_width": 1200,
-    "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0),
-}  # fmt: skip
 
 
-class Client:
-    """A client of viser's protocol, which keeps every message with its arrays."""
-
-    def __init__(self, server: viser.ViserServer) -> None:
-        self.socket = connect(
-            f"ws://127.0.0.1:{server.get_port()}", max_size=None, compression=None,
-            subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
-        )  # fmt: skip
-        self.messages: list[dict[str, Any]] = []
-        self.buffers: dict[int, list[bytes]] = {}
-        self.send(CAMERA)
-
-    def send(self, message: dict[str, Any]) -> None:
-        self.socket.send(msgspec.msgpack.encode(message))
-
-    def receive(self, quiet_s: float = 0.5) -> list[dict[str, Any]]:
-        """Take messages until nothing comes for a while; return the new ones."""
-        start = len(self.messages)
-        while True:
-            try:
-                data = cast(bytes, self.socket.recv(timeout=quiet_s))
-            except TimeoutError:
-                return self.messages[start:]
-            length = int.from_bytes(data[8:16], "little")
-            window = msgspec.msgpack.decode(
-                zstandard.ZstdDecompressor().decompress(data[16 : 16 + length])
-            )
-            at, buffers = 16 + length, []
-            for n in window["binaryBufferLengths"]:
-                at += -at % 8
-                buffers.append(data[at : at + n])
-                at += n
-            for message in window["messages"]:
-                self.buffers[id(message)] = buffers
-            self.messages += window["messages"]
-
-    def of(self, kind: str, name: str = "") -> list[dict[str, Any]]:
-        found = [m for m in self.messages if m["type"] == kind]
-        return [m for m in found if str(m.get("name", "")).startswith(name)]
-
-    def array(self, message: dict[str, Any], key: str, dtype: Any) -> np.ndarray:
-        index = message["props"][key]["__binary_index"]
-        return np.frombuffer(self.buffers[id(message)][index], dtype)
-
-    def click(self, name: str, owner: str, instance_index: int | None = None) -> None:
-        self.send({
-            "type": "SceneNodeClickMessage", "name": name, "instance_index": instance_index,
-            "ray_origin": (0.0, 0.0, 1.0), "ray_direction": (0.0, 0.0, -1.0),
-            "screen_pos": (0.5, 0.5), "modifier": None, "owner": owner,
-        })  # fmt: skip
+def opened(server: viser.ViserServer) -> Browser:
+    return Browser.open(f"http://127.0.0.1:{server.get_port()}")
 
 
 @pytest.fixture(scope="module")
@@ -115,27 +64,27 @@ def states(server: viser.ViserServer) -> dict[str, tuple[Any, ...]]:
 def test_a_client_is_sent_the_very_points_photographs_and_poses(
     server: viser.ViserServer, nodes: SceneNodes, shown: SceneContent
 ) -> None:
-    client = Client(server)
-    client.receive()
-    pieces = client.of("PointCloudMessage")
-    points = np.concatenate([client.array(m, "points", np.float32) for m in pieces])
+    client = opened(server)
+    client.until_quiet(0.5)
+    pieces = client.of_type("PointCloudMessage")
+    points = np.concatenate([client.array(m, "points") for m in pieces])
     colors = np.concatenate([client.array(m, "colors", np.uint8) for m in pieces])
     n = len(points) // 3
     assert 1000 <= n < 1000 + CONFIG.piece_points
     np.testing.assert_array_equal(points.reshape(-1, 3), shown.cloud.points[:n])
     np.testing.assert_array_equal(colors.reshape(-1, 3), shown.cloud.colors[:n])
-    assert len(client.array(pieces[0], "points", np.float32)) == 3 * shown.cloud.ends[0]
-    positions = {m["name"]: m["position"] for m in client.of("SetPositionMessage")}
+    assert len(client.array(pieces[0], "points")) == 3 * shown.cloud.ends[0]
+    positions = {m["name"]: m["position"] for m in client.of_type("SetPositionMessage")}
     for index, T in enumerate(CAMERAS):
         np.testing.assert_allclose(positions[f"/cameras/{index:06d}"], T[:3, 3], atol=1e-6)
     for placed in SCENE.objects:
         np.testing.assert_allclose(
             positions[f"/objects/{placed.instance}"], placed.T_world_obj[:3, 3], atol=1e-6
         )
-    sent = [m["updates"].get("_image_data") for m in client.of("SceneNodeUpdateMessage")]
+    sent = [m["updates"].get("_image_data") for m in client.of_type("SceneNodeUpdateMessage")]
     photographs = {bytes(b) for b in sent if isinstance(b, bytes | memoryview)}
     assert photographs == set(shown.thumbnails.values())
-    glbs = {bytes(m["props"]["glb_data"]) for m in client.of("GlbMessage")}
+    glbs = {bytes(m["props"]["glb_data"]) for m in client.of_type("GlbMessage")}
     assert glbs == {shown.meshes[1].glb, shown.meshes[7].glb}
 
 
@@ -225,11 +174,11 @@ def test_grasps_are_one_node_at_their_poses_and_a_click_tells_the_row(
         (g.instance, int(r)) for g in shown.grasp_sets for r in np.flatnonzero(g.base_scores == 1)
     ]
     assert drawn == len(expected) > 10
-    client = Client(server)
-    client.receive()
-    (message,) = client.of("BatchedMeshesMessage")
-    positions = client.array(message, "batched_positions", np.float32).reshape(-1, 3)
-    scales = client.array(message, "batched_scales", np.float32).reshape(-1, 3)
+    client = opened(server)
+    client.until_quiet(0.5)
+    (message,) = client.of_type("BatchedMeshesMessage")
+    positions = client.array(message, "batched_positions").reshape(-1, 3)
+    scales = client.array(message, "batched_scales").reshape(-1, 3)
     for k, (instance, row) in enumerate(expected):
         grasps = shown.grasps_of(instance)
         assert grasps is not None
@@ -238,7 +187,7 @@ def test_grasps_are_one_node_at_their_poses_and_a_click_tells_the_row(
         assert scales[k, 1] == pytest.approx(grasps.widths_m[row], rel=1e-6)
     for index in (0, drawn - 1):
         done.clear()
-        client.click("/grasps", message["owner"], index)
+        client.click_node("/grasps", message["owner"], index)
         assert done.wait(10)
         assert clicked[-1] == expected[index]
     assert nodes.draw_grasps(GraspFilter(show=False)) == 0
@@ -300,30 +249,33 @@ def test_each_browser_has_its_own_scene_and_the_coarse_cloud_comes_first(
     made: list[SceneNodes] = []
     ready = threading.Semaphore(0)
 
-    def opened(client: viser.ClientHandle) -> None:
+    def build(client: viser.ClientHandle) -> None:
         nodes = SceneNodes(client.scene, shown, CONFIG)
         nodes.build()
         nodes.refine_cloud()
         made.append(nodes)
         ready.release()
 
-    server.on_client_connect(opened)
-    first, second = Client(server), Client(server)
+    server.on_client_connect(build)
+    first, second = opened(server), opened(server)
     assert ready.acquire(timeout=20) and ready.acquire(timeout=20)
     end = time.monotonic() + 20
     while time.monotonic() < end and not all(n.wait_for_cloud(0.1) for n in made):
         first.receive(0.05), second.receive(0.05)
     for client in (first, second):
-        client.receive()
-        pieces = client.of("PointCloudMessage")
+        client.until_quiet(0.5)
+        pieces = client.of_type("PointCloudMessage")
         assert [m["name"] for m in pieces] == [f"/cloud/{k}" for k in range(len(pieces))]
-        points = np.concatenate([client.array(m, "points", np.float32) for m in pieces])
+        points = np.concatenate([client.array(m, "points") for m in pieces])
         np.testing.assert_array_equal(points.reshape(-1, 3), shown.cloud.points)
         names = [
             m["name"] for m in client.messages if m["type"].endswith("Message") and "name" in m
         ]
         assert names.index("/cloud/0") < names.index("/cameras/000003") < names.index("/cloud/2")
     made[0].place(0, se3.random_transform(np.random.default_rng(0)))
-    told = [bool([m for m in c.receive() if m["type"] == "SetPositionMessage"])
-            for c in (first, second)]  # fmt: skip
+    told: list[bool] = []
+    for client in (first, second):
+        before = len(client.of_type("SetPositionMessage"))
+        client.until_quiet(0.5)
+        told.append(len(client.of_type("SetPositionMessage")) > before)
     assert sorted(told) == [False, True]

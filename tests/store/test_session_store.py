@@ -274,6 +274,17 @@ for i in range(10_000):
 """
 
 
+def kill_growing(code, path, lines, wait_s):
+    """Run a script, and kill it a little after a file of its has grown by so many lines."""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "ready\n"
+    grow(path, lines)
+    time.sleep(wait_s)
+    process.send_signal(signal.SIGKILL)
+    process.wait(timeout=20)
+    process.stdout.close()
+
+
 def test_killed_captures_lose_at_most_the_view_in_flight(tmp_path):
     folder = tmp_path / "s"
     SessionStore.create(folder, empty_session())
@@ -281,13 +292,7 @@ def test_killed_captures_lose_at_most_the_view_in_flight(tmp_path):
     rng = np.random.default_rng(0)
     before: set[int] = set()
     for _ in range(2):
-        process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-        assert process.stdout.readline() == "ready\n"
-        grow(folder / "robot.jsonl", 3)
-        time.sleep(rng.uniform(0, 0.02))
-        process.send_signal(signal.SIGKILL)
-        process.wait(timeout=20)
-        process.stdout.close()
+        kill_growing(code, folder / "robot.jsonl", 3, rng.uniform(0, 0.02))
         lines = (folder / "robot.jsonl").read_bytes().count(b"\n")
         store = SessionStore.open(folder)
         assert before <= store.completed == set(range(lines))
@@ -318,21 +323,13 @@ def test_killed_calibrations_leave_one_set_of_cameras(tmp_path):
     folder = tmp_path / "s"
     filled(folder, 3)
     code = SETTING.format(tests=os.path.dirname(__file__), folder=str(folder))
-    rng = np.random.default_rng(1)
-    for _ in range(1):
-        process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-        assert process.stdout.readline() == "ready\n"
-        grow(folder / "manifest.jsonl", 5)
-        time.sleep(rng.uniform(0, 0.01))
-        process.send_signal(signal.SIGKILL)
-        process.wait(timeout=20)
-        process.stdout.close()
-        store = SessionStore.open(folder)
-        assert store.verify() == []
-        k = {v.T_world_cam[0, 3] for v in store.session.views}
-        assert len(k) == 1
-        entry = store.read_json("scene_camera.json")["2"]
-        np.testing.assert_allclose(entry["cam_t_w2c"], [-1e3 * k.pop(), -2e3, 0], atol=1e-6)
+    kill_growing(code, folder / "manifest.jsonl", 5, np.random.default_rng(1).uniform(0, 0.01))
+    store = SessionStore.open(folder)
+    assert store.verify() == []
+    k = {v.T_world_cam[0, 3] for v in store.session.views}
+    assert len(k) == 1
+    entry = store.read_json("scene_camera.json")["2"]
+    np.testing.assert_allclose(entry["cam_t_w2c"], [-1e3 * k.pop(), -2e3, 0], atol=1e-6)
 
 
 # --- atomic files and the manifest ---------------------------------------------------------------

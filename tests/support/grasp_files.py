@@ -44,16 +44,9 @@ class Acronym:
             return file["grasps/transforms"][()]
 
 
-class GraspGen:
-    rounding = 1e-15
-    approach, closing = 2, 0
-    tip = (0, 0, TIP)
-
+class GraspGen(Acronym):
     def write(self, path, s):
         return write_graspgen(path, s, file="a.obj")
-
-    def read(self, path):
-        return grasp_poses(self.raw(path), "acronym")
 
     def raw(self, path):
         return np.array(json.loads(path.read_text())["grasps"]["transforms"])

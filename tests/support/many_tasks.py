@@ -43,12 +43,6 @@ def dies_first(marks, times, signal_number=signal.SIGKILL):
     return lives
 
 
-def marks_and_waits(marks, name, seconds):
-    (Path(marks) / name).touch()
-    time.sleep(seconds)
-    return name
-
-
 def rewrites(folder, text):
     """Change a folder: one file anew, one longer, one gone, a large one; the last is `last.txt`."""
     (folder / "changed.txt").write_text(text)
