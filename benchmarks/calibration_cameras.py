@@ -35,16 +35,16 @@ from dataclasses import dataclass, replace
 import blas_threads  # noqa: F401
 import numpy as np
 from calibration_cameras_lab import HELD, NAMES, TABLE, UR3, Lab
-from figures import Figure, Found, Goal, run
+from calibration_real import shaped
+from figures import Figure, Found, Goal, median_of, run
 from scipy.stats import chi2
 
 from realsim.arrays import Array
 from realsim.geometry import se3
-from realsim.records import ArmErrorMap, RobotErrorMap, TagBoard
+from realsim.records import ArmErrorMap, RobotErrorMap
 from realsim_calibration.cameras.calibrate import calibrate_cameras
 from realsim_calibration.cameras.results import CamerasReport
 from realsim_calibration.fit.board_pose import planar_poses
-from realsim_calibration.results import BoardShape
 
 PACKAGES = ("realsim", "numpy", "scipy", "numba", "opencv-python-headless")
 VIEWS, HELD_OUT = 25, 15
@@ -80,16 +80,6 @@ class Judged:
     wrist: float
 
 
-def shaped(shape: BoardShape, board: TagBoard) -> Array:
-    """Return a board's points (n, 3) as the calibration believes them."""
-    points = board.points_board
-    middle = (points.max(0) + points.min(0)) / 2
-    x, y = (points - middle)[:, :2].T
-    w = shape.warp
-    lift = (w[0] * x * x + w[1] * x * y + w[2] * y * y) / shape.half_extent_m
-    return middle + shape.scale * np.stack([x, (1 + shape.aspect) * y, lift], -1)
-
-
 def hand_of(r: CamerasReport, told: Array, joints: Array) -> Array:
     """Return where the calibration says the hand is (4, 4)."""
     if isinstance(r.robot_map, ArmErrorMap):
@@ -118,7 +108,7 @@ def judge(lab: Lab, r: CamerasReport, seed: int) -> Judged:
                 if shape is None:
                     continue
                 ok = np.isfinite(uv[:, 0])
-                points = shaped(shape, board)
+                points = shaped(shape, board.points_board)
                 T = planar_poses(points[ok], (uv + noise)[ok], own.intrinsics,
                                  board.points_board[ok])[0][1]  # fmt: skip
                 at = hand_of(r, told, q) if c == 0 else np.eye(4)
@@ -229,13 +219,13 @@ def measure(a: argparse.Namespace) -> Found:
     with ProcessPoolExecutor(a.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
         trials = list(pool.map(trial, seeds))
     over = f"median of {count} labs, {HELD_OUT} held-out instants"
-    found.add("cameras_mm", _median([t.joints.absolute for t in trials]), over)
-    found.add("cameras_tied_joints_mm", _median([t.joints.tied for t in trials]), over)
-    found.add("cameras_poses_mm", _median([t.poses.absolute for t in trials]), over)
-    found.add("cameras_tied_mm", _median([t.poses.tied for t in trials]), over)
+    found.add("cameras_mm", median_of([t.joints.absolute for t in trials]), over)
+    found.add("cameras_tied_joints_mm", median_of([t.joints.tied for t in trials]), over)
+    found.add("cameras_poses_mm", median_of([t.poses.absolute for t in trials]), over)
+    found.add("cameras_tied_mm", median_of([t.poses.tied for t in trials]), over)
     wrist = np.array([t.wrist for t in trials])
     for n in range(len(NAMES)):
-        found.add(f"wrist_mm_{n + 1}", _median(wrist[:, n].tolist()), f"{n + 1} cameras")
+        found.add(f"wrist_mm_{n + 1}", median_of(wrist[:, n].tolist()), f"{n + 1} cameras")
     steps = np.diff(np.log(wrist), axis=1)
     error = steps.std(axis=0, ddof=1) / np.sqrt(count) if count > 1 else np.full(3, np.inf)
     worse = steps.mean(0) - 2 * error > np.log(1 + WORTH)
@@ -249,7 +239,7 @@ def measure(a: argparse.Namespace) -> Found:
         found.add(f"coverage95_fixed{name}", float(np.mean(own[:, 1:] < LIMIT)))
         found.add(f"coverage95_pairs{name}", float(np.mean(pairs < LIMIT)))
     found.add("bad_arm_named", float(np.mean([t.bad_arm for t in trials])), f"{count} labs")
-    found.add("cameras_cpu_s", _median([t.cpu_s for t in trials]), f"4 cameras, {VIEWS} instants")
+    found.add("cameras_cpu_s", median_of([t.cpu_s for t in trials]), f"4 cameras, {VIEWS} instants")
     found.cases["labs"] = [
         {"seed": t.seed, "joints_mm": t.joints.absolute, "poses_mm": t.poses.absolute,
          "tied_mm": t.poses.tied, "wrist_mm": t.wrist, "map": t.map_name,
@@ -257,10 +247,6 @@ def measure(a: argparse.Namespace) -> Found:
         for t in trials
     ]  # fmt: skip
     return found
-
-
-def _median(values: list[float]) -> float:
-    return float(np.median(values))
 
 
 def options(parser: argparse.ArgumentParser) -> None:

@@ -36,6 +36,7 @@ from realsim_calibration.inputs import (
     read_image_folder,
     reading_from_text,
 )
+from realsim_calibration.results import BoardShape
 from realsim_calibration.targets.target_text import parse_target
 
 FOLDS = 5
@@ -160,9 +161,8 @@ def image_set(data: Path, name: str, found: Sequence[TargetDetection], step: int
     )  # fmt: skip
 
 
-def board_points(report: HandEyeReport) -> Array:
-    """Return the points of the board as it was found to be printed and bent (m, 3) [m]."""
-    drawn, shape = report.target.points_board, report.board
+def shaped(shape: BoardShape, drawn: Array) -> Array:
+    """Return a board's points (m, 3) as the calibration found them printed and bent [m]."""
     middle = (drawn.max(0) + drawn.min(0)) / 2
     x, y = (drawn - middle)[:, :2].T
     w = shape.warp
@@ -202,7 +202,8 @@ def run_fold(fold: Fold) -> FoldResult:
     except RealsimError as error:
         bad = (float("inf"),) * len(test)
         return FoldResult(px=bad, alone_px=bad, said=str(error), **where)
-    points, px, alone = board_points(report), list[float](), list[float]()
+    points = shaped(report.board, report.target.points_board)
+    px, alone = list[float](), list[float]()
     for k in test:
         T, seen = data.Ts[k], data.detections[k]
         moved = corrected(report, T, None if q is None else q[k])
