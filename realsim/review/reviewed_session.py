@@ -65,6 +65,10 @@ class ReviewedSession:
             InputError: the session is not registered, or a model of an object is missing.
         """
         self.store = store
+        self.name = store.folder.resolve().name
+        """Name of the session; scenes of a data set are told apart by their folders."""
+        self.journal_path = store.path(JOURNAL_FILE)
+        """Where the decisions stand."""
         self.number = number
         self.config = config or SceneConfig()
         """How much is shown."""
@@ -89,16 +93,6 @@ class ReviewedSession:
         self._snapper: tuple[tuple[int, ...], Snapper] | None = None
         self._measuring = threading.Lock()
         self._residuals: CloudResiduals | None = None
-
-    @property
-    def name(self) -> str:
-        """Name of the session; scenes of a data set are told apart by their folders."""
-        return self.store.folder.resolve().name
-
-    @property
-    def journal_path(self) -> Path:
-        """Where the decisions stand."""
-        return self.store.path(JOURNAL_FILE)
 
     def has_changed(self) -> bool:
         """Return whether poses, cameras or grasps were written anew since they were read.

@@ -63,33 +63,9 @@ class CheckReport:
     inner: tuple["CheckReport", ...] = ()
     """Reports of the sessions inside, such as the board views in calibration/capture."""
 
-    def _paths(self, kind: Kind) -> tuple[str, ...]:
+    def paths(self, kind: Kind) -> tuple[str, ...]:
+        """Return the files of one kind of finding."""
         return tuple(f.path for f in self.findings if f.kind == kind)
-
-    @property
-    def missing(self) -> tuple[str, ...]:
-        """Listed files that are not there."""
-        return self._paths("missing")
-
-    @property
-    def changed(self) -> tuple[str, ...]:
-        """Listed files with other bytes than were written."""
-        return self._paths("changed")
-
-    @property
-    def torn(self) -> tuple[str, ...]:
-        """Lists whose last line is half: a run was interrupted."""
-        return self._paths("torn")
-
-    @property
-    def leftovers(self) -> tuple[str, ...]:
-        """Temporary files of runs that are over."""
-        return self._paths("leftover")
-
-    @property
-    def unlisted(self) -> tuple[str, ...]:
-        """Images and lines that no complete view has."""
-        return self._paths("unlisted")
 
     @property
     def not_captured(self) -> tuple[int, ...]:

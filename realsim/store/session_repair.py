@@ -157,7 +157,7 @@ class _Repair:
     def list_anew(self, before: CheckReport) -> None:
         """List the session's own files that no checksum covers, and say which they are."""
         lost = any(f.path == MANIFEST_FILE and f.kind == "missing" for f in before.findings)
-        orphans = set(before.unlisted)
+        orphans = set(before.paths("unlisted"))
         there = [
             p for p in before.unproven
             if is_own(p) and p not in orphans and (self.folder / p).is_file()

@@ -92,7 +92,7 @@ def test_a_lost_image_costs_its_view(session: Path) -> None:
     SessionStore.open(session).close()
     assert bytes_of(session) == before
     report = check_session(session)
-    assert report.missing == (path,) and report.damaged_views == (2,) and not report.sound
+    assert report.paths("missing") == (path,) and report.damaged_views == (2,) and not report.sound
     repaired = repair_session(session)
     store = SessionStore.open(session)
     assert repaired.dropped_views == (2,) and "captured" in repaired.notes[0]
@@ -106,7 +106,7 @@ def test_a_cut_robot_file_costs_the_views_whose_lines_are_gone(session: Path) ->
     path = session / "robot.jsonl"
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 55 // 100])
     report = check_session(session)
-    assert "robot.jsonl" in report.changed and report.torn == ("robot.jsonl",)
+    assert "robot.jsonl" in report.paths("changed") and report.paths("torn") == ("robot.jsonl",)
     assert report.damaged_views == (3, 4, 5)
     repaired = repair_session(session)
     assert repaired.after.sound and repaired.after.views == (0, 1, 2)
@@ -147,8 +147,8 @@ def test_what_a_kill_leaves_is_no_damage(session: Path) -> None:
         (session / MANIFEST).write_bytes(manifest_bytes)
         report = check_session(session)
         assert report.sound and len(report.views) == views, report.findings
-        assert report.leftovers == (f"rgb/.000007.png.{DEAD}.part",)
-        assert set(report.unlisted) == (
+        assert report.paths("leftover") == (f"rgb/.000007.png.{DEAD}.part",)
+        assert set(report.paths("unlisted")) == (
             set() if views == 7 else {"rgb/000006.png", "depth/000006.png"}
         )
     opened = SessionStore.open(session)

@@ -68,6 +68,8 @@ class BopLabelledScene:
         """Names of its files."""
         self.indices = tuple(content.cameras)
         """Numbers of the images, increasing."""
+        self.models_folder = content.models if isinstance(content.models, Path) else None
+        """Where the models are; None = they were given, or there are none."""
         self.truth = content.truth
         """All annotations; None = the scene has none."""
         self.notes_found = list(notes)
@@ -203,11 +205,6 @@ class BopLabelledScene:
         return found
 
     # --- models -----------------------------------------------------------------------------------
-
-    @property
-    def models_folder(self) -> Path | None:
-        """Where the models are; None = they were given, or there are none."""
-        return self.content.models if isinstance(self.content.models, Path) else None
 
     def models(self) -> Mapping[int, ObjectModel]:
         """Return the models of the scene's objects; those without a mesh are not there.

@@ -71,6 +71,9 @@ class GraspnetLabelledScene:
         self.camera = ref.camera
         """'kinect' or 'realsense'."""
         self.files = cameras
+        has_table = cameras.first is not None and cameras.poses is not None
+        self.T_world_table = np.eye(4) if has_table else None
+        """The identity: world is the table's frame; None without cam0_wrt_table.npy."""
         self.indices = indices
         """Numbers of the images, increasing."""
         self._instances = instances
@@ -82,11 +85,6 @@ class GraspnetLabelledScene:
         self._Ts_0_cam = None if poses is None else se3.check_rigid(poses, "camera_poses")
         first = cameras.first
         self._T_world_0 = np.eye(4) if first is None else se3.check_rigid(first, "cam0_wrt_table")
-
-    @property
-    def T_world_table(self) -> Array | None:
-        """The identity: world is the table's frame; None without cam0_wrt_table.npy."""
-        return None if self.files.first is None or self.files.poses is None else np.eye(4)
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -72,17 +72,11 @@ class LeRobotDemonstrations:
         """
         self.name, self._source, self._chosen = name, source, tuple(chosen)
         self._depth = depth
-        self.tasks = sorted({source.goal(k).language for k in self._chosen})
-
-    @property
-    def robot_type(self) -> str:
+        self.robot_type = source.arm.arm.folder.name
         """The arm's name."""
-        return self._source.arm.arm.folder.name
-
-    @property
-    def fps(self) -> int:
+        self.fps = source.config.rate_hz
         """Steps per second."""
-        return self._source.config.rate_hz
+        self.tasks = sorted({source.goal(k).language for k in self._chosen})
 
     @property
     def features(self) -> Mapping[str, LeRobotFeature]:

@@ -64,6 +64,9 @@ _INFO = {
 class TableWorld:
     """The scene's bodies in an engine of their own; leaving the context frees it."""
 
+    dt = 1.0 / RATE_HZ
+    """Length of a step [s]."""
+
     def __init__(self, scene: SchoolScene, cache: Path | None = None) -> None:
         """Build the world.
 
@@ -223,11 +226,6 @@ class TableWorld:
             _require_taken(key, float(info[_INFO[key]]), value, name)
 
     # --- what happens in it -------------------------------------------------------------------
-
-    @property
-    def dt(self) -> float:
-        """Time of a step [s]."""
-        return 1.0 / RATE_HZ
 
     def step(self) -> None:
         """Let one time step pass."""
