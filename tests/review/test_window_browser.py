@@ -12,6 +12,7 @@ import pytest
 from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.review import ReviewServer
+from realsim.review.drawing.grasp_drawing import FINGER_M
 from realsim.review.journal import Entry
 from realsim.review.static.static_page import write_static
 from realsim.store import SessionStore, load_scene, save_scene
@@ -308,7 +309,7 @@ def test_the_mouse_chooses_objects_frustums_grasps_and_three_points(
         grasps = window.content.grasps_of(0)
         widest = int(np.argmax(grasps.widths_m))
         T_grasp = scene.object(0).T_world_obj @ grasps.Ts_obj_grasp[widest]
-        finger = [[0.0, 0.52 * grasps.widths_m[widest], -0.5 * SMALL.gripper.finger_m]]
+        finger = [[0.0, 0.52 * grasps.widths_m[widest], -0.5 * FINGER_M]]
         page.click_at(camera, se3.transform(T_grasp, np.array(finger)), "of 40, tall (instance 0)")
         page.press("Next")
         page.wait_for("The arm does not reach it")
