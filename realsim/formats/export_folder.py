@@ -54,13 +54,22 @@ class ExportFolder:
     @staticmethod
     def is_finished(folder: Path | str, asked: Mapping[str, Any]) -> bool:
         """Return whether a folder holds the finished export of this very request."""
-        path = Path(folder) / FINISHED
-        if not path.is_file() or (Path(folder) / ASKED).is_file():
-            return False
         try:
-            return read_object(path) == _request(asked)
+            return ExportFolder.is_whole(folder) and (
+                read_object(Path(folder) / FINISHED) == _request(asked)
+            )
         except InputError:
             return False
+
+    @staticmethod
+    def is_whole(folder: Path | str) -> bool:
+        """Return whether a folder holds a finished export."""
+        return (Path(folder) / FINISHED).is_file() and not (Path(folder) / ASKED).is_file()
+
+    @staticmethod
+    def note_finished(folder: Path | str, asked: Mapping[str, Any]) -> None:
+        """Note which request the export in a folder is of."""
+        atomic.write_json(Path(folder) / FINISHED, _request(asked))
 
     def below(self, relative: str) -> "ExportFolder":
         """Return a folder of this export as a writer sees it that fills a folder of its own."""

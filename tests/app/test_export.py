@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -221,8 +222,6 @@ def test_a_lens_that_is_kept_says_what_it_costs(bent, tmp_path):
 
 
 def test_masks_of_objects_without_a_mesh_are_resampled_and_said_to_be(bent, tmp_path):
-    import shutil
-
     bare = shutil.copytree(bent, tmp_path / "bare")
     for name in ("models", "models_eval"):
         shutil.rmtree(bare / name)
@@ -246,8 +245,6 @@ def test_cameras_go_out_and_come_back(bop, tmp_path):
 
 
 def test_labels_that_are_no_reference_say_so_wherever_they_go(bop, tmp_path):
-    import shutil
-
     rough = shutil.copytree(bop, tmp_path / "rough")
     for file in rough.glob("*/*/scene_gt.json"):
         file.rename(file.with_name("scene_gt_approximate.json"))
@@ -266,3 +263,19 @@ def test_an_import_makes_up_no_camera_pose_for_the_data_set(bop, tmp_path):
     finished("export", tmp_path / "session", "--to", "bop", "--out", tmp_path / "again", "--quiet")
     assert_same_scene(tmp_path / "bop", tmp_path / "again")
     assert "cam_R_w2c" not in next(tmp_path.glob("again/*/*/scene_camera.json")).read_text()
+
+
+def test_sources_that_were_only_touched_are_the_same(bop, tmp_path):
+    source, out = tmp_path / "source", tmp_path / "out"
+    shutil.copytree(bop, source)
+    words = ("export", source, "--to", "bop", "--out", out, "--quiet")
+    finished(*words)
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file() and p.name[0] != "."}
+    for path in source.rglob("*"):
+        path.touch()
+    for _ in range(2):
+        finished(*words)
+        assert {p: p.read_bytes() for p in before} == before
+    file = next(source.glob("*/*/rgb/*.png"))
+    file.write_bytes(file.read_bytes() + b"\0")
+    assert "holds a finished export" in refused(*words)

@@ -18,7 +18,6 @@ from realsim.review.static.static_page import write_static
 from realsim.store import SessionStore, load_scene, save_scene
 from tests.support.review_browser import (
     CHROMIUM,
-    SMALL,
     ReviewBrowser,
     ReviewPage,
     needs_chromium,

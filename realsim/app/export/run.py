@@ -75,6 +75,9 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
     asked = request.asked() | {CONTENT: content_of(scenes)}
     if ExportFolder.is_finished(out, asked):
         return ExportResult(folder=out, card=out / CARD_FILE, scenes=(), was_finished=True)
+    if _is_of(out, request):
+        ExportFolder.note_finished(out, asked)
+        return ExportResult(folder=out, card=out / CARD_FILE, scenes=(), was_finished=True)
     folder = ExportFolder.begin(out, asked)
     if folder.resumed:
         console.say(f"going on with the export in {out}.")
@@ -108,13 +111,7 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
         licences = licence_files(request.sources)
         folder.write_piece("licences", licences)
         card = _card(request, out, target, facts, models, licences)
-        record, run = made_of(
-            "export", console, request=request,
-            inputs={
-                f"{provenance.GIVEN}sources.{k}": provenance.sha256_of(source)
-                for k, source in enumerate(request.sources)
-            },
-        )  # fmt: skip
+        record, run = made_of("export", console, request=request, inputs=_hashes(request))
         folder.finish(
             {
                 CARD_FILE: card_bytes(card),
@@ -126,6 +123,29 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
         )
         provenance.write(out, record, run)
     return ExportResult(folder=out, card=out / CARD_FILE, scenes=tuple(f.written for f in facts))
+
+
+def _hashes(request: ExportRequest) -> dict[str, str]:
+    """Return the sha256 of all sources, by the fields of the request that give them."""
+    return {
+        f"{provenance.GIVEN}sources.{k}": provenance.sha256_of(source)
+        for k, source in enumerate(request.sources)
+    }
+
+
+def _is_of(out: Path, request: ExportRequest) -> bool:
+    """Return whether a finished export is of this request, and its sources hold the same bytes.
+
+    Times of files change when they are copied or touched.
+    """
+    if not ExportFolder.is_whole(out) or not (out / provenance.FOLDER_FILE).is_file():
+        return False
+    try:
+        record, _ = provenance.read(out)
+    except InputError:
+        return False
+    asked, _ = provenance.plain_request(request)
+    return record.request == asked and record.inputs == _hashes(request)
 
 
 def _with_notes(facts: SceneFacts, told: Sequence[str]) -> SceneFacts:

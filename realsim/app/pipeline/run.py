@@ -148,16 +148,15 @@ def _run_of_all(
             words = _words_of_all(campaign, step, done, part)
             out = Path(words[-1])
             before = out.with_name(f"{out.name}.before")
-            record = campaign.out / RECORDS / f"of_all.{step.stage}.json"
-            asked = _plain(_command(step, words, 1).words)
-            is_same = result.kept == len(done) and [_plain(e.words) for e in _ends(record)] == [
-                asked
-            ]
-            if not is_same and out.is_dir() and not before.exists():
+            end = _run(campaign, step, words, where.processes)
+            is_refused = not end.is_done and (out / FINISHED).is_file() and not before.exists()
+            if is_refused:  # it is of other options, or of scenes as they were
                 out.rename(before)  # kept until there is a new one
-            result.of_all.append(_run(campaign, step, words, where.processes))
-            write_json(record, to_json(result.of_all[-1:]))
-            if result.of_all[-1].is_done and before.is_dir():
+                end = _run(campaign, step, words, where.processes)
+            result.of_all.append(end)
+            if not end.is_done and before.is_dir():
+                console.warn(f"the earlier {out.name} stays in {before}.")
+            if end.is_done and before.is_dir():
                 kept = _take_away(before, out)
                 if kept is not None:
                     console.warn(
