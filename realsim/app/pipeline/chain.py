@@ -1,4 +1,4 @@
-"""The commands of one scene, each in a process of its own: what it takes or breaks ends with it."""
+"""The commands of one scene, each in a process of its own; and what is known of earlier runs."""
 
 import ctypes
 import os
@@ -13,7 +13,10 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import BinaryIO
 
+from realsim.app.pipeline.campaign import Step
+from realsim.errors import InputError
 from realsim.store import provenance
+from realsim.untrusted.own_json import read_own
 
 PROGRAM = (sys.executable, "-c", "from realsim.app.pipeline.chain import child; child()")
 PR_SET_PDEATHSIG = 1
@@ -22,6 +25,7 @@ DONE, LOOK = 0, 1
 """Exit codes of a command that did its work; 1: one of its checks failed."""
 WORDS, TAIL_BYTES = 600, 20_000
 """Characters of a command's last words that are kept, and where they are looked for."""
+RESTART = "--restart"
 SCENE = "SCENE"
 """Word of a command that stands for the scene's folder, wherever that is."""
 ENVIRONMENT = {"REALSIM_CONFIG": "", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
@@ -145,3 +149,38 @@ def _last_words(written: BinaryIO, start: int, code: int) -> str:
     if code < 0:
         told = f"ended by signal {-code}, as when memory runs out{f'; {told}' if told else ''}"
     return told[:WORDS] or f"exit code {code}"
+
+
+# --- what earlier runs did -----------------------------------------------------------------------
+
+
+def ends_of(record: Path) -> tuple[Ended, ...]:
+    """Return what a record holds; a damaged one holds nothing: the commands find out themselves."""
+    try:
+        return tuple(read_own(record, list[Ended])) if record.is_file() else ()
+    except InputError:
+        return ()
+
+
+def are_same(commands: Sequence[Command], ends: Sequence[Ended]) -> list[bool]:
+    """Return which commands were run as they are asked for now."""
+    return [_plain(c.words) == _plain(e.words) for c, e in zip(commands, ends, strict=False)]
+
+
+def begun_anew(
+    commands: Sequence[Command], steps: Sequence[Step], ends: Sequence[Ended]
+) -> list[Command]:
+    """Return commands that begin anew what was done with other options, or of other results."""
+    same = are_same(commands, ends)
+    return [
+        replace(c, words=(*c.words, RESTART))
+        if step.has_restart and RESTART not in c.words and False in same[: k + 1] and k < len(same)
+        else c
+        for k, (c, step) in enumerate(zip(commands, steps, strict=True))
+    ]
+
+
+def _plain(words: Sequence[str]) -> list[str]:
+    """Return a command without what changes no result: its processes, and that it begins anew."""
+    at = words.index("--workers") if "--workers" in words else len(words)
+    return [word for word in (*words[:at], *words[at + 2 :]) if word != RESTART]

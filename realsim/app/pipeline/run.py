@@ -14,20 +14,29 @@ from typing import Any
 from realsim.app.check.checksums import listed_sums
 from realsim.app.console import Console
 from realsim.app.pipeline.campaign import Campaign, Step
-from realsim.app.pipeline.chain import SCENE, Command, Ended, result_of, run_chain, run_command
+from realsim.app.pipeline.chain import (
+    SCENE,
+    Command,
+    Ended,
+    are_same,
+    begun_anew,
+    ends_of,
+    result_of,
+    run_chain,
+    run_command,
+)
 from realsim.errors import InputError, RealsimError
 from realsim.formats.export_folder import FINISHED, SUMS_FILE
 from realsim.many import Outcome, PoolConfig, Task, Worked, open_pool, run_many
 from realsim.store import provenance
 from realsim.store.atomic import storing, write_bytes, write_json
 from realsim.store.lock import only_run_in
-from realsim.untrusted.own_json import read_object, read_own, to_json
+from realsim.untrusted.own_json import read_object, to_json
 
 SCENES, RECORDS, LOGS = "scenes", "records", "logs"
 DOCUMENT, PAGE = "campaign.json", "campaign.html"
 CAMPAIGN = "campaign"
 """Key of the document: the campaign's file."""
-RESTART = "--restart"
 OWN_FILES = (SUMS_FILE, FINISHED, provenance.FOLDER_FILE, "provenance.run.json")
 """Files of an export that its list of checksums does not name."""
 RENEWED_S = 10.0
@@ -325,8 +334,8 @@ def _run_scenes(
         for s in due:
             _require_room(campaign.out)
             log = _log(campaign, s.name)
-            record = _ends(campaign.out / RECORDS / f"{s.name}.json")
-            left = _anew(commands, campaign.of_a_scene, record)[len(kept[s.name]) :]
+            record = ends_of(campaign.out / RECORDS / f"{s.name}.json")
+            left = begun_anew(commands, campaign.of_a_scene, record)[len(kept[s.name]) :]
             args = (left, Worked(s.folder.resolve()), _folder(campaign), log)
             yield Task(name=s.name, fn=run_chain, args=args)
 
@@ -386,9 +395,9 @@ def _known(campaign: Campaign, name: str, place: Path) -> SceneState:
     scene = SceneState(name=name, folder=place)
     if not place.is_dir():
         return scene
-    ends = _ends(campaign.out / RECORDS / f"{name}.json")
+    ends = ends_of(campaign.out / RECORDS / f"{name}.json")
     commands = [_command(step, [SCENE], 1) for step in campaign.of_a_scene]
-    same = _same(commands, ends)
+    same = are_same(commands, ends)
     ends = ends[: same.index(False)] if False in same else ends[: len(same)]
     for k, end in enumerate(ends):
         now = result_of(place, end.stage) if end.result else ""
@@ -402,38 +411,6 @@ def _known(campaign: Campaign, name: str, place: Path) -> SceneState:
             )
             return replace(scene, ends=(*ends[:k], replace(end, result=now)), note=note)
     return replace(scene, ends=ends)
-
-
-def _ends(record: Path) -> tuple[Ended, ...]:
-    """Return what a record holds; a damaged one holds nothing: the commands find out themselves."""
-    try:
-        return tuple(read_own(record, list[Ended])) if record.is_file() else ()
-    except InputError:
-        return ()
-
-
-def _same(commands: Sequence[Command], ends: Sequence[Ended]) -> list[bool]:
-    """Return which commands were run as they are asked for now."""
-    return [_plain(c.words) == _plain(e.words) for c, e in zip(commands, ends, strict=False)]
-
-
-def _anew(
-    commands: Sequence[Command], steps: Sequence[Step], ends: Sequence[Ended]
-) -> list[Command]:
-    """Return commands that begin anew what was done with other options, or of other results."""
-    same = _same(commands, ends)
-    return [
-        replace(c, words=(*c.words, RESTART))
-        if step.has_restart and RESTART not in c.words and False in same[: k + 1] and k < len(same)
-        else c
-        for k, (c, step) in enumerate(zip(commands, steps, strict=True))
-    ]
-
-
-def _plain(words: Sequence[str]) -> list[str]:
-    """Return a command without what changes no result: its processes, and that it begins anew."""
-    at = words.index("--workers") if "--workers" in words else len(words)
-    return [word for word in (*words[:at], *words[at + 2 :]) if word != RESTART]
 
 
 def _write(campaign: Campaign, result: PipelineResult) -> None:
