@@ -148,6 +148,9 @@ def test_models_that_are_not_sought_are_named(session: Path, tmp_path: Path) -> 
     save_models(tmp_path / "own", {mug: models_of()[mug]})
     again = read_inputs(SessionStore.open(session), replace(request, library=tmp_path / "own"))
     assert len(again.models_out) == 1 and again.key != inputs.key
+    (tmp_path / f"lib/obj_{77:06d}.ply").unlink()
+    last = read_inputs(SessionStore.open(session), request).models_out[-1]
+    assert last.startswith("lib/models_info.json") and last.endswith(": 77.")
 
 
 def test_a_scene_that_no_registration_made_is_kept(

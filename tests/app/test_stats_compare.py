@@ -160,6 +160,31 @@ def test_other_pixels_are_told_and_another_packing_is_not(releases, tmp_path):
     assert (row["images_changed"], row["masks_changed"]) == (2, 1)
 
 
+def test_a_label_that_is_gone_from_one_frame_is_told(releases, tmp_path):
+    def drop(folder):
+        for name in ("scene_gt", "scene_gt_info"):
+            edit(folder / f"{name}.json", lambda rows: rows["1"].pop())
+        for kind in ("mask", "mask_visib"):
+            (folder / kind / "000001_000002.png").unlink()
+
+    row = changed_copy(releases, tmp_path, drop)
+    assert (row["labels_lost"], row["labels_added"]) == (1, 0)
+    assert not row["objects_lost"] and row["files_changed"] == ["scene_gt_info.json"]
+
+
+def test_other_models_and_tables_are_told(releases, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(releases[0], copy)
+    mesh = copy / "models/obj_000007.ply"
+    mesh.write_bytes(mesh.read_bytes()[:-1] + b"\1")
+    (copy / "camera.json").write_text("{}")
+    edit(copy / "models/models_info.json", lambda rows: rows["30"].update(diameter=1.0))
+    words = [str(w) for w in ("stats", copy, "--compare", releases[0], "--json")]
+    result = CliRunner().invoke(commands, words, catch_exceptions=False)
+    files = json.loads(result.stdout)["files"]
+    assert files == ["camera.json", "models/flat.ply", "models/models_info.json"]
+
+
 def test_renumbered_models_are_the_same_objects(releases, tmp_path):
     def renumber(folder):
         new = {1: 4, 7: 2, 30: 9}
@@ -233,7 +258,7 @@ def test_labels_of_graspnets_format_are_compared(tmp_path):
         collision=np.zeros(3, np.bool_),
     )  # fmt: skip
     write_grasp_labels(tmp_path / "old/grasp_label/006_labels.npz", labels)
-    other = replace(labels, friction=np.array([0.4, 0.2, 0.4], np.float32))
+    other = replace(labels, depths_m=np.array([0.02, 0.03, 0.02], np.float32))
     write_grasp_labels(tmp_path / "new/grasp_label/006_labels.npz", other.rows(np.arange(2)))
     (row,) = compared(tmp_path / "new", tmp_path / "old")
     assert (row["grasps_lost"], row["grasps_added"]) == (1, 0)

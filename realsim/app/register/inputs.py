@@ -137,24 +137,25 @@ def _available(
     And in words which others were given.
     """
     from realsim.formats.bop.models import load_models
-    from realsim.models.library_files import read_info
+    from realsim.models.library_files import INFO_FILE, read_info
 
     library = {} if request.library is None else load_models(request.library)
     folder = store.folder / "models"
-    if library and not folder.is_dir():
-        return library, ()
-    own = session_models(store)
+    own = {} if library and not folder.is_dir() else session_models(store)
     out = [
         f"model {i} of the library, '{m.name}', is not used: the session's model {i} is "
         f"'{own[i].name}'. Give one of them another id."
         for i, m in sorted(library.items()) if i in own and own[i].name != m.name
     ]  # fmt: skip
-    lost = (
-        sorted(read_info(folder).keys() - own.keys() - library.keys()) if request.find_all else ()
-    )
-    if lost:
-        ids = ", ".join(map(str, lost))
-        out.append(f"models_info.json lists models without a mesh, which are not sought: {ids}.")
+    for home in (folder, request.library) if request.find_all else ():
+        if home is None or not (home / INFO_FILE).is_file():
+            continue
+        lost = sorted(read_info(home).keys() - own.keys() - library.keys())
+        if lost:
+            ids = ", ".join(map(str, lost))
+            out.append(
+                f"{home.name}/{INFO_FILE} lists models without a mesh, which are not sought: {ids}."
+            )
     return library | own, tuple(out)
 
 

@@ -4,6 +4,7 @@ import io
 import json
 import math
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from realsim.errors import InputError
+from realsim.formats.export_folder import SUMS_FILE
 from realsim.images import read_image
 from realsim.store import provenance
 
@@ -50,7 +52,7 @@ def _compare(first: Path, second: Path, name: str) -> FileDifference | None:
     for path, words in ((first, "it is new"), (second, "it was not made again")):
         if not path.is_file():
             return FileDifference(path=name, words=(words,))
-    a, b = first.read_bytes(), second.read_bytes()
+    a, b = (_told(p, p.read_bytes()) for p in (first, second))
     if a == b:
         return None
     try:
@@ -66,6 +68,19 @@ def _compare(first: Path, second: Path, name: str) -> FileDifference | None:
     return FileDifference(path=name, words=tuple(words), greatest=max(sizes) if sizes else math.nan)
 
 
+def _told(file: Path, content: bytes) -> bytes:
+    """Return what a file says of a result: other versions are told apart from it."""
+    if file.name == SUMS_FILE:
+        lines = content.splitlines(keepends=True)
+        return b"".join(x for x in lines if not x.rstrip().endswith(_RECORD))
+    is_record = file.name == provenance.FOLDER_FILE or file.parent.name == "stages"
+    if is_record and file.suffix == ".json" and b'"versions"' in content:
+        with suppress(ValueError):
+            return json.dumps(json.loads(content) | {"versions": {}}).encode()
+    return content
+
+
+_RECORD = f" {provenance.FOLDER_FILE}".encode()
 Row = tuple[str, str, str, float]
 """Field, old value, new value, difference."""
 

@@ -61,13 +61,26 @@ def reproduce(folder: Path, stage: str, console: Console, workers: int = 1) -> R
         console.warn(
             f"made with other versions ({'; '.join(other)}): results may differ for that alone."
         )
+    if record.stage != (stage or "export"):
+        raise InputError(
+            f"the record of {stage or 'this folder'} says that it is of '{record.stage}': it was "
+            f"changed or exchanged. Run {stage or 'the export'} again."
+        )
     request = given_again(record.request, run.places)
     with tempfile.TemporaryDirectory(prefix="realsim-reproduce-") as temporary:
         place = Path(temporary)
-        if record.stage == "export":
-            again = _export(folder, request, place, console)
-        else:
-            again = _in_session(folder, record.stage, request, place, console, workers)
+        try:
+            if record.stage == "export":
+                again = _export(folder, request, place, console)
+            else:
+                again = _in_session(folder, record.stage, request, place, console, workers)
+        except TypeError as error:
+            if "argument" not in str(error):
+                raise
+            raise InputError(
+                f"the record of {record.stage} asks for something that this realsim does not know "
+                f"({error}); it was changed, or is of another version. Run it again."
+            ) from error
         with console.stage("compare"):
             files, differing = compare_folders(folder, again)
     return Reproduced(stage=record.stage, files=files, differing=differing, other_versions=other)
@@ -96,6 +109,11 @@ def _read(folder: Path, stage: str, is_session: bool) -> tuple[Provenance, Run]:
         raise InputError(
             f"'{folder}' is no session and no export: it holds neither session.json nor {name}. "
             "Give a session with a stage, or the folder of an export."
+        )
+    if is_session and stage not in AGAIN:
+        raise InputError(
+            f"'{stage}' is not made again by this command; {', '.join(AGAIN)} are, and the folders "
+            "of exports."
         )
     if not (folder / name).is_file():
         raise InputError(

@@ -34,9 +34,9 @@ def stats_command(
     SOURCE is a session or a folder of sessions (of `realsim generate` or `upgrade`).
 
     With --compare, SOURCE and OLD are two releases of one data set, BOP or GraspNet data sets too:
-    scenes, frames, objects, poses that moved and by how much, other cameras, images and masks,
-    grasps that came, went or changed. Scenes are matched by number and camera, objects by the names
-    of their models. Point clouds, normals and coordinates are not compared.
+    scenes, frames, objects, poses that moved and by how much, labels of single frames, other
+    cameras, images and masks, grasps that came, went or changed, and further files that differ.
+    Scenes are matched by number and camera, objects by the names of their models.
     """
     from realsim.app.stats.run import run_stats
 

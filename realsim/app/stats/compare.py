@@ -14,6 +14,7 @@ from realsim.app.console import Console
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.sources import SourceScene, source_scenes
 from realsim.app.stages import open_session
+from realsim.app.stats.compare_files import other_files, other_in_roots, other_models
 from realsim.arrays import Array, Int64
 from realsim.formats.bop.labelled import BopLabelledScene, read_models_info
 from realsim.formats.graspnet.grasp_labels import read_grasp_labels
@@ -47,6 +48,9 @@ class SceneDiff:
     frames_lost: int = 0
     objects_added: list[Thing] = field(default_factory=list[Thing])
     objects_lost: list[Thing] = field(default_factory=list[Thing])
+    labels_added: int = 0
+    """Objects in single frames that have a pose now, of things that both releases know."""
+    labels_lost: int = 0
     moved: dict[Thing, tuple[float, float]] = field(
         default_factory=dict[Thing, tuple[float, float]]
     )
@@ -63,7 +67,7 @@ class SceneDiff:
     """Grasps with another label, score or width."""
     grasps_kept: int = 0
     files_changed: list[str] = field(default_factory=list[str])
-    """Files of further labels that differ."""
+    """Further files that differ: tables, models, maps, grasps."""
 
     @property
     def is_same(self) -> bool:
@@ -81,9 +85,7 @@ class SceneDiff:
         return asdict(self) | {"moved": moved}
 
 
-def compare_releases(
-    new: Sequence[Path], old: Path, console: Console
-) -> dict[str, list[dict[str, Any]]]:
+def compare_releases(new: Sequence[Path], old: Path, console: Console) -> dict[str, Any]:
     """Show what two releases differ in, from scenes to masks and grasps, and return it.
 
     Args:
@@ -104,10 +106,14 @@ def compare_releases(
             console.warn(stale)
         with console.stage("compare", name):
             diffs.append(diff_scenes(name, before[name].open(), after[name].open()))
+            places = (before[name].folder, after[name].folder)
+            diffs[-1].files_changed += other_files(*places)
+            if before[name].kind == after[name].kind == "session":
+                diffs[-1].files_changed += other_models(places, [{}, {}])
     console.table(
         f"{', '.join(p.name for p in new)} since {old.name}",
-        ("scene", "state", "frames", "objects", "moved", "at most [mm]", "[deg]", "grasps",
-         "other cameras", "images", "masks", "files"),
+        ("scene", "state", "frames", "objects", "moved", "at most [mm]", "[deg]", "labels",
+         "grasps", "other cameras", "images", "masks", "files"),
         [_shown(d) for d in diffs],
     )  # fmt: skip
     if not after.keys() & before.keys():
@@ -116,9 +122,22 @@ def compare_releases(
             f"{', '.join(sorted(before)[:4])}. Scenes are matched by number and camera; give two "
             "releases of one data set."
         )
+    roots = _roots(before), _roots(after)
+    files = [f for a, b in zip(*roots, strict=False) for f in other_in_roots(a, b)]
+    if files:
+        console.warn(f"{len(files)} files beside the scenes differ: {', '.join(files[:8])}"
+                     f"{' ...' if len(files) > 8 else ''}.")  # fmt: skip
     same = sum(d.is_same for d in diffs)
     console.say(f"{same} of {len(diffs)} scenes are the same.")
-    return {"comparison": [d.row() for d in diffs]}
+    return {"comparison": [d.row() for d in diffs], "files": files}
+
+
+def _roots(scenes: dict[str, SourceScene]) -> list[Path]:
+    """Return the roots of data sets: BOP's and GraspNet's scenes share what is beside them."""
+    above = {"bop": 1, "graspnet": 2}
+    return list(dict.fromkeys(
+        s.folder.resolve().parents[above[s.kind]] for s in scenes.values() if s.kind in above
+    ))  # fmt: skip
 
 
 def _by_name(sources: tuple[Path, ...]) -> dict[str, SourceScene]:
@@ -160,6 +179,8 @@ def diff_scenes(name: str, old: LabelledScene, new: LabelledScene) -> SceneDiff:
     for (index, a, b), rows, rows_new in zip(frames, rows_of_old, rows_of_new, strict=True):
         rows_old = {called.get(t, t): k for t, k in rows.items()}
         both = rows_old.keys() & rows_new.keys()
+        found.labels_lost += len((rows_old.keys() & after) - both)
+        found.labels_added += len((rows_new.keys() & before) - both)
         for thing in both:
             T_old, T_new = (
                 f.objects[rows[thing]].T_cam_obj for f, rows in ((a, rows_old), (b, rows_new))
@@ -272,24 +293,17 @@ def _label_files(found: SceneDiff, old: GraspnetLabelledScene, new: GraspnetLabe
         found.grasps_added += len(b[0]) - len(j)
         found.grasps_changed += changed
         found.grasps_kept += len(i) - changed
-    further = [f"collision_label/scene_{old.number:04d}/collision_labels.npz"]
-    pairs = [(name, [r / name for r in roots]) for name in further]
-    pairs += [
-        (f"rect/{k:04d}.npy", [s.ref.folder / f"rect/{k:04d}.npy" for s in (old, new)])
-        for k in sorted(set(old.indices) & set(new.indices))
-    ]
-    for name, files in pairs:
-        a, b = (f.read_bytes() if f.is_file() else b"" for f in files)
-        if a != b:
-            found.files_changed.append(name)
+    name = f"collision_label/scene_{old.number:04d}"
+    found.files_changed += [f"{name}/{f}" for f in other_files(*(r / name for r in roots))]
 
 
 def _label_rows(file: Path) -> tuple[Int64, Array]:
-    """Return the candidates of a label file: numbers (N,), and what is said of them (N, 6)."""
+    """Return the candidates of a label file: numbers (N,), and what is said of them (N, 8)."""
     if not file.is_file():
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 6))
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 8))
     labels = read_grasp_labels(file, friction_at_most=2.0, with_collision=True)
-    said = (labels.openings_m, labels.friction, labels.collision)
+    said = (labels.openings_m, labels.friction, labels.collision, labels.angles_rad,
+            labels.depths_m)  # fmt: skip
     points = labels.points[labels.index[:, 0]]
     return labels.numbers, np.column_stack([*said, points]).astype(np.float64)
 
@@ -340,7 +354,7 @@ def _same(before: GraspSet, after: GraspSet) -> list[tuple[int, int]]:
 
 def _shown(d: SceneDiff) -> list[object]:
     if d.state != "kept":
-        return [d.scene, d.state, *[""] * 10]
+        return [d.scene, d.state, *[""] * 11]
 
     def change(added: int, lost: int, kept: int | str = "") -> str:
         parts = [f"+{added}"] * bool(added) + [f"-{lost}"] * bool(lost)
@@ -352,6 +366,7 @@ def _shown(d: SceneDiff) -> list[object]:
     return [
         d.scene, d.state, change(d.frames_added, d.frames_lost, d.frames),
         change(len(d.objects_added), len(d.objects_lost)), len(d.moved), f"{mm:.3f}", f"{deg:.3f}",
+        change(d.labels_added, d.labels_lost),
         f"{grasps} changed {d.grasps_changed}" if d.grasps_changed else grasps,
         d.cameras_changed, d.images_changed, d.masks_changed, len(d.files_changed),
     ]  # fmt: skip

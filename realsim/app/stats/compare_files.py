@@ -1,0 +1,87 @@
+"""Files of two releases that differ, beside images and poses: tables, models, maps, grasps."""
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+from realsim.formats.bop.labelled import read_models_info
+from realsim.formats.bop.models import INFO_FILE
+
+LEFT_OUT = re.compile(
+    r"(^|/)(rgb|gray|depth|mask|mask_visib|label|reports|stages|cache|pictures|thumbnails|models\w*"
+    r"|sensors)/|(^|/)\.|\.(html|jpg|md)$|(^|/)(SHA256SUMS|croissant\.json|provenance.*\.json"
+    r"|session.*\.json|manifest\.jsonl|scene_gt\.json|scene_camera\.json)$"
+)
+"""Paths of files that are compared otherwise, that are made of others, or say how and when."""
+
+
+def other_files(old: Path, new: Path) -> list[str]:
+    """Return the files of two folders that hold something else, or are in one of them only.
+
+    Left out are images, which are compared pixel by pixel, and what says how a folder was made.
+    """
+    names = {
+        p.relative_to(root).as_posix()
+        for root in (old, new)
+        for p in root.rglob("*")
+        if p.is_file() and not LEFT_OUT.search(p.relative_to(root).as_posix())
+    }
+    return [n for n in sorted(names) if not _is_same_file(old / n, new / n)]
+
+
+def other_models(roots: Sequence[Path], names: Sequence[dict[int, str]]) -> list[str]:
+    """Return the files of models that differ: of equal names, or of equal ids without names."""
+    found: list[str] = []
+    for folder in sorted({p.name for r in roots for p in r.glob("models*") if p.is_dir()}):
+        files = [
+            {_called(p, r / folder, ids): p for p in (r / folder).rglob("*")
+             if p.is_file() and p.name != INFO_FILE and not LEFT_OUT.search(p.name)}
+            for r, ids in zip(roots, names, strict=True)
+        ]  # fmt: skip
+        found += [
+            f"{folder}/{n}" for n in sorted(files[0].keys() | files[1].keys())
+            if n not in files[0] or n not in files[1] or not _is_same_file(files[0][n], files[1][n])
+        ]  # fmt: skip
+        rows = [
+            {ids.get(i, str(i)): row for i, row in read_models_info(r / folder).items()}
+            for r, ids in zip(roots, names, strict=True)
+        ]
+        if rows[0] != rows[1]:
+            found.append(f"{folder}/{INFO_FILE}")
+    return found
+
+
+def other_in_roots(old: Path, new: Path) -> list[str]:
+    """Return the files of models and tables in the roots of two data sets that differ."""
+    names = [
+        {i: str(row.get("name", i)) for i, row in read_models_info(r / "models").items()}
+        for r in (old, new)
+    ]
+    tables = {p.name for r in (old, new) for p in r.glob("*.json") if not LEFT_OUT.search(p.name)}
+    other = [n for n in sorted(tables) if not _is_same_file(old / n, new / n)]
+    return other + other_models((old, new), names)
+
+
+def _is_same_file(old: Path, new: Path) -> bool:
+    if not (old.is_file() and new.is_file()):
+        return False
+    a, b = old.read_bytes(), new.read_bytes()
+    if a == b or old.suffix != ".json":
+        return a == b
+    try:
+        tables: list[Any] = [json.loads(text) for text in (a, b)]
+    except ValueError:
+        return False
+    for table in tables:
+        if isinstance(table, dict):
+            cast("dict[str, Any]", table).pop("info", None)  # COCO's says when it was made
+    return tables[0] == tables[1]
+
+
+def _called(file: Path, folder: Path, names: dict[int, str]) -> str:
+    """Return a model's file by the name of the model, where it has one."""
+    path = file.relative_to(folder).as_posix()
+    number = re.fullmatch(r"obj_(\d{6})(.*)", path)
+    return path if number is None else names.get(int(number[1]), f"obj_{number[1]}") + number[2]
