@@ -115,4 +115,7 @@ def _verdict(s: SceneAgreement, o: ObjectAgreement) -> str:
     """Return whether an object's labels agree, and whether they are meant to."""
     if s.approximate:
         return "no, approximate" if o.faults else "approximate"
+    compared = (o.mask_iou, o.visible_iou, o.depth_mm)
+    if not o.faults and all(value is None for value in compared):
+        return "not compared"
     return "no" if o.faults else "yes"

@@ -52,7 +52,8 @@ def what_to_give(missing: Sequence[int]) -> str:
     """Return which meshes are missing, by object ids, and how they are given."""
     first = missing[0]
     return (
-        f"there is no mesh of object(s) {', '.join(f'{i - 1:03d}' for i in missing[:12])}. Give "
+        f"there is no mesh of object(s) {', '.join(map(str, missing[:12]))} (GraspNet's "
+        f"{', '.join(f'{i - 1:03d}' for i in missing[:12])}). Give "
         f"the models with --models FOLDER: {first - 1:03d}/{PLAIN} or {TEXTURED} [m], as GraspNet "
         f"has them, or {model_file(first)} and {INFO_FILE} [mm], as BOP has them (ids are "
         "GraspNet's numbers + 1)."
