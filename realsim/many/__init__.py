@@ -31,7 +31,6 @@ KeyboardInterrupt with one. Commands take the pool from the two options of
 """
 
 from realsim.many.carried import Sent, Shared, Worked
-from realsim.many.opening import open_pool
 from realsim.many.pool import (
     ClusterLostError,
     ForeignNodeError,
@@ -41,7 +40,7 @@ from realsim.many.pool import (
     Workers,
     at_most,
 )
-from realsim.many.run import Outcome, Summary, Task, run_many
+from realsim.many.run import Outcome, Summary, Task, open_pool, run_many
 
 __all__ = [
     "ClusterLostError",

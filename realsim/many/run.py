@@ -1,14 +1,24 @@
-"""Many tasks on a pool: failures listed, lost ones tried again, all told in sentences."""
+"""Many tasks on a pool, opened here: failures listed, lost ones tried again, told in sentences."""
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
 from realsim.errors import RealsimError
-from realsim.many.pool import ClusterLostError, ForeignNodeError, Pool, WorkerDiedError
+from realsim.many.pool import (
+    ClusterLostError,
+    ForeignNodeError,
+    Pool,
+    PoolConfig,
+    WorkerDiedError,
+    Workers,
+)
+from realsim.many.processes import local_pool
+from realsim.many.ray_pool import ray_pool
 from realsim.store.atomic import FULL, StorageError
 
 MOST_DEATHS = 3
@@ -216,3 +226,22 @@ class _Run:
             self.summary.done += now.error is None
             if more is not None:
                 self._sources.append(iter(more))
+
+
+@contextmanager
+def open_pool(where: Workers = None) -> Generator[Pool]:
+    """Yield who does the work; leaving ends it, in the middle of jobs where an error leaves.
+
+    Args:
+        where: a number = so many processes, 1 = this one; None = one a core.
+
+    Raises:
+        InputError: the cluster is not there, lets in anyone, or Ray is not installed.
+    """
+    config = where if isinstance(where, PoolConfig) else PoolConfig(workers=where)
+    if config.address:
+        with ray_pool(config) as pool:
+            yield pool
+        return
+    with local_pool(config.workers) as pool:
+        yield pool

@@ -16,7 +16,7 @@ class ExportRequest:
     sources: tuple[Path, ...]
     """Sessions, folders of sessions, BOP or GraspNet data sets."""
     target: str
-    """Format to write; see `realsim.app.export.targets.TARGETS`."""
+    """Format to write; see `realsim.app.export.run.TARGETS`."""
     labels: Literal["auto", "annotated", "imported", "none"] = "auto"
     """Which labels of sessions are taken."""
     scenes: tuple[int, ...] = ()

@@ -11,7 +11,10 @@ from realsim.app.annotate.current import refresh_labels
 from realsim.app.console import Console
 from realsim.app.export.card import CARD_FILE, DatasetCard, SceneFacts, card_bytes
 from realsim.app.export.croissant import CROISSANT_FILE, croissant_bytes
+from realsim.app.export.data_set_targets import DATA_SETS
+from realsim.app.export.grasp_targets import GRASPS
 from realsim.app.export.request import ExportRequest
+from realsim.app.export.scene_targets import SCENES
 from realsim.app.export.sources import (
     SourceScene,
     content_of,
@@ -20,7 +23,6 @@ from realsim.app.export.sources import (
     trust_in,
 )
 from realsim.app.export.target import TABLE, TRIED, RootJob, SceneJob, ScenePlace, Target
-from realsim.app.export.targets import TARGETS
 from realsim.app.stages import made_of, open_session
 from realsim.errors import InputError
 from realsim.formats.bop.labelled import BopLabelledScene
@@ -40,6 +42,8 @@ STATED = ("name", "licence", "models_licence", "attribution")
 """Options that the card tells elsewhere."""
 OPTION_NAMES = {"masks": "no-masks", "camera": "camera-name", "scenes": "only-scenes",
                 "points": "colmap-points", "name": "title"}  # fmt: skip
+TARGETS: dict[str, Target] = {**DATA_SETS, **SCENES, **GRASPS}
+"""Formats by the name that the command line gives them; its own list must be the same."""
 HOLD_OBJECTS = ("dataset", "scene")
 """Kinds of formats that have a place for objects and their poses."""
 LABELS = {"annotated": "computed by realsim", "imported": "as imported, unchecked", "none": "none"}

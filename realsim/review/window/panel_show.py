@@ -1,5 +1,7 @@
 """The panel of what is shown: colours of the points, looks of the objects, how sure a pose is."""
 
+import threading
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import viser
@@ -9,7 +11,6 @@ from realsim.review.placing import depth_residuals
 from realsim.review.placing.ellipsoid import ellipsoid_of
 from realsim.review.reviewed_session import Standing
 from realsim.review.window import window_text
-from realsim.review.window.latest import LatestOnly
 
 if TYPE_CHECKING:
     from realsim.review.window.window import Window
@@ -136,3 +137,35 @@ class ShowPanel:
         if unknown:
             text += f" Not known of instance {', '.join(unknown)}."
         self._said.content = text
+
+
+class LatestOnly:
+    """Does a piece of work in a thread of its own; what is asked meanwhile is done once after."""
+
+    def __init__(self, work: Callable[[], None]) -> None:
+        """Wait to be asked.
+
+        Args:
+            work: looks itself what is to be done; it must not raise.
+        """
+        self._work = work
+        self._lock = threading.Lock()
+        self._is_wanted = self._is_running = False
+
+    def ask(self) -> None:
+        """Have it done soon; returns at once."""
+        with self._lock:
+            self._is_wanted = True
+            if self._is_running:
+                return
+            self._is_running = True
+        threading.Thread(target=self._run, name="review-latest", daemon=True).start()
+
+    def _run(self) -> None:
+        while True:
+            with self._lock:
+                if not self._is_wanted:
+                    self._is_running = False
+                    return
+                self._is_wanted = False
+            self._work()
