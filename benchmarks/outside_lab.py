@@ -18,13 +18,13 @@ from outside_shapes import mesh_of, objects
 from scipy.ndimage import gaussian_filter, grey_dilation
 from scipy.spatial.transform import Rotation
 
-from realsim.arrays import Array
 from realsim.geometry.mesh import Mesh
 from realsim.interop import import_open3d
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose
 from realsim.registration.evidence import DepthFrame
 
 o3d = import_open3d()
+Array = NDArray[np.float64]
 Image = NDArray[np.float64]
 Triple = tuple[float, float, float]
 

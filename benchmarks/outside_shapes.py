@@ -6,14 +6,15 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from realsim.arrays import Array
 from realsim.geometry.mesh import Mesh
 from realsim.interop import import_open3d
 from realsim.records import ObjectModel
 
 o3d = import_open3d()
+Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
 
