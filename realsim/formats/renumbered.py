@@ -1,6 +1,6 @@
 """A scene whose objects get the ids of a data set of many scenes, where one id is one model."""
 
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Collection, Mapping, MutableMapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,9 @@ from realsim.records import ObjectModel
 
 
 def shared_ids(
-    models: MutableMapping[int, ObjectModel], new: Mapping[int, ObjectModel]
+    models: MutableMapping[int, ObjectModel],
+    new: Mapping[int, ObjectModel],
+    taken: Collection[int] = (),
 ) -> dict[int, int]:
     """Return the ids of a scene's models in the data set, and add those that it has not yet.
 
@@ -23,19 +25,44 @@ def shared_ids(
     Args:
         models: of the data set so far, by id.
         new: of the scene, by its own ids.
+        taken: ids in the data set of objects without a mesh.
     """
     ids: dict[int, int] = {}
     for obj_id, model in new.items():
         known = models.get(obj_id)
-        if known is None or is_same(known, model):
+        if (obj_id not in taken) if known is None else is_same(known, model):
             ids[obj_id] = obj_id
         else:
             same = (i for i, m in models.items() if is_same(m, model))
-            ids[obj_id] = next(same, max(*models, *new) + 1)
+            ids[obj_id] = next(same, max(*models, *new, *taken) + 1)
         shared = ids[obj_id]
         models.setdefault(
             shared, model if shared == obj_id else replace(model, obj_id=shared)
         )  # fmt: skip
+    return ids
+
+
+def ids_without_mesh(
+    scene: LabelledScene,
+    owner: object,
+    models: Collection[int],
+    bare: MutableMapping[tuple[object, int], int],
+) -> dict[int, int]:
+    """Return the ids in the data set of a scene's objects that have no mesh, and note them.
+
+    Nothing says that two of them are the same object but that one owner gave them one id.
+
+    Args:
+        scene: the scene.
+        owner: of its ids: a session, or a data set.
+        models: ids in the data set that have a mesh.
+        bare: (owner, id) -> id in the data set of those of earlier scenes; added to.
+    """
+    used = {o.obj_id for i in scene.indices for o in scene.frame(i).objects}
+    ids: dict[int, int] = {}
+    for i in sorted(used - scene.models().keys()):
+        taken = {*models, *bare.values()}
+        ids[i] = bare.setdefault((owner, i), max(taken) + 1 if i in taken else i)
     return ids
 
 

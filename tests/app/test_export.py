@@ -279,3 +279,20 @@ def test_sources_that_were_only_touched_are_the_same(bop, tmp_path):
     file = next(source.glob("*/*/rgb/*.png"))
     file.write_bytes(file.read_bytes() + b"\0")
     assert "holds a finished export" in refused(*words)
+
+
+def test_an_object_without_a_mesh_is_not_taken_for_another_sources_object(bop, tmp_path):
+    scene = labelled_scene(tmp_path / "images", [1])
+    other = written_bop(tmp_path / "other", scene)
+    for name in ("models", "models_eval"):
+        for file in (other / name).glob("obj_000007*"):
+            file.unlink()
+    words = ("export", bop, other, "--to", "bop", "--out", tmp_path / "both", "--quiet")
+    assert "no mesh of object 7 (here 31)" in " ".join(finished(*words).output.split())
+    finished("export", other, bop, "--to", "bop", "--out", tmp_path / "again", "--quiet")
+    for out in ("both", "again"):
+        ids = [
+            {o["obj_id"] for rows in json.loads(f.read_text()).values() for o in rows}
+            for f in sorted((tmp_path / out).glob("*/*/scene_gt.json"))
+        ]
+        assert ids == [{1, 7, 30}, {1, 30, 31}]

@@ -29,7 +29,7 @@ from realsim.formats.bop.labelled import BopLabelledScene
 from realsim.formats.export_folder import CONTENT, STATE, ExportFolder
 from realsim.formats.grasps.scene_grasps import executed
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene
-from realsim.formats.renumbered import RenumberedScene, shared_ids
+from realsim.formats.renumbered import RenumberedScene, ids_without_mesh, shared_ids
 from realsim.formats.session_scene import SessionScene
 from realsim.records import ObjectModel
 from realsim.store import provenance
@@ -89,17 +89,22 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
     models: dict[int, ObjectModel] = {}
     infos: dict[int, Mapping[str, Any]] = {}
     all_ids: list[dict[int, int]] = []
+    bare: dict[tuple[object, int], int] = {}
     with only_run_in(out):
         try:
             for source, place in zip(scenes, places, strict=True):
                 opened = source.open()
-                ids = shared_ids(models, opened.models())
+                ids = shared_ids(models, opened.models(), bare.values())
+                owner = source.folder if source.kind == "session" else source.source
+                ids |= (without := ids_without_mesh(opened, owner, models, bare))
                 if isinstance(opened, BopLabelledScene):
                     infos |= {ids.get(i, i): info for i, info in opened.models_info().items()}
                 given = _as_asked(_numbered(opened, ids), target, request, out)
                 all_ids.append(ids)
                 written = _write(given, place, target, folder, request, console)
-                facts.append(_facts(source, opened, written, target))
+                facts.append(_with_notes(
+                    _facts(source, opened, written, target), _bare_words(without, target)
+                ))  # fmt: skip
         except InputError:
             folder.abandon()
             raise
@@ -150,6 +155,13 @@ def _is_of(out: Path, request: ExportRequest) -> bool:
         return False
     asked, _ = provenance.plain_request(request)
     return record.request == asked and record.inputs == _hashes(request)
+
+
+def _bare_words(without: Mapping[int, int], target: Target) -> list[str]:
+    if not without or target.kind not in HOLD_OBJECTS:
+        return []
+    here = ", ".join(f"{i} (here {k})" for i, k in without.items())
+    return [f"there is no mesh of object {here}: it is exported without a model."]
 
 
 def _with_notes(facts: SceneFacts, told: Sequence[str]) -> SceneFacts:

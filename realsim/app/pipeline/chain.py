@@ -1,6 +1,7 @@
 """The commands of one scene, each in a process of its own; and what is known of earlier runs."""
 
 import ctypes
+import hashlib
 import os
 import signal
 import subprocess
@@ -25,7 +26,14 @@ DONE, LOOK = 0, 1
 """Exit codes of a command that did its work; 1: one of its checks failed."""
 WORDS, TAIL_BYTES = 600, 20_000
 """Characters of a command's last words that are kept, and where they are looked for."""
+RESULTS = {
+    "register": ("registration/*.json",),
+    "school": ("grasps/*.*", "grasps/trajectories"),
+    "annotate": ("annotations", "mask", "mask_visib", "labels", "grasps/views", "scene_gt*.json"),
+}
+"""Stage -> the files of its result."""
 RESTART = "--restart"
+NOTE, MOST_NOTES = "note: ", 8
 SCENE = "SCENE"
 """Word of a command that stands for the scene's folder, wherever that is."""
 ENVIRONMENT = {"REALSIM_CONFIG": "", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
@@ -58,7 +66,9 @@ class Ended:
     told: str
     """Why it failed, in its own words."""
     result: str = ""
-    """sha256 of the record that the stage left in the scene; empty = it leaves none."""
+    """What the stage left in the scene, see `result_of`; empty = it leaves no record."""
+    notes: tuple[str, ...] = ()
+    """What a command that did its work had to say."""
 
     @property
     def is_done(self) -> bool:
@@ -92,9 +102,22 @@ def run_chain(
 
 
 def result_of(scene: Path, stage: str) -> str:
-    """Return the sha256 of the record that a stage left in a scene; empty = there is none."""
+    """Return the sha256 of a stage's record, and of names and sizes of the files of its result.
+
+    Empty: there is no record.
+    """
     record = scene / provenance.file_of(stage)
-    return provenance.sha256_of(record) if record.is_file() else ""
+    if not record.is_file():
+        return ""
+    paths = {p for pattern in RESULTS.get(stage, ()) for p in scene.glob(pattern)}
+    paths |= {p for folder in paths if folder.is_dir() for p in folder.rglob("*")}
+    sizes = [
+        f"{p.relative_to(scene).as_posix()} {p.stat().st_size}\n"
+        for p in sorted(paths)
+        if p.is_file()
+    ]
+    left = hashlib.sha256("".join(sizes).encode()).hexdigest()
+    return f"{provenance.sha256_of(record)} {left}"
 
 
 def run_command(command: Command, scene: Path, folder: Path, log: Path) -> Ended:
@@ -117,7 +140,9 @@ def run_command(command: Command, scene: Path, folder: Path, log: Path) -> Ended
             raise
         process.returncode = code = os.waitstatus_to_exitcode(status)
         with Path(f"/proc/self/fd/{out.fileno()}").open("rb") as written:
-            told = "" if code in (DONE, LOOK) else _last_words(written, start, code)
+            is_done = code in (DONE, LOOK)
+            told = "" if is_done else _last_words(written, start, code)
+            notes = _notes(written, start) if is_done else ()
     return Ended(
         stage=command.stage,
         words=command.words,
@@ -126,6 +151,7 @@ def run_command(command: Command, scene: Path, folder: Path, log: Path) -> Ended
         cpu_s=used.ru_utime + used.ru_stime,
         peak_mb=used.ru_maxrss / 1024,
         told=told,
+        notes=notes,
     )
 
 
@@ -137,6 +163,13 @@ def child() -> None:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a pool's process ignores it
     main()
+
+
+def _notes(written: BinaryIO, start: int) -> tuple[str, ...]:
+    """Return the notes of a command, the first of them."""
+    written.seek(max(start, written.seek(0, os.SEEK_END) - TAIL_BYTES))
+    lines = written.read().decode("utf-8", "replace").splitlines()
+    return tuple(x[len(NOTE) : WORDS] for x in lines if x.startswith(NOTE))[:MOST_NOTES]
 
 
 def _last_words(written: BinaryIO, start: int, code: int) -> str:

@@ -163,8 +163,11 @@ def _run_of_all(
                 out.rename(before)  # kept until there is a new one
                 end = _run(campaign, step, words, where.processes)
             result.of_all.append(end)
+            for note in end.notes:
+                console.warn(f"{step.stage}: {note}")
             if not end.is_done and before.is_dir():
-                console.warn(f"the earlier {out.name} stays in {before}.")
+                place = before if out.exists() else before.rename(out)
+                console.warn(f"the earlier {out.name} stays in {place}.")
             if end.is_done and before.is_dir():
                 kept = _take_away(before, out)
                 if kept is not None:
@@ -403,6 +406,13 @@ def _known(campaign: Campaign, name: str, place: Path) -> SceneState:
         now = result_of(place, end.stage) if end.result else ""
         if end.result and not now:
             note = f"its result of {end.stage} is gone; it is made again, with what follows it."
+            return replace(scene, ends=ends[:k], note=note)
+        if now != end.result and now.split()[0] == end.result.split()[0]:
+            note = (
+                f"files of its result of {end.stage} are gone or others; it is made again, with "
+                "what follows it."
+            )
+            (place / provenance.file_of(end.stage)).unlink()
             return replace(scene, ends=ends[:k], note=note)
         if now != end.result:
             note = (
