@@ -8,14 +8,18 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import BinaryIO
 
+from realsim.app.check.checksums import listed_sums
 from realsim.app.pipeline.campaign import Step
+from realsim.app.reproduce.run import AGAIN
 from realsim.errors import InputError
+from realsim.formats.export_folder import FINISHED, SUMS_FILE
 from realsim.store import provenance
 from realsim.untrusted.own_json import read_own
 
@@ -26,13 +30,9 @@ DONE, LOOK = 0, 1
 """Exit codes of a command that did its work; 1: one of its checks failed."""
 WORDS, TAIL_BYTES = 600, 20_000
 """Characters of a command's last words that are kept, and where they are looked for."""
-RESULTS = {
-    "register": ("registration/*.json",),
-    "school": ("grasps/*.*", "grasps/trajectories"),
-    "annotate": ("annotations", "mask", "mask_visib", "labels", "grasps/views", "scene_gt*.json"),
-}
-"""Stage -> the files of its result."""
 RESTART = "--restart"
+OWN_FILES = (SUMS_FILE, FINISHED, provenance.FOLDER_FILE, "provenance.run.json")
+"""Files of an export that its list of checksums does not name."""
 NOTE, MOST_NOTES = "note: ", 8
 SCENE = "SCENE"
 """Word of a command that stands for the scene's folder, wherever that is."""
@@ -109,12 +109,13 @@ def result_of(scene: Path, stage: str) -> str:
     record = scene / provenance.file_of(stage)
     if not record.is_file():
         return ""
-    paths = {p for pattern in RESULTS.get(stage, ()) for p in scene.glob(pattern)}
+    _, patterns = AGAIN.get(stage, (None, ()))
+    paths = {p for pattern in patterns for p in scene.glob(pattern)}
     paths |= {p for folder in paths if folder.is_dir() for p in folder.rglob("*")}
     sizes = [
         f"{p.relative_to(scene).as_posix()} {p.stat().st_size}\n"
         for p in sorted(paths)
-        if p.is_file()
+        if p.is_file() and p.parent.name != record.parent.name
     ]
     left = hashlib.sha256("".join(sizes).encode()).hexdigest()
     return f"{provenance.sha256_of(record)} {left}"
@@ -166,10 +167,11 @@ def child() -> None:
 
 
 def _notes(written: BinaryIO, start: int) -> tuple[str, ...]:
-    """Return the notes of a command, the first of them."""
+    """Return the first notes of a command, of each that is said of several scenes one."""
     written.seek(max(start, written.seek(0, os.SEEK_END) - TAIL_BYTES))
     lines = written.read().decode("utf-8", "replace").splitlines()
-    return tuple(x[len(NOTE) : WORDS] for x in lines if x.startswith(NOTE))[:MOST_NOTES]
+    notes = [x[len(NOTE) : WORDS] for x in lines if x.startswith(NOTE)]
+    return tuple({n.partition(": ")[2]: n for n in reversed(notes)}.values())[::-1][:MOST_NOTES]
 
 
 def _last_words(written: BinaryIO, start: int, code: int) -> str:
@@ -217,3 +219,32 @@ def _plain(words: Sequence[str]) -> list[str]:
     """Return a command without what changes no result: its processes, and that it begins anew."""
     at = words.index("--workers") if "--workers" in words else len(words)
     return [word for word in (*words[:at], *words[at + 2 :]) if word != RESTART]
+
+
+def take_away(before: Path, new: Path) -> Path | None:
+    """Remove what an earlier run wrote into a folder; return where the rest stays, if there is any.
+
+    Args:
+        before: the folder, moved aside.
+        new: the same as it was made anew.
+    """
+    sums = before / SUMS_FILE
+    written = dict(listed_sums(sums, before.resolve())) if sums.is_file() else {}
+    for path in [p for p in before.rglob("*") if p.is_file()]:
+        name = path.relative_to(before).as_posix()
+        if name in written:
+            is_own = written[name] == provenance.sha256_of(path)
+        else:
+            is_own = name in OWN_FILES or (not written and (new / name).is_file())
+        if is_own:
+            path.unlink()
+    for folder in sorted((p for p in before.rglob("*") if p.is_dir()), reverse=True):
+        with suppress(OSError):  # not empty
+            folder.rmdir()
+    if not any(before.iterdir()):
+        before.rmdir()
+        return None
+    names = (f"{new.name}.kept{f'_{k}' if k > 1 else ''}" for k in count(1))
+    kept = next(p for p in map(new.with_name, names) if not p.exists())
+    before.rename(kept)
+    return kept

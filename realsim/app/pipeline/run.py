@@ -7,11 +7,10 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import count, takewhile
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from realsim.app.check.checksums import listed_sums
 from realsim.app.console import Console
 from realsim.app.pipeline.campaign import Campaign, Step
 from realsim.app.pipeline.chain import (
@@ -24,9 +23,10 @@ from realsim.app.pipeline.chain import (
     result_of,
     run_chain,
     run_command,
+    take_away,
 )
 from realsim.errors import InputError, RealsimError
-from realsim.formats.export_folder import FINISHED, SUMS_FILE
+from realsim.formats.export_folder import FINISHED
 from realsim.many import Outcome, PoolConfig, Task, Worked, open_pool, run_many
 from realsim.store import provenance
 from realsim.store.atomic import storing, write_bytes, write_json
@@ -37,8 +37,6 @@ SCENES, RECORDS, LOGS = "scenes", "records", "logs"
 DOCUMENT, PAGE = "campaign.json", "campaign.html"
 CAMPAIGN = "campaign"
 """Key of the document: the campaign's file."""
-OWN_FILES = (SUMS_FILE, FINISHED, provenance.FOLDER_FILE, "provenance.run.json")
-"""Files of an export that its list of checksums does not name."""
 RENEWED_S = 10.0
 """Least time between two writings of the page [s]."""
 LEAST_FREE_MB = 200
@@ -169,41 +167,12 @@ def _run_of_all(
                 place = before if out.exists() else before.rename(out)
                 console.warn(f"the earlier {out.name} stays in {place}.")
             if end.is_done and before.is_dir():
-                kept = _take_away(before, out)
+                kept = take_away(before, out)
                 if kept is not None:
                     console.warn(
                         f"files in the earlier {out.name} that no command wrote, or that were "
                         f"changed since, stay in {kept}."
                     )
-
-
-def _take_away(before: Path, new: Path) -> Path | None:
-    """Remove what an earlier run wrote into a folder; return where the rest stays, if there is any.
-
-    Args:
-        before: the folder, moved aside.
-        new: the same as it was made anew.
-    """
-    sums = before / SUMS_FILE
-    written = dict(listed_sums(sums, before.resolve())) if sums.is_file() else {}
-    for path in [p for p in before.rglob("*") if p.is_file()]:
-        name = path.relative_to(before).as_posix()
-        if name in written:
-            is_own = written[name] == provenance.sha256_of(path)
-        else:
-            is_own = name in OWN_FILES or (not written and (new / name).is_file())
-        if is_own:
-            path.unlink()
-    for folder in sorted((p for p in before.rglob("*") if p.is_dir()), reverse=True):
-        with suppress(OSError):  # not empty
-            folder.rmdir()
-    if not any(before.iterdir()):
-        before.rmdir()
-        return None
-    names = (f"{new.name}.kept{f'_{k}' if k > 1 else ''}" for k in count(1))
-    kept = next(p for p in map(new.with_name, names) if not p.exists())
-    before.rename(kept)
-    return kept
 
 
 def scenes_of(campaign: Campaign) -> list[tuple[str, Path]]:
