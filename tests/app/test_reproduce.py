@@ -68,7 +68,7 @@ def test_what_differs_is_named_with_its_size(copy: Path) -> None:
     assert result.exit_code == 1, (result.output, result.exception)
     rows = {r["path"]: r["words"] for r in json.loads(result.stdout)["differing"]}
     assert set(rows) == {"annotations/000001.json", f"mask/{mask.name}"}
-    assert rows[f"mask/{mask.name}"] == ["it is new"]
+    assert rows[f"mask/{mask.name}"] == ["it is missing"]
     assert any("spoiled: 3 -> (nothing)" in w for w in rows["annotations/000001.json"])
 
 

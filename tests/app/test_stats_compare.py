@@ -169,7 +169,10 @@ def test_a_label_that_is_gone_from_one_frame_is_told(releases, tmp_path):
 
     row = changed_copy(releases, tmp_path, drop)
     assert (row["labels_lost"], row["labels_added"]) == (1, 0)
-    assert not row["objects_lost"] and row["files_changed"] == ["scene_gt_info.json"]
+    assert not row["objects_lost"] and row["files_changed"] == [
+        "scene_gt.json",
+        "scene_gt_info.json",
+    ]
 
 
 def test_other_models_and_tables_are_told(releases, tmp_path):

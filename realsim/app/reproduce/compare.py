@@ -49,7 +49,7 @@ def _files(folder: Path) -> Iterator[str]:
 
 def _compare(first: Path, second: Path, name: str) -> FileDifference | None:
     """Return in what a file differs; None = it does not."""
-    for path, words in ((first, "it is new"), (second, "it was not made again")):
+    for path, words in ((first, "it is missing"), (second, "it was not made again")):
         if not path.is_file():
             return FileDifference(path=name, words=(words,))
     a, b = (_told(p, p.read_bytes()) for p in (first, second))

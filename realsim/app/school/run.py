@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from realsim_sim_bridge.school import SchoolConfig
 
 
-MADE_FROM = ("registration/scene.json", "review/journal.jsonl", "models/*")
+MADE_FROM = ("registration/scene.json", "review/journal.jsonl", "models/*", "models/collision/*")
 """Files of a session that a school is made of."""
 
 

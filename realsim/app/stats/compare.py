@@ -14,10 +14,11 @@ from realsim.app.console import Console
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.sources import SourceScene, source_scenes
 from realsim.app.stages import open_session
-from realsim.app.stats.compare_files import other_files, other_in_roots, other_models
+from realsim.app.stats.compare_files import is_same_file, other_files, other_in_roots, other_models
 from realsim.arrays import Array, Int64
 from realsim.formats.bop.labelled import BopLabelledScene, read_models_info
 from realsim.formats.graspnet.grasp_labels import read_grasp_labels
+from realsim.formats.graspnet.instances import OBJECT_LIST
 from realsim.formats.graspnet.labelled import GraspnetLabelledScene
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
 from realsim.formats.session_scene import SessionScene
@@ -108,6 +109,9 @@ def compare_releases(new: Sequence[Path], old: Path, console: Console) -> dict[s
             diffs.append(diff_scenes(name, before[name].open(), after[name].open()))
             places = (before[name].folder, after[name].folder)
             diffs[-1].files_changed += other_files(*places)
+            lists = [p.parent / OBJECT_LIST for p in places]
+            if after[name].kind == "graspnet" and not is_same_file(*lists):
+                diffs[-1].files_changed.append(OBJECT_LIST)
             if before[name].kind == after[name].kind == "session":
                 diffs[-1].files_changed += other_models(places, [{}, {}])
     console.table(

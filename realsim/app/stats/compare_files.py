@@ -10,9 +10,9 @@ from realsim.formats.bop.labelled import read_models_info
 from realsim.formats.bop.models import INFO_FILE
 
 LEFT_OUT = re.compile(
-    r"(^|/)(rgb|gray|depth|mask|mask_visib|label|reports|stages|cache|pictures|thumbnails|models\w*"
-    r"|sensors)/|(^|/)\.|\.(html|jpg|md)$|(^|/)(SHA256SUMS|croissant\.json|provenance.*\.json"
-    r"|session.*\.json|manifest\.jsonl|scene_gt\.json|scene_camera\.json)$"
+    r"(^|cameras/[^/]+/)(rgb|gray|depth|mask|mask_visib|label|reports|stages|models\w*)/"
+    r"|(^|/)(cache|pictures|thumbnails)/|(^|/)\.|\.(html|jpg|md)$"
+    r"|(^|/)(SHA256SUMS|croissant\.json|provenance.*\.json|session.*\.json|manifest\.jsonl)$"
 )
 """Paths of files that are compared otherwise, that are made of others, or say how and when."""
 
@@ -28,7 +28,7 @@ def other_files(old: Path, new: Path) -> list[str]:
         for p in root.rglob("*")
         if p.is_file() and not LEFT_OUT.search(p.relative_to(root).as_posix())
     }
-    return [n for n in sorted(names) if not _is_same_file(old / n, new / n)]
+    return [n for n in sorted(names) if not is_same_file(old / n, new / n)]
 
 
 def other_models(roots: Sequence[Path], names: Sequence[dict[int, str]]) -> list[str]:
@@ -42,7 +42,7 @@ def other_models(roots: Sequence[Path], names: Sequence[dict[int, str]]) -> list
         ]  # fmt: skip
         found += [
             f"{folder}/{n}" for n in sorted(files[0].keys() | files[1].keys())
-            if n not in files[0] or n not in files[1] or not _is_same_file(files[0][n], files[1][n])
+            if n not in files[0] or n not in files[1] or not is_same_file(files[0][n], files[1][n])
         ]  # fmt: skip
         rows = [
             {ids.get(i, str(i)): row for i, row in read_models_info(r / folder).items()}
@@ -60,11 +60,12 @@ def other_in_roots(old: Path, new: Path) -> list[str]:
         for r in (old, new)
     ]
     tables = {p.name for r in (old, new) for p in r.glob("*.json") if not LEFT_OUT.search(p.name)}
-    other = [n for n in sorted(tables) if not _is_same_file(old / n, new / n)]
+    other = [n for n in sorted(tables) if not is_same_file(old / n, new / n)]
     return other + other_models((old, new), names)
 
 
-def _is_same_file(old: Path, new: Path) -> bool:
+def is_same_file(old: Path, new: Path) -> bool:
+    """Return whether two files are there and hold the same bytes, or the same JSON values."""
     if not (old.is_file() and new.is_file()):
         return False
     a, b = old.read_bytes(), new.read_bytes()

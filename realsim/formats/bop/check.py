@@ -16,7 +16,7 @@ import numpy as np
 from realsim import images
 from realsim.arrays import Array, Array32, Mask
 from realsim.errors import InputError
-from realsim.formats.bop.check_poses import Silhouette, pose_findings, silhouette
+from realsim.formats.bop.check_poses import SMALLEST_PX, Silhouette, pose_findings, silhouette
 from realsim.formats.bop.labels import bbox_of
 from realsim.formats.bop.layout import Document, SceneLayout
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, LabelledScene
@@ -214,7 +214,8 @@ def check_info(
         compare("bbox_obj", [-1, -1, -1, -1])
     elif inside and whole is not None:
         compare("bbox_obj", list(bbox_of(whole)))
-    if shape is not None and shape.box is not None and count_visible:
+    is_large = not isinstance(count_all, int) or count_all >= SMALLEST_PX
+    if shape is not None and shape.box is not None and count_visible and is_large:
         offs = [_box_difference(info["bbox_obj"], b) for b in (shape.box, shape.drawn_box)]
         agree = any(off is not None and off <= BOX_PX for off in offs)
         x0, y0, x1, y1 = (float(v) for v in shape.box)
