@@ -15,7 +15,7 @@ from pathlib import Path
 
 from realsim.errors import InputError
 from realsim.store import atomic
-from realsim.store.atomic import storing
+from realsim.store.atomic import storing, sync_folder
 from realsim.store.lock import only_run_in
 from realsim.untrusted.own_json import read_object
 
@@ -107,15 +107,7 @@ def _move_into_place(folder: Path) -> None:
         place.parent.mkdir(parents=True, exist_ok=True)
         if (staging / name).is_file():
             os.replace(staging / name, place)
-            _flush(place.parent)
+            sync_folder(place.parent)
     (staging / NOTE).unlink()
-    _flush(staging)
+    sync_folder(staging)
     shutil.rmtree(staging, ignore_errors=True)
-
-
-def _flush(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

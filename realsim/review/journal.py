@@ -22,6 +22,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import ObjectPose
+from realsim.store.atomic import sync_folder
 
 JOURNAL_FILE = "review/journal.jsonl"
 """Where in a session the decisions stand."""
@@ -312,16 +313,7 @@ def append(path: Path, entry: Entry, *, check: Callable[[ReviewState], None] | N
     finally:
         os.close(handle)
     if created:
-        _sync_folder(path.parent)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Put the folder's entry for a new file on the disk too."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        sync_folder(path.parent)
 
 
 def read(path: Path) -> JournalContent:

@@ -60,7 +60,8 @@ def temporary(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
+    """Have the names in a folder on the disk."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)
@@ -74,7 +75,7 @@ def _make_folder(folder: Path) -> None:
         return
     _make_folder(folder.parent)
     folder.mkdir(exist_ok=True)
-    _sync_folder(folder.parent)
+    sync_folder(folder.parent)
 
 
 def write_bytes(
@@ -105,7 +106,7 @@ def write_bytes(
             announced = True
         os.replace(unnamed, path)
         if flush:
-            _sync_folder(path.parent)
+            sync_folder(path.parent)
     except BaseException as error:
         if not announced:
             unnamed.unlink(missing_ok=True)
@@ -168,7 +169,7 @@ def append_line(path: Path | str, line: str) -> None:
     finally:
         os.close(handle)
     if is_new:
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
 
 
 def complete_lines(path: Path | str) -> list[str]:

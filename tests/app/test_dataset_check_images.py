@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from realsim.app.check.agreement import AgreementConfig, ObjectAgreement, SceneAgreement
+from realsim.app.check.agreement import ObjectAgreement, SceneAgreement
 from realsim.app.check.checksums import check_checksums, checksum_list
 from realsim.app.check.dataset import checked_scenes
 from realsim.app.check.tally import MaskOverlap, Tally, agreement_of
@@ -17,7 +17,6 @@ from tests.support.bop_scenes import edit, write_boxes
 from typed_commands import finished, invoked
 
 IMAGES = (1, 5, 9, 13, 17, 21)
-CONFIG = AgreementConfig()
 
 
 @pytest.fixture
@@ -123,7 +122,7 @@ def seen_at(points_mm: np.ndarray) -> Tally:
 
 
 def strays(tally: Tally) -> tuple[str, ...]:
-    return agreement_of(8, "", tally, CONFIG).faults
+    return agreement_of(8, "", tally).faults
 
 
 def test_images_that_all_differ_have_no_stray_among_them() -> None:

@@ -153,15 +153,15 @@ def test_results_that_are_gone_or_of_others_are_seen_and_nobodys_files_are_remov
         result = run(path)
     assert result.exit_code == 0, result.output
     told = " ".join(result.output.split())
-    assert "scene_000000: its result of annotate is gone; it is made again" in told
-    assert "scene_000001: annotate was run on it outside this campaign" in told
+    assert "scene_000000: files that annotate left are gone or others" in told
+    assert "scene_000001: annotate was run outside this campaign" in told
     # A view's mask is lost, another one's labels lost something.
     scene = out / "scenes/scene_000000"
     (scene / "mask_visib/000000_000000.png").unlink()
     with no_interpreters():
         result = run(path)
     told = " ".join(result.output.split())
-    assert "scene_000000: files of its result of annotate are gone or others" in told
+    assert "scene_000000: files that annotate left are gone or others" in told
     assert result.exit_code == 0 and (scene / "mask_visib/000000_000000.png").is_file()
     assert (out / "scenes/scene_000000/stages/annotate.json").is_file()
     assert sorted(p.name for p in (out / "export.kept").iterdir()) == ["NOTES.md", "README.md"]

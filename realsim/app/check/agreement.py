@@ -3,44 +3,39 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class AgreementConfig:
-    """When labels and poses disagree."""
-
-    least_mask_iou: float = 0.90
-    """Median over the frames, of the silhouette: renderers differ along the outline only, which is
-    a twentieth of an object 80 px wide."""
-    least_visible_iou: float = 0.80
-    """Median over the frames, of the visible part, for which BOP uses the noisy measured depth."""
-    least_single_iou: float = 0.50
-    """Least IoU of one frame's silhouette and visible part: below it the mask is another
-    thing's."""
-    least_pixels: int = 200
-    """Smaller silhouettes are not judged: their outline is too much of them [px]."""
-    depth_mm: float = 15.0
-    """Median difference of measured and rendered depth: BOP's own tolerance of visibility [mm]."""
-    most_hidden: float = 0.10
-    """Share of an object's visible pixels that are measured nearer than it by `depth_mm`: BOP calls
-    such pixels hidden. A stereo camera spreads a near edge over 4 px of what lies behind it, which
-    along one side is a twentieth of an object 80 px wide; realsim's masks keep these pixels."""
-    least_measured: int = 50
-    """Pixels with depth that a median is taken over."""
-    stray_mm: float = 5.0
-    """One image against the others, of an object's place and of depth: labels and camera poses of
-    public data sets are good to some millimetres, and so is depth averaged over objects [mm]."""
-    stray_spreads: float = 5.0
-    """It must stand off by this many times what the others differ by, too (median distance from
-    their median): where all images differ, none stands off."""
-    stray_iou: float = 0.05
-    """One image against the others, of an IoU: by which it may be less."""
-    stray_times: float = 3.0
-    """It must be less by so many times what the others lack, too."""
-    stray_outline_px: float = 0.5
-    """The outline, too, must be off by so much [px] more than so many times the others': half
-    hidden things are all outline, so that a rounded pose costs a tenth of them."""
-    fewest_images: int = 3
-    """From which on one image of places or depth can be told to be the one that is off."""
+LEAST_MASK_IOU = 0.90
+"""Median over the frames, of the silhouette: renderers differ along the outline only, which is
+a twentieth of an object 80 px wide."""
+LEAST_VISIBLE_IOU = 0.80
+"""Median over the frames, of the visible part, for which BOP uses the noisy measured depth."""
+LEAST_SINGLE_IOU = 0.50
+"""Least IoU of one frame's silhouette and visible part: below it the mask is another
+thing's."""
+LEAST_PIXELS = 200
+"""Smaller silhouettes are not judged: their outline is too much of them [px]."""
+DEPTH_MM = 15.0
+"""Median difference of measured and rendered depth: BOP's own tolerance of visibility [mm]."""
+MOST_HIDDEN = 0.10
+"""Share of an object's visible pixels that are measured nearer than it by `DEPTH_MM`: BOP calls
+such pixels hidden. A stereo camera spreads a near edge over 4 px of what lies behind it, which
+along one side is a twentieth of an object 80 px wide; realsim's masks keep these pixels."""
+LEAST_MEASURED = 50
+"""Pixels with depth that a median is taken over."""
+STRAY_MM = 5.0
+"""One image against the others, of an object's place and of depth: labels and camera poses of
+public data sets are good to some millimetres, and so is depth averaged over objects [mm]."""
+STRAY_SPREADS = 5.0
+"""It must stand off by this many times what the others differ by, too (median distance from
+their median): where all images differ, none stands off."""
+STRAY_IOU = 0.05
+"""One image against the others, of an IoU: by which it may be less."""
+STRAY_TIMES = 3.0
+"""It must be less by so many times what the others lack, too."""
+STRAY_OUTLINE_PX = 0.5
+"""The outline, too, must be off by so much [px] more than so many times the others': half
+hidden things are all outline, so that a rounded pose costs a tenth of them."""
+FEWEST_IMAGES = 3
+"""From which on one image of places or depth can be told to be the one that is off."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from realsim import images
-from realsim.app.check.agreement import AgreementConfig, SceneAgreement
+from realsim.app.check import agreement
+from realsim.app.check.agreement import SceneAgreement
 from realsim.app.check.tally import DepthDifference, MaskOverlap, Tally, agreement_of, stray_depth
 from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig, open_scene, scenes_of
 from realsim.arrays import Array32, Mask
@@ -35,16 +36,12 @@ def is_dataset(folder: Path) -> bool:
 
 
 def checked_scenes(
-    folder: Path,
-    config: AgreementConfig | None = None,
-    *,
-    progress: Callable[[int, int], None] | None = None,
+    folder: Path, *, progress: Callable[[int, int], None] | None = None
 ) -> Iterator[SceneAgreement]:
     """Yield how every scene of a data set agrees with itself.
 
     Args:
         folder: a root, split or scene of BOP; a root, scene or camera of GraspNet.
-        config: when labels and poses disagree.
         progress: called with (scenes done, scenes in all).
 
     Raises:
@@ -54,7 +51,7 @@ def checked_scenes(
     for k, ref in enumerate(refs):
         try:
             scene = open_scene(ref)
-            found = checked_scene(scene, ref.place, config or AgreementConfig())
+            found = checked_scene(scene, ref.place)
             yield _with_the_formats(found, scene, ref)
         except RealsimError as error:
             yield SceneAgreement(place=ref.place, frames=0, objects=(), findings=(str(error),))
@@ -86,7 +83,7 @@ def _with_the_formats(found: SceneAgreement, scene: LabelledScene, ref: SceneRef
     return replace(found, objects=objects, findings=tuple(findings))
 
 
-def checked_scene(scene: LabelledScene, place: str, config: AgreementConfig) -> SceneAgreement:
+def checked_scene(scene: LabelledScene, place: str) -> SceneAgreement:
     """Return how a scene's masks and depth agree with its poses, frame by frame.
 
     Raises:
@@ -99,9 +96,9 @@ def checked_scene(scene: LabelledScene, place: str, config: AgreementConfig) -> 
         frame = scene.frame(index)
         _note_objects(frame, tallies)
         without |= {o.obj_id for o in frame.objects} - models.keys()
-        _compare(scene, frame, models, tallies, config)
+        _compare(scene, frame, models, tallies)
     objects = [
-        agreement_of(obj_id, models[obj_id].name if obj_id in models else "", tally, config)
+        agreement_of(obj_id, models[obj_id].name if obj_id in models else "", tally)
         for obj_id, tally in sorted(tallies.items())
     ]
     notes = list(scene.notes)
@@ -113,7 +110,7 @@ def checked_scene(scene: LabelledScene, place: str, config: AgreementConfig) -> 
         notes.append("there are no masks: only poses and depth were compared.")
     return SceneAgreement(
         place=place, frames=len(scene.indices), objects=tuple(objects),
-        findings=tuple(stray_depth(list(tallies.values()), config)), notes=tuple(notes),
+        findings=tuple(stray_depth(list(tallies.values()))), notes=tuple(notes),
         approximate=_is_approximate(scene),
     )  # fmt: skip
 
@@ -145,7 +142,6 @@ def _compare(
     frame: LabelledFrame,
     models: Mapping[int, ObjectModel],
     tallies: dict[int, Tally],
-    config: AgreementConfig,
 ) -> None:
     """Compare one frame: every object's masks and depth with what its pose renders."""
     placed = [
@@ -171,22 +167,22 @@ def _compare(
                 )
         visible = labels.visible(k)
         if given[0] is not None:
-            tally.mask += _overlap(given[0], labels.amodal[k], frame.index, config)
+            tally.mask += _overlap(given[0], labels.amodal[k], frame.index)
         if given[1] is not None:
             if depth is not None:
                 # A hand or a robot in front has no model: what is measured there tells of it.
-                behind_m = labels.depth_m - 1e-3 * config.depth_mm
+                behind_m = labels.depth_m - 1e-3 * agreement.DEPTH_MM
                 visible &= given[1] | (depth == 0) | (depth >= behind_m)
-            tally.visible += _overlap(given[1], visible, frame.index, config)
+            tally.visible += _overlap(given[1], visible, frame.index)
         if depth is not None:
             seen = visible if given[1] is None else visible & given[1]
-            tally.depth += _depth_difference(frame.index, depth, labels, seen, config)
+            tally.depth += _depth_difference(frame.index, depth, labels, seen)
 
 
-def _overlap(given: Mask, rendered: Mask, image: int, config: AgreementConfig) -> list[MaskOverlap]:
+def _overlap(given: Mask, rendered: Mask, image: int) -> list[MaskOverlap]:
     """Return the IoU of a mask with the rendered one; nothing where there is too little of both."""
     union = int(np.count_nonzero(given | rendered))
-    if union < config.least_pixels:
+    if union < agreement.LEAST_PIXELS:
         return []
     both = int(np.count_nonzero(given & rendered))
     iou = both / union
@@ -204,11 +200,11 @@ def _outline(mask: Mask) -> int:
 
 
 def _depth_difference(
-    image: int, depth_m: Array32, labels: Labels, seen: Mask, config: AgreementConfig
+    image: int, depth_m: Array32, labels: Labels, seen: Mask
 ) -> list[DepthDifference]:
     """Return how the measured depth of visible pixels differs from the rendered one."""
     measured = seen & (depth_m > 0)
-    if np.count_nonzero(measured) < config.least_measured:
+    if np.count_nonzero(measured) < agreement.LEAST_MEASURED:
         return []
     off_mm = 1e3 * (depth_m[measured] - labels.depth_m[measured])
     return [
@@ -216,6 +212,6 @@ def _depth_difference(
             image=image,
             off_mm=float(np.median(off_mm)),
             scale=float(np.median(depth_m[measured] / labels.depth_m[measured])),
-            hidden=float(np.mean(off_mm < -config.depth_mm)),
+            hidden=float(np.mean(off_mm < -agreement.DEPTH_MM)),
         )
     ]

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from realsim.app.check.agreement import AgreementConfig, ObjectAgreement
+from realsim.app.check import agreement
+from realsim.app.check.agreement import ObjectAgreement
 from realsim.arrays import Array
 
 LISTED = 5
@@ -64,13 +65,13 @@ class Tally:
             self.places.setdefault(instance, []).append((image, position))
 
 
-def agreement_of(obj_id: int, name: str, tally: Tally, config: AgreementConfig) -> ObjectAgreement:
+def agreement_of(obj_id: int, name: str, tally: Tally) -> ObjectAgreement:
     """Return what was found of an object over all images."""
     faults: list[str] = []
     figures: dict[str, tuple[float | None, float | None, int | None]] = {}
     for what, found, least in (
-        ("mask", tally.mask, config.least_mask_iou),
-        ("mask_visib", tally.visible, config.least_visible_iou),
+        ("mask", tally.mask, agreement.LEAST_MASK_IOU),
+        ("mask_visib", tally.visible, agreement.LEAST_VISIBLE_IOU),
     ):
         if not found:
             figures[what] = None, None, None
@@ -81,14 +82,14 @@ def agreement_of(obj_id: int, name: str, tally: Tally, config: AgreementConfig) 
         if median < least:
             faults.append(f"{what} has the IoU {median:.2f} with what its pose renders")
         else:
-            faults += _listed(list(_stray_masks(what, found, config)))
+            faults += _listed(list(_stray_masks(what, found)))
     depth = float(np.median([d.off_mm for d in tally.depth])) if tally.depth else None
-    if depth is not None and abs(depth) > config.depth_mm:
+    if depth is not None and abs(depth) > agreement.DEPTH_MM:
         faults.append(f"the depth is measured {depth:+.0f} mm from where its pose puts it")
     hidden = float(np.median([d.hidden for d in tally.depth])) if tally.depth else None
-    if hidden is not None and hidden > config.most_hidden and tally.visible:
+    if hidden is not None and hidden > agreement.MOST_HIDDEN and tally.visible:
         faults.append(f"{hidden:.0%} of mask_visib are measured in front of what its pose renders")
-    faults += _listed(list(_stray_places(obj_id, tally, config)))
+    faults += _listed(list(_stray_places(obj_id, tally)))
     return ObjectAgreement(
         obj_id=obj_id, name=name, frames=tally.frames, mask_iou=figures["mask"][0],
         mask_iou_worst=figures["mask"][1], mask_worst_image=figures["mask"][2],
@@ -99,9 +100,7 @@ def agreement_of(obj_id: int, name: str, tally: Tally, config: AgreementConfig) 
     )  # fmt: skip
 
 
-def _stray_masks(
-    what: str, found: Sequence[MaskOverlap], config: AgreementConfig
-) -> Iterator[tuple[float, str]]:
+def _stray_masks(what: str, found: Sequence[MaskOverlap]) -> Iterator[tuple[float, str]]:
     """Yield the images whose IoU is far below that of the others, or too small for any."""
     iou = np.array([o.iou for o in found])
     outline_px = np.array([o.outline_px for o in found])
@@ -112,16 +111,14 @@ def _stray_masks(
         if len(others):
             usual = float(np.median(others))
             usual_px = float(np.median(np.delete(outline_px, k)))
-            is_stray = lacking > config.stray_times * (1.0 - usual) + config.stray_iou
-            is_stray &= o.outline_px > config.stray_times * usual_px + config.stray_outline_px
-        if o.iou < config.least_single_iou or is_stray:
+            is_stray = lacking > agreement.STRAY_TIMES * (1.0 - usual) + agreement.STRAY_IOU
+            is_stray &= o.outline_px > agreement.STRAY_TIMES * usual_px + agreement.STRAY_OUTLINE_PX
+        if o.iou < agreement.LEAST_SINGLE_IOU or is_stray:
             told = f"{what} of image {o.image} has the IoU {o.iou:.2f} with its pose"
             yield lacking, told + (f", the others {usual:.2f}" if len(others) else "")
 
 
-def _stray_places(
-    obj_id: int, tally: Tally, config: AgreementConfig
-) -> Iterator[tuple[float, str]]:
+def _stray_places(obj_id: int, tally: Tally) -> Iterator[tuple[float, str]]:
     """Yield the images that see an object in another place of the world than the others do."""
     if tally.is_ambiguous:
         return
@@ -130,7 +127,7 @@ def _stray_places(
         points = 1e3 * np.array([p for _, p in seen])
         if len(points) == 2:  # which of the two is off, nothing can tell
             off = float(np.linalg.norm(points[1] - points[0]))
-            if off > config.stray_mm:
+            if off > agreement.STRAY_MM:
                 yield (
                     off,
                     (
@@ -138,19 +135,19 @@ def _stray_places(
                         "apart in them"
                     ),
                 )
-        if len(points) < config.fewest_images:
+        if len(points) < agreement.FEWEST_IMAGES:
             continue
         for k, point in enumerate(points):
             others = np.delete(points, k, axis=0)
             middle = np.median(others, axis=0)
             spread = float(np.median(np.linalg.norm(others - middle, axis=1)))
             off = float(np.linalg.norm(point - middle))
-            if off > max(config.stray_mm, config.stray_spreads * spread):
+            if off > max(agreement.STRAY_MM, agreement.STRAY_SPREADS * spread):
                 told = f"image {images[k]}: object {obj_id} stands {off:.1f} mm from where the "
                 yield off, told + f"other {len(others)} images see it"
 
 
-def stray_depth(tallies: Sequence[Tally], config: AgreementConfig) -> list[str]:
+def stray_depth(tallies: Sequence[Tally]) -> list[str]:
     """Return the images whose depth is off that of the others.
 
     Each object is held against itself in the other images, so that a model or a surface which is
@@ -159,7 +156,7 @@ def stray_depth(tallies: Sequence[Tally], config: AgreementConfig) -> list[str]:
     off_mm: dict[int, list[float]] = {}
     scale: dict[int, list[float]] = {}
     for tally in tallies:
-        if len(tally.depth) < config.fewest_images:
+        if len(tally.depth) < agreement.FEWEST_IMAGES:
             continue
         usual_mm = float(np.median([d.off_mm for d in tally.depth]))
         usual_scale = float(np.median([d.scale for d in tally.depth]))
@@ -168,7 +165,7 @@ def stray_depth(tallies: Sequence[Tally], config: AgreementConfig) -> list[str]:
             scale.setdefault(d.image, []).append(d.scale / usual_scale)
     images = sorted(off_mm)
     of_image = np.array([np.median(off_mm[image]) for image in images])
-    if len(images) < config.fewest_images:
+    if len(images) < agreement.FEWEST_IMAGES:
         return []
     found: list[tuple[float, str]] = []
     for k, image in enumerate(images):
@@ -176,7 +173,7 @@ def stray_depth(tallies: Sequence[Tally], config: AgreementConfig) -> list[str]:
         middle = float(np.median(others))
         spread = float(np.median(np.abs(others - middle)))
         off = float(of_image[k]) - middle
-        if abs(off) > max(config.stray_mm, config.stray_spreads * spread):
+        if abs(off) > max(agreement.STRAY_MM, agreement.STRAY_SPREADS * spread):
             way = "farther" if off > 0 else "nearer"
             found.append(
                 (

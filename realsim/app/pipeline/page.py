@@ -62,11 +62,9 @@ def page_of(campaign: Campaign, result: "PipelineResult") -> Page:
                      rows=[[Cell(name, "bad"), why] for name, why in failed.items()])  # fmt: skip
     elif total and done == total:
         unsure = sum(bool(TO_LOOK_AT & set(verdicts_of(s))) for s in result.scenes)
-        told = f"{total} scenes went through all stages"
-        if unsure:
-            page.verdict("warn", "Done", f"{told}; objects of {unsure} need a look")
-        else:
-            page.verdict("good", "Done", told)
+        look = f"; objects of {unsure} need a look" if unsure else ""
+        kind = "warn" if unsure else "good"
+        page.verdict(kind, "Done", f"{total} scenes went through all stages{look}")
     else:
         page.verdict("off", "Under way", f"{done} of {total} scenes went through all stages")
     ends = [e for s in result.scenes for e in s.ends] + result.of_all

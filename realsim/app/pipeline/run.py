@@ -373,22 +373,14 @@ def _known(campaign: Campaign, name: str, place: Path) -> SceneState:
     ends = ends[: same.index(False)] if False in same else ends[: len(same)]
     for k, end in enumerate(ends):
         now = result_of(place, end.stage) if end.result else ""
-        if end.result and not now:
-            note = f"its result of {end.stage} is gone; it is made again, with what follows it."
+        if now == end.result:
+            continue
+        if now.split()[:1] in ([], end.result.split()[:1]):  # no record, or that of this campaign
+            (place / provenance.file_of(end.stage)).unlink(missing_ok=True)
+            note = f"files that {end.stage} left are gone or others: it is done again, and what follows."
             return replace(scene, ends=ends[:k], note=note)
-        if now != end.result and now.split()[0] == end.result.split()[0]:
-            note = (
-                f"files of its result of {end.stage} are gone or others; it is made again, with "
-                "what follows it."
-            )
-            (place / provenance.file_of(end.stage)).unlink()
-            return replace(scene, ends=ends[:k], note=note)
-        if now != end.result:
-            note = (
-                f"{end.stage} was run on it outside this campaign; that result stays, and what "
-                "follows is done again."
-            )
-            return replace(scene, ends=(*ends[:k], replace(end, result=now)), note=note)
+        note = f"{end.stage} was run outside this campaign: it stays, the rest is done again."
+        return replace(scene, ends=(*ends[:k], replace(end, result=now)), note=note)
     return replace(scene, ends=ends)
 
 

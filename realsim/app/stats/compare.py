@@ -14,9 +14,15 @@ from realsim.app.console import Console
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.sources import SourceScene, source_scenes
 from realsim.app.stages import open_session
-from realsim.app.stats.compare_files import is_same_file, other_files, other_in_roots, other_models
+from realsim.app.stats.compare_files import (
+    is_same_file,
+    names_in,
+    other_files,
+    other_in_roots,
+    other_models,
+)
 from realsim.arrays import Array, Int64
-from realsim.formats.bop.labelled import BopLabelledScene, read_models_info
+from realsim.formats.bop.labelled import BopLabelledScene
 from realsim.formats.graspnet.grasp_labels import read_grasp_labels
 from realsim.formats.graspnet.instances import OBJECT_LIST
 from realsim.formats.graspnet.labelled import GraspnetLabelledScene
@@ -220,14 +226,10 @@ def _counterparts(before: set[Thing], after: set[Thing]) -> dict[Thing, Thing]:
 
 def _names(scene: LabelledScene) -> dict[int, str]:
     """Return the names of the models by id; {} where they do not tell models apart."""
-    if isinstance(scene, BopLabelledScene):
-        rows = scene.models_info()
-    elif isinstance(scene, SessionScene):
-        rows = read_models_info(scene.store.folder / "models")
-    else:
-        return {}
-    names = {i: str(row.get("name", i)) for i, row in rows.items()}
-    return names if len(set(names.values())) == len(names) else {}
+    if isinstance(scene, SessionScene):
+        return names_in(scene.store.folder / "models")
+    folder = scene.models_folder if isinstance(scene, BopLabelledScene) else None
+    return {} if folder is None else names_in(folder)
 
 
 def _rows(frame: LabelledFrame, names: dict[int, str]) -> dict[Thing, int]:

@@ -17,6 +17,12 @@ LEFT_OUT = re.compile(
 """Paths of files that are compared otherwise, that are made of others, or say how and when."""
 
 
+def names_in(models: Path) -> dict[int, str]:
+    """Return the names of a folder's models by id; {} where they do not tell models apart."""
+    names = {i: str(row.get("name", i)) for i, row in read_models_info(models).items()}
+    return names if len(set(names.values())) == len(names) else {}
+
+
 def other_files(old: Path, new: Path) -> list[str]:
     """Return the files of two folders that hold something else, or are in one of them only.
 
@@ -55,10 +61,7 @@ def other_models(roots: Sequence[Path], names: Sequence[dict[int, str]]) -> list
 
 def other_in_roots(old: Path, new: Path) -> list[str]:
     """Return the files of models and tables in the roots of two data sets that differ."""
-    names = [
-        {i: str(row.get("name", i)) for i, row in read_models_info(r / "models").items()}
-        for r in (old, new)
-    ]
+    names = [names_in(r / "models") for r in (old, new)]
     tables = {p.name for r in (old, new) for p in r.glob("*.json") if not LEFT_OUT.search(p.name)}
     other = [n for n in sorted(tables) if not is_same_file(old / n, new / n)]
     return other + other_models((old, new), names)
