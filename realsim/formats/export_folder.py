@@ -66,11 +66,6 @@ class ExportFolder:
         """Return whether a folder holds a finished export."""
         return (Path(folder) / FINISHED).is_file() and not (Path(folder) / ASKED).is_file()
 
-    @staticmethod
-    def note_finished(folder: Path | str, asked: Mapping[str, Any]) -> None:
-        """Note which request the export in a folder is of."""
-        atomic.write_json(Path(folder) / FINISHED, _request(asked))
-
     def below(self, relative: str) -> "ExportFolder":
         """Return a folder of this export as a writer sees it that fills a folder of its own."""
         inner = ExportFolder(self.folder, self.asked, self._done, resumed=self.resumed)
@@ -105,7 +100,7 @@ class ExportFolder:
                 "were before they changed. It is not mixed with this one: give a new folder, or "
                 "delete that one first."
             )
-        if folder.is_dir() and any(folder.iterdir()):
+        if folder.is_dir() and any(p.name != STATE for p in folder.iterdir()):
             raise InputError(
                 f"'{folder}' is not empty; what is there would be mixed with the export. Give a "
                 "new folder."
@@ -219,6 +214,9 @@ class ExportFolder:
                 atomic.write_bytes(self.folder / _inside(relative), data)
             self._stream(SUMS_FILE, self._sums(files))
             atomic.write_json(self.folder / FINISHED, _request(self.asked))
+            (
+                self.folder / ASKED
+            ).unlink()  # first: with it, and without the rest, it looks unfinished
             shutil.rmtree(self.folder / STATE)
 
     def written(self) -> Iterator[tuple[str, int, str]]:

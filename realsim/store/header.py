@@ -66,8 +66,9 @@ def checked_header(path: Path) -> dict[str, Any]:
     try:
         from_json(header["camera"], CameraIntrinsics, f"the camera of {path}")
         float(header["depth_unit_m"])
-        dict(header["T_world_cam"])
-        dict(header.get("extra", {}))
+        for table in (header["T_world_cam"], header.get("extra", {})):
+            if not isinstance(table, dict):
+                raise TypeError(f"a table was expected, not {str(table)[:40]}")
     except (TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path} has a camera, unit or pose that is none ({error}).") from error
     return header

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 
 import pytest
 
@@ -40,6 +41,23 @@ def test_a_torn_row_is_not_glued_to_the_next_one(tmp_path):
     rows = tmp_path / "torn" / STATE / "rows/scene/all.jsonl"
     with rows.open("a") as file:
         file.write('["frame 5", "5", {"num')
+    fill(tmp_path / "torn")
+    assert bytes_of(tmp_path / "torn") == bytes_of(tmp_path / "whole")
+
+
+def test_a_kill_while_the_notes_are_taken_away_leaves_a_finished_export(tmp_path, monkeypatch):
+    def killed(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(shutil, "rmtree", killed)
+    with pytest.raises(KeyboardInterrupt):
+        fill(tmp_path)
+    assert ExportFolder.is_finished(tmp_path, ASKED)
+
+
+def test_a_kill_before_the_request_is_noted_leaves_a_folder_to_begin_in(tmp_path):
+    (tmp_path / "torn" / STATE).mkdir(parents=True)
+    fill(tmp_path / "whole")
     fill(tmp_path / "torn")
     assert bytes_of(tmp_path / "torn") == bytes_of(tmp_path / "whole")
 

@@ -1,6 +1,7 @@
 """`realsim export`: scene by scene into one folder; interrupted, the same command goes on."""
 
 import re
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -77,10 +78,8 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
         for folder in dict.fromkeys(s.folder for s in scenes if s.kind == "session"):
             refresh_labels(open_session(folder), console)
     asked = request.asked() | {CONTENT: content_of(scenes)}
-    if ExportFolder.is_finished(out, asked):
-        return ExportResult(folder=out, card=out / CARD_FILE, scenes=(), was_finished=True)
-    if _is_of(out, request):
-        ExportFolder.note_finished(out, asked)
+    if ExportFolder.is_finished(out, asked) or _is_of(out, request):
+        shutil.rmtree(out / STATE, ignore_errors=True)  # left by a run that ended just there
         return ExportResult(folder=out, card=out / CARD_FILE, scenes=(), was_finished=True)
     folder = ExportFolder.begin(out, asked)
     if folder.resumed:

@@ -377,7 +377,7 @@ def _known(campaign: Campaign, name: str, place: Path) -> SceneState:
             continue
         if now.split()[:1] in ([], end.result.split()[:1]):  # no record, or that of this campaign
             (place / provenance.file_of(end.stage)).unlink(missing_ok=True)
-            note = f"files that {end.stage} left are gone or others: it is done again, and what follows."
+            note = f"files that {end.stage} left are gone or others: this and the rest is redone."
             return replace(scene, ends=ends[:k], note=note)
         note = f"{end.stage} was run outside this campaign: it stays, the rest is done again."
         return replace(scene, ends=(*ends[:k], replace(end, result=now)), note=note)
