@@ -95,6 +95,8 @@ def test_what_a_person_has_to_look_at_is_on_the_page(tmp_path):
         page = page_of(campaign, result).encode().decode()
         assert told in page and ("1 not placed" in page) == bool(missing)
     assert verdicts_of(state) == {"accepted": 2, "not placed": 1}
+    (scene / "registration/report.json").unlink()
+    assert verdicts_of(state) == {"accepted": 2}
 
 
 def document(out):

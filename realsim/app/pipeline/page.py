@@ -41,9 +41,9 @@ def verdicts_of(scene: "SceneState") -> Counter[str]:
     """Return how many objects of a registered scene have which verdict, or are not placed."""
     try:
         found: Any = read_object(scene.folder / "registration/scene.json")["objects"]
-        counts = Counter(str(o["verdict"]) for o in found)
-        missing = read_object(scene.folder / "registration/report.json").get("not_placed", ())
-        return counts + Counter({"not placed": len(missing)})
+        report = scene.folder / "registration/report.json"  # a generated scene has none
+        missing = read_object(report).get("not_placed", ()) if report.is_file() else ()
+        return Counter(str(o["verdict"]) for o in found) + Counter({"not placed": len(missing)})
     except (InputError, KeyError, TypeError):
         return Counter()
 
@@ -97,8 +97,9 @@ def page_of(campaign: Campaign, result: "PipelineResult") -> Page:
 
 def stage_rows(stages: Sequence[str], ends: Sequence[Ended]) -> list[list[object]]:
     """Return a row for each stage: how often it ran, how it ended, and what it took."""
-    first = [name for name in dict.fromkeys(e.stage for e in ends) if name not in stages]
-    return [_stage_row(name, [e for e in ends if e.stage == name]) for name in (*stages, *first)]
+    of_all = [name for name in dict.fromkeys(e.stage for e in ends) if name not in stages]
+    order = sorted((*stages, *of_all), key=lambda name: name != "generate")
+    return [_stage_row(name, [e for e in ends if e.stage == name]) for name in order]
 
 
 def _stage_row(stage: str, ends: Sequence[Ended]) -> list[object]:
