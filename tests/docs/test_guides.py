@@ -8,22 +8,15 @@ import pytest
 from documents import ROOT
 from played import play
 
-GUIDE = ROOT / "docs/how-to/calibrate-a-new-lab.md"
-"""A lab of its own, board views first: plan, capture, calibrate, and the figures of all three."""
-GRIPPER = ROOT / "docs/how-to/your-own-gripper.md"
+PLAYED = ("calibrate-a-new-lab", "your-own-gripper")
+"""A lab of its own, board views first: plan, capture, calibrate, and the figures of all three; a
+gripper that is not in the package: described, proven and simulated."""
 
 
 @pytest.mark.slow
-def test_the_guide_to_a_new_lab_prints_what_it_says(tmp_path: Path) -> None:
-    wrong = play(GUIDE, tmp_path)
-    assert not wrong, "\n\n".join(wrong)
-
-
-@pytest.mark.slow
-def test_a_gripper_that_is_not_in_the_package_is_described_proven_and_simulated(
-    tmp_path: Path,
-) -> None:
-    wrong = play(GRIPPER, tmp_path)
+@pytest.mark.parametrize("guide", PLAYED)
+def test_a_guide_prints_what_it_says(guide: str, tmp_path: Path) -> None:
+    wrong = play(ROOT / f"docs/how-to/{guide}.md", tmp_path)
     assert not wrong, "\n\n".join(wrong)
 
 
