@@ -14,13 +14,12 @@ batch_viewpoint_params_to_matrix, xmlReader): numpy and xml.etree only.
 """
 
 import argparse
-import subprocess
-import sys
 import tempfile
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
+from campaign_loop import demo, timed
 from figures import Figure, Found, Goal, run
 
 FIGURES = {
@@ -39,27 +38,15 @@ def grasps_back(args: argparse.Namespace) -> Found:
     found = Found()
     with tempfile.TemporaryDirectory(prefix="campaign_graspnet_") as place:
         given: Path | None = getattr(args, "session", None)
-        session = given or _demo(Path(place), args.quick)
+        session = given or demo(args.seed, *((8, 2, 6) if args.quick else (8, 5, 60)))[0]
         out = Path(place) / "graspnet"
-        _realsim("export", session, "--to", "graspnet", "--out", out, "--quiet")
+        timed("export", session, "--to", "graspnet", "--out", out)
         right, count, worst, turned = _compared(session, out)
     words = f"{count} grasps of all images of {given or 'a demo'}"
     found.add("graspnet_grasps_back", right / max(count, 1), words)
     found.add("graspnet_worst_mm", worst, "the worst of them")
     found.add("graspnet_view_deg", turned, "median; 300 views are up to 8.8 deg from a direction")
     return found
-
-
-def _demo(place: Path, quick: bool) -> Path:
-    size = ("--views", 4, "--objects", 2, "--grasps", 20) if quick else ("--views", 8)
-    _realsim("demo", "--out", place / "demo", "--quiet", "--workers", 1, *size)
-    return place / "demo/session"
-
-
-def _realsim(*words: object) -> None:
-    code = "from realsim.app.cli import main; main()"
-    command = [sys.executable, "-c", code, *map(str, words)]
-    subprocess.run(command, check=True, capture_output=True)
 
 
 def _compared(session: Path, out: Path) -> tuple[int, int, float, float]:

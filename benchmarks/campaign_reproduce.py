@@ -14,36 +14,28 @@ import sys
 import tempfile
 from pathlib import Path
 
+from campaign_loop import demo, timed
 from figures import Found
-
-STAGES = ("register", "school", "annotate")
 
 
 def reproduce(args: argparse.Namespace) -> Found:
     """Return whether every result of a demo is made again as it is."""
     found = Found()
     with tempfile.TemporaryDirectory(prefix="campaign_reproduce_") as place:
-        out, demo = Path(place) / "bop", Path(place) / "demo"
-        views, objects, grasps = (8, 3, 4) if args.quick else (24, 5, 20)
-        size = ("--views", views, "--objects", objects, "--grasps", grasps)
-        _realsim("1", "demo", "--out", demo, *size, "--quiet")
-        _realsim("1", "export", demo / "session", "--to", "bop", "--out", out, "--quiet")
-        results = [(demo / "session", stage) for stage in STAGES] + [(out, "")]
-        codes = {
-            stage or "export": _realsim(
-                "2", "reproduce", result, *([stage] if stage else []), "--workers", "1", check=False
-            )
-            for result, stage in results
-        }
+        out = Path(place) / "bop"
+        session, *_ = demo(args.seed, *((8, 2, 6) if args.quick else (24, 5, 20)))
+        timed("export", session, "--to", "bop", "--out", out)
+        results = {stage: (session, stage) for stage in ("register", "school", "annotate")}
+        codes = {name: _again(*words) for name, words in (results | {"export": (out,)}).items()}
     told = ", ".join(f"{stage} exit {code}" for stage, code in codes.items())
     found.add("reproduce_equal", float(not any(codes.values())), told)
     return found
 
 
-def _realsim(threads: str, *words: object, check: bool = True) -> int:
-    """Run the command line with a number of threads; return its exit code."""
-    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
-    command = [sys.executable, "-c", "from realsim.app.cli import main; main()", *map(str, words)]
-    return subprocess.run(
-        command, check=check, env=os.environ | dict.fromkeys(names, threads)
-    ).returncode
+def _again(*result: object) -> int:
+    """Make a result again with two threads; return the exit code."""
+    line = "from realsim.app.cli import main; main()"
+    words = ["reproduce", *map(str, result), "--workers", "1"]
+    threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "2")
+    command = [sys.executable, "-c", line, *words]
+    return subprocess.run(command, check=False, env=os.environ | threads).returncode

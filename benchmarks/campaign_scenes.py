@@ -1,6 +1,6 @@
 """A campaign of generated scenes from one file to an exported data set, and what a large one costs.
 
-scenes      scenes_done       scenes that went through all stages, of 20 (--quick: 2)
+scenes      scenes_done       scenes that went through all stages, of 20 (--quick: 2 small ones)
             manual_steps      commands that somebody had to type beside `realsim pipeline`
             memory_growth     of the pipeline's own processes, last quarter of the scenes over the
                               second [share]
@@ -45,8 +45,8 @@ stages = ["register", "school", "annotate", "export", "stats"]
 [generate]
 scenes = {scenes}
 views = {views}
-objects = "6-10"
-size = "848x480"
+objects = "{objects}"
+size = "{size}"
 range = "d405"
 seed = {seed}
 no-maps = true
@@ -57,6 +57,12 @@ grasps = {grasps}
 [export]
 to = "bop"
 """
+FULL: dict[str, Any] = {
+    "scenes": 20, "views": 64, "objects": "6-10", "size": "848x480", "grasps": 25,
+}  # fmt: skip
+QUICK: dict[str, Any] = {
+    "scenes": 2, "views": 4, "objects": "2-3", "size": "424x240", "grasps": 4,
+}  # fmt: skip
 PAPER_SCENES, PAPER_VIEWS, PAPER_GRASPS = 1135, 256, 2.3e6
 CORES, NETWORK_BYTES_S, DISK_BYTES_S = 8, 110e6, 400e6
 """Cores of a machine, a gigabit network, one writer's disk."""
@@ -66,15 +72,16 @@ PER_VIEW, PER_GRASP = ("generate", "register", "annotate", "export"), ("school",
 def scenes(args: argparse.Namespace) -> Found:
     """Run a campaign and return what became of it."""
     found = Found()
-    count, views, grasps = (2, 4, 4) if args.quick else (20, 64, 25)
+    size = QUICK if args.quick else FULL
+    count, views = size["scenes"], size["views"]
     with tempfile.TemporaryDirectory(prefix="campaign_scenes_") as place:
         folder = Path(args.keep or place)
         folder.mkdir(parents=True, exist_ok=True)
         file = folder / "campaign.toml"
-        file.write_text(FILE.format(scenes=count, views=views, grasps=grasps, seed=args.seed))
+        file.write_text(FILE.format(seed=args.seed, **size))
         code, memory = run_watched(file, folder / "out" / "records")
         told = json.loads((folder / "out/campaign.json").read_text())
-        size = sum(p.stat().st_size for p in (folder / "out/scenes").rglob("*") if p.is_file())
+        written = sum(p.stat().st_size for p in (folder / "out/scenes").rglob("*") if p.is_file())
         tried = tried_grasps(folder / "out/scenes")
         placed = [objects_right(scene) for scene in sorted((folder / "out/scenes").glob("scene_*"))]
     found.add("scenes_done", told["done"], f"{count} scenes, exit code {code}")
@@ -84,7 +91,7 @@ def scenes(args: argparse.Namespace) -> Found:
     right, there, wrong = np.sum(placed, axis=0)
     found.add("objects_right_share", right / there, f"{right} of {there}")
     found.add("wrong_accepted", wrong)
-    rates = Rates.of(told, count, views, tried, size)
+    rates = Rates.of(told, count, views, tried, written)
     found.add("paper_scene_cpu_s", rates.scene_cpu_s(PAPER_VIEWS, PAPER_GRASPS / PAPER_SCENES))
     found.notes += [f"{name}: {why}" for name, why in told["failed"].items()]
     found.notes += [str(rates), *(rates.cost(machines) for machines in (1, 10, 100))]
