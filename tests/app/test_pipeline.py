@@ -94,9 +94,11 @@ def test_what_a_person_has_to_look_at_is_on_the_page(tmp_path):
         (scene / "registration/report.json").write_text(json.dumps(report))
         page = page_of(campaign, result).encode().decode()
         assert told in page and ("1 not placed" in page) == bool(missing)
-    assert verdicts_of(state) == {"accepted": 2, "not placed": 1}
+    assert verdicts_of(result, state) == {"accepted": 2, "not placed": 1}
     (scene / "registration/report.json").unlink()
-    assert verdicts_of(state) == {"accepted": 2}
+    assert verdicts_of(result, state) == {"accepted": 2}
+    result.stages = ("register", "annotate")
+    assert not verdicts_of(result, state), "poses of before the registration are not its verdicts"
 
 
 def document(out):

@@ -37,8 +37,13 @@ TO_LOOK_AT = {"doubtful", "rejected", "not placed"}
 """What a person has to look at."""
 
 
-def verdicts_of(scene: "SceneState") -> Counter[str]:
-    """Return how many objects of a registered scene have which verdict, or are not placed."""
+def verdicts_of(result: "PipelineResult", scene: "SceneState") -> Counter[str]:
+    """Return how many objects of a scene have which verdict, or are not placed.
+
+    Nothing is told of a scene that waits for its registration: generated ones have poses before.
+    """
+    if "register" in {*result.stages} - {e.stage for e in scene.ends}:
+        return Counter()
     try:
         found: Any = read_object(scene.folder / "registration/scene.json")["objects"]
         report = scene.folder / "registration/report.json"  # a generated scene has none
@@ -61,7 +66,7 @@ def page_of(campaign: Campaign, result: "PipelineResult") -> Page:
         page.verdict("bad", f"{len(failed)} failed", "the other scenes went on",
                      rows=[[Cell(name, "bad"), why] for name, why in failed.items()])  # fmt: skip
     elif total and done == total:
-        unsure = sum(bool(TO_LOOK_AT & set(verdicts_of(s))) for s in result.scenes)
+        unsure = sum(bool(TO_LOOK_AT & set(verdicts_of(result, s))) for s in result.scenes)
         look = f"; objects of {unsure} need a look" if unsure else ""
         kind = "warn" if unsure else "good"
         page.verdict(kind, "Done", f"{total} scenes went through all stages{look}")
@@ -86,11 +91,11 @@ def page_of(campaign: Campaign, result: "PipelineResult") -> Page:
     if made:
         page.section("Results")
         page.table(["page"], [[cell] for cell in made])
-    order = [result.scenes[k] for k in spread(total)]
-    views = [View(s.name, {"": p.read_bytes()}) for s in order if (p := _photograph(s)) is not None]
+    shown = [result.scenes[k] for k in sorted(list(spread(total))[:PICTURES])]
+    views = [View(s.name, {"": p.read_bytes()}) for s in shown if (p := _photograph(s)) is not None]
     if views:
         page.section("Pictures", "The first photograph of each scene.")
-        page.sheet(views[:PICTURES])
+        page.sheet(views)
     page.document = result.told
     return page
 
@@ -116,7 +121,7 @@ def _stage_row(stage: str, ends: Sequence[Ended]) -> list[object]:
 
 def _row(campaign: Campaign, result: "PipelineResult", scene: "SceneState") -> list[Cell]:
     ends = {e.stage: e for e in scene.ends}
-    verdicts = verdicts_of(scene)
+    verdicts = verdicts_of(result, scene)
     told = ", ".join(f"{n} {word}" for word, n in sorted(verdicts.items()))
     kind = "warn" if TO_LOOK_AT & set(verdicts) else "good"
     return [

@@ -214,7 +214,7 @@ def show_pipeline(campaign: Campaign, result: PipelineResult, console: Console) 
     console.table(f"Campaign {campaign.file.name}", STAGE_HEADER, rows)
     for name, why in result.failed.items():
         console.warn(f"{name}: {why}")
-    verdicts = sum((verdicts_of(s) for s in result.scenes), Counter[str]())
+    verdicts = sum((verdicts_of(result, s) for s in result.scenes), Counter[str]())
     if TO_LOOK_AT & set(verdicts):
         told = ", ".join(f"{n} {word}" for word, n in sorted(verdicts.items()))
         console.warn(f"objects: {told}; `realsim review` shows those that need a person.")
