@@ -1,6 +1,7 @@
 """`realsim pipeline`: a campaign's file is checked before anything runs; scenes fail alone."""
 
 import contextlib
+import gc
 import json
 import os
 import shutil
@@ -20,6 +21,7 @@ from realsim.app.pipeline.campaign import read_campaign
 from realsim.app.pipeline.chain import SCENE, Ended
 from realsim.app.pipeline.page import page_of, verdicts_of
 from realsim.errors import InputError
+from realsim.pages import Page
 from typed_commands import realsim
 
 HEAD = '[campaign]\nout = "out"\nstages = ["annotate", "export", "stats"]\n'
@@ -99,6 +101,19 @@ def test_what_a_person_has_to_look_at_is_on_the_page(tmp_path):
     assert verdicts_of(result, state) == {"accepted": 2}
     result.stages = ("register", "annotate")
     assert not verdicts_of(result, state), "poses of before the registration are not its verdicts"
+
+
+def test_a_page_is_given_back_when_it_is_written(tmp_path):
+    campaign = read_campaign(written(tmp_path, HEAD + SCENES + EXPORT), commands)
+    campaign.out.mkdir()
+    gc.collect()
+    before = pages_in_memory()
+    pipeline_run._write(campaign, pipeline_run.PipelineResult(scenes=[]))
+    assert pages_in_memory() == before
+
+
+def pages_in_memory():
+    return sum(isinstance(o, Page) for o in gc.get_objects())
 
 
 def document(out):

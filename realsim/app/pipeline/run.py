@@ -1,5 +1,6 @@
 """A campaign as it runs: first its scenes, then each one's stages, then what is made of all."""
 
+import gc
 import os
 import shutil
 import time
@@ -390,6 +391,7 @@ def _write(campaign: Campaign, result: PipelineResult) -> None:
 
     write_json(campaign.out / DOCUMENT, {CAMPAIGN: _said_from(campaign)} | result.told)
     write_bytes(campaign.out / PAGE, page_of(campaign, result).encode())
+    gc.collect()  # a template holds its page, and the pictures there, in a circle
 
 
 def _require_room(out: Path) -> None:
