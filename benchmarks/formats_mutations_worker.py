@@ -2,7 +2,7 @@
 
 A worker is forked from a process that has imported everything, reads the whole sample once, and
 then has 1 GB more than that. The kernel ends it after 5 s of CPU on one mutation, its parent after
-20 s of waiting; either costs that mutation only.
+30 s of waiting; either costs that mutation only.
 """
 
 import contextlib
@@ -29,13 +29,13 @@ from formats_mutations_scenes import Sample
 from realsim.errors import RealsimError
 
 HEADROOM_BYTES = 1 << 30
-CPU_S, WALL_S = 5, 60
+CPU_S, WALL_S, WARM_S = 5, 30, 60
+"""Limits of one mutation; the whole sample may wait longer: libraries are compiled first."""
 BATCH = 25
 """Mutations that a worker gets at once."""
 NAN_ALLOWED = frozenset(
     # A grasp that was not tried, or that says no more, has NaN by the record's own meaning.
-    # An order of quaternions in which objects cannot stand has an infinite spread.
-    "spread_m scores base_scores slip_m slip_rad widths_m openings_m measures values_m".split()
+    "scores base_scores slip_m slip_rad widths_m openings_m measures values_m".split()
 )
 
 
@@ -49,6 +49,8 @@ class Outcome(NamedTuple):
     change: str
     detail: str
     """The end of the traceback, or the message."""
+    peak_mb: float = 0.0
+    """The most memory that its process, or one of its own, has had so far."""
 
 
 class Job(NamedTuple):
@@ -170,7 +172,9 @@ def _run_job(pipe: Connection, sample: Sample, files: Files, job: Job) -> None:
             outcome = read_mutation(sample, files, seed, known)
             if time.process_time() - before > CPU_S:
                 outcome = outcome._replace(kind="hang")
-            pipe.send(("end", outcome))
+            used = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+            peak = max(resource.getrusage(who).ru_maxrss for who in used) / 1024
+            pipe.send(("end", outcome._replace(peak_mb=peak)))
     finally:
         resource.setrlimit(resource.RLIMIT_CPU, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         resource.setrlimit(resource.RLIMIT_AS, (hard, hard))
@@ -221,6 +225,10 @@ class _Worker:
         self.job, self.at, self.done, self.since = job, None, 0, time.monotonic()
         self.pipe.send(job)
 
+    def is_late(self) -> bool:
+        limit = WARM_S if self.at is None else WALL_S
+        return time.monotonic() - self.since > limit
+
     def end(self) -> None:
         with contextlib.suppress(OSError):
             self.pipe.send(None)
@@ -248,8 +256,7 @@ def outcomes(samples: Mapping[str, Sample], jobs: list[Job], workers: int) -> It
                     yield from _heard(worker)
                 except (EOFError, OSError):
                     yield from _lost(worker, pool, samples, files, waiting)
-            late = [w for w in pool if w.job and time.monotonic() - w.since > WALL_S]
-            for worker in late:
+            for worker in [w for w in pool if w.job and w.is_late()]:
                 worker.process.kill()
                 yield from _lost(worker, pool, samples, files, waiting, late=True)
     finally:

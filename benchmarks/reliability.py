@@ -1,23 +1,24 @@
 """What breaks realsim: damaged inputs, kills, full disks, faults of every kind, long use.
 
-    uv run python benchmarks/reliability.py [--quick] [--part NAME]
+    uv run python benchmarks/reliability.py [--quick] [--part NAME] [--log FILE [--seed N]]
 
+With a log, `fuzz` and `kills` keep every result as it comes. The same command goes on with a run
+that was stopped; another seed adds to what is there, and the figures are those of all of it.
 One damaged file alone, for a debugger: `benchmarks/formats_mutations.py NAME:SEED`.
 """
 
 import argparse
 import re
-import resource
 import subprocess
 import sys
 import tempfile
 import xml.etree.ElementTree as ET
-from collections import Counter
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 from figures import Figure, Found, Goal, run
+from reliability_log import OFFENCES, Log
 
 PACKAGES = ("numpy", "realsim", "h5py", "pyarrow", "scipy", "trimesh", "viser", "websockets")
 NONE = Goal(high=0)
@@ -38,10 +39,6 @@ FIGURES = {
 }
 INPUTS, QUICK_INPUTS = 50_000, 1_500
 WORKERS = 1
-CLASSES = {
-    "fuzz_tracebacks": ("traceback", "memory", "crash"), "fuzz_nan": ("nan",),
-    "fuzz_hangs": ("hang",),
-}  # fmt: skip
 ROOT = Path(__file__).parents[1]
 PROOF = re.compile(r"^\| (.+?) \|.*\| `([\w/]+)\.py::(\w+)` \|$", re.M)
 """A fault in the table of docs/reliability.md, and the test that provokes it."""
@@ -54,33 +51,31 @@ def fuzz(given: argparse.Namespace) -> Found:
     from reliability_door import frames
     from reliability_own import typed
 
-    found = files(given)
-    for more in (frames(given), typed(given)):
-        for key, value in more.figures.items():
-            found.figures[key] += value
-        found.notes += more.notes
-        found.cases |= more.cases
-    found.add("fuzz_peak_mb", resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024)
+    log, found = Log(given.log), Found()
+    for part in (files, frames, typed):
+        part(given, log)
+    lines = log.of("files") + log.of("frames") + log.of("typed")
+    formats = len({line["key"][0] for line in log.of("files")})
+    kinds = {k: sum(line.get(k, 0) for line in lines) for k in ("inputs", "read", *OFFENCES)}
+    told = f"{formats} formats, frames, words; {kinds['read']} files read, the others refused"
+    found.add("fuzz_inputs", kinds["inputs"], told)
+    found.add("fuzz_tracebacks", sum(kinds[k] for k in OFFENCES[:3]))
+    found.add("fuzz_nan", kinds["nan"])
+    found.add("fuzz_hangs", kinds["hang"])
+    found.add("fuzz_peak_mb", max(line.get("peak_mb", 0.0) for line in lines))
+    found.notes += [str(line) for line in lines if any(line.get(k) for k in OFFENCES)]
     return found
 
 
-def files(given: argparse.Namespace) -> Found:
-    """Damage a sample of every format, foreign and our own, and read it."""
-    from formats_mutations import run_mutations
+def files(given: argparse.Namespace, log: Log) -> None:
+    """Damage a sample of every format, foreign and our own, and read it; offenders once more."""
+    from formats_mutations import mutations
 
     count = given.inputs or (QUICK_INPUTS if given.quick else INPUTS)
-    result = run_mutations(count, given.seed + 1_000_000, WORKERS)
-    sums, found = Counter[str](), Found()
-    for row in result.counts.values():
-        sums.update(row)
-    told = f"{len(result.counts)} formats; {sums['read']} read, {sums['refused']} refused"
-    found.add("fuzz_inputs", result.total(), told)
-    for key, kinds in CLASSES.items():
-        found.add(key, sum(sums[kind] for kind in kinds))
-    found.cases["inputs"] = result.counts
-    found.cases["offenders"] = [o._asdict() for o in result.offenders]
-    found.notes += [f"{o.kind}: formats_mutations.py '{o.name}:{o.seed}'" for o in result.offenders]
-    return found
+    done = {tuple(n["key"]) for n in log.of("files") if not any(n.get(k) for k in OFFENCES)}
+    for o in mutations(count, given.seed + 1_000_000, WORKERS, done=done):
+        said = {"change": o.change, "detail": o.detail} if o.kind in OFFENCES else {}
+        log.add("files", o.name, o.seed, inputs=1, peak_mb=o.peak_mb, **{o.kind: 1}, **said)
 
 
 def faults(given: argparse.Namespace) -> Found:
@@ -130,6 +125,7 @@ def outputs(_: argparse.Namespace) -> Found:
 def options(parser: argparse.ArgumentParser) -> None:
     """Add how many inputs are damaged, and how many commands killed."""
     parser.add_argument("--inputs", type=int, default=0, help=f"damaged files ({INPUTS})")
+    parser.add_argument("--log", type=Path, help="keeps results, and has those of earlier runs")
     parser.add_argument("--kills", type=int, default=0, help="commands that are killed (200)")
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 from figures import Found
+from reliability_log import Log
 from review_client import CAMERA, Browser
 from review_opening import Server, serving
 from websockets.exceptions import ConnectionClosed
@@ -74,29 +75,33 @@ def frame(rng: np.random.Generator, controls: list[str]) -> bytes | str:
     return "text" if kind == 8 else data
 
 
-def frames(given: argparse.Namespace) -> Found:
-    """Send frames that are no messages; the log has a line for each at most, no traceback."""
-    rng, count = np.random.default_rng(given.seed), QUICK_FRAMES if given.quick else FRAMES
-    hangs, sent = 0, 0
-    with served() as (server, log):
-        while sent < count:
-            browser = Browser.open(server.url)
-            browser.until_scene(0.3, 60.0)
-            controls = [str(m["uuid"]) for m in browser.messages if "uuid" in m]
-            with contextlib.suppress(ConnectionClosed):
-                while sent < count:
-                    for _ in range(BATCH):
-                        sent += 1
+def frames(given: argparse.Namespace, log: Log) -> None:
+    """Send frames that are no messages; the server's log has a line for each, no traceback."""
+    count = (QUICK_FRAMES if given.quick else FRAMES) // BATCH
+    if not (todo := [*log.todo("frames", given.seed, count)]):
+        return
+    browser, controls, before = None, list[str](), 0
+    with served() as (server, file):
+        for k in todo:
+            rng, sent, hangs = np.random.default_rng((given.seed, k)), 0, 0
+            while sent < BATCH:
+                if browser is None or browser.socket.close_code is not None:
+                    browser = Browser.open(server.url)
+                    browser.until_scene(0.3, 60.0)
+                    controls = [str(m["uuid"]) for m in browser.messages if "uuid" in m]
+                with contextlib.suppress(ConnectionClosed):
+                    while sent < BATCH:
                         browser.socket.send(frame(rng, controls))
+                        sent += 1
                     answer, end = browser.socket.ping(), time.monotonic() + ANSWER_S
-                    while not answer.wait(0.1) and browser.socket.close_code is None:
-                        if time.monotonic() > end:
-                            hangs += 1
-                            break
-        said = log.read_text(errors="replace")
-    wrong = said.count("Traceback (most recent call last)")
-    figures: dict[str, float] = {"fuzz_inputs": sent, "fuzz_tracebacks": wrong, "fuzz_hangs": hangs}
-    return Found(figures=figures, notes=[said[-3000:]] if wrong else [])
+                    while not answer.wait(0.1) and browser.socket.close_code is None and not hangs:
+                        hangs = int(time.monotonic() > end)
+            said = file.read_text(errors="replace")
+            wrong = said.count("Traceback (most recent call last)") - before
+            before += wrong
+            found = {"inputs": sent, "traceback": wrong, "hang": hangs}
+            found |= {"peak_mb": server.cost().peak_mb, "said": said[-3000:] if wrong else ""}
+            log.add("frames", given.seed, k, **found)
 
 
 def soak(given: argparse.Namespace) -> Found:

@@ -4,11 +4,14 @@ A command is forked from a process that has imported all it needs, so that momen
 It is killed (SIGKILL), asked to end (SIGTERM) at a moment drawn evenly over its running time, or
 gets no room for files beyond a random size (as of a full disk); then the same command runs to its
 end in the same folder. Compared is every file and value, as `realsim reproduce` does; fields
-in which two runs left alone differ (times) do not count.
+in which two runs left alone differ (times) do not count. A capture's log has the events of both
+runs: what it says of each view is compared. A view that is taken after a kill has a time of its
+own, as the arm comes from elsewhere, and so its line has another checksum.
 """
 
 import argparse
 import contextlib
+import json
 import os
 import resource
 import shutil
@@ -22,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 from figures import Found
+from reliability_log import Log
 
 KILLS, QUICK_KILLS = 200, 2
 FULL = signal.SIGXFSZ
@@ -46,6 +50,8 @@ LONG = {
 QUICK = ("export", "stats")
 Fields = set[tuple[str, str]]
 """Files and the fields in which they differ."""
+TIMES = {("shots/robot.jsonl", f"{k}.{field}") for k in (0, 1) for field in ("time_s", "sha256")}
+"""Of views that are captured, and the checksums that follow from them."""
 
 
 def make_inputs(folder: Path) -> None:
@@ -111,8 +117,17 @@ def fields(first: Path, second: Path) -> Fields:
     from realsim.app.reproduce import compare
 
     compare.MOST_FIELDS = 10**6
+    for log in (*first.rglob("capture_log.jsonl"), *second.rglob("capture_log.jsonl")):
+        log.write_text(told_of_views(log.read_text()))
     found = compare.compare_folders(first, second)[1]
     return {(d.path, w.split(": ")[0] if ": " in w else w[-12:]) for d in found for w in d.words}
+
+
+def told_of_views(log: str) -> str:
+    """Return a capture's log with the last event of every kind and view."""
+    entries = [json.loads(line) for line in log.splitlines()]
+    last = {(e["event"], e.get("view")): e | {"captured": "by one run"} for e in entries}
+    return "\n".join(map(json.dumps, last.values()))
 
 
 def views(folder: Path) -> set[str]:
@@ -169,37 +184,41 @@ class Command:
         wrong += [f"a view that was stored is lost: {line}" for line in sealed - views(self.work)]
         if last != self.code:
             wrong.append(f"exit code {last} when it was run again: {self.said()}")
-        found = fields(self.after, self.work) - self.apart
+        found = fields(self.after, self.work) - self.apart - TIMES
         return code in expected, [*wrong, *(": ".join(f) for f in sorted(found))]
 
 
 def kills(given: argparse.Namespace) -> Found:
     """Kill, run again, compare: every command once, then those that are fast more often."""
-    rng, found = np.random.default_rng(given.seed), Found()
+    log, found = Log(given.log), Found()
     wanted = given.kills or (QUICK_KILLS if given.quick else KILLS)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         make_inputs(root / "work")
         made = {n: Command(root, w) for n, w in LONG.items() if not given.quick or n in QUICK}
         names, rates = list(made), np.array([1 / c.seconds for c in made.values()])
-        turns, done, full, differing = iter(names), dict.fromkeys(names, 0), 0, Counter[bool]()
-        while sum(done.values()) < wanted:
-            name = next(turns, "") or str(rng.choice(names, p=rates / rates.sum()))
+        for k in log.todo("kills", given.seed, 9 * wanted):
+            done = sum(line["kill"] for line in log.of("kills") if line["key"][0] == given.seed)
+            if done >= wanted:
+                break
+            rng = np.random.default_rng((given.seed, k))
+            name = names[k] if k < len(names) else str(rng.choice(names, p=rates / rates.sum()))
             how = (signal.SIGKILL, signal.SIGTERM, FULL)[int(rng.integers(3))]
             much = rng.uniform(0, made[name].seconds)
             if how == FULL:
                 much = float(np.exp(rng.uniform(*np.log(ROOM_BYTES))))
             caught, wrong = made[name].ended(how, much)
-            done[name] += caught and how != FULL
-            full += caught and how == FULL
-            differing[how == FULL] += bool(wrong)
-            said = f"{name}, {how.name} {much:.2f}: {wrong[:5]}"
-            found.notes += [said] if wrong else []
-            print(f"{sum(done.values())} of {wanted} kills: {said}", file=sys.stderr, flush=True)
-    told = ", ".join(f"{name} {n}" for name, n in done.items())
-    found.add("kills", sum(done.values()), told)
-    found.add("kills_with_difference", differing[False])
-    found.add("full_disks", full)
-    found.add("full_disks_with_difference", differing[True])
+            ends = {"kill": caught and how != FULL, "full": caught and how == FULL}
+            told = {"name": name, "how": how.name, "much": round(much, 3), "wrong": wrong[:5]}
+            log.add("kills", given.seed, k, **ends, **told)
+            print(f"{done} of {wanted} kills: {told}", file=sys.stderr, flush=True)
+    lines = log.of("kills")
+    count = Counter(line["name"] for line in lines if line["kill"])
+    full = [line["how"] == FULL.name for line in lines if line["wrong"]]
+    found.add("kills", count.total(), ", ".join(f"{n} {count[n]}" for n in LONG))
+    found.add("kills_with_difference", full.count(False))
+    found.add("full_disks", sum(line["full"] for line in lines))
+    found.add("full_disks_with_difference", full.count(True))
+    found.notes += [str(line) for line in lines if line["wrong"]]
     found.cases["apart"] = {name: sorted(c.apart) for name, c in made.items()}
     return found

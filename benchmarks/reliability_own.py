@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from figures import Found
 from formats_mutations_scenes import Sample
+from reliability_log import Log
 
 
 def make_results(folder: Path) -> None:
@@ -109,7 +109,7 @@ OWN = (
 
 # --- the command line -----------------------------------------------------------------------------
 
-TYPED, QUICK_TYPED = 5_000, 200
+TYPED, QUICK_TYPED, BATCH = 5_000, 200, 100
 WRONG = (
     "", "-1", "nan", "inf", "1e999", "0x10", "\udcff", "a" * 5000, "../../no", "no/such", "-", "--",
     "--no", "1-", ",", "[", "{}", "x=y", "1,2", "\u202e", "10**9", "99999999999999999999",
@@ -117,30 +117,32 @@ WRONG = (
 """What no option wants, or few do."""
 
 
-def typed(given: argparse.Namespace) -> Found:
-    """Type commands whose first argument is not there, with foreign values: all are refused."""
+def typed(given: argparse.Namespace, log: Log) -> None:
+    """Type commands whose first argument is not there, with foreign values: all are refused.
+
+    Where help was asked for, it is given before anything is looked at.
+    """
     from click.testing import CliRunner
 
     from realsim.app.cli import commands
     from realsim.app.command import walk
     from realsim.errors import RealsimError
 
-    rng, found = np.random.default_rng(given.seed), Found()
-    count, wrong = QUICK_TYPED if given.quick else TYPED, 0
     every = [(p, c) for p, c in walk(commands).items() if needs_a_source(c)]
-    with CliRunner().isolated_filesystem():
-        for _ in range(count):
-            path, command = every[int(rng.integers(len(every)))]
-            here = ["--workers", "1"] if any(p.name == "workers" for p in command.params) else []
-            words = [*path, "no/such/source", *here]
-            for option in rng.choice(np.array(command.params, object), int(rng.integers(5))):
-                words += [*option.opts[:1], WRONG[int(rng.integers(len(WRONG)))]]
-            done = CliRunner().invoke(commands, words)
-            if not isinstance(done.exception, RealsimError | OSError | SystemExit):
-                wrong += 1
-                found.notes.append(f"realsim {words}: {done.exception!r}"[:300])
-    found.figures |= {"fuzz_inputs": count, "fuzz_tracebacks": wrong}
-    return found
+    for k in log.todo("typed", given.seed, (QUICK_TYPED if given.quick else TYPED) // BATCH):
+        rng, wrong = np.random.default_rng((given.seed, k)), list[str]()
+        with CliRunner().isolated_filesystem():
+            for _ in range(BATCH):
+                path, command = every[int(rng.integers(len(every)))]
+                words = [*path, "no/such/source"]
+                words += ["--workers", "1"] * any(p.name == "workers" for p in command.params)
+                for option in rng.choice(np.array(command.params, object), int(rng.integers(5))):
+                    words += [*option.opts[:1], WRONG[int(rng.integers(len(WRONG)))]]
+                done = CliRunner().invoke(commands, words)
+                helped = "--help-all" in words and done.exit_code == 0
+                if not (helped or isinstance(done.exception, RealsimError | OSError | SystemExit)):
+                    wrong.append(f"realsim {words}: {done.exception!r}"[:300])
+        log.add("typed", given.seed, k, inputs=BATCH, traceback=len(wrong), said=wrong)
 
 
 def needs_a_source(command: Any) -> bool:

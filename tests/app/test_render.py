@@ -95,6 +95,9 @@ def test_a_rejected_object_is_named(real, tmp_path):
     store = captured_session(tmp_path / "s", 1, two_boxes())
     save_scene(store, rejected(two_boxes(), 3))
     outcome = run_render(store.folder, RenderRequest(depth="clean"), QUIET)
+    page = outcome.page.read_bytes()
+    again = run_render(store.folder, RenderRequest(depth="clean"), QUIET)
+    assert again.summary.rendered == 0 and again.page.read_bytes() == page
     assert any("flat (instance 3) is rejected" in note for note in notes_of(outcome))
     assert set(np.unique(outcome.twin.read_image("labels/instance/000000.png"))) == {0, 1}
 

@@ -15,6 +15,7 @@ sys.path.append(str(ROOT / "benchmarks"))
 mutations: Any = importlib.import_module("formats_mutations")
 worker: Any = importlib.import_module("formats_mutations_worker")
 own: Any = importlib.import_module("reliability_own")
+logs: Any = importlib.import_module("reliability_log")
 
 ROW = re.compile(r"^\| [^|]+ \| `([\w.]+)\.([A-Z_]+)` \| (\d+) \|$", re.M)
 TABLE = ROW.findall((ROOT / "docs/reliability.md").read_text())
@@ -51,3 +52,23 @@ def test_a_usd_file_at_which_the_library_breaks_down_is_refused() -> None:
     pytest.importorskip("pxr")
     found = mutations.replay("mesh usdc", 32_000_140)
     assert found.kind == "refused" and "damaged" in found.detail
+
+
+@pytest.mark.parametrize(("name", "seed", "kind"), [
+    ("graspit", 11_900_056, "read"),  # no grasps beside it
+    ("graspit", 12_300_180, "read"),  # 5000 letters name the file of grasps
+])  # fmt: skip
+def test_what_was_found_once_stays_read_or_refused(name: str, seed: int, kind: str) -> None:
+    assert mutations.replay(name, seed).kind == kind
+
+
+def test_a_log_that_was_cut_off_keeps_its_whole_lines_and_goes_on(tmp_path: Path) -> None:
+    first = logs.Log(tmp_path / "log")
+    for k, wrong in ((0, 1), (2, 0), (0, 0), (3, 0)):
+        first.add("typed", 5, k, traceback=wrong)
+    (tmp_path / "log").write_text((tmp_path / "log").read_text()[:-5])
+    logs.Log(tmp_path / "log").add("typed", 6, 0)
+    log = logs.Log(tmp_path / "log")
+    assert [line["key"] for line in log.of("typed")] == [[5, 0], [5, 2], [6, 0]]
+    assert log.of("typed")[0]["traceback"] == 0  # what was measured again
+    assert [*log.todo("typed", 5, 4)] == [1, 3]

@@ -22,17 +22,11 @@ def tried(instance, obj_id, middle, n=12):
     R = np.stack([np.cross([0.0, 1.0, 0.0], z), [0.0, 1.0, 0.0], z], axis=1)
     at = np.asarray(middle) + np.linspace(-0.005, 0.005, n)[:, None] * [0, 0, 1]
     return GraspSet(
-        obj_id=obj_id,
-        instance=instance,
-        Ts_obj_grasp=se3.from_rt(np.tile(R, (n, 1, 1)), at),
-        widths_m=np.full(n, 0.05),
-        scores=np.ones(n),
-        base_scores=np.ones(n),
-        slip_m=np.zeros((n, 4)),
-        slip_rad=np.zeros((n, 4)),
-        reachable=np.ones(n, dtype=bool),
+        obj_id=obj_id, instance=instance, Ts_obj_grasp=se3.from_rt(np.tile(R, (n, 1, 1)), at),
+        widths_m=np.full(n, 0.05), scores=np.ones(n), base_scores=np.ones(n),
+        slip_m=np.zeros((n, 4)), slip_rad=np.zeros((n, 4)), reachable=np.ones(n, dtype=bool),
         failures=("",) * n,
-    )
+    )  # fmt: skip
 
 
 def grasps():

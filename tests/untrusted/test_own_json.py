@@ -70,34 +70,24 @@ def camera(rng):
 def hand_eye(rng):
     A = rng.normal(size=(6, 6))
     return HandEye(
-        T_ee_cam=se3.random_transform(rng),
-        covariance=A @ A.T,
-        T_base_board=se3.random_transform(rng),
-        intrinsics=camera(rng),
-        intrinsics_sd=rng.random(12),
-        view_indices=(0, 2, 5),
-        view_rms_px=np.array([0.1, np.nan, np.inf]),
-        held_out_px=float("nan"),
-        rejected=((1, "blurred"),),
-        method="joint",
-        starts=(("park", 3.2), ("tsai", float("inf"))),
-    )
+        T_ee_cam=se3.random_transform(rng), covariance=A @ A.T,
+        T_base_board=se3.random_transform(rng), intrinsics=camera(rng),
+        intrinsics_sd=rng.random(12), view_indices=(0, 2, 5),
+        view_rms_px=np.array([0.1, np.nan, np.inf]), held_out_px=float("nan"),
+        rejected=((1, "blurred"),), method="joint", starts=(("park", 3.2), ("tsai", float("inf"))),
+    )  # fmt: skip
 
 
 def scene(rng):
     A = rng.normal(size=(6, 6))
     objects = tuple(
         ObjectPose(
-            obj_id=3,
-            instance=k,
-            T_world_obj=se3.random_transform(rng),
-            covariance=A @ A.T if k else None,
+            obj_id=3, instance=k, T_world_obj=se3.random_transform(rng),
+            covariance=A @ A.T if k else None, verdict="doubtful", reasons=("hidden",),
             checks={"agree": float(rng.random()), "free": float("nan"), "gap": float("-inf")},
-            verdict="doubtful",
-            reasons=("hidden",),
         )
         for k in range(3)
-    )
+    )  # fmt: skip
     plane = SupportPlane(
         T_world_table=se3.random_transform(rng), rms_m=float(rng.random()), inliers=77
     )
@@ -110,18 +100,13 @@ def grasps(rng, n=20, instance=2):
     scores = rng.random(n)
     scores[:3] = np.nan
     return GraspSet(
-        obj_id=7,
-        instance=instance,
+        obj_id=7, instance=instance, widths_m=rng.random(n), scores=scores,
         Ts_obj_grasp=se3.random_transform(rng, n) if n else np.zeros((0, 4, 4)),
-        widths_m=rng.random(n),
-        scores=scores,
         base_scores=np.where(np.isnan(scores), np.nan, np.round(4 * rng.random(n)) / 4),
-        slip_m=slip,
-        slip_rad=slip[::-1],
-        reachable=rng.random(n) > 0.5,
+        slip_m=slip, slip_rad=slip[::-1], reachable=rng.random(n) > 0.5,
         failures=tuple(["lost in lift", "", "Widerstand über Null"][i % 3] for i in range(n)),
         parameters={"friction": 0.5, "stages": ["close", "lift"], "seed": 4},
-    )
+    )  # fmt: skip
 
 
 def views(rng):

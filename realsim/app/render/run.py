@@ -162,7 +162,10 @@ def _refuse_folder(folder: Path, session: Path) -> None:
 
 def show_render(outcome: RenderOutcome, console: Console) -> None:
     """Print what was rendered, what it cost, how like the real frames it is, and what is odd."""
-    console.table("Synthetic views", ["what", "value"], summary_rows(outcome))
+    summary, rows = outcome.summary, scene_rows(outcome)
+    rows[0][1] += f" ({summary.rendered} rendered now)"
+    rows += [[f"{part} of a frame", f"{cpu:.2f} CPU s"] for part, cpu in summary.cpu_s.items()]
+    console.table("Synthetic views", ["what", "value"], rows)
     if outcome.figures is not None:
         console.table(_figures_title(outcome.figures), FIGURES_HEADER, outcome.figures.rows())
     for note in notes_of(outcome):
@@ -186,17 +189,14 @@ def render_document(outcome: RenderOutcome) -> dict[str, object]:
     }
 
 
-def summary_rows(outcome: RenderOutcome) -> list[list[str]]:
-    """Return the table's rows: what was rendered, and its cost per frame by part."""
+def scene_rows(outcome: RenderOutcome) -> list[list[str]]:
+    """Return what was rendered, as the page has it: the same, in however many runs it was made."""
     summary, look = outcome.summary, outcome.look
-    rows = [
-        ["views", f"{summary.views} ({summary.rendered} rendered now)"],
+    return [
+        ["views", str(summary.views)],
         ["objects", str(len(summary.labels.objects))],
         ["table", str(look.synthetic.provenance["table_material"])],
         ["light", look.synthetic.environment.name],
-    ]
-    return rows + [
-        [f"{part} of a frame", f"{cpu:.2f} CPU s"] for part, cpu in summary.cpu_s.items()
     ]
 
 
@@ -209,9 +209,10 @@ def write_page(outcome: RenderOutcome) -> None:
     from realsim.pages import Page
     from realsim.store.atomic import write_bytes
 
-    page = Page(
-        title=f"Synthetic views of {outcome.store.session.name}", about=str(outcome.summary)
-    )
+    summary = outcome.summary
+    about = f"{len(summary.empty_views)} views without any object, "
+    about += f"{len(summary.left_out)} objects left out"
+    page = Page(title=f"Synthetic views of {outcome.store.session.name}", about=about)
     for note in notes_of(outcome):
         page.text(note, "note")
     if outcome.real is not None:
@@ -223,7 +224,7 @@ def write_page(outcome: RenderOutcome) -> None:
         page.section(_figures_title(outcome.figures))
         page.table(FIGURES_HEADER, outcome.figures.rows())
     page.section("The run")
-    page.table(["what", "value"], summary_rows(outcome))
+    page.table(["what", "value"], scene_rows(outcome))
     write_bytes(outcome.page, page.encode())
 
 

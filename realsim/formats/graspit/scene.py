@@ -12,6 +12,7 @@ Grasps are in `grasps`, writing in `writing`.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from os.path import isfile  # a name that no file can have is not there, and no error
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
@@ -41,7 +42,7 @@ EVIDENCE_FLOOR_M = 0.001
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class OrderEvidence:
+class _Evidence:
     """What speaks for one order of the quaternions; less is better, NaN = there is none."""
 
     spread_m: float
@@ -57,7 +58,6 @@ class GraspitScene:
     scene: Scene
     models: dict[int, ObjectModel]
     order: QuaternionOrder
-    evidence: dict[QuaternionOrder, OrderEvidence]
     grasp_file: Path | None
     """None: there is none beside the scene."""
     names: dict[int, str]
@@ -124,9 +124,8 @@ def read_graspit_scene(
     grasp_file = _beside(path.parent, str(data.get("grasp_path", GRASP_FILE)))
     notes = [] if grasp_file else ["there is no grasps.hdf5 beside the scene."]
     placed = _placed(entries, grasp_file, notes)
-    evidence: dict[QuaternionOrder, OrderEvidence] = {o: _evidence(placed, o) for o in ORDERS}
     if order is None:
-        order, said = _proven(placed, evidence, path)
+        order, said = _proven(placed, path)
         notes.append(said)
     Ts = [p.T_world_obj(order) for p in placed]
     plane, said = _table(placed, Ts, path)
@@ -144,7 +143,6 @@ def read_graspit_scene(
         scene=Scene(name=name, objects=tuple(objects), plane=plane),
         models=models,
         order=order,
-        evidence=evidence,
         grasp_file=grasp_file,
         names={k: e.name for k, e in enumerate(entries)},
         notes=tuple(notes),
@@ -214,7 +212,7 @@ def _numbers(value: Any, count: int, name: str) -> list[float]:
 def _beside(folder: Path, name: str) -> Path | None:
     """Return the file of this name in the scene's folder: paths in the file are of its authors."""
     path = folder / Path(name).name
-    return path if path.is_file() else None
+    return path if isfile(path) else None
 
 
 def _mesh_file(name: str, folder: Path, meshes: Path | None, where: str) -> Path:
@@ -223,7 +221,7 @@ def _mesh_file(name: str, folder: Path, meshes: Path | None, where: str) -> Path
     stl = f"{Path(name).stem}.stl"
     places = [p for p in (meshes, folder, folder / "assets") if p is not None]
     for place in places:
-        if (place / stl).is_file():
+        if isfile(place / stl):
             return place / stl
     raise InputError(
         f"the mesh of {where} is {name}; neither it nor {stl} can be read from "
@@ -281,7 +279,7 @@ def _lowest(placed: list[_Placed], Ts: list[Array]) -> Array:
     return np.array(heights)
 
 
-def _evidence(placed: list[_Placed], order: QuaternionOrder) -> OrderEvidence:
+def _evidence(placed: list[_Placed], order: QuaternionOrder) -> _Evidence:
     Ts = [p.T_world_obj(order) for p in placed]
     low = _lowest(placed, Ts)
     spread = float(np.median(np.abs(low - np.median(low)))) if len(low) > 1 else float("nan")
@@ -291,17 +289,16 @@ def _evidence(placed: list[_Placed], order: QuaternionOrder) -> OrderEvidence:
         if len(p.Ts_world_grasp)
     ]
     midway = float(np.median(np.concatenate(errors))) if errors else float("nan")
-    return OrderEvidence(spread_m=spread, midway_m=midway)
+    return _Evidence(spread_m=spread, midway_m=midway)
 
 
-def _proven(
-    placed: list[_Placed], evidence: dict[QuaternionOrder, OrderEvidence], path: Path
-) -> tuple[QuaternionOrder, str]:
+def _proven(placed: list[_Placed], path: Path) -> tuple[QuaternionOrder, str]:
     """Return the order that the content proves, and the sentence that says how.
 
     Raises:
         InputError: nothing speaks for either, or one thing for each.
     """
+    evidence: dict[QuaternionOrder, _Evidence] = {o: _evidence(placed, o) for o in ORDERS}
     a, b = (evidence[o] for o in ORDERS)
     given = (_vote(a.spread_m, b.spread_m), _vote(a.midway_m, b.midway_m))
     votes: set[QuaternionOrder] = {v for v in given if v is not None}
@@ -322,7 +319,7 @@ def _proven(
     )
 
 
-def _in_words(e: OrderEvidence) -> str:
+def _in_words(e: _Evidence) -> str:
     """Return what an order would mean for the content."""
     spread = f"lowest points within {1e3 * e.spread_m:.1f} mm"
     if np.isnan(e.spread_m):

@@ -64,15 +64,6 @@ class SyntheticSummary:
     notes: tuple[str, ...] = ()
     """What the renderer wants a person to know."""
 
-    def __str__(self) -> str:
-        """Return one line for the terminal."""
-        cost = ", ".join(f"{name} {value:.2f}" for name, value in self.cpu_s.items())
-        return (
-            f"{self.views} synthetic views ({self.rendered} rendered now), "
-            f"{len(self.empty_views)} without any object, {len(self.left_out)} objects left out; "
-            f"CPU s per frame: {cost or 'none'}"
-        )
-
 
 def exact_annotation(maps: tuple[str, ...]) -> AnnotationConfig:
     """Return the settings for a scene without error: no clearance, and nothing that is unknown."""
