@@ -145,21 +145,15 @@ def document_of(
     return {
         "benchmark": name,
         "machine": {
-            "cpu": platform.machine(),
-            "cores": len(os.sched_getaffinity(0)),
+            "cpu": platform.machine(), "cores": len(os.sched_getaffinity(0)),
             "load": os.getloadavg()[0],
         },
-        "versions": {package: _version(package) for package in packages},
-        "seed": arguments.seed,
-        "parts": arguments.parts,
-        "quick": arguments.quick,
+        "versions": {package: _version(package) for package in packages}, "seed": arguments.seed,
+        "parts": arguments.parts, "quick": arguments.quick,
         "figures": {k: float(v) if np.isfinite(v) else None for k, v in values.items()},
-        "goals": {k: str(f.goal) for k, f in figures.items()},
-        "over": found.over,
-        "rivals": found.rivals,
-        "notes": found.notes,
-        "cases": found.cases,
-    }
+        "goals": {k: str(f.goal) for k, f in figures.items()}, "over": found.over,
+        "rivals": found.rivals, "notes": found.notes, "cases": found.cases,
+    }  # fmt: skip
 
 
 def children_cpu_s() -> float:

@@ -34,13 +34,10 @@ PACKAGES = ("realsim", "numpy", "isal", "opencv-python-headless", "pillow", "h5p
 FIGURES = {
     "write_frames_per_s": Figure(unit="1/s", goal=Goal(low=15.0)),
     "jpeg_frames_per_s": Figure(unit="1/s", goal=Goal(low=40.0)),
-    "copy_frames_per_s": Figure(unit="1/s"),
-    "bytes_over_cv2": Figure(unit="x"),
-    "bop_headers_s": Figure(unit="s", goal=Goal(high=2.0)),
-    "bop_list_s": Figure(unit="s"),
+    "copy_frames_per_s": Figure(unit="1/s"), "bytes_over_cv2": Figure(unit="x"),
+    "bop_headers_s": Figure(unit="s", goal=Goal(high=2.0)), "bop_list_s": Figure(unit="s"),
     "graspnet_headers_s": Figure(unit="s"),
-    "export_peak_mb": Figure(unit="MB", goal=Goal(high=1000.0)),
-    "resume_s": Figure(unit="s"),
+    "export_peak_mb": Figure(unit="MB", goal=Goal(high=1000.0)), "resume_s": Figure(unit="s"),
     "graspnet_export_peak_mb": Figure(unit="MB", goal=Goal(high=1000.0)),
     "graspnet_resume_s": Figure(unit="s"),
     "bop_round_trip_diff": Figure(unit="", goal=Goal(high=0.0)),
@@ -49,16 +46,12 @@ FIGURES = {
     "bop_graspnet_mm": Figure(
         unit="mm", goal=Goal(high=BOUND_MM), rival="0.0866 by graspnetAPI's four decimals"
     ),
-    "bop_graspnet_deg": Figure(unit="deg"),
-    "acronym_mm": Figure(unit="mm"),
-    "acronym_deg": Figure(unit="deg"),
-    "graspgen_mm": Figure(unit="mm"),
-    "graspgen_deg": Figure(unit="deg"),
-    "isaac_mm": Figure(unit="mm"),
-    "isaac_deg": Figure(unit="deg"),
-    "graspgroup_mm": Figure(unit="mm"),
+    "bop_graspnet_deg": Figure(unit="deg"), "acronym_mm": Figure(unit="mm"),
+    "acronym_deg": Figure(unit="deg"), "graspgen_mm": Figure(unit="mm"),
+    "graspgen_deg": Figure(unit="deg"), "isaac_mm": Figure(unit="mm"),
+    "isaac_deg": Figure(unit="deg"), "graspgroup_mm": Figure(unit="mm"),
     "graspgroup_deg": Figure(unit="deg"),
-}
+}  # fmt: skip
 """All keys, in the table's order. In every run they are in the JSON."""
 
 

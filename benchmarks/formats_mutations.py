@@ -16,14 +16,13 @@ import blas_threads  # noqa: F401
 os.environ.setdefault("MALLOC_ARENA_MAX", "2")  # an arena a thread would count as memory
 
 import sys
-import tempfile
 from collections.abc import Collection, Container, Iterator
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 from formats_mutations_files import FILES
-from formats_mutations_scenes import SCENES, Sample
+from formats_mutations_scenes import SCENES
 from formats_mutations_worker import BATCH, Job, Outcome, outcomes, read_mutation, sample_files
 from reliability_own import OWN
 
@@ -61,10 +60,7 @@ def mutations(
 
 def replay(name: str, seed: int) -> Outcome:
     """Read one mutation in this process, for a debugger."""
-    sample: Sample = SAMPLES[name]
-    files = sample_files(sample)
-    with tempfile.TemporaryDirectory():
-        return read_mutation(sample, files, seed, frozenset())
+    return read_mutation(SAMPLES[name], sample_files(SAMPLES[name]), seed, frozenset())
 
 
 if __name__ == "__main__":

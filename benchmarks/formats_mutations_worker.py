@@ -141,8 +141,11 @@ def not_finite(value: Any, name: str = "", depth: int = 0) -> set[str]:
 # --- the worker -----------------------------------------------------------------------------------
 
 
-def work(pipe: Connection, samples: Mapping[str, Sample], files: Mapping[str, Files]) -> None:
-    """Read batches of mutations until the pipe closes."""
+def work(
+    pipe: Connection, theirs: Connection, samples: Mapping[str, Sample], files: Mapping[str, Files]
+) -> None:
+    """Read batches of mutations until the pipe closes, also as its other end dies."""
+    theirs.close()
     scratch = tempfile.mkdtemp(prefix="mutations-worker-")
     tempfile.tempdir = scratch
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -211,10 +214,11 @@ class _Worker:
 
     def __init__(self, samples: Mapping[str, Sample], files: Mapping[str, Files]) -> None:
         context = mp.get_context("fork")
-        self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=work, args=(theirs, samples, files), daemon=True)
+        self.pipe, its = context.Pipe()
+        given = (its, self.pipe, samples, files)
+        self.process = context.Process(target=work, args=given, daemon=True)
         self.process.start()
-        theirs.close()
+        its.close()
         self.scratch = str(self.pipe.recv())
         self.job: Job | None = None
         self.at: int | None = None

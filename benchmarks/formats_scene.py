@@ -71,20 +71,16 @@ class LongScene:
         T_world_cam = _camera(index)
         T_cam_world = se3.invert(T_world_cam)
         return LabelledFrame(
-            index=index,
-            intrinsics=self.intrinsics,
-            depth_unit_m=DEPTH_UNIT_M,
+            index=index, intrinsics=self.intrinsics, depth_unit_m=DEPTH_UNIT_M,
             objects=tuple(
                 LabelledObject(
-                    obj_id=k + 1,
-                    T_cam_obj=T_cam_world @ _stand(k),
-                    instance=k,
+                    obj_id=k + 1, T_cam_obj=T_cam_world @ _stand(k), instance=k,
                     gt_info=self._info(index, k) if self.with_info else None,
                 )
                 for k in range(self.objects)
             ),
             T_world_cam=T_world_cam,
-        )
+        )  # fmt: skip
 
     def colour_file(self, index: int) -> Path:
         """Return the one colour image."""

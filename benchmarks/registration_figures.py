@@ -22,34 +22,20 @@ PROVOKED = (
 """Wrong poses that are given as results; models that are wanted and not there."""
 
 GOALS = {
-    "mssd_mm_256": Goal(high=0.12),
-    "mssd_p90_mm_256": Goal(high=0.3),
-    "rough_share_under_3mm": Goal(low=0.98),
-    "cold_share_under_3mm": Goal(low=0.96),
-    "unknown_share_under_3mm": Goal(low=0.94),
-    "false_object_share": Goal(high=0.01),
-    "pile_share_under_3mm": Goal(low=0.88),
-    "wrong_flagged_share": Goal(low=0.99),
-    "false_alarm_share": Goal(high=0.05),
-    "reproj_px_before": Goal(),
-    "reproj_px_after": Goal(high=0.2),
-    "reproj_p90_px_after": Goal(high=0.5),
-    "camera_mm_after": Goal(high=0.2),
-    "camera_deg_after": Goal(high=0.025),
-    "biased_mssd_mm": Goal(high=0.22),
-    "biased_reproj_px": Goal(high=0.25),
-    "ratio_mssd_vs_topdown": Goal(low=20.0),
-    "ratio_adds_vs_topdown": Goal(low=10.0),
-    "total_cpu_s": Goal(high=25.0),
-    "pile_cpu_s": Goal(high=60.0),
-    "mesh_cache_cpu_s": Goal(high=2.0),
-    "peak_mb": Goal(high=2000.0),
-    "real_start_spread_mm": Goal(high=1.0),
-    "real_start_spread_deg": Goal(high=0.5),
-    "real_dz_mm_ours": Goal(),
-    "real_dz_mm_truth": Goal(),
-    "real_shift_named_share": Goal(low=1.0),
-}
+    "mssd_mm_256": Goal(high=0.12), "mssd_p90_mm_256": Goal(high=0.3),
+    "rough_share_under_3mm": Goal(low=0.98), "cold_share_under_3mm": Goal(low=0.96),
+    "unknown_share_under_3mm": Goal(low=0.94), "false_object_share": Goal(high=0.01),
+    "pile_share_under_3mm": Goal(low=0.88), "wrong_flagged_share": Goal(low=0.99),
+    "false_alarm_share": Goal(high=0.05), "reproj_px_before": Goal(),
+    "reproj_px_after": Goal(high=0.2), "reproj_p90_px_after": Goal(high=0.5),
+    "camera_mm_after": Goal(high=0.2), "camera_deg_after": Goal(high=0.025),
+    "biased_mssd_mm": Goal(high=0.22), "biased_reproj_px": Goal(high=0.25),
+    "ratio_mssd_vs_topdown": Goal(low=20.0), "ratio_adds_vs_topdown": Goal(low=10.0),
+    "total_cpu_s": Goal(high=25.0), "pile_cpu_s": Goal(high=60.0),
+    "mesh_cache_cpu_s": Goal(high=2.0), "peak_mb": Goal(high=2000.0),
+    "real_start_spread_mm": Goal(high=1.0), "real_start_spread_deg": Goal(high=0.5),
+    "real_dz_mm_ours": Goal(), "real_dz_mm_truth": Goal(), "real_shift_named_share": Goal(low=1.0),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

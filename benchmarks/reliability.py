@@ -24,19 +24,17 @@ PACKAGES = ("numpy", "realsim", "h5py", "pyarrow", "scipy", "trimesh", "viser", 
 NONE = Goal(high=0)
 FIGURES = {
     "fuzz_inputs": Figure(unit="", goal=Goal(low=50_000)),
-    "fuzz_tracebacks": Figure(unit="", goal=NONE),
-    "fuzz_nan": Figure(unit="", goal=NONE),
+    "fuzz_tracebacks": Figure(unit="", goal=NONE), "fuzz_nan": Figure(unit="", goal=NONE),
     "fuzz_hangs": Figure(unit="", goal=NONE),
     "fuzz_peak_mb": Figure(unit="MB", goal=Goal(high=2000)),
     "outputs_guarded_share": Figure(unit="", goal=Goal(low=1, high=1)),
     "kills": Figure(unit="", goal=Goal(low=200)),
-    "kills_with_difference": Figure(unit="", goal=NONE),
-    "full_disks": Figure(unit=""),
+    "kills_with_difference": Figure(unit="", goal=NONE), "full_disks": Figure(unit=""),
     "full_disks_with_difference": Figure(unit="", goal=NONE),
     "faults_listed": Figure(unit="", goal=Goal(low=25)),
     "faults_failed": Figure(unit="", goal=NONE),
     "soak_growth": Figure(unit="", goal=Goal(high=0.05)),
-}
+}  # fmt: skip
 INPUTS, QUICK_INPUTS = 50_000, 1_500
 WORKERS = 1
 ROOT = Path(__file__).parents[1]

@@ -81,22 +81,26 @@ def run(work: Path, words: str, how: int = 0, much: float = 0.0) -> int:
         how: signal that ends it after `much` seconds; `FULL`: no file is longer than `much` bytes.
         much: see there.
     """
+    heard, spoken = os.pipe()  # what is printed needs no room
     pid = os.fork()
     if pid == 0:
-        _be_the_command(work, words, int(much) if how == FULL else 0)
+        _be_the_command(work, words, int(much) if how == FULL else 0, spoken)
+    os.close(spoken)
     if how and how != FULL:
         time.sleep(much)
         os.kill(pid, how)
+    with os.fdopen(heard, "rb") as said, (work.parent / "log").open("wb") as log:
+        shutil.copyfileobj(said, log)
     return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
 
 
-def _be_the_command(work: Path, words: str, room: int) -> None:
+def _be_the_command(work: Path, words: str, room: int, spoken: int) -> None:
     code, before = 70, set(sys.modules)
     try:
         os.chdir(work)
-        sys.stdout = sys.stderr = (work.parent / "log").open("w", buffering=1)
+        sys.stdout = sys.stderr = os.fdopen(spoken, "w", buffering=1)
         for stream in (1, 2):
-            os.dup2(sys.stdout.fileno(), stream)
+            os.dup2(spoken, stream)
         if room:
             resource.setrlimit(resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
         from realsim.app.cli import main

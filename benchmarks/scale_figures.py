@@ -36,7 +36,7 @@ FIGURES = {
     "interval_coverage": Figure(unit="", goal=Goal(low=0.90, high=0.98)),
     "sfm_scale_pct": Figure(unit="%", goal=Goal(high=0.5)),
     "tsdf_median_mm": Figure(unit="mm", goal=Goal(high=0.8)),
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

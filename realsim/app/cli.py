@@ -153,6 +153,13 @@ def refusal(error: Exception) -> str | None:
 
         return str(missing_library(error.name or "a library", error))
     if isinstance(error, OSError):
+        from realsim.store.atomic import FULL
+
+        if error.errno in FULL:
+            return (
+                f"there is no room for {error.filename or 'what is written'} ({error.strerror}). "
+                "Everything stored before is intact. Make room, then run the same command again."
+            )
         where = f" ({error.filename})" if error.filename else ""
         return (
             f"the system refused a file operation: {error.strerror or error}{where}. "

@@ -124,6 +124,21 @@ def require_no_data(path: Path, name: str, besides: Sequence[str] = ()) -> None:
     require_no_links(path, name)
 
 
+def require_outside(out: Path, sources: Iterable[Path]) -> None:
+    """Raise where an output would be written into what is only read.
+
+    Raises:
+        InputError: it is one of the sources, or lies in one.
+    """
+    place = out.resolve()
+    for source in sources:
+        if source.resolve() in (place, *place.parents):
+            raise InputError(
+                f"--out '{out}' lies inside the source '{source}', which is only read; choose a "
+                "folder outside it."
+            )
+
+
 def require_no_links(path: Path, name: str) -> None:
     """Raise where a folder is a link or has links that lead out of it: results would go there.
 

@@ -19,7 +19,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-@pytest.fixture(scope="module", params=["annotate", "export"])
+@pytest.fixture(scope="module", params=["annotate", "export", "stats"])
 def command(request: pytest.FixtureRequest, root: Path) -> Any:
     return kills.Command(root, kills.LONG[request.param])
 

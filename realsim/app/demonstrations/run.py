@@ -1,7 +1,9 @@
 """`realsim demonstrations`: attempts of the school as a LeRobot data set with pictures."""
 
 import hashlib
+import itertools
 import json
+import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -12,18 +14,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from realsim.app.console import Console
+from realsim.app.outputs import require_outside
 from realsim.app.school.files import stored_grasps
 from realsim.app.school.inputs import CACHE, SchoolInputs, SchoolRequest, is_session, weighed
 from realsim.errors import InputError
-from realsim.formats.export_folder import ExportFolder
+from realsim.formats.export_folder import STATE, ExportFolder
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.labelled_scene import WrittenScene
-from realsim.formats.lerobot.episodes import NOTES
+from realsim.formats.lerobot.episodes import INFO, NOTES
 from realsim.formats.lerobot.spool import EncodedEpisode, encoded, import_av
 from realsim.geometry import se3
 from realsim.many import Outcome, PoolConfig, Sent, Task, open_pool, run_many
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectModel, Scene
+from realsim.untrusted.own_json import read_object
 
 if TYPE_CHECKING:
     from realsim.formats.lerobot.writer import Take
@@ -273,23 +277,32 @@ def export_demonstrations(
     from realsim.store.lock import only_run_in
 
     import_av()
-    _require_outside(source, out)
+    require_outside(out, [source])
     attempts, episodes = _episodes(source, request, console)
-    folder = ExportFolder.begin(out, _asked(source, attempts, request))
+    asked = _asked(source, attempts, request)
+    if ExportFolder.is_finished(out, asked):
+        shutil.rmtree(out / STATE, ignore_errors=True)  # left by a run that ended just there
+        frames = int(read_object(out / INFO)["total_frames"])
+        written = WrittenScene(
+            name=episodes.name, folder=out, frames=frames, frames_written=0, objects=frames,
+            counts={"episodes": len(episodes), "tasks": len(episodes.tasks)},
+        )  # fmt: skip
+        return _result(out, attempts, written)
+    folder = ExportFolder.begin(out, asked)
     if folder.resumed:
         console.say(f"going on with the demonstrations in {out}.")
     with only_run_in(out):
+        done = itertools.count(1)
         with console.stage("demonstrations", f"{len(episodes)} attempts") as tick:
             encoding = _Encoding(source, request, episodes, where or PoolConfig(workers=1), console)
             written = write_lerobot(
                 episodes, folder, episodes_per_file=request.episodes_per_file,
-                progress=_counter(tick, len(episodes)), encode=encoding.encode,
+                progress=lambda: tick(next(done), len(episodes)), encode=encoding.encode,
             )  # fmt: skip
         with console.stage("page"):
             folder.write_piece("page", page_file(folder.folder, attempts.config.rate_hz, PAGE))
-        notes = (folder.folder / NOTES).read_text().splitlines()
-        successes = sum(bool(json.loads(line)["success"]) for line in notes)
-        card = demonstrations_card(request, written, _names(attempts), successes, out)
+        result = _result(out, attempts, written)
+        card = demonstrations_card(request, written, _names(attempts), result.successes, out)
         from realsim.app.stages import made_of
         from realsim.store import provenance
 
@@ -300,13 +313,19 @@ def export_demonstrations(
         )  # fmt: skip
         folder.finish({CARD_FILE: card, provenance.FOLDER_FILE: provenance.record_bytes(record)})
         provenance.write(out, record, run)
+    return result
+
+
+def _result(
+    out: Path, attempts: "DemonstrationSource", written: WrittenScene
+) -> DemonstrationsResult:
+    """Return what is there when all is written."""
+    notes = (out / NOTES).read_text().splitlines()
     return DemonstrationsResult(
-        folder=out,
-        page=out / PAGE,
-        written=written,
-        successes=successes,
+        folder=out, page=out / PAGE, written=written,
+        successes=sum(bool(json.loads(line)["success"]) for line in notes),
         not_attempted=len(attempts.not_attempted),
-    )
+    )  # fmt: skip
 
 
 def _episodes(
@@ -377,27 +396,6 @@ def _encoded(
 def _opened(source: Path, request: DemonstrationRequest) -> "LeRobotDemonstrations":
     """Return the episodes of a source; a worker opens it once."""
     return _episodes(source, request, Console(quiet=True))[1]
-
-
-def _require_outside(source: Path, out: Path) -> None:
-    """Raise if the data set would be written into what is only read."""
-    place, root = out.resolve(), source.resolve()
-    if place == root or root in place.parents:
-        raise InputError(
-            f"--out '{out}' lies inside '{source}', which is only read; give a folder outside it."
-        )
-
-
-def _counter(tick: Any, total: int) -> Any:
-    """Return what is called once an episode."""
-    done = 0
-
-    def one_more() -> None:
-        nonlocal done
-        done += 1
-        tick(done, total)
-
-    return one_more
 
 
 def _asked(

@@ -1,5 +1,6 @@
 """`realsim export`: scene by scene into one folder; interrupted, the same command goes on."""
 
+import itertools
 import re
 import shutil
 from collections.abc import Mapping, Sequence
@@ -24,6 +25,7 @@ from realsim.app.export.sources import (
     trust_in,
 )
 from realsim.app.export.target import TABLE, TRIED, RootJob, SceneJob, ScenePlace, Target
+from realsim.app.outputs import require_outside
 from realsim.app.stages import made_of, open_session
 from realsim.errors import InputError
 from realsim.formats.bop.labelled import BopLabelledScene
@@ -71,7 +73,7 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
     """
     target = target_of(request)
     scenes = source_scenes(request, all_cameras=target.holds_cameras)
-    _require_outside(request, out)
+    require_outside(out, request.sources)
     _tell_left_out(scenes, target, console)
     places = scene_places(scenes, target)
     if request.labels in ("auto", "annotated"):
@@ -231,17 +233,6 @@ def _tell_left_out(scenes: Sequence[SourceScene], target: Target, console: Conso
         )
 
 
-def _require_outside(request: ExportRequest, out: Path) -> None:
-    place = out.resolve()
-    for source in request.sources:
-        root = source.resolve()
-        if place == root or root in place.parents:
-            raise InputError(
-                f"--out '{out}' lies inside the source '{source}', which is only read; choose a "
-                "folder outside it."
-            )
-
-
 def _as_asked(
     scene: LabelledScene, target: Target, request: ExportRequest, out: Path
 ) -> LabelledScene:
@@ -262,19 +253,12 @@ def _write(
     request: ExportRequest,
     console: Console,
 ) -> WrittenScene:
-    total, done = len(scene.indices), 0
+    total, done = len(scene.indices), itertools.count(1)
     if not total and target.kind in ("dataset", "cameras"):
         raise InputError(f"{scene.name} has no views; there is nothing to write as {target.name}.")
     with console.stage("export", f"{scene.name} to {target.name}") as tick:
-
-        def one_more() -> None:
-            nonlocal done
-            done += 1
-            tick(done, total)
-
-        written = target.write_scene(
-            scene, folder, SceneJob(request=request, place=place, tick=one_more)
-        )
+        job = SceneJob(request=request, place=place, tick=lambda: tick(next(done), total))
+        written = target.write_scene(scene, folder, job)
     has = {TABLE: scene.T_world_table is not None, TRIED: scene.grasps() is not None}
     lost = [what for what in target.no_place if has[what]]
     told = [f"{target.name} has no place for {' and '.join(lost)}: left out."] if lost else []

@@ -10,7 +10,7 @@ from realsim.app.console import Console
 from realsim.app.stages import save_starts
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.formats.bop.models import save_models
+from realsim.formats.bop.models import INFO_FILE, save_models
 from realsim.formats.bop.source import BopSource
 from realsim.formats.frame_source import FrameSource
 from realsim.formats.graspnet.models import what_to_give
@@ -73,7 +73,7 @@ def import_labels(
     ids = {o.obj_id for i in indices for o in scene.frame(i).objects}
     with only_run_in(folder), SessionStore.open(folder) as store:
         models = scene.models()
-        if models and not any((folder / "models").glob("obj_*.ply")):
+        if models and not (folder / "models" / INFO_FILE).is_file():
             save_models(folder / "models", models)
         if load_imported(store) is not None:
             return

@@ -167,9 +167,9 @@ def _write_all(
         (SESSION_HEADER, session_table(stats)),
         (OBJECT_HEADER, object_table(stats)),
     )
+    atomic.write_json(out / DOCUMENT, document)  # first: by it the folder is known as ours
     for name, (header, rows) in zip(TABLES, tables, strict=True):
         atomic.write_bytes(out / name, csv_bytes(header, rows))
-    atomic.write_json(out / DOCUMENT, document)
     _write_page(out / PAGE, stats, notes)
     for name in (*TABLES, DOCUMENT, PAGE):
         console.say(f"written   {out / name}")

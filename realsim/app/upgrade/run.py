@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from realsim.app.console import Console
+from realsim.app.outputs import require_outside
 from realsim.app.upgrade.analytic import agreement_of, all_sets
 from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig, scenes_of
 from realsim.app.upgrade.files import (
@@ -55,7 +56,7 @@ def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Consol
             there, or broken content of the only scene (of many, a broken one is left out).
     """
     refs = scenes_of(dataset, config)
-    _refuse_inside(out, refs)
+    require_outside(out, sorted({r.root.resolve() for r in refs}))
     _refuse_what_cannot_be_written(out)
     done: dict[str, Record] = {}
     todo: list[SceneRef] = []
@@ -155,16 +156,6 @@ def _write_together(out: Path, failed: dict[str, str], console: Console) -> Reco
         write_tables(out, records, failed, analytic)
         write_page(out, records, failed, analytic)
     return analytic
-
-
-def _refuse_inside(out: Path, refs: Sequence[SceneRef]) -> None:
-    """Raise if the output would be written into the data set."""
-    for root in sorted({r.root.resolve() for r in refs}):
-        if out.resolve() == root or root in out.resolve().parents:
-            raise InputError(
-                f"--out '{out}' lies inside the dataset '{root}', which is only read; choose a "
-                "folder outside it."
-            )
 
 
 def _refuse_what_cannot_be_written(out: Path) -> None:

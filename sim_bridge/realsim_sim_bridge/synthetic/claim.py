@@ -11,7 +11,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.formats.bop.models import load_models, model_file, save_models
+from realsim.formats.bop.models import INFO_FILE, load_models, model_file, save_models
 from realsim.models.library_reading import LibraryReader
 from realsim.models.library_session import copy_models
 from realsim.records import CameraIntrinsics, CaptureSession, ObjectModel
@@ -150,7 +150,7 @@ def with_stored_models(
     wanted = {o.obj_id: synthetic.models[o.obj_id] for o in synthetic.shown}
     if models_from is not None:
         copy_models(LibraryReader(models_from), list(wanted), folder)
-    elif not all((folder / model_file(i)).is_file() for i in wanted):
+    elif not all((folder / f).is_file() for f in (INFO_FILE, *map(model_file, wanted))):
         save_models(folder, wanted)
     stored = load_models(folder, list(wanted))
     for obj_id, model in stored.items():
