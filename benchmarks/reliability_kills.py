@@ -213,7 +213,7 @@ def kills(given: argparse.Namespace) -> Found:
                 much = float(np.exp(rng.uniform(*np.log(ROOM_BYTES))))
             caught, wrong = made[name].ended(how, much)
             ends = {"kill": caught and how != FULL, "full": caught and how == FULL}
-            told = {"name": name, "how": how.name, "much": round(much, 3), "wrong": wrong[:5]}
+            told = {"name": name, "how": how.name, "much": round(much, 3), "wrong": wrong[:20]}
             log.add("kills", given.seed, k, **ends, **told)
             print(f"{done} of {wanted} kills: {told}", file=sys.stderr, flush=True)
     lines = log.of("kills")

@@ -45,6 +45,21 @@ def require_free(folder: Path) -> None:
         )
 
 
+def finish_beginning(folder: Path) -> None:
+    """Give a session's first header its name where a kill kept it from it, or take it away.
+
+    Until its header has its name nobody knows a folder as a session.
+    """
+    if (folder / SESSION_FILE).exists():
+        return
+    for _, final in atomic.leftovers(folder):
+        if final == folder / SESSION_FILE:
+            manifest = Manifest(folder)
+            if SESSION_FILE not in manifest.entries:
+                (folder / MANIFEST_FILE).unlink(missing_ok=True)
+            manifest.finish_interrupted()
+
+
 def require_header(folder: Path) -> None:
     """Refuse a session whose session.json is gone; any other folder is none of ours.
 

@@ -18,17 +18,12 @@ OPTIONS = [(path, option) for path, command in EVERY.items() for option in setta
 WITHOUT_RESULT = {("completion",), ("config", "template")}
 """These print a text that is their result; JSON of it would help nobody."""
 SHARED = {
-    "json": (click.types.BoolParamType, True),
-    "quiet": (click.types.BoolParamType, True),
-    "overwrite": (click.types.BoolParamType, True),
-    "restart": (click.types.BoolParamType, True),
-    "no-pictures": (click.types.BoolParamType, True),
-    "workers": (click.IntRange, False),
-    "seed": (click.IntRange, False),
-    "out": (click.Path, False),
-    "json-file": (click.Path, False),
+    "json": (click.types.BoolParamType, True), "quiet": (click.types.BoolParamType, True),
+    "overwrite": (click.types.BoolParamType, True), "restart": (click.types.BoolParamType, True),
+    "no-pictures": (click.types.BoolParamType, True), "workers": (click.IntRange, False),
+    "seed": (click.IntRange, False), "out": (click.Path, False), "json-file": (click.Path, False),
     "port": (click.IntRange, False),
-}
+}  # fmt: skip
 """Option -> its type, and whether it is a flag, wherever it is."""
 OTHER_SPELLINGS = {
     "output": "out", "out-dir": "out", "output-dir": "out", "outdir": "out", "jobs": "workers",

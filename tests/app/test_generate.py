@@ -17,13 +17,9 @@ from typed_commands import finished, invoked, refused
 SMALL = ("--views", "2", "--size", "160x90", "--objects", "2-3", "--seed", "5", "--workers", "1",
          "--depth", "disparity", "--quiet")  # fmt: skip
 UNREPEATED = (
-    "session.json",
-    "session.begun.json",
-    "manifest.jsonl",
-    "generate.json",
-    "scene_gt_coco.json",
+    "session.json", "session.begun.json", "manifest.jsonl", "generate.json", "scene_gt_coco.json",
     "index.html",
-)
+)  # fmt: skip
 """Files that name the time at which they were begun or how long it took, lists of checksums."""
 
 

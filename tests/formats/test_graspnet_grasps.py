@@ -32,13 +32,10 @@ SINGLE = 2e-7
 def a_group(seed=0, n=20):
     rng = np.random.default_rng(seed)
     return GraspGroup(
-        Ts_a_grasp=se3.random_transform(rng, n, 0.5),
-        scores=rng.normal(size=n),
-        openings_m=rng.uniform(0, 0.1, n),
-        heights_m=np.full(n, 0.02),
-        depths_m=rng.choice(frame.DEPTHS_M, n),
-        obj_ids=rng.integers(0, 89, n),
-    )
+        Ts_a_grasp=se3.random_transform(rng, n, 0.5), scores=rng.normal(size=n),
+        openings_m=rng.uniform(0, 0.1, n), heights_m=np.full(n, 0.02),
+        depths_m=rng.choice(frame.DEPTHS_M, n), obj_ids=rng.integers(0, 89, n),
+    )  # fmt: skip
 
 
 def some_labels(seed=0, points=20, n=150):

@@ -10,13 +10,8 @@ from realsim.images import png
 from realsim.images.png import encode_window
 
 WINDOWS = [
-    (0, 0, 64, 48),
-    (0, 0, 0, 0),
-    (5, 7, 1, 1),
-    (60, 40, 4, 8),
-    (0, 10, 64, 3),
-    (3, 0, 9, 48),
-]
+    (0, 0, 64, 48), (0, 0, 0, 0), (5, 7, 1, 1), (60, 40, 4, 8), (0, 10, 64, 3), (3, 0, 9, 48),
+]  # fmt: skip
 
 
 def decoded(data: bytes) -> np.ndarray:

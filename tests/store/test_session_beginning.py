@@ -10,7 +10,7 @@ from file_trees import bytes_of
 from realsim.errors import InputError
 from realsim.records import CaptureSession
 from realsim.store import SessionStore, atomic
-from realsim.store.opening import BEGUN_FILE, RECOVERED, read_begun
+from realsim.store.opening import BEGUN_FILE, RECOVERED, finish_beginning, read_begun
 from realsim.store.session_check import check_session
 from realsim.store.session_repair import repair_session
 from stored_sessions import CAMERA, VIEWS, flip
@@ -102,3 +102,22 @@ def test_a_damaged_header_says_how_to_go_on(session: Path) -> None:
     with pytest.raises(InputError, match="newer realsim") as told:
         SessionStore.open(session)
     assert "--repair" not in str(told.value)
+
+
+@pytest.mark.parametrize("listed", [0, 20, 10_000])
+def test_a_header_that_a_kill_kept_from_its_name_gets_it_or_goes(tmp_path: Path, listed: int):
+    whole = CaptureSession(name="new", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    SessionStore.create(tmp_path, whole).close()
+    header, manifest = tmp_path / "session.json", tmp_path / "manifest.jsonl"
+    line = next(x for x in manifest.read_text().splitlines(True) if '"session.json"' in x)
+    for path in tmp_path.iterdir():
+        if path != header:
+            path.unlink()
+    header.rename(tmp_path / ".session.json.999999999.part")
+    if listed:
+        manifest.write_text(line[:listed])  # the last line may be torn
+    finish_beginning(tmp_path)
+    if listed < len(line):
+        assert list(tmp_path.iterdir()) == []
+    else:
+        assert SessionStore.open(tmp_path).session.name == "new"

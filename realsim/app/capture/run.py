@@ -341,8 +341,10 @@ def _session(
 
 def _check_free(out: Path) -> None:
     """Refuse a folder that holds something else: nothing of anybody is mixed with a session."""
+    from realsim.store.opening import finish_beginning
     from realsim.store.session_check import is_session
 
+    finish_beginning(out)
     if is_session(out) and not (out / "session.json").is_file():
         raise InputError(
             f"'{out}' holds a session whose session.json is gone. `realsim check {out} --repair` "

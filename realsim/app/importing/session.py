@@ -20,6 +20,7 @@ from realsim.formats.folders.listing import shown
 from realsim.formats.frame_source import FrameSource, SourceFrame
 from realsim.records import CaptureSession, View
 from realsim.store.lock import only_run_in
+from realsim.store.opening import finish_beginning
 from realsim.store.session_store import SESSION_FILE, SessionStore
 from realsim.untrusted.own_json import to_json
 from realsim_capture_plans.capturing.contact_sheet import Thumbnails, cell_size, write_contact_sheet
@@ -149,6 +150,7 @@ def _make_room(folder: Path, source: FrameSource, key: str, *, overwrite: bool) 
     """
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file; the folder of a session is expected.")
+    finish_beginning(folder)
     if not folder.is_dir() or not any(p for p in folder.iterdir()):
         return
     if not (folder / SESSION_FILE).is_file():
@@ -332,18 +334,14 @@ def _summary(
     views = store.session.views
     times = [v.time_s for v in views]
     return ImportSummary(
-        folder=store.folder,
-        frames=len(views),
-        imported=len(views) - done,
+        folder=store.folder, frames=len(views), imported=len(views) - done,
         with_depth=sum(store.has_depth(v.index) for v in views),
         with_joints=sum(v.joints is not None for v in views),
         with_tool_pose=sum(v.T_base_ee is not None for v in views),
         with_camera_pose=sum(v.T_world_cam is not None for v in views),
-        time_span_s=max(times) - min(times),
-        seconds=seconds,
-        notes=tuple(source.notes),
+        time_span_s=max(times) - min(times), seconds=seconds, notes=tuple(source.notes),
         contact_sheet=sheet,
-    )
+    )  # fmt: skip
 
 
 def show_import(summary: ImportSummary, console: Console) -> None:

@@ -21,6 +21,7 @@ from realsim.images import image_size
 from realsim.records import GraspSet, ObjectModel, Scene
 from realsim.store import SessionStore
 from realsim.store.session_store import rgb_path
+from realsim_sim_bridge.synthetic.claim import require_claimable
 from realsim_sim_bridge.synthetic.write import SyntheticSummary, write_session
 
 FIGURES_HEADER = ["figure", "real", "synthetic", "together"]
@@ -148,16 +149,7 @@ def _refuse_folder(folder: Path, session: Path) -> None:
             f"--out '{folder}' is the session itself, which is only read; choose a folder of its "
             f"own, or leave --out away: {session / 'synthetic'}/... is taken."
         )
-    if folder.exists() and not folder.is_dir():
-        raise InputError(
-            f"--out '{folder}' is a file; a folder that may be made or filled is taken."
-        )
-    begun = any((folder / name).is_file() for name in ("session.json", "session.begun.json"))
-    if folder.is_dir() and any(folder.iterdir()) and not begun:
-        raise InputError(
-            f"--out '{folder}' is not empty and holds no session. Choose another folder: nothing "
-            "of yours is overwritten."
-        )
+    require_claimable(folder)
 
 
 def show_render(outcome: RenderOutcome, console: Console) -> None:

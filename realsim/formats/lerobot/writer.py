@@ -193,7 +193,10 @@ def _write_group(
     }
     spooling = folder.folder / SPOOL
     spooling.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=spooling) as joined:
+    with (
+        atomic.storing(folder.folder, f"the videos of episodes {first} and further"),
+        tempfile.TemporaryDirectory(dir=spooling) as joined,
+    ):
         for i, key in enumerate(source.cameras):
             path = Path(joined) / f"{i}.mp4"
             join([(e.videos[key], e.steps) for e in episodes], path, source.fps)

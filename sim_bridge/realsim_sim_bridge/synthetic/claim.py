@@ -16,6 +16,7 @@ from realsim.models.library_reading import LibraryReader
 from realsim.models.library_session import copy_models
 from realsim.records import CameraIntrinsics, CaptureSession, ObjectModel
 from realsim.store import SessionStore
+from realsim.store.opening import finish_beginning
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
 from realsim_sim_bridge.synthetic.scene import SyntheticScene
 
@@ -44,6 +45,22 @@ def inputs_of(
     }
 
 
+def require_claimable(folder: Path) -> None:
+    """Raise where views cannot be written.
+
+    Raises:
+        InputError: there is a file, or a folder that holds something else than a session.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"'{folder}' is a file; a folder that may be made or filled is expected.")
+    finish_beginning(folder)
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "session.json").is_file():
+        raise InputError(
+            f"'{folder}' is not empty and holds no session. Choose another folder: nothing of "
+            "yours is overwritten."
+        )
+
+
 def claimed_session(
     folder: Path,
     synthetic: SyntheticScene,
@@ -59,18 +76,12 @@ def claimed_session(
             that is not synthetic, or something else.
     """
     inputs = inputs_of(synthetic, intrinsics, config, seed)
+    require_claimable(folder)
     if (folder / "session.json").is_file():
         store = SessionStore.open(folder)
         _require_same(store, inputs)
         _require_same_cameras(store, Ts_world_cam)
         return store
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"'{folder}' is a file; a folder that may be made or filled is expected.")
-    if folder.is_dir() and any(folder.iterdir()):
-        raise InputError(
-            f"'{folder}' is not empty and holds no session. Choose another folder: nothing of "
-            "yours is overwritten."
-        )
     session = CaptureSession(
         name=synthetic.name, intrinsics=intrinsics, views=(), depth_unit_m=config.unit_m
     )
