@@ -55,7 +55,7 @@ def finish_beginning(folder: Path) -> None:
     for _, final in atomic.leftovers(folder):
         if final == folder / SESSION_FILE:
             manifest = Manifest(folder)
-            if SESSION_FILE not in manifest.entries:
+            if not manifest.entries:
                 (folder / MANIFEST_FILE).unlink(missing_ok=True)
             manifest.finish_interrupted()
 
