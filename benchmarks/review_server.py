@@ -7,9 +7,9 @@ cost so far, and ends when that input does.
 """
 
 import json
-import resource
 import sys
 import time
+from pathlib import Path
 
 from realsim.review import ReviewServer
 from realsim.review.content.config import SceneConfig
@@ -26,7 +26,9 @@ def main() -> None:
     server.start()
     print(json.dumps({"url": server.url}), flush=True)
     for _ in sys.stdin:
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / KB_PER_MB
+        # Not ru_maxrss: that one survives exec, so it would hold what made the session.
+        status = Path("/proc/self/status").read_text("ascii", "replace")
+        peak = int(status.split("VmHWM:")[1].split()[0]) / KB_PER_MB
         print(json.dumps({"cpu_s": time.process_time(), "peak_mb": peak}), flush=True)
     server.stop()
 

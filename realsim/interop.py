@@ -344,3 +344,9 @@ def T_world_gl_from_cam(T_world_cam: ArrayLike) -> Array:
 def T_world_cam_from_gl(T_world_gl: ArrayLike) -> Array:
     """Return T_world_cam (..., 4, 4), OpenCV axes, of a camera given in OpenGL axes."""
     return np.asarray(T_world_gl, dtype=np.float64) @ T_CAM_GL
+
+
+def give_back_memory() -> None:
+    """Give the system what was freed: glibc keeps tens of megabytes of large arrays otherwise."""
+    with suppress(AttributeError, OSError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)

@@ -155,3 +155,19 @@ def plane_frame(normal: ArrayLike, offset: float, points: ArrayLike) -> Array:
     x = x / np.linalg.norm(x)
     R = np.stack([x, np.cross(z, x), z], axis=-1)
     return se3.from_rt(R, centroid - (z @ centroid - offset) * z)
+
+
+def cloud_ply(points: ArrayLike, colors: ArrayLike, comment: str = "") -> bytes:
+    """Return points (N, 3) with colours (N, 3) uint8 as binary PLY; the comment is its third line.
+
+    Args:
+        points: in the unit that the file is to have.
+        colors: sRGB.
+        comment: words without a line break; '' = none.
+    """
+    rows = np.zeros(len(np.asarray(points)), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    rows["xyz"], rows["rgb"] = points, colors
+    lines = ["ply", "format binary_little_endian 1.0", *([f"comment {comment}"] if comment else [])]
+    lines += [f"element vertex {len(rows)}", *(f"property float {axis}" for axis in "xyz")]
+    lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii") + rows.tobytes()

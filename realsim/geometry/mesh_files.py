@@ -7,8 +7,10 @@ metres.
 import contextlib
 import io
 import logging
+import re
 import warnings
 from collections.abc import Generator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +31,16 @@ SMALLEST_M = 0.002
 grasps is so small."""
 MOST_TEXELS = 100_000_000
 """Pixels of a texture; a header can claim any number, and decoders allocate what it claims."""
+PLAIN_PLY = re.compile(
+    rb"ply\nformat binary_little_endian 1\.0\nelement vertex (\d{1,9})\n"
+    rb"property float x\nproperty float y\nproperty float z\n"
+    rb"property float nx\nproperty float ny\nproperty float nz\n"
+    rb"(property uchar red\nproperty uchar green\nproperty uchar blue\n)?"
+    rb"element face (\d{1,9})\nproperty list uchar int vertex_indices\nend_header\n"
+)
+"""Header of what `ply_bytes` writes without texture: vertices, whether coloured, faces."""
+PLACE = [("xyz", "<f4", 3), ("normal", "<f4", 3)]
+TRIANGLE = np.dtype([("n", "u1"), ("v", "<i4", 3)])
 LARGEST_M = 3.0
 """A 'metre' file whose largest extent is above 3 m holds millimetres: nothing on a table is so
 large."""
@@ -75,13 +87,17 @@ def load_mesh(path: Path | str, unit: Unit, notes: list[str] | None = None) -> M
         InputError: no such file, not a mesh, no triangles.
         UnitError: the size of the mesh contradicts the unit.
     """
-    import trimesh
-
     path = Path(path)
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path}: '{path.suffix}' is not a mesh format; {', '.join(FORMATS)} are.")
     if not path.is_file():
         raise InputError(f"{path} does not exist; a mesh file was expected there.")
+    plain = _plain_ply(path.read_bytes()) if path.suffix.lower() == ".ply" else None
+    if plain is not None:
+        check_unit(float(plain.extent.max()), unit, str(path))
+        return replace(plain, vertices=plain.vertices * METRES[unit])
+    import trimesh
+
     beside = _files_beside(path)
     try:
         with _quiet("trimesh"):
@@ -120,6 +136,31 @@ def load_mesh(path: Path | str, unit: Unit, notes: list[str] | None = None) -> M
         vertices=vertices * METRES[unit], faces=faces, colors=colors, uv=uv, texture=texture
     )
     return welded_mesh(mesh) if path.suffix.lower() == ".stl" else mesh
+
+
+def _plain_ply(data: bytes) -> Mesh | None:
+    """Return the mesh of a file as `ply_bytes` writes it without texture, in the file's unit.
+
+    None = it is for the general reader, whose import alone takes longer than ten such files.
+    """
+    found = PLAIN_PLY.match(data)
+    if found is None:
+        return None
+    vertex = np.dtype([*PLACE, ("rgb", "u1", 3)] if found[2] else PLACE)
+    vertices, faces, start = int(found[1]), int(found[3]), found.end()
+    middle = start + vertices * vertex.itemsize
+    if not faces or len(data) != middle + faces * TRIANGLE.itemsize:
+        return None
+    table = np.frombuffer(data, vertex, vertices, start)
+    triangles = np.frombuffer(data, TRIANGLE, faces, middle)
+    corners = triangles["v"]
+    if (triangles["n"] != 3).any() or corners.min() < 0 or corners.max() >= vertices:
+        return None
+    return Mesh(
+        vertices=table["xyz"].astype(np.float64),
+        faces=corners,
+        colors=table["rgb"] if found[2] else None,
+    )
 
 
 def _files_beside(path: Path) -> Any:
@@ -271,7 +312,7 @@ def ply_bytes(mesh: Mesh, unit: Unit, *, ascii: bool = False, texture_file: str 
         rows = [" ".join(f"{v:.9g}" for v in row.tolist()) for row in table]
         rows += [f"3 {a} {b} {c}" for a, b, c in mesh.faces.tolist()]
         return header + ("\n".join(rows) + "\n").encode("ascii")
-    triangles = np.empty(len(mesh.faces), dtype=[("n", "u1"), ("v", "<i4", (3,))])
+    triangles = np.empty(len(mesh.faces), dtype=TRIANGLE)
     triangles["n"], triangles["v"] = 3, mesh.faces
     return header + table.tobytes() + triangles.tobytes()
 

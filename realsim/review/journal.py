@@ -241,17 +241,13 @@ def new_entry(
     if placed is not None and action in ("accept", "reject"):
         said = {"obj_id": placed.obj_id} | said
     return Entry(
-        id=uuid.uuid4().hex,
-        time=datetime.now(UTC).isoformat(timespec="milliseconds"),
-        reviewer=reviewer.strip(),
-        action=action,
+        id=uuid.uuid4().hex, time=datetime.now(UTC).isoformat(timespec="milliseconds"),
+        reviewer=reviewer.strip(), action=action,
         instance=None if placed is None else placed.instance,
-        subject="" if placed is None else subject_of(placed),
-        comment=comment.strip(),
-        undoes=undoes,
-        T_world_obj=None if T is None else tuple(tuple(row) for row in T.tolist()),
+        subject="" if placed is None else subject_of(placed), comment=comment.strip(),
+        undoes=undoes, T_world_obj=None if T is None else tuple(tuple(row) for row in T.tolist()),
         **said,
-    )
+    )  # fmt: skip
 
 
 def replay(entries: Sequence[Entry], start: ReviewState | None = None) -> ReviewState:

@@ -16,16 +16,9 @@ VERDICT_ORDER = ("rejected", "doubtful", "unchecked", "accepted")
 DEEPEST = 4
 """How far below a given folder sessions are looked for: BOP's ROOT/SPLIT/SCENE, and one more."""
 INNER = (
-    "calibration",
-    "cameras",
-    "rgb",
-    "depth",
-    "models",
-    "registration",
-    "grasps",
-    "labels",
+    "calibration", "cameras", "rgb", "depth", "models", "registration", "grasps", "labels",
     "annotations",
-)
+)  # fmt: skip
 """Folders of a session that hold no session to be reviewed."""
 Which = Literal["all", "undecided", "decided"]
 

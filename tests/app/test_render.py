@@ -10,11 +10,12 @@ from realsim import CameraIntrinsics, InputError, Mesh
 from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
 from realsim.app.render.compare import label_ids, rim_distances_px
-from realsim.app.render.light import linear_of, neutral_environment, upright
+from realsim.app.render.light import neutral_environment, upright
 from realsim.app.render.request import RenderRequest, resized
 from realsim.app.render.run import notes_of, run_render
 from realsim.app.render.scene import twin_scene
 from realsim.geometry import camera
+from realsim.geometry.colors import light_of_bytes
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.photo import PhotoRenderer
 from realsim.store import SessionStore, save_scene
@@ -60,7 +61,7 @@ def light_and_table_match_the_photographs(real, twin):
     assert look.has_colors
     assert look.object_error < 0.02 and look.table_error < 0.02
     for made, shot in enumerate(twin.real):
-        ours, theirs = (linear_of(s.rgb(k)) for s, k in ((twin.twin, made), (real, shot)))
+        ours, theirs = (light_of_bytes(s.rgb(k)) for s, k in ((twin.twin, made), (real, shot)))
         assert np.abs(ours.mean((0, 1)) - theirs.mean((0, 1))).max() < 0.05
 
 
@@ -182,8 +183,8 @@ def test_a_model_without_colours_is_painted_as_the_photographs_show_it(real):
     assert set(paints) == {instances[i] for i in colorless}
     view = real.session.view(2)
     renderer = PhotoRenderer(made.synthetic.placed(), environment=made.synthetic.environment)
-    shown = linear_of(renderer.render(INTRINSICS, view.T_world_cam).rgb)
-    ids, photograph = label_ids(real, 2), linear_of(real.rgb(2))
+    shown = light_of_bytes(renderer.render(INTRINSICS, view.T_world_cam).rgb)
+    ids, photograph = label_ids(real, 2), light_of_bytes(real.rgb(2))
     for instance in paints:
         seen = ids == instance
         ours, theirs = shown[seen].mean(0), photograph[seen].mean(0)

@@ -9,7 +9,7 @@ import pytest
 
 from realsim.errors import InputError, UnitError
 from realsim.geometry import mesh as meshes
-from realsim.geometry import metrics, se3
+from realsim.geometry import mesh_files, metrics, se3
 from realsim.records import Mesh, ObjectModel
 from trimesh_solids import ball, box
 
@@ -123,12 +123,10 @@ def test_samples_lie_on_the_surface_evenly():
 
 def test_symmetries_are_a_closed_set_that_keeps_the_object():
     model = ObjectModel(
-        obj_id=1,
-        name="can",
-        mesh=box(),
+        obj_id=1, name="can", mesh=box(),
         symmetries=np.stack([np.eye(4), np.diag([1.0, -1, -1, 1])]),
         symmetry_axes=(((0.0, 0.0, 2.0), (0.01, 0.0, 0.0)),),
-    )
+    )  # fmt: skip
     S = meshes.symmetry_transforms(model, max_step_rad=0.5)
     assert S.shape == (2 * 13, 4, 4)
     np.testing.assert_allclose(S[0], np.eye(4), atol=1e-15)
@@ -207,6 +205,22 @@ def test_a_ply_comes_back_the_same(tmp_path, ascii, unit):
     np.testing.assert_allclose(back.vertices, mesh.vertices, atol=1e-8)
     np.testing.assert_array_equal(back.faces, mesh.faces)
     np.testing.assert_array_equal(back.colors, mesh.colors)
+
+
+@pytest.mark.parametrize("colors", [None, np.arange(24).reshape(8, 3), np.full((8, 3), 9)])
+def test_a_plain_ply_is_what_the_general_reader_makes_of_it(tmp_path, monkeypatch, colors):
+    data = meshes.ply_bytes(dataclasses.replace(box(), colors=colors), "mm")
+    path = tmp_path / "box.ply"
+    path.write_bytes(data)
+    ours = meshes.load_mesh(path, "mm")
+    header = data.index(b"end_header\n")
+    beyond = data[:-4] + b"\x08\0\0\0"  # of vertices 0 to 7
+    odd = (data[:-1], data + b"\0", data[: header + 9], data.replace(b" 8\n", b" 9\n"), beyond)
+    assert all(mesh_files._plain_ply(d) is None for d in odd)
+    monkeypatch.setattr(mesh_files, "_plain_ply", lambda _: None)
+    theirs = meshes.load_mesh(path, "mm")
+    for name in ("vertices", "faces", "colors"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
 
 
 def test_a_textured_ply_comes_back_right_side_up(tmp_path):

@@ -10,6 +10,7 @@ import pytest
 from realsim import CameraIntrinsics, GraspSet, InputError, View
 from realsim.geometry import camera, depth, se3
 from realsim.rendering import overlay
+from realsim.review.content import clouds
 from realsim.review.content.config import SceneConfig
 from realsim.review.content.content import SceneContent
 from realsim.review.content.views import Region, region_of, strided
@@ -80,6 +81,19 @@ def test_pieces_are_the_cloud_in_order_and_no_message_is_large(
     np.testing.assert_array_equal(together, np.arange(min(most, len(shown.cloud))))
     assert pieces[0].stop <= shown.cloud.ends[0]
     assert all(0 < p.stop - p.start <= 700 for p in pieces)
+
+
+@pytest.mark.parametrize("voxel_m", [0.05, 4e-7])
+def test_points_are_grouped_by_voxels_and_those_seen_most_often_stay(voxel_m: float) -> None:
+    points = np.random.default_rng(0).normal(0, 0.05, (4000, 3)).astype(np.float32)
+    points[1000:2000] = points[:1000]
+    order, counts = clouds._by_voxel(points, voxel_m)  # pyright: ignore[reportPrivateUsage]
+    cells = np.floor(points[order] / np.float64(voxel_m))
+    _, expected = np.unique(cells, axis=0, return_counts=True)
+    np.testing.assert_array_equal(counts, expected)
+    assert len(np.unique(order)) == len(points)
+    kept = clouds._greatest(counts, 40)  # pyright: ignore[reportPrivateUsage]
+    assert kept.sum() == 40 and counts[kept].min() >= counts[~kept].max(initial=0)
 
 
 # --- the scene --------------------------------------------------------------------------------

@@ -68,13 +68,9 @@ def test_a_moved_object_keeps_nothing_that_was_computed_of_the_old_pose() -> Non
         checks={"agree": 0.9}, verdict="accepted",
     )  # fmt: skip
     line = journal.new_entry(
-        "move",
-        sure,
-        "ada",
-        pose=se3.from_translation([0.003, 0, 0]),
-        how="icp",
+        "move", sure, "ada", pose=se3.from_translation([0.003, 0, 0]), how="icp",
         checks={"agree": 1},
-    )
+    )  # fmt: skip
     now = after(scene(sure), [line])
     assert (now.covariance, now.verdict, now.checks) == (None, "unchecked", {"agree": 1})
     assert now.reasons == ("moved by ada (icp): 3 mm, 0 deg from where it was registered",)
@@ -124,7 +120,7 @@ def test_pending_names_rejections_views_and_marks_but_not_accepts() -> None:
         journal.new_entry("exclude", None, "ada", view=5),
         journal.new_entry("include", None, "bob", view=5),
         journal.new_entry("symmetric", None, "ada", obj_id=3, symmetry="z"),
-    ]
+    ]  # fmt: skip
     state = journal.replay(lines)
     assert {e.id for e in pending(start, state)} == {lines[k].id for k in (1, 2, 5)}
     assert list(state.excluded_views()) == [4]

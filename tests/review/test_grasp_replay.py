@@ -90,12 +90,10 @@ def test_the_approach_moves_with_the_world() -> None:
 def test_motions_that_are_none_are_refused() -> None:
     good = carried()
     for broken in (
-        {"time_s": np.zeros(len(good))},
-        {"opening_m": np.zeros(3)},
-        {"phase": np.full(len(good), 17)},
-        {"Ts_world_obj": good.Ts_world_obj[:2]},
+        {"time_s": np.zeros(len(good))}, {"opening_m": np.zeros(3)},
+        {"phase": np.full(len(good), 17)}, {"Ts_world_obj": good.Ts_world_obj[:2]},
         {"link_meshes": (TRIANGLE,), "Ts_world_link": np.zeros((len(good), 2, 4, 4))},
-    ):
+    ):  # fmt: skip
         with pytest.raises(InputError):
             replace(good, **broken)
     with pytest.raises(InputError, match="no sample"):

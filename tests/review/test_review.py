@@ -71,12 +71,9 @@ def handshake(server: ReviewServer, origin: str | None = None, **headers: str) -
     address = f"ws://127.0.0.1:{port_of(server)}"
     try:
         with connect(
-            address,
-            origin=None if origin is None else Origin(origin),
-            subprotocols=[SOCKET],
-            additional_headers=headers,
-            max_size=None,
-        ) as line:
+            address, origin=None if origin is None else Origin(origin), subprotocols=[SOCKET],
+            additional_headers=headers, max_size=None,
+        ) as line:  # fmt: skip
             assert len(line.recv(timeout=20)) > 0
             return 101
     except InvalidStatus as refused:

@@ -157,6 +157,8 @@ def test_colours_of_the_cloud_are_set_in_its_order_and_taken_back(
     np.testing.assert_array_equal(sent(), colors)
     nodes.set_cloud_colors(None)
     np.testing.assert_array_equal(sent(), shown.cloud.colors)
+    handle: Any = server.scene.get_handle_by_name("/cloud/1")
+    assert np.shares_memory(handle.points, shown.cloud.points)  # and is no window's own
     with pytest.raises(InputError, match="colours"):
         nodes.set_cloud_colors(colors[:-1])
 

@@ -27,11 +27,8 @@ def held_from_above(body, off_m=(0.0,)):
     Ts = np.repeat(se3.from_rt(DOWN, np.zeros(3))[None], n, axis=0)
     Ts[:, 0, 3] = off_m
     return SlipTrial(
-        body=body,
-        Ts_obj_grasp=Ts,
-        Ts_table_grasp=Ts,
-        openings_m=np.full(n, SIDE + 0.008),
+        body=body, Ts_obj_grasp=Ts, Ts_table_grasp=Ts, openings_m=np.full(n, SIDE + 0.008),
         swing_axes=np.tile([0.0, 1.0, 0.0], (n, 1)),
         swing_points=np.tile([-0.088, 0.0, -0.21], (n, 1)),
         swing_ranges=np.tile([-2.0, 2.0], (n, 1)),
-    )
+    )  # fmt: skip

@@ -26,19 +26,14 @@ def tried_set(rng, n=20, *, obj_id=7, instance=2, measures=tuple(MEASURES)):
         known = [np.nan, 0.25, -0.0, 1 / 3] + [np.inf] * (not MEASURES[name].is_share)
         values[name] = rng.choice(known, shape)
     return GraspSet(
-        obj_id=obj_id,
-        instance=instance,
+        obj_id=obj_id, instance=instance,
         Ts_obj_grasp=se3.random_transform(rng, n, 0.1) if n else np.zeros((0, 4, 4)),
         widths_m=rng.uniform(0, 0.08, n),
         scores=np.where(kind == 0, np.nan, np.clip(base - rng.integers(0, 3, n) / 12, 0, 1)),
-        base_scores=base,
-        slip_m=slip,
-        slip_rad=slip * 3,
-        reachable=kind > 1,
-        failures=tuple(REASONS[k] for k in rng.integers(0, len(REASONS), n)),
-        measures=values,
+        base_scores=base, slip_m=slip, slip_rad=slip * 3, reachable=kind > 1,
+        failures=tuple(REASONS[k] for k in rng.integers(0, len(REASONS), n)), measures=values,
         parameters={"config": {"friction": 0.5, "names": ["a", "ö"]}, "seed": 4, "none": None},
-    )
+    )  # fmt: skip
 
 
 def attempts_of(rng, grasps, joints=7):

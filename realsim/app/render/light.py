@@ -15,6 +15,7 @@ from realsim.app.render.compare import label_ids
 from realsim.arrays import Array, Int32, Mask, Rgb
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
+from realsim.geometry.colors import light_of_bytes
 from realsim.records import CameraIntrinsics, View
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.labels import LabelRenderer, Labels
@@ -308,13 +309,7 @@ def _means(
         if len(real) < least:
             return None
         fine = np.ones(len(real), np.bool_)
-    return linear_of(real[fine]).mean(0), linear_of(made[fine]).mean(0)
-
-
-def linear_of(rgb: Rgb) -> Array:
-    """Return the linear light of 8-bit sRGB values (IEC 61966-2-1)."""
-    v = np.asarray(rgb, np.float64) / 255.0
-    return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
+    return light_of_bytes(real[fine]).mean(0), light_of_bytes(made[fine]).mean(0)
 
 
 def _scaled(environment: Environment, gain: Array) -> Environment:

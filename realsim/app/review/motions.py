@@ -149,20 +149,12 @@ class SessionMotions:
         arm = scenery.arm
         meshes, Ts_world_link, links = self._drawn_arm(arm, m.joints_rad, m.opening_m, T_world_base)
         return GraspMotion(
-            instance=s.instance,
-            row=row,
-            time_s=m.time_s,
-            Ts_world_hand=T_world_base @ m.Ts_base_ee,
-            opening_m=m.opening_m,
-            phase=m.phase,
-            Ts_world_obj=T_world_table @ m.Ts_table_obj,
-            obj_mesh=self._mesh(s.obj_id),
-            Ts_world_link=Ts_world_link,
-            link_meshes=meshes,
-            arm_links=links,
-            hand=arm.hand,
+            instance=s.instance, row=row, time_s=m.time_s,
+            Ts_world_hand=T_world_base @ m.Ts_base_ee, opening_m=m.opening_m, phase=m.phase,
+            Ts_world_obj=T_world_table @ m.Ts_table_obj, obj_mesh=self._mesh(s.obj_id),
+            Ts_world_link=Ts_world_link, link_meshes=meshes, arm_links=links, hand=arm.hand,
             notes=demonstration.notes,
-        )
+        )  # fmt: skip
 
     def _as_stored(
         self, s: GraspSet, row: int, attempts: GraspTrajectories, why: str
@@ -200,33 +192,19 @@ class SessionMotions:
         width: Array = np.where(closed, np.maximum(opening, s.widths_m[row]), opening)
         meshes, Ts_world_link, links = self._drawn_arm(arm, joints, width, T_world_base)
         return GraspMotion(
-            instance=s.instance,
-            row=row,
-            time_s=t,
-            Ts_world_hand=Ts_world_hand,
-            opening_m=width,
-            phase=phases[at],
-            Ts_world_obj=Ts_world_obj,
-            obj_mesh=self._mesh(s.obj_id),
-            Ts_world_link=Ts_world_link,
-            link_meshes=meshes,
-            arm_links=links,
-            hand=arm.hand,
+            instance=s.instance, row=row, time_s=t, Ts_world_hand=Ts_world_hand, opening_m=width,
+            phase=phases[at], Ts_world_obj=Ts_world_obj, obj_mesh=self._mesh(s.obj_id),
+            Ts_world_link=Ts_world_link, link_meshes=meshes, arm_links=links, hand=arm.hand,
             notes=(f"{FIXED_IN_HAND}: {why}",),
-        )
+        )  # fmt: skip
 
     def _approach(self, s: GraspSet, row: int, notes: tuple[str, ...]) -> GraspMotion:
         """Return the hand's approach, with the hand's meshes."""
         made = hand_approach(
-            s.instance,
-            row,
-            self._grasps.Ts_world_obj[s.instance],
-            s.Ts_obj_grasp[row],
-            float(s.widths_m[row]),
-            HandApproach(rate_hz=float(self._rate), hand=hand_of_set(s)),
-            obj_mesh=self._mesh(s.obj_id),
-            notes=notes,
-        )
+            s.instance, row, self._grasps.Ts_world_obj[s.instance], s.Ts_obj_grasp[row],
+            float(s.widths_m[row]), HandApproach(rate_hz=float(self._rate), hand=hand_of_set(s)),
+            obj_mesh=self._mesh(s.obj_id), notes=notes,
+        )  # fmt: skip
         if not self._with_arm or s.hand[0] != FRANKA:
             return made
         try:

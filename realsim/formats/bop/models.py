@@ -187,6 +187,11 @@ def _three(value: Any, factor: float, name: str) -> tuple[float, float, float]:
 
 
 def _check_diameter(mesh: Mesh, info: dict[str, Any], file: Path) -> None:
+    extent_mm = mesh.extent * MM_PER_M
+    low, high = extent_mm.max(), np.linalg.norm(extent_mm)
+    given = number(info.get("diameter", low), f"diameter of {file.name} in {INFO_FILE}", 0.0)
+    if high <= LARGEST_DIAMETER_M * MM_PER_M and high / UNIT_RATIO < given < low * UNIT_RATIO:
+        return  # whatever it is between the box's side and its diagonal
     found_mm = diameter(mesh) * MM_PER_M
     if found_mm > LARGEST_DIAMETER_M * MM_PER_M:
         raise UnitError(

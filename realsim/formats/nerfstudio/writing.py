@@ -17,7 +17,7 @@ import numpy as np
 
 from realsim import images
 from realsim.errors import InputError
-from realsim.formats.coloured_points import ColouredPoints, require_points, write_points
+from realsim.formats.coloured_points import require_points, write_points
 from realsim.formats.export_folder import Content, ExportFolder
 from realsim.formats.folders.depth_evidence import read_counts
 from realsim.formats.folders.listing import shown
@@ -29,6 +29,7 @@ from realsim.formats.nerfstudio.transforms import (
     camera_entry,
     transform_matrix,
 )
+from realsim.geometry.clouds import cloud_ply
 from realsim.records import CameraIntrinsics
 
 POINTS_FILE = "sparse_pc.ply"
@@ -95,7 +96,7 @@ def write_nerfstudio(
         written += 1
     points = write_points(
         scene, folder, config.points, "points",
-        lambda cloud: {POINTS_FILE: ply_of(cloud)} if len(cloud.points) else {},
+        lambda c: {POINTS_FILE: cloud_ply(c.points, c.colours)} if len(c.points) else {},
     )  # fmt: skip
     top = _top(scene, shared, unit_m, points)
     folder.write_document(FILE, _document(top, folder))
@@ -163,19 +164,6 @@ def _frame(
     assert frame.T_world_cam is not None  # only posed frames come here
     entry["transform_matrix"] = transform_matrix(frame.T_world_cam)
     return entry, files
-
-
-def ply_of(cloud: ColouredPoints) -> bytes:
-    """Return coloured points as binary PLY [m]."""
-    header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud.points)}\n"
-        + "".join(f"property float {axis}\n" for axis in "xyz")
-        + "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
-        + "end_header\n"
-    )
-    rows = np.zeros(len(cloud.points), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    rows["xyz"], rows["rgb"] = cloud.points, cloud.colours
-    return header.encode("ascii") + rows.tobytes()
 
 
 def _top(

@@ -12,6 +12,7 @@ import numpy as np
 from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
 from realsim.formats.bop.models import load_models, model_file, require_meshes
+from realsim.interop import give_back_memory
 from realsim.records import CameraIntrinsics, GraspSet, ObjectModel, Scene, View
 from realsim.review.content import clouds
 from realsim.review.content.clouds import LeveledCloud
@@ -93,6 +94,7 @@ class SceneContent:
             voxel_m=config.voxel_m, most=config.most_points, coarse=config.coarse_points,
             on_photograph=take,
         )  # fmt: skip
+        give_back_memory()
         instances = {o.instance for o in scene.objects}
         return SceneContent(
             store=store, scene=scene, models=models, meshes=DisplayMeshes(models, config),

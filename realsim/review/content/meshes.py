@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from realsim.arrays import Array, Array32, UInt8, UInt16
 from realsim.errors import DegenerateError
 from realsim.geometry import mesh as mesh_tools
+from realsim.geometry.colors import light_of_bytes
 from realsim.pages.pictures import jpeg_bytes
 from realsim.records import Mesh
 from realsim.review.content.config import SceneConfig
@@ -57,13 +58,8 @@ def display_mesh(mesh: Mesh, config: SceneConfig) -> DisplayMesh:
     few = within_budget(mesh, config)
     vertices = np.ascontiguousarray(few.vertices, dtype=np.float32)
     faces = np.ascontiguousarray(few.faces, dtype=np.uint32)
-    return DisplayMesh(
-        vertices=vertices,
-        faces=faces,
-        glb=glb_of(few, config.most_texels),
-        low=mesh.bounds[0],
-        high=mesh.bounds[1],
-    )
+    glb, (low, high) = glb_of(few, config.most_texels), mesh.bounds
+    return DisplayMesh(vertices=vertices, faces=faces, glb=glb, low=low, high=high)
 
 
 def within_budget(mesh: Mesh, config: SceneConfig) -> Mesh:
@@ -131,7 +127,7 @@ def glb_of(mesh: Mesh, most_texels: int) -> bytes:
     else:
         colors = mesh_tools.vertex_colors(mesh)
         if colors is None:
-            material["baseColorFactor"] = [*_linear(np.array(PLAIN_RGB)).tolist(), 1.0]
+            material["baseColorFactor"] = [*light_of_bytes(PLAIN_RGB).tolist(), 1.0]
         else:
             primitive["attributes"]["COLOR_0"] = parts.add(
                 _colors16(colors), UINT16, "VEC4", VERTICES, normalized=True
@@ -200,14 +196,8 @@ def _texture_jpeg(texture: UInt8, most_texels: int) -> bytes:
     return jpeg_bytes(small, TEXTURE_QUALITY)
 
 
-def _linear(rgb: NDArray[Any]) -> Array:
-    """Return 8-bit sRGB colours as linear light, white = 1 (IEC 61966-2-1)."""
-    c = np.asarray(rgb, dtype=np.float64) / 255.0
-    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-
-
 def _colors16(rgb: UInt8) -> UInt16:
     """Return vertex colours (V, 4) as glTF wants them: linear, of 16 bit, opaque."""
-    table = np.rint(65535 * _linear(np.arange(256))).astype(np.uint16)
+    table = np.rint(65535 * light_of_bytes(np.arange(256))).astype(np.uint16)
     opaque = np.full((len(rgb), 1), 65535, np.uint16)
     return np.concatenate([table[rgb], opaque], axis=1)

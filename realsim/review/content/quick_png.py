@@ -23,6 +23,8 @@ CHUNK_BYTES = 12
 """Length, name and sum of a chunk."""
 IHDR = struct.Struct(">IIBBBBB")
 """Width, height, bits a channel, colour type, compression, filter, interlace."""
+LANES = np.uint64(255 | 255 << 21 | 255 << 42)
+"""The three bytes of `_lanes`: added at once, no colour of a pixel carries over into another."""
 RGB, DEPTH = (8, png.COLOUR), (16, png.GREY)
 """Bits and colour type of what sessions hold."""
 
@@ -137,6 +139,25 @@ def _paeth(a: Any, b: Any, c: Any) -> Any:
 
 
 @njit(nogil=True)
+def _lanes(row: Any, at: int) -> Any:
+    """Return three bytes from a place on as one number, each in 21 bits of its own."""
+    green, blue = np.uint64(row[at + 1]), np.uint64(row[at + 2])
+    return np.uint64(row[at]) | green << np.uint64(21) | blue << np.uint64(42)
+
+
+@njit(nogil=True)
+def _average(coded: Any, above: Any, is_below: Any, row: Any) -> None:
+    """Undo the filter Average in a row of RGB pixels, all three colours at once."""
+    left = np.uint64(0)
+    for x in range(len(row) // 3):
+        both = left + is_below * _lanes(above, 3 * x)
+        left = (_lanes(coded, 3 * x) + (both >> np.uint64(1))) & LANES
+        row[3 * x] = np.uint8(left)
+        row[3 * x + 1] = np.uint8(left >> np.uint64(21))
+        row[3 * x + 2] = np.uint8(left >> np.uint64(42))
+
+
+@njit(nogil=True)
 def _unfilter(filtered: Any, rows: Any, step: int) -> bool:
     """Undo the filters of the rows; return whether all are known.
 
@@ -159,6 +180,8 @@ def _unfilter(filtered: Any, rows: Any, step: int) -> bool:
         elif kind == 2:
             for x in range(length):
                 row[x] = coded[x] + above[x]
+        elif kind == 3 and step == 3:
+            _average(coded, above, np.uint64(y > 0), row)
         elif kind == 3:
             for x in range(length):
                 left = np.int32(row[x - step]) if x >= step else np.int32(0)

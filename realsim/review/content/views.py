@@ -37,15 +37,11 @@ def spread(views: Sequence[View], most: int) -> list[View]:
 
 def strided(intrinsics: CameraIntrinsics, stride: int) -> CameraIntrinsics:
     """Return the camera of an image's every `stride`-th row and column; exact, lens included."""
+    i = intrinsics
     return CameraIntrinsics(
-        width=-(-intrinsics.width // stride),
-        height=-(-intrinsics.height // stride),
-        fx=intrinsics.fx / stride,
-        fy=intrinsics.fy / stride,
-        cx=intrinsics.cx / stride,
-        cy=intrinsics.cy / stride,
-        distortion=intrinsics.distortion,
-    )
+        width=-(-i.width // stride), height=-(-i.height // stride), fx=i.fx / stride,
+        fy=i.fy / stride, cx=i.cx / stride, cy=i.cy / stride, distortion=i.distortion,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, slots=True)

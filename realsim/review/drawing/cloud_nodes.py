@@ -120,10 +120,10 @@ class CloudNodes:
         for handle in self._handles:
             handle.point_size = size
         # In float32: viser's float16 has steps of 1 mm a metre away.
-        self._handles.append(
-            self._api.add_point_cloud(
-                f"/cloud/{k}", self._cloud.points[piece], shown[piece],
-                point_size=size, point_shape="circle", point_shading="flat",
-                precision="float32",
-            )
+        handle = self._api.add_point_cloud(
+            f"/cloud/{k}", self._cloud.points[piece], shown[piece],
+            point_size=size, point_shape="circle", point_shading="flat", precision="float32",
         )  # fmt: skip
+        # All windows share the places: what a handle keeps would be a copy for each of them.
+        handle._impl.props.points = self._cloud.points[piece]  # pyright: ignore
+        self._handles.append(handle)

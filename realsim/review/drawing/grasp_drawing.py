@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.arrays import Array, Array32, Mask, Rgb, Rows
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
+from realsim.geometry.colors import light_of_bytes
 from realsim.records import STAGES, GraspSet
 from realsim.rendering.overlay import evenly_ranked
 from realsim.review.content import quick_png
@@ -166,9 +167,7 @@ def _unhidden(points: Array, depth_m: Array32, content: "SceneContent") -> Mask:
 
 def linear_rgb(rgb: Rgb) -> Rgb:
     """Return sRGB colours as linear light, 8 bit: what the browser takes instances' colours for."""
-    c = rgb.astype(np.float64) / 255.0
-    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-    return np.rint(255.0 * linear).astype(np.uint8)
+    return np.rint(255.0 * light_of_bytes(rgb)).astype(np.uint8)
 
 
 def gripper_mesh() -> tuple[Array32, NDArray[np.uint32]]:

@@ -109,15 +109,9 @@ class ReplayNodes:
     def _add_box(self, part: str, low: Array, high: Array) -> Any:
         box = mesh_tools.box_mesh(low, high)
         return self._scene.add_mesh_simple(
-            f"{self._name}/{part}",
-            box.vertices.astype(np.float32),
-            box.faces,
-            color=HAND_RGB,
-            flat_shading=True,
-            side="double",
-            cast_shadow=False,
-            visible=False,
-        )
+            f"{self._name}/{part}", box.vertices.astype(np.float32), box.faces, color=HAND_RGB,
+            flat_shading=True, side="double", cast_shadow=False, visible=False,
+        )  # fmt: skip
 
 
 def _place(node: Any, T: Array, shown: bool = True) -> None:

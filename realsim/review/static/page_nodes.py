@@ -89,14 +89,11 @@ def _build(api: Any, content: SceneContent, scene: Scene, size: StaticSize) -> N
     if kept:
         # Fewer points of the same scene are drawn larger.
         coarser = float(np.sqrt(len(content.cloud) / kept))
+        size_m = POINT_SHARE * content.cloud.voxel_m * min(coarser, 2.0)
         api.add_point_cloud(
-            "/cloud",
-            content.cloud.points[:kept],
-            content.cloud.colors[:kept],
-            point_size=POINT_SHARE * content.cloud.voxel_m * min(coarser, 2.0),
-            point_shape="circle",
-            precision="float32",
-        )
+            "/cloud", content.cloud.points[:kept], content.cloud.colors[:kept],
+            point_size=size_m, point_shape="circle", precision="float32",
+        )  # fmt: skip
     if scene.plane is not None:
         add_table(api, scene.plane.T_world_table, config)
     for view in spread(content.shown_views, size.cameras):
@@ -108,30 +105,20 @@ def _build(api: Any, content: SceneContent, scene: Scene, size: StaticSize) -> N
 def _add_objects(api: Any, content: SceneContent, scene: Scene, size: StaticSize) -> None:
     """Add every object, and a box in the colour of its verdict that shows which is chosen."""
     config = SceneConfig(
-        most_triangles=size.triangles,
-        most_textured_triangles=5 * size.triangles,
+        most_triangles=size.triangles, most_textured_triangles=5 * size.triangles,
         most_texels=size.texels,
-    )
+    )  # fmt: skip
     meshes = {i: content.models[i].mesh for i in {o.obj_id for o in scene.objects}}
     glbs = {i: glb_of(within_budget(m, config), size.texels) for i, m in meshes.items()}
     for placed in scene.objects:
         wxyz, position = viser_wxyz_position(placed.T_world_obj)
-        api.add_glb(
-            f"/objects/{placed.instance}",
-            glbs[placed.obj_id],
-            wxyz=wxyz,
-            position=position,
-            cast_shadow=False,
-        )
+        stands: Any = {"wxyz": wxyz, "position": position}
+        name, edges = f"/objects/{placed.instance}", box_edges(*meshes[placed.obj_id].bounds)
+        api.add_glb(name, glbs[placed.obj_id], cast_shadow=False, **stands)
         api.add_line_segments(
-            f"/boxes/{placed.instance}",
-            box_edges(*meshes[placed.obj_id].bounds),
-            VERDICT_RGB[placed.verdict],
-            thickness=BOX_LINE_M,
-            wxyz=wxyz,
-            position=position,
-            visible=False,
-        )
+            f"/boxes/{placed.instance}", edges, VERDICT_RGB[placed.verdict],
+            thickness=BOX_LINE_M, visible=False, **stands,
+        )  # fmt: skip
 
 
 def _add_grasps(api: Any, content: SceneContent, scene: Scene, size: StaticSize) -> None:
@@ -145,18 +132,13 @@ def _add_grasps(api: Any, content: SceneContent, scene: Scene, size: StaticSize)
             some = rows[classes == k]
             wxyzs, positions = viser_wxyz_position(T_world_obj @ grasps.Ts_obj_grasp[some])
             api.add_batched_meshes_simple(
-                f"/grasps/{grasps.instance}/{k}",
-                vertices,
-                faces,
+                f"/grasps/{grasps.instance}/{k}", vertices, faces,
                 batched_wxyzs=wxyzs.astype(np.float32),
                 batched_positions=positions.astype(np.float32),
                 batched_scales=gripper_scales(grasps.widths_m[some]),
                 batched_colors=linear_rgb(grasp_rgb(grasps, some)),
-                flat_shading=True,
-                side="double",
-                lod="off",
-                cast_shadow=False,
-            )
+                flat_shading=True, side="double", lod="off", cast_shadow=False,
+            )  # fmt: skip
 
 
 def drawn_grasps(grasps: GraspSet, most: int) -> Int64:

@@ -9,8 +9,10 @@ import logging
 import threading
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal
+from zipfile import ZipFile
 
 import numpy as np
 import viser
@@ -41,6 +43,9 @@ PANEL_PX, PANEL_HEIGHT_PX, EDGE_PX = 300, 530, 8
 """Width and height of the panel on the right, and how far from the window's edges it floats [px]:
 with the list it leaves three quarters of 1280x800 to the scene."""
 log = logging.getLogger(__name__)
+# Viser reads the list of its 5,000 icons anew for every button, at 10 ms; the archive stays open.
+_icons: Any = viser._icons  # pyright: ignore
+_icons.zipfile = SimpleNamespace(ZipFile=cache(lambda *a: contextlib.nullcontext(ZipFile(*a))))
 
 
 @dataclass(frozen=True, eq=False, slots=True)

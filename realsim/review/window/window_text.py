@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from realsim.arrays import Array
+from realsim.geometry.colors import light_of_bytes, luminance
 from realsim.records import ObjectModel, ObjectPose
 from realsim.rendering.overlay import VERDICT_RGB
 from realsim.review.journal import Entry
@@ -74,9 +75,7 @@ def verdict_rgb(verdict: str) -> tuple[int, int, int]:
 
 def _luminance(rgb: Array) -> float:
     """Return the relative luminance of an sRGB colour, white = 1 (WCAG 2.1)."""
-    c = rgb / 255.0
-    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-    return float(linear @ [0.2126, 0.7152, 0.0722])
+    return float(luminance(light_of_bytes(rgb)))
 
 
 def color_dot(verdict: str) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from realsim.geometry.clouds import cloud_ply
 from realsim.scanning.sfm.config import SfmConfig
 from realsim.scanning.sfm.result import Alignment, SfmResult
 from realsim.store import provenance
@@ -36,25 +37,10 @@ def write_result(
         folder: to write into.
         inputs: plain JSON values that say what went in (source, hash of the images, ...).
     """
-    write_bytes(folder / CLOUD, cloud_ply(result))
+    g, unit = result.geometry, "m" if result.is_metric else "arbitrary"  # COLMAP's
+    write_bytes(folder / CLOUD, cloud_ply(g.points, g.colors, f"unit {unit}"))
     write_json(folder / CAMERAS, cameras_json(result))
     write_json(folder / RESULT, result_json(result, config) | {"inputs": inputs})
-
-
-def cloud_ply(result: SfmResult) -> bytes:
-    """Return the sparse points with colours as binary PLY [m, or COLMAP's unit]."""
-    g = result.geometry
-    unit = "m" if result.is_metric else "arbitrary"
-    header = (
-        f"ply\nformat binary_little_endian 1.0\ncomment unit {unit}\n"
-        f"element vertex {len(g.points)}\n"
-        + "".join(f"property float {axis}\n" for axis in "xyz")
-        + "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
-        + "end_header\n"
-    )
-    rows = np.zeros(len(g.points), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    rows["xyz"], rows["rgb"] = g.points, g.colors
-    return header.encode("ascii") + rows.tobytes()
 
 
 def cameras_json(result: SfmResult) -> dict[str, Any]:
