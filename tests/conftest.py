@@ -14,12 +14,14 @@ Tests that only read use the folder as it is. A test that writes takes a copy:
 - `weak_school`: two things whose grasps a weak hand tried; some hold, some slip, some are lost.
 - `demo_session`: a whole `realsim demo` of six views, two objects, eight grasps each: captured,
   calibrated, registered, schooled, annotated, reported. It costs about 50 CPU s: for slow tests.
+- `rs`: the module pyrealsense2; where it cannot be loaded the test is skipped.
 """
 
 import os
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 if sys.dont_write_bytecode:
     # Without byte code on disk every process of the tests compiles all libraries anew: 4 CPU s.
@@ -38,6 +40,17 @@ from shared_sessions import once
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     base = tmp_path_factory.getbasetemp()
     return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
+@pytest.fixture(scope="session")
+def rs() -> Any:
+    from realsim.errors import MissingLibraryError
+    from realsim.interop import import_pyrealsense2
+
+    try:
+        return import_pyrealsense2()
+    except MissingLibraryError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="session")

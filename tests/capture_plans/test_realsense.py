@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from realsim.errors import InputError, MissingLibraryError
+from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
-from realsim.interop import import_pyrealsense2
 from realsim.records import CameraIntrinsics
 from realsim_capture_plans.devices.interfaces import DepthCamera, DeviceError
 from realsim_capture_plans.devices.realsense import (
@@ -26,14 +25,6 @@ from software_realsense import FOCAL, FRAME_MS, HEIGHT, WIDTH, Software, depth_o
 
 DATA = Path(os.environ.get("REALSIM_DATA", "../shared/data"))
 FAST = RealSenseConfig(width=WIDTH, height=HEIGHT, settle_pairs=2, timeout_s=1.0)
-
-
-@pytest.fixture(scope="module")
-def rs() -> Any:
-    try:
-        return import_pyrealsense2()
-    except MissingLibraryError as error:
-        pytest.skip(str(error))
 
 
 Make = Callable[..., Software]

@@ -11,11 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
-from realsim.errors import InputError, MissingLibraryError
+from realsim.errors import InputError
 from realsim.formats.bags import BagChoice, open_bag
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
-from realsim.interop import import_pyrealsense2
 
 BAGS = Path(os.environ.get("REALSIM_DATA", "../shared/data")) / "bags"
 WIDTH, HEIGHT = 320, 240
@@ -69,14 +68,6 @@ def test_a_real_d435s_depth_lies_on_its_colour_image() -> None:
 
 
 # --- the SDK's recorder ---------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def rs() -> Any:
-    try:
-        return import_pyrealsense2()
-    except MissingLibraryError as error:
-        pytest.skip(str(error))
 
 
 def wall(k: int) -> Any:

@@ -259,18 +259,15 @@ def put(at, value):
     return change
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        (put((1, 13), np.nan), "grasp 1 has nan"),
-        (put((2, 4), 2.0), "grasp 2 are no rotation"),
-        (put((0, 1), 80.0), "metres"),
-        (put((0, 16), 0.5), "no object id"),
-        (put((0, 1), -0.1), "negative"),
-        (lambda rows: rows[:, :16], "a GraspGroup is"),
-        (lambda rows: rows.astype(object), "never objects"),
-    ],
-)
+@pytest.mark.parametrize(("change", "says"), [
+    (put((1, 13), np.nan), "grasp 1 has nan"),
+    (put((2, 4), 2.0), "grasp 2 are no rotation"),
+    (put((0, 1), 80.0), "metres"),
+    (put((0, 16), 0.5), "no object id"),
+    (put((0, 1), -0.1), "negative"),
+    (lambda rows: rows[:, :16], "a GraspGroup is"),
+    (lambda rows: rows.astype(object), "never objects"),
+])  # fmt: skip
 def test_a_broken_group_is_refused_with_the_reason(tmp_path, change, says):
     np.save(tmp_path / "g.npy", broken_group(change), allow_pickle=True)
     with pytest.raises(InputError, match=says):
@@ -289,16 +286,13 @@ def small_file(path, **changes):
     return path
 
 
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"points": np.full((2, 3), 80.0)}, "millimetres"),
-        ({"scores": None}, "no array 'scores'"),
-        ({"scores": np.full((2, 300, 12, 4), 90.0)}, "scores reach 90"),
-        ({"offsets": np.full((2, 300, 12, 4, 3), 3.0)}, "in the order angle, depth, width"),
-        ({"view_tried": np.ones(299, bool)}, "the shape"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "says"), [
+    ({"points": np.full((2, 3), 80.0)}, "millimetres"),
+    ({"scores": None}, "no array 'scores'"),
+    ({"scores": np.full((2, 300, 12, 4), 90.0)}, "scores reach 90"),
+    ({"offsets": np.full((2, 300, 12, 4, 3), 3.0)}, "in the order angle, depth, width"),
+    ({"view_tried": np.ones(299, bool)}, "the shape"),
+])  # fmt: skip
 def test_broken_labels_are_refused_with_the_reason(tmp_path, changes, says):
     with pytest.raises(InputError, match=says):
         read_grasp_labels(small_file(tmp_path / "l.npz", **changes))

@@ -45,15 +45,12 @@ def test_a_mask_is_read_back_by_the_repositorys_own_reader(tmp_path):
     assert np.count_nonzero(images.read_grey(path)) == 12
 
 
-@pytest.mark.parametrize(
-    ("window", "origin", "said"),
-    [
-        (np.ones((4, 4), bool), (62, 0), "reaches out"),
-        (np.ones((4, 4), bool), (-1, 0), "reaches out"),
-        (np.ones((4, 4), np.float32), (0, 0), "can be written"),
-        (np.ones((4, 4, 3), np.uint8), (0, 0), "can be written"),
-    ],
-)
+@pytest.mark.parametrize(("window", "origin", "said"), [
+    (np.ones((4, 4), bool), (62, 0), "reaches out"),
+    (np.ones((4, 4), bool), (-1, 0), "reaches out"),
+    (np.ones((4, 4), np.float32), (0, 0), "can be written"),
+    (np.ones((4, 4, 3), np.uint8), (0, 0), "can be written"),
+])  # fmt: skip
 def test_what_cannot_be_written_is_named(window, origin, said):
     with pytest.raises(InputError, match=said):
         encode_window(window, origin, (64, 48))

@@ -29,20 +29,17 @@ def test_the_mark_of_windows_editors_is_no_character(tmp_path: Path) -> None:
     assert read_json(tmp_path / "a.json") == {"a": 1}
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ('{"starts": [{"x": 1}, {"T": [[0, NaN]]}]}', "has NaN at starts[1].T[0][1]: "),
-        ("[1e999]", "double precision"),
-        ("[-" + "9" * 1_000_000 + "]", "1000001 digits"),
-        ("[" * 100_000 + "]" * 100_000, "deeper"),
-        ('{"a":' * 300 + "1" + "}" * 300, "deeper"),
-        ('{"a": 1, "b": 2, "a": 3}', "'a' is there twice"),
-        ('["\\ud800"]', "half a character"),
-        ('["a\\u0000b"]', "zero"),
-        ("[1, 2", "not valid JSON"),
-    ],
-)
+@pytest.mark.parametrize(("text", "says"), [
+    ('{"starts": [{"x": 1}, {"T": [[0, NaN]]}]}', "has NaN at starts[1].T[0][1]: "),
+    ("[1e999]", "double precision"),
+    ("[-" + "9" * 1_000_000 + "]", "1000001 digits"),
+    ("[" * 100_000 + "]" * 100_000, "deeper"),
+    ('{"a":' * 300 + "1" + "}" * 300, "deeper"),
+    ('{"a": 1, "b": 2, "a": 3}', "'a' is there twice"),
+    ('["\\ud800"]', "half a character"),
+    ('["a\\u0000b"]', "zero"),
+    ("[1, 2", "not valid JSON"),
+])  # fmt: skip
 def test_what_cannot_be_computed_with_is_refused(tmp_path: Path, text: str, says: str) -> None:
     path = tmp_path / "a.json"
     path.write_text(text)

@@ -57,25 +57,22 @@ LAUGHS = "a0: &a0 [ha, ha]\n" + "".join(
 )
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        (LAUGHS, "unfolds"),
-        ("&a [*a]", "inside of what it stands for"),
-        ("[" * 2_000, "deeper"),
-        ("!!python/object/apply:os.system ['true']", "tag"),
-        ("a: .nan", "finite"),
-        ("a: 1e999", "finite"),
-        ("a: " + "9" * 1_000_000, "digits"),
-        ("a: 1\nb: 2\na: 3", "'a' twice"),
-        ("a: &x {b: 1}\nc: {<<: *x}", "<<"),
-        ("? [1]\n: 2", "as a key"),
-        ("--- 1\n--- 2", "several documents"),
-        ("a: [1, 2", "not valid YAML"),
-        ("a: \x07", "not valid YAML"),
-        ("!!int x", "as int"),
-    ],
-)
+@pytest.mark.parametrize(("text", "says"), [
+    (LAUGHS, "unfolds"),
+    ("&a [*a]", "inside of what it stands for"),
+    ("[" * 2_000, "deeper"),
+    ("!!python/object/apply:os.system ['true']", "tag"),
+    ("a: .nan", "finite"),
+    ("a: 1e999", "finite"),
+    ("a: " + "9" * 1_000_000, "digits"),
+    ("a: 1\nb: 2\na: 3", "'a' twice"),
+    ("a: &x {b: 1}\nc: {<<: *x}", "<<"),
+    ("? [1]\n: 2", "as a key"),
+    ("--- 1\n--- 2", "several documents"),
+    ("a: [1, 2", "not valid YAML"),
+    ("a: \x07", "not valid YAML"),
+    ("!!int x", "as int"),
+])  # fmt: skip
 def test_what_unfolds_runs_or_is_no_number_is_refused(tmp_path: Path, text: str, says: str) -> None:
     path = tmp_path / "a.yaml"
     path.write_text(text)
