@@ -115,14 +115,10 @@ def ycbv_view(scene_id: int) -> tuple[KnownView, PlaneView]:
     placed = [*objects, _table(plane, intrinsics)]
     labels = LabelRenderer(placed).render(intrinsics, T)
     view = KnownView(
-        measured_m=frame.depth_m,
-        exact_m=labels.depth_m,
-        ids=labels.ids,
-        kinds={p.instance: models[p.obj_id].name for p in truth},
-        intrinsics=intrinsics,
-        scene=RayScene(placed),
-        T_world_cam=T,
-    )
+        measured_m=frame.depth_m, exact_m=labels.depth_m, ids=labels.ids,
+        kinds={p.instance: models[p.obj_id].name for p in truth}, intrinsics=intrinsics,
+        scene=RayScene(placed), T_world_cam=T,
+    )  # fmt: skip
     return view, plane
 
 
@@ -148,13 +144,9 @@ def fitted_to(
     """Return noise and losses of a sensor from frames of YCB-Video."""
     first = views[0][0]
     noise = fit_depth_model(
-        [v.measured_m for v, _ in views],
-        first.intrinsics,
-        XTION,
-        unit_m=1e-3,
-        regions=[p.area for _, p in views],
-        names=[f"view {k}" for k in range(len(views))],
-    )
+        [v.measured_m for v, _ in views], first.intrinsics, XTION, unit_m=1e-3,
+        regions=[p.area for _, p in views], names=[f"view {k}" for k in range(len(views))],
+    )  # fmt: skip
     model = replace(noise.model, border=False, loss_patch_px=6.0)
     return noise, fit_losses(model, [v for v, _ in views], EDGES)
 
@@ -165,13 +157,9 @@ def _ycbv(views: Sequence[tuple[KnownView, PlaneView]], tested: int, seed: int) 
     _, losses = fitted_to(others)
     view, _ = views[tested]
     simulated = losses.model.measure(
-        view.exact_m,
-        view.intrinsics,
-        np.random.default_rng([seed, tested]),
-        scene=view.scene,
-        T_world_cam=view.T_world_cam,
-        reflectance=losses.reflectance_of(view),
-    )
+        view.exact_m, view.intrinsics, np.random.default_rng([seed, tested]), scene=view.scene,
+        T_world_cam=view.T_world_cam, reflectance=losses.reflectance_of(view),
+    )  # fmt: skip
     objects = view.ids > BACKGROUND
     region = view.exact_m > 0
     names = " ".join(str(YCBV_FRAMES[k]) for k in range(len(views)) if k != tested)

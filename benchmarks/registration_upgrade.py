@@ -142,12 +142,9 @@ def upgraded(frame: Frame) -> tuple[Registration, list[Judged]]:
     offset = found.report.get("refinement", {}).get("depth_offset_per_m", 0.0)
     z = DepthBias(offset_per_m=offset).corrected(frame.picture.depth_m).astype(np.float32)
     outcomes = decide(
-        [replace(frame.picture, depth_m=z)],
-        frame.models,
-        frame.annotations,
-        found.scene.objects,
+        [replace(frame.picture, depth_m=z)], frame.models, frame.annotations, found.scene.objects,
         found.scene.plane,
-    )
+    )  # fmt: skip
     rows: list[Judged] = []
     for right, given, outcome in zip(frame.right, frame.annotations, outcomes, strict=True):
         model = frame.models[right.obj_id]

@@ -17,6 +17,8 @@ Parts and the figures they give (keys of the JSON's "figures"):
            open_mb, open_sent_mb    peak of the server's resident memory; bytes sent
   big      big_open_cpu_s, big_open_mb, big_sent_mb    the same with 2 million points and all
                                5,000 grasps drawn, nothing kept
+  windows  windows_growth      resident memory after 60 more windows were opened and closed, one by
+                               one, over that after the first
   clicks   click_ms            for how long a click keeps the server busy, the slowest kind of a
                                dozen, median of its repetitions; 100,000 points, 256 frustums
            click_median_ms     the median kind
@@ -38,6 +40,7 @@ from review_opening import clean_up
 
 PACKAGES = ("realsim", "numpy", "viser", "websockets", "isal", "opencv-python-headless")
 FIGURES = {
+    "windows_growth": Figure(unit="x", goal=Goal(high=1.15)),
     "click_ms": Figure(unit="ms", goal=Goal(high=50.0)),
     "click_median_ms": Figure(unit="ms"),
     "click_wall_ms": Figure(unit="ms"),
@@ -59,6 +62,7 @@ PARTS = {
     "opening": "review_opening:opening",
     "clicks": "review_clicks:clicks",
     "big": "review_opening:big_scene",
+    "windows": "review_opening:windows",
     "page": "review_page:page",
 }
 

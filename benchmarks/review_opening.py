@@ -28,6 +28,8 @@ BIG = ("0.0003", "2000000", "2000000")
 """The same with 2 million points, all of them sent."""
 QUIET_S = 2.0
 """Nothing is sent for so long: the scene is there."""
+WINDOWS, SHORT_S = 60, 0.5
+"""Windows that are opened one after the other, and for how long nothing is sent to each at last."""
 CLICK_QUIET_S = 0.3
 """Nothing is sent for so long after a click: it is answered."""
 IMPORTS = (
@@ -48,6 +50,7 @@ class Cost:
 
     cpu_s: float
     peak_mb: float
+    now_mb: float
 
 
 class Server:
@@ -181,6 +184,21 @@ def opening(arguments: Namespace) -> Found:
     found.add("open_sent_mb", browser.received_bytes / 1e6)
     warm, _ = _opened(folder, USUAL)
     found.add("open_warm_cpu_s", warm.cpu_s, "photographs kept by an earlier opening")
+    return found
+
+
+def windows(arguments: Namespace) -> Found:
+    """Open and close one window after the other; compare the memory with that after the first."""
+    found, held = Found(), list[float]()
+    with serving(scene_of(arguments), USUAL) as server:
+        for _ in range(1 + WINDOWS):
+            browser = Browser.open(server.url)
+            browser.until_scene(SHORT_S)
+            browser.close()
+            time.sleep(SHORT_S)
+            held.append(server.cost().now_mb)
+    over = ", ".join(f"{mb:.0f}" for mb in held[::10])
+    found.add("windows_growth", held[-1] / held[0], f"{WINDOWS} windows; every tenth: {over} MB")
     return found
 
 

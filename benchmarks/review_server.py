@@ -28,8 +28,9 @@ def main() -> None:
     for _ in sys.stdin:
         # Not ru_maxrss: that one survives exec, so it would hold what made the session.
         status = Path("/proc/self/status").read_text("ascii", "replace")
-        peak = int(status.split("VmHWM:")[1].split()[0]) / KB_PER_MB
-        print(json.dumps({"cpu_s": time.process_time(), "peak_mb": peak}), flush=True)
+        peak, now = (int(status.split(k)[1].split()[0]) / KB_PER_MB for k in ("VmHWM:", "VmRSS:"))
+        cost = {"cpu_s": time.process_time(), "peak_mb": peak, "now_mb": now}
+        print(json.dumps(cost), flush=True)
     server.stop()
 
 

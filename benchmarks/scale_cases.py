@@ -81,15 +81,10 @@ def make_case(name: str, seed: int, width: int = FULL_WIDTH) -> Case:
     exact, other = (_in_units(m, R_given, scale) for m in (mesh, bent))
     rng = stream(name, seed, "start")
     return Case(
-        name=name,
-        seed=seed,
-        views=views,
-        given_exact=exact,
-        given_distorted=other,
-        true_scale=scale,
-        start_exact=_start(exact, scale, T_world_given, rng),
+        name=name, seed=seed, views=views, given_exact=exact, given_distorted=other,
+        true_scale=scale, start_exact=_start(exact, scale, T_world_given, rng),
         start_distorted=_start(other, scale, T_world_given, rng),
-    )
+    )  # fmt: skip
 
 
 def _in_units(mesh: Mesh, R: Array, scale: float) -> Mesh:

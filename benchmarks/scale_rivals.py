@@ -62,13 +62,10 @@ def icp_scale(mesh: Mesh, start: Similarity, scene: Array, rng: np.random.Genera
     T[:3, :3] *= start.scale
     for reach in REACH_M:
         result = registration.registration_icp(
-            _cloud(points),
-            target,
-            reach,
-            T,
+            _cloud(points), target, reach, T,
             registration.TransformationEstimationPointToPoint(with_scaling=True),
             registration.ICPConvergenceCriteria(max_iteration=ITERATIONS),
-        )
+        )  # fmt: skip
         T = np.asarray(result.transformation)
     return float(np.cbrt(np.linalg.det(T[:3, :3])))
 

@@ -272,12 +272,10 @@ def margins(seed: int, keep: Path, quick: bool) -> Found:
     """Return the rank correlations with their intervals."""
     case = school_case(seed, keep, quick)
     config = SchoolConfig(
-        seed=seed,
-        max_candidates=SWEPT_QUICK if quick else SWEPT,
-        candidates=candidate_config(quick),
-        slip=slip_config(ENGINE, "plain", 1.0),
+        seed=seed, max_candidates=SWEPT_QUICK if quick else SWEPT,
+        candidates=candidate_config(quick), slip=slip_config(ENGINE, "plain", 1.0),
         sweep=SweepConfig(),
-    )
+    )  # fmt: skip
     with spent() as cost:
         sets = run_school(case.scene, case.models, config, workers=2, solids=case.solids)
     # What the arm does not reach has no margin, which may be all of an object.

@@ -101,12 +101,9 @@ def _chain(engine: str, case: SchoolCase, size: Size, start: Spent, **robot: Any
     slip = slip_config(engine, "plain", 1.0)
     with spent() as cost:
         sets = run_school(
-            case.scene,
-            case.models,
-            replace(size.config(engine, slip), **robot),
-            workers=PROCESSES,
+            case.scene, case.models, replace(size.config(engine, slip), **robot), workers=PROCESSES,
             solids=case.solids,
-        )
+        )  # fmt: skip
     tried = sum(int(executed(s).sum()) for s in sets)
     candidates = sum(len(s) for s in sets)
     passed = np.mean(np.concatenate([s.scores[executed(s)] >= 1.0 for s in sets]))

@@ -54,12 +54,9 @@ def run_suite(job: SuiteJob) -> ValidationReport:
         return validate(settings_of(job.engine), config)
     # The finger's bare box, the object's true mass, and nothing but the friction set.
     settings = BulletSettings(
-        rate_hz=240.0,
-        iterations=50,
-        friction_anchor=False,
-        collision_margin_m=0.001,
+        rate_hz=240.0, iterations=50, friction_anchor=False, collision_margin_m=0.001,
         replay=Replay(),
-    )
+    )  # fmt: skip
     bare = SlipConfig(sure=None, physics=SlipPhysics(pads=None, mass_floor_kg=0.0))
     return validate(settings, replace(config, slip=bare))
 

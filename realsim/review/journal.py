@@ -97,16 +97,8 @@ class Entry:
     def _check_types(self) -> None:
         """Raise if a field is of another type, too long, or a number that cannot be meant."""
         texts = (
-            "id",
-            "time",
-            "reviewer",
-            "action",
-            "subject",
-            "comment",
-            "undoes",
-            "symmetry",
-            "how",
-        )
+            "id", "time", "reviewer", "action", "subject", "comment", "undoes", "symmetry", "how",
+        )  # fmt: skip
         for name in texts:
             value, most = getattr(self, name), MOST_COMMENT if name == "comment" else MOST_NAME
             if not isinstance(value, str) or len(value) > most:

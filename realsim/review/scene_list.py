@@ -128,6 +128,15 @@ def next_undecided(
     return None
 
 
+def first_wanted(rows: Sequence[ObjectRow]) -> ObjectRow | None:
+    """Return the object that a new window shows: the worst that waits for a person, else the worst.
+
+    None = there is none at all.
+    """
+    ordered = worst_first(rows)
+    return next_undecided(ordered, None, 1) or next(iter(ordered), None)
+
+
 def counts(rows: Sequence[ObjectRow]) -> tuple[int, int]:
     """Return how many objects a person has judged, and how many there are."""
     return sum(r.is_decided for r in rows), len(rows)

@@ -86,6 +86,7 @@ class ReviewServer:
         self._begun = {e.id for s in self._sessions for e in s.standing.state.entries}
         self._server: viser.ViserServer | None = None
         self._windows: dict[int, Window] = {}
+        self._reader = threading.Thread()
         self._lock = threading.Lock()
         self._motions_lock = threading.Lock()
         self._stop = threading.Event()
@@ -173,6 +174,8 @@ class ReviewServer:
         server.on_client_connect(self._came)
         server.on_client_disconnect(self._went)
         threading.Thread(target=self._watch, name="review-journals", daemon=True).start()
+        self._reader = threading.Thread(target=self._read_first, name="review-first", daemon=True)
+        self._reader.start()
 
     def stop(self) -> None:
         """Stop listening; the journals stay."""
@@ -184,8 +187,30 @@ class ReviewServer:
             with contextlib.redirect_stdout(io.StringIO()):
                 self._server.stop()
             self._server = None
+        if self._reader.is_alive():
+            self._reader.join()
         with self._lock:
             self._windows.clear()
+
+    def _read_first(self) -> None:
+        """Read what a browser shows first, while it still loads the page.
+
+        What goes wrong is said when a window opens that scene.
+        """
+
+        def go_on(*_: int) -> None:
+            if self._stop.is_set():
+                raise InputError("the server was stopped.")
+
+        try:
+            first = scene_list.first_wanted([row for s in self._sessions for row in s.rows()])
+            session = self._sessions[0 if first is None else first.session]
+            content = session.content(go_on)
+            for placed in session.registered.objects:
+                go_on()
+                _ = content.meshes[placed.obj_id]
+        except Exception as error:
+            log.debug("the first scene was not read ahead: %r", error)
 
     def decisions(self) -> list[Entry]:
         """Return the lines that were written to the journals since the server was made.

@@ -323,3 +323,8 @@ def test_an_unregistered_session_is_refused(store: SessionStore, tmp_path: Path)
     )
     with pytest.raises(InputError, match=r"scene\.json"):
         ReviewServer(SessionStore.create(tmp_path / "s", raw_session))
+
+
+def test_the_first_scene_is_read_before_any_browser_comes(server: ReviewServer) -> None:
+    server._reader.join(60)  # type: ignore[reportPrivateUsage]
+    assert server.sessions[0]._content is not None  # type: ignore[reportPrivateUsage]

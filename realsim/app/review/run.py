@@ -45,14 +45,9 @@ def run_review(request: ReviewRequest, console: Console) -> None:
     token = _token(request)
     stores, remarks = open_all(request.folders)
     server = ReviewServer(
-        stores,
-        host=request.host,
-        port=request.port,
-        token=token,
-        reviewer=request.reviewer,
-        motions=SessionMotions.of_session,
-        remarks=remarks,
-    )
+        stores, host=request.host, port=request.port, token=token, reviewer=request.reviewer,
+        motions=SessionMotions.of_session, remarks=remarks,
+    )  # fmt: skip
     for remark in remarks:
         console.warn(_plain(remark))
     with _until_interrupted() as ended:

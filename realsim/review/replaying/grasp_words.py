@@ -56,14 +56,9 @@ def grasp_words(grasps: GraspSet, row: int, name: str = "") -> str:
         raise IndexError(f"row {row} of {len(grasps)} grasps")
     of = f"{escaped(name)} (instance {grasps.instance})" if name else f"instance {grasps.instance}"
     lines = [
-        f"**Grasp {row}** of {len(grasps)}, {of}",
-        "",
-        why_words(grasps, row),
-        "",
-        *_p_hold(grasps, row),
-        _score(grasps, row),
-        f"- {_reach(grasps, row)}",
-    ]
+        f"**Grasp {row}** of {len(grasps)}, {of}", "", why_words(grasps, row), "",
+        *_p_hold(grasps, row), _score(grasps, row), f"- {_reach(grasps, row)}",
+    ]  # fmt: skip
     lines.append(f"- distance of the contacts {1e3 * grasps.widths_m[row]:.1f} mm")
     lines += ["", *slip_table(grasps, row)]
     measured = measure_lines(grasps, row)

@@ -10,6 +10,10 @@
       return open.call(this, kind, String(kind).startsWith("webgl") ? { ...wish, antialias: false } : wish);
     };
   if (drawn) drawn.getExtension("WEBGL_lose_context")?.loseContext();
+  // Viser would light the scene by a photograph until the server's word comes: that one is not read.
+  const fetched = window.fetch;
+  window.fetch = (what, ...rest) =>
+    String(what.url ?? what).startsWith("data:image/jpeg") ? new Promise(() => {}) : fetched(what, ...rest);
   // Keys that come before the scene stands wait for it: only then is somebody there to hear them.
   const waiting = [], stands = () => document.querySelector("[data-realsim-photograph]");
   addEventListener("keydown", (event) => {

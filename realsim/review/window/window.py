@@ -119,8 +119,7 @@ class Window:
             self._name.value = kept
 
     def _go_to_worst(self) -> None:
-        rows = scene_list.worst_first(self.rows())
-        first = scene_list.next_undecided(rows, None, 1) or (rows[0] if rows else None)
+        first = scene_list.first_wanted(self.rows())
         if first is not None:
             self.go_to(*first.key)
         elif self.server.sessions:
