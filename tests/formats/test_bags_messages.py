@@ -74,15 +74,12 @@ RGB = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
 
 
 @pytest.mark.parametrize("padding", [0, 5])
-@pytest.mark.parametrize(
-    ("encoding", "sent"),
-    [
-        ("rgb8", RGB),
-        ("bgr8", RGB[..., ::-1]),
-        ("rgba8", np.dstack([RGB, RGB[..., :1]])),
-        ("bgra8", np.dstack([RGB[..., ::-1], RGB[..., :1]])),
-    ],
-)
+@pytest.mark.parametrize(("encoding", "sent"), [
+    ("rgb8", RGB),
+    ("bgr8", RGB[..., ::-1]),
+    ("rgba8", np.dstack([RGB, RGB[..., :1]])),
+    ("bgra8", np.dstack([RGB[..., ::-1], RGB[..., :1]])),
+])  # fmt: skip
 def test_colour_encodings(encoding: str, sent: Any, padding: int) -> None:
     found = pixels.rgb_of(raw_image(sent, encoding, padding), False, "x")
     assert np.array_equal(found, RGB)
