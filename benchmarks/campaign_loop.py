@@ -53,7 +53,7 @@ def upgrade(args: argparse.Namespace) -> Found:
     frames = found.real_data("upgrade", "scenes/ycbv_mini")
     if frames is None:
         return found
-    size = ("--grasps", 2, "--scenes", "50") if args.quick else ("--grasps", 10)
+    size = ("--grasps", 2, "--only-scenes", "50") if args.quick else ("--grasps", 10)
     with tempfile.TemporaryDirectory(prefix="campaign_upgrade_") as place:
         _, cpu_s = timed("upgrade", frames, "--out", Path(place) / "upgraded", *size)
     found.add("upgrade_cpu_s", cpu_s, f"load {os.getloadavg()[1]:.1f}")
