@@ -51,7 +51,7 @@ QUICK = ("export", "stats")
 Fields = set[tuple[str, str]]
 """Files and the fields in which they differ."""
 TIMES = {("shots/robot.jsonl", f"{k}.{field}") for k in (0, 1) for field in ("time_s", "sha256")}
-"""Of views that are captured, and the checksums that follow from them."""
+"""Times of captured views, and the checksums that follow from them."""
 
 
 def make_inputs(folder: Path) -> None:
@@ -79,7 +79,7 @@ def run(work: Path, words: str, how: int = 0, much: float = 0.0) -> int:
         work: folder in which it runs.
         words: behind `realsim`.
         how: signal that ends it after `much` seconds; `FULL`: no file is longer than `much` bytes.
-        much: see there.
+        much: time [s] or size [bytes], as `how` says; 0 = it is left alone.
     """
     heard, spoken = os.pipe()  # what is printed needs no room
     pid = os.fork()

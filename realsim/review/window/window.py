@@ -43,9 +43,10 @@ PANEL_PX, PANEL_HEIGHT_PX, EDGE_PX = 300, 530, 8
 """Width and height of the panel on the right, and how far from the window's edges it floats [px]:
 with the list it leaves three quarters of 1280x800 to the scene."""
 log = logging.getLogger(__name__)
-# Viser reads the list of its 5,000 icons anew for every button, at 10 ms; the archive stays open.
-_icons: Any = viser._icons  # pyright: ignore
-_icons.zipfile = SimpleNamespace(ZipFile=cache(lambda *a: contextlib.nullcontext(ZipFile(*a))))
+# Viser reads the list of its 5,000 icons anew for every icon, at 10 ms; the archive stays open.
+with contextlib.suppress(AttributeError):  # another viser reads them otherwise
+    _icons: Any = viser._icons  # pyright: ignore
+    _icons.zipfile = SimpleNamespace(ZipFile=cache(lambda *a: contextlib.nullcontext(ZipFile(*a))))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
