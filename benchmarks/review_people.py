@@ -53,8 +53,12 @@ CAMERA = CameraIntrinsics(
 LONGEST_S = 300.0
 FEW = SceneConfig(coarse_points=4_000, shown_points=4_000, most_points=20_000)
 """So little that a processor draws the scene; the photographs are as they are."""
-CAPTION = "(document.querySelector('.rs-caption') || {innerText: ''}).innerText"
-CIRCLES = "document.querySelector('.rs-pane').dataset.missing"
+HERE = """(() => {
+    const all = document.querySelector(".rs-photograph"); if (!all) return "";
+    const said = all.querySelector(".rs-caption").innerText;
+    return (all.dataset.whose || "") + " \u00b7 " + said; })()"""
+"""Scene and object whose photographs are shown, its name, and what is said of the view."""
+CIRCLES = "document.querySelector('.rs-pane')?.dataset.missing"
 FIGURES = {
     "defects_found_share": Figure(unit="", goal=Goal(low=0.95)),
     "false_alarms_share": Figure(unit="", goal=Goal(high=0.05)),
@@ -159,11 +163,11 @@ def _review(page: Any, names: list[str]) -> tuple[int, float, dict[str, list[Any
     start, keys, before = time.perf_counter(), 1, ""
     page.keyboard.press("g")
     for _ in range(8 * len(names)):
-        _until(page, lambda b=before: "against the pose" in _here(page) and _here(page) != b)
-        before = _here(page)
-        caption = page.evaluate(CAPTION).split(" \u00b7 ")
-        view, share = int(caption[1].split()[1]), float(caption[2].split()[0])
-        scene = page.evaluate("new URLSearchParams(location.hash.slice(1)).get('scene')")
+        # After a judgement an object's own views are compared again: that is not the next one.
+        _until(page, lambda b=before: _here(page).split(" \u00b7 ")[0] not in ("", b))
+        before, _, of_view, against, *_ = _here(page).split(" \u00b7 ")
+        view, share = int(of_view.split()[1]), float(against.split()[0])
+        scene = names[int(before.split("/")[0])]
         _until(page, lambda: page.evaluate(CIRCLES) is not None)
         circles[scene].append((view, json.loads(page.evaluate(CIRCLES))))
         page.keyboard.press("x" if share > AGAINST else "y")
@@ -175,7 +179,7 @@ def _review(page: Any, names: list[str]) -> tuple[int, float, dict[str, list[Any
 
 
 def _here(page: Any) -> str:
-    return page.evaluate(f"[location.hash.match(/scene=[^&]*/), {CAPTION}].join()")
+    return page.evaluate(HERE)
 
 
 def _until(page: Any, holds: Any) -> None:

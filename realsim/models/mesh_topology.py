@@ -193,20 +193,15 @@ def _merged_rims(
     positions: Array, edges: dict[str, Any], distance: float
 ) -> tuple[Int64, Int64] | None:
     """Return which positions stay and the new number of each, or None if no rims touch."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import KDTree
-
     rim = np.unique(edges["edge_ends"][edges["edge_uses"] == 1])
     if len(rim) < 2 or not distance > 0:
         return None
+    from scipy.spatial import KDTree
+
     pairs = KDTree(positions[rim]).query_pairs(distance, output_type="ndarray")
     if len(pairs) == 0:
         return None
-    i, j = rim[pairs[:, 0]], rim[pairs[:, 1]]
-    n = len(positions)
-    graph = coo_matrix((np.ones(len(i), dtype=np.int8), (i, j)), shape=(n, n))
-    _, label = connected_components(graph, directed=False)
+    _, label = components(len(positions), rim[pairs[:, 0]], rim[pairs[:, 1]])
     first, new_index = equal_rows(label[:, None])
     return first, new_index
 

@@ -9,6 +9,7 @@ looked at, so that what another reviewer decides appears by itself, even one at 
 """
 
 import contextlib
+import gc
 import io
 import json
 import logging
@@ -157,6 +158,8 @@ class ReviewServer:
         if self._server is not None:
             return
         port = local_pages.free_port(self._host, self._port)
+        # Looking for garbage among all that is sent costs a tenth of the opening; 700 is usual.
+        gc.set_threshold(max(50_000, gc.get_threshold()[0]))
         self._stop.clear()
         # Viser prints a banner with its address; the caller says what is to be said.
         with (

@@ -48,6 +48,7 @@ def server() -> Iterator[viser.ViserServer]:
 def nodes(server: viser.ViserServer, shown: SceneContent) -> SceneNodes:
     built = SceneNodes(server.scene, shown, CONFIG)
     built.build()
+    built.refine_cloud(CONFIG.shown_points)
     assert built.wait_for_cloud(20)
     return built
 
@@ -242,7 +243,10 @@ def test_clear_takes_everything_away_and_stops_the_background(
     assert left <= {"/objects", "/ellipsoids"}  # empty anchors that viser made itself
     built.clear()
     built.build()
+    asked: list[bool] = []
+    built.refine_cloud(CONFIG.shown_points, lambda: asked.append("/cloud/1" in states(server)))
     assert built.wait_for_cloud(20) and "/cloud/1" in states(server)
+    assert asked == [False]  # finer points leave only then
 
 
 def test_each_browser_has_its_own_scene_and_the_coarse_cloud_comes_first(

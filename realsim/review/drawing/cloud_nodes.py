@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -42,12 +43,17 @@ class CloudNodes:
             if self._pieces:
                 self._send(0)
 
-    def refine(self, points: int) -> None:
-        """Send pieces in the background until there are about so many points."""
+    def refine(self, points: int, after: Callable[[], None] = lambda: None) -> None:
+        """Send pieces in the background until there are about so many points.
+
+        Args:
+            points: how many.
+            after: returns when the first of them may leave; called in the background.
+        """
         with self._lock:
             self._wanted = max(self._wanted, sum(p.start < points for p in self._pieces))
             if self._sender is None and len(self._handles) < self._wanted:
-                self._sender = threading.Thread(target=self._send_rest, daemon=True)
+                self._sender = threading.Thread(target=self._send_rest, args=(after,), daemon=True)
                 self._sender.start()
 
     def wait(self, timeout_s: float | None) -> bool:
@@ -87,8 +93,9 @@ class CloudNodes:
                 self._root.remove()
                 self._root = None
 
-    def _send_rest(self) -> None:
+    def _send_rest(self, after: Callable[[], None]) -> None:
         """Send one piece after the other while more are wanted."""
+        after()
         while True:
             with self._lock:
                 enough = len(self._handles) >= self._wanted

@@ -75,7 +75,7 @@ class SceneNodes:
         self._lock = threading.RLock()
 
     def build(self) -> None:
-        """Send the scene, what is seen at once first; the finer cloud follows in the background."""
+        """Send the scene with the coarse cloud; `refine_cloud` sends the rest."""
         with self._lock:
             self._api.set_up_direction(self._content.look.up)
             if self._content.scene.plane is not None:
@@ -85,7 +85,6 @@ class SceneNodes:
                 self._add_object(placed.instance, placed.T_world_obj)
             self._cloud.build()
             self._add_cameras()
-        self._cloud.refine(self._config.shown_points)
 
     def clear(self) -> None:
         """Take everything away, and stop sending."""
@@ -257,9 +256,16 @@ class SceneNodes:
         """Show or hide the measured points."""
         self._cloud.show(visible)
 
-    def refine_cloud(self, points: int | None = None) -> None:
-        """Send finer levels in the background, up to so many points in all; None = all."""
-        self._cloud.refine(len(self._content.cloud) if points is None else points)
+    def refine_cloud(
+        self, points: int | None = None, after: Callable[[], None] = lambda: None
+    ) -> None:
+        """Send finer levels in the background, up to so many points in all; None = all.
+
+        Args:
+            points: how many.
+            after: returns when the first of them may leave; called in the background.
+        """
+        self._cloud.refine(len(self._content.cloud) if points is None else points, after)
 
     def wait_for_cloud(self, timeout_s: float | None = None) -> bool:
         """Wait until what was asked for of the cloud is sent; return whether it is."""

@@ -4,11 +4,14 @@
   const open = HTMLCanvasElement.prototype.getContext, probe = document.createElement("canvas");
   const drawn = probe.getContext("webgl2") || probe.getContext("webgl");
   const named = drawn && drawn.getExtension("WEBGL_debug_renderer_info");
-  if (named && /swiftshader|llvmpipe|software/i.test(drawn.getParameter(named.UNMASKED_RENDERER_WEBGL)))
-    // Smoothed edges cost a processor as much as the rest of the scene.
+  const isPlain = named && /swiftshader|llvmpipe|software/i.test(drawn.getParameter(named.UNMASKED_RENDERER_WEBGL));
+  if (isPlain) {
+    // Smoothed edges, shadows and fading cost a processor as much as the rest of the scene.
+    document.documentElement.classList.add("realsim-plain");
     HTMLCanvasElement.prototype.getContext = function (kind, wish) {
-      return open.call(this, kind, String(kind).startsWith("webgl") ? { ...wish, antialias: false } : wish);
+      return open.call(this, kind, String(kind).startsWith("webgl") ? { ...wish, antialias: false, preserveDrawingBuffer: false } : wish);
     };
+  }
   if (drawn) drawn.getExtension("WEBGL_lose_context")?.loseContext();
   // Viser would light the scene by a photograph until the server's word comes: that one is not read.
   const fetched = window.fetch;
@@ -32,7 +35,8 @@
   const is = (key) => String(key).endsWith(PLACE);
   // Viser takes its server's address from the page's: at that moment there must be no fragment.
   let place = location.hash.slice(1);
-  history.replaceState(null, "", location.pathname);
+  // As coarse as viser itself would draw after some seconds of being slow.
+  history.replaceState(null, "", location.pathname + (isPlain ? "?fixedDpr=0.75" : ""));
   const said = () => new URLSearchParams(place);
   const tell = (fields) => {
     place = fields.toString();

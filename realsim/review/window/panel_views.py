@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 NONE = "-"
 OPEN = """<div data-realsim-photograph data-window="{client}" data-state="{state}"
-data-instance="{instance}" data-name="{name}" data-turn="{turn}" data-view="{view}">
+data-scene="{scene}" data-instance="{instance}" data-name="{name}" data-turn="{turn}"
+data-view="{view}">
 <button data-realsim-open class="realsim-open">Photographs at full size (G)</button></div>"""
 
 
@@ -54,7 +55,8 @@ class PhotographLink:
         content = OPEN.format(
             client=window.client.client_id,
             state=f"{zlib.crc32(state.encode()):08x}",
-            instance=window.selected if chosen else "",
+            scene=window.session.number,
+            instance=_instance(window.selected),
             name=html.escape(f"{window.selected} {window.model_of(window.placed).name}")
             if chosen
             else "",
@@ -81,17 +83,22 @@ class PhotographLink:
         if not window.content.views:
             raise InputError(window_text.NO_PHOTOGRAPHS)
         found, objects = window.session.photographs(), window.shown_objects()
+        selected, whose = window.selected, f"{window.session.number}/{_instance(window.selected)}"
         view = int(numbers[0]) if numbers else 0
         if what == "thumb":
             return "image/jpeg", window.content.thumbnails[view]
         if what in KINDS:
             return "image/jpeg", found.picture(view, what, objects)
         answers = {
-            "strip": lambda: found.strip(window.selected, objects),
+            "strip": lambda: {"whose": whose} | found.strip(selected, objects),
             "outlines": lambda: found.outlines(view, objects),
             "spot": lambda: found.spot(view, (numbers[1], numbers[2]), objects),
         }
         return "application/json", json.dumps(answers[what]()).encode()
+
+
+def _instance(selected: int | None) -> str:
+    return "" if selected is None else str(selected)
 
 
 class ViewsPanel:

@@ -6,9 +6,10 @@
   const SVG = "http://www.w3.org/2000/svg";
   let root = null, strip = null, at = 0, layer = "photo", isThree = false, spot = null, lines = true;
   let wanted = window.realsimPlace.photo(), turn = "0";
-  let zoom = 0, middle = [0, 0], seen = { state: "", instance: "" }, panes = [], asked = 0;
+  let zoom = 0, middle = [0, 0], seen = { state: "", whose: "" }, panes = [], asked = 0;
 
   const shown = () => document.querySelector("[data-realsim-photograph]");
+  const whose = () => `${shown().dataset.scene}/${shown().dataset.instance}`;
   const make = (tag, kind, parent, text) => {
     const e = document.createElement(tag);
     if (kind) e.className = kind;
@@ -91,7 +92,7 @@
       p.source = source;
       p.box.classList.add("rs-wait");
       ask(layer, p.row.view).then((picture) => {
-        if (p.source !== source) return picture && URL.revokeObjectURL(picture);
+        if (p.source !== source || !panes.includes(p)) return picture && URL.revokeObjectURL(picture);
         p.box.classList.remove("rs-wait");
         if (!picture) return;
         URL.revokeObjectURL(p.image.src);
@@ -103,7 +104,7 @@
     if (p.drawn === drawn) return;
     p.drawn = drawn;
     ask("outlines", p.row.view).then((objects) => {
-      if (!objects || p.drawn !== drawn) return;
+      if (!objects || p.drawn !== drawn || !panes.includes(p)) return;
       p.group.replaceChildren();
       for (const o of objects) for (const kind of ["hidden", "seen"]) {
         const path = document.createElementNS(SVG, "path");
@@ -146,7 +147,7 @@
     place();
     root.classList.toggle("rs-three", isThree);
     root.classList.toggle("rs-bare", !lines);
-    root.dataset.instance = seen.instance;
+    root.dataset.whose = seen.whose; // scene and object that is drawn
     root.querySelector(".rs-caption").textContent = caption();
     for (const b of root.querySelectorAll("[data-layer]")) b.ariaPressed = String(b.dataset.layer === layer);
     const legend = root.querySelector(".rs-legend");
@@ -161,14 +162,25 @@
       if (k === at) b.scrollIntoView({ block: "nearest", inline: "nearest" });
     });
   };
+  // Nothing of another object stays: what one view says against it would be read as said of this one.
+  const forget = () => {
+    strip = null; panes = []; root.dataset.whose = "";
+    for (const part of [".rs-panes", ".rs-strip", ".rs-legend"]) root.querySelector(part).replaceChildren();
+    root.querySelector(".rs-caption").textContent = shown().dataset.name;
+    tell("The views are being compared with the models ...");
+  };
+  const later = () => {
+    clearTimeout(later.timer);
+    later.timer = setTimeout(() => { if (root) renew(); }, 250);
+  };
   const renew = async () => {
-    const turn = ++asked, { state, instance } = shown().dataset;
-    const isOther = instance !== seen.instance, before = row() && row().view;
-    if (isOther) tell("The views are being compared with the models ...");
+    const turn = ++asked, { state } = shown().dataset, isOther = whose() !== seen.whose, before = row() && row().view;
+    if (isOther) forget();
     const found = await ask("strip");
     if (!found || turn !== asked || !root) return;
+    if (found.whose !== whose()) return later(); // another was chosen on the way
     tell("");
-    seen = { state, instance }; strip = found;
+    seen = { state, whose: found.whose }; strip = found;
     const kept = strip.views.findIndex((r) => String(r.view) === String(wanted ?? (isOther ? -1 : before)));
     at = Math.max(kept, 0); wanted = null;
     if (isOther) { spot = null; zoom = 0; }
@@ -248,7 +260,7 @@
       if (from && !from.moved && strip) pick(event);
       from = null;
     });
-    seen = { state: "", instance: "" }; strip = null; panes = []; zoom = 0;
+    seen = { state: "", whose: "" }; zoom = 0;
     renew();
   };
   const close = () => { hideScene(false); if (root) root.remove(); root = null; panes = []; window.realsimPlace.tell(null); };
@@ -270,7 +282,7 @@
     const p = panes.find((q) => { const b = q.box.getBoundingClientRect(); return event.clientX >= b.x && event.clientX <= b.right; });
     if (!p) return;
     const [u, v] = pixel(event, p), found = await ask("spot", p.row.view, u.toFixed(2), v.toFixed(2));
-    if (!found || !root) return;
+    if (!found || !root || !panes.includes(p)) return;
     if (!found.length) return tell("nothing was measured at this pixel, and no model stands there");
     spot = new Map(found.map((f) => [f.view, [f.u, f.v]]));
     tell(`this spot is in ${found.length} views: walk through them with the arrow keys, or press S`);
@@ -304,9 +316,8 @@
       else if (strip) go(strip.views.findIndex((r) => String(r.view) === shown().dataset.view));
     } else if (wanted && !root) open();
     if (!root || shown().dataset.state === seen.state) return;
-    if (shown().dataset.instance === seen.instance && strip) { seen.state = shown().dataset.state; draw(); }
-    clearTimeout(renew.later);
-    renew.later = setTimeout(() => { if (root) renew(); }, 250);
     seen.state = shown().dataset.state;
+    if (whose() !== seen.whose) forget(); else draw();
+    later();
   }, 120);
 })();

@@ -272,6 +272,8 @@ class Window:
                 self._up = content.look.up
             with self.lock:
                 self.views.first_look()
+            # A browser without a graphics card would draw the fine cloud before it shows anything.
+            nodes.refine_cloud(session.config.shown_points, self.browser.wait)
             if not content.views:
                 self.refuse(window_text.NO_PHOTOGRAPHS)
 
