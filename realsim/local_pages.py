@@ -376,7 +376,8 @@ def _without_tracebacks(record: logging.LogRecord) -> bool:
     """Keep tracebacks of what strangers send, such as port scanners, off the terminal."""
     said = record.getMessage()
     error = record.exc_info[1] if record.exc_info else None
-    if said == "opening handshake failed":
+    left = said == "unexpected internal error" and isinstance(error, AssertionError)
+    if said == "opening handshake failed" or left:  # left before it was answered
         log.debug("a connection ended before it was open: %s", error)
     elif said == "connection handler failed":
         _not_understood(None, {"exception": error})

@@ -199,6 +199,22 @@ def test_addresses_that_are_none_are_answered_without_a_traceback(
     assert [r for r in caplog.records if r.levelname in ("WARNING", "ERROR")] == []
 
 
+def test_a_browser_that_leaves_before_it_is_answered_fills_no_terminal(
+    server: ReviewServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("DEBUG", "realsim.local_pages"):
+        with server._lock:  # pyright: ignore[reportPrivateUsage]
+            with socket.create_connection(("127.0.0.1", port_of(server)), 20) as line:
+                line.sendall(b"GET /photograph/9/-/strip HTTP/1.1\r\nHost: localhost\r\n\r\n")
+                time.sleep(0.2)
+            time.sleep(0.2)
+        end = time.monotonic() + 20
+        while not any("ended before" in r.getMessage() for r in caplog.records):
+            assert time.monotonic() < end
+            time.sleep(0.02)
+    assert [r for r in caplog.records if r.levelname in ("WARNING", "ERROR")] == []
+
+
 @pytest.mark.parametrize(
     "frame", [b"", b"\xff" * 9, "text", msgpack(None), msgpack([1]), msgpack({"type": "No"}),
               msgpack({"type": "GuiUpdateMessage", "uuid": [], "updates": 3}),
