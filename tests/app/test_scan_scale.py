@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from realsim.app.console import Console
-from realsim.app.scan.scale.cli import scale
+from realsim.app.scan.scale.cli import RESULT, scale
 from realsim.app.scan.scale.files import Place, write_result
 from realsim.app.scan.scale.inputs import (
     NamedMesh,
@@ -217,6 +217,29 @@ def test_every_file_is_there_and_listed_in_the_session(written):
         path.write_bytes(whole)
 
 
+def test_a_folder_whose_run_was_ended_is_its_own_and_not_finished(known, written, monkeypatch):
+    place, record, session = written
+    folder = Place(session, session.folder.parent / "out")
+    write = Place.write
+
+    def ended(self, name, data):
+        if name == "scale.html":
+            raise KeyboardInterrupt
+        write(self, name, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Place, "write", ended)
+        with pytest.raises(KeyboardInterrupt):
+            write_result(folder, record, named_of(known), session)
+    assert folder.record(record.inputs["key"]) is None
+    assert RESULT.convert(folder.folder, None, None) == folder.folder
+    write_result(folder, record, named_of(known), session)
+    files = sorted(p.name for p in place.folder.iterdir())
+    assert sorted(p.name for p in folder.folder.iterdir()) == files
+    for name in {*files} - {"scale.html"}:
+        assert (folder.folder / name).read_bytes() == (place.folder / name).read_bytes()
+
+
 def test_the_page_begins_with_the_verdict_and_needs_nothing_else(written):
     place, record, _ = written
     text = (place.folder / "scale.html").read_text()
@@ -243,13 +266,16 @@ def mesh_file(known, tmp_path):
 
 def test_the_scale_by_a_caliper_alone_is_unchecked(known, mesh_file, tmp_path, capsys):
     longest = UNIT_M * length_of(known.scan, parse_measurement("longest=1m"))
+    words = [str(mesh_file), "--measured", f"longest={1e3 * longest}mm", "--out",
+             str(tmp_path / "out"), "--json-file", str(tmp_path / "s.json"), "--quiet"]  # fmt: skip
     with pytest.raises(SystemExit) as stop:
-        scale.main(
-            [str(mesh_file), "--measured", f"longest={1e3 * longest}mm", "--out",
-             str(tmp_path / "out"), "--json-file", str(tmp_path / "s.json"), "--quiet"],
-            standalone_mode=False,
-        )  # fmt: skip
+        scale.main(words, standalone_mode=False)
     assert stop.value.code == 1
+    (tmp_path / "out/model.ply").unlink()  # as if it had been ended before
+    with pytest.raises(SystemExit):
+        scale.main(words, standalone_mode=False)
+    with pytest.raises(InputError, match="--overwrite"):
+        scale.main(words, standalone_mode=False)
     said = capsys.readouterr().out
     assert said.startswith("UNCHECKED: mug") and "model.ply in mm" in said
     assert "--library models --accept-doubtful" in said

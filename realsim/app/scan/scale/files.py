@@ -57,10 +57,14 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def write_result(place: Place, record: ScaleRecord, named: NamedMesh, store: SessionStore) -> None:
-    """Write the scaled model, the pictures, the page and, last, scale.json."""
+    """Write the scaled model, the pictures, the page and, last, scale.json.
+
+    First it stands there without its inputs: the folder is this command's, and not finished.
+    """
     from realsim.app.scan.scale.page import page_bytes
 
     box_mm = 1e3 * record.fit.scale * smallest_box(named.mesh)
+    place.write(FILE, result_bytes(replace(record, inputs={}), box_mm))
     for name, data in model_files(named.mesh, record.fit.scale).items():
         place.write(name, data)
     # The titles name one size: that of the object, which a caliper finds, not of the mesh's axes.

@@ -220,11 +220,11 @@ def _by_measurement(request: ScaleRequest, console: Console) -> bool:
     }  # fmt: skip
     text = json_lines(_lists(values)).encode("utf-8")
     if request.out is not None:
-        if (request.out / FILE).exists() and not request.overwrite:
+        files = {FILE: text} | model_files(named.mesh, scale)  # a run that is ended leaves no model
+        if all((request.out / name).exists() for name in files) and not request.overwrite:
             raise InputError(f"{request.out / FILE} exists; --overwrite replaces it.")
-        for name, data in model_files(named.mesh, scale).items():
+        for name, data in files.items():
             write_file(request.out / name, data)
-        write_file(request.out / FILE, text)
         console.say(f"result    {request.out}")
     if request.json is not None:
         write_file(request.json, text)
