@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_origin
 
 import msgspec
 import numpy as np
-from msgspec import inspect
 from msgspec.inspect import type_info
 
 from realsim.arrays import Array
@@ -76,9 +75,9 @@ def from_json(data: Any, kind: type[Declared], what: str) -> Declared:
         told = str(error).replace("`$.", "`").replace(" - at `$`", "")
         if "missing" in told and isinstance(data, dict):
             told += f"; it has: {', '.join(map(str, data)) or 'nothing'}"
-        if "enum value" in told:
-            field = told.rsplit("`", 2)[-2].rpartition(".")[2].partition("[")[0]
-            told += f"; accepted: {', '.join(map(str, _words(type_info(kind), field)))}"
+        if (names := "unknown field" in told) or "enum value" in told:
+            at = told.partition(" - at `")[2].strip("`$").rpartition(".")[2].partition("[")[0]
+            told += f"; accepted: {', '.join(map(str, _words(type_info(kind), at, names)))}"
         raise InputError(f"{what}: {told[:1].lower()}{told[1:500]}.") from error
     except InputError as error:  # a record's own check
         raise type(error)(f"{what}: {error}") from error
@@ -131,15 +130,16 @@ def read_object(path: Path | str) -> dict[str, Any]:
     return {str(key): item for key, item in value.items()}  # pyright: ignore[reportUnknownVariableType]
 
 
-def _words(kind: Any, field: str, inside: bool = False) -> list[Any]:
-    """Return the words that a field of this name may hold, wherever it stands in a declaration."""
-    if isinstance(kind, inspect.LiteralType):
-        return list(kind.values) if inside or not field else []
-    names = [n for n in ("type", "item_type", "value_type") if hasattr(kind, n)]
-    parts = [*(getattr(kind, n) for n in names), *getattr(kind, "types", ())]
-    found = [_words(part, field, inside) for part in parts]
-    for known in getattr(kind, "fields", ()):
-        found.append(_words(known.type, field, inside or known.encode_name == field))
+def _words(kind: Any, field: str, names: bool, inside: bool = False) -> list[Any]:
+    """Return the words, or the names of fields, that a field of this name may hold anywhere."""
+    fields = getattr(kind, "fields", ())
+    known = [f.encode_name for f in fields] if names else list(getattr(kind, "values", ()))
+    if known and (inside or not field):
+        return known
+    parts = [getattr(kind, n, None) for n in ("type", "item_type", "value_type")]
+    parts += getattr(kind, "types", ())
+    found = [_words(part, field, names, inside) for part in parts if part]
+    found += [_words(f.type, field, names, inside or f.encode_name == field) for f in fields]
     return list(dict.fromkeys(word for words in found for word in words))
 
 

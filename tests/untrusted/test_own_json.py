@@ -32,6 +32,7 @@ from realsim.records import (
 from realsim.records.calibration import RobotMap
 from realsim.records.depth_bias import DepthBias
 from realsim.robots.arm import UR5
+from realsim.robots.hand_file import PadFile
 from realsim.untrusted.own_json import OwnFile, Real, from_json, read_own, to_json
 
 few = settings(max_examples=10, deadline=None)
@@ -153,8 +154,7 @@ def test_bare_records_and_either_error_map_come_back(record):
 def test_numbers_that_json_lacks():
     values = np.array([[1.5, np.nan], [np.inf, -np.inf]])
     assert to_json(values) == [[1.5, None], ["inf", "-inf"]]
-    back = from_json(through_text(to_json(values)), Array, "an array")
-    np.testing.assert_array_equal(back, values)
+    np.testing.assert_array_equal(from_json(through_text(to_json(values)), Array, "it"), values)
 
 
 def test_a_rotation_edited_by_hand_is_made_rigid_again():
@@ -170,6 +170,7 @@ class Note(OwnFile, kw_only=True):
     sigma: Real = math.nan
     scene: Scene | None = None
     map: RobotMap | None = None
+    pad: PadFile | None = None
 
 
 POSE = {"obj_id": 1, "instance": 0, "T_world_obj": np.eye(4).tolist()}
@@ -180,13 +181,14 @@ POSE = {"obj_id": 1, "instance": 0, "T_world_obj": np.eye(4).tolist()}
     [
         ({}, "missing required field `unit_m`; it has: nothing"),
         ({"unit_m": 1}, "`float` <= 0.02 - at `unit_m`"),
-        ({"unit_m": 0.01, "unitt": 1}, "unknown field `unitt`"),
+        ({"unit_m": 0.01, "unitt": 1}, "unknown field `unitt`; accepted: format, unit_m, "),
         ({"unit_m": 0.01, "format": "note 2"}, "'note 2' - at `format`"),
         ({"unit_m": 0.01, "sigma": "much"}, "at `sigma`"),
         ({"unit_m": 0.01, "scene": {"name": "s", "objects": [POSE | {"obj_id": "one"}]}},
          "expected `int`, got `str` - at `scene.objects[0].obj_id`"),
         ({"unit_m": 0.01, "scene": {"name": "s", "objects": [{"obj_id": 1}]}},
          "missing required field `instance` - at `scene.objects[0]`"),
+        ({"pad": {"widht_m": 1}}, "field `widht_m` - at `pad`; accepted: width_m, length_m"),
         ({"unit_m": 0.01, "map": {"kind": "guess"}}, "'guess' is not known; pose map, arm are"),
         ([], "expected `object`, got `array`"),
     ],

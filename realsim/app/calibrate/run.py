@@ -106,7 +106,7 @@ def _run(source: Path, console: Console, *, live: bool, **options: Any) -> bool:
     show_report(result.hand_eye, result.checks, console)
     show_next_views(result.hand_eye, console)
     console.say(f"report: {files[0]}")
-    console.say(f"{len(files) - 1} pictures and files for other tools beside it, in {request.out}")
+    console.say(f"for ROS, URDF, OpenCV and NumPy: {request.out / 'exports'}")
     console.result(report_document(result.hand_eye, result.checks, files))
     return not any(c.verdict == "bad" for c in result.checks)
 

@@ -150,7 +150,7 @@ def show_upgrade(result: "UpgradeResult", console: Console) -> None:
         console.say(summary_line(summary_of(result.scenes)))
     console.say(f"page      {result.out / PAGE}")
     console.say(f"tables    {result.out / JSON_FILE}, {CSV_FILE}")
-    console.say(f"dataset   {result.out}")
+    console.say(f"dataset   {result.out}; judge it with: realsim review {result.out}")
 
 
 def _notes(records: Sequence[Record]) -> Iterable[str]:

@@ -264,15 +264,14 @@ def load_scene_source(
         f"'{path}' holds no scene that is known: {_contents(path)}. Read are a {SCENE_FILE} of "
         "GraspIT (object1: {file_path, name, orientation, position}), a scene of GraspNet-1Billion "
         f"(realsense/{POSES} or kinect/{POSES}), one image of it (color.png, depth.png, meta.mat), "
-        f"and a BOP dataset, split or scene ({CAMERA_FILE})."
+        f"and a BOP dataset, split or scene ({CAMERA_FILE}). Of a folder of meshes make a scene: "
+        "`realsim generate NEW --pool MESHES --scenes 1`, then `realsim school NEW/scene_000000`."
     )
 
 
 def _contents(path: Path) -> str:
     if path.is_file():
-        return (
-            f"it is a file of the kind '{path.suffix or 'no suffix'}' without the keys of a scene"
-        )
+        return f"it is a file of the kind '{path.suffix}' without the keys of a scene"
     names = sorted(p.name for p in path.iterdir())
     return (
         f"the folder has {', '.join(names[:12]) or 'nothing'}{', ...' if len(names) > 12 else ''}"
