@@ -38,46 +38,42 @@ from realsim.registration.photo import (
 
 Kind = Literal["kept", "improved", "rejected"]
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class OutcomeConfig:
-    """When an annotation is replaced."""
-
-    same_m: float = 0.0005
-    """Poses nearer than this are the same [m]."""
-    far_m: float = 0.015
-    """A pose that moved further is a proposal and must win clearly [m]."""
-    depth_t: float = 3.0
-    """Standard errors by which a new pose must be better on depth."""
-    far_depth_t: float = 6.0
-    """Standard errors by which a proposal must be better on depth."""
-    photo_t: float = 3.0
-    """Standard errors by which a new pose must be better on the photograph, half of it used."""
-    photo_ratio: float = 0.85
-    """Greatest ratio of the mean distance from the photograph's edges to the annotation's; the
-    square of it for a proposal."""
-    least_visible: float = 0.3
-    """Visible share, at either pose, below which an object keeps its annotation."""
-    far_visible: float = 0.5
-    """The same share for an object that is to move far."""
-    far_agree: float = 0.15
-    """Share of its pixels by which more must agree with the depth where it moves far."""
-    wrong_agree: float = 0.4
-    """An annotation with which less of the depth agrees looks wrong itself."""
-    block_px: int = 12
-    """Blocks of pixels whose depth counts as one piece: noise and holes are correlated."""
-    sectors: int = 36
-    """Sectors of an outline, each one piece."""
-    cap_px: float = 3.0
-    """An edge further away, or none, counts as this [px]."""
-    ray_share: float = 0.005
-    """1-sigma of one view's whole depth, as a share of the distance: data sheets of depth cameras
-    state limits of 1 to 2 %."""
-    least_pieces: int = 8
-    """Fewer pieces decide nothing."""
-    views: int = 6
-    """Views that are looked at, at most."""
-    photo: PhotoConfig = PhotoConfig()  # noqa: RUF009 - frozen
+SAME_M = 0.0005
+"""Poses nearer than this are the same [m]."""
+FAR_M = 0.015
+"""A pose that moved further is a proposal and must win clearly [m]."""
+DEPTH_T = 3.0
+"""Standard errors by which a new pose must be better on depth."""
+FAR_DEPTH_T = 6.0
+"""Standard errors by which a proposal must be better on depth."""
+PHOTO_T = 3.0
+"""Standard errors by which a new pose must be better on the photograph, half of it used."""
+PHOTO_RATIO = 0.85
+"""Greatest ratio of the mean distance from the photograph's edges to the annotation's; the
+square of it for a proposal."""
+LEAST_VISIBLE = 0.3
+"""Visible share, at either pose, below which an object keeps its annotation."""
+FAR_VISIBLE = 0.5
+"""The same share for an object that is to move far."""
+FAR_AGREE = 0.15
+"""Share of its pixels by which more must agree with the depth where it moves far."""
+WRONG_AGREE = 0.4
+"""An annotation with which less of the depth agrees looks wrong itself."""
+BLOCK_PX = 12
+"""Blocks of pixels whose depth counts as one piece: noise and holes are correlated."""
+SECTORS = 36
+"""Sectors of an outline, each one piece."""
+CAP_PX = 3.0
+"""An edge further away, or none, counts as this [px]."""
+RAY_SHARE = 0.005
+"""1-sigma of one view's whole depth, as a share of the distance: data sheets of depth cameras
+state limits of 1 to 2 %."""
+LEAST_PIECES = 8
+"""Fewer pieces decide nothing."""
+VIEWS = 6
+"""Views that are looked at, at most."""
+PHOTO = PhotoConfig()
+"""How outlines are laid onto photographs."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -163,10 +159,9 @@ class Referee:
         pictures: Sequence[Picture],
         models: Mapping[int, ObjectModel],
         plane: SupportPlane | None,
-        config: OutcomeConfig,
     ) -> None:
         """Measure the depth's noise; `models` are by instance."""
-        self.pictures, self.models, self.config = tuple(pictures), dict(models), config
+        self.pictures, self.models = tuple(pictures), dict(models)
         frames = [
             DepthFrame(index=k, depth_m=p.depth_m, T_world_cam=p.T_world_cam)
             for k, p in enumerate(pictures)
@@ -186,7 +181,6 @@ class Referee:
 
         `held_out`: of the photograph only the squares that no pose was shifted onto.
         """
-        config = self.config
         depth: list[Array] = []
         photo: list[Array] = []
         claims: list[tuple[_Claim, _Claim]] = []
@@ -200,7 +194,7 @@ class Referee:
         edges = [np.abs(np.concatenate([c[k].outline.offsets for c in claims])) for k in (0, 1)]
         old, new = (float(np.nanmedian(e)) if np.isfinite(e).any() else np.nan for e in edges)
         return Evidence(
-            depth_t=_t(np.concatenate(depth), config), photo_t=_t(costs @ [1.0, -1.0], config),
+            depth_t=_t(np.concatenate(depth)), photo_t=_t(costs @ [1.0, -1.0]),
             photo_ratio=float(means[1] / max(means[0], 1e-9)),
             agree=(self._agree([a for a, _ in claims]), self._agree([b for _, b in claims])),
             edge_px=(old, new),
@@ -219,11 +213,11 @@ class Referee:
         rest = [self._depth_of(v, i, X) for i, X in others.items() if i != instance]
         behind = np.min([np.full_like(own, np.inf), *rest], axis=0)
         scene = np.minimum(np.minimum(own, behind), self._tables[v])
-        hidden = hidden_by_measured(picture.depth_m, own, self.config.photo)
+        hidden = hidden_by_measured(picture.depth_m, own, PHOTO)
         sight = np.isfinite(own) & (own <= behind) & ~hidden
         return _Claim(
             own, scene, sight, float(sight.sum() / max(np.isfinite(own).sum(), 1)),
-            outline_of(picture, own, behind, self.config.photo),
+            outline_of(picture, own, behind, PHOTO),
         )  # fmt: skip
 
     def _likelihood(self, v: int, scene: Array, where: Mask) -> Array:
@@ -248,7 +242,7 @@ class Referee:
         """Return (N,) by how much the new pose is more likely, block by block."""
         where = (a.sight | b.sight) & self._usable(v)
         gain = self._gain(v, a, b, where)
-        i, j = (x // self.config.block_px for x in np.nonzero(where))
+        i, j = (x // BLOCK_PX for x in np.nonzero(where))
         _, of = np.unique(i * 100_000 + j, return_inverse=True)
         return np.bincount(of.reshape(-1), weights=gain).astype(np.float64)
 
@@ -256,7 +250,7 @@ class Referee:
         self, v: int, instance: int, T: Array, a: _Claim, b: _Claim, held_out: bool
     ) -> Array:
         """Return (N, 2) mean distances of the edges, old and new, sector by sector."""
-        config, picture = self.config, self.pictures[v]
+        picture = self.pictures[v]
         T_cam_obj = se3.invert(picture.T_world_cam) @ T
         middle = se3.transform(T_cam_obj, self.models[instance].mesh.bounds.mean(0)[None])
         center = camera.project(picture.intrinsics, middle)[0]
@@ -265,9 +259,9 @@ class Referee:
         for claim in (a, b):
             o = claim.outline
             if held_out:
-                o = o.part(o.squares(config.photo.block_px, odd=True))
-            d = np.minimum(np.nan_to_num(np.abs(o.offsets), nan=config.cap_px), config.cap_px)
-            at, n = o.sectors(center, config.sectors), config.sectors
+                o = o.part(o.squares(PHOTO.block_px, odd=True))
+            d = np.minimum(np.nan_to_num(np.abs(o.offsets), nan=CAP_PX), CAP_PX)
+            at, n = o.sectors(center, SECTORS), SECTORS
             sums.append(np.bincount(at, weights=d, minlength=n).astype(np.float64))
             counts.append(np.bincount(at, minlength=n).astype(np.float64))
         both = (counts[0] > 0) & (counts[1] > 0)
@@ -287,7 +281,6 @@ def decide(
     annotations: Sequence[ObjectPose],
     registered: Sequence[ObjectPose],
     plane: SupportPlane | None,
-    config: OutcomeConfig | None = None,
 ) -> list[Outcome]:
     """Return what becomes of every annotation.
 
@@ -297,11 +290,9 @@ def decide(
         annotations: one per instance.
         registered: the new poses; an instance that is missing was not placed.
         plane: the table; None = not known.
-        config: settings.
     """
-    config = config or OutcomeConfig()
     of = {a.instance: models[a.obj_id] for a in annotations}
-    referee = Referee(pictures, of, plane, config)
+    referee = Referee(pictures, of, plane)
     new = {r.instance: r for r in registered if r.instance in of}
     now = {a.instance: a.T_world_obj for a in annotations}
     proposals = {i: [_Proposal(r.T_world_obj)] for i, r in new.items()}
@@ -309,13 +300,13 @@ def decide(
         # Several views were brought together by their depth; one can be laid onto its photograph.
         moved = shifted(
             pictures[0], [of[i].mesh for i in new], [r.T_world_obj for r in new.values()],
-            config.photo,
+            PHOTO,
         )  # fmt: skip
         proposals = {
             i: [_Proposal(T, on_photo=True), *proposals[i]] for i, T in zip(new, moved, strict=True)
         }
     proposals = {
-        i: [_fused(now[i], p, new[i], of[i], pictures, config) for p in given]
+        i: [_fused(now[i], p, new[i], of[i], pictures) for p in given]
         for i, given in proposals.items()
     }
     outcomes: dict[int, Outcome] = {}
@@ -329,12 +320,7 @@ def decide(
 
 
 def _fused(
-    T_old: Array,
-    p: _Proposal,
-    found: ObjectPose,
-    model: ObjectModel,
-    pictures: Sequence[Picture],
-    config: OutcomeConfig,
+    T_old: Array, p: _Proposal, found: ObjectPose, model: ObjectModel, pictures: Sequence[Picture]
 ) -> _Proposal:
     """Return a proposal together with the annotation, each as far as it is sure."""
     if found.covariance is None:
@@ -348,7 +334,7 @@ def _fused(
     C = to_centre @ found.covariance @ to_centre.T
     if len(pictures) == 1:
         ray = new[:3, :3].T @ (new[:3, 3] - pictures[0].T_world_cam[:3, 3])
-        C[3:, 3:] += config.ray_share**2 * np.outer(ray, ray)
+        C[3:, 3:] += RAY_SHARE**2 * np.outer(ray, ray)
     variances, axes = np.linalg.eigh(C)
     x = axes.T @ (units * se3.log(se3.invert(new) @ old))
 
@@ -378,7 +364,7 @@ def _decided(
     first: tuple[Evidence, Kind, str, Array] | None = None
     for p in proposals:
         e = referee.evidence(given.instance, T, p.T_world_obj, others, p.on_photo)
-        kind, words = _judged(e, found, referee.config)
+        kind, words = _judged(e, found)
         words += p.words
         if kind == "improved":
             return Outcome(instance=given.instance, kind=kind, words=words,
@@ -386,7 +372,7 @@ def _decided(
         first = first or (e, kind, words, p.T_world_obj)
     assert first is not None
     e, kind, words, T_proposed = first
-    wrong = e.visible >= referee.config.least_visible and e.agree[0] < referee.config.wrong_agree
+    wrong = e.visible >= LEAST_VISIBLE and e.agree[0] < WRONG_AGREE
     if wrong:
         words += (
             f"; the annotation itself looks wrong: depth agrees at {100 * e.agree[0]:.0f} % of it"
@@ -395,38 +381,38 @@ def _decided(
                    T_proposed=T_proposed, looks_wrong=wrong)  # fmt: skip
 
 
-def _judged(e: Evidence, found: ObjectPose, config: OutcomeConfig) -> tuple[Kind, str]:
+def _judged(e: Evidence, found: ObjectPose) -> tuple[Kind, str]:
     """Return what becomes of an annotation by the evidence for a new pose, in words."""
     said = (
         f"depth agrees at {_share(e.agree[1])} instead of {_share(e.agree[0])} "
         f"(t {e.depth_t:.1f}), the photograph's edges at {e.edge_px[1]:.1f} instead of "
         f"{e.edge_px[0]:.1f} px (t {e.photo_t:.1f})"
     )
-    far = e.moved_m > config.far_m
-    if (why := _why_kept(e, config)) is not None:
+    far = e.moved_m > FAR_M
+    if (why := _why_kept(e)) is not None:
         return "kept", why
     if found.verdict == "rejected":
         why = "; ".join(found.reasons) or "its checks failed"
         return "rejected", f"the new pose was refused: {why}"
-    on_depth = e.depth_t > config.depth_t
-    ratio = config.photo_ratio
+    on_depth = e.depth_t > DEPTH_T
+    ratio = PHOTO_RATIO
     if far:
-        more = e.agree[1] - e.agree[0] >= config.far_agree
-        on_depth, ratio = e.depth_t > config.far_depth_t and more, ratio**2
-    if on_depth and e.photo_t > config.photo_t and e.photo_ratio < ratio:
+        more = e.agree[1] - e.agree[0] >= FAR_AGREE
+        on_depth, ratio = e.depth_t > FAR_DEPTH_T and more, ratio**2
+    if on_depth and e.photo_t > PHOTO_T and e.photo_ratio < ratio:
         return "improved", said
-    if far or e.depth_t < -config.depth_t or e.photo_t < -config.photo_t:
+    if far or e.depth_t < -DEPTH_T or e.photo_t < -PHOTO_T:
         way = f"{1e3 * e.moved_m:.0f} mm away, does not win clearly" if far else "is worse"
         return "rejected", f"the new pose, {way}: {said}" if far else f"the new pose {way}: {said}"
-    sure = f"{config.depth_t:g} and {config.photo_t:g}"
+    sure = f"{DEPTH_T:g} and {PHOTO_T:g}"
     return "kept", f"the new pose is not surely better on both (t of {sure} would be): {said}"
 
 
-def _why_kept(e: Evidence, config: OutcomeConfig) -> str | None:
+def _why_kept(e: Evidence) -> str | None:
     """Return why a new pose is not even considered; None = it is."""
-    if e.moved_m < config.same_m:
-        return f"the new pose, where it is sure, is the same within {1e3 * config.same_m:g} mm"
-    least = config.far_visible if e.moved_m > config.far_m else config.least_visible
+    if e.moved_m < SAME_M:
+        return f"the new pose, where it is sure, is the same within {1e3 * SAME_M:g} mm"
+    least = FAR_VISIBLE if e.moved_m > FAR_M else LEAST_VISIBLE
     if e.visible < least:
         return f"only {100 * e.visible:.0f} % of it is in sight"
     if np.isnan(e.depth_t) or np.isnan(e.photo_t):
@@ -435,9 +421,9 @@ def _why_kept(e: Evidence, config: OutcomeConfig) -> str | None:
     return None
 
 
-def _t(gains: Array, config: OutcomeConfig) -> float:
+def _t(gains: Array) -> float:
     """Return by how many standard errors the mean of (N,) pieces is above 0; NaN = too few."""
-    if len(gains) < config.least_pieces:
+    if len(gains) < LEAST_PIECES:
         return float("nan")
     return float(gains.mean() / max(np.std(gains, ddof=1) / np.sqrt(len(gains)), 1e-9))
 

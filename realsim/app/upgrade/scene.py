@@ -21,7 +21,7 @@ from realsim.app.stages import note, save_starts
 from realsim.app.upgrade.analytic import AnalyticJob, agreement_of, try_analytic
 from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig, open_scene
 from realsim.app.upgrade.files import NOTE, keep_imported
-from realsim.app.upgrade.outcome import Outcome, OutcomeConfig, decide
+from realsim.app.upgrade.outcome import VIEWS, Outcome, decide
 from realsim.app.upgrade.source import SceneSource, moved_from_start, prepare, world_starts
 from realsim.formats.grasps.scene_grasps import executed
 from realsim.geometry import se3
@@ -175,8 +175,7 @@ def settled(
         result: what was registered.
         console: progress.
     """
-    config, objects = OutcomeConfig(), result.scene.objects
-    cameras = result.cameras.refined
+    objects, cameras = result.scene.objects, result.cameras.refined
     # By the cameras as they are now: an annotation is a pose in its image.
     annotations = world_starts({k: source.seen[k] for k in source.seen if k in cameras}, cameras)
     if not annotations or not objects:
@@ -193,9 +192,9 @@ def settled(
                 intrinsics=store.session.intrinsics, depth_m=f.depth_m, T_world_cam=f.T_world_cam,
                 rgb=store.rgb(f.index),
             )
-            for f in spread_frames(frames, middle, config.views)
+            for f in spread_frames(frames, middle, VIEWS)
         ]  # fmt: skip
-        outcomes = decide(pictures, source.models, annotations, objects, result.scene.plane, config)
+        outcomes = decide(pictures, source.models, annotations, objects, result.scene.plane)
     scene = replace(result.scene, objects=_with_outcomes(objects, outcomes))
     seen: dict[int, dict[int, SeenPose]] = {}
     for view, rows in result.seen.items():
