@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -56,14 +55,9 @@ STEP = 1e-6
 """Step of the numerical derivative [rad, m]."""
 
 
-def register_session(
-    store: SessionStore,
-    console: Console,
-    library: Path | None = None,
-    request: RegisterRequest | None = None,
-) -> Scene:
+def register_session(store: SessionStore, console: Console) -> Scene:
     """Register the objects of a session and return the scene; see `run_register`."""
-    return run_register(store, console, request or RegisterRequest(library=library)).scene
+    return run_register(store, console, RegisterRequest()).scene
 
 
 def run_register(

@@ -23,14 +23,13 @@ VIEWS = 3
 """Sliders in a report, spread over the session."""
 
 
-def registration_pairs(store: SessionStore, views: int = VIEWS) -> tuple[list[View], str]:
+def registration_pairs(store: SessionStore) -> tuple[list[View], str]:
     """Return before/after pairs of registered views, and in words what 'before' is.
 
     Both are empty where nothing tells what was before: no rough poses, no camera refined.
 
     Args:
         store: a session with a registered scene.
-        views: how many pairs, at most.
     """
     from realsim.store import load_scene
 
@@ -61,7 +60,7 @@ def registration_pairs(store: SessionStore, views: int = VIEWS) -> tuple[list[Vi
         (o, started.get(o.instance, o.T_world_obj)) for o in after
     ]
     kept: list[tuple[ObjectPose, Array]] = [(o, o.T_world_obj) for o in after]
-    pick = np.unique(np.linspace(0, len(seen) - 1, views).round().astype(int))
+    pick = np.unique(np.linspace(0, len(seen) - 1, VIEWS).round().astype(int))
     pairs: list[View] = []
     for view in (seen[k] for k in pick):
         assert view.T_world_cam is not None

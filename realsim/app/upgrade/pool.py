@@ -1,63 +1,60 @@
 """Scenes upgraded by processes or machines: one that breaks or is killed harms no other."""
 
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 from realsim.app.console import Console
 from realsim.app.upgrade.scene import Record, SceneJob, read_source, upgrade_scene
 from realsim.many import Outcome, Sent, Task, Worked, Workers, at_most, open_pool, run_many
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class SceneEnd:
-    """How a scene ended."""
-
-    job: SceneJob
-    record: Record | None
-    """None = it was left out."""
-    error: str = ""
-    """Why."""
-
-
-class Told(Protocol):
-    """Called when a scene has ended, with those that are under way."""
-
-    def __call__(self, ended: SceneEnd | None, under_way: Sequence[str]) -> None:
-        """Show it."""
-        ...
-
-
 def upgrade_scenes(
-    jobs: Sequence[SceneJob], where: Workers, tell: Told, take: Callable[[SceneEnd], None]
-) -> None:
-    """Upgrade scenes, as many at a time as there are workers, and hand on how each ended.
+    jobs: Sequence[SceneJob], where: Workers, console: Console, done: dict[str, Record]
+) -> dict[str, str]:
+    """Upgrade scenes, as many at a time as there are workers.
 
     A scene with broken input ends with its reason. A scene whose process was killed is gone on
     with, from the stage where it was; what its stages had finished is not done again.
+
+    Args:
+        jobs: the scenes; those of an earlier run took no time of this one.
+        where: who upgrades them.
+        console: shows how many have ended, with the remaining time and those under way.
+        done: place of a scene -> what came of it; those that end well are added.
+
+    Returns:
+        Place of a scene -> why it was left out.
 
     Raises:
         StorageError: the disk is full.
         ClusterLostError: the cluster's head is gone.
     """
-    by = {job.ref.place: job for job in jobs}
+    failed: dict[str, str] = {}
+    ended = 0
     under_way: Sequence[str] = ()
 
-    def tick(names: Sequence[str]) -> None:
+    def show(names: Sequence[str]) -> None:
         nonlocal under_way
         under_way = names
-        tell(None, names)
+        console.doing(", ".join(names))
+        tick(ended, len(jobs))
 
-    def done(outcome: Outcome) -> None:
-        why = outcome.why + (". Run the same again with fewer --workers." if outcome.deaths else "")
-        end = SceneEnd(job=by[outcome.task.name], record=outcome.value, error=why)
-        tell(end, [name for name in under_way if name != outcome.task.name])
-        take(end)
+    def take(outcome: Outcome) -> None:
+        nonlocal ended
+        ended += 1
+        place = outcome.task.name
+        show([name for name in under_way if name != place])
+        if outcome.value is not None:
+            done[place] = outcome.value
+            return
+        again = ". Run the same again with fewer --workers." if outcome.deaths else ""
+        failed[place] = outcome.why + again
+        console.say(f"scene {place} is left out: {failed[place]}")
 
-    with open_pool(at_most(where, len(jobs))) as pool:
-        run_many(map(_task, jobs), pool, done, tick=tick)
+    with console.stage("upgrade", "scenes") as tick, open_pool(at_most(where, len(jobs))) as pool:
+        run_many(map(_task, jobs), pool, take, tick=show)
+    return failed
 
 
 def _task(job: SceneJob) -> Task:
@@ -94,23 +91,3 @@ def upgraded(out: Path, job: SceneJob, root: Path, models: Path | None) -> Recor
     at = replace(ref, root=root, folder=folder, models=models or ref.models)
     job = replace(job, out=out, at=at)
     return upgrade_scene(job, read_source(job), None)
-
-
-@contextmanager
-def scene_progress(total: int, console: Console) -> Generator[Told]:
-    """Show how many scenes have ended, with the remaining time and those under way.
-
-    Args:
-        total: scenes to upgrade; those of an earlier run took no time of this one.
-        console: where it is shown.
-    """
-    done = 0
-    with console.stage("upgrade", "scenes") as tick:
-
-        def tell(ended: SceneEnd | None, under_way: Sequence[str]) -> None:
-            nonlocal done
-            done += ended is not None
-            console.doing(", ".join(under_way))
-            tick(done, total)
-
-        yield tell

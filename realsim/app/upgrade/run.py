@@ -7,7 +7,6 @@ the data set said of it goes along in OUT/SPLIT/SCENE/imported.
 
 import contextlib
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from realsim.app.upgrade.files import (
     labels_of,
     write_root_files,
 )
-from realsim.app.upgrade.pool import SceneEnd, scene_progress, upgrade_scenes
+from realsim.app.upgrade.pool import upgrade_scenes
 from realsim.app.upgrade.scene import Record, SceneJob, read_source, upgrade_scene
 from realsim.app.upgrade.tables import show_upgrade, write_tables
 from realsim.errors import InputError
@@ -69,11 +68,17 @@ def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Consol
     skipped = len(done)
     if skipped:
         console.say(f"{skipped} of {len(refs)} scenes are upgraded already, with the same inputs")
+    failed: dict[str, str] = {}
     with contextlib.ExitStack() as lock:
         if len(refs) == 1 and todo:
-            failed = _alone(_job(todo[0], config, out, config.where), lock, console, done)
+            job = _job(todo[0], config, out, config.where)
+            done[job.ref.place] = _alone(job, lock, console)
         else:
-            failed = _many(todo, config, out, lock, console, done)
+            out.mkdir(parents=True, exist_ok=True)
+            lock.enter_context(only_run_in(out))
+            if todo:
+                jobs = [_job(ref, config, out, 1) for ref in todo]
+                failed = upgrade_scenes(jobs, config.where, console, done)
         if not done:
             _remove_empty(out)
             reasons = "; ".join(f"{place}: {why}" for place, why in list(failed.items())[:3])
@@ -90,9 +95,7 @@ def _job(ref: SceneRef, config: UpgradeConfig, out: Path, workers: Workers) -> S
     )  # fmt: skip
 
 
-def _alone(
-    job: SceneJob, lock: contextlib.ExitStack, console: Console, done: dict[str, Record]
-) -> dict[str, str]:
+def _alone(job: SceneJob, lock: contextlib.ExitStack, console: Console) -> Record:
     """Upgrade the only scene in this process; nothing is written before it has been read whole."""
     from threadpoolctl import threadpool_limits
 
@@ -101,42 +104,7 @@ def _alone(
         source = read_source(job)
         job.out.mkdir(parents=True, exist_ok=True)
         lock.enter_context(only_run_in(job.out))
-        done[job.ref.place] = upgrade_scene(job, source, console)
-    return {}
-
-
-def _many(
-    refs: Sequence[SceneRef],
-    config: UpgradeConfig,
-    out: Path,
-    lock: contextlib.ExitStack,
-    console: Console,
-    done: dict[str, Record],
-) -> dict[str, str]:
-    """Upgrade scenes in processes; add those that ended well to `done`, return why others did not.
-
-    Raises:
-        InputError: another run is working in the folder.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    lock.enter_context(only_run_in(out))
-    if not refs:
-        return {}
-    failed: dict[str, str] = {}
-    jobs = [_job(ref, config, out, 1) for ref in refs]
-    with scene_progress(len(refs), console) as tell:
-        upgrade_scenes(jobs, config.where, tell, lambda e: _take(e, done, failed, console))
-    return failed
-
-
-def _take(end: SceneEnd, done: dict[str, Record], failed: dict[str, str], console: Console) -> None:
-    """Note how a scene ended."""
-    place = end.job.ref.place
-    if end.record is not None:
-        done[place] = end.record
-    else:
-        failed[place] = end.error
-        console.say(f"scene {place} is left out: {end.error}")
+        return upgrade_scene(job, source, console)
 
 
 def _write_together(out: Path, failed: dict[str, str], console: Console) -> Record | None:
