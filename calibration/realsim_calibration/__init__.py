@@ -9,9 +9,8 @@ from realsim_calibration.calibrate import (
 from realsim_calibration.clock.offset import ClockOffset, estimate_clock_offset
 from realsim_calibration.depth.bias import estimate_depth_bias
 from realsim_calibration.depth.board import DepthBoardView
-from realsim_calibration.detect.find import FindConfig, find_target
+from realsim_calibration.detect.find import find_target
 from realsim_calibration.faults.diagnose import diagnose, prove_reading
-from realsim_calibration.faults.gates import GateConfig
 from realsim_calibration.fit.board_pose import BoardPose, estimate_board_pose
 from realsim_calibration.fit.closed_forms import (
     CLOSED_FORMS,
@@ -42,8 +41,6 @@ __all__ = [
     "CalibrationConfig",
     "ClockOffset",
     "DepthBoardView",
-    "FindConfig",
-    "GateConfig",
     "HandEyeConfig",
     "HandEyeReport",
     "IntrinsicsConfig",

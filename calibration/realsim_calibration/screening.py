@@ -21,9 +21,8 @@ from realsim_calibration.faults.consequences import (
     motion_check_of,
     renumbered,
 )
-from realsim_calibration.faults.diagnosis import DiagnosisConfig
 from realsim_calibration.faults.gates import (
-    GateConfig,
+    TWIN_RATIO,
     frame_gate,
     px_gate,
     rotation_mismatch_deg,
@@ -46,8 +45,6 @@ class HandEyeConfig:
     """Everything the hand-eye calibration may be told."""
 
     mode: Mode = "eye_in_hand"
-    diagnosis: DiagnosisConfig = field(default_factory=DiagnosisConfig)
-    gates: GateConfig = field(default_factory=GateConfig)
     joint: JointConfig = field(default_factory=JointConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     robot: RobotErrorConfig = field(default_factory=RobotErrorConfig)
@@ -109,23 +106,20 @@ def screen(
     labels = [c.view.label for c in candidates]
     diagnosis = examine(
         _given(candidates), C, labels, target, config.mode, _nominal(candidates, arm),
-        config.diagnosis,
     )  # fmt: skip
     conventions = check_of(diagnosis, [c.view.index for c in candidates])
     if diagnosis is not None and diagnosis.fault in SINGLE_VIEWS:
         rejected |= {candidates[k].view.index: diagnosis.sentence for k in diagnosis.views}
         keep = [k for k in range(len(candidates)) if k not in diagnosis.views]
         candidates, C = [candidates[k] for k in keep], C[keep]
-    twins = [_plausible_twin(c.pose, config.gates) for c in candidates]
+    twins = [_plausible_twin(c.pose) for c in candidates]
     middle = target.points_board.mean(0)
-    C, dropped, _ = frame_gate(
-        _given(candidates), C, twins, middle, config.gates, eye_in_hand=in_hand
-    )
+    C, dropped, _ = frame_gate(_given(candidates), C, twins, middle, eye_in_hand=in_hand)
     rejected |= {candidates[k].view.index: reason for k, reason in dropped.items()}
     keep = [k for k in range(len(candidates)) if k not in dropped]
     candidates, C = [candidates[k] for k in keep], C[keep]
     A = stacks(candidates)[0]
-    mismatch, ratio = rotation_mismatch_deg(A, C), screw_ratio(A, C, config.gates)
+    mismatch, ratio = rotation_mismatch_deg(A, C), screw_ratio(A, C)
     candidates, start, starts, more = _start(candidates, C, intrinsics0, config)
     used = stacks(candidates)[1]
     motion = motion_check_of(_given(candidates), used, middle, eye_in_hand=in_hand)
@@ -250,9 +244,9 @@ def stacks(candidates: list[Candidate]) -> tuple[Array, Array]:
     return A, np.array([c.pose.T_cam_board for c in candidates]).reshape(-1, 4, 4)
 
 
-def _plausible_twin(pose: BoardPose, gates: GateConfig) -> Array | None:
+def _plausible_twin(pose: BoardPose) -> Array | None:
     """Return the mirror solution where it fits the image almost as well."""
-    limit = gates.twin_ratio * max(pose.rms_px, TWIN_FLOOR_PX)
+    limit = TWIN_RATIO * max(pose.rms_px, TWIN_FLOOR_PX)
     return pose.twin if pose.twin_rms_px <= limit else None
 
 
@@ -263,7 +257,7 @@ def _start(
     rejected: dict[int, str] = {}
     tried = _closed_forms(candidates, C, intrinsics)
     for _ in range(config.gate_rounds):
-        bad = px_gate(_best(tried)[2], config.gates)
+        bad = px_gate(_best(tried)[2])
         if not bad:
             break
         rejected |= {candidates[k].view.index: reason for k, reason in bad.items()}

@@ -9,7 +9,7 @@ from realsim.errors import InputError, NotRigidError
 from realsim.geometry import se3
 from realsim_calibration.faults.diagnose import diagnose, prove_reading
 from realsim_calibration.faults.frame_fit import fit_frames, hand_side, mismatch
-from realsim_calibration.faults.gates import GateConfig, frame_gate
+from realsim_calibration.faults.gates import frame_gate
 from realsim_calibration.faults.half_turns import half_turn, synchronise_half_turns
 from realsim_calibration.faults.motion_check import check_motion
 from realsim_calibration.faults.rotation_readings import (
@@ -73,12 +73,8 @@ def test_the_fit_of_perfect_data_is_the_truth(eye_in_hand):
     fit = fit_frames(hand_side(T, eye_in_hand), C, MIDDLE)
     assert np.abs(fit.X - X).max() < 1e-6 and np.abs(fit.Z - Z).max() < 1e-6
     assert abs(fit.length_ratio - 1) < 1e-6 and fit.score < 1e-4
-    own = np.diag(mismatch(fit, hand_side(T, eye_in_hand), C, faults_fit()))
+    own = np.diag(mismatch(fit, hand_side(T, eye_in_hand), C))
     assert own.max() < 1e-4
-
-
-def faults_fit():
-    return GateConfig().fit
 
 
 def test_the_fit_does_not_depend_on_the_frames_of_base_tool_and_board():
@@ -294,7 +290,7 @@ def test_the_frame_gate_sees_swapped_views_of_equal_orientation():
     T = T @ se3.exp(rng.normal(scale=3e-4, size=(20, 6)))
     C[[4, 5]] = C[[5, 4]]
     none = [None] * 20
-    dropped = frame_gate(T, C, none, MIDDLE, GateConfig(), eye_in_hand=s.eye_in_hand)[1]
+    dropped = frame_gate(T, C, none, MIDDLE, eye_in_hand=s.eye_in_hand)[1]
     assert dropped.keys() == {4, 5} and "mm and" in dropped[4]
 
 
@@ -303,9 +299,7 @@ def test_a_mirror_twin_stands_in():
     C, twins = s.C.copy(), [None] * 20
     twins[7] = C[7].copy()
     C[7] = C[7] @ turn_about_middle([0.6, 0.0, 0.0])
-    chosen, dropped, used = frame_gate(
-        s.T, C, twins, MIDDLE, GateConfig(), eye_in_hand=s.eye_in_hand
-    )
+    chosen, dropped, used = frame_gate(s.T, C, twins, MIDDLE, eye_in_hand=s.eye_in_hand)
     assert used == [7] and not dropped and np.array_equal(chosen, s.C)
 
 
@@ -317,9 +311,7 @@ def turn_about_middle(w):
 def test_the_frame_gate_keeps_clean_views():
     for seed in range(6):
         s = session(seed)
-        gate = frame_gate(
-            s.T, s.C, [None] * len(s.T), MIDDLE, GateConfig(), eye_in_hand=s.eye_in_hand
-        )
+        gate = frame_gate(s.T, s.C, [None] * len(s.T), MIDDLE, eye_in_hand=s.eye_in_hand)
         assert not gate[1] and not gate[2]
 
 

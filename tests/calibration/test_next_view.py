@@ -11,7 +11,6 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import Chessboard
 from realsim_calibration.planning.next_view import (
-    NextViewConfig,
     board_geometry,
     choose_next_views,
     displacement_metric,
@@ -67,7 +66,7 @@ def test_a_view_never_increases_the_covariance(
     case: str, reports: dict[str, HandEyeReport]
 ) -> None:
     report, rng = reports[case], np.random.default_rng(3)
-    M = displacement_metric(report, NextViewConfig())
+    M = displacement_metric(report)
     now = 1e3 * np.sqrt(np.trace(M @ report.X_covariance))
     rows = rank_next_views(report, plan_of(report, rng, 40))
     assert any(v.visible for v in rows)
@@ -146,7 +145,7 @@ def test_greedy_beats_random_in_expected_and_actual_error() -> None:
     )
     plan = np.concatenate([random_hands(rng, 16, tilt=15, roll=10), random_hands(rng, 8)])
     report = report_of(start)
-    M = displacement_metric(report, NextViewConfig())
+    M = displacement_metric(report)
     greedy = [v.plan_index for v in choose_next_views(report, plan, 4)]
     others = [rng.choice(len(plan), 4, replace=False) for _ in range(12)]
 

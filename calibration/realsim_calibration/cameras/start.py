@@ -21,6 +21,7 @@ from realsim.geometry.camera import project
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Check
 from realsim_calibration.cameras.rig import MOUNTS, PLACES, Rig, Sighting
+from realsim_calibration.faults.gates import PX_FLOOR, PX_RATIO
 from realsim_calibration.fit.board_pose import estimate_board_pose
 from realsim_calibration.screening import HandEyeConfig, screen
 from realsim_calibration.views import BoardView
@@ -259,7 +260,6 @@ class _Finder:
 
     def gate(self) -> None:
         """Leave out the views that do not fit; doubt the arm where all views of an instant do."""
-        gates = self.config.gates
         px = {k: self.px(k) for k in self.C}
         groups: dict[tuple[int, int], list[int]] = {}
         for k in self.C:
@@ -268,7 +268,7 @@ class _Finder:
         for ks in groups.values():
             usual = float(np.median([px[k] for k in ks]))
             most = MOST_OFF * self.sightings[ks[0]].detection.image_size[0]
-            limit = max(gates.px_ratio * usual, gates.px_floor) if usual < most else most
+            limit = max(PX_RATIO * usual, PX_FLOOR) if usual < most else most
             limits |= dict.fromkeys(ks, limit)
         bad = {k for k in self.C if k in self.screened or px[k] > limits[k]}
         for i in sorted({self.sightings[k].instant for k in bad}):

@@ -11,7 +11,7 @@ least squares and of the sum of the pairs' scores with their autocorrelation (Ne
 Econometrica 55(3), 1987): neighbours in a stream share what the models leave.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,7 +41,9 @@ from realsim_calibration.pairs.noise import (
     solve,
 )
 from realsim_calibration.pairs.solve import (
-    PairsConfig,
+    NOISE_PAIRS,
+    ROUNDS,
+    WIDTH_SHARE,
     gate_limit,
     jackknifed,
     require_agreement,
@@ -63,27 +65,22 @@ NOISE_STEPS = (0, 1, 3)
 """Steps of the least squares before which the sizes are estimated anew."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ClockConfig:
-    """When an offset is believed, and when it matters."""
-
-    pairs: PairsConfig = field(default_factory=PairsConfig)
-    least_correlation: float = 0.5
-    """Turning speeds of the same motion correlate better: 0.8 and more at 5 mrad of noise."""
-    distinct: float = 0.02
-    """No other lag, a window away, may come that close to the best correlation."""
-    least_speed: float = 0.02
-    """Turning speed whose changes tell the time [rad/s], RMS about its mean."""
-    least_pairs: int = 8
-    """Fewest frames in the time that both streams cover."""
-    steps: int = 8
-    """Steps of the least squares: four are usual."""
-    settled: float = 0.02
-    """A step of this part of sigma ends them."""
-    start_pairs: int = 120
-    """Frames, evenly spread, that the first frames X and Z are found from."""
-    matters: float = 0.3
-    """An offset matters when what it moves the board by exceeds this part of the pairs' scatter."""
+LEAST_CORRELATION = 0.5
+"""Turning speeds of the same motion correlate better: 0.8 and more at 5 mrad of noise."""
+DISTINCT = 0.02
+"""No other lag, a window away, may come that close to the best correlation."""
+LEAST_SPEED = 0.02
+"""Turning speed whose changes tell the time [rad/s], RMS about its mean."""
+LEAST_PAIRS = 8
+"""Fewest frames in the time that both streams cover."""
+STEPS = 8
+"""Steps of the least squares: four are usual."""
+SETTLED = 0.02
+"""A step of this part of sigma ends them."""
+START_PAIRS = 120
+"""Frames, evenly spread, that the first frames X and Z are found from."""
+MATTERS = 0.3
+"""An offset matters when what it moves the board by exceeds this part of the pairs' scatter."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -138,7 +135,6 @@ def estimate_clock_offset(
     Ts_cam_board: ArrayLike,
     *,
     mode: Mode = "eye_in_hand",
-    config: ClockConfig | None = None,
 ) -> ClockOffset:
     """Return the offset of the camera's clock, with X and Z.
 
@@ -148,13 +144,11 @@ def estimate_clock_offset(
         camera_times: (m,) by the camera's clock [s].
         Ts_cam_board: (m, 4, 4) the board in the camera [m]; NaN where it was not seen.
         mode: where the camera sits.
-        config: when an offset is believed.
 
     Raises:
         InputError: no motion, no lag at which the motions agree, or hardly any time in common.
         DegenerateError: the motion does not determine the hand-eye.
     """
-    config = config or ClockConfig()
     tr, A = checked_stream(np.asarray(robot_times), np.asarray(Ts_base_ee), "the robot's stream")
     tc, C = checked_stream(
         np.asarray(camera_times), np.asarray(Ts_cam_board), "the camera's stream"
@@ -162,14 +156,12 @@ def estimate_clock_offset(
     # Stamps of 1.7e9 s leave a quarter of a microsecond: times from the middle keep all digits.
     zero = tr[0], tc[0]
     tr, tc = tr - zero[0], tc - zero[1]
-    start, correlation = first_offset(tr, A, tc, C, config)
-    fit = _Fit(tr, A, tc, C, zero[1] - zero[0], mode, config)
+    start, correlation = first_offset(tr, A, tc, C)
+    fit = _Fit(tr, A, tc, C, zero[1] - zero[0], mode)
     return replace(fit.run(start), correlation=correlation)
 
 
-def first_offset(
-    tr: Array, A: Array, tc: Array, C: Array, config: ClockConfig
-) -> tuple[float, float]:
+def first_offset(tr: Array, A: Array, tc: Array, C: Array) -> tuple[float, float]:
     """Return the lag at which the turning speeds agree best [s], and their correlation.
 
     Raises:
@@ -179,12 +171,12 @@ def first_offset(
     robot = turning_speeds(*without_spikes(tr, A), window)
     camera = turning_speeds(*without_spikes(tc, C), window)
     for name, (t, w) in (("robot", robot), ("camera", camera)):
-        if len(t) < config.least_pairs or float(np.std(w)) < config.least_speed:
+        if len(t) < LEAST_PAIRS or float(np.std(w)) < LEAST_SPEED:
             spread = float(np.std(w)) if len(w) else 0.0
             raise InputError(
                 f"clock: the {name}'s stream shows no motion that tells the time: its turning "
                 f"speed changes by {np.degrees(spread):.2f} deg/s over {len(t)} poses; "
-                f"{np.degrees(config.least_speed):.1f} deg/s or more are needed. Record while the "
+                f"{np.degrees(LEAST_SPEED):.1f} deg/s or more are needed. Record while the "
                 "hand turns and pauses, or give the offset (--clock-offset SECONDS, or off)."
             )
     lags, value = correlated(robot, camera, window / STEPS_PER_WINDOW)
@@ -196,7 +188,7 @@ def first_offset(
     best = int(np.argmax(value))
     away = np.abs(lags - lags[best]) > 2 * window
     rival = float(value[away].max()) if away.any() else -1.0
-    if value[best] < config.least_correlation or rival > value[best] - config.distinct:
+    if value[best] < LEAST_CORRELATION or rival > value[best] - DISTINCT:
         raise InputError(
             f"clock: the turns of hand and camera agree at no offset (best correlation "
             f"{value[best]:.2f} at {lags[best]:+.2f} s from the beginnings of both, next best "
@@ -214,12 +206,10 @@ class _Fit:
 
     def __init__(
         self, tr: Array, A: Array, tc: Array, C: Array, apart: float, mode: Mode,
-        config: ClockConfig,
     ) -> None:  # fmt: skip
         self.apart = apart  # how much later the camera's zero is than the robot's, by their stamps
         self.tr, self.A, self.tc, self.C = tr, A, tc, C
         self.mode: Mode = mode
-        self.config = config
         self.window = window_of(tr)
 
     def _hand(self, offset: float) -> tuple[Array, Array, Mask]:
@@ -231,25 +221,24 @@ class _Fit:
 
     def run(self, offset: float) -> ClockOffset:
         """Return the offset from a start."""
-        config, pairs = self.config, self.config.pairs
         Ts, _, inside = self._hand(offset)
-        if inside.sum() < config.least_pairs:
+        if inside.sum() < LEAST_PAIRS:
             raise InputError(
                 f"clock: at the best offset only {int(inside.sum())} frames lie in the time that "
-                f"both streams cover; at least {config.least_pairs} are needed. Record both longer."
+                f"both streams cover; at least {LEAST_PAIRS} are needed. Record both longer."
             )
-        few = spread(np.flatnonzero(inside), config.start_pairs)
+        few = spread(np.flatnonzero(inside), START_PAIRS)
         frames = fit_frames(
-            hand_side(Ts[few], self.mode == "eye_in_hand"), self.C[few], config=pairs.fit
+            hand_side(Ts[few], self.mode == "eye_in_hand"), self.C[few], width_share=WIDTH_SHARE
         )
-        start_inside(frames, pairs)
+        start_inside(frames)
         used, noise = inside.copy(), Noise.start("axes", RobotParts(velocity=np.zeros((1, 6))))
         X, Z, offset, noise, solved = self._solved(frames.X, frames.Z, offset, used, noise)
-        for _ in range(pairs.rounds):
+        for _ in range(ROUNDS):
             Ts, V, inside = self._hand(offset)
             linear = linearise(Ts, self.C, X, Z, to_hand=self.mode == "eye_to_hand")
-            agree = inside & (distances(linear, noise, RobotParts(velocity=V)) <= gate_limit(pairs))
-            require_agreement(agree[inside], pairs)
+            agree = inside & (distances(linear, noise, RobotParts(velocity=V)) <= gate_limit())
+            require_agreement(agree[inside])
             if np.array_equal(agree, used):
                 break
             used = agree
@@ -262,8 +251,8 @@ class _Fit:
         """Return the least squares over the frames that are used."""
         rows = np.flatnonzero(used)
         solved: Solved | None = None
-        few = spread(np.arange(len(rows)), self.config.pairs.noise_pairs)
-        for k in range(self.config.steps):
+        few = spread(np.arange(len(rows)), NOISE_PAIRS)
+        for k in range(STEPS):
             Ts, V, _ = self._hand(offset)
             velocity = V[rows]
             parts = RobotParts(velocity=velocity)
@@ -282,7 +271,7 @@ class _Fit:
             X, Z = X @ se3.exp(step[:6]), Z @ se3.exp(step[6:12])
             offset += float(step[12])
             sigma = float(np.sqrt(solved.covariance[12, 12]))
-            if k > 3 and abs(step[12]) < self.config.settled * sigma:
+            if k > 3 and abs(step[12]) < SETTLED * sigma:
                 break
         assert solved is not None
         return X, Z, offset, noise, solved
@@ -295,7 +284,7 @@ class _Fit:
         Ts, V, _ = self._hand(offset)
         linear = linearise(Ts[used], self.C[used], X, Z, to_hand=self.mode == "eye_to_hand")
         try:
-            require_explained(linear.residuals, Ts[used], self.config.pairs)
+            require_explained(linear.residuals, Ts[used])
         except InputError as error:
             raise InputError(
                 f"clock: hand and camera agree at no offset: {NO_OFFSET} ({error})"
@@ -307,7 +296,7 @@ class _Fit:
         return ClockOffset(
             offset_s=whole, sigma_s=float(np.sqrt(inverse[12, 12] * factor)),
             correlation=float("nan"), jitter_s=float(noise.sizes[-1]), moved_mm=moved_mm,
-            scatter_mm=scatter, matters=moved_mm > self.config.matters * scatter, mode=self.mode,
+            scatter_mm=scatter, matters=moved_mm > MATTERS * scatter, mode=self.mode,
             X=X, Z=Z, covariance=inverse[:12, :12], used=used,
         )  # fmt: skip
 

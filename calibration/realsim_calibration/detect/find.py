@@ -1,6 +1,6 @@
 """Find a target's points in an image, whatever kind of target it is."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,20 +21,12 @@ FEW_POINTS = 8
 """With fewer points it is looked at whether the picture is blurred."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class FindConfig:
-    """How each kind of target is found, and when its points are good enough."""
-
-    tags: DetectionConfig = field(default_factory=DetectionConfig)
-    """Boards of AprilTags."""
+TAGS = DetectionConfig()
+"""Boards of AprilTags."""
 
 
 def find_target(
-    image: UInt8,
-    target: Target,
-    *,
-    intrinsics: CameraIntrinsics | None = None,
-    config: FindConfig | None = None,
+    image: UInt8, target: Target, *, intrinsics: CameraIntrinsics | None = None
 ) -> TargetDetection:
     """Return the points of a target that can be trusted; none is no error, `rejected` says why.
 
@@ -46,13 +38,11 @@ def find_target(
         target: what was printed.
         intrinsics: with them the lens is taken into account: straight edges may look bent, and
             ellipses lie askew. Rough ones will do.
-        config: how each kind of target is found.
 
     Raises:
         InputError: the image is not 8 bit, the intrinsics belong to another image size, or the
             marker dictionary is not known.
     """
-    config = config or FindConfig()
     gray = gray_image(image)
     if intrinsics is not None and size_of(gray) != (intrinsics.width, intrinsics.height):
         width, height = size_of(gray)
@@ -60,7 +50,7 @@ def find_target(
             f"the image is {width}x{height} px, the intrinsics are for {intrinsics.width}x"
             f"{intrinsics.height}: give the intrinsics of this image size, or none."
         )
-    found = _points(gray, target, intrinsics, config)
+    found = _points(gray, target, intrinsics)
     if len(found) < FEW_POINTS:
         blurred = blur_reason(gray)
         if blurred:
@@ -69,13 +59,11 @@ def find_target(
     return replace(found, rejected=(drawn, *found.rejected)) if drawn else found
 
 
-def _points(
-    gray: UInt8, target: Target, intrinsics: CameraIntrinsics | None, config: FindConfig
-) -> TargetDetection:
+def _points(gray: UInt8, target: Target, intrinsics: CameraIntrinsics | None) -> TargetDetection:
     """Return the points by the search for the target's kind."""
     if isinstance(target, TagBoard):
         return tag_points(
-            detect_tags(gray, target, config.tags, intrinsics=intrinsics), target, size_of(gray)
+            detect_tags(gray, target, TAGS, intrinsics=intrinsics), target, size_of(gray)
         )
     if isinstance(target, CharucoBoard):
         return find_charuco(gray, target, intrinsics=intrinsics)

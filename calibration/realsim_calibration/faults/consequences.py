@@ -7,7 +7,7 @@ from realsim.errors import InputError, UnitError
 from realsim.records import Check, Target
 from realsim_calibration.detect.drawings import DRAWN
 from realsim_calibration.faults.diagnose import diagnose
-from realsim_calibration.faults.diagnosis import Diagnosis, DiagnosisConfig
+from realsim_calibration.faults.diagnosis import Diagnosis
 from realsim_calibration.faults.frame_fit import MIN_VIEWS
 from realsim_calibration.faults.half_turns import HalfTurns, synchronise_half_turns
 from realsim_calibration.faults.motion_check import check_motion
@@ -28,7 +28,7 @@ SHOWN = 4
 
 def examine(
     Ts_base_ee: Array, Ts_cam_board: Array, labels: Sequence[str], target: Target,
-    mode: Mode, nominal: Array | None, config: DiagnosisConfig,
+    mode: Mode, nominal: Array | None,
 ) -> Diagnosis | None:  # fmt: skip
     """Return the diagnosis of the poses, None where there are too few to say anything.
 
@@ -40,7 +40,6 @@ def examine(
         return None
     found = diagnose(
         Ts_base_ee, Ts_cam_board, labels=labels, target=target, nominal=nominal, mode=mode,
-        config=config,
     )  # fmt: skip
     if found.harmless or found.fault in (*SINGLE_VIEWS, "board_flips"):
         return found

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from realsim.arrays import Array, Mask
-from realsim_calibration.faults.diagnosis import DiagnosisConfig
-from realsim_calibration.faults.frame_fit import chord_angle
+from realsim_calibration.faults.diagnosis import OTHER_VIEW, SAME_POSE_DEG, SAME_POSE_MM, SAME_VIEW
+from realsim_calibration.faults.frame_fit import UNIT_DEG, UNIT_PART, chord_angle
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -21,20 +21,20 @@ class Copies:
     """The same image, different poses."""
 
 
-def find_copies(T: Array, C: Array, middle: Array, config: DiagnosisConfig) -> Copies:
+def find_copies(T: Array, C: Array, middle: Array) -> Copies:
     """Return the groups of (n, 4, 4) hand and board poses that repeat each other."""
     unit = _length_unit(T)
-    same_hand = _near(T, 1e-3 * config.same_pose_mm * unit, np.radians(config.same_pose_deg))
+    same_hand = _near(T, 1e-3 * SAME_POSE_MM * unit, np.radians(SAME_POSE_DEG))
     q = C[:, :3, :3] @ middle + C[:, :3, 3]
     distance = max(float(np.median(np.linalg.norm(q, axis=-1))), 1e-12)
     turn = chord_angle(C[:, None, :3, :3], C[None, :, :3, :3])
     slip = np.linalg.norm(q[:, None] - q[None], axis=-1) / distance
-    seen = np.hypot(turn / np.radians(config.fit.unit_deg), slip / config.fit.unit_part)
+    seen = np.hypot(turn / np.radians(UNIT_DEG), slip / UNIT_PART)
     # The same image gives the same numbers; a second photograph of the same view does not.
-    same_image = seen < 1e-6 * config.same_view
+    same_image = seen < 1e-6 * SAME_VIEW
     return Copies(
-        duplicates=_groups(same_hand & (seen < config.same_view)),
-        frozen=_groups(same_hand & (seen > config.other_view)),
+        duplicates=_groups(same_hand & (seen < SAME_VIEW)),
+        frozen=_groups(same_hand & (seen > OTHER_VIEW)),
         repeated=_groups(same_image & ~same_hand),
     )
 

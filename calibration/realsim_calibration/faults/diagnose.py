@@ -20,8 +20,18 @@ from realsim.records import Target
 from realsim_calibration.faults import pairing
 from realsim_calibration.faults.copied_views import Copies, find_copies
 from realsim_calibration.faults.diagnosis import (
+    ACCEPT_SCORE,
+    DECISIVE,
+    DOUBTFUL_SCORE,
+    FEW_VIEWS,
+    GAIN,
+    GAIN_FEW,
+    LEAST_TURN_DEG,
+    MAX_SIZE_RATIO,
+    SIZE_SIGMAS,
+    SURE_SCORE,
+    TIE,
     Diagnosis,
-    DiagnosisConfig,
     Evidence,
     Fault,
     ReadingFit,
@@ -69,7 +79,6 @@ def diagnose(
     target: Target | None = None,
     nominal: ArrayLike | None = None,
     mode: Mode = "eye_in_hand",
-    config: DiagnosisConfig | None = None,
 ) -> Diagnosis:
     """Return the most plausible single fault of the poses, with evidence and, if possible, repair.
 
@@ -80,13 +89,11 @@ def diagnose(
         target: the printed target: for its middle, its size in messages, whether it can be turned.
         nominal: (n, 4, 4) T_base_flange by the nominal kinematics [m], for the tool offset.
         mode: where the camera is said to sit.
-        config: when a reading is believed.
 
     Raises:
         InputError: stacks of different lengths, or fewer than four views.
         NotRigidError: a pose is not rigid.
     """
-    config = config or DiagnosisConfig()
     T = se3.check_rigid(Ts_base_ee, "Ts_base_ee").reshape(-1, 4, 4)
     C = se3.check_rigid(Ts_cam_board, "Ts_cam_board").reshape(-1, 4, 4)
     if len(T) != len(C) or len(T) < MIN_VIEWS + 1:
@@ -100,23 +107,23 @@ def diagnose(
     middle = np.zeros(3) if target is None else target.points_board.mean(0)
     p = Poses(T=T, C=C, eye_in_hand=mode == "eye_in_hand", middle=middle, labels=names,
               target=target)  # fmt: skip
-    copies = find_copies(T, C, middle, config)
-    rows, copied = _without_copies(p, copies, config)
+    copies = find_copies(T, C, middle)
+    rows, copied = _without_copies(p, copies)
     if copied is not None and copied.fault == "unknown":
-        return _diagnosis(p, copied, (), config)
+        return _diagnosis(p, copied, ())
     part = Poses(
         T=T[rows], C=C[rows], eye_in_hand=p.eye_in_hand, middle=middle,
         labels=tuple(names[k] for k in rows), target=target,
     )  # fmt: skip
     known = None if nominal is None else np.asarray(nominal, dtype=np.float64)[rows]
-    found, tried = _search(part, known, config)
+    found, tried = _search(part, known)
     found = _with_rows(found, rows)
     if copied is not None:
         if found.fault in ("none", "tool_offset", "base_turned"):
             found = replace(copied, fit=found.fit)
         else:
             found = replace(found, sentence=f"{found.sentence} Also: {copied.sentence}")
-    return _diagnosis(p, found, tried, config)
+    return _diagnosis(p, found, tried)
 
 
 def _with_rows(h: Hypothesis, rows: Int64) -> Hypothesis:
@@ -124,13 +131,11 @@ def _with_rows(h: Hypothesis, rows: Int64) -> Hypothesis:
     return replace(h, rows=rows[h.rows], views=tuple(int(rows[k]) for k in h.views))
 
 
-def _diagnosis(
-    p: Poses, h: Hypothesis, tried: Sequence[Hypothesis], config: DiagnosisConfig
-) -> Diagnosis:
+def _diagnosis(p: Poses, h: Hypothesis, tried: Sequence[Hypothesis]) -> Diagnosis:
     table: list[Evidence] = []
     for other in tried:
         if len(other.T) >= MIN_VIEWS and other.name not in {e.hypothesis for e in table}:
-            table.append(evidence_of(other, p.eye_in_hand, config))
+            table.append(evidence_of(other, p.eye_in_hand))
     mended = bool(h.note)
     return Diagnosis(
         fault=h.fault, sentence=h.sentence, advice=h.advice, views=h.views,
@@ -141,9 +146,7 @@ def _diagnosis(
     )  # fmt: skip
 
 
-def _without_copies(
-    p: Poses, copies: Copies, config: DiagnosisConfig
-) -> tuple[Int64, Hypothesis | None]:
+def _without_copies(p: Poses, copies: Copies) -> tuple[Int64, Hypothesis | None]:
     """Return the rows that repeat nothing, and what the others are."""
     groups = {"duplicated_views": copies.duplicates, "frozen_pose": copies.frozen,
               "repeated_image": copies.repeated}  # fmt: skip
@@ -158,8 +161,8 @@ def _without_copies(
     sure = np.array([k for k in range(n) if k not in doubtful | spare], dtype=np.int64)
     kept = list(sure)
     if doubtful and len(sure) > MIN_VIEWS:
-        fit = p.fit(p.T[sure], p.C[sure], config)
-        errors = np.diag(mismatch(fit, hand_side(p.T, p.eye_in_hand), p.C, config.fit))
+        fit = p.fit(p.T[sure], p.C[sure])
+        errors = np.diag(mismatch(fit, hand_side(p.T, p.eye_in_hand), p.C))
         gate = max(pairing.RATIO * fit.usual, pairing.SWAP_FLOOR)
         for kind in ("frozen_pose", "repeated_image"):
             for group in groups[kind]:
@@ -185,33 +188,31 @@ def _without_copies(
     use = rows if enough else every
     return use, Hypothesis(
         fault=fault if enough else "unknown", name=fault.replace("_", " "),
-        fit=p.fit(p.T[use], p.C[use], config), score=0.0, T=p.T[use], C=p.C[use],
+        fit=p.fit(p.T[use], p.C[use]), score=0.0, T=p.T[use], C=p.C[use],
         rows=np.stack([use, use], -1), sentence=f"Views {groups_text} {text[0]}.",
         advice=text[1], views=named, note="the views named were left out." if enough else "",
     )  # fmt: skip
 
 
-def _search(
-    p: Poses, nominal: Array | None, config: DiagnosisConfig
-) -> tuple[Hypothesis, list[Hypothesis]]:
+def _search(p: Poses, nominal: Array | None) -> tuple[Hypothesis, list[Hypothesis]]:
     """Return what is wrong with the poses, and all that was tried, as given first."""
-    given = simple(p, "none", "as given", p.T, p.C, config)
-    if (reason := _untestable(p, config)) is not None:
+    given = simple(p, "none", "as given", p.T, p.C)
+    if (reason := _untestable(p)) is not None:
         return replace(given, fault="untestable", sentence=reason[0], advice=reason[1]), [given]
-    if given.score <= config.sure_score and given.fit.errors.max() <= pairing.FLOOR:
-        return _sound(p, given, nominal, config), [given]
-    tried = [inverted(p, config), *mirrored(p, config)]
-    tried += [h for h in (flipped_boards(p, config), paired_otherwise(p, config), moved(p, config))
+    if given.score <= SURE_SCORE and given.fit.errors.max() <= pairing.FLOOR:
+        return _sound(p, given, nominal), [given]
+    tried = [inverted(p), *mirrored(p)]
+    tried += [h for h in (flipped_boards(p), paired_otherwise(p), moved(p))
               if h is not None]  # fmt: skip
-    tried += reread_rotations(p, config, thorough=False)
-    best = _best(given, tried, config)
+    tried += reread_rotations(p, thorough=False)
+    best = _best(given, tried)
     # Slow but complete, for poses too few or too parallel for a vote.
-    if given.score > config.accept_score and _doubtful(best, config):
-        tried += reread_rotations(p, config, thorough=True)
-        best = _best(given, tried, config)
-    if best is None and given.score > config.accept_score:
-        tried += reread_as_degrees(p, config)
-        best = _best(given, tried, config)
+    if given.score > ACCEPT_SCORE and _doubtful(best):
+        tried += reread_rotations(p, thorough=True)
+        best = _best(given, tried)
+    if best is None and given.score > ACCEPT_SCORE:
+        tried += reread_as_degrees(p)
+        best = _best(given, tried)
     listed = [given, *sorted(tried, key=lambda h: h.score)]
     if best is not None:
         figures = (
@@ -223,8 +224,8 @@ def _search(
             if offset.known and len(offset.offsets) > 1:
                 figures += f" {offset.sentence}"
         return replace(best, sentence=best.sentence + figures), listed
-    if given.score <= config.accept_score:
-        return _sound(p, given, nominal, config), listed
+    if given.score <= ACCEPT_SCORE:
+        return _sound(p, given, nominal), listed
     return _unknown(given, tried), listed
 
 
@@ -247,34 +248,30 @@ def _mm(h: Hypothesis) -> str:
     return f"{length:.1f} mm" if length < 1e4 else "metres"
 
 
-def _doubtful(best: Hypothesis | None, config: DiagnosisConfig) -> bool:
+def _doubtful(best: Hypothesis | None) -> bool:
     return best is None or (
-        best.fault in ("rotation_reading", "radians_as_degrees")
-        and best.score > config.doubtful_score
+        best.fault in ("rotation_reading", "radians_as_degrees") and best.score > DOUBTFUL_SCORE
     )
 
 
-def _best(
-    given: Hypothesis, tried: Sequence[Hypothesis], config: DiagnosisConfig
-) -> Hypothesis | None:
+def _best(given: Hypothesis, tried: Sequence[Hypothesis]) -> Hypothesis | None:
     """Return the reading that fits far better than the given one, the simplest of equals."""
-    gain = config.gain if len(given.T) >= config.few_views else config.gain_few
+    gain = GAIN if len(given.T) >= FEW_VIEWS else GAIN_FEW
     fitting = [
         h
         for h in tried
-        if h.score <= config.accept_score
-        and h.score * (gain if h.gain is None else h.gain) < given.score
+        if h.score <= ACCEPT_SCORE and h.score * (gain if h.gain is None else h.gain) < given.score
     ]
     if not fitting:
         return None
-    limit = config.tie * min(h.score for h in fitting)
+    limit = TIE * min(h.score for h in fitting)
     return next(h for h in fitting if h.score <= limit)
 
 
-def _untestable(p: Poses, config: DiagnosisConfig) -> tuple[str, str] | None:
+def _untestable(p: Poses) -> tuple[str, str] | None:
     """Return why conventions cannot be tested, None where they can."""
     second = [np.degrees(principal_turns(m.turns)[0][1]) for m in motions(p.T, p.C)]
-    if max(second) >= config.least_turn_deg:
+    if max(second) >= LEAST_TURN_DEG:
         return None
     return (
         f"Hand and camera turn by only {second[0]:.2f} and {second[1]:.2f} deg (RMS) about their "
@@ -283,25 +280,23 @@ def _untestable(p: Poses, config: DiagnosisConfig) -> tuple[str, str] | None:
     )
 
 
-def _sound(
-    p: Poses, given: Hypothesis, nominal: Array | None, config: DiagnosisConfig
-) -> Hypothesis:
+def _sound(p: Poses, given: Hypothesis, nominal: Array | None) -> Hypothesis:
     """Return the faults that leave the frames consistent: units, sizes, tool offsets; or none."""
     ratio, sd = given.fit.length_ratio, given.fit.ratio_sd
     for unit, factor in UNITS:
         if factor / UNIT_TOLERANCE < ratio < factor * UNIT_TOLERANCE:
             T = p.T.copy()
             T[:, :3, 3] /= factor
-            return _unit(p, "robot_unit", "hand poses", unit, ratio, T, p.C, config)
+            return _unit(p, "robot_unit", "hand poses", unit, ratio, T, p.C)
         if factor / UNIT_TOLERANCE < 1 / ratio < factor * UNIT_TOLERANCE:
             C = p.C.copy()
             C[:, :3, 3] /= factor
-            return _unit(p, "board_unit", "board poses", unit, ratio, p.T, C, config)
+            return _unit(p, "board_unit", "board poses", unit, ratio, p.T, C)
     off = abs(np.log(ratio))
-    if off > np.log(config.max_size_ratio) and off > config.size_sigmas * sd:
+    if off > np.log(MAX_SIZE_RATIO) and off > SIZE_SIGMAS * sd:
         C = p.C.copy()
         C[:, :3, 3] *= ratio
-        h = simple(p, "board_size", "board scaled", p.T, C, config)
+        h = simple(p, "board_size", "board scaled", p.T, C)
         return replace(
             h,
             sentence=f"The board has another size: {size_name(p.target, ratio)} (the hand moves "
@@ -340,9 +335,8 @@ def _with_tool(p: Poses, none: Hypothesis, nominal: Array) -> Hypothesis:
 
 def _unit(
     p: Poses, fault: Fault, what: str, unit: str, ratio: float, T: Array, C: Array,
-    config: DiagnosisConfig,
 ) -> Hypothesis:  # fmt: skip
-    h = simple(p, fault, f"{what} in {unit}", T, C, config)
+    h = simple(p, fault, f"{what} in {unit}", T, C)
     return replace(
         h, sentence=f"The {what} are in {unit}, not in metres: the hand moves {ratio:.4g} times as "
         "far as the camera, and 1 is right.",
@@ -353,7 +347,6 @@ def _unit(
 def prove_reading(
     candidates: Sequence[tuple[str, ArrayLike]],
     Ts_cam_board: ArrayLike,
-    config: DiagnosisConfig | None = None,
     *,
     target: Target | None = None,
 ) -> ReadingProof:
@@ -366,13 +359,11 @@ def prove_reading(
     Args:
         candidates: (name, (n, 4, 4) T_base_ee) of every reading.
         Ts_cam_board: (n, 4, 4) board poses.
-        config: when a reading is believed.
         target: for the middle of the board.
 
     Raises:
         InputError: no candidate, or stacks of different lengths.
     """
-    config = config or DiagnosisConfig()
     C = se3.check_rigid(Ts_cam_board, "Ts_cam_board").reshape(-1, 4, 4)
     if not candidates:
         raise InputError("prove_reading: no reading was given; at least one is needed.")
@@ -385,7 +376,7 @@ def prove_reading(
     for (name, T), mode in product(read, modes):
         A = hand_side(T, mode == "eye_in_hand")
         key = (np.round(A, 9) + 0.0).tobytes()
-        fit = fits.get(key) or fit_frames(A, C, middle, config.fit)
+        fit = fits.get(key) or fit_frames(A, C, middle)
         fits[key] = fit
         h = Hypothesis(fault="none", name=f"{name} ({mode})", fit=fit, score=fit.score, T=A,
                        C=C, rows=np.zeros((0, 2), dtype=np.int64))  # fmt: skip
@@ -393,14 +384,14 @@ def prove_reading(
         # What sits in the hand is nearer to it than what stands in the base.
         natural = bool(x < z if mode == "eye_in_hand" else z < x)
         penalised = fit.score * (1 + abs(float(np.log(fit.length_ratio))) / np.log(1.5))
-        row = ReadingFit(name=name, mode=mode, evidence=evidence_of(h, True, config),
+        row = ReadingFit(name=name, mode=mode, evidence=evidence_of(h, True),
                          penalised=penalised)  # fmt: skip
         entries.append((row, A, natural))
     entries.sort(key=lambda e: e[0].penalised * (1.0 if e[2] else 1.01))
-    return _proof(entries, config)
+    return _proof(entries)
 
 
-def _proof(entries: list[tuple[ReadingFit, Array, bool]], config: DiagnosisConfig) -> ReadingProof:
+def _proof(entries: list[tuple[ReadingFit, Array, bool]]) -> ReadingProof:
     best, A, natural = entries[0]
     same = [
         e for e in entries[1:]
@@ -410,8 +401,8 @@ def _proof(entries: list[tuple[ReadingFit, Array, bool]], config: DiagnosisConfi
     others = [e for e in entries[1:] if all(e is not s for s in same)]
     runner = others[0][0] if others else None
     ratio = runner.penalised / max(best.penalised, 1e-12) if runner else float("inf")
-    fits = best.evidence.score <= config.accept_score
-    decisive = bool(fits and ratio >= config.decisive)
+    fits = best.evidence.score <= ACCEPT_SCORE
+    decisive = bool(fits and ratio >= DECISIVE)
     e = best.evidence
     text = (
         f"Read as {best.name}, {best.mode.replace('_', ' ')}, hand and camera agree to "

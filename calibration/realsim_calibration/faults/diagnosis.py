@@ -1,11 +1,9 @@
 """Records of the convention test: what was tried, what fits, what is wrong and how to mend it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from realsim.arrays import Array, Int64
-from realsim_calibration.faults.frame_fit import FitConfig
-from realsim_calibration.faults.gates import GateConfig
 from realsim_calibration.results import Mode
 
 Fault = Literal[
@@ -19,55 +17,49 @@ Fault = Literal[
 ]  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DiagnosisConfig:
-    """When data are right, and when another reading of them is believed."""
-
-    sure_score: float = 1.0
-    """Below this nothing else is tried: 0.5 deg and 1 % of the distance, RMS of the views."""
-    accept_score: float = 5.0
-    """A reading fits up to this score: real sets measure 1 to 2.5, wrong readings 10 to 20."""
-    gain: float = 2.0
-    """Another reading must fit this many times better than the poses as given."""
-    gain_few: float = 3.0
-    """The same with few views, where chance helps."""
-    gross_error: float = 8.0
-    """Single views are called mispaired from this error on: 4 deg or 8 % of the distance; planar
-    poses of good real sets reach 6."""
-    gain_gross: float = 1.15
-    """The rest must then fit only this many times better."""
-    accept_degrees: float = 2.7
-    """Degrees taken for radians are believed up to this score: each number may be any of 57."""
-    doubtful_score: float = 1.5
-    """Where no quick reading fits better than this, every pair of conventions is fitted."""
-    few_views: int = 8
-    """Fewer views than this are few."""
-    tie: float = 1.25
-    """Readings whose scores are within this factor fit equally well: the simpler one is named."""
-    max_size_ratio: float = 1.07
-    """A board this many times larger or smaller than said has another size; less is reported as a
-    scale: printers and intrinsics are off by up to 5 %."""
-    size_sigmas: float = 5.0
-    """The difference must be this many standard deviations."""
-    same_pose_mm: float = 0.02
-    """Poses nearer than this are one reading of the controller: arms at rest scatter more [mm]."""
-    same_pose_deg: float = 0.002
-    """The same for the angle [deg]."""
-    same_view: float = 0.5
-    """Error below which images of one pose are one view, in units of `FitConfig`."""
-    other_view: float = 2.0
-    """Error above which they are different views."""
-    least_turn_deg: float = 2.0
-    """RMS turn about the second axis below which conventions cannot be tested [deg]."""
-    small_turn_part: float = 0.2
-    """Hand turns below this part of the camera's look like radians read as degrees."""
-    plausible_off_axis: float = 1.5
-    """Camera poses are taken for inverted when the board would lie this many times further off the
-    optical axis than inverted."""
-    decisive: float = 3.0
-    """A reading of a pose file is proven when the next one fits this many times worse."""
-    fit: FitConfig = field(default_factory=FitConfig)
-    gates: GateConfig = field(default_factory=GateConfig)
+SURE_SCORE = 1.0
+"""Below this nothing else is tried: 0.5 deg and 1 % of the distance, RMS of the views."""
+ACCEPT_SCORE = 5.0
+"""A reading fits up to this score: real sets measure 1 to 2.5, wrong readings 10 to 20."""
+GAIN = 2.0
+"""Another reading must fit this many times better than the poses as given."""
+GAIN_FEW = 3.0
+"""The same with few views, where chance helps."""
+GROSS_ERROR = 8.0
+"""Single views are called mispaired from this error on: 4 deg or 8 % of the distance; planar
+poses of good real sets reach 6."""
+GAIN_GROSS = 1.15
+"""The rest must then fit only this many times better."""
+ACCEPT_DEGREES = 2.7
+"""Degrees taken for radians are believed up to this score: each number may be any of 57."""
+DOUBTFUL_SCORE = 1.5
+"""Where no quick reading fits better than this, every pair of conventions is fitted."""
+FEW_VIEWS = 8
+"""Fewer views than this are few."""
+TIE = 1.25
+"""Readings whose scores are within this factor fit equally well: the simpler one is named."""
+MAX_SIZE_RATIO = 1.07
+"""A board this many times larger or smaller than said has another size; less is reported as a
+scale: printers and intrinsics are off by up to 5 %."""
+SIZE_SIGMAS = 5.0
+"""The difference must be this many standard deviations."""
+SAME_POSE_MM = 0.02
+"""Poses nearer than this are one reading of the controller: arms at rest scatter more [mm]."""
+SAME_POSE_DEG = 0.002
+"""The same for the angle [deg]."""
+SAME_VIEW = 0.5
+"""Error below which images of one pose are one view, in the units of `fit_frames`."""
+OTHER_VIEW = 2.0
+"""Error above which they are different views."""
+LEAST_TURN_DEG = 2.0
+"""RMS turn about the second axis below which conventions cannot be tested [deg]."""
+SMALL_TURN_PART = 0.2
+"""Hand turns below this part of the camera's look like radians read as degrees."""
+PLAUSIBLE_OFF_AXIS = 1.5
+"""Camera poses are taken for inverted when the board would lie this many times further off the
+optical axis than inverted."""
+DECISIVE = 3.0
+"""A reading of a pose file is proven when the next one fits this many times worse."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

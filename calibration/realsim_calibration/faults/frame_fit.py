@@ -34,32 +34,26 @@ COLLAPSED = 0.02
 """A ratio that makes the camera's motion this part of the hand's is a collapse, not a fit."""
 MIN_VIEWS = 3
 """Two frames and a ratio are 13 unknowns, a view gives 6 equations."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class FitConfig:
-    """What counts as agreement, and how hard the fit looks for it."""
-
-    unit_deg: float = 0.5
-    """A rotation error of this size counts 1 [deg]: twice that of a good robot and board."""
-    unit_part: float = 0.01
-    """A translation error of this part of the camera's distance counts 1: 4 mm at 0.4 m."""
-    agree: float = 3.0
-    """Views with a larger error do not speak for a sample."""
-    cap: float = 20.0
-    """No view counts more than this in the score: one bad view must not outweigh a reading."""
-    samples: int = 120
-    """Triples and groups that are tried: with half of the views wrong, one in eight triples is
-    good, and 120 miss all of them once in 10^7 times."""
-    group: int = 5
-    """Views that start the translations: 15 equations for 7 unknowns."""
-    width_share: float = 0.5
-    """The width of the refinement's weights follows the error of this share of the views: the
-    median, unless as many as half of the views may be wrong."""
-    steps: int = 12
-    """Gauss-Newton steps: the start is near, six are usual."""
-    seed: int = 0
-    """Seed of the samples: the same data give the same answer."""
+UNIT_DEG = 0.5
+"""A rotation error of this size counts 1 [deg]: twice that of a good robot and board."""
+UNIT_PART = 0.01
+"""A translation error of this part of the camera's distance counts 1: 4 mm at 0.4 m."""
+AGREE = 3.0
+"""Views with a larger error do not speak for a sample."""
+CAP = 20.0
+"""No view counts more than this in the score: one bad view must not outweigh a reading."""
+SAMPLES = 120
+"""Triples and groups that are tried: with half of the views wrong, one in eight triples is
+good, and 120 miss all of them once in 10^7 times."""
+GROUP = 5
+"""Views that start the translations: 15 equations for 7 unknowns."""
+WIDTH_SHARE = 0.5
+"""The width of the refinement's weights follows the error of this share of the views: the
+median, unless as many as half of the views may be wrong."""
+STEPS = 12
+"""Gauss-Newton steps: the start is near, six are usual."""
+SEED = 0
+"""Seed of the samples: the same data give the same answer."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -83,7 +77,7 @@ class FrameFit:
     slips: Array
     """(n,) translation error per view [camera's unit]."""
     errors: Array
-    """(n,) both in units of `FitConfig`."""
+    """(n,) both in UNIT_DEG and UNIT_PART."""
     score: float
     """RMS of the capped errors, corrected for the 13 unknowns: 0.2 to 1.5 for right data."""
     usual: float
@@ -107,7 +101,11 @@ def hand_side(Ts_base_ee: ArrayLike, eye_in_hand: bool) -> Array:
 
 
 def fit_frames(
-    A: ArrayLike, C: ArrayLike, middle: ArrayLike = (0.0, 0.0, 0.0), config: FitConfig | None = None
+    A: ArrayLike,
+    C: ArrayLike,
+    middle: ArrayLike = (0.0, 0.0, 0.0),
+    *,
+    width_share: float = WIDTH_SHARE,
 ) -> FrameFit:
     """Return the frames and the ratio of lengths that most views agree with.
 
@@ -115,12 +113,11 @@ def fit_frames(
         A: (n, 4, 4) hand poses (`hand_side`), any unit of length.
         C: (n, 4, 4) board poses, any unit of length.
         middle: (3,) the board's middle in the board's frame, in the unit of C.
-        config: what counts as agreement.
+        width_share: see WIDTH_SHARE.
 
     Raises:
         InputError: fewer than three views, or stacks of different lengths.
     """
-    config = config or FitConfig()
     A, C = np.asarray(A, dtype=np.float64), np.asarray(C, dtype=np.float64)
     if len(A) != len(C) or len(A) < MIN_VIEWS:
         raise InputError(
@@ -129,11 +126,11 @@ def fit_frames(
         )
     m = np.asarray(middle, dtype=np.float64)
     q = C[:, :3, :3] @ m + C[:, :3, 3]
-    rng = np.random.default_rng(config.seed)
-    Rx, Rz = _start_rotations(A, C, config, rng)
+    rng = np.random.default_rng(SEED)
+    Rx, Rz = _start_rotations(A, C, rng)
     distance = max(float(np.median(np.linalg.norm(q, axis=-1))), 1e-12)
-    linear = _start_translations(A, q, Rx, distance, config, rng)
-    return _refine(A, C[:, :3, :3], q, (Rx, Rz, linear), m, config)
+    linear = _start_translations(A, q, Rx, distance, rng)
+    return _refine(A, C[:, :3, :3], q, (Rx, Rz, linear), m, width_share)
 
 
 def mean_transform(Ts: Array) -> Array:
@@ -141,7 +138,7 @@ def mean_transform(Ts: Array) -> Array:
     return se3.from_rt(se3.mean_rotation(Ts[:, :3, :3]), np.median(Ts[:, :3, 3], 0))
 
 
-def mismatch(fit: FrameFit, A: ArrayLike, C: ArrayLike, config: FitConfig) -> Array:
+def mismatch(fit: FrameFit, A: ArrayLike, C: ArrayLike) -> Array:
     """Return the error (k, l) of k hand poses with l board poses through frames already known."""
     A, C = np.asarray(A, dtype=np.float64), np.asarray(C, dtype=np.float64)
     left = A @ fit.X
@@ -151,11 +148,11 @@ def mismatch(fit: FrameFit, A: ArrayLike, C: ArrayLike, config: FitConfig) -> Ar
     where = np.einsum("kij,lj->kli", left[:, :3, :3], seen) + left[:, None, :3, 3]
     z = fit.Z[:3, :3] @ fit.middle * fit.length_ratio + fit.Z[:3, 3]
     slip = np.linalg.norm(where - z, axis=-1) / fit.length_ratio
-    return _units(angle, slip, fit.distance, config)
+    return _units(angle, slip, fit.distance)
 
 
-def _units(angles: Array, slips: Array, distance: float, config: FitConfig) -> Array:
-    return np.hypot(angles / np.radians(config.unit_deg), slips / (distance * config.unit_part))
+def _units(angles: Array, slips: Array, distance: float) -> Array:
+    return np.hypot(angles / np.radians(UNIT_DEG), slips / (distance * UNIT_PART))
 
 
 def chord_angle(R: Array, S: Array) -> Array:
@@ -191,25 +188,23 @@ def _turns(A: Array, C: Array) -> tuple[Array, Array]:
     return turns[0], turns[1]
 
 
-def _start_rotations(
-    A: Array, C: Array, config: FitConfig, rng: np.random.Generator
-) -> tuple[Array, Array]:
+def _start_rotations(A: Array, C: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Return R_X and R_Z that most views agree with."""
     Ra, Rd = A[:, :3, :3], np.swapaxes(C[:, :3, :3], -1, -2)
     a, b = _turns(A, C)
-    triples = np.sort(_draw(len(Ra), 3, 3 * config.samples, rng), axis=1)
+    triples = np.sort(_draw(len(Ra), 3, 3 * SAMPLES, rng), axis=1)
     i, j, k = triples.T
     M = sum(a[p, q][:, :, None] * b[p, q][:, None, :] for p, q in ((i, j), (i, k), (j, k)))
     M = np.asarray(M, dtype=np.float64)
     # Triples that turn about one axis only say little: the better third is kept.
-    order = np.argsort(-np.linalg.svd(M, compute_uv=False)[:, 1])[: config.samples]
+    order = np.argsort(-np.linalg.svd(M, compute_uv=False)[:, 1])[:SAMPLES]
     everything = np.einsum("ijk,ijl->kl", a, b)
     Rx = _nearest_rotations(np.concatenate([M[order], everything[None]]))
     Zs = Ra @ Rx[:, None] @ np.swapaxes(Rd, -1, -2)
     members = np.concatenate([Zs[np.arange(len(order))[:, None], triples[order]].sum(1),
                               Zs[-1:].sum(1)])  # fmt: skip
     Rz = _nearest_rotations(members)
-    limit = np.radians(config.unit_deg) * config.agree
+    limit = np.radians(UNIT_DEG) * AGREE
     loss = np.minimum(chord_angle(Zs, Rz[:, None]), limit)
     best = int(np.argmin(np.sum(loss**2, 1)))
     X, Z = Rx[best], Rz[best]
@@ -224,7 +219,7 @@ def _start_rotations(
 
 
 def _start_translations(
-    A: Array, q: Array, Rx: Array, distance: float, config: FitConfig, rng: np.random.Generator
+    A: Array, q: Array, Rx: Array, distance: float, rng: np.random.Generator
 ) -> Array:
     """Return (7,) t_X, z, s that most views agree with, given R_X.
 
@@ -235,7 +230,7 @@ def _start_translations(
     rows[:, :, :3], rows[:, :, 3:6] = A[:, :3, :3], -np.eye(3)
     rows[:, :, 6] = np.einsum("nij,jk,nk->ni", A[:, :3, :3], Rx, q)
     rhs = -A[:, :3, 3]
-    groups = _draw(n, min(config.group, n), config.samples, rng)
+    groups = _draw(n, min(GROUP, n), SAMPLES, rng)
     size = max(float(np.median(np.linalg.norm(rhs - np.median(rhs, 0), axis=-1))), 1e-12)
     column = np.array([1, 1, 1, 1, 1, 1, distance])
     H = np.einsum("gvri,gvrj->gij", rows[groups] / column, rows[groups] / column)
@@ -247,13 +242,13 @@ def _start_translations(
     slips = np.linalg.norm(np.einsum("nri,gi->gnr", rows, found) - rhs, axis=-1)
     # A ratio far below the spread of the hand is a collapse, not a fit.
     ratio = np.maximum(np.abs(found[:, 6:]), COLLAPSED * size / distance)
-    loss = np.minimum(slips / ratio / (distance * config.unit_part), config.agree)
+    loss = np.minimum(slips / ratio / (distance * UNIT_PART), AGREE)
     return found[int(np.argmin(np.sum(loss**2, 1) + 1e3 * (found[:, 6] <= 0)))]
 
 
 def _refine(
     A: Array, Rc: Array, q: Array, start: tuple[Array, Array, Array], middle: Array,
-    config: FitConfig,
+    width_share: float,
 ) -> FrameFit:  # fmt: skip
     """Return the joint robust least-squares fit from a start R_X, R_Z, (t_X, z, s)."""
     Rx, Rz, (tx, z, s) = start[0], start[1], (start[2][:3], start[2][3:6], float(start[2][6]))
@@ -262,9 +257,9 @@ def _refine(
     least = max(COLLAPSED * spread / distance, 1e-9)
     s = max(s, least)
     data = (np.ascontiguousarray(A), np.ascontiguousarray(Rc), q)
-    units = (np.radians(config.unit_deg), distance, distance * config.unit_part)
-    weights = (config.agree, config.width_share)
-    for _ in range(config.steps):
+    units = (np.radians(UNIT_DEG), distance, distance * UNIT_PART)
+    weights = (AGREE, width_share)
+    for _ in range(STEPS):
         J, r, errors, _ = _weighted(*data, Rx, Rz, tx, z, s, units, weights)
         H = J.T @ J
         move = -np.linalg.solve(H + RIDGE * np.trace(H) / 13 * np.eye(13), J.T @ r)
@@ -277,7 +272,7 @@ def _refine(
         s = max(s * float(np.exp(np.clip(move[12], -1.0, 1.0))), least)
     J, rw, errors, r = _weighted(*data, Rx, Rz, tx, z, s, units, weights)
     freedom = max(6 * n - 13, 1)
-    capped = np.minimum(errors, config.cap)
+    capped = np.minimum(errors, CAP)
     inverse = np.linalg.pinv(J.T @ J, hermitian=True)
     return FrameFit(
         X=se3.from_rt(Rx, tx), Z=se3.from_rt(Rz, z - s * Rz @ middle), middle=middle,

@@ -7,40 +7,32 @@ are named; a bad view breaks it for itself and is dropped. Two corrupted views l
 fit worse than no fit. Angles alone do not see inverted poses: tr(R_i^T R_j) = tr(R_i R_j^T).
 """
 
-from dataclasses import dataclass, field
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from realsim.arrays import Array
-from realsim_calibration.faults.frame_fit import FitConfig, fit_frames, hand_side, mismatch
+from realsim_calibration.faults.frame_fit import fit_frames, hand_side, mismatch
 from realsim_calibration.fit.closed_forms import clear_of_half_turns, motions, nearest_rotation
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class GateConfig:
-    """When a view, or the whole set of poses, is refused."""
-
-    min_slide_m: float = 0.005
-    """Median slide along the screw axes that makes the ratio meaningful [m]."""
-    min_turn_deg: float = 5.0
-    """Pairs that turn less have no sure screw axis [deg]."""
-    px_ratio: float = 5.0
-    """A view is dropped when its px through the closed form exceeds this many medians."""
-    px_floor: float = 3.0
-    """A dropped view's px exceeds this, too [px]."""
-    twin_ratio: float = 2.0
-    """The mirror twin of a planar pose may stand in when its px is at most this much worse."""
-    frame_ratio: float = 5.0
-    """A view is dropped when its error through the fitted frames exceeds this many medians."""
-    frame_floor: float = 4.0
-    """A dropped view's error exceeds this, too, in units of `FitConfig`: 2 deg or 4 % of the
-    distance to the board. Views of good real sets reach 4.1 medians where the board is small and
-    seen at a slant."""
-    fit: FitConfig = field(default_factory=FitConfig)
+MIN_SLIDE_M = 0.005
+"""Median slide along the screw axes that makes the ratio meaningful [m]."""
+MIN_TURN_DEG = 5.0
+"""Pairs that turn less have no sure screw axis [deg]."""
+PX_RATIO = 5.0
+"""A view is dropped when its px through the closed form exceeds this many medians."""
+PX_FLOOR = 3.0
+"""A dropped view's px exceeds this, too [px]."""
+TWIN_RATIO = 2.0
+"""The mirror twin of a planar pose may stand in when its px is at most this much worse."""
+FRAME_RATIO = 5.0
+"""A view is dropped when its error through the fitted frames exceeds this many medians."""
+FRAME_FLOOR = 4.0
+"""A dropped view's error exceeds this, too, in the units of `fit_frames`: 2 deg or 4 % of the
+distance to the board. Views of good real sets reach 4.1 medians where the board is small and
+seen at a slant."""
 
 
-def screw_ratio(Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike, config: GateConfig) -> float:
+def screw_ratio(Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike) -> float:
     """Return how many times further the hand slides along its screw axes than the camera does.
 
     The slide d = axis . t of a rigid motion is the same seen from hand and camera (Chen 1991): 1
@@ -50,12 +42,12 @@ def screw_ratio(Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike, config: GateConf
     slides: list[Array] = []
     for m in motions(Ts_base_ee, Ts_cam_board):
         n = np.linalg.norm(m.turns, axis=-1)
-        turned = n > np.radians(config.min_turn_deg)
+        turned = n > np.radians(MIN_TURN_DEG)
         slide = np.abs((m.turns * m.Ts[:, :3, 3]).sum(-1)) / np.where(turned, n, 1.0)
         slides.append(np.where(turned, slide, np.nan))
     hand, cam = slides
     both = np.isfinite(hand) & np.isfinite(cam)
-    if both.sum() < 3 or float(np.median(cam[both])) < config.min_slide_m:
+    if both.sum() < 3 or float(np.median(cam[both])) < MIN_SLIDE_M:
         return float("nan")
     return float(np.median(hand[both]) / np.median(cam[both]))
 
@@ -86,7 +78,6 @@ def frame_gate(
     Ts_cam_board: Array,
     twins: list[Array | None],
     middle: ArrayLike,
-    config: GateConfig,
     *,
     eye_in_hand: bool = True,
 ) -> tuple[Array, dict[int, str], list[int]]:
@@ -101,16 +92,15 @@ def frame_gate(
         Ts_cam_board: (n, 4, 4) board poses [m].
         twins: per view the mirror solution where it fits the image almost as well, else None.
         middle: (3,) the board's middle in its frame [m].
-        config: the gate.
         eye_in_hand: whether the camera sits in the hand.
     """
     A = hand_side(Ts_base_ee, eye_in_hand)
-    fit = fit_frames(A, Ts_cam_board, middle, config.fit)
-    limit = max(config.frame_ratio * fit.usual, config.frame_floor)
+    fit = fit_frames(A, Ts_cam_board, middle)
+    limit = max(FRAME_RATIO * fit.usual, FRAME_FLOOR)
     chosen, dropped, swapped = Ts_cam_board.copy(), dict[int, str](), list[int]()
     for k in np.flatnonzero(fit.errors > limit):
         twin = twins[k]
-        if twin is not None and mismatch(fit, A[k : k + 1], twin[None], config.fit)[0, 0] <= limit:
+        if twin is not None and mismatch(fit, A[k : k + 1], twin[None])[0, 0] <= limit:
             chosen[k] = twin
             swapped.append(int(k))
             continue
@@ -123,9 +113,9 @@ def frame_gate(
     return chosen, dropped, swapped
 
 
-def px_gate(view_px: Array, config: GateConfig) -> dict[int, str]:
+def px_gate(view_px: Array) -> dict[int, str]:
     """Return the views whose reprojection through a closed form is far beyond the others'."""
-    limit = max(config.px_ratio * float(np.median(view_px)), config.px_floor)
+    limit = max(PX_RATIO * float(np.median(view_px)), PX_FLOOR)
     return {
         int(k): f"pixel gate: {view_px[k]:.1f} px through the best closed form; the limit is "
         f"{limit:.1f} px."

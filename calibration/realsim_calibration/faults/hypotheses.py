@@ -9,7 +9,15 @@ from realsim.arrays import Array, Rows
 from realsim.geometry import se3
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim_calibration.faults import pairing
-from realsim_calibration.faults.diagnosis import DiagnosisConfig, Evidence, Fault
+from realsim_calibration.faults.diagnosis import (
+    ACCEPT_DEGREES,
+    GAIN_GROSS,
+    GROSS_ERROR,
+    PLAUSIBLE_OFF_AXIS,
+    SMALL_TURN_PART,
+    Evidence,
+    Fault,
+)
 from realsim_calibration.faults.frame_fit import FrameFit, fit_frames, hand_side, mismatch
 from realsim_calibration.faults.gates import rotation_mismatch_deg, screw_ratio
 from realsim_calibration.faults.half_turns import synchronise_half_turns
@@ -40,9 +48,9 @@ class Poses:
     labels: tuple[str, ...]
     target: Target | None
 
-    def fit(self, T: Array, C: Array, config: DiagnosisConfig) -> FrameFit:
+    def fit(self, T: Array, C: Array) -> FrameFit:
         """Return the frames of other hand and board poses of this session."""
-        return fit_frames(hand_side(T, self.eye_in_hand), C, self.middle, config.fit)
+        return fit_frames(hand_side(T, self.eye_in_hand), C, self.middle)
 
     def names(self, rows: Sequence[int]) -> str:
         """Return the names of rows for a sentence, long runs shortened."""
@@ -85,7 +93,7 @@ class Hypothesis:
     """How many times better than as given it must fit; None = as configured."""
 
 
-def evidence_of(h: Hypothesis, eye_in_hand: bool, config: DiagnosisConfig) -> Evidence:
+def evidence_of(h: Hypothesis, eye_in_hand: bool) -> Evidence:
     """Return the row of the table for a hypothesis."""
     A = hand_side(h.T, eye_in_hand)
     ratio = h.fit.length_ratio
@@ -94,7 +102,7 @@ def evidence_of(h: Hypothesis, eye_in_hand: bool, config: DiagnosisConfig) -> Ev
     return Evidence(
         hypothesis=h.name,
         rotation_mismatch_deg=rotation_mismatch_deg(A, h.C),
-        screw_ratio=screw_ratio(A, h.C, config.gates),
+        screw_ratio=screw_ratio(A, h.C),
         view_deg=h.fit.usual_deg,
         view_mm=unit * 1e-3 * h.fit.usual_mm,
         length_ratio=ratio,
@@ -112,11 +120,9 @@ def _whole(n: int) -> Rows:
     return np.stack([np.arange(n), np.arange(n)], -1)
 
 
-def simple(
-    p: Poses, fault: Fault, name: str, T: Array, C: Array, config: DiagnosisConfig
-) -> Hypothesis:
+def simple(p: Poses, fault: Fault, name: str, T: Array, C: Array) -> Hypothesis:
     """Return a hypothesis that keeps every view, still without words."""
-    fit = p.fit(T, C, config)
+    fit = p.fit(T, C)
     return Hypothesis(
         fault=fault, name=name, fit=fit, score=fit.score, T=T, C=C, rows=_whole(len(T))
     )
@@ -129,7 +135,7 @@ def _off_axis(C: Array, middle: Array) -> tuple[bool, float]:
     return bool(np.all(q[:, 2] > 0)), float(np.median(angle))
 
 
-def inverted(p: Poses, config: DiagnosisConfig) -> Hypothesis:
+def inverted(p: Poses) -> Hypothesis:
     """Return the hypothesis that hand or camera poses are inverted.
 
     Inverted hand poses, inverted camera poses and a camera at the other place fit equally well. The
@@ -139,18 +145,18 @@ def inverted(p: Poses, config: DiagnosisConfig) -> Hypothesis:
     front, off = _off_axis(p.C, p.middle)
     other_front, other_off = _off_axis(other, p.middle)
     behind = other_front and not front
-    aside = other_front and front and off > config.plausible_off_axis * other_off
+    aside = other_front and front and off > PLAUSIBLE_OFF_AXIS * other_off
     if behind or aside:
         where = "behind the camera" if behind else f"{np.degrees(off):.0f} deg off its axis"
         return replace(
-            simple(p, "camera_inverted", "camera poses inverted", p.T, other, config),
+            simple(p, "camera_inverted", "camera poses inverted", p.T, other),
             sentence="The camera poses are inverted: they fit as T_board_cam, and as given the "
             f"board would lie {where}.",
             advice="Give T_cam_board, which maps points of the board into the camera (what "
             "solvePnP returns).",
             note="the camera poses were inverted.",
         )  # fmt: skip
-    h = simple(p, "robot_inverted", "hand poses inverted", se3.invert(p.T), p.C, config)
+    h = simple(p, "robot_inverted", "hand poses inverted", se3.invert(p.T), p.C)
     x, z = (float(np.linalg.norm(T[:3, 3])) for T in (h.fit.X, h.fit.Z))
     likely = "the file holds T_ee_base"
     if p.eye_in_hand:
@@ -189,7 +195,7 @@ def _mm(length: float, h: Hypothesis) -> str:
     return f"{length * scale:.0f} mm"
 
 
-def flipped_boards(p: Poses, config: DiagnosisConfig) -> Hypothesis | None:
+def flipped_boards(p: Poses) -> Hypothesis | None:
     """Return the hypothesis that some boards were read turned by 180 deg."""
     if p.target is None or not _can_turn(p.target):
         return None
@@ -199,7 +205,7 @@ def flipped_boards(p: Poses, config: DiagnosisConfig) -> Hypothesis | None:
     views = tuple(int(k) for k in np.flatnonzero(turns.flips))
     name = f"{len(views)} boards turned by 180 deg"
     return replace(
-        simple(p, "board_flips", name, p.T, turns.repaired, config),
+        simple(p, "board_flips", name, p.T, turns.repaired),
         sentence=f"{len(views)} of {len(p.T)} boards were read turned by 180 deg: views "
         f"{p.names(views)}. The difference of the turns of hand and camera falls from "
         f"{turns.before_deg:.1f} to {turns.after_deg:.2f} deg RMS when they are turned back.",
@@ -213,28 +219,27 @@ def _can_turn(target: Target) -> bool:
     return isinstance(target, (Chessboard, CircleGrid))
 
 
-def reread_rotations(p: Poses, config: DiagnosisConfig, *, thorough: bool) -> list[Hypothesis]:
+def reread_rotations(p: Poses, *, thorough: bool) -> list[Hypothesis]:
     """Return the hypotheses that the hand's rotations were decoded by another convention.
 
     Args:
         p: the poses.
-        config: how readings are judged.
         thorough: fit every pair of conventions instead of the few that win the vote.
     """
     D = se3.invert(p.C) if p.eye_in_hand else p.C
     R, t = p.T[:, :3, :3], p.T[:, :3, 3]
     readings = every_reading(R) if thorough else reread(R, t, D)
     found = [
-        _reread(p, "rotation_reading", r, config,
+        _reread(p, "rotation_reading", r,
                 f"Hand and camera agree when what was read as {r.read_as} is read as {r.meant}.")
         for r in readings
     ]  # fmt: skip
     hand, cam = (float(np.sqrt(np.mean(np.sum(m.turns**2, -1)))) for m in motions(p.T, p.C))
-    if hand < config.small_turn_part * cam:
+    if hand < SMALL_TURN_PART * cam:
         scale = float(np.degrees(1.0))
         readings = every_reading(R, scale) if thorough else reread(R, t, D, scale)
         found += [
-            _reread(p, "radians_as_degrees", r, config,
+            _reread(p, "radians_as_degrees", r,
                     f"Angles in radians were taken for degrees: the hand turns by "
                     f"{np.degrees(hand):.2f} deg (RMS of the pairs), the camera by "
                     f"{np.degrees(cam):.1f}; times 180 / pi, read as {r.meant}, they agree.")
@@ -244,7 +249,7 @@ def reread_rotations(p: Poses, config: DiagnosisConfig, *, thorough: bool) -> li
     return found[:FINALISTS]
 
 
-def reread_as_degrees(p: Poses, config: DiagnosisConfig) -> list[Hypothesis]:
+def reread_as_degrees(p: Poses) -> list[Hypothesis]:
     """Return the hypotheses that numbers in degrees were taken for radians.
 
     They are named but not mended: a degree is known modulo 2 pi only, so that the first and the
@@ -254,19 +259,19 @@ def reread_as_degrees(p: Poses, config: DiagnosisConfig) -> list[Hypothesis]:
     D = se3.invert(p.C) if p.eye_in_hand else p.C
     found: list[Hypothesis] = []
     for r in reread_degrees(p.T[:, :3, :3], p.T[:, :3, 3], D):
-        h = _reread(p, "degrees_as_radians", r, config,
+        h = _reread(p, "degrees_as_radians", r,
                     "Angles in degrees were taken for radians: hand and camera agree when the "
                     f"numbers are read as {r.meant}.")  # fmt: skip
         for _ in range(SNAPS):
             if r.snap is None:
                 break
             Rs = r.snap(_predicted_rotations(p, h))
-            h = _reread(p, "degrees_as_radians", replace(r, Rs=Rs), config, h.sentence)
+            h = _reread(p, "degrees_as_radians", replace(r, Rs=Rs), h.sentence)
         found.append(h)
     return [
         replace(h, note="", advice=f"{h.advice} The poses as decoded have lost the degrees.")
         for h in found
-        if h.score <= config.accept_degrees
+        if h.score <= ACCEPT_DEGREES
     ]
 
 
@@ -277,20 +282,18 @@ def _predicted_rotations(p: Poses, h: Hypothesis) -> Array:
     return A if p.eye_in_hand else np.swapaxes(A, -1, -2)
 
 
-def _reread(
-    p: Poses, fault: Fault, r: Reread, config: DiagnosisConfig, sentence: str
-) -> Hypothesis:
+def _reread(p: Poses, fault: Fault, r: Reread, sentence: str) -> Hypothesis:
     T = se3.from_rt(r.Rs, p.T[:, :3, 3])
     reading = reading_of(r.meant)
     flag = "" if reading is None else f": --reading {reading} (mm for m if the file holds them)"
     return replace(
-        simple(p, fault, r.name, T, p.C, config), sentence=sentence,
+        simple(p, fault, r.name, T, p.C), sentence=sentence,
         advice=f"Read the rotations as {r.meant}{flag}.",
         note=f"the rotations were read as {r.name}.",
     )  # fmt: skip
 
 
-def paired_otherwise(p: Poses, config: DiagnosisConfig) -> Hypothesis | None:
+def paired_otherwise(p: Poses) -> Hypothesis | None:
     """Return the hypothesis that images and hand poses were paired wrongly."""
     found = find_pairing(hand_side(p.T, p.eye_in_hand), p.C, p.middle)
     if found is None:
@@ -303,11 +306,11 @@ def paired_otherwise(p: Poses, config: DiagnosisConfig) -> Hypothesis | None:
     if fault == "none":
         return None
     A = hand_side(p.T, p.eye_in_hand)
-    bad = np.diag(mismatch(found.fit, A, p.C, config.fit))[list(views)]
+    bad = np.diag(mismatch(found.fit, A, p.C))[list(views)]
     # A few views among many hardly move the score, but each is far off by itself.
-    gross = fault != "shifted_pairing" and bool(np.all(bad > config.gross_error))
+    gross = fault != "shifted_pairing" and bool(np.all(bad > GROSS_ERROR))
     return Hypothesis(
-        gain=config.gain_gross if gross else None,
+        gain=GAIN_GROSS if gross else None,
         fault=fault, name=name, fit=found.fit, score=score, T=p.T[found.rows[:, 0]],
         C=p.C[found.rows[:, 1]], rows=found.rows, sentence=sentence, views=views,
         advice="Pair by file name or time stamp, never by position in a list: a failed detection "
@@ -364,7 +367,7 @@ def _pairing_text(p: Poses, found: Pairing) -> tuple[Fault, str, str, tuple[int,
     return "none", "", "", ()
 
 
-def moved(p: Poses, config: DiagnosisConfig) -> Hypothesis | None:
+def moved(p: Poses) -> Hypothesis | None:
     """Return the hypothesis that camera, tool or board was moved within the session."""
     A = hand_side(p.T, p.eye_in_hand)
     m = find_move(A, p.C, p.middle)
@@ -389,7 +392,7 @@ def moved(p: Poses, config: DiagnosisConfig) -> Hypothesis | None:
     S = m.step if m.frame == "X" else se3.invert(m.step)
     text = describe_offset(S).replace("in the flange", "in the tool").replace("flange", "tool")
     how = text if hand else f"by {1e3 * np.linalg.norm(m.step[:3, 3]):.1f} mm"
-    fit = fit_frames(A, p.C, p.middle, config.fit)
+    fit = fit_frames(A, p.C, p.middle)
     views = tuple(range(m.start, len(p.T)))
     return Hypothesis(
         fault=fault, name=f"{what} from view {p.labels[m.start]} on", fit=fit, score=m.score, T=T,

@@ -6,11 +6,10 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.geometry import se3
-from realsim_calibration.faults.diagnosis import DiagnosisConfig
 from realsim_calibration.faults.hypotheses import Hypothesis, Poses, simple
 
 
-def mirrored(p: Poses, config: DiagnosisConfig) -> list[Hypothesis]:
+def mirrored(p: Poses) -> list[Hypothesis]:
     """Return the hypotheses that an axis is mirrored: of the positions, the rotations, or both.
 
     A left-handed frame turns T into S T S with one sign of S flipped. Which axis it is cannot be
@@ -24,15 +23,15 @@ def mirrored(p: Poses, config: DiagnosisConfig) -> list[Hypothesis]:
         S[k, k] = -1.0
         turned, moved = S @ R @ S, t @ S
         found += [
-            _hypothesis(p, config, R, moved, f"the {axis} axis of the positions is mirrored",
+            _hypothesis(p, R, moved, f"the {axis} axis of the positions is mirrored",
                         f"Correct the export: the sign of {axis} in the positions."),
-            _hypothesis(p, config, turned, t, f"the {axis} axis of the rotations is mirrored",
+            _hypothesis(p, turned, t, f"the {axis} axis of the rotations is mirrored",
                         f"Correct the export: the sign of {axis} in the rotations; turns about the "
                         "two other axes go the other way."),
         ]  # fmt: skip
         if axis == "z":
             found.append(_hypothesis(
-                p, config, turned, moved,
+                p, turned, moved,
                 "the poses are read as left-handed: an axis of the robot's frames is mirrored (x, "
                 "y or z, the poses cannot tell which)",
                 "Export right-handed poses; or, with S = diag(1, 1, -1), give S t as position and "
@@ -41,11 +40,9 @@ def mirrored(p: Poses, config: DiagnosisConfig) -> list[Hypothesis]:
     return found
 
 
-def _hypothesis(
-    p: Poses, config: DiagnosisConfig, R: Array, t: Array, what: str, advice: str
-) -> Hypothesis:
+def _hypothesis(p: Poses, R: Array, t: Array, what: str, advice: str) -> Hypothesis:
     return replace(
-        simple(p, "mirrored_axis", what, se3.from_rt(R, t), p.C, config),
+        simple(p, "mirrored_axis", what, se3.from_rt(R, t), p.C),
         sentence=f"Hand and camera agree when {what}.",
         advice=advice,
         note="the axis was turned round.",

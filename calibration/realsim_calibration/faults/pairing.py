@@ -15,8 +15,9 @@ import numpy as np
 from realsim.arrays import Array, Mask, Rows
 from realsim.geometry import se3
 from realsim_calibration.faults.frame_fit import (
+    AGREE,
+    CAP,
     MIN_VIEWS,
-    FitConfig,
     FrameFit,
     fit_frames,
     mean_transform,
@@ -31,13 +32,12 @@ MOVE_ROUNDS = 3
 """The move and the frames are found in turn, from the frames of either stretch."""
 
 
-FIT = FitConfig()
 MAX_SHIFT = 4
 """Largest shift of the images against the poses that is tried."""
 RATIO = 4.0
 """Pose and image belong together when their error is below this many usual errors."""
 FLOOR = 6.0
-"""Pose and image belong together below this error, too, in units of `FitConfig`: 3 deg or 6 %
+"""Pose and image belong together below this error, too, in the units of `fit_frames`: 3 deg or 6 %
 of the distance. Planar poses of good real sets reach 5."""
 SWAP_FLOOR = 3.0
 """Two views that fit far better exchanged are swapped from this error on."""
@@ -99,8 +99,8 @@ def find_pairing(A: Array, C: Array, middle: Array) -> Pairing | None:
     result: Pairing | None = None
     # Twice: the first frames come from a part of the views, the second from all that were paired.
     for _ in range(2):
-        table = mismatch(fit, A, C, FIT)
-        paired = table[table < FLOOR * FIT.agree]
+        table = mismatch(fit, A, C)
+        paired = table[table < FLOOR * AGREE]
         usual = float(np.median(np.min(table, 0))) if len(paired) else np.inf
         gate = max(RATIO * usual, FLOOR)
         shifts = _path(table, gate)
@@ -120,12 +120,12 @@ def _best_stretch(A: Array, C: Array, middle: Array) -> FrameFit | None:
         half = len(a) // 2
         for part in (slice(None), slice(half), slice(half, None)):
             if len(a[part]) >= MIN_VIEWS + 1:
-                fits.append(fit_frames(a[part], c[part], middle, FIT))
+                fits.append(fit_frames(a[part], c[part], middle))
     if not fits:
         return None
     # A few views fit wrong frames by chance: the stretch that explains most of the table wins.
     fits.sort(key=lambda f: f.usual)
-    return min(fits[:6], key=lambda f: _explained(mismatch(f, A, C, FIT)))
+    return min(fits[:6], key=lambda f: _explained(mismatch(f, A, C)))
 
 
 def _explained(table: Array) -> float:
@@ -133,7 +133,7 @@ def _explained(table: Array) -> float:
     n = len(table)
     i, j = np.indices((n, n))
     near = np.where(np.abs(i - j) <= MAX_SHIFT, table, np.inf)
-    return float(np.mean(np.minimum(near.min(0), FIT.cap)))
+    return float(np.mean(np.minimum(near.min(0), CAP)))
 
 
 def _path(table: Array, gate: float) -> Rows:
@@ -202,7 +202,7 @@ def _pairing(
     return Pairing(
         rows=kept, shifts=shifts, swapped=swapped, strays=tuple(strays),
         elsewhere=tuple(elsewhere),
-        fit=fit_frames(A[kept[:, 0]], C[kept[:, 1]], middle, FIT),
+        fit=fit_frames(A[kept[:, 0]], C[kept[:, 1]], middle),
     )  # fmt: skip
 
 
@@ -241,17 +241,16 @@ def find_move(A: Array, C: Array, middle: Array) -> Moved | None:
     for part in (slice(half), slice(half, None)):
         if half < MIN_STRETCH:
             return None
-        seed = fit_frames(A[part], C[part], middle, FIT)
-        errors = np.minimum(np.diag(mismatch(seed, A, C, FIT)), FIT.cap)
+        seed = fit_frames(A[part], C[part], middle)
+        errors = np.minimum(np.diag(mismatch(seed, A, C)), CAP)
         if part.start is None:
             cost = (
                 np.cumsum(np.append(0, errors))
-                + np.cumsum(np.append(0, (FIT.cap - errors)[::-1]))[::-1]
+                + np.cumsum(np.append(0, (CAP - errors)[::-1]))[::-1]
             )
         else:
             cost = (
-                np.cumsum(np.append(0, FIT.cap - errors))
-                + np.cumsum(np.append(0, errors[::-1]))[::-1]
+                np.cumsum(np.append(0, CAP - errors)) + np.cumsum(np.append(0, errors[::-1]))[::-1]
             )
         start = int(np.argmin(cost))
         if min(start, n - start) < MIN_STRETCH:
@@ -277,7 +276,7 @@ def _likeliest(found: list[Moved]) -> Moved | None:
 
 def _moves_at(A: Array, C: Array, middle: Array, start: int) -> list[Moved]:
     """Return both kinds of move at a row, each with the score of a model that shares the rest."""
-    halves = [fit_frames(A[s], C[s], middle, FIT) for s in (slice(start), slice(start, None))]
+    halves = [fit_frames(A[s], C[s], middle) for s in (slice(start), slice(start, None))]
     moves: list[Moved] = []
     for frame in MOVED_FRAMES:
         for fit in halves:
@@ -306,5 +305,5 @@ def _carried(
             places = A @ fit.X @ seen
             step = mean_transform(places[:start]) @ se3.invert(mean_transform(places[start:]))
             hands = np.concatenate([A[:start], step @ A[start:]])
-        fit = fit_frames(hands, C, middle, FIT)
+        fit = fit_frames(hands, C, middle)
     return step, fit

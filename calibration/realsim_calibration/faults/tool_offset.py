@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_calibration.faults.frame_fit import FitConfig, fit_frames, mean_transform
+from realsim_calibration.faults.frame_fit import fit_frames, mean_transform
 
 LEAST_MM = 5.0
 """Offsets below this are the nominal kinematics' own error [mm]: real arms show 1 to 3."""
@@ -30,7 +30,6 @@ LEVER_M = 0.5
 """Angles count as the slip they make at this distance [m]."""
 MAX_ERROR_MM = 15.0
 """Beyond this RMS the nominal poses belong to another robot or to other joints [mm]."""
-FIT = FitConfig()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -90,7 +89,7 @@ def _simplest(A: Array, N: Array) -> tuple[Array, tuple[Array, ...], Int64, Arra
     """Return L, offsets, groups, errors (n, 6) of the simplest model that fits nearly as well."""
     one = np.zeros(len(A), dtype=np.int64)
     I4 = np.eye(4)
-    fit = fit_frames(A, se3.invert(N), config=FIT)
+    fit = fit_frames(A, se3.invert(N))
     L = se3.from_rt(fit.Z[:3, :3], fit.Z[:3, 3])
     E = se3.invert(fit.X)
     turn = se3.from_rt(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))

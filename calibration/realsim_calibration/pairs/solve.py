@@ -5,7 +5,7 @@
 3. pairs further off than chance allows leave, and 2 is done again, until none changes
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +14,7 @@ from realsim.arrays import Array, Int64, Mask
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
-from realsim_calibration.faults.frame_fit import FitConfig, FrameFit, fit_frames, hand_side
+from realsim_calibration.faults.frame_fit import FrameFit, fit_frames, hand_side
 from realsim_calibration.fit.closed_forms import MIN_VIEWS, check_observable
 from realsim_calibration.fit.robot_error import RobotErrorConfig, arm_basis
 from realsim_calibration.pairs.noise import (
@@ -37,24 +37,21 @@ TOGETHER = (
 )
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PairsConfig:
-    """When a pair is wrong, and how long is looked."""
-
-    fit: FitConfig = field(default_factory=lambda: FitConfig(width_share=0.25))
-    start_ratio: float = 5.0
-    """A pair starts inside when its error through the first frames is at most this many lower
-    quartiles: of half good pairs the lower quartile of all is the median of the good ones."""
-    chance: float = 5e-4
-    """A good pair is that far off with this probability: one of a hundred sets of 20 loses one."""
-    rounds: int = 4
-    """Rounds of leaving pairs out and estimating the sizes anew."""
-    least_share: float = 0.3
-    """With fewer pairs that agree, none of it can be trusted."""
-    most_left: float = 0.25
-    """The turns left over may be this part of the hand's turns: shuffled poses leave half."""
-    noise_pairs: int = 250
-    """Pairs, evenly spread, that the sizes are estimated from."""
+WIDTH_SHARE = 0.25
+"""Share of the pairs whose error the fit of the first frames follows: half may be wrong."""
+START_RATIO = 5.0
+"""A pair starts inside when its error through the first frames is at most this many lower
+quartiles: of half good pairs the lower quartile of all is the median of the good ones."""
+CHANCE = 5e-4
+"""A good pair is that far off with this probability: one of a hundred sets of 20 loses one."""
+ROUNDS = 4
+"""Rounds of leaving pairs out and estimating the sizes anew."""
+LEAST_SHARE = 0.3
+"""With fewer pairs that agree, none of it can be trusted."""
+MOST_LEFT = 0.25
+"""The turns left over may be this part of the hand's turns: shuffled poses leave half."""
+NOISE_PAIRS = 250
+"""Pairs, evenly spread, that the sizes are estimated from."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -89,7 +86,6 @@ def solve_pose_pairs(
     mode: Mode = "eye_in_hand",
     joints: ArrayLike | None = None,
     arm: DhArm | None = None,
-    config: PairsConfig | None = None,
 ) -> PosePairs:
     """Return the hand-eye of pose pairs with its covariance; pairs that do not agree are left out.
 
@@ -99,32 +95,30 @@ def solve_pose_pairs(
         mode: where the camera sits.
         joints: (n, q) joint angles [rad].
         arm: the arm's kinematics; with the joints its errors are estimated, too.
-        config: when a pair is wrong.
 
     Raises:
         InputError: stacks of different lengths, values that are no poses, or too few pairs agree.
         DegenerateError: the poses do not determine the hand-eye.
     """
-    config = config or PairsConfig()
     A, C = checked_pairs(Ts_base_ee, Ts_cam_board)
     check_observable(hand_side(A, mode == "eye_in_hand"))
-    fit = fit_frames(hand_side(A, mode == "eye_in_hand"), C, config=config.fit)
-    used = start_inside(fit, config)
+    fit = fit_frames(hand_side(A, mode == "eye_in_hand"), C, width_share=WIDTH_SHARE)
+    used = start_inside(fit)
     parts = robot_parts(A, joints, arm)
     X, Z, noise = fit.X, fit.Z, None
-    for turn in range(config.rounds):
-        last = turn == config.rounds - 1
-        X, Z, noise = _refined(A, C, mode, (X, Z), used, noise, parts, config)
+    for turn in range(ROUNDS):
+        last = turn == ROUNDS - 1
+        X, Z, noise = _refined(A, C, mode, (X, Z), used, noise, parts)
         linear = linearise(A, C, X, Z, to_hand=mode == "eye_to_hand")
         far = distances(linear, noise, parts)
-        inside = far <= gate_limit(config)
+        inside = far <= gate_limit()
         if last or np.array_equal(inside, used):
             break
         used = inside
-        require_agreement(used, config)
+        require_agreement(used)
     assert noise is not None
     linear = linearise(A, C, X, Z, to_hand=mode == "eye_to_hand")
-    require_explained(linear.residuals[used], A[used], config)
+    require_explained(linear.residuals[used], A[used])
     solved = solve(rows_of(linear, used), noise, parts.at(used))
     covariance = jackknifed(solved)[:12, :12]
     return PosePairs(
@@ -168,20 +162,20 @@ def checked_pairs(Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike) -> tuple[Array
     return A, C
 
 
-def start_inside(fit: FrameFit, config: PairsConfig) -> Mask:
+def start_inside(fit: FrameFit) -> Mask:
     """Return which pairs agree with the first frames.
 
     Raises:
         InputError: too few of them.
     """
-    inside = fit.errors <= config.start_ratio * max(float(np.quantile(fit.errors, 0.25)), 1e-9)
-    require_agreement(inside, config)
+    inside = fit.errors <= START_RATIO * max(float(np.quantile(fit.errors, 0.25)), 1e-9)
+    require_agreement(inside)
     return inside
 
 
-def require_agreement(inside: Mask, config: PairsConfig) -> None:
+def require_agreement(inside: Mask) -> None:
     """Raise if too few pairs agree."""
-    least = max(MIN_VIEWS, int(np.ceil(config.least_share * len(inside))))
+    least = max(MIN_VIEWS, int(np.ceil(LEAST_SHARE * len(inside))))
     if inside.sum() < least:
         raise InputError(
             f"hand-eye: only {int(inside.sum())} of {len(inside)} pose pairs agree with one place "
@@ -189,12 +183,12 @@ def require_agreement(inside: Mask, config: PairsConfig) -> None:
         )
 
 
-def require_explained(residuals: Array, A: Array, config: PairsConfig) -> None:
+def require_explained(residuals: Array, A: Array) -> None:
     """Raise if the turns left over are like those of the hand itself."""
     left = float(np.median(np.linalg.norm(residuals[:, :3], axis=-1)))
     middle = se3.mean_rotation(A[:, :3, :3])
     turns = float(np.median(np.linalg.norm(se3.log_so3(middle.T @ A[:, :3, :3]), axis=-1)))
-    if left > config.most_left * turns:
+    if left > MOST_LEFT * turns:
         raise InputError(
             f"hand-eye: no place of the camera explains the pose pairs: {np.degrees(left):.1f} deg "
             f"are left where the hand turns by {np.degrees(turns):.1f} deg. {TOGETHER}"
@@ -227,21 +221,21 @@ def rows_of(linear: Linear, rows: Mask | Int64) -> Linear:
     )
 
 
-def gate_limit(config: PairsConfig) -> float:
+def gate_limit() -> float:
     """Return the squared distance that a good pair exceeds by chance."""
     from scipy.stats import chi2
 
-    return float(chi2.isf(config.chance, 6))
+    return float(chi2.isf(CHANCE, 6))
 
 
 def _refined(
     A: Array, C: Array, mode: Mode, frames: tuple[Array, Array], used: Mask, noise: Noise | None,
-    parts: RobotParts, config: PairsConfig,
+    parts: RobotParts,
 ) -> tuple[Array, Array, Noise]:  # fmt: skip
     """Return X, Z and the sizes from the pairs that are used; the camera's kind is found first."""
     X, Z = frames
     at = np.flatnonzero(used)
-    few = spread(at, config.noise_pairs)
+    few = spread(at, NOISE_PAIRS)
     to_hand = mode == "eye_to_hand"
     linear = linearise(A, C, X, Z, to_hand=to_hand)
     if noise is None:

@@ -14,12 +14,7 @@ from realsim.errors import DegenerateError, InputError, RealsimError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Target
 from realsim_calibration.fit.board_pose import planar_poses
-from realsim_calibration.planning.next_view import (
-    NextView,
-    NextViewConfig,
-    predicted_boards,
-    rank_next_views,
-)
+from realsim_calibration.planning.next_view import NextView, predicted_boards, rank_next_views
 from realsim_calibration.planning.view_proposals import (
     Need,
     SeenBoard,
@@ -81,7 +76,6 @@ class LiveConfig:
     same_m: float = 0.01
     """A hand that turned so little and moved by less than this [m] has taken the same view
     again."""
-    next_view: NextViewConfig = field(default_factory=NextViewConfig)
     limits: ViewLimits = field(default_factory=ViewLimits)
     """Where the next view may be, where no plan is given."""
 
@@ -292,7 +286,7 @@ class LiveCalibration:
                 Ts = self._not_taken(self._plan)
             if not len(Ts):
                 return None
-            best = rank_next_views(report, Ts, self.config.next_view)[0]
+            best = rank_next_views(report, Ts)[0]
         except DegenerateError:
             return None
         return best if best.visible else None

@@ -38,24 +38,20 @@ SHARED = 29
 """X 6, Z 6, camera 12, board 5."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class NextViewConfig:
-    """What a view must fulfil, and what is to become small."""
-
-    working_distance_m: float = 0.4
-    """Distance at which the camera will be used: where points are to move least [m]."""
-    border_px: float = 8.0
-    """Points nearer than this to the image border are not counted on [px]: the arm arrives a few
-    millimetres off."""
-    min_visible_share: float = 0.4
-    """Least share of the target's points in the image; chessboards and circle grids, which are
-    found whole or not at all, need all."""
-    max_tilt_deg: float = 60.0
-    """Largest angle between line of sight and board normal: corners blur beyond [deg]."""
-    distance_m: tuple[float, float] = (0.12, 1.5)
-    """Least and greatest distance at which the target is found [m]."""
-    grid: int = 3
-    """Points per image side at the working distance whose displacement is averaged."""
+WORKING_DISTANCE_M = 0.4
+"""Distance at which the camera will be used: where points are to move least [m]."""
+BORDER_PX = 8.0
+"""Points nearer than this to the image border are not counted on [px]: the arm arrives a few
+millimetres off."""
+MIN_VISIBLE_SHARE = 0.4
+"""Least share of the target's points in the image; chessboards and circle grids, which are
+found whole or not at all, need all."""
+MAX_TILT_DEG = 60.0
+"""Largest angle between line of sight and board normal: corners blur beyond [deg]."""
+DISTANCE_M = (0.12, 1.5)
+"""Least and greatest distance at which the target is found [m]."""
+GRID = 3
+"""Points per image side at the working distance whose displacement is averaged."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -137,28 +133,25 @@ def predicted_boards(report: HandEyeReport, Ts_base_ee: ArrayLike) -> Array:
     return se3.invert(report.X) @ A @ report.Z_points
 
 
-def rank_next_views(
-    report: HandEyeReport, Ts_planned: ArrayLike, config: NextViewConfig | None = None
-) -> tuple[NextView, ...]:
+def rank_next_views(report: HandEyeReport, Ts_planned: ArrayLike) -> tuple[NextView, ...]:
     """Return planned poses with what each ALONE would bring, the best first, unseen ones last.
 
     Args:
         report: the calibration so far.
         Ts_planned: (n, 4, 4) planned tool poses T_base_ee [m].
-        config: what a view must fulfil.
 
     Raises:
         InputError: there is no pose, or one is not rigid.
         DegenerateError: the calibration so far does not determine X.
     """
-    planned = _Planned(report, Ts_planned, config or NextViewConfig())
+    planned = _Planned(report, Ts_planned)
     state = _Knowledge(report, planned.metric)
     rows = planned.rate(state, np.ones(len(planned.Ts), bool))
     return tuple(sorted(rows, key=lambda v: (not v.visible, v.rms_mm, v.plan_index)))
 
 
 def choose_next_views(
-    report: HandEyeReport, Ts_planned: ArrayLike, count: int, config: NextViewConfig | None = None
+    report: HandEyeReport, Ts_planned: ArrayLike, count: int
 ) -> tuple[NextView, ...]:
     """Return at most `count` planned poses chosen greedily, each given the ones before it.
 
@@ -170,7 +163,7 @@ def choose_next_views(
     """
     if count < 1:
         raise InputError(f"{count} next views were asked for; at least 1 is accepted.")
-    planned = _Planned(report, Ts_planned, config or NextViewConfig())
+    planned = _Planned(report, Ts_planned)
     state, left = _Knowledge(report, planned.metric), np.ones(len(planned.Ts), bool)
     chosen: list[NextView] = []
     for _ in range(count):
@@ -191,14 +184,14 @@ def estimated_terms(report: HandEyeReport) -> Mask:
     return np.asarray(known & (np.diag(report.information) > 0), np.bool_)
 
 
-def displacement_metric(report: HandEyeReport, config: NextViewConfig) -> Array:
+def displacement_metric(report: HandEyeReport) -> Array:
     """Return M (6, 6) with E|dp|^2 = tr(M Cov_X) over points at the working distance [m]."""
     i = report.intrinsics
-    u, v = np.meshgrid(np.linspace(0, i.width - 1, config.grid),
-                       np.linspace(0, i.height - 1, config.grid))  # fmt: skip
+    u, v = np.meshgrid(np.linspace(0, i.width - 1, GRID),
+                       np.linspace(0, i.height - 1, GRID))  # fmt: skip
     xy, valid = undistort(i, np.stack([u.ravel(), v.ravel()], -1))
     xy = xy[valid] if valid.any() else np.zeros((1, 2))
-    points = config.working_distance_m * np.concatenate([xy, np.ones((len(xy), 1))], -1)
+    points = WORKING_DISTANCE_M * np.concatenate([xy, np.ones((len(xy), 1))], -1)
     moved = np.concatenate([-se3.hat(points), np.broadcast_to(np.eye(3), (len(xy), 3, 3))], -1)
     return np.asarray(np.mean(np.swapaxes(moved, -1, -2) @ moved, axis=0), np.float64)
 
@@ -271,15 +264,15 @@ class _Knowledge:
 class _Planned:
     """Planned poses, what is seen from them, and what they would add."""
 
-    def __init__(self, report: HandEyeReport, Ts: ArrayLike, config: NextViewConfig) -> None:
+    def __init__(self, report: HandEyeReport, Ts: ArrayLike) -> None:
         Ts = np.asarray(Ts, dtype=np.float64)
         if Ts.ndim != 3 or not len(Ts):
             raise InputError(
                 f"planned poses have shape {Ts.shape}; (n, 4, 4) with at least one is accepted."
             )
         self.Ts = se3.check_rigid(Ts, "planned T_base_ee")
-        self.report, self.config = report, config
-        self.metric = displacement_metric(report, config)
+        self.report = report
+        self.metric = displacement_metric(report)
         self.boards = predicted_boards(report, self.Ts)
         self.geometry = [board_geometry(T, report.target) for T in self.boards]
         self._project()
@@ -299,17 +292,17 @@ class _Planned:
         shape = self.in_cam.shape[:2]
         uv = uv.reshape(*shape, 2)
         self.d_point, self.d_cam = d_point.reshape(*shape, 2, 3), d_cam.reshape(*shape, 2, 12)
-        border = self.config.border_px
+        border = BORDER_PX
         last = np.array([i.width - 1, i.height - 1]) - border
         self.inside: Mask = front & np.all((uv >= border) & (uv <= last), axis=-1)
 
     def _reason(self, k: int) -> str:
         """Return why pose k does not see the target, '' where it does."""
-        c, g, share = self.config, self.geometry[k], float(self.inside[k].mean())
+        g, share = self.geometry[k], float(self.inside[k].mean())
         whole = isinstance(self.report.target, Chessboard | CircleGrid)
-        least = 1.0 if whole else c.min_visible_share
-        low, high = c.distance_m
-        if g.tilt_deg > c.max_tilt_deg:
+        least = 1.0 if whole else MIN_VISIBLE_SHARE
+        low, high = DISTANCE_M
+        if g.tilt_deg > MAX_TILT_DEG:
             return f"the line of sight is {g.tilt_deg:.0f} deg off the board's normal"
         if not low <= g.distance_m <= high:
             return f"the target is {g.distance_m:.2f} m away ({low:g} to {high:g} m is accepted)"
