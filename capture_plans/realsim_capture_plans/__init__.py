@@ -15,7 +15,6 @@ from realsim_capture_plans.devices.interfaces import ArmState as ArmState
 from realsim_capture_plans.devices.interfaces import DepthCamera as DepthCamera
 from realsim_capture_plans.devices.interfaces import DeviceError as DeviceError
 from realsim_capture_plans.devices.interfaces import Frame as Frame
-from realsim_capture_plans.pictures.plan_pictures import plan_picture as plan_picture
 from realsim_capture_plans.plan_files.plan_json import load_plan as load_plan
 from realsim_capture_plans.plan_files.plan_json import save_plan as save_plan
 from realsim_capture_plans.planning.make import calibration_plan as calibration_plan
