@@ -10,11 +10,12 @@ Beside `photo.PhotoRenderer`, which casts rays, the pictures are the same but fo
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from realsim.arrays import Array, Array32, Int64, Mask, UInt8
+from realsim.arrays import Array, Array32, Int32, Int64, Mask, UInt8
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics
 from realsim.rendering.casting.pixel_caster import (
@@ -23,6 +24,7 @@ from realsim.rendering.casting.pixel_caster import (
     PixelCaster,
     empty_buffers,
     enter,
+    may_be_seen,
 )
 from realsim.rendering.embedded.room_light import (
     RoomSamples,
@@ -36,7 +38,13 @@ from realsim.rendering.embedded.room_light import (
     sample_room,
     tones,
 )
-from realsim.rendering.embedded.sun_shadows import SortedPoints, cast_shadows, sort_points
+from realsim.rendering.embedded.sun_shadows import (
+    SortedPoints,
+    SunBodies,
+    cast_shadows,
+    in_frames,
+    sort_points,
+)
 from realsim.rendering.photo import Lighting
 from realsim.rendering.rays import PlacedMesh
 
@@ -57,8 +65,8 @@ class Moment:
 
     Ts_world_obj: Array
     """(G, 4, 4) [m]."""
-    in_the_sun: tuple[Array, ...]
-    """Vertices (V, 3) of each mesh in the sun's frame [m]."""
+    in_the_sun: SunBodies
+    """The meshes in the sun's frame."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -75,6 +83,8 @@ class Seen:
     """Where the sun could shine on what the centres see."""
     lit: Mask
     """(P,) where it does."""
+    ambient: Array32
+    """(P, 3) light of the centres without the sun."""
     color: Array32
     """(P, 3) light of the centres."""
     tone: Array32
@@ -99,18 +109,28 @@ class MovingScene:
         self._surfaces = room_surfaces(placed, light.gamma)
         self._R_sun_world = light.R_sun_world()
         self._light = light.rows()
-        poses = [p.T_world_obj for p in placed]
-        self._first = Moment(np.array(poses), tuple(map(self._in_the_sun, self._every, poses)))
+        bodies = self._caster.bodies
+        counts = [len(b.vertices) for b in bodies]
+        firsts = np.cumsum([0, *counts])
+        self._vertices = np.concatenate([b.vertices for b in bodies])
+        self._owners = np.repeat(np.arange(len(bodies), dtype=np.int32), counts)
+        self._faces = np.concatenate(
+            [b.faces + k for b, k in zip(bodies, firsts[:-1], strict=True)]
+        )
+        self._is_solid = np.array([b.is_solid for b in bodies])
+        self._boxes = np.array([list(product(*b.bounds.T)) for b in bodies])
+        self._kept: dict[tuple[int, ...], tuple[Buffers, Mask]] = {}
+        self._first = self._moment(np.array([p.T_world_obj for p in placed]))
 
     def moment(self, Ts_world_obj: Mapping[int, Array]) -> Moment:
         """Return a time at which some meshes, by number, are at poses (4, 4) [m].
 
         The others are where they were at first.
         """
-        Ts, seen = self._first.Ts_world_obj.copy(), list(self._first.in_the_sun)
+        Ts = self._first.Ts_world_obj.copy()
         for k, T in Ts_world_obj.items():
-            Ts[k], seen[k] = T, self._in_the_sun(k, T)
-        return Moment(Ts, tuple(seen))
+            Ts[k] = T
+        return self._moment(Ts)
 
     def still(
         self, intrinsics: CameraIntrinsics, T_world_cam: ArrayLike, numbers: Sequence[int]
@@ -122,13 +142,20 @@ class MovingScene:
             T_world_cam: (4, 4) camera in world [m].
             numbers: of the meshes that stay where they were at first.
         """
-        return self._seen(self._first, intrinsics, T_world_cam, tuple(numbers))
+        T = se3.check_rigid(T_world_cam, "T_world_cam")
+        finer = self._finer(intrinsics)
+        seen = self._seen(self._first, (intrinsics, finer, T), tuple(numbers))
+        parts = empty_buffers(camera.ray_table(finer))
+        self._enter(numbers, self._first, (finer, T), parts)
+        return replace(seen, hits=(seen.hits[0], parts))
 
     def picture(
         self, moment: Moment, intrinsics: CameraIntrinsics, T_world_cam: ArrayLike
     ) -> MovingPicture:
         """Return what a camera sees, all of it rendered; arguments as of `still`."""
-        return self._finished(self._seen(moment, intrinsics, T_world_cam, self._every))
+        T = se3.check_rigid(T_world_cam, "T_world_cam")
+        seen = self._seen(moment, (intrinsics, self._finer(intrinsics), T), self._every)
+        return self._finished(seen.hits[0], seen.whole)
 
     def renewed(self, moment: Moment, still: Seen) -> MovingPicture:
         """Return what `picture` does for a camera that stands still.
@@ -138,59 +165,61 @@ class MovingScene:
         """
         import cv2
 
-        intrinsics, finer, T = still.camera
-        centres, parts = (
-            (depth.copy(), geometry.copy(), face.copy()) for depth, geometry, face in still.hits
-        )
+        intrinsics, _, T = still.camera
+        depth, geometry, face = still.hits[0]
+        centres = depth.copy(), geometry.copy(), face.copy()
         moving = [k for k in self._every if k not in still.numbers]
         self._enter(moving, moment, (intrinsics, T), centres)
-        self._enter(moving, moment, (finer, T), parts)
         lit = still.lit.copy()
         self._cast_shadows(moving, moment, still.points, lit)
-        changed = (centres[1] != still.hits[0][1]).ravel() | (lit != still.lit)
-        rows = np.flatnonzero(changed)
+        moved, darker = (centres[1] != geometry).ravel(), lit != still.lit
         color, tone, whole = still.color.copy(), still.tone.copy(), still.whole.copy()
-        view = self._view(moment, T)
-        color[rows] = self._lit_colors(moment, view, intrinsics, centres, rows, self._every)[2]
-        tones(color, self.lighting.gamma, rows, tone)
-        near = changed.reshape(centres[1].shape).astype(np.uint8)
+        color[darker] = still.ambient[darker]
+        view, rows = self._view(moment, T), np.flatnonzero(moved)
+        samples, _, sunlit = self._sampled(moment, view, intrinsics, centres, rows, self._every)
+        color[rows] = lit_colors(samples, sunlit)
+        changed = moved | darker
+        tones(color, self.lighting.gamma, np.flatnonzero(changed), tone)
+        near = changed.reshape(geometry.shape).astype(np.uint8)
         rows = np.flatnonzero(cv2.dilate(near, np.ones((3, 3), np.uint8)))
         whole[rows] = color[rows]
-        seen = Seen(
-            still.camera, self._every, (centres, parts), still.points, lit, color, tone, whole
-        )
-        self._refine(moment, view, seen, rows)
-        return self._finished(seen)
+        pixels = (centres[1], tone, rows, whole)
+        self._refine(moment, view, still.camera, pixels, still.hits[1], moving)
+        return self._finished(centres, whole)
 
     # --- how ----------------------------------------------------------------------------------
 
-    def _in_the_sun(self, number: int, T_world_obj: Array) -> Array:
-        """Return the vertices (V, 3) of a mesh in the sun's frame [m]."""
-        T = se3.from_rt(self._R_sun_world, np.zeros(3)) @ T_world_obj
-        return se3.transform(T, self._caster.bodies[number].vertices)
+    def _moment(self, Ts_world_obj: Array) -> Moment:
+        """Return a time at which the meshes are at poses (G, 4, 4) [m]."""
+        Ts_sun_obj = se3.from_rt(self._R_sun_world, np.zeros(3)) @ Ts_world_obj
+        vertices = in_frames(self._vertices, self._owners, Ts_sun_obj)
+        first_face = self._surfaces.first_face
+        return Moment(Ts_world_obj, SunBodies(vertices, self._faces, first_face, self._is_solid))
 
-    def _seen(
-        self, moment: Moment, intrinsics: CameraIntrinsics, T_world_cam: ArrayLike,
-        numbers: tuple[int, ...],
-    ) -> Seen:  # fmt: skip
-        """Return what a camera sees of the meshes `numbers`."""
-        T, n, i = se3.check_rigid(T_world_cam, "T_world_cam"), self.lighting.samples, intrinsics
-        finer = replace(
+    def _finer(self, intrinsics: CameraIntrinsics) -> CameraIntrinsics:
+        """Return the camera whose pixels are the parts of a camera's pixels."""
+        i, n = intrinsics, self.lighting.samples
+        return replace(
             i, width=n * i.width, height=n * i.height, fx=n * i.fx, fy=n * i.fy,
             cx=n * i.cx + (n - 1) / 2.0, cy=n * i.cy + (n - 1) / 2.0,
         )  # fmt: skip
-        centres, parts = (empty_buffers(camera.ray_table(c)) for c in (i, finer))
+
+    def _seen(
+        self, moment: Moment, seen_by: tuple[CameraIntrinsics, CameraIntrinsics, Array],
+        numbers: tuple[int, ...],
+    ) -> Seen:  # fmt: skip
+        """Return what a camera, as of `Seen`, sees of the meshes `numbers`; not for all parts."""
+        i, _, T = seen_by
+        centres = empty_buffers(camera.ray_table(i))
         self._enter(numbers, moment, (i, T), centres)
-        self._enter(numbers, moment, (finer, T), parts)
         view, rows = self._view(moment, T), np.arange(i.height * i.width)
-        points, lit, color = self._lit_colors(moment, view, i, centres, rows, numbers)
-        tone = np.empty(len(rows), np.float32)
+        samples, points, lit = self._sampled(moment, view, i, centres, rows, numbers)
+        color, tone = lit_colors(samples, lit), np.empty(len(rows), np.float32)
         tones(color, self.lighting.gamma, rows, tone)
-        seen = Seen(
-            (i, finer, T), numbers, (centres, parts), points, lit, color, tone, color.copy()
-        )
-        self._refine(moment, view, seen, rows)
-        return seen
+        whole = color.copy()
+        self._refine(moment, view, seen_by, (centres[1], tone, rows, whole), None, numbers)
+        hits = centres, centres
+        return Seen(seen_by, numbers, hits, points, lit, samples.ambient, color, tone, whole)
 
     def _view(self, moment: Moment, T_world_cam: Array) -> RoomView:
         """Return a camera as the kernels take it."""
@@ -198,28 +227,28 @@ class MovingScene:
 
     def _enter(
         self, numbers: Sequence[int], moment: Moment, seen_by: tuple[CameraIntrinsics, Array],
-        buffers: Buffers,
+        buffers: Buffers, among: Mask = NOT_WANTED,
     ) -> None:  # fmt: skip
-        """Enter meshes into what a camera sees."""
+        """Enter meshes into what a camera sees, at the pixels `among` (H, W)."""
         intrinsics, T_world_cam = seen_by
-        rays = camera.ray_table(intrinsics)
+        rays, Ts = camera.ray_table(intrinsics), moment.Ts_world_obj
+        may = may_be_seen(intrinsics, self._boxes, se3.invert(T_world_cam) @ Ts)
         for k in numbers:
-            mesh = self._caster.project(k, intrinsics, T_world_cam, moment.Ts_world_obj[k])
-            enter(mesh, k, rays, buffers, NOT_WANTED)
+            if may[k]:
+                mesh = self._caster.project(k, intrinsics, T_world_cam, Ts[k])
+                enter(mesh, k, rays, buffers, NOT_WANTED, among)
 
     def _cast_shadows(
         self, numbers: Sequence[int], moment: Moment, points: SortedPoints, lit: Mask
     ) -> None:
         """Clear `lit` where one of these meshes keeps the sun off."""
-        for k in numbers:
-            body = self._caster.bodies[k]
-            cast_shadows(points, (moment.in_the_sun[k], body.faces), body.is_solid, lit)
+        cast_shadows(points, moment.in_the_sun, np.array(numbers, np.int64), lit)
 
-    def _lit_colors(
+    def _sampled(
         self, moment: Moment, view: RoomView, intrinsics: CameraIntrinsics, hits: Buffers,
         rows: Int64, numbers: Sequence[int],
-    ) -> tuple[SortedPoints, Mask, Array32]:  # fmt: skip
-        """Return for rays of a camera where the sun could shine, where it does, and the light."""
+    ) -> tuple[RoomSamples, SortedPoints, Mask]:  # fmt: skip
+        """Return what rays of a camera see, where the sun could shine there, and where it does."""
         out: RoomSamples = empty_samples(len(rows))
         rays = camera.ray_table(intrinsics).reshape(-1, 3)
         pixel_rad = 1.0 / float(np.sqrt(intrinsics.fx * intrinsics.fy))
@@ -227,27 +256,54 @@ class MovingScene:
         sample_room(self._surfaces, view, rays, seen, rows, pixel_rad, out)
         points, lit = sort_points(out.toward_sun), np.ones(len(rows), np.bool_)
         self._cast_shadows(numbers, moment, points, lit)
-        return points, lit, lit_colors(out, lit)
+        return out, points, lit
 
-    def _refine(self, moment: Moment, view: RoomView, seen: Seen, rows: Int64) -> None:
-        """Put the means over their parts into those of the pixels `rows` that have contrast."""
-        n, (intrinsics, finer, _), geometry = self.lighting.samples, seen.camera, seen.hits[0][1]
+    def _refine(
+        self, moment: Moment, view: RoomView,
+        seen_by: tuple[CameraIntrinsics, CameraIntrinsics, Array],
+        pixels: tuple[Int32, Array32, Int64, Array32], below: Buffers | None,
+        numbers: Sequence[int],
+    ) -> None:  # fmt: skip
+        """Put the means over their parts into those pixels that have contrast.
+
+        Args:
+            moment: the time.
+            view: the camera as the kernels take it.
+            seen_by: the camera, as of `Seen`.
+            pixels: the mesh (H, W) that they see, their tone (P,), which of them may be changed
+                (N,), and their light (P, 3), which is.
+            below: what parts see of the meshes that are not among `numbers`; None = there are none.
+            numbers: the other meshes.
+        """
+        geometry, tone, rows, whole = pixels
+        n, (intrinsics, finer, T) = self.lighting.samples, seen_by
         if n == 1:
             return
-        busy = busy_among(seen.tone, geometry.ravel(), rows, geometry.shape, self.lighting.contrast)
+        busy = busy_among(tone, geometry.ravel(), rows, geometry.shape, self.lighting.contrast)
         rows = rows[busy]
         first = (rows // intrinsics.width) * n * finer.width + (rows % intrinsics.width) * n
         of_pixel = (np.arange(n)[:, None] * finer.width + np.arange(n)).ravel()
         parts = (first[:, None] + of_pixel).ravel()
-        color = self._lit_colors(moment, view, finer, seen.hits[1], parts, seen.numbers)[2]
-        seen.whole[rows] = color.reshape(len(rows), n * n, 3).mean(1)
+        # Only these parts are cast, into buffers that are kept from picture to picture.
+        rays = camera.ray_table(finer)
+        if rays.shape not in self._kept:
+            self._kept[rays.shape] = empty_buffers(rays), np.zeros(rays.shape[:2], np.bool_)
+        hits, among = self._kept[rays.shape]
+        for k, nothing in enumerate((np.inf, -1, -1)):
+            hits[k].reshape(-1)[parts] = nothing if below is None else below[k].reshape(-1)[parts]
+        among.reshape(-1)[parts] = True
+        self._enter(numbers, moment, (finer, T), hits, among)
+        among.reshape(-1)[parts] = False
+        every = numbers if below is None else self._every
+        samples, _, lit = self._sampled(moment, view, finer, hits, parts, every)
+        whole[rows] = lit_colors(samples, lit).reshape(len(rows), n * n, 3).mean(1)
 
-    def _finished(self, seen: Seen) -> MovingPicture:
+    def _finished(self, centres: Buffers, whole: Array32) -> MovingPicture:
         """Return the picture behind the lens, and its depth."""
         import cv2
 
-        depth, geometry, _ = seen.hits[0]
-        color = seen.whole.reshape(*depth.shape, 3)
+        depth, geometry, _ = centres
+        color = whole.reshape(*depth.shape, 3)
         if self.lighting.psf_px > 0:
             color = np.asarray(cv2.GaussianBlur(color, (0, 0), self.lighting.psf_px), np.float32)
         rgb = encoded(color.reshape(-1, 3), self.lighting.gamma).reshape(color.shape)

@@ -94,7 +94,7 @@ class PixelCaster:
         T_cam_obj = se3.invert(T_world_cam) @ T_world_obj
         lens = lens_array(intrinsics)
         points, seen = project_vertices(body.vertices, T_cam_obj, lens)
-        eye = se3.invert(T_cam_obj)[:3, 3]
+        eye = -T_cam_obj[:3, 3] @ T_cam_obj[:3, :3]
         low, high = body.bounds
         contains = bool(np.all(eye > low) and np.all(eye < high)) and (
             abs(solid_angle_share(points, body.faces)) > INSIDE_SHARE
@@ -117,6 +117,26 @@ class PixelCaster:
         for number in range(len(self.placed)):
             enter(self.project(number, intrinsics, T), number, rays, buffers, NOT_WANTED)
         return finished(buffers)
+
+
+def may_be_seen(intrinsics: CameraIntrinsics, boxes: Array, Ts_cam_obj: Array) -> Mask:
+    """Return (G,) which boxes a camera may see: all, where the lens bends the view's border.
+
+    Args:
+        intrinsics: the camera.
+        boxes: (G, 8, 3) corners [m].
+        Ts_cam_obj: (G, 4, 4).
+    """
+    i = intrinsics
+    if i.is_distorted:
+        return np.ones(len(boxes), np.bool_)
+    x, y, z = np.moveaxis(se3.transform(Ts_cam_obj, boxes), -1, 0)
+    # Outside is what lies beyond one of the planes through the border, a pixel further out.
+    beyond = (
+        z <= 0, x < z * (-1 - i.cx) / i.fx, x > z * (i.width - i.cx) / i.fx,
+        y < z * (-1 - i.cy) / i.fy, y > z * (i.height - i.cy) / i.fy,
+    )  # fmt: skip
+    return ~np.any([np.all(outside, axis=-1) for outside in beyond], axis=0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,8 +168,9 @@ def empty_buffers(rays: Array32) -> Buffers:
 
 
 def enter(
-    mesh: ProjectedMesh, number: int, rays: Array32, buffers: Buffers, covered: Mask
-) -> Entered:
+    mesh: ProjectedMesh, number: int, rays: Array32, buffers: Buffers, covered: Mask,
+    among: Mask = NOT_WANTED,
+) -> Entered:  # fmt: skip
     """Enter a mesh into the buffers and return where it is.
 
     Args:
@@ -158,10 +179,12 @@ def enter(
         rays: (H, W, 3) the camera's ray table.
         buffers: changed.
         covered: (H, W) changed: what the mesh covers; `NOT_WANTED` = nobody asked.
+        among: (H, W) the pixels that are cast; `NOT_WANTED` = all.
     """
     count, (left, right, top, bottom), bounds = cast_triangles(
-        (mesh.points, mesh.seen, mesh.faces), mesh.lens, rays, number, mesh.cull, buffers, covered
-    )
+        (mesh.points, mesh.seen, mesh.faces), mesh.lens, rays, number, mesh.cull, buffers, covered,
+        among,
+    )  # fmt: skip
     window = (slice(top, bottom + 1), slice(left, right + 1)) if count else NOWHERE
     return Entered(count, window, bounds)
 

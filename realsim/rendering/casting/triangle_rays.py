@@ -238,6 +238,7 @@ def cast_triangles(
     cull: bool,
     buffers: tuple[Array32, Int32, Int32],
     covered: Mask,
+    among: Mask,
 ) -> tuple[int, PixelRange, Box]:
     """Enter a mesh's hits where they are nearer than what is there; mark all that it covers.
 
@@ -251,6 +252,7 @@ def cast_triangles(
         buffers: changed: depth (H, W) of the nearest hit, inf = none [m]; placed mesh (H, W);
             its face (H, W).
         covered: (H, W) changed: True where any face is hit; may be empty (0, 0) = not wanted.
+        among: (H, W) the pixels that are cast; may be empty (0, 0) = all.
 
     Returns:
         How many pixels of `covered` were set; the first and last column, first and last row of
@@ -260,7 +262,7 @@ def cast_triangles(
     points, seen, faces = mesh
     depth, geometry, face = buffers
     height, width = depth.shape
-    wanted = covered.shape[0] > 0
+    wanted, some = covered.shape[0] > 0, among.shape[0] > 0
     count = 0
     left, right, top, bottom = width, -1, height, -1
     low_u = low_v = np.inf
@@ -284,6 +286,8 @@ def cast_triangles(
             first, last = _narrowed(first, last, gb, hb, eb, v)
             first, last = _narrowed(first, last, gc, hc, ec, v)
             for u in range(first, last + 1):
+                if some and not among[v, u]:
+                    continue
                 x, y = np.float64(rays[v, u, 0]), np.float64(rays[v, u, 1])
                 wa = side * (x * px + y * py + pz)
                 wb = side * (x * qx + y * qy + qz)

@@ -4,7 +4,7 @@ Seen along the sun's rays everything is a flat picture, and a point is in shadow
 covers it there and lies nearer to the sun. The points are sorted into cells, so that a triangle is
 tested against few (Aila and Laine, "Alias-free shadow maps", 2004). Nothing is sampled: the outcome
 is that of one ray for each point, at a fraction of its cost, and no structure is built for bodies
-that move.
+that move. What happens to a point does not depend on the others.
 """
 
 from typing import NamedTuple
@@ -14,25 +14,53 @@ import numpy as np
 from realsim.arrays import Array, Array32, Int32, Int64, Mask
 from realsim.compiled import njit
 
-POINTS_A_CELL = 2.0
-"""Points of a cell, on average."""
-MOST_CELLS = 1024
+POINTS_A_CELL = 1.5
+"""Points of a cell, on average, where they are many."""
+FEWEST_CELLS = 50_000.0
+"""Few points lie in clusters, such as along edges: without so many cells a few would hold all."""
+MOST_CELLS = 4096
 """Cells along one side, at most."""
+SLACK = 1e-3
+"""By so much a triangle's part of a row is widened for rounding [cells]."""
 
 
 class SortedPoints(NamedTuple):
     """Points in the sun's frame, sorted into cells."""
 
     points: Array32
-    """(N, 3) along the picture's two axes, and towards the sun [m]."""
-    order: Int64
-    """(M,) numbers of the points that can be lit, cell by cell."""
-    first: Int64
-    """(R * C + 1,) where each cell begins in `order`."""
+    """(3, M) those that can be lit, cell by cell: along both axes, towards the sun [m]."""
+    order: Int32
+    """(M,) their numbers."""
+    first: Int32
+    """(R * C + 1,) where each cell begins; those of a row follow one another."""
     lowest: Array32
-    """(R * C,) the point of each cell that is farthest from the sun [m]."""
+    """(R,) the point of each row that is farthest from the sun [m]."""
     grid: Array
-    """(5,) first edge along both axes [m], edge of a cell [m], rows, columns."""
+    """(5,) first edge along both axes [m], cells per metre, rows, columns."""
+
+
+class SunBodies(NamedTuple):
+    """Meshes as the sun sees them, one after another."""
+
+    vertices: Array
+    """(V, 3) in the sun's frame [m]."""
+    faces: Int32
+    """(F, 3)."""
+    first_face: Int64
+    """(G + 1,) first face of each mesh."""
+    is_solid: Mask
+    """(G,) whether it is closed and its faces look outwards: those towards the sun are enough."""
+
+
+@njit
+def in_frames(vertices: Array, owners: Int32, Ts: Array) -> Array:
+    """Return vertices (V, 3) of meshes `owners` (V,) moved by the poses Ts (G, 4, 4) of these."""
+    out = np.empty_like(vertices)
+    for i in range(len(vertices)):
+        T, x, y, z = Ts[owners[i]], vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        for k in range(3):
+            out[i, k] = T[k, 0] * x + T[k, 1] * y + T[k, 2] * z + T[k, 3]
+    return out
 
 
 @njit(error_model="numpy")
@@ -50,77 +78,112 @@ def sort_points(points: Array32) -> SortedPoints:
     if count == 0:
         low_a, high_a, low_b, high_b = 0.0, 1.0, 0.0, 1.0
     wide, high = max(high_a - low_a, 1e-9), max(high_b - low_b, 1e-9)
-    edge = np.sqrt(wide * high * POINTS_A_CELL / max(count, 1))
-    edge = max(edge, max(wide, high) / MOST_CELLS)
-    columns, rows = int(wide / edge) + 1, int(high / edge) + 1
-    cells = np.full(len(points), -1, np.int64)
-    first = np.zeros(rows * columns + 1, np.int64)
-    lowest = np.full(rows * columns, np.inf, np.float32)
+    edge = np.sqrt(wide * high / max(count / POINTS_A_CELL, FEWEST_CELLS))
+    a_metre = 1.0 / max(edge, max(wide, high) / MOST_CELLS)
+    columns, rows = int(wide * a_metre) + 1, int(high * a_metre) + 1
+    cells = np.full(len(points), -1, np.int32)
+    first = np.zeros(rows * columns + 1, np.int32)
+    lowest = np.full(rows, np.inf, np.float32)
     for i in range(len(points)):
         if np.isnan(points[i, 0]):
             continue
-        c = int((points[i, 1] - low_b) / edge) * columns + int((points[i, 0] - low_a) / edge)
-        cells[i] = c
-        first[c + 1] += 1
-        lowest[c] = min(lowest[c], points[i, 2])
+        row = int((points[i, 1] - low_b) * a_metre)
+        cells[i] = row * columns + int((points[i, 0] - low_a) * a_metre)
+        first[cells[i]] += 1
+        lowest[row] = min(lowest[row], points[i, 2])
     for c in range(rows * columns):
         first[c + 1] += first[c]
-    order = np.empty(count, np.int64)
-    filled = first[:-1].copy()
-    for i in range(len(points)):
+    order = np.empty(count, np.int32)
+    kept = np.empty((3, count), np.float32)
+    for i in range(len(points) - 1, -1, -1):
         if cells[i] >= 0:
-            order[filled[cells[i]]] = i
-            filled[cells[i]] += 1
-    grid = np.array([low_a, low_b, edge, float(rows), float(columns)])
-    return SortedPoints(points, order, first, lowest, grid)
+            first[cells[i]] -= 1
+            m = first[cells[i]]
+            order[m] = i
+            kept[0, m], kept[1, m], kept[2, m] = points[i]
+    grid = np.array([low_a, low_b, a_metre, float(rows), float(columns)])
+    return SortedPoints(kept, order, first, lowest, grid)
+
+
+@njit(inline="always", error_model="numpy")
+def _narrowed(
+    left: float, right: float, side: tuple[float, float, float, float], low: float, high: float
+) -> tuple[float, float]:
+    """Return the x of left..right in which g x + h y + e >= 0 may hold for y in low..high.
+
+    `side` is g, h, e and 1 / g.
+    """
+    g, h, e, per_g = side
+    edge = -(max(h * low, h * high) + e) * per_g
+    if g > 0.0:
+        return max(left, edge), right
+    if g < 0.0:
+        return left, min(right, edge)
+    return left, right
 
 
 @njit(error_model="numpy")
-def cast_shadows(
-    sorted_points: SortedPoints, mesh: tuple[Array, Int32], solid: bool, lit: Mask
-) -> None:
-    """Clear `lit` (N,) where a mesh lies between a point and the sun.
-
-    Args:
-        sorted_points: the points.
-        mesh: vertices (V, 3) in the sun's frame [m] and faces (F, 3).
-        solid: whether it is closed and its faces look outwards: those towards the sun are enough.
-        lit: is changed.
-    """
+def cast_shadows(sorted_points: SortedPoints, bodies: SunBodies, numbers: Int64, lit: Mask) -> None:
+    """Clear `lit` (N,) where one of the meshes `numbers` lies between a point and the sun."""
     points, order, first, lowest, grid = sorted_points
-    vertices, faces = mesh
-    rows, columns, a_cell = int(grid[3]), int(grid[4]), 1.0 / grid[2]
-    for f in range(len(faces)):
-        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
-        ax, ay, bx, by = vertices[i, 0], vertices[i, 1], vertices[j, 0], vertices[j, 1]
-        cx, cy = vertices[k, 0], vertices[k, 1]
-        turn = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        if turn == 0.0 or (solid and turn < 0.0):
-            continue
-        first_x, last_x = (min(ax, bx, cx) - grid[0]) * a_cell, (max(ax, bx, cx) - grid[0]) * a_cell
-        first_y, last_y = (min(ay, by, cy) - grid[1]) * a_cell, (max(ay, by, cy) - grid[1]) * a_cell
-        if last_x < 0.0 or last_y < 0.0 or first_x >= columns or first_y >= rows:
-            continue
-        left, right = int(max(first_x, 0.0)), int(min(last_x, columns - 1.0))
-        low, high = int(max(first_y, 0.0)), int(min(last_y, rows - 1.0))
-        az, bz, cz = vertices[i, 2], vertices[j, 2], vertices[k, 2]
-        top = max(az, bz, cz)
-        s = 1.0 if turn > 0.0 else -1.0
-        for row in range(low, high + 1):
-            for column in range(left, right + 1):
-                cell = row * columns + column
-                if top <= lowest[cell]:
+    vertices, faces, first_face, is_solid = bodies
+    low_a, low_b, a_metre = grid[0], grid[1], grid[2]
+    rows, columns, edge = int(grid[3]), int(grid[4]), 1.0 / grid[2]
+    x, y = points[0], points[1]
+    z = np.empty(len(order), np.float32)
+    for m in range(len(order)):
+        z[m] = points[2, m] if lit[order[m]] else np.inf  # nothing is above what is in shadow
+    for number in numbers:
+        for f in range(first_face[number], first_face[number + 1]):
+            i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+            ax, ay, bx, by = vertices[i, 0], vertices[i, 1], vertices[j, 0], vertices[j, 1]
+            cx, cy = vertices[k, 0], vertices[k, 1]
+            turn = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+            if turn == 0.0 or (is_solid[number] and turn < 0.0):
+                continue
+            x0, x1, y0, y1 = min(ax, bx, cx), max(ax, bx, cx), min(ay, by, cy), max(ay, by, cy)
+            first_x, last_x = (x0 - low_a) * a_metre, (x1 - low_a) * a_metre
+            first_y, last_y = (y0 - low_b) * a_metre, (y1 - low_b) * a_metre
+            if last_x < 0.0 or last_y < 0.0 or first_x >= columns or first_y >= rows:
+                continue
+            left, right = int(max(first_x, 0.0)), int(min(last_x, columns - 1.0))
+            low, high = int(max(first_y, 0.0)), int(min(last_y, rows - 1.0))
+            az, bz, cz = vertices[i, 2], vertices[j, 2], vertices[k, 2]
+            top = max(az, bz, cz)
+            # The sides as lines g x + h y + e, positive inside: two triangles have the one that
+            # they share with opposite signs, so that no point slips through. Then the plane.
+            s = 1.0 if turn > 0.0 else -1.0
+            ga, ha, ea = s * (by - cy), s * (cx - bx), s * (bx * cy - by * cx)
+            gb, hb, eb = s * (cy - ay), s * (ax - cx), s * (cx * ay - cy * ax)
+            gc, hc, ec = s * (ay - by), s * (bx - ax), s * (ax * by - ay * bx)
+            u, v = (bz - az) / turn, (cz - az) / turn
+            gz, hz = u * (cy - ay) - v * (by - ay), v * (bx - ax) - u * (cx - ax)
+            ez = az - gz * ax - hz * ay
+            fa, fb, fc = np.float32(ga), np.float32(gb), np.float32(gc)
+            pa, pb, pc = np.float32(ha), np.float32(hb), np.float32(hc)
+            qa, qb, qc = np.float32(ea), np.float32(eb), np.float32(ec)
+            fz, pz, qz = np.float32(gz), np.float32(hz), np.float32(ez)
+            wide = right - left > 2 and high > low
+            ia, ib, ic = (1.0 / ga, 1.0 / gb, 1.0 / gc) if wide else (0.0, 0.0, 0.0)
+            for row in range(low, high + 1):
+                if top <= lowest[row]:
                     continue
-                for m in range(first[cell], first[cell + 1]):
-                    p = order[m]
-                    if not lit[p] or points[p, 2] >= top:
+                begin, end = left, right
+                if wide:
+                    y_low = max(low_b + (row - SLACK) * edge, y0)
+                    y_high = min(low_b + (row + 1 + SLACK) * edge, y1)
+                    xl, xr = _narrowed(x0, x1, (ga, ha, ea, ia), y_low, y_high)
+                    xl, xr = _narrowed(xl, xr, (gb, hb, eb, ib), y_low, y_high)
+                    xl, xr = _narrowed(xl, xr, (gc, hc, ec, ic), y_low, y_high)
+                    begin = max(left, int((xl - low_a) * a_metre - SLACK))
+                    end = min(right, int((xr - low_a) * a_metre + SLACK))
+                    if begin > end:
                         continue
-                    x, y = float(points[p, 0]), float(points[p, 1])
-                    wa = s * ((bx - x) * (cy - y) - (by - y) * (cx - x))
-                    wb = s * ((cx - x) * (ay - y) - (cy - y) * (ax - x))
-                    wc = s * ((ax - x) * (by - y) - (ay - y) * (bx - x))
-                    if wa < 0.0 or wb < 0.0 or wc < 0.0:
-                        continue
-                    total = wa + wb + wc
-                    if wa * az + wb * bz + wc * cz > total * points[p, 2]:
-                        lit[p] = False
+                # Without branches: eight points at a time.
+                for m in range(first[row * columns + begin], first[row * columns + end + 1]):
+                    w = min(fa * x[m] + pa * y[m] + qa, fb * x[m] + pb * y[m] + qb)
+                    w = min(w, fc * x[m] + pc * y[m] + qc)
+                    above = fz * x[m] + pz * y[m] + qz > z[m]
+                    z[m] = np.inf if (w >= 0.0) & above else z[m]
+    for m in range(len(order)):
+        lit[order[m]] = z[m] < np.inf
