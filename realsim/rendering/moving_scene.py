@@ -24,7 +24,9 @@ from realsim.rendering.casting.pixel_caster import (
     PixelCaster,
     empty_buffers,
     enter,
+    lens_array,
     may_be_seen,
+    projected,
 )
 from realsim.rendering.embedded.room_light import (
     RoomSamples,
@@ -33,6 +35,7 @@ from realsim.rendering.embedded.room_light import (
     empty_samples,
     encoded,
     lit_colors,
+    mean_colors,
     room_surfaces,
     room_view,
     sample_room,
@@ -232,10 +235,11 @@ class MovingScene:
         """Enter meshes into what a camera sees, at the pixels `among` (H, W)."""
         intrinsics, T_world_cam = seen_by
         rays, Ts = camera.ray_table(intrinsics), moment.Ts_world_obj
-        may = may_be_seen(intrinsics, self._boxes, se3.invert(T_world_cam) @ Ts)
+        lens, T_cam_world = lens_array(intrinsics), se3.invert(T_world_cam)
+        may = may_be_seen(intrinsics, self._boxes, T_cam_world @ Ts)
         for k in numbers:
             if may[k]:
-                mesh = self._caster.project(k, intrinsics, T_world_cam, Ts[k])
+                mesh = projected(self._caster.bodies[k], lens, T_cam_world @ Ts[k])
                 enter(mesh, k, rays, buffers, NOT_WANTED, among)
 
     def _cast_shadows(
@@ -279,8 +283,7 @@ class MovingScene:
         n, (intrinsics, finer, T) = self.lighting.samples, seen_by
         if n == 1:
             return
-        busy = busy_among(tone, geometry.ravel(), rows, geometry.shape, self.lighting.contrast)
-        rows = rows[busy]
+        rows = rows[busy_among(tone, geometry, self.lighting.contrast).ravel()[rows]]
         first = (rows // intrinsics.width) * n * finer.width + (rows % intrinsics.width) * n
         of_pixel = (np.arange(n)[:, None] * finer.width + np.arange(n)).ravel()
         parts = (first[:, None] + of_pixel).ravel()
@@ -296,7 +299,7 @@ class MovingScene:
         among.reshape(-1)[parts] = False
         every = numbers if below is None else self._every
         samples, _, lit = self._sampled(moment, view, finer, hits, parts, every)
-        whole[rows] = lit_colors(samples, lit).reshape(len(rows), n * n, 3).mean(1)
+        mean_colors(samples, lit, n * n, rows, whole)
 
     def _finished(self, centres: Buffers, whole: Array32) -> MovingPicture:
         """Return the picture behind the lens, and its depth."""

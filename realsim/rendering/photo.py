@@ -207,8 +207,8 @@ class PhotoRenderer:
         if n > 1:
             tone = np.empty(len(every), np.float32)
             tones(color, light.gamma, every, tone)
-            busy = busy_among(tone, geometry, every, table.shape[:2], light.contrast)
-            rows = every[busy & np.isfinite(table[..., 0].ravel())]
+            busy = busy_among(tone, hits.geometry, light.contrast)
+            rows = np.flatnonzero(busy & np.isfinite(table[..., 0]))
             offsets = ((np.arange(n) + 0.5) / n - 0.5).astype(np.float32)
             offsets = np.stack(np.meshgrid(offsets, offsets), -1).reshape(-1, 2)
             for of in np.array_split(rows, 1 + len(rows) * n * n // BLOCK_RAYS):

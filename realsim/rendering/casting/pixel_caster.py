@@ -89,20 +89,9 @@ class PixelCaster:
         T_world_obj: Array | None = None,
     ) -> ProjectedMesh:
         """Return the placed mesh of this number as the camera has it; None = where it was put."""
-        body = self.bodies[number]
         T_world_obj = self.placed[number].T_world_obj if T_world_obj is None else T_world_obj
         T_cam_obj = se3.invert(T_world_cam) @ T_world_obj
-        lens = lens_array(intrinsics)
-        points, seen = project_vertices(body.vertices, T_cam_obj, lens)
-        eye = -T_cam_obj[:3, 3] @ T_cam_obj[:3, :3]
-        low, high = body.bounds
-        contains = bool(np.all(eye > low) and np.all(eye < high)) and (
-            abs(solid_angle_share(points, body.faces)) > INSIDE_SHARE
-        )
-        return ProjectedMesh(
-            points=points, seen=seen, faces=body.faces, lens=lens, contains_camera=contains,
-            cull=body.is_solid and not contains,
-        )  # fmt: skip
+        return projected(self.bodies[number], lens_array(intrinsics), T_cam_obj)
 
     def cast(self, intrinsics: CameraIntrinsics, T_world_cam: ArrayLike) -> FirstHits:
         """Return what the pixels see first.
@@ -117,6 +106,19 @@ class PixelCaster:
         for number in range(len(self.placed)):
             enter(self.project(number, intrinsics, T), number, rays, buffers, NOT_WANTED)
         return finished(buffers)
+
+
+def projected(body: Body, lens: Array, T_cam_obj: Array) -> ProjectedMesh:
+    """Return a body at T_cam_obj (4, 4) [m] as a camera has it, given as of `lens_array`."""
+    points, seen = project_vertices(body.vertices, T_cam_obj, lens)
+    eye = -T_cam_obj[:3, 3] @ T_cam_obj[:3, :3]
+    contains = bool(((eye > body.bounds[0]) & (eye < body.bounds[1])).all()) and (
+        abs(solid_angle_share(points, body.faces)) > INSIDE_SHARE
+    )
+    return ProjectedMesh(
+        points=points, seen=seen, faces=body.faces, lens=lens, contains_camera=contains,
+        cull=body.is_solid and not contains,
+    )  # fmt: skip
 
 
 def may_be_seen(intrinsics: CameraIntrinsics, boxes: Array, Ts_cam_obj: Array) -> Mask:

@@ -352,33 +352,41 @@ def lit_colors(samples: RoomSamples, lit: Mask) -> Array32:
 
 
 @njit(error_model="numpy", fastmath=FAST)
-def tones(color: Array32, gamma: float, rows: Int64, out: Array32) -> None:
-    """Fill the encoded brightness `out` (P,) of the pixels `rows` of a picture (P, 3)."""
-    for n in range(len(rows)):
-        i = rows[n]
-        mean = (color[i, 0] + color[i, 1] + color[i, 2]) / 3.0
-        out[i] = min(max(mean, 0.0), 1.0) ** (1.0 / gamma)
+def mean_colors(samples: RoomSamples, lit: Mask, parts: int, rows: Int64, out: Array32) -> None:
+    """Fill the pixels `rows` (M,) of a picture (P, 3) with the light of their parts (M * parts)."""
+    for m in range(len(rows)):
+        for k in range(3):
+            total = 0.0
+            for i in range(m * parts, (m + 1) * parts):
+                total += samples.ambient[i, k] + (samples.sunny[i, k] if lit[i] else 0.0)
+            out[rows[m], k] = total / parts
 
 
 @njit(error_model="numpy", fastmath=FAST)
-def busy_among(
-    tone: Array32, geometry: Int32, rows: Int64, size: tuple[int, int], contrast: float
-) -> Mask:
-    """Return (M,) which pixels `rows` have contrast or the edge of a mesh within 3 x 3 pixels."""
-    height, width = size
-    out = np.zeros(len(rows), np.bool_)
-    for m in range(len(rows)):
-        y, x = rows[m] // width, rows[m] % width
-        low, high, g = np.inf, -np.inf, geometry[rows[m]]
-        for v in range(max(y - 1, 0), min(y + 2, height)):
-            for u in range(max(x - 1, 0), min(x + 2, width)):
-                i = v * width + u
-                low, high = min(low, tone[i]), max(high, tone[i])
-                if geometry[i] != g:
-                    out[m] = True
-        if high - low > contrast:
-            out[m] = True
-    return out
+def tones(color: Array32, gamma: float, rows: Int64, out: Array32) -> None:
+    """Fill the encoded brightness `out` (P,) of the pixels `rows` of a picture (P, 3).
+
+    Between its values at 4096 steps: what is compared are differences of a few percent.
+    """
+    steps = (np.arange(4098) / 4096.0) ** (1.0 / gamma)
+    for n in range(len(rows)):
+        i = rows[n]
+        at = min(max((color[i, 0] + color[i, 1] + color[i, 2]) / 3.0, 0.0), 1.0) * 4096.0
+        k = int(at)
+        out[i] = steps[k] + (at - k) * (steps[k + 1] - steps[k])
+
+
+def busy_among(tone: Array32, geometry: Int32, contrast: float) -> Mask:
+    """Return (H, W) which pixels have contrast or the edge of a mesh within 3 x 3 pixels.
+
+    `tone` is (P,), `geometry` (H, W).
+    """
+    import cv2
+
+    around, meshes = np.ones((3, 3), np.uint8), geometry.astype(np.float32)
+    tone = tone.reshape(geometry.shape)
+    edges = cv2.dilate(meshes, around) != cv2.erode(meshes, around)
+    return edges | (cv2.dilate(tone, around) - cv2.erode(tone, around) > contrast)
 
 
 @njit(error_model="numpy", fastmath=FAST)
