@@ -14,11 +14,12 @@ from realsim.arrays import Array, Array32, Int32, Int64, Mask, UInt8, UInt16
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.records import Mesh
-from realsim.rendering.embedded.face_geometry import edges_of, plane_met
+from realsim.rendering.embedded.face_geometry import Edges, edges_of, plane_met
 from realsim.rendering.embedded.materials import Surface
 from realsim.rendering.rays import PlacedMesh
 
 MOST_HALVINGS = 16
+Point = tuple[float, float, float]
 LIFT_M = 1e-4
 """Points are tested for shadow this far off the surface, or rounding would shade it by itself."""
 FAST = {"nsz", "arcp", "contract", "afn", "reassoc"}
@@ -71,6 +72,10 @@ class RoomView(NamedTuple):
     """(3, 3)."""
     light: Array
     """(7, 3) see `GROUND` and the following."""
+    suns: Array
+    """(G, 3) unit directions to the sun."""
+    ups: Array
+    """(G, 3) unit directions upwards."""
 
 
 class RoomSamples(NamedTuple):
@@ -128,13 +133,16 @@ def room_view(
     `light` and `R_sun_world` are those of `RoomView`.
     """
     Ts_obj_cam = se3.invert(Ts_world_obj) @ T_world_cam
+    Ts_sun_obj = se3.from_rt(R_sun_world, np.zeros(3)) @ Ts_world_obj
     return RoomView(
         eyes=np.ascontiguousarray(Ts_obj_cam[:, :3, 3]),
         Rs_obj_cam=np.ascontiguousarray(Ts_obj_cam[:, :3, :3]),
         R_world_cam=np.ascontiguousarray(T_world_cam[:3, :3]),
-        Ts_sun_obj=se3.from_rt(R_sun_world, np.zeros(3)) @ Ts_world_obj,
+        Ts_sun_obj=Ts_sun_obj,
         R_sun_world=R_sun_world,
         light=light,
+        suns=np.ascontiguousarray(Ts_sun_obj[:, 2, :3]),
+        ups=np.ascontiguousarray(Ts_world_obj[:, 2, :3]),
     )
 
 
@@ -209,22 +217,14 @@ def _painted(
 
 
 @njit(inline="always", error_model="numpy")
-def _met(
-    corners: Array32, f: int, eye: tuple[float, float, float], ray: tuple[float, float, float]
-) -> tuple[float, float, float, float, float, float, float]:
-    """Return where a ray meets face f: the weights of its corners, t, and its unit normal.
-
-    An open surface is lit from the side it is seen from: the normal looks at the eye.
-    """
+def _face_seen(corners: Array32, f: int, eye: Point) -> tuple[Edges, Point, Point, Point]:
+    """Return of face f as seen from a point: its edges, o and q of `plane_met`, its unit normal."""
     e = edges_of(corners, f)
     o = (eye[0] - corners[f, 0, 0], eye[1] - corners[f, 0, 1], eye[2] - corners[f, 0, 2])
     q = (o[1] * e[2] - o[2] * e[1], o[2] * e[0] - o[0] * e[2], o[0] * e[1] - o[1] * e[0])
-    b, w, t = plane_met(e, o, q, ray)
-    b, w = min(max(b, 0.0), 1.0), min(max(w, 0.0), 1.0)
     x, y, z = e[1] * e[5] - e[2] * e[4], e[2] * e[3] - e[0] * e[5], e[0] * e[4] - e[1] * e[3]
     size = max(np.sqrt(x * x + y * y + z * z), 1e-30)
-    size = size if x * ray[0] + y * ray[1] + z * ray[2] <= 0.0 else -size
-    return max(1.0 - b - w, 0.0), b, w, t, x / size, y / size, z / size
+    return e, o, q, (x / size, y / size, z / size)
 
 
 @njit(inline="always", error_model="numpy")
@@ -250,7 +250,7 @@ def _fill_background(light: Array, up: float, out: Array32, n: int) -> None:
         out[n, k] = h + rise * (light[ZENITH, k] - h) + fall * (light[FLOOR, k] - h)
 
 
-@njit(error_model="numpy", fastmath=FAST)
+@njit(error_model="numpy", fastmath=FAST, _nrt=False)  # nothing is allocated nor counted
 def sample_room(
     s: RoomSurfaces,
     view: RoomView,
@@ -272,12 +272,13 @@ def sample_room(
         out: buffers of N rows.
     """
     geometry, face = hits
-    # Taken out of their tuples once: each time would be counted as one more user of an array.
-    light, R, T, S = view.light, view.Rs_obj_cam, view.Ts_sun_obj, view.R_sun_world
+    light, R, T, suns, ups = view.light, view.Rs_obj_cam, view.Ts_sun_obj, view.suns, view.ups
     R_world_cam, eyes, first_face, corners = view.R_world_cam, view.eyes, s.first_face, s.corners
     normals, painted, density, texels = s.normals, s.paint, s.density, s.texels
     layout, halvings, wraps, tint, glossy = s.layout, s.halvings, s.wraps, s.tint, s.glossy
     ambient, sunny, toward_sun = out.ambient, out.sunny, out.toward_sun
+    f, eye = 0, (eyes[0, 0], eyes[0, 1], eyes[0, 2])
+    e, o, q, normal = _face_seen(corners, f, eye)
     for n in range(len(rows)):
         i = rows[n]
         toward_sun[n, 0] = np.nan
@@ -295,15 +296,17 @@ def sample_room(
         x = R[g, 0, 0] * u + R[g, 0, 1] * v + R[g, 0, 2]
         y = R[g, 1, 0] * u + R[g, 1, 1] * v + R[g, 1, 2]
         z = R[g, 2, 0] * u + R[g, 2, 1] * v + R[g, 2, 2]
-        f = int(first_face[g] + face[i])
-        eye = (eyes[g, 0], eyes[g, 1], eyes[g, 2])
-        a, b, w, t, fx, fy, fz = _met(corners, f, eye, (x, y, z))
+        if f != first_face[g] + face[i]:  # neighbours are often on one face
+            f, eye = int(first_face[g] + face[i]), (eyes[g, 0], eyes[g, 1], eyes[g, 2])
+            e, o, q, normal = _face_seen(corners, f, eye)
+        b, w, t = plane_met(e, o, q, (x, y, z))
+        b, w = min(max(b, 0.0), 1.0), min(max(w, 0.0), 1.0)
+        a, (fx, fy, fz) = max(1.0 - b - w, 0.0), normal
+        if fx * x + fy * y + fz * z > 0.0:  # an open surface is lit from the side it is seen from
+            fx, fy, fz = -fx, -fy, -fz
         nx, ny, nz = _smooth(normals, f, (a, b, w), (fx, fy, fz))
-        # Up and towards the sun, in the mesh's frame: R_sun_obj is R_sun_world R_world_obj.
-        sx, sy, sz = T[g, 2, 0], T[g, 2, 1], T[g, 2, 2]
-        ux = S[0, 2] * T[g, 0, 0] + S[1, 2] * T[g, 1, 0] + S[2, 2] * sx
-        uy = S[0, 2] * T[g, 0, 1] + S[1, 2] * T[g, 1, 1] + S[2, 2] * sy
-        uz = S[0, 2] * T[g, 0, 2] + S[1, 2] * T[g, 1, 2] + S[2, 2] * sz
+        sx, sy, sz = suns[g, 0], suns[g, 1], suns[g, 2]
+        ux, uy, uz = ups[g, 0], ups[g, 1], ups[g, 2]
         images = (texels, layout, int(halvings[g]), bool(wraps[g]))
         paint = _painted(painted, images, (g, f, a, b, w), t * pixel_rad * float(density[f]))
         paint = (paint[0] * tint[g, 0], paint[1] * tint[g, 1], paint[2] * tint[g, 2])
