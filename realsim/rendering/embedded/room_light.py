@@ -306,19 +306,18 @@ def sample_room(
             fx, fy, fz = -fx, -fy, -fz
         nx, ny, nz = _smooth(normals, f, (a, b, w), (fx, fy, fz))
         sx, sy, sz = suns[g, 0], suns[g, 1], suns[g, 2]
-        ux, uy, uz = ups[g, 0], ups[g, 1], ups[g, 2]
         images = (texels, layout, int(halvings[g]), bool(wraps[g]))
         paint = _painted(painted, images, (g, f, a, b, w), t * pixel_rad * float(density[f]))
         paint = (paint[0] * tint[g, 0], paint[1] * tint[g, 1], paint[2] * tint[g, 2])
-        up = 0.5 + 0.5 * (nx * ux + ny * uy + nz * uz)
+        up = 0.5 + 0.5 * (nx * ups[g, 0] + ny * ups[g, 1] + nz * ups[g, 2])
         for k in range(3):
             low = light[GROUND, k]
             ambient[n, k] = paint[k] * (low + up * (light[SKY, k] - low))
         facing = nx * sx + ny * sy + nz * sz
         if facing <= 0.0 or fx * sx + fy * sy + fz * sz <= 0.0:
             continue
-        px, py, pz = eye[0] + t * x, eye[1] + t * y, eye[2] + t * z
-        px, py, pz = px + LIFT_M * fx, py + LIFT_M * fy, pz + LIFT_M * fz
+        px, py = eye[0] + t * x + LIFT_M * fx, eye[1] + t * y + LIFT_M * fy
+        pz = eye[2] + t * z + LIFT_M * fz
         for k in range(3):
             along = T[g, k, 0] * px + T[g, k, 1] * py + T[g, k, 2] * pz
             toward_sun[n, k] = along + T[g, k, 3]

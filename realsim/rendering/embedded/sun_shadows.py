@@ -16,12 +16,17 @@ from realsim.compiled import njit
 
 POINTS_A_CELL = 1.5
 """Points of a cell, on average, where they are many."""
-FEWEST_CELLS = 50_000.0
+FEWEST_CELLS = 25_000.0
 """Few points lie in clusters, such as along edges: without so many cells a few would hold all."""
 MOST_CELLS = 4096
 """Cells along one side, at most."""
+BLOCK = 16
+"""Points that a processor tests at once; blocks of x, y and z of so many follow one another."""
 SLACK = 1e-3
 """By so much a triangle's part of a row is widened for rounding [cells]."""
+
+
+Lines = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 
 
 class SortedPoints(NamedTuple):
@@ -105,6 +110,24 @@ def sort_points(points: Array32) -> SortedPoints:
     return SortedPoints(kept, order, first, lowest, grid)
 
 
+@njit(_nrt=False)
+def _cover(blocks: Array32, first: int, last: int, lines: Lines) -> None:
+    """Put z to inf for the points of blocks first..last that lie under a triangle.
+
+    `lines` are g, h, e of its sides and of its height, g x + h y + e; without branches and with
+    places that cannot be negative, the inner loop is one instruction for a block.
+    """
+    fa, pa, qa, fb, pb, qb, fc, pc, qc, fz, pz, qz = lines
+    for block in range(first, last + 1):
+        at = np.uint64(block * 3 * BLOCK)
+        for n in range(BLOCK):
+            m = at + np.uint64(n)
+            x, y, z = blocks[m], blocks[m + np.uint64(BLOCK)], blocks[m + np.uint64(2 * BLOCK)]
+            inside = (fa * x + pa * y + qa >= 0.0) & (fb * x + pb * y + qb >= 0.0)
+            inside = inside & (fc * x + pc * y + qc >= 0.0) & (fz * x + pz * y + qz > z)
+            blocks[m + np.uint64(2 * BLOCK)] = np.float32(np.inf) if inside else z
+
+
 @njit(inline="always", error_model="numpy")
 def _narrowed(
     left: float, right: float, side: tuple[float, float, float, float], low: float, high: float
@@ -129,15 +152,19 @@ def cast_shadows(sorted_points: SortedPoints, bodies: SunBodies, numbers: Int64,
     vertices, faces, first_face, is_solid = bodies
     low_a, low_b, a_metre = grid[0], grid[1], grid[2]
     rows, columns, edge = int(grid[3]), int(grid[4]), 1.0 / grid[2]
-    x, y = points[0], points[1]
-    z = np.empty(len(order), np.float32)
+    blocks = np.full((len(order) // BLOCK + 1) * 3 * BLOCK, np.float32(np.inf), np.float32)
     for m in range(len(order)):
-        z[m] = points[2, m] if lit[order[m]] else np.inf  # nothing is above what is in shadow
+        at = m // BLOCK * 3 * BLOCK + m % BLOCK
+        blocks[at], blocks[at + BLOCK] = points[0, m], points[1, m]
+        if lit[order[m]]:  # nothing is above what is in shadow already
+            blocks[at + 2 * BLOCK] = points[2, m]
     for number in numbers:
         for f in range(first_face[number], first_face[number + 1]):
             i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
             ax, ay, bx, by = vertices[i, 0], vertices[i, 1], vertices[j, 0], vertices[j, 1]
-            cx, cy = vertices[k, 0], vertices[k, 1]
+            cx, cy, az, bz, cz = (
+                vertices[k, 0], vertices[k, 1], vertices[i, 2], vertices[j, 2], vertices[k, 2],
+            )  # fmt: skip
             turn = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
             if turn == 0.0 or (is_solid[number] and turn < 0.0):
                 continue
@@ -148,21 +175,20 @@ def cast_shadows(sorted_points: SortedPoints, bodies: SunBodies, numbers: Int64,
                 continue
             left, right = int(max(first_x, 0.0)), int(min(last_x, columns - 1.0))
             low, high = int(max(first_y, 0.0)), int(min(last_y, rows - 1.0))
-            az, bz, cz = vertices[i, 2], vertices[j, 2], vertices[k, 2]
-            top = max(az, bz, cz)
+            top, s = max(az, bz, cz), 1.0 if turn > 0.0 else -1.0
             # The sides as lines g x + h y + e, positive inside: two triangles have the one that
             # they share with opposite signs, so that no point slips through. Then the plane.
-            s = 1.0 if turn > 0.0 else -1.0
             ga, ha, ea = s * (by - cy), s * (cx - bx), s * (bx * cy - by * cx)
             gb, hb, eb = s * (cy - ay), s * (ax - cx), s * (cx * ay - cy * ax)
             gc, hc, ec = s * (ay - by), s * (bx - ax), s * (ax * by - ay * bx)
             u, v = (bz - az) / turn, (cz - az) / turn
             gz, hz = u * (cy - ay) - v * (by - ay), v * (bx - ax) - u * (cx - ax)
             ez = az - gz * ax - hz * ay
-            fa, fb, fc = np.float32(ga), np.float32(gb), np.float32(gc)
-            pa, pb, pc = np.float32(ha), np.float32(hb), np.float32(hc)
-            qa, qb, qc = np.float32(ea), np.float32(eb), np.float32(ec)
-            fz, pz, qz = np.float32(gz), np.float32(hz), np.float32(ez)
+            lines = (
+                np.float32(ga), np.float32(ha), np.float32(ea), np.float32(gb), np.float32(hb),
+                np.float32(eb), np.float32(gc), np.float32(hc), np.float32(ec), np.float32(gz),
+                np.float32(hz), np.float32(ez),
+            )  # fmt: skip
             wide = right - left > 2 and high > low
             ia, ib, ic = (1.0 / ga, 1.0 / gb, 1.0 / gc) if wide else (0.0, 0.0, 0.0)
             for row in range(low, high + 1):
@@ -179,11 +205,8 @@ def cast_shadows(sorted_points: SortedPoints, bodies: SunBodies, numbers: Int64,
                     end = min(right, int((xr - low_a) * a_metre + SLACK))
                     if begin > end:
                         continue
-                # Without branches: eight points at a time.
-                for m in range(first[row * columns + begin], first[row * columns + end + 1]):
-                    w = min(fa * x[m] + pa * y[m] + qa, fb * x[m] + pb * y[m] + qb)
-                    w = min(w, fc * x[m] + pc * y[m] + qc)
-                    above = fz * x[m] + pz * y[m] + qz > z[m]
-                    z[m] = np.inf if (w >= 0.0) & above else z[m]
+                start, stop = first[row * columns + begin], first[row * columns + end + 1]
+                if start < stop:
+                    _cover(blocks, start // BLOCK, (stop - 1) // BLOCK, lines)
     for m in range(len(order)):
-        lit[order[m]] = z[m] < np.inf
+        lit[order[m]] = blocks[m // BLOCK * 3 * BLOCK + m % BLOCK + 2 * BLOCK] < np.inf
