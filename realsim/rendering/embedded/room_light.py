@@ -277,8 +277,8 @@ def sample_room(
     normals, painted, density, texels = s.normals, s.paint, s.density, s.texels
     layout, halvings, wraps, tint, glossy = s.layout, s.halvings, s.wraps, s.tint, s.glossy
     ambient, sunny, toward_sun = out.ambient, out.sunny, out.toward_sun
-    f, eye = 0, (eyes[0, 0], eyes[0, 1], eyes[0, 2])
-    e, o, q, normal = _face_seen(corners, f, eye)
+    f, eye = -1, (eyes[0, 0], eyes[0, 1], eyes[0, 2])
+    e, o, q, normal = _face_seen(corners, 0, eye)
     for n in range(len(rows)):
         i = rows[n]
         toward_sun[n, 0] = np.nan
@@ -287,15 +287,16 @@ def sample_room(
         u, v = float(rays[i, 0]), float(rays[i, 1])
         if np.isnan(u):
             continue
-        length = np.sqrt(u * u + v * v + 1.0)
-        g = int(geometry[i])
+        length, g = np.sqrt(u * u + v * v + 1.0), int(geometry[i])
         if g < 0:
             up = R_world_cam[2, 0] * u + R_world_cam[2, 1] * v + R_world_cam[2, 2]
             _fill_background(light, up / length, ambient, n)
             continue
-        x = R[g, 0, 0] * u + R[g, 0, 1] * v + R[g, 0, 2]
-        y = R[g, 1, 0] * u + R[g, 1, 1] * v + R[g, 1, 2]
-        z = R[g, 2, 0] * u + R[g, 2, 1] * v + R[g, 2, 2]
+        x, y, z = (
+            R[g, 0, 0] * u + R[g, 0, 1] * v + R[g, 0, 2],
+            R[g, 1, 0] * u + R[g, 1, 1] * v + R[g, 1, 2],
+            R[g, 2, 0] * u + R[g, 2, 1] * v + R[g, 2, 2],
+        )
         if f != first_face[g] + face[i]:  # neighbours are often on one face
             f, eye = int(first_face[g] + face[i]), (eyes[g, 0], eyes[g, 1], eyes[g, 2])
             e, o, q, normal = _face_seen(corners, f, eye)
@@ -316,8 +317,11 @@ def sample_room(
         facing = nx * sx + ny * sy + nz * sz
         if facing <= 0.0 or fx * sx + fy * sy + fz * sz <= 0.0:
             continue
-        px, py = eye[0] + t * x + LIFT_M * fx, eye[1] + t * y + LIFT_M * fy
-        pz = eye[2] + t * z + LIFT_M * fz
+        px, py, pz = (
+            eye[0] + t * x + LIFT_M * fx,
+            eye[1] + t * y + LIFT_M * fy,
+            eye[2] + t * z + LIFT_M * fz,
+        )
         for k in range(3):
             along = T[g, k, 0] * px + T[g, k, 1] * py + T[g, k, 2] * pz
             toward_sun[n, k] = along + T[g, k, 3]
