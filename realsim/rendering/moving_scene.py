@@ -10,7 +10,7 @@ Beside `photo.PhotoRenderer`, which casts rays, the pictures are the same but fo
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import accumulate, pairwise, product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,7 +45,6 @@ from realsim.rendering.embedded.sun_shadows import (
     SortedPoints,
     SunBodies,
     cast_shadows,
-    in_frames,
     sort_points,
 )
 from realsim.rendering.photo import Lighting
@@ -112,28 +111,29 @@ class MovingScene:
         self._surfaces = room_surfaces(placed, light.gamma)
         self._R_sun_world = light.R_sun_world()
         self._light = light.rows()
-        bodies = self._caster.bodies
-        counts = [len(b.vertices) for b in bodies]
-        firsts = np.cumsum([0, *counts])
-        self._vertices = np.concatenate([b.vertices for b in bodies])
-        self._owners = np.repeat(np.arange(len(bodies), dtype=np.int32), counts)
-        self._faces = np.concatenate(
-            [b.faces + k for b, k in zip(bodies, firsts[:-1], strict=True)]
-        )
-        self._is_solid = np.array([b.is_solid for b in bodies])
+        bodies, Ts = self._caster.bodies, [p.T_world_obj for p in placed]
         self._boxes = np.array([list(product(*b.bounds.T)) for b in bodies])
         self._kept: dict[tuple[int, ...], tuple[Buffers, Mask]] = {}
-        self._first = self._moment(np.array([p.T_world_obj for p in placed]))
+        firsts = [0, *accumulate(len(b.vertices) for b in bodies)]
+        self._rows = [slice(*ends) for ends in pairwise(firsts)]
+        in_the_sun = SunBodies(
+            np.concatenate([self._in_the_sun(k, T) for k, T in enumerate(Ts)]),
+            np.concatenate([b.faces + np.int32(k) for b, k in zip(bodies, firsts, strict=False)]),
+            self._surfaces.first_face,
+            np.array([b.is_solid for b in bodies]),
+        )
+        self._first = Moment(np.array(Ts), in_the_sun)
 
     def moment(self, Ts_world_obj: Mapping[int, Array]) -> Moment:
         """Return a time at which some meshes, by number, are at poses (4, 4) [m].
 
         The others are where they were at first.
         """
-        Ts = self._first.Ts_world_obj.copy()
+        Ts, first = self._first.Ts_world_obj.copy(), self._first.in_the_sun
+        vertices = first.vertices.copy()
         for k, T in Ts_world_obj.items():
-            Ts[k] = T
-        return self._moment(Ts)
+            Ts[k], vertices[self._rows[k]] = T, self._in_the_sun(k, T)
+        return Moment(Ts, first._replace(vertices=vertices))
 
     def still(
         self, intrinsics: CameraIntrinsics, T_world_cam: ArrayLike, numbers: Sequence[int]
@@ -192,12 +192,10 @@ class MovingScene:
 
     # --- how ----------------------------------------------------------------------------------
 
-    def _moment(self, Ts_world_obj: Array) -> Moment:
-        """Return a time at which the meshes are at poses (G, 4, 4) [m]."""
-        Ts_sun_obj = se3.from_rt(self._R_sun_world, np.zeros(3)) @ Ts_world_obj
-        vertices = in_frames(self._vertices, self._owners, Ts_sun_obj)
-        first_face = self._surfaces.first_face
-        return Moment(Ts_world_obj, SunBodies(vertices, self._faces, first_face, self._is_solid))
+    def _in_the_sun(self, number: int, T_world_obj: Array) -> Array:
+        """Return the vertices (V, 3) of a mesh in the sun's frame [m]."""
+        T = se3.from_rt(self._R_sun_world, np.zeros(3)) @ T_world_obj
+        return se3.transform(T, self._caster.bodies[number].vertices)
 
     def _finer(self, intrinsics: CameraIntrinsics) -> CameraIntrinsics:
         """Return the camera whose pixels are the parts of a camera's pixels."""

@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 
 from realsim.arrays import Array
-from realsim.geometry import se3
+from realsim.geometry import camera, se3
 from realsim.geometry.parts import part
 from realsim.records import CameraIntrinsics, Mesh
+from realsim.rendering.casting.pixel_caster import (
+    NOT_WANTED,
+    PixelCaster,
+    empty_buffers,
+    enter,
+    may_be_seen,
+)
+from realsim.rendering.embedded.sun_shadows import SunBodies, cast_shadows, sort_points
 from realsim.rendering.moving_scene import Moment, MovingScene
 from realsim.rendering.photo import Lighting, PhotoRenderer, PlacedMesh
 
@@ -109,3 +117,55 @@ def test_a_camera_among_the_bodies_sees_what_the_ray_caster_sees(scene: MovingSc
     expected = PhotoRenderer(placed(), LIGHT).render(VIEW, T)
     apart = np.abs(found.rgb.astype(int) - expected.rgb).max(-1)
     assert np.mean(apart > 1) <= 0.002
+
+
+@pytest.mark.parametrize("lens", (np.zeros(5), LENS))
+def test_some_pixels_cast_are_those_of_all_cast(lens: Array) -> None:
+    view, caster = replace(VIEW, distortion=lens), PixelCaster(placed())
+    rays = camera.ray_table(view)
+    among = np.random.default_rng(4).random(rays.shape[:2]) < 0.3
+    every, some = empty_buffers(rays), empty_buffers(rays)
+    for k in range(len(placed())):
+        mesh = caster.project(k, view, T_WORLD_CAM)
+        enter(mesh, k, rays, every, NOT_WANTED)
+        enter(mesh, k, rays, some, NOT_WANTED, among)
+    for found, whole, nothing in zip(some, every, empty_buffers(rays), strict=True):
+        np.testing.assert_array_equal(found, np.where(among, whole, nothing))
+
+
+def test_what_cannot_be_seen_meets_no_ray_and_most_of_it_is_found() -> None:
+    cube, rng = part("cube").mesh, np.random.default_rng(5)
+    corners = np.array(np.meshgrid(*cube.bounds.T)).reshape(3, -1).T
+    Ts = [se3.from_rt(se3.exp_so3(rng.normal(size=3)), rng.normal(size=3)) for _ in range(300)]
+    may = may_be_seen(VIEW, np.tile(corners, (len(Ts), 1, 1)), np.array(Ts))
+    caster, rays = PixelCaster([PlacedMesh(0, cube, T) for T in Ts]), camera.ray_table(VIEW)
+    met = [enter(caster.project(k, VIEW, np.eye(4)), k, rays, empty_buffers(rays),
+                 np.zeros(rays.shape[:2], np.bool_)).count > 0 for k in range(len(Ts))]  # fmt: skip
+    assert not np.any(np.array(met) & ~may)
+    assert 0 < np.sum(met) <= may.sum() < 1.5 * np.sum(met)
+    assert may_be_seen(replace(VIEW, distortion=LENS), corners[None], np.array(Ts[:1])).all()
+
+
+@pytest.mark.parametrize("count", (1, 15, 16, 17, 3000))
+def test_shadows_by_the_block_are_those_of_each_point_and_triangle(count: int) -> None:
+    rng = np.random.default_rng(count)
+    points = rng.random((count, 3)).astype(np.float32)
+    points[rng.random(count) < 0.1] = np.nan
+    corners = rng.random((60, 1, 3)) + rng.normal(size=(60, 3, 3)) * 0.25
+    bodies = SunBodies(corners.reshape(-1, 3), np.arange(180, dtype=np.int32).reshape(-1, 3),
+                       np.array([0, 20, 40, 60]), np.array([False, True, False]))  # fmt: skip
+    lit = np.ones(count, np.bool_)
+    cast_shadows(sort_points(points), bodies, np.array([0, 1]), lit)
+    # The weights of the corners under which each point lies, and the triangle's height there.
+    a, b, c = np.moveaxis(corners[:40], 1, 0)
+    M = np.linalg.inv(np.stack([b - a, c - a], -1)[:, :2])
+    v = np.einsum("fij,fpj->fpi", M, points[None, :, :2] - a[:, None, :2])
+    weights = np.concatenate([1 - v.sum(-1, keepdims=True), v], -1)
+    above = np.einsum("fpk,fk->fp", weights, corners[:40, :, 2]) - points[:, 2]
+    under = (weights > 0).all(-1) & (above > 0)
+    under[20:] &= (np.linalg.det(M) > 0)[20:, None]
+    near = (np.abs(weights).min(-1) < 1e-4) | (np.abs(above) < 1e-4)
+    sure = ~near.any(0) & ~np.isnan(points[:, 0])
+    np.testing.assert_array_equal(lit[sure], ~under.any(0)[sure])
+    assert lit[np.isnan(points[:, 0])].all()
+    assert count < 3000 or (sure.mean() > 0.8 and 0.2 < lit.mean() < 0.8)

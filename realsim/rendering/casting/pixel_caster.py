@@ -82,15 +82,10 @@ class PixelCaster:
         self.bodies = [bodies[id(p.mesh)] for p in self.placed]
 
     def project(
-        self,
-        number: int,
-        intrinsics: CameraIntrinsics,
-        T_world_cam: ArrayLike,
-        T_world_obj: Array | None = None,
+        self, number: int, intrinsics: CameraIntrinsics, T_world_cam: ArrayLike
     ) -> ProjectedMesh:
-        """Return the placed mesh of this number as the camera has it; None = where it was put."""
-        T_world_obj = self.placed[number].T_world_obj if T_world_obj is None else T_world_obj
-        T_cam_obj = se3.invert(T_world_cam) @ T_world_obj
+        """Return the placed mesh of this number as the camera has it."""
+        T_cam_obj = se3.invert(T_world_cam) @ self.placed[number].T_world_obj
         return projected(self.bodies[number], lens_array(intrinsics), T_cam_obj)
 
     def cast(self, intrinsics: CameraIntrinsics, T_world_cam: ArrayLike) -> FirstHits:

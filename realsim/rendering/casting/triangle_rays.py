@@ -229,7 +229,7 @@ def _narrowed(first: int, last: int, g: float, h: float, e: float, v: int) -> tu
     return first, last if h * v + e >= 0.0 else first - 1
 
 
-@njit(_nrt=False)  # nothing is allocated nor counted
+@njit(allocates=False)
 def cast_triangles(
     mesh: Placed,
     lens: Array,

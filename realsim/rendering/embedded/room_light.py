@@ -250,7 +250,7 @@ def _fill_background(light: Array, up: float, out: Array32, n: int) -> None:
         out[n, k] = h + rise * (light[ZENITH, k] - h) + fall * (light[FLOOR, k] - h)
 
 
-@njit(error_model="numpy", fastmath=FAST, _nrt=False)  # nothing is allocated nor counted
+@njit(error_model="numpy", fastmath=FAST, allocates=False)
 def sample_room(
     s: RoomSurfaces,
     view: RoomView,

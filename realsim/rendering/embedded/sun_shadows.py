@@ -22,9 +22,6 @@ MOST_CELLS = 4096
 """Cells along one side, at most."""
 BLOCK = 16
 """Points that a processor tests at once; blocks of x, y and z of so many follow one another."""
-SLACK = 1e-3
-"""By so much a triangle's part of a row is widened for rounding [cells]."""
-
 
 Lines = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 
@@ -55,17 +52,6 @@ class SunBodies(NamedTuple):
     """(G + 1,) first face of each mesh."""
     is_solid: Mask
     """(G,) whether it is closed and its faces look outwards: those towards the sun are enough."""
-
-
-@njit
-def in_frames(vertices: Array, owners: Int32, Ts: Array) -> Array:
-    """Return vertices (V, 3) of meshes `owners` (V,) moved by the poses Ts (G, 4, 4) of these."""
-    out = np.empty_like(vertices)
-    for i in range(len(vertices)):
-        T, x, y, z = Ts[owners[i]], vertices[i, 0], vertices[i, 1], vertices[i, 2]
-        for k in range(3):
-            out[i, k] = T[k, 0] * x + T[k, 1] * y + T[k, 2] * z + T[k, 3]
-    return out
 
 
 @njit(error_model="numpy")
@@ -110,7 +96,7 @@ def sort_points(points: Array32) -> SortedPoints:
     return SortedPoints(kept, order, first, lowest, grid)
 
 
-@njit(_nrt=False)
+@njit(allocates=False)
 def _cover(blocks: Array32, first: int, last: int, lines: Lines) -> None:
     """Put z to inf for the points of blocks first..last that lie under a triangle.
 
@@ -128,30 +114,12 @@ def _cover(blocks: Array32, first: int, last: int, lines: Lines) -> None:
             blocks[m + np.uint64(2 * BLOCK)] = np.float32(np.inf) if inside else z
 
 
-@njit(inline="always", error_model="numpy")
-def _narrowed(
-    left: float, right: float, side: tuple[float, float, float, float], low: float, high: float
-) -> tuple[float, float]:
-    """Return the x of left..right in which g x + h y + e >= 0 may hold for y in low..high.
-
-    `side` is g, h, e and 1 / g.
-    """
-    g, h, e, per_g = side
-    edge = -(max(h * low, h * high) + e) * per_g
-    if g > 0.0:
-        return max(left, edge), right
-    if g < 0.0:
-        return left, min(right, edge)
-    return left, right
-
-
 @njit(error_model="numpy")
 def cast_shadows(sorted_points: SortedPoints, bodies: SunBodies, numbers: Int64, lit: Mask) -> None:
     """Clear `lit` (N,) where one of the meshes `numbers` lies between a point and the sun."""
     points, order, first, lowest, grid = sorted_points
     vertices, faces, first_face, is_solid = bodies
-    low_a, low_b, a_metre = grid[0], grid[1], grid[2]
-    rows, columns, edge = int(grid[3]), int(grid[4]), 1.0 / grid[2]
+    low_a, low_b, a_metre, rows, columns = grid[0], grid[1], grid[2], int(grid[3]), int(grid[4])
     blocks = np.full((len(order) // BLOCK + 1) * 3 * BLOCK, np.float32(np.inf), np.float32)
     for m in range(len(order)):
         at = m // BLOCK * 3 * BLOCK + m % BLOCK
@@ -162,9 +130,8 @@ def cast_shadows(sorted_points: SortedPoints, bodies: SunBodies, numbers: Int64,
         for f in range(first_face[number], first_face[number + 1]):
             i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
             ax, ay, bx, by = vertices[i, 0], vertices[i, 1], vertices[j, 0], vertices[j, 1]
-            cx, cy, az, bz, cz = (
-                vertices[k, 0], vertices[k, 1], vertices[i, 2], vertices[j, 2], vertices[k, 2],
-            )  # fmt: skip
+            cx, cy, cz = vertices[k, 0], vertices[k, 1], vertices[k, 2]
+            az, bz = vertices[i, 2], vertices[j, 2]
             turn = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
             if turn == 0.0 or (is_solid[number] and turn < 0.0):
                 continue
@@ -189,23 +156,10 @@ def cast_shadows(sorted_points: SortedPoints, bodies: SunBodies, numbers: Int64,
                 np.float32(eb), np.float32(gc), np.float32(hc), np.float32(ec), np.float32(gz),
                 np.float32(hz), np.float32(ez),
             )  # fmt: skip
-            wide = right - left > 2 and high > low
-            ia, ib, ic = (1.0 / ga, 1.0 / gb, 1.0 / gc) if wide else (0.0, 0.0, 0.0)
             for row in range(low, high + 1):
                 if top <= lowest[row]:
                     continue
-                begin, end = left, right
-                if wide:
-                    y_low = max(low_b + (row - SLACK) * edge, y0)
-                    y_high = min(low_b + (row + 1 + SLACK) * edge, y1)
-                    xl, xr = _narrowed(x0, x1, (ga, ha, ea, ia), y_low, y_high)
-                    xl, xr = _narrowed(xl, xr, (gb, hb, eb, ib), y_low, y_high)
-                    xl, xr = _narrowed(xl, xr, (gc, hc, ec, ic), y_low, y_high)
-                    begin = max(left, int((xl - low_a) * a_metre - SLACK))
-                    end = min(right, int((xr - low_a) * a_metre + SLACK))
-                    if begin > end:
-                        continue
-                start, stop = first[row * columns + begin], first[row * columns + end + 1]
+                start, stop = first[row * columns + left], first[row * columns + right + 1]
                 if start < stop:
                     _cover(blocks, start // BLOCK, (stop - 1) // BLOCK, lines)
     for m in range(len(order)):
