@@ -151,11 +151,7 @@ def cast_shadows(sorted_points: SortedPoints, bodies: SunBodies, numbers: Int64,
             u, v = (bz - az) / turn, (cz - az) / turn
             gz, hz = u * (cy - ay) - v * (by - ay), v * (bx - ax) - u * (cx - ax)
             ez = az - gz * ax - hz * ay
-            lines = (
-                np.float32(ga), np.float32(ha), np.float32(ea), np.float32(gb), np.float32(hb),
-                np.float32(eb), np.float32(gc), np.float32(hc), np.float32(ec), np.float32(gz),
-                np.float32(hz), np.float32(ez),
-            )  # fmt: skip
+            lines = (ga, ha, ea, gb, hb, eb, gc, hc, ec, gz, hz, ez)
             for row in range(low, high + 1):
                 if top <= lowest[row]:
                     continue
