@@ -27,7 +27,7 @@ import numpy as np
 from figures import Found
 from reliability_log import Log
 
-KILLS, QUICK_KILLS = 200, 2
+KILLS, QUICK_KILLS, EACH = 200, 2, 5
 FULL = signal.SIGXFSZ
 """Stands for a full disk among the ways to end: the signal of a file that may not grow."""
 ROOM_BYTES = (2_000, 100_000)
@@ -193,7 +193,7 @@ class Command:
 
 
 def kills(given: argparse.Namespace) -> Found:
-    """Kill, run again, compare: every command once, then those that are fast more often."""
+    """Kill, run again, compare: every command some times, then those that are fast more often."""
     log, found = Log(given.log), Found()
     wanted = given.kills or (QUICK_KILLS if given.quick else KILLS)
     with tempfile.TemporaryDirectory() as folder:
@@ -202,11 +202,15 @@ def kills(given: argparse.Namespace) -> Found:
         made = {n: Command(root, w) for n, w in LONG.items() if not given.quick or n in QUICK}
         names, rates = list(made), np.array([1 / c.seconds for c in made.values()])
         for k in log.todo("kills", given.seed, 9 * wanted):
-            done = sum(line["kill"] for line in log.of("kills") if line["key"][0] == given.seed)
+            killed = [line["name"] for line in log.of("kills")
+                      if line["kill"] and line["key"][0] == given.seed]  # fmt: skip
+            done, rarest = len(killed), min(names, key=killed.count)
             if done >= wanted:
                 break
             rng = np.random.default_rng((given.seed, k))
-            name = names[k] if k < len(names) else str(rng.choice(names, p=rates / rates.sum()))
+            name = str(rng.choice(names, p=rates / rates.sum()))
+            if killed.count(rarest) < min(EACH, wanted // len(names)):
+                name = rarest
             how = (signal.SIGKILL, signal.SIGTERM, FULL)[int(rng.integers(3))]
             much = rng.uniform(0, made[name].seconds)
             if how == FULL:
