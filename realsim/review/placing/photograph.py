@@ -202,7 +202,7 @@ class Photographs:
         buffers = empty_buffers(rays)
         covered = [np.zeros(rays.shape[:2], np.bool_) for _ in objects]
         for k, o in enumerate(objects):
-            mesh = self._caster(o.obj_id).project(0, K, T, o.T_world_obj)
+            mesh = self._caster(o.obj_id).project(0, K, se3.invert(o.T_world_obj) @ T)
             enter(mesh, k, rays, buffers, covered[k])
         hits = finished(buffers)
         return hits.depth_m, hits.geometry, hits.face, covered
