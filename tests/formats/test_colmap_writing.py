@@ -15,6 +15,7 @@ from realsim.formats.export_folder import ExportFolder
 from realsim.formats.session_scene import open_session_scene
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
+from refusals import refused
 from tests.support.synthetic_scenes import captured_session
 
 LENSES = {
@@ -100,8 +101,7 @@ def test_points_lie_on_the_scene_with_its_colours(store, tmp_path):
 
 
 def test_what_cannot_be_written_is_said(store, tmp_path):
-    with pytest.raises(InputError, match="-1 points"):
-        written(store, tmp_path / "few", points=-1)
+    refused("-1 points", written, store, tmp_path / "few", points=-1)
 
     class Poseless:
         def __init__(self, scene):
@@ -146,8 +146,7 @@ def text_model(folder: Path, **changed: str) -> Path:
 )
 def test_a_text_that_cannot_be_is_refused(tmp_path, file, text, said):
     assert len(open_colmap(text_model(tmp_path / "fine"))) == 1
-    with pytest.raises(InputError, match=said):
-        open_colmap(text_model(tmp_path / "wrong", **{file: text}))
+    refused(said, open_colmap, text_model(tmp_path / "wrong", **{file: text}))
 
 
 def test_a_binary_quaternion_that_is_none_is_refused(tmp_path):
@@ -156,5 +155,4 @@ def test_a_binary_quaternion_that_is_none_is_refused(tmp_path):
     none = np.zeros((0, 3))
     for name, data in model_files([camera_row(1, camera("PINHOLE"))], [bad], none, none).items():
         (tmp_path / name).write_bytes(data)
-    with pytest.raises(InputError, match=r"image 1 of images.bin.*length 0\.5"):
-        read_model(tmp_path)
+    refused(r"image 1 of images.bin.*length 0\.5", read_model, tmp_path)

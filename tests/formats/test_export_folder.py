@@ -9,6 +9,7 @@ import pytest
 from file_trees import bytes_of
 from realsim.errors import InputError
 from realsim.formats.export_folder import FINISHED, STATE, SUMS_FILE, ExportFolder
+from refusals import refused
 
 ASKED = {"target": "bop", "scenes": [1, 2]}
 PIECES = 12
@@ -80,19 +81,15 @@ def test_another_request_is_not_mixed_in(tmp_path):
     with pytest.raises(InputError, match=r"another request \(scenes: \[1, 2\] there, \[3\]"):
         ExportFolder.begin(tmp_path, {**ASKED, "scenes": [3]})
     fill(tmp_path)
-    with pytest.raises(InputError, match="holds a finished export"):
-        ExportFolder.begin(tmp_path, ASKED)
-    with pytest.raises(InputError, match="is a file"):
-        ExportFolder.begin(tmp_path / "README.md", ASKED)
+    refused("holds a finished export", ExportFolder.begin, tmp_path, ASKED)
+    refused("is a file", ExportFolder.begin, tmp_path / "README.md", ASKED)
 
 
 @pytest.mark.parametrize("path", ["../out", "/etc/passwd", "a/../../b", ""])
 def test_no_path_leads_out(tmp_path, path):
     export = ExportFolder.begin(tmp_path / "export", ASKED)
-    with pytest.raises(InputError, match="not a path inside"):
-        export.write_piece("one", {path: b"x"})
-    with pytest.raises(InputError, match="not a path inside"):
-        export.below("scene").write_piece("one", {}, {path: ("k", 1)})
+    refused("not a path inside", export.write_piece, "one", {path: b"x"})
+    refused("not a path inside", export.below("scene").write_piece, "one", {}, {path: ("k", 1)})
     assert not (tmp_path / "out").exists()
 
 

@@ -18,6 +18,7 @@ from realsim.formats.nerfstudio.writing import NerfstudioWriteConfig, write_nerf
 from realsim.formats.session_scene import open_session_scene
 from realsim.geometry import se3
 from realsim.geometry.camera import project
+from refusals import refused
 from tests.support.synthetic_scenes import DEPTH_UNIT_M, captured_session
 
 GL = np.diag([1.0, -1, -1, 1])
@@ -142,8 +143,7 @@ def test_poses_in_another_unit_are_refused_unless_it_is_said(store, data):
                 row[3] /= 4
 
     folder = data(shrink)
-    with pytest.raises(InputError, match=r"--scale (3\.9|4)"):
-        open_nerfstudio(folder)
+    refused(r"--scale (3\.9|4)", open_nerfstudio, folder)
     told = open_nerfstudio(folder, metres_per_unit=4.0, use_depth=False)
     frame = next(iter(told.frames()))
     np.testing.assert_allclose(frame.T_world_cam, store.session.views[0].T_world_cam, atol=1e-12)
@@ -204,8 +204,7 @@ def escaping(rows):
     ],
 )
 def test_a_file_that_cannot_be_is_refused(tmp_path, top, said):
-    with pytest.raises(InputError, match=said):
-        open_nerfstudio(ngp(tmp_path / "x", **top))
+    refused(said, open_nerfstudio, ngp(tmp_path / "x", **top))
 
 
 @pytest.mark.parametrize(
@@ -219,8 +218,7 @@ def test_a_file_that_cannot_be_is_refused(tmp_path, top, said):
     ],
 )
 def test_frames_that_cannot_be_are_refused(tmp_path, frames, said):
-    with pytest.raises(InputError, match=said):
-        open_nerfstudio(ngp(tmp_path / "x", frames, fl_x=40))
+    refused(said, open_nerfstudio, ngp(tmp_path / "x", frames, fl_x=40))
 
 
 def test_an_image_that_is_not_there_is_named(tmp_path):
@@ -228,5 +226,4 @@ def test_an_image_that_is_not_there_is_named(tmp_path):
     (folder / "r_1.png").unlink()
     source = open_nerfstudio(folder)
     assert len(source) == 2 and any("r_1" in n for n in source.notes)
-    with pytest.raises(InputError, match=r"holds no transforms\.json"):
-        open_nerfstudio(tmp_path)
+    refused(r"holds no transforms\.json", open_nerfstudio, tmp_path)

@@ -16,6 +16,7 @@ from realsim.models.library_prepare import PrepareConfig, prepare_mesh, prepare_
 from realsim.models.library_records import ScaleNote
 from realsim.models.library_session import copy_models, known_solids
 from realsim.untrusted.own_json import to_json
+from refusals import refused
 
 BARE = PrepareConfig(with_parts=False)
 
@@ -35,8 +36,7 @@ def test_promoting_equals_importing_at_that_size(library: ModelLibrary):
     mesh = textured_wedge()
     raw = replace(mesh, vertices=mesh.vertices / scale)
     library.add_unscaled(prepare_unscaled(raw, BARE), "scan", picture=b"p")
-    with pytest.raises(InputError, match="without metric scale: `realsim scan scale scan"):
-        library.find("scan")
+    refused("without metric scale: `realsim scan scale scan", library.find, "scan")
     held = library.load_unscaled("scan")
     assert np.allclose(held.mesh.extent, raw.extent, rtol=1e-6)
     assert np.array_equal(held.mesh.texture, raw.texture)
@@ -50,8 +50,7 @@ def test_promoting_equals_importing_at_that_size(library: ModelLibrary):
     assert up.scale is not None and to_json(up.scale) == to_json(note)
     assert len(up.model.symmetries) == len(same.properties.symmetries.discrete)
     # It can be promoted again, by a better session, only if that is asked for.
-    with pytest.raises(InputError, match="--overwrite"):
-        library.promote("scan", note, BARE)
+    refused("--overwrite", library.promote, "scan", note, BARE)
     better = library.promote("scan", replace(note, scale=1.01 * scale), BARE, overwrite=True)
     assert better.model.obj_id == up.model.obj_id
     assert np.allclose(better.model.mesh.extent, 1.01 * mesh.extent, rtol=1e-5)
@@ -67,19 +66,15 @@ def test_a_doubtful_scale_makes_a_doubtful_model(library: ModelLibrary):
 
 def test_a_model_without_scale_is_no_bop_model(library: ModelLibrary):
     raw = prepare_unscaled(part("wedge").mesh, BARE)
-    with pytest.raises(InputError, match="no metric scale"):
-        library.add(raw, "scan")
+    refused("no metric scale", library.add, raw, "scan")
     library.add_unscaled(raw, "scan")
-    with pytest.raises(InputError, match="already in"):
-        library.add_unscaled(raw, "scan")
-    with pytest.raises(InputError, match="there are: scan"):
-        library.load_unscaled("cup")
+    refused("already in", library.add_unscaled, raw, "scan")
+    refused("there are: scan", library.load_unscaled, "cup")
 
 
 def test_nonsense_scales_are_refused():
     for bad in (0.0, float("nan"), -1.0):
-        with pytest.raises(InputError, match="positive"):
-            ScaleNote(scale=bad)
+        refused("positive", ScaleNote, scale=bad)
 
 
 # --- into a session ---------------------------------------------------------------------------

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from realsim.errors import InputError, UnitError
+from realsim.errors import UnitError
 from realsim.geometry import se3
 from realsim.geometry.mesh import transformed
 from realsim.geometry.parts import part
 from realsim.models.model_records import ConvexParts
 from realsim.models.properties import physical_properties
 from realsim.records import Mesh
+from refusals import refused
 from trimesh_solids import box
 
 
@@ -75,18 +76,12 @@ def test_an_open_mesh_says_whose_volume_it_is_given():
 
 def test_two_answers_and_wrong_units_are_refused():
     mesh = part("cube").mesh
-    with pytest.raises(InputError, match="one follows from the other"):
-        physical_properties(mesh, density=1000, mass_kg=0.1)
+    refused("one follows from the other", physical_properties, mesh, density=1000, mass_kg=0.1)
     with pytest.raises(UnitError, match=r"Were grams given\? 125 g would be 1000 kg/m\^3"):
         physical_properties(mesh, mass_kg=125.0)
-    with pytest.raises(UnitError, match="mesh too large"):
-        physical_properties(mesh, mass_kg=1e-4)
-    with pytest.raises(UnitError, match=r"Were grams given"):
-        physical_properties(mesh, mass_kg=1e9)
+    refused("mesh too large", physical_properties, mesh, error=UnitError, mass_kg=1e-4)
+    refused(r"Were grams given", physical_properties, mesh, error=UnitError, mass_kg=1e9)
     for wrong in (0.0, -1.0, float("nan")):
-        with pytest.raises(InputError, match="positive number"):
-            physical_properties(mesh, density=wrong)
-        with pytest.raises(InputError, match="positive number"):
-            physical_properties(mesh, mass_kg=wrong)
-    with pytest.raises(InputError, match="flat"):
-        physical_properties(Mesh(vertices=np.eye(3), faces=np.array([[0, 1, 2]])))
+        refused("positive number", physical_properties, mesh, density=wrong)
+        refused("positive number", physical_properties, mesh, mass_kg=wrong)
+    refused("flat", physical_properties, Mesh(vertices=np.eye(3), faces=np.array([[0, 1, 2]])))

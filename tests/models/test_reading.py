@@ -13,6 +13,7 @@ from realsim.models.mesh_atlas import Piece, one_mesh, transformed_uv
 from realsim.models.reading import METRES, ROTATIONS, read_scan
 from realsim.models.simplify import colors_at, deviation
 from realsim.records import Mesh
+from refusals import refused
 from written_meshes import as_trimesh, colorful_texture, textured_box, write_textured_obj, write_usd
 
 Y_UP = np.array(ROTATIONS["y"], dtype=float)
@@ -240,13 +241,10 @@ def test_without_a_unit_the_message_says_what_each_would_be(tmp_path):
 
 def test_impossible_sizes_are_refused(tmp_path):
     as_trimesh(textured_box((0.1, 0.06, 0.04))).export(tmp_path / "a.stl")
-    with pytest.raises(UnitError, match=r"0\.1 mm large"):
-        read_scan(tmp_path / "a.stl", "mm")
+    refused(r"0\.1 mm large", read_scan, tmp_path / "a.stl", "mm", error=UnitError)
     as_trimesh(textured_box((100.0, 60, 40))).export(tmp_path / "a.stl")
-    with pytest.raises(UnitError, match="100 m large"):
-        read_scan(tmp_path / "a.stl", "m")
-    with pytest.raises(UnitError, match="not known"):
-        read_scan(tmp_path / "a.stl", "feet")
+    refused("100 m large", read_scan, tmp_path / "a.stl", "m", error=UnitError)
+    refused("not known", read_scan, tmp_path / "a.stl", "feet", error=UnitError)
 
 
 def test_usd_states_its_unit_and_a_contradiction_names_both(tmp_path):
@@ -259,11 +257,9 @@ def test_usd_states_its_unit_and_a_contradiction_names_both(tmp_path):
     with pytest.raises(UnitError, match="states its unit as mm, but --unit cm"):
         read_scan(tmp_path / "a.usda", "cm")
     write_usd(tmp_path / "b.usda", box, metres=None)
-    with pytest.raises(InputError, match="does not state its unit"):
-        read_scan(tmp_path / "b.usda", None)
+    refused("does not state its unit", read_scan, tmp_path / "b.usda", None)
     write_usd(tmp_path / "c.usda", box, metres=0.3048)
-    with pytest.raises(InputError, match=r"metersPerUnit 0\.3048"):
-        read_scan(tmp_path / "c.usda", None)
+    refused(r"metersPerUnit 0\.3048", read_scan, tmp_path / "c.usda", None)
 
 
 @pytest.mark.parametrize("up", list(ROTATIONS))

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 from realsim.geometry.parts import part
 from realsim.models.resting import Resting, RestingConfig, resting_orientations
 from realsim.records import Mesh
 from realsim.scanning.simulated import distorted
+from refusals import refused
 
 
 def _down(resting: tuple[Resting, ...]) -> np.ndarray:
@@ -138,9 +138,6 @@ def test_a_flat_mesh_and_impossible_settings_are_refused() -> None:
         vertices=np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]),
         faces=np.array([[0, 1, 2]], dtype=np.int32),
     )
-    with pytest.raises(InputError, match="flat"):
-        resting_orientations(flat)
-    with pytest.raises(InputError, match="spacing_deg"):
-        RestingConfig(spacing_deg=0.0)
-    with pytest.raises(InputError, match="barrier_share"):
-        RestingConfig(barrier_share=-1.0)
+    refused("flat", resting_orientations, flat)
+    refused("spacing_deg", RestingConfig, spacing_deg=0.0)
+    refused("barrier_share", RestingConfig, barrier_share=-1.0)

@@ -19,6 +19,7 @@ from realsim.registration.register import Registration, RegistrationConfig, regi
 from realsim.registration.registered import is_wrong, without_inventions
 from realsim.registration.search.records import Wanted
 from realsim.registration.simulated import TableScene
+from refusals import refused
 from table_faults import foreign, without_any_depth, without_depth_on
 from table_scenes import QUICK, named_scene, part_models
 
@@ -124,8 +125,7 @@ def test_a_mesh_in_millimetres_is_named_and_the_rest_goes_on():
 
 def test_no_model_in_metres_is_refused():
     models = {i: in_millimetres(m) for i, m in scene().models.items()}
-    with pytest.raises(InputError, match=r"none of the 4 models.*mixed up"):
-        run(None, models=models)
+    refused(r"none of the 4 models.*mixed up", run, None, models=models)
     # Those that were asked for are reported one by one.
     result = run(starts(), models=models)
     assert result.scene.objects == () and len(result.not_placed) == 4
@@ -238,8 +238,7 @@ def test_one_view_only_is_worse_and_says_so():
 
 def test_top_down_needs_starts_and_says_so():
     config = replace(QUICK, method="top-down")
-    with pytest.raises(InputError, match="rough poses"):
-        run(None, config=config)
+    refused("rough poses", run, None, config=config)
     first = starts()[0]
     wanted = [
         Wanted(obj_id=first.obj_id, instance=0, T_start=first.T_world_obj),
@@ -258,23 +257,16 @@ def test_top_down_needs_starts_and_says_so():
 
 
 def test_what_cannot_be_registered_is_refused_by_name():
-    with pytest.raises(InputError, match="at least one"):
-        run(starts(), [])
-    with pytest.raises(InputError, match="same number"):
-        run(starts(), [*scene().frames, scene().frames[0]])
-    with pytest.raises(InputError, match="no start poses"):
-        run([])
-    with pytest.raises(InputError, match="same instance"):
-        run([starts()[0], starts()[0]])
+    refused("at least one", run, starts(), [])
+    refused("same number", run, starts(), [*scene().frames, scene().frames[0]])
+    refused("no start poses", run, [])
+    refused("same instance", run, [starts()[0], starts()[0]])
     with pytest.raises(InputError, match="no object models"):
         register_scene("s", scene().intrinsics, scene().frames, {}, None, QUICK)
-    with pytest.raises(InputError, match="object 99, which is not among the models"):
-        run([replace(starts()[0], obj_id=99)])
+    refused("object 99, which is not among the models", run, [replace(starts()[0], obj_id=99)])
     with pytest.raises(InputError, match="'best'; joint or top-down"):
         run(starts(), config=replace(QUICK, method="best"))  # pyright: ignore[reportArgumentType]
     small = replace(scene().frames[0], depth_m=np.zeros((5, 5), np.float32))
-    with pytest.raises(InputError, match="shape"):
-        run(starts(), [small])
+    refused("shape", run, starts(), [small])
     blind = [without_any_depth(f) for f in scene().frames]
-    with pytest.raises(InputError, match="all zero"):
-        run(starts(), blind)
+    refused("all zero", run, starts(), blind)

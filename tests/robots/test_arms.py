@@ -7,13 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from realsim.errors import InputError, RealsimError
+from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.robots.arm import ArmFile, find_arm, known_chains
 from realsim.robots.check_arm import check_arm
 from realsim.robots.compiled_chain import chain_numbers, follow_lines, frames_into, jacobian_into
 from realsim.robots.dh_of_chain import dh_of_chain
 from realsim.robots.robot_files import VARIABLE, names_of, robot_file
+from refusals import refused
 
 ARMS = tuple(names_of("arm"))
 
@@ -141,8 +142,7 @@ def test_an_arm_of_ones_own_needs_no_code(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr("realsim.robots.arm._found", {})
     assert find_arm("six").folder.name == "one_of_six"
     six_joints(folder.parent / "two")
-    with pytest.raises(InputError, match="more than one arm is called 'six'"):
-        robot_file("six", ArmFile)
+    refused("more than one arm is called 'six'", robot_file, "six", ArmFile)
 
 
 def test_an_mjcf_is_read_as_the_urdf_of_the_same_arm(tmp_path: Path) -> None:
@@ -173,8 +173,7 @@ def test_an_mjcf_is_read_as_the_urdf_of_the_same_arm(tmp_path: Path) -> None:
     np.testing.assert_allclose(of_mjcf.chain.forward(q), of_urdf.chain.forward(q), atol=1e-6)
     assert [s.kind for s in of_mjcf.shapes] == ["box", *["capsule"] * 6]
     (folder / "six.xml").write_text(xml.replace('"hinge"', '"slide"', 1))
-    with pytest.raises(InputError, match="is no hinge"):
-        find_arm(str(folder))
+    refused("is no hinge", find_arm, str(folder))
 
 
 @pytest.mark.parametrize(
@@ -218,7 +217,5 @@ def test_a_description_that_can_be_read_and_is_wrong_is_told(tmp_path: Path) -> 
 
 
 def test_a_folder_that_is_no_robot_is_told(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"has no robot\.toml"):
-        find_arm(str(tmp_path) + "/")
-    with pytest.raises(InputError, match=r"no arm 'ur55'\. There are: .*ur5,"):
-        find_arm("ur55")
+    refused(r"has no robot\.toml", find_arm, str(tmp_path) + "/")
+    refused(r"no arm 'ur55'\. There are: .*ur5,", find_arm, "ur55")

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.records import Mesh
 from realsim.scanning.scale.picture_overlays import Photograph, overlays_png
 from realsim.scanning.scale.pictures import candidates_png, residuals_png, views_png
 from realsim.scanning.shading import UNSEEN, ShadingConfig, diverging, shaded_views, value_paint
+from refusals import refused
 from scale_fits import fit_of, known_scan
 
 SMALL = ShadingConfig(size_px=120)
@@ -86,14 +86,10 @@ def test_a_view_that_was_left_out_is_marked(fit):
 
 
 def test_what_cannot_be_drawn_is_named(known, fit):
-    with pytest.raises(InputError, match="not of each other"):
-        residuals_png(known.scan, replace(fit, residual_mm=np.zeros(3)))
-    with pytest.raises(InputError, match="no views"):
-        views_png(replace(fit, views=()))
-    with pytest.raises(InputError, match="no candidates"):
-        candidates_png(replace(fit, candidates=()))
-    with pytest.raises(InputError, match="no photographs"):
-        overlays_png(known.scan, fit, known.views.intrinsics, ())
+    refused("not of each other", residuals_png, known.scan, replace(fit, residual_mm=np.zeros(3)))
+    refused("no views", views_png, replace(fit, views=()))
+    refused("no candidates", candidates_png, replace(fit, candidates=()))
+    refused("no photographs", overlays_png, known.scan, fit, known.views.intrinsics, ())
 
 
 # --- overlays ---------------------------------------------------------------------------------

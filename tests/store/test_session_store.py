@@ -16,6 +16,7 @@ from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.store import SessionStore, atomic
 from realsim.store.manifest import Manifest, entry_of
+from refusals import refused
 
 CAMERA = CameraIntrinsics(
     width=64, height=48, fx=60.1, fy=60.2, cx=31.7, cy=23.9,
@@ -112,8 +113,7 @@ def test_camera_poses_come_back_bit_for_bit(tmp_path):
     np.testing.assert_allclose(R, Ts[1][:3, :3].T, atol=1e-12)
     np.testing.assert_allclose(entry["cam_t_w2c"], 1e3 * se3.invert(Ts[1])[:3, 3], atol=1e-9)
     assert "cam_distortion" not in entry
-    with pytest.raises(InputError, match="view 8"):
-        store.set_cameras(new, {8: np.eye(4)})
+    refused("view 8", store.set_cameras, new, {8: np.eye(4)})
 
 
 def test_the_folder_is_a_bop_scene_from_its_first_frame_on(tmp_path):
@@ -154,21 +154,14 @@ def test_the_same_files_come_back(tmp_path):
 def test_bad_requests_say_what_would_do(tmp_path):
     store = filled(tmp_path, 2)
     rgb, depth_m = make_images(0)
-    with pytest.raises(InputError, match="already holds a session"):
-        SessionStore.create(tmp_path, empty_session())
-    with pytest.raises(InputError, match="holds no session"):
-        SessionStore.open(tmp_path / "rgb")
-    with pytest.raises(InputError, match="view 1 is already"):
-        store.add_view(View(index=1), rgb, depth_m)
+    refused("already holds a session", SessionStore.create, tmp_path, empty_session())
+    refused("holds no session", SessionStore.open, tmp_path / "rgb")
+    refused("view 1 is already", store.add_view, View(index=1), rgb, depth_m)
     for images in ((rgb[:, :32], depth_m), (rgb, depth_m[:24])):
-        with pytest.raises(InputError, match="size"):
-            store.add_view(View(index=5), *images)
-    with pytest.raises(InputError, match=r"view 9 .* 0, 1"):
-        store.rgb(9)
-    with pytest.raises(InputError, match="inside the session"):
-        store.write_json("../outside.json", {})
-    with pytest.raises(ValueError, match="JSON"):
-        store.write_json("nan.json", {"x": float("nan")})
+        refused("size", store.add_view, View(index=5), *images)
+    refused(r"view 9 .* 0, 1", store.rgb, 9)
+    refused("inside the session", store.write_json, "../outside.json", {})
+    refused("JSON", store.write_json, "nan.json", {"x": float("nan")}, error=ValueError)
     assert store.completed == {0, 1} and not store.has("nan.json") and store.verify() == []
     with pytest.raises(InputError, match="add_view"):
         SessionStore.create(
@@ -204,8 +197,7 @@ def test_derived_files_are_listed_and_replaced_together(tmp_path):
     reopened = SessionStore.open(tmp_path)
     assert reopened.verify() == [] and store.verify() == []
     assert reopened.path("mask/000003.png").read_bytes() == b"second"
-    with pytest.raises(InputError, match="inside the session"):
-        store.write_derived({"mask/a.png": b"1", "../b.png": b"2"})
+    refused("inside the session", store.write_derived, {"mask/a.png": b"1", "../b.png": b"2"})
     assert not store.has("mask/a.png")
 
 

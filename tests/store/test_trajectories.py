@@ -3,15 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from realsim import store as stores
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession
 from realsim.store.trajectories import load_trajectories, save_trajectories
+from refusals import refused
 from tried_grasps import assert_same, attempts_of, tried_set
 
 
@@ -54,10 +53,8 @@ def test_attempts_of_other_grasps_are_refused(tmp_path):
     t = attempts_of(rng, s)
     save_trajectories(tmp_path, s, t)
     moved = s.Ts_obj_grasp @ se3.from_translation([0.0, 0.0, 1e-6])
-    with pytest.raises(InputError, match="other grasps"):
-        load_trajectories(tmp_path, replace(s, Ts_obj_grasp=moved))
-    with pytest.raises(InputError, match="rows"):
-        save_trajectories(tmp_path, s, replace(t, rows=t.rows + 100))
+    refused("other grasps", load_trajectories, tmp_path, replace(s, Ts_obj_grasp=moved))
+    refused("rows", save_trajectories, tmp_path, s, replace(t, rows=t.rows + 100))
     # What the scores became later does not make them other grasps.
     assert load_trajectories(tmp_path, replace(s, measures={})) is not None
 
@@ -69,5 +66,4 @@ def test_a_torn_file_is_named(tmp_path):
     data = path.read_bytes()
     for share in (0.0, 0.3, 0.7, 0.99):
         path.write_bytes(data[: int(share * len(data))])
-        with pytest.raises(InputError, match="not a complete file of trajectories"):
-            load_trajectories(tmp_path, s)
+        refused("not a complete file of trajectories", load_trajectories, tmp_path, s)

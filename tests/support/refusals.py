@@ -1,0 +1,16 @@
+"""Hold that a call is refused, and with which words."""
+
+from collections.abc import Callable
+
+import pytest
+
+from realsim.errors import InputError
+
+
+def refused(
+    why: str, call: Callable[..., object], *args: object, error: type[Exception] = InputError,
+    **options: object,
+) -> None:  # fmt: skip
+    """Assert that `call(*args, **options)` raises an error that says `why` (a pattern)."""
+    with pytest.raises(error, match=why):
+        call(*args, **options)
