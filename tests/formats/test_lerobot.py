@@ -11,12 +11,13 @@ import pyarrow.parquet as pq
 import pytest
 
 from file_trees import bytes_of
-from realsim.errors import InputError, MissingLibraryError
+from realsim.errors import MissingLibraryError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.lerobot import episodes as layout
 from realsim.formats.lerobot import spool
 from realsim.formats.lerobot.episodes import LeRobotCamera, LeRobotEpisode, LeRobotFeature
 from realsim.formats.lerobot.writer import write_lerobot
+from refusals import refused
 
 LENGTHS = (3, 7, 4, 1, 5)
 FPS = 10
@@ -236,15 +237,13 @@ def test_columns_without_pictures_are_a_data_set(tmp_path):
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused(tmp_path, source, words):
-    with pytest.raises(InputError, match=words):
-        write(tmp_path / "set", source)
+    refused(words, write, tmp_path / "set", source)
 
 
 def test_a_missing_pyav_is_said_before_anything_is_written(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     source = Source()
-    with pytest.raises(MissingLibraryError, match=r"realsim\[lerobot\]"):
-        write(tmp_path / "set", source)
+    refused(r"realsim\[lerobot\]", write, tmp_path / "set", source, error=MissingLibraryError)
     assert source.asked == []
 
 

@@ -23,6 +23,7 @@ from realsim.registration.hints import (
     region_of,
 )
 from realsim.store import SessionStore
+from refusals import refused
 from table_faults import seen_instances
 from table_scenes import part_models, small_scene
 
@@ -165,8 +166,7 @@ def test_typed_objects_are_understood():
     ],
 )
 def test_typed_nonsense_is_an_error(text, words):
-    with pytest.raises(InputError, match=words):
-        parse_object(text, part_models())
+    refused(words, parse_object, text, part_models())
 
 
 # --- files ------------------------------------------------------------------------------------
@@ -242,5 +242,4 @@ SHEARED = (np.eye(4) + np.eye(4, k=1) * 0.3).tolist()
 def test_a_wrong_row_is_named(tmp_path, row, error, words):
     path = tmp_path / "starts.json"
     path.write_text(json.dumps({"starts": [{"obj_id": 5, "instance": 0}, row]}))
-    with pytest.raises(error, match=words):
-        read_hints(path, part_models())
+    refused(words, read_hints, path, part_models(), error=error)

@@ -13,6 +13,7 @@ from realsim.errors import RealsimError
 from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.store import SessionStore, StorageError, atomic
 from realsim.store.session_check import check_session
+from refusals import refused
 
 CAMERA = CameraIntrinsics(width=60, height=40, fx=60, fy=60, cx=29.5, cy=19.5)
 SESSION = CaptureSession(name="full", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
@@ -99,8 +100,7 @@ def test_other_files_and_the_header_stay_as_they_were(disk: Path) -> None:
     ballast.write_bytes(b"\0" * shutil.disk_usage(disk).free)
     with pytest.raises(StorageError, match=r"no room for reports/a\.json .* MB free"):
         store.write_json("reports/a.json", list(range(2000)))
-    with pytest.raises(StorageError, match="no room"):
-        SessionStore.create(disk / "t", SESSION)
+    refused("no room", SessionStore.create, disk / "t", SESSION, error=StorageError)
     ballast.unlink()
     assert store.read_json("reports/a.json") == [1] and store.verify() == []
     assert SessionStore.create(disk / "t", SESSION).completed == set()
@@ -128,8 +128,7 @@ def test_a_line_that_does_not_fit_leaves_no_half_line(
     before = path.read_bytes()
     hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
     resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 50, hard))
-    with pytest.raises(StorageError, match="File too large"):
-        add(store, 100)
+    refused("File too large", add, store, 100, error=StorageError)
     resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
     assert path.read_bytes() == before
     assert (100 in store.completed) == (name == "manifest.jsonl")

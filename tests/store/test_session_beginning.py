@@ -13,6 +13,7 @@ from realsim.store import SessionStore, atomic
 from realsim.store.opening import BEGUN_FILE, RECOVERED, finish_beginning, read_begun
 from realsim.store.session_check import check_session
 from realsim.store.session_repair import repair_session
+from refusals import refused
 from stored_sessions import CAMERA, VIEWS, flip
 
 
@@ -92,11 +93,9 @@ def test_a_damaged_header_says_how_to_go_on(session: Path) -> None:
             path.unlink()
         else:
             path.write_text(data)
-        with pytest.raises(InputError, match=r"session\.json.*`realsim check .*/s --repair`"):
-            SessionStore.open(session)
+        refused(r"session\.json.*`realsim check .*/s --repair`", SessionStore.open, session)
     record = CaptureSession(name="x", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    with pytest.raises(InputError, match=r"holds views of a session .* --repair"):
-        SessionStore.create(session, record)
+    refused(r"holds views of a session .* --repair", SessionStore.create, session, record)
     header = json.loads(atomic.json_bytes({"format": "realsim session", "format_version": 99}))
     path.write_text(json.dumps(header))
     with pytest.raises(InputError, match="newer realsim") as told:
