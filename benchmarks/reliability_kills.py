@@ -159,6 +159,7 @@ class Command:
             with contextlib.suppress(Exception):  # some exclude each other
                 import_module(name)
         shutil.copytree(self.work, self.after)
+        time.sleep(1.0)  # dates are written in whole seconds: two fast runs would have the same
         begin = time.monotonic()
         self.again()
         self.seconds = time.monotonic() - begin
