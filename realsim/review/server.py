@@ -22,6 +22,7 @@ import viser
 
 from realsim import local_pages
 from realsim.errors import InputError, RealsimError
+from realsim.interop import give_back_memory
 from realsim.local_pages import Door
 from realsim.review import journal, scene_list
 from realsim.review.content.config import SceneConfig
@@ -255,6 +256,7 @@ class ReviewServer:
             window = self._windows.pop(client.client_id, None)
         if window is not None:
             window.close()
+        give_back_memory()
 
     def _watch(self) -> None:
         """Look at the journals once a second, and at once after a decision made here."""
