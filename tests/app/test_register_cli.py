@@ -158,11 +158,14 @@ def test_a_scene_that_no_registration_made_is_kept(
 ) -> None:
     folder = copy_of(registered[0], tmp_path / "s")
     exact = (folder / "registration/scene.json").read_bytes()
-    (folder / "stages/register.json").unlink()
+    (folder / "stages/register.json").unlink()  # one that was ended before its last note
     finished("register", folder, "--quiet")
-    assert (folder / "registration/earlier/scene_001.json").read_bytes() == exact
-    (folder / "stages/register.json").unlink()  # and the same once more: it is kept once
-    finished("register", folder, "--quiet")
+    assert not (folder / "registration/earlier").exists()
+    for _ in range(2):  # and the same once more: it is kept once
+        for name in ("stages/register.json", "registration/views.json"):
+            (folder / name).unlink()
+        finished("register", folder, "--quiet")
+        assert (folder / "registration/earlier/scene_001.json").read_bytes() == exact
     assert len(list((folder / "registration/earlier").iterdir())) == 1
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from realsim.app.register.results import STAGE_FILE
+from realsim.app.register.results import STAGE_FILE, VIEWS_FILE
 from realsim.app.reviewed import damage_words, review_of
 from realsim.errors import InputError
 from realsim.geometry import se3
@@ -148,7 +148,9 @@ def is_precious(store: SessionStore) -> bool:
 
     A registration can be made again.
     """
-    return bool(review_of(store).standing) or not store.has(STAGE_FILE)
+    # One that was ended after its scene was written has no stage yet.
+    is_registered = store.has(STAGE_FILE) or store.has(VIEWS_FILE)
+    return bool(review_of(store).standing) or not is_registered
 
 
 def keep_earlier(store: SessionStore) -> str | None:
