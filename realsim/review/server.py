@@ -31,6 +31,7 @@ from realsim.review.journal import Entry
 from realsim.review.replaying.grasp_replay import Motions
 from realsim.review.reviewed_session import ReviewedSession
 from realsim.review.window import page_head
+from realsim.review.window.gui_values import is_camera
 from realsim.review.window.window import Window
 from realsim.store import SessionStore
 
@@ -239,6 +240,9 @@ class ReviewServer:
     # --- browsers come and go ---------------------------------------------------------------------
 
     def _came(self, client: viser.ClientHandle) -> None:
+        if not is_camera(client.camera):
+            log.warning("a message from a browser was not understood: its camera is none")
+            return
         try:
             window = Window(client, self, self._reviewer)
         except Exception:

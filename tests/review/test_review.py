@@ -24,6 +24,11 @@ from tests.support.review_browser import serving
 from tests.support.reviewed_boxes import boxes_session
 
 SOCKET = Subprotocol(f"{viser.__name__}-v{viser.__version__}")
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, 1], "fov": 1.0,
+    "near": 0.01, "far": 9.0, "image_height": 80, "image_width": 90, "look_at": [0, 0, 0],
+    "up_direction": [0, 1, 0],
+}  # fmt: skip
 TOKEN = "a-secret-of-more-than-16"
 
 
@@ -219,13 +224,16 @@ def test_a_browser_that_leaves_before_it_is_answered_fills_no_terminal(
     "frame", [b"", b"\xff" * 9, "text", msgpack(None), msgpack([1]), msgpack({"type": "No"}),
               msgpack({"type": "GuiUpdateMessage", "uuid": [], "updates": 3}),
               msgpack({"type": "FileTransferStartUpload", "part_count": -1}),
-              msgpack({"type": "ViewerCameraMessage", "position": "far"})]
+              msgpack({"type": "ViewerCameraMessage", "position": "far"}),
+              msgpack(CAMERA | {"position": []}),
+              [msgpack(CAMERA), msgpack(CAMERA | {"look_at": 1})]]
 )  # fmt: skip
 def test_a_frame_that_is_no_message_gets_a_line_in_the_log(
-    server: ReviewServer, frame: bytes | str, caplog: pytest.LogCaptureFixture
+    server: ReviewServer, frame: bytes | str | list[bytes], caplog: pytest.LogCaptureFixture
 ) -> None:
     with connect(f"ws://127.0.0.1:{port_of(server)}", subprotocols=[SOCKET], max_size=None) as line:
-        line.send(frame)
+        for part in frame if isinstance(frame, list) else [frame]:
+            line.send(part)
         with contextlib.suppress(ConnectionClosed):
             pong, end = line.ping(), time.monotonic() + 20
             while not pong.wait(0.05) and line.close_code is None:  # a closed line never answers

@@ -4,16 +4,19 @@ Viser takes every value that is sent. Here it is looked at before, so that no co
 choice that it does not offer, and no panel has to ask.
 """
 
+import logging
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import viser
 
 from realsim.errors import InputError
 from realsim.local_pages import refuse_uploads
 from realsim.review.replaying.grasp_words import one_line
 
+log = logging.getLogger(__name__)
 MOST_TEXT = 20_000
 """Characters of a text field: more than a comment may have, so that it can still be shortened."""
 SHOWN, SHOWN_TEXT = 8, 60
@@ -45,9 +48,29 @@ def refuse_foreign_values(gui: viser.GuiApi, refuse: Callable[[str], None]) -> N
                 return
         await take(client_id, message)
 
+    handlers = wire._incoming_handlers
+    takers = handlers[viser_messages.ViewerCameraMessage]
+
+    async def seen(client_id: int, message: Any) -> None:
+        if not is_camera(message):
+            log.warning("a message from a browser was not understood: %.200r", message)
+            return
+        for taker in takers:
+            await taker(client_id, message)
+
     refuse_uploads(wire)
     wire.unregister_handler(viser_messages.GuiUpdateMessage, take)
     wire.register_handler(viser_messages.GuiUpdateMessage, checked)
+    handlers[viser_messages.ViewerCameraMessage] = [seen]
+
+
+def is_camera(camera: Any) -> bool:
+    """Return whether what a browser gives as its camera has a place, a direction and what is up."""
+    parts = ((camera.wxyz, 4), (camera.position, 3), (camera.look_at, 3), (camera.up_direction, 3))
+    try:
+        return all(np.isfinite(v).all() and np.shape(v) == (n,) for v, n in parts)
+    except (TypeError, ValueError):
+        return False
 
 
 def check_update(handle: Any, updates: Mapping[str, Any]) -> None:
