@@ -19,6 +19,7 @@ from typing import IO, Any, NamedTuple, Self
 
 from realsim.errors import InputError
 from realsim.untrusted.files import file_bytes
+from realsim.untrusted.values import LONGEST_PART
 from realsim.untrusted.zip_members import opened_zip
 
 MOST_PACKED = 1e12
@@ -29,7 +30,7 @@ than ten, zeros by a thousand."""
 MOST_MEMBERS = 2_000_000
 MOST_HEADER_READ = 1 << 20
 """Bytes of a header that extends the next one, such as a long name; it can claim terabytes."""
-DEEPEST, LONGEST_PART, LONGEST_NAME = 32, 255, 1000
+DEEPEST, LONGEST_NAME = 32, 1000
 CHUNK = 1 << 20
 GZIP, ZIP = b"\x1f\x8b", b"PK"
 TAR_MARK, TAR_MARK_AT = b"ustar", 257

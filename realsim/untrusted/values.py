@@ -4,6 +4,7 @@
 """
 
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any, cast
@@ -18,6 +19,8 @@ EXACT_WHOLE = 2**53
 """Up to here every whole number is a double."""
 LONGEST_TEXT = 10_000
 """Characters of a name, a path or a remark."""
+LONGEST_PART = 255
+"""Bytes of a folder's or a file's name."""
 
 
 def number(value: Any, name: str, low: float = -math.inf, high: float = math.inf) -> float:
@@ -138,7 +141,8 @@ def path_inside(folder: Path, value: Any, name: str) -> Path:
     """Return the path that a file names, if it stays inside the folder, links resolved.
 
     Raises:
-        InputError: it is no text, absolute, goes up with '..', or a link leads out.
+        InputError: it is no text, absolute, goes up with '..', or a link leads out; no system has
+            files of such a name.
     """
     given = text(value, name)
     parts = PurePosixPath(given.replace("\\", "/"))
@@ -146,6 +150,8 @@ def path_inside(folder: Path, value: Any, name: str) -> Path:
     try:
         path = folder / parts
         escapes = escapes or not path.resolve().is_relative_to(folder.resolve())
+        if any(len(os.fsencode(part)) > LONGEST_PART for part in parts.parts):
+            raise ValueError("too long")
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"{name} is {_shown(value)}; no file has such a name.") from error
     if escapes:

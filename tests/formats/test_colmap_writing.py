@@ -149,10 +149,15 @@ def test_a_text_that_cannot_be_is_refused(tmp_path, file, text, said):
     refused(said, open_colmap, text_model(tmp_path / "wrong", **{file: text}))
 
 
-def test_a_binary_quaternion_that_is_none_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("pose", "said"),
+    [((0.5, 0, 0, 0, 0, 0, 0), r"image 1 of images.bin.*length 0\.5"),
+     ((1, 0, 0, 0, np.nan, 0, 0), r"pose of a\.png.* NaN")],
+)  # fmt: skip
+def test_a_binary_pose_that_is_none_is_refused(tmp_path, pose, said):
     row = image_row(1, 1, np.eye(4), "a.png")
-    bad = type(row)(image_id=1, camera_id=1, pose=(0.5, 0, 0, 0, 0, 0, 0), name="a.png")
+    bad = type(row)(image_id=1, camera_id=1, pose=pose, name="a.png")
     none = np.zeros((0, 3))
     for name, data in model_files([camera_row(1, camera("PINHOLE"))], [bad], none, none).items():
         (tmp_path / name).write_bytes(data)
-    refused(r"image 1 of images.bin.*length 0\.5", read_model, tmp_path)
+    refused(said, read_model, tmp_path)

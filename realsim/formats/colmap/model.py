@@ -328,13 +328,14 @@ def read_model(folder: Path | str) -> ColmapModel:
         if not image.has_pose:
             unregistered.append(str(image.name))
             continue
-        T_cam_world = T_from_rigid3d(image.cam_from_world())
-        found.append(
-            ColmapImage(
-                name=str(image.name),
-                camera_id=int(image.camera_id),
-                T_world_cam=se3.invert(T_cam_world),
+        T = se3.invert(T_from_rigid3d(image.cam_from_world()))
+        if not np.isfinite(T).all():
+            raise InputError(
+                f"the pose of {image.name} in {folder} has NaN or infinite numbers; the file is "
+                "damaged. Export it again."
             )
+        found.append(
+            ColmapImage(name=str(image.name), camera_id=int(image.camera_id), T_world_cam=T)
         )
     used = {i.camera_id for i in found}
     cameras = {k: _intrinsics(c, folder) for k, c in dict(model.cameras).items() if k in used}
