@@ -33,7 +33,12 @@ def copy_models(library: LibraryReader, obj_ids: Collection[int], folder: Path) 
         InputError: the library has not all of them; the message names those that are missing.
     """
     there = read_info(folder) if (folder / INFO_FILE).is_file() else {}
-    wanted = sorted(i for i in set(obj_ids) if not (folder / model_file(i)).is_file())
+    # The library's own mesh without a row in the table is of a copy that was ended.
+    wanted = sorted(
+        i for i in set(obj_ids)
+        if not (folder / model_file(i)).is_file()
+        or (i not in there and _is_same(folder / model_file(i), library.folder / model_file(i)))
+    )  # fmt: skip
     info = read_info(library.folder)
     missing = [i for i in wanted if i not in info or not (library.folder / model_file(i)).is_file()]
     if missing:
@@ -58,6 +63,10 @@ def copy_models(library: LibraryReader, obj_ids: Collection[int], folder: Path) 
     with only_writer_of(folder):
         commit(folder, {**new, INFO_FILE: atomic.json_bytes(entries)})
     return tuple(wanted)
+
+
+def _is_same(path: Path, other: Path) -> bool:
+    return other.is_file() and path.read_bytes() == other.read_bytes()
 
 
 def known_solids(

@@ -96,6 +96,10 @@ def test_a_session_gets_what_it_needs_and_no_more(library: ModelLibrary, tmp_pat
     } == {k: v for k, v in taken.items() if "info" not in k}
     solids, unknown = known_solids(session, [1, 3])
     assert sorted(solids) == [1, 3] and unknown == {}
+    table = (session / "models_info.json").read_bytes()
+    (session / "models_info.json").unlink()  # as a copy leaves it that is ended
+    assert copy_models(library, [1, 3], session) == (1, 3)
+    assert (session / "models_info.json").read_bytes() == table
     library.add(prepare_mesh(part("box").mesh, BARE), "box", overwrite=True)
     assert copy_models(library, [1, 2, 3], session) == (2,)
     assert load_models(session)[1].mesh.extent == pytest.approx(part("wedge").mesh.extent, rel=1e-6)
