@@ -17,6 +17,7 @@ import importlib
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -344,6 +345,28 @@ def T_world_gl_from_cam(T_world_cam: ArrayLike) -> Array:
 def T_world_cam_from_gl(T_world_gl: ArrayLike) -> Array:
     """Return T_world_cam (..., 4, 4), OpenCV axes, of a camera given in OpenGL axes."""
     return np.asarray(T_world_gl, dtype=np.float64) @ T_CAM_GL
+
+
+@contextmanager
+def unbroken() -> Generator[None]:
+    """Let Ctrl-C and SIGTERM wait for the end of a block.
+
+    Trimesh catches them as failures of its own, and goes on without a mesh's colours.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # they never come here
+        return
+    came: list[int] = []
+    before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
+    for number in before:
+        signal.signal(number, lambda n, _: came.append(n))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        for number in came[:1]:
+            signal.raise_signal(number)
 
 
 def give_back_memory() -> None:

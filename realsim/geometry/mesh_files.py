@@ -98,9 +98,11 @@ def load_mesh(path: Path | str, unit: Unit, notes: list[str] | None = None) -> M
         return replace(plain, vertices=plain.vertices * METRES[unit])
     import trimesh
 
+    from realsim.interop import unbroken
+
     beside = _files_beside(path)
     try:
-        with _quiet("trimesh"):
+        with _quiet("trimesh"), unbroken():
             loaded: Any = trimesh.load_scene(path, process=False, resolver=beside).to_mesh()
     except Exception as error:  # a broken file raises whatever the format's reader trips over
         raise InputError(

@@ -11,6 +11,7 @@ import numpy as np
 
 from realsim.errors import InputError
 from realsim.geometry.mesh_files import MOST_TEXELS
+from realsim.interop import unbroken
 from realsim.models.mesh_atlas import (
     FileContent,
     Piece,
@@ -46,9 +47,10 @@ def load_pieces(path: Path) -> FileContent:
     declared = _declared(path, kind, header)
     folder = _folder(path)
     try:
-        scene: Any = trimesh.load_scene(path, process=False, resolver=folder)
-        folder.raise_if_refused()
-        pieces = _pieces(scene, kind, folder, header, notes)
+        with unbroken():
+            scene: Any = trimesh.load_scene(path, process=False, resolver=folder)
+            folder.raise_if_refused()
+            pieces = _pieces(scene, kind, folder, header, notes)
     except InputError:
         raise
     except Exception as error:  # a broken file raises whatever the format's reader trips over

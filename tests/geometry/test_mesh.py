@@ -2,10 +2,12 @@
 
 import dataclasses
 import os
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from realsim.errors import InputError, UnitError
 from realsim.geometry import mesh as meshes
@@ -288,3 +290,19 @@ def test_a_real_scan_keeps_its_texture():
     assert r > 1.3 * g and r > 1.3 * b
     with pytest.raises(UnitError):
         meshes.load_mesh(YCBV / "meshes_textured/003_cracker_box/textured.obj", "mm")
+
+
+def test_ctrl_c_is_not_taken_for_a_mesh_without_colours(tmp_path, monkeypatch):
+    parts = [trimesh.creation.box(), trimesh.creation.icosphere(1)]
+    for part, rgba in zip(parts, ([255, 0, 0, 255], [0, 0, 255, 255]), strict=True):
+        part.visual.vertex_colors = rgba
+    trimesh.Scene(parts).export(tmp_path / "two.glb")
+    joined = trimesh.visual.ColorVisuals.concatenate
+
+    def struck(*arguments):
+        signal.raise_signal(signal.SIGINT)
+        return joined(*arguments)
+
+    monkeypatch.setattr(trimesh.visual.ColorVisuals, "concatenate", struck)
+    with pytest.raises(KeyboardInterrupt):
+        meshes.load_mesh(tmp_path / "two.glb", "m")

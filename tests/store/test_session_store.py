@@ -256,7 +256,7 @@ def grow(path, lines):
 
 CAPTURE = """
 import sys
-sys.path.insert(0, {tests!r})
+sys.path[:0] = [{tests!r}, {tests!r} + '/../support']
 from test_session_store import SessionStore, make_view, make_images
 store = SessionStore.open({folder!r})
 print("ready", flush=True)
@@ -300,7 +300,7 @@ def test_killed_captures_lose_at_most_the_view_in_flight(tmp_path):
 
 SETTING = """
 import sys
-sys.path.insert(0, {tests!r})
+sys.path[:0] = [{tests!r}, {tests!r} + '/../support']
 from test_session_store import SessionStore, CAMERA
 from realsim.geometry import se3
 store = SessionStore.open({folder!r})

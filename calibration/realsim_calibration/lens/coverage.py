@@ -47,11 +47,6 @@ class Coverage:
     advice: str
     """What to add; empty where nothing is missing."""
 
-    @property
-    def distance_ratio(self) -> float:
-        """Largest distance relative to the smallest."""
-        return float(self.distance_m.max() / self.distance_m.min())
-
 
 def measure_coverage(uv: Array, image_size: tuple[int, int], poses: Array) -> Coverage:
     """Return the coverage of corners (N, 2) [px] by boards at poses (views, 4, 4) [m].

@@ -37,6 +37,7 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
+from realsim.interop import unbroken
 from realsim.robots.shapes import SIZES, Box, Kind, Mount, Shape
 from realsim.untrusted.toml_text import read_toml
 from realsim_capture_plans.collision.mount import FLANGE, camera_body, plain_bracket
@@ -257,7 +258,8 @@ def _corners(fields: Fields, folder: Path) -> Array:
     if not path.is_file():
         raise InputError(f"{fields.where}: the mesh {path} does not exist.")
     try:
-        mesh = trimesh.load_mesh(path, process=False)
+        with unbroken():
+            mesh = trimesh.load_mesh(path, process=False)
         points = np.asarray(mesh.vertices, dtype=np.float64) * UNITS[unit]
         hull = points[ConvexHull(points).vertices]
     except (QhullError, ValueError, OSError, KeyError, IndexError, AttributeError) as error:

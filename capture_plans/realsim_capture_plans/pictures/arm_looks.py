@@ -9,7 +9,7 @@ from realsim.arrays import Array, Int64
 from realsim.errors import MissingLibraryError, RealsimError
 from realsim.geometry import se3
 from realsim.geometry.mesh_files import load_mesh
-from realsim.interop import import_pinocchio
+from realsim.interop import import_pinocchio, unbroken
 from realsim.models.convex_hulls import hull_triangles
 from realsim.robots.arm import arm_of
 from realsim.robots.link_shapes import LARGEST_MM_SCALE, link_placements, link_shape
@@ -157,7 +157,8 @@ def _ur5_looks(plan: CapturePlan) -> list[Part] | None:
     for one in visual.geometryObjects:
         frame = int(one.parentJoint)
         T_ros_mesh = (data.oMi[frame] * one.placement).homogeneous
-        mesh: Any = trimesh.load_mesh(one.meshPath)
+        with unbroken():
+            mesh: Any = trimesh.load_mesh(one.meshPath)
         T_link_mesh = T_link_base[frame] @ BASE_LINK_FROM_BASE @ T_ros_mesh
         parts.append(
             Part(

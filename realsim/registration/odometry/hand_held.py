@@ -167,11 +167,6 @@ class HandHeld:
     """CPU time [s]."""
 
     @property
-    def sigmas_mm(self) -> Array:
-        """(F,) 1-sigma of each camera's place, root of the sum over the axes [mm]."""
-        return 1e3 * np.sqrt(np.trace(self.covariances[:, 3:, 3:], axis1=1, axis2=2))
-
-    @property
     def sigmas_deg(self) -> Array:
         """(F,) 1-sigma of each camera's turn, root of the sum over the axes [deg]."""
         return np.degrees(np.sqrt(np.trace(self.covariances[:, :3, :3], axis1=1, axis2=2)))
