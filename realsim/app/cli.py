@@ -127,9 +127,12 @@ def _run() -> None:
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)
-    except (click.Abort, KeyboardInterrupt) as stop:
-        # click puts its own in the place of the one that knows how far it came.
+    except (click.Abort, KeyboardInterrupt, SystemError) as stop:
+        # click puts its own in the place of the one that knows how far it came, Python where a
+        # compiled loop is called.
         reason = stop.__cause__ or stop
+        if isinstance(stop, SystemError) and not isinstance(reason, KeyboardInterrupt):
+            raise  # a bug: its place is wanted
         told = str(reason) or "interrupted"
         click.echo(
             told if told.endswith(".") else f"{told}; the same command goes on from here.", err=True

@@ -58,6 +58,10 @@ def finish_beginning(folder: Path) -> None:
             if not manifest.entries:
                 (folder / MANIFEST_FILE).unlink(missing_ok=True)
             manifest.finish_interrupted()
+    # Ctrl-C takes away the bytes that the list has already.
+    if folder.is_dir() and [p.name for p in folder.iterdir()] == [MANIFEST_FILE]:
+        if set(Manifest(folder).entries) <= {SESSION_FILE}:
+            (folder / MANIFEST_FILE).unlink()
 
 
 def require_header(folder: Path) -> None:

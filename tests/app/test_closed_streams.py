@@ -80,6 +80,23 @@ def test_pycolmap_leaves_the_answer_to_sigterm_alone() -> None:
     assert done.returncode == 143 and b"stack trace" not in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("cause", "code"), [("cli.Terminated()", 143), ("KeyboardInterrupt()", 130), ("None", 1)]
+)
+def test_sigterm_in_the_call_of_a_compiled_loop_is_no_bug(cause: str, code: int) -> None:
+    script = f"""if True:
+        import sys
+        from realsim.app import cli
+        def work():
+            raise SystemError("returned a result with an exception set") from {cause}
+        cli.commands.command("work")(work)
+        sys.argv = ["realsim", "work"]
+        cli.main()
+    """
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
+    assert done.returncode == code and (b"goes on from here" in done.stderr) == (code != 1)
+
+
 def test_a_second_sigterm_does_not_break_into_the_ending() -> None:
     script = """if True:
         import sys, time

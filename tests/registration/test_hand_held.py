@@ -62,9 +62,13 @@ def test_the_table_is_the_ground():
 
 
 def test_sigmas_grow_with_the_way():
-    sigma = 1e3 * np.sqrt(np.trace(found().covariances[:, 3:, 3:], axis1=1, axis2=2))
+    place, turn = slice(3, 6), slice(0, 3)  # of the twists
+    sigma, sigma_deg = (
+        unit * np.sqrt(np.trace(found().covariances[:, s, s], axis1=1, axis2=2))
+        for unit, s in ((1e3, place), (180 / np.pi, turn))
+    )
     assert sigma[0] < sigma[-1] < 10
-    assert np.all(found().sigmas_deg < 2)
+    assert np.all(sigma_deg < 2)
     assert found().overlaps[0] == 1.0 and found().overlaps.min() > 0.6
 
 

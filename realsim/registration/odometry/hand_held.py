@@ -166,11 +166,6 @@ class HandHeld:
     cpu_s: float
     """CPU time [s]."""
 
-    @property
-    def sigmas_deg(self) -> Array:
-        """(F,) 1-sigma of each camera's turn, root of the sum over the axes [deg]."""
-        return np.degrees(np.sqrt(np.trace(self.covariances[:, :3, :3], axis1=1, axis2=2)))
-
 
 def hand_held_poses(
     intrinsics: CameraIntrinsics, depths: Sequence[Array32], sample: SampleConfig

@@ -56,7 +56,7 @@ class PhotographLink:
             client=window.client.client_id,
             state=f"{zlib.crc32(state.encode()):08x}",
             scene=window.session.number,
-            instance=_instance(window.selected),
+            instance=window.selected if chosen else "",
             name=html.escape(f"{window.selected} {window.model_of(window.placed).name}")
             if chosen
             else "",
@@ -83,7 +83,8 @@ class PhotographLink:
         if not window.content.views:
             raise InputError(window_text.NO_PHOTOGRAPHS)
         found, objects = window.session.photographs(), window.shown_objects()
-        selected, whose = window.selected, f"{window.session.number}/{_instance(window.selected)}"
+        selected = window.selected
+        whose = f"{window.session.number}/{'' if selected is None else selected}"
         view = int(numbers[0]) if numbers else 0
         if what == "thumb":
             return "image/jpeg", window.content.thumbnails[view]
@@ -95,10 +96,6 @@ class PhotographLink:
             "spot": lambda: found.spot(view, (numbers[1], numbers[2]), objects),
         }
         return "application/json", json.dumps(answers[what]()).encode()
-
-
-def _instance(selected: int | None) -> str:
-    return "" if selected is None else str(selected)
 
 
 class ViewsPanel:
