@@ -357,13 +357,12 @@ def unbroken() -> Generator[None]:
         yield  # they never come here
         return
     came: list[int] = []
-    before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
-    for number in before:
-        signal.signal(number, lambda n, _: came.append(n))
+    both = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda n, _: came.append(n)) for number in both]
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in zip(both, before, strict=True):
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
         for number in came[:1]:
             signal.raise_signal(number)

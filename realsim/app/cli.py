@@ -130,8 +130,10 @@ def _run() -> None:
     except (click.Abort, KeyboardInterrupt, SystemError) as stop:
         # click puts its own in the place of the one that knows how far it came, Python where a
         # compiled loop is called.
-        reason = stop.__cause__ or stop
-        if isinstance(stop, SystemError) and not isinstance(reason, KeyboardInterrupt):
+        reason: BaseException = stop
+        while isinstance(reason, click.Abort | SystemError) and reason.__cause__ is not None:
+            reason = reason.__cause__
+        if not isinstance(reason, click.Abort | KeyboardInterrupt):
             raise  # a bug: its place is wanted
         told = str(reason) or "interrupted"
         click.echo(

@@ -88,7 +88,10 @@ def test_sigterm_in_the_call_of_a_compiled_loop_is_no_bug(cause: str, code: int)
         import sys
         from realsim.app import cli
         def work():
-            raise SystemError("returned a result with an exception set") from {cause}
+            try:
+                raise SystemError("returned a result with an exception set") from {cause}
+            except SystemError as error:
+                raise SystemError("returned a result with an exception set") from error
         cli.commands.command("work")(work)
         sys.argv = ["realsim", "work"]
         cli.main()

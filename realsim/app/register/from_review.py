@@ -149,8 +149,7 @@ def is_precious(store: SessionStore) -> bool:
     A registration can be made again.
     """
     # One that was ended after its scene was written has no stage yet.
-    is_registered = store.has(STAGE_FILE) or store.has(VIEWS_FILE)
-    return bool(review_of(store).standing) or not is_registered
+    return bool(review_of(store).standing) or not any(map(store.has, (STAGE_FILE, VIEWS_FILE)))
 
 
 def keep_earlier(store: SessionStore) -> str | None:
