@@ -30,7 +30,7 @@ from realsim.review.drawing.scene_nodes import light
 from realsim.review.journal import Entry
 from realsim.review.replaying.grasp_replay import Motions
 from realsim.review.reviewed_session import ReviewedSession
-from realsim.review.window import page_head
+from realsim.review.window import page_head, window_text
 from realsim.review.window.gui_values import is_camera
 from realsim.review.window.window import Window
 from realsim.store import SessionStore
@@ -235,14 +235,16 @@ class ReviewServer:
             said = {"error": str(error)}
         except (LookupError, ValueError):
             said = {"error": "there is nothing of this address; load the page anew."}
+        except Exception as error:
+            log.exception("a photograph could not be shown")
+            said = {"error": window_text.BUG.format(error)}
         return "application/json", json.dumps(said).encode()
 
     # --- browsers come and go ---------------------------------------------------------------------
 
     def _came(self, client: viser.ClientHandle) -> None:
         if not is_camera(client.camera):
-            log.warning("a message from a browser was not understood: its camera is none")
-            return
+            return log.warning("a message from a browser was not understood: its camera is none")
         try:
             window = Window(client, self, self._reviewer)
         except Exception:

@@ -67,7 +67,7 @@ def test_a_page_is_whole_escaped_and_asks_for_nothing() -> None:
     text = page.encode().decode()
     assert page.encode().decode() == text == everything().encode().decode()
     assert "http" not in text and "/data" not in text and "/home" not in text
-    assert "in SESSION and file.txt" in text
+    assert "in SESSION and file.txt" in text and '<link rel="icon" href="data:,">' in text
     for told in ("A &amp; B", "&lt;b&gt;two", "&lt;look&gt;", "&lt;mug&gt;", "rgb(1,2,3)",
                  ">1.2<", "a &#34;cup&#34;", '{"figure": "\\u003c/script>"}'):  # fmt: skip
         assert told in text, told

@@ -7,6 +7,7 @@ import re
 import socket
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
-from realsim import CaptureSession, InputError, local_pages
+from realsim import InputError, local_pages
 from realsim.local_pages import Door
 from realsim.review import ReviewServer
 from realsim.store import SessionStore
@@ -100,12 +101,10 @@ def test_loopback_is_accepted(host: str) -> None:
 
 
 def test_a_host_that_is_not_here_is_told_before_anything_listens() -> None:
-    with pytest.raises(InputError, match="cannot listen on"):
-        local_pages.free_port("203.0.113.77", 8080)
-    with pytest.raises(InputError, match="cannot listen on"):
-        local_pages.free_port("no.such.machine.invalid", 8080)
-    with pytest.raises(InputError, match=r"300 characters"):
-        local_pages.free_port("a" * 300, 8080)
+    words = {"203.0.113.77": "cannot listen on", "no.such.machine.invalid": "cannot listen on"}
+    for host, told in (words | {"a" * 300: "300 characters"}).items():
+        with pytest.raises(InputError, match=told):
+            local_pages.free_port(host, 8080)
 
 
 def test_a_port_in_use_is_passed_over() -> None:
@@ -154,8 +153,7 @@ def test_foreign_pages_are_refused(server: ReviewServer, origin: str) -> None:
 
 
 def test_own_pages_get_the_scene_and_so_do_programs_of_this_machine(server: ReviewServer) -> None:
-    assert handshake(server, server.url) == 101
-    assert handshake(server, None) == 101
+    assert handshake(server, server.url) == handshake(server, None) == 101
 
 
 def test_a_forwarded_port_is_our_own_page(server: ReviewServer) -> None:
@@ -341,12 +339,8 @@ def test_a_token_file_that_never_ends_is_refused(tmp_path: Path) -> None:
 
 
 def test_an_unregistered_session_is_refused(store: SessionStore, tmp_path: Path) -> None:
-    given = store.session
-    raw_session = CaptureSession(
-        name="raw", intrinsics=given.intrinsics, views=(), depth_unit_m=1e-4
-    )
     with pytest.raises(InputError, match=r"scene\.json"):
-        ReviewServer(SessionStore.create(tmp_path / "s", raw_session))
+        ReviewServer(SessionStore.create(tmp_path / "s", replace(store.session, views=())))
 
 
 def test_the_first_scene_is_read_before_any_browser_comes(server: ReviewServer) -> None:

@@ -24,22 +24,27 @@ def test_sessions_that_cannot_be_reviewed_are_told_and_the_others_opened(tmp_pat
     boxes_session(tmp_path / "root/a").close()
     raw = boxes_session(tmp_path / "root/b")
     raw.remove("registration/scene.json")
+    cut = boxes_session(tmp_path / "root/c").path("registration/scene.json")
+    cut.write_text(cut.read_text()[:99])
     stores, remarks = open_all((tmp_path / "root",))
-    assert [s.folder.name for s in stores] == ["a"]
-    assert len(remarks) == 1 and "b is left out" in remarks[0] and "realsim register" in remarks[0]
+    assert [s.folder.name for s in stores] == ["a"] and len(remarks) == 2
+    assert "b is left out" in remarks[0] and "realsim register" in remarks[0]
+    assert "c is left out" in remarks[1] and "not valid JSON" in remarks[1]
     with pytest.raises(InputError, match="not registered yet"):
         open_all((tmp_path / "root/b",))
 
 
 def test_ctrl_c_ends_with_a_summary_and_exit_code_0(tmp_path: Path) -> None:
     folder = boxes_session(tmp_path / "boxes").folder
+    (folder / "review").mkdir()
+    (folder / "review/journal.jsonl").write_text('{"format": 2, "id\n')
+    words = [sys.executable, "-c", MAIN, "review", folder, "--port=0", "--no-browser", "--json"]
     process = subprocess.Popen(
-        [sys.executable, "-c", MAIN, "review", str(folder), "--port", "0",
-         "--no-browser", "--json"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
     )  # fmt: skip
     assert process.stderr is not None
+    assert "line 1 of" in process.stderr.readline()
     assert "http://127.0.0.1:" in process.stderr.readline()
     session = ReviewedSession(SessionStore.open(folder))
     session.decide("reject", session.standing.scene.object(3), "ada", comment="floats")

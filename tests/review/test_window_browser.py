@@ -262,6 +262,9 @@ def test_a_correction_outlives_a_reload_and_the_edit_of_another(
         page.press("Save the pose")
         page.wait_message("Recorded: moved 22.4 mm")
         page.wait_gone("your correction is not saved")
+        server.stop()
+        said = "getComputedStyle(document.body, '::after').content.includes('does not answer')"
+        page.wait_until(lambda: page.page.evaluate(said), "that nothing is recorded")
     assert [e.reviewer for e in lines(server)] == ["bob", "ada"]
 
 

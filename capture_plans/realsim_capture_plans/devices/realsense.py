@@ -144,7 +144,8 @@ class RealSenseCamera:
             half_frame_ms=500.0 / max(1, color.fps()),
             lossless=self._recording is not None,
         )
-        self._last: dict[str, Any] = {}
+        self.last_metadata: dict[str, Any] = {}
+        """Frame number, clock, exposure [us] and gain of the last pair, "depth" and "color"."""
         self._unsettled = self._recording is None
         self._open(
             [(depth_sensor, [depth, color])]
@@ -291,11 +292,6 @@ class RealSenseCamera:
             "recording": None if self._recording is None else self._recording.name,
         }
 
-    @property
-    def last_metadata(self) -> dict[str, Any]:
-        """Frame number, clock, exposure [us] and gain of the last pair, "depth" and "color"."""
-        return self._last
-
     # --- frames -------------------------------------------------------------------------------
 
     def grab(self) -> Frame:
@@ -334,7 +330,7 @@ class RealSenseCamera:
         if pair is not None:
             return pair
         if self._pairs.ended:
-            if not self._last:
+            if not self.last_metadata:
                 raise EndOfRecordingError(
                     f"{self._recording} holds no pair of depth and colour: {self._pairs.why_none()}"
                 )
@@ -357,7 +353,7 @@ class RealSenseCamera:
         )
 
     def _frame(self, pair: Pair) -> Frame:
-        self._last = {
+        self.last_metadata = {
             "depth": facts.frame_json(self._rs, pair.depth),
             "color": facts.frame_json(self._rs, pair.color),
         }

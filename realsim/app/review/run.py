@@ -12,10 +12,11 @@ from typing import Any
 
 from realsim import local_pages
 from realsim.app.console import Console
+from realsim.app.reviewed import damage_words
 from realsim.app.stages import open_session
 from realsim.errors import InputError, RealsimError
 from realsim.review import scene_list
-from realsim.store import SessionStore
+from realsim.store import SessionStore, load_scene
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -121,6 +122,7 @@ def open_all(folders: tuple[Path, ...]) -> tuple[list[SessionStore], list[str]]:
     for folder in found:
         try:
             stores.append(_opened(folder))
+            remarks += filter(None, [damage_words(stores[-1])])
         except RealsimError as error:
             if len(found) == 1:
                 raise
@@ -140,6 +142,7 @@ def _opened(folder: Path) -> SessionStore:
         raise InputError(
             f"session '{folder}' is not registered yet: run `realsim register {folder}` first."
         )
+    load_scene(store)  # a damaged one is told before anything is served
     return store
 
 

@@ -133,9 +133,7 @@ def find_scenes(root: Path | str) -> list[BopSceneRef]:
     """
     root = Path(root)
     if not root.is_dir():
-        raise InputError(
-            f"{root} is not a folder; give a BOP data set, one of its splits or scenes."
-        )
+        raise InputError(f"{root} is not a folder; a BOP data set, split or scene is expected.")
     if cameras_of(root):
         return _refs(root)
     pattern = f"{Path(CAMERA_FILE).stem}*.json"

@@ -24,7 +24,7 @@ SHOWN, SHOWN_TEXT = 8, 60
 
 
 def refuse_foreign_values(gui: viser.GuiApi, refuse: Callable[[str], None]) -> None:
-    """Put a check before what one browser sets its controls to.
+    """Put a check before what one browser sets its controls to, and before its camera.
 
     Args:
         gui: of the client.
@@ -48,20 +48,18 @@ def refuse_foreign_values(gui: viser.GuiApi, refuse: Callable[[str], None]) -> N
                 return
         await take(client_id, message)
 
-    handlers = wire._incoming_handlers
-    takers = handlers[viser_messages.ViewerCameraMessage]
+    takers = wire._incoming_handlers.pop(viser_messages.ViewerCameraMessage)
 
     async def seen(client_id: int, message: Any) -> None:
         if not is_camera(message):
-            log.warning("a message from a browser was not understood: %.200r", message)
-            return
+            return log.warning("a message from a browser was not understood: %.200r", message)
         for taker in takers:
             await taker(client_id, message)
 
     refuse_uploads(wire)
     wire.unregister_handler(viser_messages.GuiUpdateMessage, take)
     wire.register_handler(viser_messages.GuiUpdateMessage, checked)
-    handlers[viser_messages.ViewerCameraMessage] = [seen]
+    wire.register_handler(viser_messages.ViewerCameraMessage, seen)
 
 
 def is_camera(camera: Any) -> bool:

@@ -377,7 +377,7 @@ class Window:
             self.refuse(f"Not done: {disk_words(error)}.")
         else:
             log.error("the review page failed", exc_info=error)
-            self.alarm(f"This is a bug in realsim, please report it with the log: {error!r}")
+            self.alarm(window_text.BUG.format(error))
 
     def guarded(self, action: Callable[[Any], object]) -> Callable[[Any], None]:
         """Return a callback that never ends silently: what goes wrong is said in the panel."""

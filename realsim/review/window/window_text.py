@@ -24,9 +24,12 @@ ALARM = "#c92a2a"
 LEAST_CONTRAST = 4.5
 """Least contrast of letters to their ground: what WCAG 2.1 asks for at the size of the panel's
 text."""
+BUG = "This is a bug in realsim, please report it with the log: {!r}"
+"""Where the error stands."""
 NO_PHOTOGRAPHS = (
-    "No view of this scene has a photograph and a camera pose: objects, table and grasps are shown "
-    "alone. Copy the images back, or run `realsim calibrate`, then start `realsim review` again."
+    "No view of this scene has a photograph, its depth and a camera pose: objects, table and "
+    "grasps are shown alone. Copy the images back, or run `realsim calibrate`, then start "
+    "`realsim review` again."
 )
 ACTION_WORDS = {
     "accept": "accepted",
