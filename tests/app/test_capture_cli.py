@@ -239,6 +239,6 @@ def test_a_replay_file_is_not_replaced_unasked(plans: Path, tmp_path: Path) -> N
 
 def test_a_session_without_its_header_is_sent_to_the_repair(plans: Path, tmp_path: Path) -> None:
     (tmp_path / "s").mkdir()
-    (tmp_path / "s" / "manifest.jsonl").write_text("")
+    (tmp_path / "s" / "robot.jsonl").write_text("{}\n")
     done = realsim("capture", tmp_path / "s", "--plan", plans / "plan.json", "--simulated")
     assert done.returncode == 2 and "realsim check" in done.stderr and "--repair" in done.stderr
