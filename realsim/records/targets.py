@@ -24,8 +24,8 @@ def _check_length(value: float, name: str, least: float = 0.0005, most: float = 
     """Raise unless a printed length is plausible in metres."""
     if not (np.isfinite(value) and least <= value <= most):
         raise InputError(
-            f"{name} is {value} m: metres are expected, between {least:g} and {most:g} m. Were "
-            "millimetres given?"
+            f"{name} is {value} m: metres are expected, between {least:g} and {most:g} m."
+            + " Were millimetres given?" * (value > most)
         )
 
 
@@ -75,7 +75,7 @@ class TagBoard:
         if not (0.001 <= self.tag_size_m <= 1.0) or not (0.0 < self.gap_m <= 1.0):
             raise InputError(
                 f"tag size {self.tag_size_m} m and gap {self.gap_m} m: metres are expected, tags "
-                "between 0.001 and 1 m. Were millimetres given?"
+                "between 0.001 and 1 m." + " Were millimetres given?" * (self.tag_size_m > 1.0)
             )
 
     @property

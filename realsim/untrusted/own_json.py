@@ -73,7 +73,7 @@ def from_json(data: Any, kind: type[Declared], what: str) -> Declared:
         return msgspec.convert(data, kind, dec_hook=_built)
     except msgspec.ValidationError as error:
         told = str(error).replace("`$.", "`").replace(" - at `$`", "")
-        if "missing" in told and isinstance(data, dict):
+        if "missing" in told and " - at `" not in told and isinstance(data, dict):
             told += f"; it has: {', '.join(map(str, data)) or 'nothing'}"
         if (names := "unknown field" in told) or "enum value" in told:
             at = told.partition(" - at `")[2].strip("`$").rpartition(".")[2].partition("[")[0]

@@ -19,7 +19,7 @@ from typed_commands import finished, invoked
 from typed_commands import refused as refused_by
 
 SMALL = ("--fps", "4", "--width", "64", "--height", "48", "--limit", "3", "--quiet",
-         "--episodes-per-file", "2")  # fmt: skip
+         "--episodes-per-file", "2", "--workers", "1")  # fmt: skip
 
 
 def refused(*args):

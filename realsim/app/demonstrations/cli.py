@@ -18,7 +18,7 @@ from realsim.app.outputs import GOES_ON
     out=Has(kind=GOES_ON, note="; new, or to go on in", required=True), task="grasp", fps=20,
     outcome="all", limit=None, width=320, height=240, with_depth=False,
 )  # fmt: skip
-@many(1, "; all give the same bytes")
+@many(None, "; all give the same bytes  [one a core]")
 @options(title="", licence="", models_licence="", attribution="")
 @rare(
     grasp=(), view=Has(None, "  [beside the table]"), hand_eye=False,

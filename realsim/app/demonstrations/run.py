@@ -24,7 +24,7 @@ from realsim.formats.labelled_scene import WrittenScene
 from realsim.formats.lerobot.episodes import INFO, NOTES
 from realsim.formats.lerobot.spool import EncodedEpisode, encoded, import_av
 from realsim.geometry import se3
-from realsim.many import Outcome, PoolConfig, Sent, Task, open_pool, run_many
+from realsim.many import Outcome, PoolConfig, Sent, Task, at_most, open_pool, run_many
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectModel, Scene
 from realsim.untrusted.own_json import read_object
@@ -363,7 +363,8 @@ class _Encoding:
                     f"will take about {minutes:.1f} CPU min."
                 )
 
-        if self.where.workers == 1 and not self.where.address:
+        where = at_most(self.where, len(numbers))
+        if where.workers == 1 and not where.address:
             for k in numbers:
                 begun = time.process_time()
                 episode = encoded(self.episodes, k)
@@ -379,7 +380,7 @@ class _Encoding:
         sent = Sent(self.source)
         tasks = (Task(name=f"attempt {k}", fn=_encoded, args=(sent, self.request, k))
                  for k in numbers)  # fmt: skip
-        with open_pool(self.where) as pool:
+        with open_pool(where) as pool:
             run_many(tasks, pool, done, in_order=True)
 
 

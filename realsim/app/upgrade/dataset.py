@@ -15,6 +15,10 @@ from realsim.many import Workers
 from realsim.store.header import SESSION_FILE
 
 Kind = Literal["auto", "bop", "graspnet"]
+GRASPNET = (
+    "scenes/scene_0000/{kinect,realsense}/camera_poses.npy is expected, or one image as color.png, "
+    "depth.png and meta.mat."
+)
 GT = "gt"
 """Start poses: the data set's own annotations."""
 
@@ -125,7 +129,11 @@ def _require_places(refs: Sequence[SceneRef]) -> None:
 
 
 def _bop(dataset: Path, config: UpgradeConfig) -> list[SceneRef]:
-    refs = find_scenes(dataset)
+    try:
+        refs = find_scenes(dataset)
+    except InputError as error:
+        more = f" A GraspNet scene is not there either: {GRASPNET}" * (config.kind == "auto")
+        raise InputError(f"{error}{more}") from error
     for r in refs:
         has_models = (config.models or _root(r) / "models").is_dir()
         if not has_models and (r.folder / SESSION_FILE).is_file():
@@ -185,8 +193,7 @@ def _graspnet(dataset: Path, config: UpgradeConfig) -> list[SceneRef]:
         raise InputError(
             f"'{dataset}' holds no GraspNet scene"
             + (f" of the camera {config.camera}" if config.camera else "")
-            + ": scenes/scene_0000/{kinect,realsense}/camera_poses.npy is expected, or one image "
-            "as color.png, depth.png and meta.mat."
+            + f": {GRASPNET}"
         )
     refs: list[SceneRef] = []
     for folder in folders:

@@ -13,6 +13,7 @@ from realsim.app.upgrade.scene import Record
 from realsim.app.upgrade.tables import (
     HEADER,
     PAGE,
+    TOLD,
     objects_of,
     row_of,
     summary_line,
@@ -156,7 +157,7 @@ def _pair(out: Path, record: Record, o: Mapping[str, Any]) -> View:
     moved = f"moved by {o['moved_mm']:.1f} mm and {o['moved_deg']:.1f} deg"
     right, became = {  # what stands right of the handle, and what is said of the annotation
         "improved": ("improved", f"improved, {moved}"), "kept": ("kept", "kept"),
-        "rejected": ("new pose refused", "kept, new pose refused"),
+        "rejected": ("new pose refused", TOLD["rejected"]),
     }[o["outcome"]]  # fmt: skip
     label = (
         f"{record['place']} image {o['shown']['image']}, {o['name']}: annotation {became}; the "

@@ -31,7 +31,9 @@ HEADER = [
     "scene, object", "annotation", "verdict", "moved [mm]", "turned [deg]",
     "depth agrees: annotation, new [%]", "edges: annotation, new [px]", "good grasps",
 ]  # fmt: skip
-OUTCOMES = ("rejected", "kept", "improved")
+TOLD = {"rejected": "kept, new pose refused", "kept": "kept", "improved": "improved"}
+"""What became of an annotation, in words."""
+OUTCOMES = tuple(TOLD)
 MOST_ROWS = 60
 """Objects in the console's table, worst first where there are more; upgrade.csv has all."""
 MOST_NOTES = 30
@@ -62,7 +64,7 @@ def row_of(record: Record, o: Mapping[str, Any]) -> list[str]:
     edges = [o["edge_px_annotation"], o["edge_px_new"]]
     return [
         f"{record['place']} {o['name']}",
-        str(o["outcome"]),
+        TOLD[o["outcome"]],
         str(o["verdict"]),
         f"{o['moved_mm']:.1f}",
         f"{o['moved_deg']:.1f}",
@@ -98,7 +100,7 @@ def summary_of(records: Sequence[Record]) -> dict[str, Any]:
 def summary_line(summary: Mapping[str, Any]) -> str:
     """Return the summary as a sentence."""
     verdicts = ", ".join(f"{n} {v}" for v, n in summary["verdicts"].items()) or "no verdict"
-    became = ", ".join(f"{n} {k}" for k, n in summary["annotations"].items()) or "none"
+    became = ", ".join(f"{n} {TOLD[k]}" for k, n in summary["annotations"].items()) or "none"
     moved = summary["median_moved_mm"]
     far = "" if moved is None else (
         f"; moved by {moved:.1f} mm and {summary['median_moved_deg']:.1f} deg in the median"

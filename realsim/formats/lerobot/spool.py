@@ -118,7 +118,7 @@ class VideoFile:
             colours = np.ascontiguousarray(picture)
             frame = self._av.VideoFrame.from_ndarray(colours, format="rgb24")
             # Left to the encoder, the conversion gives other bytes in one video of a hundred.
-            frame = self._reformatter.reformat(frame, format=PIXELS)
+            frame = self._reformatter.reformat(frame, format=PIXELS, threads=1)
         frame.pts, frame.time_base = self.frames, self._stream.codec_context.time_base
         self._file.mux(self._stream.encode(frame))
         self.frames += 1
