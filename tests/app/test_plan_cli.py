@@ -48,6 +48,17 @@ def test_a_plan_is_made_and_written() -> None:
     assert Path("a.json").read_bytes() == before
 
 
+@pytest.mark.slow
+def test_a_plan_comes_after_its_pictures_so_that_what_was_interrupted_is_run_again() -> None:
+    in_the_way = Path("a_pictures/views.png")
+    in_the_way.mkdir(parents=True)
+    done = realsim("plan", "--views", 1, "--quiet", "--out", "a.json")
+    assert done.returncode == 2 and "views.png" in done.stderr and not Path("a.json").exists()
+    in_the_way.rmdir()
+    assert realsim("plan", "--views", 1, "--quiet", "--out", "a.json").returncode == 0
+    assert len(load_plan("a.json")) == 1 and in_the_way.is_file()
+
+
 @pytest.mark.parametrize(
     ("args", "says"),
     [

@@ -63,13 +63,12 @@ def run_plan(request: PlanRequest, console: Console, *, advise: bool) -> bool:
     if advise:
         show_advice(request, chain, mount, config, console)
         return True
-    out, pictures = request.out, not request.no_pictures
-    _check_free_name(out, request.overwrite, pictures)
+    out = request.out
+    _check_free_name(out, request.overwrite)
     plan = make_plan(request, chain, mount, config, console)
     plan = replace(plan, metrics=plan.metrics | plan_metrics(plan))
     from realsim_capture_plans.plan_files.plan_json import save_plan
 
-    save_plan(plan, out)
     show_plan(plan, plan.metrics, console)
     free = show_colliding(plan, console)
     if plan.kind == "hemisphere" and plan.metrics["reachable_share"] < LEAST_SHARE:
@@ -78,10 +77,11 @@ def run_plan(request: PlanRequest, console: Console, *, advise: bool) -> bool:
             f"only {100 * plan.metrics['reachable_share']:.0f} % of the directions are reachable "
             f"from here: the views leave one side out. {better_place(chain, mount, config, above)}"
         )
-    console.say(f"plan: {out}")
     files: list[Path] = []
-    if pictures:
+    if not request.no_pictures:
         files = _write_pictures(plan, plan.metrics, picture_folder(out), console)
+    save_plan(plan, out)  # last: what was interrupted before can be run again
+    console.say(f"plan: {out}")
     console.result(_document(plan, plan.metrics) | {"plan": out, "pictures": files})
     return free
 
@@ -401,17 +401,16 @@ def picture_folder(out: Path) -> Path:
     return out.with_name(out.stem + PICTURES)
 
 
-def _check_free_name(out: Path, overwrite: bool, pictures: bool) -> None:
+def _check_free_name(out: Path, overwrite: bool) -> None:
     """Raise before the work is done if its result could not be written."""
     if out.suffix.lower() != ".json":
         raise InputError(f"--out '{out}': a plan is a .json file; plan-convert writes other forms.")
     if out.is_dir():
         raise InputError(f"--out '{out}' is a folder; name a .json file.")
-    folder = picture_folder(out)
-    there = [p for p in (out, folder) if p.exists() and (pictures or p is out)]
-    if there and not overwrite:
+    require_free_folder(picture_folder(out), "the pictures of the plan:", (), ("", ()))
+    if out.exists() and not overwrite:
         raise InputError(
-            f"{there[0]} is there already, and a plan that was driven must not be lost. Name "
+            f"{out} is there already, and a plan that was driven must not be lost. Name "
             "another with --out, or replace it with --overwrite."
         )
     if out.exists():
