@@ -14,7 +14,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -319,14 +319,10 @@ def measure_coverage(a: argparse.Namespace) -> Found:
     return found
 
 
-def _faults(seed: int) -> tuple[float, list[tuple[str, int, int, dict[str, int]]]]:
-    return faults_named_share(1, seed)
-
-
 def measure_faults(a: argparse.Namespace) -> Found:
     """Measure how often the fault put into a session is named, clean sessions included."""
     found = Found()
-    trials = each(a, _faults, range(a.seed, a.seed + (1 if a.quick else 10)))
+    trials = each(a, partial(faults_named_share, 1), range(a.seed, a.seed + (1 if a.quick else 10)))
     share = float(np.mean([share for share, _ in trials]))
     found.add("faults_named_share", share, f"{len(trials)} x {len(trials[0][1])} sessions")
     layouts = layouts_that_are_read()

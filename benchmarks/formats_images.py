@@ -39,7 +39,9 @@ def write_speed(seed: int, quick: bool) -> Found:
         timed = _timed(ways, pictures, Path(home), QUICK_ROUNDS if quick else ROUNDS)
     found = Found()
     kinds = list(dict.fromkeys(p.kind for p in pictures))
-    speeds = {way: {k: _speed(timed[way, k]) for k in kinds} for way in ways}
+    speeds = {
+        way: {k: float(1.0 / np.mean([s for s, _ in timed[way, k]])) for k in kinds} for way in ways
+    }
     slowest = {way: min(by_kind.values()) for way, by_kind in speeds.items()}
     found.add("write_frames_per_s", slowest["realsim"], _over(speeds["realsim"]))
     found.add("jpeg_frames_per_s", slowest["jpeg"], _over(speeds["jpeg"]))
@@ -142,10 +144,6 @@ def _timed(ways: Mapping[str, Way], pictures: Sequence[Picture], home: Path, rou
                 timed[way, picture.kind].append((seconds / share, round(size / share)))
             shutil.rmtree(home / "written")
     return timed
-
-
-def _speed(rows: Sequence[tuple[float, int]]) -> float:
-    return float(1.0 / np.mean([s for s, _ in rows]))
 
 
 def _size(rows: Sequence[tuple[float, int]]) -> float:

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -242,16 +243,6 @@ def _make_colmap(folder: Path, *, text: bool) -> None:
     (model.write_text if text else model.write_binary)(str(folder / "sparse/0"))
 
 
-def make_colmap_text(folder: Path) -> None:
-    """Write a COLMAP project with a model of text files."""
-    _make_colmap(folder, text=True)
-
-
-def make_colmap_binary(folder: Path) -> None:
-    """Write a COLMAP project with a binary model."""
-    _make_colmap(folder, text=False)
-
-
 def read_colmap(folder: Path) -> Any:
     """Read a COLMAP project as frames."""
     from realsim.formats.colmap.source import open_colmap
@@ -302,7 +293,7 @@ SCENES = (
     Sample("session", make_session, read_session),
     Sample("graspnet", make_graspnet, read_graspnet),
     Sample("graspnet table", make_graspnet, read_graspnet_table),
-    Sample("colmap text", make_colmap_text, read_colmap),
-    Sample("colmap binary", make_colmap_binary, read_colmap),
+    Sample("colmap text", partial(_make_colmap, text=True), read_colmap),
+    Sample("colmap binary", partial(_make_colmap, text=False), read_colmap),
     Sample("nerfstudio", make_nerfstudio, read_nerfstudio),
 )

@@ -90,7 +90,10 @@ def _bop(found: Found, bop: Path, home: Path, frames: int) -> None:
     a, b = (next(r.glob("*/*/scene_gt.json")).parent for r in (bop, home / "bop2"))
     numbers, differing = 0, 0
     for name in ("scene_camera.json", "scene_gt.json", "scene_gt_info.json"):
-        first, second = (list(_leaves(_texts(folder / name))) for folder in (a, b))
+        texts = ((folder / name).read_text() for folder in (a, b))
+        first, second = (
+            list(_leaves(json.loads(t, parse_float=str, parse_int=str))) for t in texts
+        )
         numbers += len(first)
         differing += _differing(first, second)
     pixels, wrong = _pixels(a, b, ("rgb", "depth", "mask", "mask_visib"))
@@ -134,10 +137,6 @@ def _graspnet(found: Found, bop: Path, home: Path, frames: int) -> None:
         f"of {meta_numbers} numbers of single precision in the meta files; the worst is {off:.2g} "
         "off: rotations are made orthonormal when they are read",
     )  # fmt: skip
-
-
-def _texts(path: Path) -> Any:
-    return json.loads(path.read_text(), parse_float=str, parse_int=str)
 
 
 def _leaves(value: Any, place: str = "") -> Iterator[str]:

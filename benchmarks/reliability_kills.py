@@ -33,8 +33,7 @@ KILLS, QUICK_KILLS, EACH = 200, 2, 5
 FULL = signal.SIGXFSZ
 """Stands for a full disk among the ways to end: the signal of a file that may not grow."""
 ROOM_BYTES = (2_000, 100_000)
-SMALL = "--fps 4 --width 64 --height 48 --limit 2"
-BOARD = "aprilgrid_7x5_tag30mm_gap10mm"
+BOARD, SMALL = "aprilgrid:7x5,tag=30mm,gap=10mm", "--fps 4 --width 64 --height 48 --limit 2"
 LONG = {
     "annotate": "annotate session --workers 1",
     "export": "export session --to bop --out bop",
@@ -47,9 +46,8 @@ LONG = {
     "demonstrations": f"demonstrations two --out demonstrations {SMALL}",
     "register": "register raw --object mug",
     "capture": "capture shots --plan plan.json --simulated --objects 1",
-    "board": "board aprilgrid:7x5,tag=30mm,gap=10mm --paper A3",
     "plan": "plan --board-views --views 8 --center 0.45,0,0 --out views.json --overwrite",
-    "board views": f"capture lab --plan views.json --board boards/{BOARD}.json --simulated",
+    "board views": f"capture lab --plan views.json --board {BOARD} --simulated",
     "calibrate": "calibrate lab",
     "upgrade": "upgrade bop --out upgraded --grasps 2 --workers 1",
 }
@@ -57,7 +55,7 @@ LONG = {
 QUICK = ("export", "stats")
 Fields = set[tuple[str, str]]
 """Files and the fields in which they differ."""
-TIMES = {(f"{session}/robot.jsonl", f"{k}.{field}") for session in ("shots", "lab")
+TIMES = {(f"{at}/robot.jsonl", f"{k}.{field}") for at in ("shots", "lab/calibration/capture")
          for k in range(8) for field in ("time_s", "sha256")}  # fmt: skip
 """Times of captured views, and the checksums that follow from them."""
 TIMED = re.compile(r"(^|\.)(costs\..*|seconds|settle_s|created)$")

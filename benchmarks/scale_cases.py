@@ -72,7 +72,8 @@ def make_case(name: str, seed: int, width: int = FULL_WIDTH) -> Case:
     mesh = SHAPES[name]()
     rng = stream(name, seed, "lab")
     T_world_obj = standing(mesh, resting_rotation(mesh, rng), rng)
-    views = _quantised(scan_views(mesh, T_world_obj, lab(width), rng))
+    views = scan_views(mesh, T_world_obj, lab(width), rng)
+    views = replace(views, frames=tuple(map(_stored, views.frames)))
     bent = distorted(mesh, DISTORTION, stream(name, seed, "shape"))
     rng = stream(name, seed, "given")
     R_given = se3.random_rotation(rng)
@@ -107,11 +108,6 @@ def _start(mesh: Mesh, scale: float, T: Array, rng: np.random.Generator) -> Simi
     return Similarity(
         scale=rough, T_world_obj=se3.from_rt(R, place - R @ (rough * middle)), source="given"
     )
-
-
-def _quantised(views: ScanViews) -> ScanViews:
-    """Return the views as a session stores them: 16 bit of 0.1 mm."""
-    return replace(views, frames=tuple(_stored(f) for f in views.frames))
 
 
 def _stored(frame: DepthFrame) -> DepthFrame:
