@@ -173,7 +173,8 @@ def import_open3d() -> Any:
         _preload_libusb()
         _plotly_when_called()
         stand_ins.for_windows(_folder_of("open3d").glob("libOpen3D.so*"))
-        import open3d  # pyright: ignore[reportMissingTypeStubs]
+        with unbroken():  # half loaded, it ends the process with a code of its own
+            import open3d  # pyright: ignore[reportMissingTypeStubs]
     except (ImportError, OSError) as error:
         raise missing_library("open3d", error) from error
     module: ModuleType = open3d
@@ -193,11 +194,8 @@ def import_pinocchio() -> Any:
 
 def import_pycolmap() -> Any:
     """Return the module `pycolmap`, which must not answer SIGTERM with a stack trace as it does."""
-    answer = signal.getsignal(signal.SIGTERM)
-    import pycolmap
-
-    with suppress(ValueError):  # not the main thread: whoever runs that handles signals
-        signal.signal(signal.SIGTERM, answer)
+    with unbroken():
+        import pycolmap
     return pycolmap
 
 

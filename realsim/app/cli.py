@@ -127,23 +127,29 @@ def _run() -> None:
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)
-    except (click.Abort, KeyboardInterrupt, SystemError) as stop:
-        # click puts its own in the place of the one that knows how far it came, Python where a
-        # compiled loop is called.
-        reason: BaseException = stop
-        while isinstance(reason, click.Abort | SystemError) and reason.__cause__ is not None:
-            reason = reason.__cause__
-        if not isinstance(reason, click.Abort | KeyboardInterrupt):
-            raise  # a bug: its place is wanted
-        told = str(reason) or "interrupted"
-        click.echo(
-            told if told.endswith(".") else f"{told}; the same command goes on from here.", err=True
-        )
-        sys.exit(TERMINATED if isinstance(reason, Terminated) else 130)
     except BrokenPipeError:
         raise
-    except (RealsimError, ImportError, OSError) as error:
-        if (text := refusal(error)) is None:
+    except (
+        click.Abort,
+        KeyboardInterrupt,
+        SystemError,
+        RealsimError,
+        ImportError,
+        OSError,
+    ) as stop:
+        # click puts its own in the place of the one that knows how far it came, Python where a
+        # compiled loop is called, and compiled modules where they are loaded.
+        reason: BaseException = stop
+        while not isinstance(reason, KeyboardInterrupt) and reason.__cause__ is not None:
+            reason = reason.__cause__
+        if isinstance(reason, click.Abort | KeyboardInterrupt):
+            told = str(reason) or "interrupted"
+            click.echo(
+                told if told.endswith(".") else f"{told}; the same command goes on from here.",
+                err=True,
+            )
+            sys.exit(TERMINATED if isinstance(reason, Terminated) else 130)
+        if isinstance(stop, SystemError) or (text := refusal(stop)) is None:
             raise  # a bug: its place is wanted
         click.echo(f"error: {text}", err=True)
         sys.exit(2)

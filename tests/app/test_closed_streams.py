@@ -83,7 +83,9 @@ def test_pycolmap_leaves_the_answer_to_sigterm_alone() -> None:
 @pytest.mark.parametrize(
     ("cause", "code"), [("cli.Terminated()", 143), ("KeyboardInterrupt()", 130), ("None", 1)]
 )
-def test_sigterm_in_the_call_of_a_compiled_loop_is_no_bug(cause: str, code: int) -> None:
+def test_sigterm_in_a_compiled_call_while_a_module_is_loaded_is_no_bug(
+    cause: str, code: int
+) -> None:
     script = f"""if True:
         import sys
         from realsim.app import cli
@@ -91,7 +93,7 @@ def test_sigterm_in_the_call_of_a_compiled_loop_is_no_bug(cause: str, code: int)
             try:
                 raise SystemError("returned a result with an exception set") from {cause}
             except SystemError as error:
-                raise SystemError("returned a result with an exception set") from error
+                raise ImportError("initialization failed") from error
         cli.commands.command("work")(work)
         sys.argv = ["realsim", "work"]
         cli.main()
