@@ -11,44 +11,26 @@ from typing import Any
 import numpy as np
 import pytest
 
-from realsim import GraspSet, InputError
-from realsim.geometry import se3
+from realsim import InputError
 from realsim.review import journal
 from realsim.review.content.config import SceneConfig
 from realsim.review.content.content import SceneContent
 from realsim.review.static.page_nodes import LABEL_EDGES, drawn_grasps, label_class
 from realsim.review.static.static_page import PageWords, StaticSummary, write_static
 from realsim.store import save_grasps, save_scene
-from registered_sessions import registered_by_hand, table_session
+from registered_sessions import registered_by_hand, table_session, true_poses
 from tests.support.review_browser import CHROMIUM, WAIT_S, review_browser
+from tests.support.reviewed_boxes import grasp_set
 
 NASTY = "</script><script>document.title='taken'</script> & \"quoted\" <img src=http://e.example/x>"
 MADE = datetime(2026, 1, 2, 3, 4, tzinfo=UTC)
-
-
-def grasp_set(n: int = 30) -> GraspSet:
-    rng = np.random.default_rng(0)
-    nan4 = np.full((n, 4), np.nan)
-    return GraspSet(
-        obj_id=registered_by_hand_ids()[0], instance=0,
-        Ts_obj_grasp=se3.from_rt(np.diag([1.0, -1.0, -1.0]), rng.normal(scale=0.01, size=(n, 3))),
-        widths_m=np.full(n, 0.05), scores=np.append(np.linspace(0, 1, n - 1), np.nan),
-        base_scores=np.zeros(n), slip_m=nan4, slip_rad=nan4, reachable=np.ones(n, dtype=bool),
-        failures=("",) * n,
-    )  # fmt: skip
-
-
-def registered_by_hand_ids() -> list[int]:
-    from registered_sessions import true_poses
-
-    return [o.obj_id for o in true_poses()]
 
 
 @pytest.fixture(scope="module")
 def content(tmp_path_factory: pytest.TempPathFactory) -> SceneContent:
     store = table_session(tmp_path_factory.mktemp("static") / "session", views=4)
     save_scene(store, registered_by_hand(store).scene)
-    save_grasps(store, grasp_set())
+    save_grasps(store, grasp_set(true_poses()[0].obj_id, 0, 30))
     return SceneContent.load(store, SceneConfig(voxel_m=0.004))
 
 
@@ -165,7 +147,7 @@ def test_every_grasp_has_the_class_of_its_label() -> None:
 
 
 def test_the_drawn_grasps_keep_good_and_bad_in_proportion() -> None:
-    grasps = grasp_set(30)
+    grasps = grasp_set(1, 0, 30)
     assert drawn_grasps(grasps, 30).tolist() == list(range(30))
     rows = drawn_grasps(grasps, 10)
     assert len(rows) == len(set(rows.tolist())) == 10

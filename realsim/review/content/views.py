@@ -20,12 +20,8 @@ LOOK_DOWN_RAD = 0.6
 
 def worst_first(objects: Sequence[ObjectPose]) -> list[ObjectPose]:
     """Return the objects, worst verdict first, then by the smallest agreement with the depth."""
-
-    def badness(placed: ObjectPose) -> tuple[int, float, int]:
-        agree = placed.checks.get("agree", 0.0)
-        return VERDICT_ORDER.index(placed.verdict), agree, placed.instance
-
-    return sorted(objects, key=badness)
+    rank = VERDICT_ORDER.index
+    return sorted(objects, key=lambda o: (rank(o.verdict), o.checks.get("agree", 0.0), o.instance))
 
 
 def spread(views: Sequence[View], most: int) -> list[View]:

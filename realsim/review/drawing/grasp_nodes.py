@@ -24,7 +24,7 @@ class GraspNodes:
         self._node: viser.BatchedMeshHandle | None = None
         self.drawn: list[tuple[int, int]] = []
         """Instance and row of every gripper, in the order of the batch."""
-        self._on_click: list[Callable[[int, int], None]] = []
+        self._on_click: Callable[[int, int], None] = lambda instance, row: None
 
     def draw(
         self, found: Sequence[tuple[GraspSet, Rows]], Ts_world_obj: Mapping[int, Array]
@@ -50,15 +50,14 @@ class GraspNodes:
         def clicked(event: Any) -> None:
             index = event.instance_index
             if index is not None and 0 <= index < len(drawn):
-                for callback in self._on_click:
-                    callback(*drawn[index])
+                self._on_click(*drawn[index])
 
         self._node.on_click(clicked)
         return len(self.drawn)
 
     def on_click(self, callback: Callable[[int, int], None]) -> None:
         """Call back with instance and row of a grasp that is clicked."""
-        self._on_click.append(callback)
+        self._on_click = callback
 
     def clear(self) -> None:
         """Draw none."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from realsim.arrays import Array, Int64
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel, ObjectPose
@@ -138,35 +138,7 @@ def unit_sphere(divisions: int = 2) -> Mesh:
     """
     if not 0 <= divisions <= 5:
         raise InputError(f"a sphere of {divisions} divisions; 0 to 5 is accepted.")
-    g = (1 + np.sqrt(5)) / 2
-    v = np.array([[0, s, t * g] for s in (-1, 1) for t in (-1, 1)], dtype=np.float64)
-    v = np.concatenate([v, np.roll(v, 1, axis=1), np.roll(v, 2, axis=1)])
-    v /= np.linalg.norm(v, axis=1, keepdims=True)
-    # Faces are the triples of corners an edge apart, turned outwards.
-    near = (v @ v.T > 0.4) & ~np.eye(12, dtype=bool)
-    triples = [
-        (i, j, k)
-        for i in range(12)
-        for j in range(i + 1, 12)
-        for k in range(j + 1, 12)
-        if near[i, j] and near[j, k] and near[i, k]
-    ]
-    f = np.array(
-        [(i, j, k) if np.linalg.det(v[[i, j, k]]) > 0 else (i, k, j) for i, j, k in triples]
-    )
-    for _ in range(divisions):
-        v, f = _halved(v, f)
-    return Mesh(vertices=v, faces=f.astype(np.int32))
+    from trimesh.creation import icosphere
 
-
-def _halved(v: Array, f: Int64) -> tuple[Array, Int64]:
-    """Return the sphere with every edge halved and every triangle made four."""
-    edges = np.sort(f[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    unique, index = np.unique(edges, axis=0, return_inverse=True)
-    new = v[unique].sum(axis=1)
-    new /= np.linalg.norm(new, axis=1, keepdims=True)
-    ab, bc, ca = (len(v) + index.reshape(-1, 3)).T
-    a, b, c = f.T
-    rows = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-    faces = np.concatenate([np.stack(r, axis=1) for r in rows])
-    return np.concatenate([v, new]), faces
+    sphere = icosphere(subdivisions=divisions)
+    return Mesh(vertices=np.array(sphere.vertices), faces=np.array(sphere.faces, np.int32))
