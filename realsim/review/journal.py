@@ -5,12 +5,17 @@ The current state is the replay of all lines, so two servers, a crash, or a merg
 journals (their lines one after the other) can lose nothing.
 """
 
+import io
 import json
 import os
+import sys
+import threading
 import uuid
-from collections.abc import Callable, Sequence
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
+from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -22,6 +27,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import ObjectPose
+from realsim.review.refusals import SessionGone
 from realsim.store.atomic import sync_folder
 
 JOURNAL_FILE = "review/journal.jsonl"
@@ -42,6 +48,11 @@ MOST_COMMENT, MOST_NAME = 2000, 80
 """Characters of a comment, of a name or another short text."""
 MOST_BYTES = 64_000_000
 """Size of a journal: a line has about 500, so this is more than a hundred thousand decisions."""
+REPEATED = ("reviewer", "action", "subject", "symmetry", "how")
+"""Texts that many lines have in common; they are held once."""
+MOST_POSES = 1000
+"""Poses that are held once for all lines that name them."""
+BLOCK_BYTES = 1 << 16
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -96,14 +107,13 @@ class Entry:
 
     def _check_types(self) -> None:
         """Raise if a field is of another type, too long, or a number that cannot be meant."""
-        texts = (
-            "id", "time", "reviewer", "action", "subject", "comment", "undoes", "symmetry", "how",
-        )  # fmt: skip
-        for name in texts:
+        for name in ("id", "time", "comment", "undoes", *REPEATED):
             value, most = getattr(self, name), MOST_COMMENT if name == "comment" else MOST_NAME
             if not isinstance(value, str) or len(value) > most:
                 what = f"{len(value)} characters" if isinstance(value, str) else repr(value)[:60]
                 raise InputError(f"'{name}' is {what}; a text of at most {most} is accepted.")
+            if name in REPEATED:
+                object.__setattr__(self, name, sys.intern(str(value)))
         if not self.id:
             raise InputError("a journal line has no id.")
         for name in ("instance", "obj_id", "view"):
@@ -134,8 +144,8 @@ class Entry:
                 f"a journal line with the action '{self.action}' has no {' and no '.join(missing)}."
             )
         if self.T_world_obj is not None:
-            T = se3.check_rigid(np.array(self.T_world_obj, dtype=np.float64), "the journal's pose")
-            object.__setattr__(self, "T_world_obj", tuple(tuple(r) for r in T.tolist()))
+            rows = tuple(tuple(row) for row in self.T_world_obj)
+            object.__setattr__(self, "T_world_obj", _one_pose(rows))
 
     @property
     def pose(self) -> Array | None:
@@ -149,10 +159,11 @@ class ReviewState:
 
     entries: tuple[Entry, ...] = ()
     """Every line, once, in the order of the journal."""
+    standing: tuple[Entry, ...] = field(init=False, compare=False, repr=False)
+    """The decisions and comments that no standing undo takes back, in order."""
 
-    @property
-    def standing(self) -> tuple[Entry, ...]:
-        """The decisions and comments that no standing undo takes back, in order."""
+    def __post_init__(self) -> None:
+        """Find out what stands."""
         # From the end: whether a line stands depends only on the undo lines after it.
         undone: set[str] = set()
         kept: list[Entry] = []
@@ -163,15 +174,11 @@ class ReviewState:
                 undone.add(entry.undoes)
             else:
                 kept.append(entry)
-        return tuple(reversed(kept))
+        object.__setattr__(self, "standing", tuple(reversed(kept)))
 
     def of(self, instance: int) -> tuple[Entry, ...]:
         """Return the standing lines on this instance, in order."""
         return tuple(e for e in self.standing if e.instance == instance)
-
-    def comments(self, instance: int) -> tuple[Entry, ...]:
-        """Return the standing comments on this instance, on any of its poses."""
-        return tuple(e for e in self.of(instance) if e.comment.strip())
 
     def excluded_views(self) -> dict[int, Entry]:
         """Return view -> the line that excludes it, of the views that are excluded."""
@@ -191,6 +198,13 @@ class JournalContent:
     entries: tuple[Entry, ...]
     damaged: tuple[int, ...]
     """Numbers (from 1) of lines that are not whole: a process died while it wrote them."""
+
+
+@lru_cache(MOST_POSES)
+def _one_pose(rows: Rows) -> Rows:
+    """Return a pose checked, and the same object whenever it is named again."""
+    T = se3.check_rigid(np.array(rows, dtype=np.float64), "the journal's pose")
+    return tuple(tuple(row) for row in T.tolist())
 
 
 def subject_of(placed: ObjectPose) -> str:
@@ -255,18 +269,31 @@ def replay(entries: Sequence[Entry], start: ReviewState | None = None) -> Review
         InputError: two lines have one id and say different things.
     """
     before = () if start is None else start.entries
-    once: dict[str, Entry] = {}
-    for entry in (*before, *entries):
-        if once.setdefault(entry.id, entry) != entry:
+    fresh = _fresh(entries, {e.id: e for e in before})
+    return ReviewState(entries=(*before, *fresh.values()))
+
+
+def _fresh(entries: Iterable[Entry], once: Mapping[str, Entry]) -> dict[str, Entry]:
+    """Return, by id, the lines that are not among those that were there before."""
+    fresh: dict[str, Entry] = {}
+    for entry in entries:
+        was = once.get(entry.id) or fresh.setdefault(entry.id, entry)
+        if was != entry:
             raise InputError(
                 f"two lines of the journal have the id '{entry.id}' and say different things "
-                f"({once[entry.id].action} by {once[entry.id].reviewer}, {entry.action} by "
+                f"({was.action} by {was.reviewer}, {entry.action} by "
                 f"{entry.reviewer}): was it merged or edited by hand? Keep the right one."
             )
-    return ReviewState(entries=tuple(once.values()))
+    return fresh
 
 
-def append(path: Path, entry: Entry, *, check: Callable[[ReviewState], None] | None = None) -> None:
+def append(
+    path: Path,
+    entry: Entry,
+    *,
+    check: Callable[[ReviewState], None] | None = None,
+    journal: "Journal | None" = None,
+) -> None:
     """Add one line to the journal; when this returns, the line is on the disk.
 
     An exclusive lock (fcntl) lets several processes write to the same journal. A fragment that a
@@ -277,6 +304,7 @@ def append(path: Path, entry: Entry, *, check: Callable[[ReviewState], None] | N
         entry: the line.
         check: called, nobody else writing, with what the journal adds up to; what it raises keeps
             the line out (see `corrections.check_is_current`).
+        journal: who has read it before and reads on; None = it is read whole.
     """
     import fcntl
 
@@ -287,7 +315,7 @@ def append(path: Path, entry: Entry, *, check: Callable[[ReviewState], None] | N
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
         if check is not None:
-            check(replay(read(path).entries))
+            check((journal or Journal(path)).read())
         size = os.fstat(handle).st_size
         torn = size > 0 and os.pread(handle, 1, size - 1) != b"\n"
         rest = (b"\n" if torn else b"") + line.encode()
@@ -311,24 +339,87 @@ def read(path: Path) -> JournalContent:
         InputError: it is no file or far too large, a line is of a newer format, or is whole JSON
             that is no journal line.
     """
-    if not path.exists():
-        return JournalContent(entries=(), damaged=())
-    if not path.is_file() or path.stat().st_size > MOST_BYTES:
-        raise InputError(
-            f"'{path}' is no journal: a file of at most {MOST_BYTES / 1e6:.0f} MB is expected."
-        )
-    entries: list[Entry] = []
-    damaged: list[int] = []
-    for number, line in enumerate(path.read_bytes().split(b"\n"), start=1):
-        if not line.strip():
-            continue
-        try:
-            fields = json.loads(line)
-        except (ValueError, RecursionError):
-            damaged.append(number)
-            continue
-        entries.append(_entry(fields, f"{path.name}, line {number}"))
-    return JournalContent(entries=tuple(entries), damaged=tuple(damaged))
+    journal = Journal(path)
+    return JournalContent(entries=journal.read().entries, damaged=journal.damaged)
+
+
+class Journal:
+    """A journal that is read again and again; everything here may be called from any thread.
+
+    What was read stays. While the file begins with the very bytes that were read, which a checksum
+    tells, only the lines after them are parsed; otherwise it is read whole.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Take where it stands; nothing is read yet."""
+        self._path, self._lock = path, threading.RLock()
+        self.state, self._once = ReviewState(), dict[str, Entry]()
+        """What it added up to when it was read last, and its lines by id."""
+        self.damaged: tuple[int, ...] = ()
+        """As in `JournalContent`."""
+        self._stamp, self._end = (0, 0, 0), (0, 0, 0)
+        """The file as it was, and what was read of it: bytes, their checksum, lines."""
+
+    def read(self) -> ReviewState:
+        """Return what it adds up to as it is on disk now; the same object if nothing is new.
+
+        Raises:
+            SessionGone: lines that were read are gone.
+            InputError: as `read` does.
+        """
+        with self._lock:
+            if (stamp := stamp_of(self._path)) != self._stamp:
+                self._read_on()
+                self._stamp = stamp
+            return self.state
+
+    def _read_on(self) -> None:
+        entries, damaged, line, checksum = list[Entry](), list[int](), b"\n", 0
+        there = self._path.exists()
+        if there and (not self._path.is_file() or self._path.stat().st_size > MOST_BYTES):
+            raise InputError(
+                f"'{self._path}' is no journal: a file of at most {MOST_BYTES / 1e6:.0f} MB is "
+                "expected."
+            )
+        with self._path.open("rb") if there else io.BytesIO() as file:
+            for at in range(0, self._end[0], BLOCK_BYTES):
+                block = file.read(min(BLOCK_BYTES, self._end[0] - at))
+                checksum = zlib.crc32(block, checksum)
+            goes_on = (file.tell(), checksum) == self._end[:2]
+            size, checksum, number = self._end if goes_on else (0, 0, 0)
+            file.seek(size)
+            for line in file:
+                size, checksum, number = size + len(line), zlib.crc32(line, checksum), number + 1
+                try:
+                    fields = json.loads(line)
+                except (ValueError, RecursionError):
+                    damaged += [number] if line.strip() else []
+                else:
+                    entries.append(_entry(fields, f"{self._path.name}, line {number}"))
+        fresh = _fresh(entries, self._once if goes_on else {})
+        if not goes_on:
+            if lost := len(self._once.keys() - fresh.keys()):
+                raise SessionGone(
+                    f"the journal that was read is gone: {self._path} lacks {lost} of its "
+                    f"{len(self._once)} lines. Nothing is recorded meanwhile. Put the file back, "
+                    "or end `realsim review` and start it again to go on without them."
+                )
+            self.state, self._once, self.damaged = ReviewState(), {}, ()
+        if fresh:
+            self.state = ReviewState(entries=(*self.state.entries, *fresh.values()))
+            self._once |= fresh
+        self.damaged += tuple(damaged)
+        # A line without its end may go on: the file is then read whole again.
+        self._end = size, checksum if line.endswith(b"\n") else -1, number
+
+
+def stamp_of(path: Path) -> tuple[int, int, int]:
+    """Return number, size and time of change of a file; zeros where there is none."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return 0, 0, 0
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def _entry(fields: Any, where: str) -> Entry:

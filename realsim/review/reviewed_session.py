@@ -7,7 +7,6 @@ import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from realsim.formats.bop.models import model_file
 from realsim.records import ObjectModel, ObjectPose, Scene
 from realsim.review import corrections, journal, scene_list
 from realsim.review.content.config import SceneConfig
-from realsim.review.journal import JOURNAL_FILE, Entry, ReviewState
+from realsim.review.journal import JOURNAL_FILE, Entry, Journal, ReviewState
 from realsim.review.refusals import SessionGone, disk_words
 from realsim.store import SessionStore, load_scene
 
@@ -41,6 +40,8 @@ class Standing:
     state: ReviewState
     scene: Scene
     """Objects where the reviewers left them, with their verdicts."""
+    rows: list[scene_list.ObjectRow]
+    """The objects as the list shows them."""
 
 
 class ReviewedSession:
@@ -82,11 +83,8 @@ class ReviewedSession:
                 f"{store.folder / 'models'} has no model of them; copy the models there."
             )
         self._lock = threading.RLock()
-        self._stamp: tuple[int, int] | None = None
+        self._journal = Journal(self.journal_path) if before is None else before._journal
         self._standing: Standing | None = None
-        self._rows: tuple[Standing, list[scene_list.ObjectRow]] | None = None
-        self._known: dict[str, Entry] = {} if before is None else dict(before._known)
-        """Every line that was read or written, by id, whatever became of the file."""
         self._loading = threading.Lock()
         self._content: SceneContent | None = None
         self._photographs: Photographs | None = None
@@ -102,8 +100,8 @@ class ReviewedSession:
         was, self._seen = self._seen, self._stamps()
         return was == self._seen != self._read
 
-    def _stamps(self) -> list[tuple[int, int]]:
-        return [_stamp(self.store.path(name)) for name in WATCHED]
+    def _stamps(self) -> list[tuple[int, int, int]]:
+        return [journal.stamp_of(self.store.path(name)) for name in WATCHED]
 
     @property
     def has_pending(self) -> bool:
@@ -122,18 +120,17 @@ class ReviewedSession:
         """
         with self._lock:
             try:
-                stamp = _stamp(self.journal_path)
-                if self._standing is not None and stamp == self._stamp:
-                    return self._standing
-                found = journal.read(self.journal_path)
+                state = self._journal.read()
             except OSError as error:
                 raise InputError(f"the journal cannot be read: {disk_words(error)}.") from error
-            state = journal.replay(found.entries)
-            self._check_whole(state)
-            scene = corrections.reviewed_scene(self.registered, state)
-            self._stamp = stamp
-            self._standing = Standing(state=state, scene=scene)
-            self._known |= {e.id: e for e in state.entries}
+            return self._made_of(state)
+
+    def _made_of(self, state: ReviewState) -> Standing:
+        """Return what this state makes of the registered scene; made once."""
+        with self._lock:
+            if self._standing is None or self._standing.state is not state:
+                scene = corrections.reviewed_scene(self.registered, state)
+                self._standing = Standing(state=state, scene=scene, rows=self._rows(state, scene))
             return self._standing
 
     @property
@@ -142,10 +139,7 @@ class ReviewedSession:
         try:
             return self.standing
         except RealsimError:
-            with self._lock:
-                state = journal.replay(tuple(self._known.values()))
-                scene = corrections.reviewed_scene(self.registered, state)
-                return Standing(state=state, scene=scene)
+            return self._made_of(self._journal.state)
 
     def trouble(self) -> str:
         """Return what keeps the journal from being read; '' = nothing."""
@@ -158,19 +152,7 @@ class ReviewedSession:
 
     def entries_seen(self) -> list[Entry]:
         """Return all lines that were read or written, also those whose file is gone since."""
-        _ = self.latest
-        with self._lock:
-            return list(self._known.values())
-
-    def _check_whole(self, state: ReviewState) -> None:
-        """Raise if a journal lacks a line that was read from it before: none is ever removed."""
-        lost = len(self._known.keys() - {e.id for e in state.entries})
-        if lost:
-            raise SessionGone(
-                f"the journal that was read is gone: {self.journal_path} lacks {lost} of its "
-                f"{len(self._known)} lines. Nothing is recorded meanwhile. Put the file back, or "
-                "end `realsim review` and start it again to go on without them."
-            )
+        return list(self.latest.state.entries)
 
     def check_folder(self) -> None:
         """Check that the session is where it was.
@@ -184,18 +166,14 @@ class ReviewedSession:
                 "meanwhile. Put it back, or end `realsim review` and start it again where it is."
             )
 
-    def rows(self, standing: Standing | None = None) -> list[scene_list.ObjectRow]:
-        """Return the objects as the list shows them; made once for what stands.
+    def rows(self) -> list[scene_list.ObjectRow]:
+        """Return the objects as the list shows them, as the journal is on disk now."""
+        return self.standing.rows
 
-        Args:
-            standing: what the journal adds up to; None = as it is on disk now.
-        """
-        standing = standing or self.standing
-        if self._rows is not None and self._rows[0] is standing:
-            return self._rows[1]
-        corrected = corrections.corrected_scene(self.registered, standing.state)
+    def _rows(self, state: ReviewState, scene: Scene) -> list[scene_list.ObjectRow]:
+        corrected = corrections.corrected_scene(self.registered, state)
         rows: list[scene_list.ObjectRow] = []
-        all_of = (self.registered.objects, standing.scene.objects, corrected.objects)
+        all_of = (self.registered.objects, scene.objects, corrected.objects)
         for registered, placed, computed in zip(*all_of, strict=True):
             rows.append(
                 scene_list.ObjectRow(
@@ -205,11 +183,10 @@ class ReviewedSession:
                     computed=computed.verdict,
                     verdict=placed.verdict,
                     agree=placed.checks.get("agree", float("nan")),
-                    is_decided=corrections.decision_on(computed, standing.state) is not None,
+                    is_decided=corrections.decision_on(computed, state) is not None,
                     is_changed=journal.subject_of(registered) != journal.subject_of(placed),
                 )
             )
-        self._rows = standing, rows
         return rows
 
     # --- decisions --------------------------------------------------------------------------------
@@ -299,19 +276,12 @@ class ReviewedSession:
         """
         self.check_folder()
         _ = self.standing  # A journal that is gone is not begun anew.
-
-        def check_all(state: ReviewState) -> None:
-            self._check_whole(state)
-            if check is not None:
-                check(state)
-
+        check = check or (lambda _: None)
         try:
-            journal.append(self.journal_path, entry, check=check_all)
+            journal.append(self.journal_path, entry, check=check, journal=self._journal)
         except OSError as error:
             raise InputError(f"Not recorded: {disk_words(error)}.") from error
-        with self._lock:
-            self._known[entry.id] = entry
-            self._stamp = None  # What was read is older than this line.
+        _ = self.standing  # The line is remembered, whatever becomes of the file.
         return entry
 
     # --- what is shown ----------------------------------------------------------------------------
@@ -431,12 +401,3 @@ def _names(store: SessionStore) -> dict[int, str]:
             named = value.get("name") if isinstance(value, dict) else None
             rows[int(key)] = str(named or f"object {key}")
     return rows
-
-
-def _stamp(path: Path) -> tuple[int, int]:
-    """Return size and time of change of a file; zeros where there is none."""
-    try:
-        found = path.stat()
-    except FileNotFoundError:
-        return 0, 0
-    return found.st_size, found.st_mtime_ns

@@ -311,7 +311,7 @@ class ReviewServer:
 
 def counted(sessions: Sequence[ReviewedSession]) -> tuple[int, int]:
     """Return how many objects a person has judged, and how many there are."""
-    return scene_list.counts([row for s in sessions for row in s.rows(s.latest)])
+    return scene_list.counts([row for s in sessions for row in s.latest.rows])
 
 
 def words_of(entries: Sequence[journal.Entry]) -> str:

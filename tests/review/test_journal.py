@@ -24,7 +24,7 @@ def random_journal(rng: np.random.Generator, n: int) -> list[journal.Entry]:
         obj = placed(int(rng.integers(3)))
         if kind == 3 and lines:
             target = lines[int(rng.integers(len(lines)))]
-            obj = placed(target.instance)
+            obj = placed(target.instance or 0)
             lines.append(journal.new_entry("undo", obj, "ada", undoes=target.id))
         elif kind == 2:
             lines.append(journal.new_entry("comment", obj, "ada", comment="look here"))
@@ -37,7 +37,7 @@ def test_replay_of_concatenated_journals_is_replay_after_replay() -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
         a, b = random_journal(rng, 12), random_journal(rng, 9)
-        b += [journal.new_entry("undo", placed(a[0].instance), "bob", undoes=a[0].id)]
+        b += [journal.new_entry("undo", placed(a[0].instance or 0), "bob", undoes=a[0].id)]
         assert journal.replay(b, journal.replay(a)) == journal.replay(a + b)
         assert journal.replay(b, journal.replay(a)).standing == journal.replay(a + b).standing
 
@@ -80,6 +80,31 @@ def test_a_torn_line_spoils_no_other(tmp_path: Path) -> None:
     assert journal.read(path) == journal.JournalContent(entries=(first,), damaged=(2,))
     journal.append(path, second)
     assert journal.read(path) == journal.JournalContent(entries=(first, second), damaged=(2,))
+
+
+def test_reading_on_is_reading_whole_whatever_was_done_to_the_file(tmp_path: Path) -> None:
+    path, rng = tmp_path / "journal.jsonl", np.random.default_rng(8)
+    followed = journal.Journal(path)
+    for line in random_journal(rng, 200):
+        journal.append(path, line)
+        done, data = rng.integers(12), path.read_bytes()
+        torn, again = b'\n{"format": 1, "id": "abc", "ti', b" \n" + data[: data.index(b"\n")]
+        edited = data.replace(b'"accept"', b'"reject"', 1)  # in place, no byte more or less
+        if done < 4:
+            path.write_bytes((data + torn, data + again, edited, b"\n" + data)[done])
+        if done < 6:
+            now = journal.JournalContent(entries=followed.read().entries, damaged=followed.damaged)
+            assert now == journal.read(path)
+
+
+def test_what_was_read_is_not_read_again_and_held_once(tmp_path: Path) -> None:
+    followed = journal.Journal(path := tmp_path / "journal.jsonl")
+    for _ in range(9):
+        before, line = followed.read().entries, journal.new_entry("accept", placed(), "ada")
+        journal.append(path, line, check=lambda _: None, journal=followed)
+        *same, last = followed.read().entries
+        assert all(a is b for a, b in zip(before, same, strict=True))
+        assert all(e.T_world_obj is last.T_world_obj and e.subject is last.subject for e in before)
 
 
 def test_foreign_lines_are_refused_with_their_number(tmp_path: Path) -> None:

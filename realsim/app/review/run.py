@@ -89,9 +89,8 @@ def write_page(request: ReviewRequest, path: Path, console: Console) -> None:
         InputError: the file cannot be made there, there are several sessions, or a model is
             missing.
     """
-    from realsim.review import journal
+    from realsim.app.reviewed import review_of
     from realsim.review.content.content import SceneConfig, SceneContent
-    from realsim.review.journal import JOURNAL_FILE
     from realsim.review.static.static_page import write_static
 
     folders = scene_list.sessions_under(request.folders)
@@ -101,7 +100,7 @@ def write_page(request: ReviewRequest, path: Path, console: Console) -> None:
             "... Give the one that is meant."
         )
     store = _opened(folders[0])
-    state = journal.replay(journal.read(store.path(JOURNAL_FILE)).entries)
+    state = review_of(store)
     with console.stage("read", store.session.name) as tick:
         content = SceneContent.load(store, SceneConfig(), tick)
     with console.stage("write", str(path)) as tick:

@@ -43,7 +43,8 @@ def object_rows(content: SceneContent, scene: Scene, state: ReviewState) -> list
         lines = [*_judged(was, decision_on(was, state)), *was.reasons]
         quotes = [
             (_said(e.comment), _said(f"{e.reviewer}, {e.time[:10]}"))
-            for e in state.comments(placed.instance)
+            for e in state.of(placed.instance)
+            if e.comment.strip()
         ]
         rows.append({
             "instance": placed.instance, "name": _said(model.name), "verdict": placed.verdict,
