@@ -58,10 +58,13 @@ def test_ctrl_c_ends_with_a_summary_and_exit_code_0(tmp_path: Path) -> None:
     assert "1 reject" in err and "--from-review" in err
 
 
-def test_the_static_page_is_of_one_scene(tmp_path: Path) -> None:
+def test_a_static_page_is_of_one_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What is torn of its journal is told."""
     from realsim.app.console import Console
 
-    boxes_session(tmp_path / "root/a").close()
+    torn = boxes_session(tmp_path / "root/a").folder / "review/journal.jsonl"
+    torn.parent.mkdir()
+    torn.write_text('{"format": 2, "id\n')
     boxes_session(tmp_path / "root/b").close()
     console = Console(quiet=True, as_json=True)
     request = ReviewRequest(folders=(tmp_path / "root",))
@@ -69,6 +72,7 @@ def test_the_static_page_is_of_one_scene(tmp_path: Path) -> None:
         write_page(request, tmp_path / "page.html", console)
     write_page(ReviewRequest(folders=(tmp_path / "root/a",)), tmp_path / "page.html", console)
     assert (tmp_path / "page.html").read_bytes().lstrip()[:15].lower() == b"<!doctype html>"
+    assert "line 1 of" in capsys.readouterr().err
 
 
 def test_where_the_static_page_cannot_be_is_told_before_anything_is_read(tmp_path: Path) -> None:

@@ -37,12 +37,9 @@ def content(tmp_path_factory: pytest.TempPathFactory) -> SceneContent:
 @pytest.fixture(scope="module")
 def state(content: SceneContent) -> journal.ReviewState:
     first, second = content.scene.objects
-    return journal.replay(
-        [
-            journal.new_entry("reject", first, "Ada <b>L</b>", comment=NASTY),
-            journal.new_entry("comment", second, "Grace", comment="seen from one side only"),
-        ]
-    )
+    one = journal.new_entry("reject", first, "Ada <b>L</b>", comment=NASTY)
+    other = journal.new_entry("comment", second, "Grace", comment="seen from one side only")
+    return journal.replay([one, other])
 
 
 @pytest.fixture(scope="module")
