@@ -10,9 +10,10 @@ from realsim.errors import InputError
 from realsim.geometry import camera
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import TAG_CELLS, Chessboard, CircleGrid
+from realsim_calibration.detect import tags
 from realsim_calibration.detect.find import find_target
 from realsim_calibration.detect.homography import apply_homography, fit_homography, seen_from_front
-from realsim_calibration.detect.tags import DetectionConfig, detect_tags
+from realsim_calibration.detect.tags import detect_tags
 from realsim_calibration.detect.visible import what_is_visible
 
 
@@ -263,13 +264,14 @@ def test_bright_dots_on_black_are_found_too():
     assert len(d) == 35 and np.abs(d.uv - truth(target, T)).max() < 0.1
 
 
-def test_bad_tags_are_rejected_with_a_reason():
+def test_bad_tags_are_rejected_with_a_reason(monkeypatch: pytest.MonkeyPatch):
     board = TARGETS["tags"]
     image = picture(board, pose(board, 10.0))
     pale = (118 + (image.astype(float) - 118) * 0.1).astype(np.uint8)
     d = detect_tags(pale, board)
     assert not len(d) and d.rejected and all("low contrast" in r for _, r in d.rejected)
-    d = detect_tags(image, board, DetectionConfig(min_side_px=100.0))
+    monkeypatch.setattr(tags, "MIN_SIDE_PX", 100.0)
+    d = detect_tags(image, board)
     assert [i for i, _ in d.rejected] == board.ids.tolist()
     assert all("too small" in r for _, r in d.rejected)
 

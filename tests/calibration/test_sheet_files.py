@@ -11,7 +11,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.records import CharucoBoard
-from realsim_calibration.sheets import SheetConfig, largest_fit, make_board, paper_size, write_sheet
+from realsim_calibration.sheets import largest_fit, make_board, paper_size, write_sheet
 from realsim_calibration.targets.target_text import parse_target
 
 pdfium = pytest.importorskip("pypdfium2", reason="rasterising a PDF needs pypdfium2")
@@ -60,7 +60,7 @@ def test_papers() -> None:
             paper_size(bad)
     with pytest.raises(InputError, match="Nothing fits there: the rulers need 100 mm"):
         write_sheet(parse_target("tag:7,size=20mm"), Path("x.pdf"), paper=(80, 80))
-    assert largest_fit(parse_target("tag:7,size=20mm"), (80, 80), SheetConfig()) is None
+    assert largest_fit(parse_target("tag:7,size=20mm"), (80, 80), cut_marks=False) is None
 
 
 def test_make_board_writes_sheet_target_and_picture(tmp_path: Path) -> None:

@@ -14,15 +14,11 @@ from realsim_calibration.detect.chessboard import find_chessboard
 from realsim_calibration.detect.circles import find_circles
 from realsim_calibration.detect.drawings import drawing_reason
 from realsim_calibration.detect.images import gray_image, size_of
-from realsim_calibration.detect.tags import DetectionConfig, TagDetections, detect_tags
+from realsim_calibration.detect.tags import TagDetections, detect_tags
 from realsim_calibration.views import TargetDetection
 
 FEW_POINTS = 8
 """With fewer points it is looked at whether the picture is blurred."""
-
-
-TAGS = DetectionConfig()
-"""Boards of AprilTags."""
 
 
 def find_target(
@@ -62,9 +58,7 @@ def find_target(
 def _points(gray: UInt8, target: Target, intrinsics: CameraIntrinsics | None) -> TargetDetection:
     """Return the points by the search for the target's kind."""
     if isinstance(target, TagBoard):
-        return tag_points(
-            detect_tags(gray, target, TAGS, intrinsics=intrinsics), target, size_of(gray)
-        )
+        return tag_points(detect_tags(gray, target, intrinsics=intrinsics), target, size_of(gray))
     if isinstance(target, CharucoBoard):
         return find_charuco(gray, target, intrinsics=intrinsics)
     if isinstance(target, Chessboard):

@@ -27,38 +27,32 @@ from realsim_calibration.detect.tag_layout import check_layout, read_missing_tag
 
 WEAK_FAMILIES = ("tag16h5",)
 """Families whose codes turn up by chance in any picture: one tag of a board proves nothing."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DetectionConfig:
-    """When a tag is good enough to calibrate with."""
-
-    max_blur_px: float = 2.0
-    """Largest sigma of the edges' blur [px]: the profiles reach 3.5 px, beyond it they see no
-    plateau and corners drift by half a pixel."""
-    square_cut_px: float = 4.0
-    """Stretch at the ends of a side that is not sampled where a black square touches the tag's
-    corner [px]: twice a strong blur and more."""
-    square_move_share: float = 0.08
-    """Furthest that refinement may move a corner there, in tag sides: the rough outline runs on
-    into the square, by less than a module."""
-    guided_rounds: int = 3
-    """How often tags are looked for beside those found: every round reaches further out."""
-    layout_share: float = 0.5
-    """Furthest that a corner may lie from where the rest of the board puts it, in tag sides; a
-    strong lens bends a board by 0.2, a wrong tag is off by more than one."""
-    min_side_px: float = 16.0
-    """Shortest side [px]: below two pixels per module the border no longer separates the edge
-    from the pattern."""
-    min_contrast: float = 25.0
-    """Least step across an edge [gray levels of 255]; noise of 4 levels then stays under 0.2 px."""
-    max_residual_px: float = 0.35
-    """Largest scatter of edge points about the lines [px]: beyond it the side is bent or
-    covered."""
-    min_inlier_share: float = 0.5
-    """Least share of the profiles that must carry each side."""
-    max_move_px: float = 3.0
-    """Furthest that refinement may move a corner [px]; more means it found another edge."""
+MAX_BLUR_PX = 2.0
+"""Largest sigma of the edges' blur [px]: the profiles reach 3.5 px, beyond it they see no
+plateau and corners drift by half a pixel."""
+SQUARE_CUT_PX = 4.0
+"""Stretch at the ends of a side that is not sampled where a black square touches the tag's
+corner [px]: twice a strong blur and more."""
+SQUARE_MOVE_SHARE = 0.08
+"""Furthest that refinement may move a corner there, in tag sides: the rough outline runs on
+into the square, by less than a module."""
+GUIDED_ROUNDS = 3
+"""How often tags are looked for beside those found: every round reaches further out."""
+LAYOUT_SHARE = 0.5
+"""Furthest that a corner may lie from where the rest of the board puts it, in tag sides; a
+strong lens bends a board by 0.2, a wrong tag is off by more than one."""
+MIN_SIDE_PX = 16.0
+"""Shortest side [px]: below two pixels per module the border no longer separates the edge
+from the pattern."""
+MIN_CONTRAST = 25.0
+"""Least step across an edge [gray levels of 255]; noise of 4 levels then stays under 0.2 px."""
+MAX_RESIDUAL_PX = 0.35
+"""Largest scatter of edge points about the lines [px]: beyond it the side is bent or
+covered."""
+MIN_INLIER_SHARE = 0.5
+"""Least share of the profiles that must carry each side."""
+MAX_MOVE_PX = 3.0
+"""Furthest that refinement may move a corner [px]; more means it found another edge."""
 
 
 def _per_tag(value: ArrayLike | None, n: int, name: str) -> Array:
@@ -115,24 +109,18 @@ class TagDetections:
 
 
 def detect_tags(
-    rgb: UInt8,
-    board: TagBoard,
-    config: DetectionConfig | None = None,
-    *,
-    intrinsics: CameraIntrinsics | None = None,
+    rgb: UInt8, board: TagBoard, *, intrinsics: CameraIntrinsics | None = None
 ) -> TagDetections:
     """Return the board's tags in an image.
 
     Args:
         rgb: (H, W, 3) or gray (H, W) image, uint8.
         board: which ids belong to the board, and how wide the white gap is.
-        config: when a tag is good enough.
         intrinsics: with them, edges are fitted as the bent curves that the lens makes of them.
 
     Raises:
         InputError: the image is not 8 bit, or not (H, W) or (H, W, 3).
     """
-    config = config or DetectionConfig()
     gray = gray_image(rgb)
     ids, corners, border = _decode(gray, board)
     rejected: list[tuple[int, str]] = []
@@ -147,11 +135,11 @@ def detect_tags(
     missing = np.setdiff1d(board.ids, ids[twice])
     keep = ours & ~twice
     seen = (ids[keep], corners[keep])
-    ids, corners, misplaced, roll = _on_board(*seen, board, config)
+    ids, corners, misplaced, roll = _on_board(*seen, board)
     rejected += misplaced
-    found = _measured(gray, ids, corners, border, (board, config, intrinsics))
+    found = _measured(gray, ids, corners, border, (board, intrinsics))
     # What was found says where the rest must be; what is found there helps the next round.
-    for _ in range(config.guided_rounds if board.rows * board.columns > 1 else 0):
+    for _ in range(GUIDED_ROUNDS if board.rows * board.columns > 1 else 0):
         left = np.setdiff1d(missing, [*found.ids, *(i for i, _ in found.rejected)])
         if len(found) < 2 or not len(left):
             break
@@ -159,7 +147,7 @@ def detect_tags(
         more = read_missing_tags(gray, board, (found.ids, found.corners_px), left, code)
         if not len(more[0]):
             break
-        found = _both(found, _measured(gray, *more, border, (board, config, intrinsics)))
+        found = _both(found, _measured(gray, *more, border, (board, intrinsics)))
     told = [(i, r) for i, r in rejected if i not in found.ids]
     return replace(found, rejected=tuple(sorted({*told, *found.rejected})))
 
@@ -175,21 +163,20 @@ def _measured(
     ids: Int64,
     corners: Array,
     border: int,
-    how: tuple[TagBoard, DetectionConfig, CameraIntrinsics | None],
+    how: tuple[TagBoard, CameraIntrinsics | None],
 ) -> TagDetections:
     """Return those of the tags (n,) with rough corners (n, 4, 2) that can be measured well."""
-    board, config, intrinsics = how
+    board, intrinsics = how
     if not len(ids):
         return TagDetections(ids=ids, corners_px=corners)
     clear = (border / (TAG_CELLS[board.family] + 2 * (border - 1)), board.gap_m / board.tag_size_m)
-    cut_px, limits = CORNER_CUT_PX, config
+    cut_px, most_px = CORNER_CUT_PX, MAX_MOVE_PX
     if board.corner_squares:
-        cut_px = max(cut_px, config.square_cut_px)
+        cut_px = max(cut_px, SQUARE_CUT_PX)
         side = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)))
-        most = max(config.max_move_px, config.square_move_share * side)
-        limits = replace(config, max_move_px=most)
+        most_px = max(MAX_MOVE_PX, SQUARE_MOVE_SHARE * side)
     refined = refine_quads(gray, corners, clear, intrinsics, cut_px)
-    reasons = [_fault(refined, corners, k, gray.shape, limits) for k in range(len(ids))]
+    reasons = [_fault(refined, corners, k, gray.shape, most_px) for k in range(len(ids))]
     good = np.array([not r for r in reasons], dtype=bool)
     return TagDetections(
         ids=ids[good],
@@ -233,14 +220,14 @@ def _decode(gray: UInt8, board: TagBoard) -> tuple[Int64, Array, int]:
 
 
 def _on_board(
-    ids: Int64, corners: Array, board: TagBoard, config: DetectionConfig
+    ids: Int64, corners: Array, board: TagBoard
 ) -> tuple[Int64, Array, list[tuple[int, str]], int]:
     """Return the tags on the board, corners in its order, others' faults, the codes' turns."""
     if len(ids) == 1 and board.rows * board.columns > 1 and board.family in WEAK_FAMILIES:
         return ids[:0], corners[:0], [(int(ids[0]), f"one {board.family} alone may be chance")], 0
     if len(ids) < 2:
         return ids, corners, [], 0
-    layout = check_layout(ids, corners, board, config.layout_share)
+    layout = check_layout(ids, corners, board, LAYOUT_SHARE)
     bad = [(int(i), layout.reason) for i in ids[~layout.good]]
     # Some generators print the codes turned on the page; the grid says by how much.
     corners = np.roll(corners[layout.good], layout.roll, axis=1)
@@ -248,7 +235,7 @@ def _on_board(
 
 
 def _fault(
-    refined: RefinedQuads, start: Array, k: int, shape: tuple[int, ...], config: DetectionConfig
+    refined: RefinedQuads, start: Array, k: int, shape: tuple[int, ...], most_px: float
 ) -> str:
     """Return why tag k cannot be used, '' where it can."""
     corners = refined.corners_px[k]
@@ -259,18 +246,18 @@ def _fault(
     inside = bool(corners.min() >= 0 and np.all(corners.max(0) <= [shape[1] - 1, shape[0] - 1]))
     # Written as "is it good", so that a NaN is a fault. The first fault is the one that is told.
     checks = (
-        (side >= config.min_side_px,
-         f"too small: its shortest side is {side:.1f} px (at least {config.min_side_px:g})"),
-        (contrast >= config.min_contrast,
-         f"low contrast: {contrast:.0f} levels (at least {config.min_contrast:g})"),
-        (float(refined.sharpness_px[k]) <= config.max_blur_px,
+        (side >= MIN_SIDE_PX,
+         f"too small: its shortest side is {side:.1f} px (at least {MIN_SIDE_PX:g})"),
+        (contrast >= MIN_CONTRAST,
+         f"low contrast: {contrast:.0f} levels (at least {MIN_CONTRAST:g})"),
+        (float(refined.sharpness_px[k]) <= MAX_BLUR_PX,
          f"out of focus: edges are blurred by {refined.sharpness_px[k]:.1f} px (at most "
-         f"{config.max_blur_px:g})"),
-        (share >= config.min_inlier_share,
+         f"{MAX_BLUR_PX:g})"),
+        (share >= MIN_INLIER_SHARE,
          f"edge covered or broken: {share:.0%} of a side's profiles fit"),
-        (residual <= config.max_residual_px,
-         f"residual: edges scatter by {residual:.2f} px (at most {config.max_residual_px:g})"),
-        (moved <= config.max_move_px,
+        (residual <= MAX_RESIDUAL_PX,
+         f"residual: edges scatter by {residual:.2f} px (at most {MAX_RESIDUAL_PX:g})"),
+        (moved <= most_px,
          f"residual: the refined corners lie {moved:.1f} px from the detected ones"),
         (inside, "cut by the image border"),
     )  # fmt: skip

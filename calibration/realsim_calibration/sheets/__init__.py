@@ -1,7 +1,7 @@
 """Printable targets: vector sheets at exact scale, and pictures of them."""
 
 from realsim_calibration.sheets.artwork import Artwork, artwork_of, dot_diameters_m, target_image
-from realsim_calibration.sheets.layout import Ruler, SheetConfig
+from realsim_calibration.sheets.layout import Ruler
 from realsim_calibration.sheets.write import (
     PAPERS_MM,
     SheetReport,
@@ -15,7 +15,6 @@ __all__ = [
     "PAPERS_MM",
     "Artwork",
     "Ruler",
-    "SheetConfig",
     "SheetReport",
     "artwork_of",
     "dot_diameters_m",

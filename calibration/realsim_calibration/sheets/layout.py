@@ -26,39 +26,32 @@ from realsim_calibration.targets.target_text import describe, format_target
 Place = Literal["bottom", "side"]
 Marks = list[Line | Area | Label]
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SheetConfig:
-    """Sizes of what surrounds the target."""
-
-    edge_mm: float = 6.0
-    """White that is left at the page's edge: office printers cannot print on the outer 4 to 5."""
-    ruler_mm: float = 7.0
-    """Depth of a ruler with its numbers."""
-    least_ruler_mm: float = 100.0
-    """Shortest ruler: a reading error of 0.2 mm is then 0.2 % of scale."""
-    axis_mm: float = 5.0
-    """Depth of the strip in which an axis's arrow lies."""
-    least_quiet_mm: float = 5.0
-    """Least white around the target, whatever its kind: thinner borders vanish under blur."""
-    arrow_mm: float = 14.0
-    """Length of an axis's arrow."""
-    line_mm: float = 0.18
-    """Width of thin lines: the thinnest that office printers draw without gaps."""
-    title_pt: float = 9.0
-    """Size of the first line of text."""
-    text_pt: float = 7.5
-    """Size of the other lines: the smallest that is read without effort."""
-    number_pt: float = 6.5
-    """Size of a ruler's numbers."""
-    cut_marks: bool = False
-    """Whether marks show where the quiet zone may be cut off."""
-    text_gap_mm: float = 2.0
-    """White between the text and what is beside it."""
-    cut_gap_mm: float = 1.0
-    """White between a cut mark and the corner that it marks: a cut there leaves no black."""
-    preview_px: int = 1600
-    """Longer side of the picture for the screen [px]."""
+EDGE_MM = 6.0
+"""White that is left at the page's edge: office printers cannot print on the outer 4 to 5."""
+RULER_MM = 7.0
+"""Depth of a ruler with its numbers."""
+LEAST_RULER_MM = 100.0
+"""Shortest ruler: a reading error of 0.2 mm is then 0.2 % of scale."""
+AXIS_MM = 5.0
+"""Depth of the strip in which an axis's arrow lies."""
+LEAST_QUIET_MM = 5.0
+"""Least white around the target, whatever its kind: thinner borders vanish under blur."""
+ARROW_MM = 14.0
+"""Length of an axis's arrow."""
+LINE_MM = 0.18
+"""Width of thin lines: the thinnest that office printers draw without gaps."""
+TITLE_PT = 9.0
+"""Size of the first line of text."""
+TEXT_PT = 7.5
+"""Size of the other lines: the smallest that is read without effort."""
+NUMBER_PT = 6.5
+"""Size of a ruler's numbers."""
+TEXT_GAP_MM = 2.0
+"""White between the text and what is beside it."""
+CUT_GAP_MM = 1.0
+"""White between a cut mark and the corner that it marks: a cut there leaves no black."""
+PREVIEW_PX = 1600
+"""Longer side of the picture for the screen [px]."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -128,31 +121,31 @@ def sheet_text(target: Target, rulers: tuple[Ruler, Ruler]) -> list[tuple[str, b
 
 
 def lay_out(
-    target: Target, artwork: Artwork, page_mm: tuple[float, float], place: Place, c: SheetConfig
+    target: Target, artwork: Artwork, page_mm: tuple[float, float], place: Place, cut_marks: bool
 ) -> Layout | None:
     """Return where everything goes on a page, None if it does not fit."""
     width, height = page_mm
-    corner = (c.edge_mm + c.ruler_mm, height - c.edge_mm - c.ruler_mm)
-    lengths = [math.floor(v / 10 + 1e-9) * 10.0 for v in (width - c.edge_mm - corner[0] - 2,
-                                                          corner[1] - c.edge_mm - 2)]  # fmt: skip
-    if min(lengths) < c.least_ruler_mm:
+    corner = (EDGE_MM + RULER_MM, height - EDGE_MM - RULER_MM)
+    lengths = [math.floor(v / 10 + 1e-9) * 10.0 for v in (width - EDGE_MM - corner[0] - 2,
+                                                          corner[1] - EDGE_MM - 2)]  # fmt: skip
+    if min(lengths) < LEAST_RULER_MM:
         return None
     rulers = (
-        Ruler(zero_mm=(corner[0], height - c.edge_mm), length_mm=lengths[0], upward=False),
-        Ruler(zero_mm=(c.edge_mm, corner[1]), length_mm=lengths[1], upward=True),
+        Ruler(zero_mm=(corner[0], height - EDGE_MM), length_mm=lengths[0], upward=False),
+        Ruler(zero_mm=(EDGE_MM, corner[1]), length_mm=lengths[1], upward=True),
     )
     along = lengths[0] if place == "bottom" else lengths[1]
-    text = _set_text(target, rulers, along, c)
-    depth = _text_depth(text) + c.text_gap_mm
-    cut = c.axis_mm if c.cut_marks else 0.0
+    text = _set_text(target, rulers, along)
+    depth = _text_depth(text) + TEXT_GAP_MM
+    cut = AXIS_MM if cut_marks else 0.0
     free = [
-        corner[0] + c.axis_mm,
-        c.edge_mm + c.axis_mm,
-        width - c.edge_mm - (depth if place == "side" else 0.0) - cut,
+        corner[0] + AXIS_MM,
+        EDGE_MM + AXIS_MM,
+        width - EDGE_MM - (depth if place == "side" else 0.0) - cut,
         corner[1] - (depth if place == "bottom" else 0.0) - cut,
     ]
     x0, y0, x1, y1 = (1000 * v for v in artwork.bounds_m)
-    quiet = max(1000 * quiet_zone_m(target), c.least_quiet_mm)
+    quiet = max(1000 * quiet_zone_m(target), LEAST_QUIET_MM)
     spare_x = free[2] - free[0] - (x1 - x0) - 2 * quiet
     spare_y = free[3] - free[1] - (y1 - y0) - 2 * quiet
     if spare_x < -1e-6 or spare_y < -1e-6:
@@ -168,28 +161,28 @@ def lay_out(
     )
 
 
-def needed_page(target: Target, artwork: Artwork, c: SheetConfig) -> tuple[float, float]:
+def needed_page(target: Target, artwork: Artwork, cut_marks: bool) -> tuple[float, float]:
     """Return the smallest page on which the target fits with the text at the bottom [mm]."""
     x0, y0, x1, y1 = (1000 * v for v in artwork.bounds_m)
-    quiet = max(1000 * quiet_zone_m(target), c.least_quiet_mm)
-    around = 2 * c.edge_mm + c.ruler_mm
-    least = around + c.least_ruler_mm + 2
-    width = max(least, math.ceil(around + c.axis_mm + x1 - x0 + 2 * quiet))
-    height = max(least, math.ceil(around + c.axis_mm + y1 - y0 + 2 * quiet))
-    while lay_out(target, artwork, (width, height), "bottom", c) is None:
+    quiet = max(1000 * quiet_zone_m(target), LEAST_QUIET_MM)
+    around = 2 * EDGE_MM + RULER_MM
+    least = around + LEAST_RULER_MM + 2
+    width = max(least, math.ceil(around + AXIS_MM + x1 - x0 + 2 * quiet))
+    height = max(least, math.ceil(around + AXIS_MM + y1 - y0 + 2 * quiet))
+    while lay_out(target, artwork, (width, height), "bottom", cut_marks) is None:
         height += 1.0
     return width, height
 
 
 def _set_text(
-    target: Target, rulers: tuple[Ruler, Ruler], measure: float, c: SheetConfig
+    target: Target, rulers: tuple[Ruler, Ruler], measure: float
 ) -> list[tuple[str, Font, float]]:
     """Return the lines of text, broken to a width [mm]."""
     lines: list[tuple[str, Font, float]] = []
     font: Font
     for k, (paragraph, is_name) in enumerate(sheet_text(target, rulers)):
         font = "Courier-Bold" if is_name else ("Helvetica-Bold" if k == 0 else "Helvetica")
-        size = c.title_pt if k == 0 else c.text_pt
+        size = TITLE_PT if k == 0 else TEXT_PT
         if is_name:
             # The name must stay on one line to be copied; the smallest print is still legible.
             size = max(4.5, min(size, size * measure / text_width_mm(paragraph, font, size)))
@@ -211,50 +204,46 @@ def _line_pitch(size_pt: float) -> float:
 # --- marks ------------------------------------------------------------------------------------
 
 
-def page_of(artwork: Artwork, layout: Layout, c: SheetConfig) -> Page:
+def page_of(artwork: Artwork, layout: Layout, cut_marks: bool) -> Page:
     """Return everything that is printed."""
     marks: Marks = []
     for ruler in layout.rulers:
-        marks += _ruler_marks(ruler, c)
-    marks += _axis_marks(layout, c)
-    marks += _text_marks(layout, c)
-    if c.cut_marks:
-        marks += _cut_marks(layout, c)
+        marks += _ruler_marks(ruler)
+    marks += _axis_marks(layout)
+    marks += _text_marks(layout)
+    if cut_marks:
+        marks += _cut_marks(layout)
     return Page(size_mm=layout.page_mm, artwork=artwork, origin_mm=layout.origin_mm, marks=marks)
 
 
-def _ruler_marks(ruler: Ruler, c: SheetConfig) -> Marks:
+def _ruler_marks(ruler: Ruler) -> Marks:
     """Return a ruler: a mark each millimetre at its exact place, a number each centimetre."""
     x0, y0 = ruler.zero_mm
 
     def at(along: float, across: float) -> tuple[float, float]:
         return (x0 + across, y0 - along) if ruler.upward else (x0 + along, y0 - across)
 
-    half = c.line_mm / 2
+    half = LINE_MM / 2
     length = ruler.length_mm
-    marks: Marks = [Line(start=at(-half, 0), end=at(length + half, 0), width=c.line_mm)]
+    marks: Marks = [Line(start=at(-half, 0), end=at(length + half, 0), width=LINE_MM)]
     for k in range(round(length) + 1):
         tall = 3.6 if k % 10 == 0 else 2.6 if k % 5 == 0 else 1.6
-        marks.append(Line(start=at(k, 0), end=at(k, tall), width=c.line_mm))
+        marks.append(Line(start=at(k, 0), end=at(k, tall), width=LINE_MM))
         if k % 10 == 0:
             # Numbers of the upright ruler are turned with it, their feet towards the marks.
             across = 6.0 if ruler.upward else 4.2
             number = Label(
-                at=at(k, across),
-                text=f"{k}",
-                size_pt=c.number_pt,
-                centred=True,
-                upward=ruler.upward,
+                at=at(k, across), text=f"{k}", size_pt=NUMBER_PT, centred=True, upward=ruler.upward
             )
             marks.append(number)
     marks.append(
-        Label(at=at(length + 3.2, 6.0 if ruler.upward else 4.2), text="mm", size_pt=c.number_pt,
+        Label(at=at(length + 3.2, 6.0 if ruler.upward else 4.2), text="mm", size_pt=NUMBER_PT,
               upward=ruler.upward)
     )  # fmt: skip
     return marks
 
 
-def _axis_marks(layout: Layout, c: SheetConfig) -> Marks:
+def _axis_marks(layout: Layout) -> Marks:
     """Return the arrows of x and y beside the quiet zone, each with a mark at the origin."""
     left, top = layout.quiet_mm[:2]
     x0, y0 = layout.origin_mm
@@ -266,46 +255,46 @@ def _axis_marks(layout: Layout, c: SheetConfig) -> Marks:
                line: float = line) -> tuple[float, float]:  # fmt: skip
             return (line - out, start + along) if upright else (start + along, line - out)
 
-        tip = c.arrow_mm
+        tip = ARROW_MM
         marks += [
-            Line(start=at(0, -1.0), end=at(0, 1.0), width=c.line_mm),
-            Line(start=at(0, 0), end=at(tip - 1.5, 0), width=c.line_mm),
+            Line(start=at(0, -1.0), end=at(0, 1.0), width=LINE_MM),
+            Line(start=at(0, 0), end=at(tip - 1.5, 0), width=LINE_MM),
             Area(corners=(at(tip, 0), at(tip - 2.4, 0.7), at(tip - 2.4, -0.7))),
             Label(at=(line - 2.6, start + 0.8) if upright else (start, line - 1.6), text="0",
-                  size_pt=c.number_pt, centred=True),
+                  size_pt=NUMBER_PT, centred=True),
             Label(at=(line, start + tip + 2.9) if upright else (start + tip + 1.4, line + 0.7),
-                  text=name, size_pt=c.title_pt, font="Helvetica-Bold", centred=upright),
+                  text=name, size_pt=TITLE_PT, font="Helvetica-Bold", centred=upright),
         ]  # fmt: skip
     return marks
 
 
-def _text_marks(layout: Layout, c: SheetConfig) -> Marks:
+def _text_marks(layout: Layout) -> Marks:
     """Return the lines of text at the bottom or up the right side."""
     width, height = layout.page_mm
     depth = _text_depth(layout.text)
-    bottom = height - c.edge_mm - c.ruler_mm
+    bottom = height - EDGE_MM - RULER_MM
     marks: Marks = []
     done = 0.0
     for text, font, size in layout.text:
         done += _line_pitch(size)
         inset = depth - done + 0.3 * size * POINT_MM
-        at = (c.edge_mm + c.ruler_mm + c.text_gap_mm, bottom - inset - 0.5)
+        at = (EDGE_MM + RULER_MM + TEXT_GAP_MM, bottom - inset - 0.5)
         if layout.place == "side":
-            at = (width - c.edge_mm - inset, bottom - c.text_gap_mm)
+            at = (width - EDGE_MM - inset, bottom - TEXT_GAP_MM)
         marks.append(
             Label(at=at, text=text, size_pt=size, font=font, upward=layout.place == "side")
         )
     return marks
 
 
-def _cut_marks(layout: Layout, c: SheetConfig) -> Marks:
+def _cut_marks(layout: Layout) -> Marks:
     """Return marks outside the four corners of the quiet zone, in line with its edges."""
     left, top, right, bottom = layout.quiet_mm
     marks: Marks = []
     for x, outward_x in ((left, -1.0), (right, 1.0)):
         for y, outward_y in ((top, -1.0), (bottom, 1.0)):
-            x0, x1 = (x + outward_x * v for v in (c.cut_gap_mm, c.axis_mm))
-            y0, y1 = (y + outward_y * v for v in (c.cut_gap_mm, c.axis_mm))
-            marks.append(Line(start=(x0, y), end=(x1, y), width=c.line_mm))
-            marks.append(Line(start=(x, y0), end=(x, y1), width=c.line_mm))
+            x0, x1 = (x + outward_x * v for v in (CUT_GAP_MM, AXIS_MM))
+            y0, y1 = (y + outward_y * v for v in (CUT_GAP_MM, AXIS_MM))
+            marks.append(Line(start=(x0, y), end=(x1, y), width=LINE_MM))
+            marks.append(Line(start=(x, y0), end=(x, y1), width=LINE_MM))
     return marks

@@ -13,10 +13,11 @@ from realsim.store import atomic
 from realsim_calibration.sheets.artwork import Artwork, artwork_of
 from realsim_calibration.sheets.drawing import pdf_bytes, png_bytes
 from realsim_calibration.sheets.layout import (
+    LEAST_RULER_MM,
+    PREVIEW_PX,
     Layout,
     Place,
     Ruler,
-    SheetConfig,
     lay_out,
     needed_page,
     page_of,
@@ -117,7 +118,7 @@ def write_sheet(
     paper: Paper = "A4",
     preview: bool = False,
     overwrite: bool = False,
-    config: SheetConfig | None = None,
+    cut_marks: bool = False,
 ) -> SheetReport:
     """Write the target as a PDF at exact scale, and its target file beside it.
 
@@ -131,13 +132,12 @@ def write_sheet(
             A4 to A0 that fits, and beyond them a page made to measure.
         preview: whether a picture for the screen is written too.
         overwrite: whether files of another target or a changed target file may be replaced.
-        config: sizes of what surrounds the target, and cut marks.
+        cut_marks: whether marks show where the quiet zone may be cut off.
 
     Raises:
         InputError: the target does not fit (the message says which size or paper does), the path
             is no PDF, or a target file with another content is already there.
     """
-    config = config or SheetConfig()
     path = Path(path)
     if path.suffix.lower() != ".pdf":
         raise InputError(f"{path}: a sheet is a PDF; its name must end in .pdf.")
@@ -146,10 +146,10 @@ def write_sheet(
     artwork = artwork_of(target)
     if not overwrite:
         _refuse_other(path, target_path, values)
-    name, layout = _choose(target, artwork, paper, config)
-    page = page_of(artwork, layout, config)
+    name, layout = _choose(target, artwork, paper, cut_marks)
+    page = page_of(artwork, layout, cut_marks)
     line = format_target(target)
-    picture = png_bytes(page, config.preview_px) if preview else None
+    picture = png_bytes(page, PREVIEW_PX) if preview else None
     try:
         atomic.write_bytes(path, pdf_bytes(page, describe(target), line))
         atomic.write_json(target_path, values)
@@ -194,7 +194,7 @@ def _refuse_other(pdf: Path, path: Path, values: dict[str, Any]) -> None:
 
 
 def _fit(
-    target: Target, artwork: Artwork, size: tuple[float, float], config: SheetConfig
+    target: Target, artwork: Artwork, size: tuple[float, float], cut_marks: bool
 ) -> Layout | None:
     """Return the layout on a paper, turned as the target is; text at the bottom where it can be."""
     x0, y0, x1, y1 = artwork.bounds_m
@@ -203,39 +203,37 @@ def _fit(
     places: tuple[Place, ...] = ("bottom", "side")
     for place in places:
         for page in pages:
-            layout = lay_out(target, artwork, page, place, config)
+            layout = lay_out(target, artwork, page, place, cut_marks)
             if layout is not None:
                 return layout
     return None
 
 
-def _choose(
-    target: Target, artwork: Artwork, paper: Paper, config: SheetConfig
-) -> tuple[str, Layout]:
+def _choose(target: Target, artwork: Artwork, paper: Paper, cut_marks: bool) -> tuple[str, Layout]:
     """Return the paper's name and the layout.
 
     Raises:
         InputError: the target does not fit.
     """
     if isinstance(paper, str) and paper.strip().lower() == "auto":
-        return _automatic(target, artwork, config)
+        return _automatic(target, artwork, cut_marks)
     name, size = paper_size(paper)
-    layout = _fit(target, artwork, size, config)
+    layout = _fit(target, artwork, size, cut_marks)
     if layout is None:
-        raise InputError(_does_not_fit(target, artwork, name, size, config))
+        raise InputError(_does_not_fit(target, artwork, name, size, cut_marks))
     return name, layout
 
 
-def _automatic(target: Target, artwork: Artwork, config: SheetConfig) -> tuple[str, Layout]:
+def _automatic(target: Target, artwork: Artwork, cut_marks: bool) -> tuple[str, Layout]:
     """Return the smallest paper of the A series that fits, else a page made to measure."""
     for name in AUTO_PAPERS:
-        layout = _fit(target, artwork, PAPERS_MM[name], config)
+        layout = _fit(target, artwork, PAPERS_MM[name], cut_marks)
         if layout is not None:
             return name, layout
     extent = 1000 * max(artwork.bounds_m[2] - artwork.bounds_m[0],
                         artwork.bounds_m[3] - artwork.bounds_m[1])  # fmt: skip
-    page = needed_page(target, artwork, config) if extent < LARGEST_PAGE_MM else (extent, extent)
-    layout = lay_out(target, artwork, page, "bottom", config)
+    page = needed_page(target, artwork, cut_marks) if extent < LARGEST_PAGE_MM else (extent, extent)
+    layout = lay_out(target, artwork, page, "bottom", cut_marks)
     if layout is None or max(page) > LARGEST_PAGE_MM:
         raise InputError(
             f"the target is {extent:.0f} mm long; a page of at most {LARGEST_PAGE_MM:.0f} mm is "
@@ -245,7 +243,7 @@ def _automatic(target: Target, artwork: Artwork, config: SheetConfig) -> tuple[s
 
 
 def _does_not_fit(
-    target: Target, artwork: Artwork, name: str, size: tuple[float, float], config: SheetConfig
+    target: Target, artwork: Artwork, name: str, size: tuple[float, float], cut_marks: bool
 ) -> str:
     """Return the message: what is too large, what would fit, and the commands for it."""
     x0, y0, x1, y1 = (1000 * v for v in artwork.bounds_m)
@@ -253,19 +251,19 @@ def _does_not_fit(
         f"the target ({describe(target)}) is {x1 - x0:.1f} x {y1 - y0:.1f} mm and does not fit "
         f"{name} ({size[0]:g} x {size[1]:g} mm) with its white border, rulers and text."
     )
-    smaller = largest_fit(target, size, config)
+    smaller = largest_fit(target, size, cut_marks)
     if smaller is None:
-        message += f" Nothing fits there: the rulers need {config.least_ruler_mm:g} mm."
+        message += f" Nothing fits there: the rulers need {LEAST_RULER_MM:g} mm."
     else:
         message += (
             f" The largest of its kind that fits: {describe(smaller)}; command: "
             f"realsim board '{format_target(smaller)}' --paper {name}."
         )
-    other, _ = _automatic(target, artwork, config)
+    other, _ = _automatic(target, artwork, cut_marks)
     return f"{message} At the size that was asked for: --paper {other}."
 
 
-def largest_fit(target: Target, size: tuple[float, float], config: SheetConfig) -> Target | None:
+def largest_fit(target: Target, size: tuple[float, float], cut_marks: bool) -> Target | None:
     """Return the target with all lengths shrunk just so far that it fits a paper, or None.
 
     Lengths are rounded down to tenths of a millimetre, those of a ratio (a marker in its field)
@@ -276,7 +274,7 @@ def largest_fit(target: Target, size: tuple[float, float], config: SheetConfig) 
     for _ in range(24):
         middle = (low + high) / 2
         candidate = _scaled(target, middle)
-        if candidate is not None and _fit(candidate, artwork_of(candidate), size, config):
+        if candidate is not None and _fit(candidate, artwork_of(candidate), size, cut_marks):
             low, best = middle, candidate
         else:
             high = middle
@@ -336,9 +334,8 @@ def make_board(
         if path.suffix and not path.is_dir():
             raise InputError(f"{path}: give a name that ends in .pdf, or a folder.")
         path = path / f"{file_name(target)}.pdf"
-    config = SheetConfig(cut_marks=cut_marks)
     report = write_sheet(
-        target, path, paper=paper, preview=preview, overwrite=overwrite, config=config
+        target, path, paper=paper, preview=preview, overwrite=overwrite, cut_marks=cut_marks
     )
     return report.paths
 

@@ -1,8 +1,9 @@
 """Robot School: every object of a registered scene, every grasp, through reach and slip test."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
+from typing import ParamSpec
 
 import numpy as np
 
@@ -19,40 +20,10 @@ from realsim_sim_bridge.school.object_task import ObjectTask
 from realsim_sim_bridge.school.run_record import Restart, folder_of_run, mark_finished, run_record
 from realsim_sim_bridge.school.shards import default_shard_grasps
 
-
-def run_school(  # noqa: PLR0913 - keywords, each with a meaning of its own
-    scene: Scene,
-    models: Mapping[int, ObjectModel],
-    config: SchoolConfig | None = None,
-    *,
-    workers: Workers = None,
-    cache: Path | None = None,
-    progress: Progress | None = None,
-    solids: Mapping[int, KnownSolid] | None = None,
-    restart: Restart = False,
-    shard_grasps: int | None = None,
-    label_files: Mapping[int, Path] | None = None,
-) -> list[GraspSet]:
-    """Return the scored grasps of every object whose pose was not rejected.
-
-    Arguments and errors are those of `run_school_results`.
-    """
-    results = run_school_results(
-        scene,
-        models,
-        config,
-        workers=workers,
-        cache=cache,
-        progress=progress,
-        solids=solids,
-        restart=restart,
-        shard_grasps=shard_grasps,
-        label_files=label_files,
-    )
-    return [result.grasp_set for result in results]
+P = ParamSpec("P")
 
 
-def run_school_results(  # noqa: PLR0913 - as above
+def run_school_results(  # noqa: PLR0913 - keywords, each with a meaning of its own
     scene: Scene,
     models: Mapping[int, ObjectModel],
     config: SchoolConfig | None = None,
@@ -120,6 +91,22 @@ def run_school_results(  # noqa: PLR0913 - as above
         if cache is not None and not any(result.unfinished for result in results):
             mark_finished(cache)
     return results
+
+
+def _grasp_sets(run: Callable[P, list[SchoolResult]]) -> Callable[P, list[GraspSet]]:
+    """Return a function of the same arguments that returns the results' grasp sets alone."""
+
+    def run_school(*args: P.args, **kwargs: P.kwargs) -> list[GraspSet]:
+        """Return the scored grasps of every object whose pose was not rejected.
+
+        Arguments and errors are those of `run_school_results`.
+        """
+        return [result.grasp_set for result in run(*args, **kwargs)]
+
+    return run_school
+
+
+run_school = _grasp_sets(run_school_results)
 
 
 def _progress(pupils: list[Pupil]) -> tuple[int, int]:

@@ -1,6 +1,7 @@
 """The load at which a held cube slips or turns, against Coulomb's limit; and no creep below it."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -67,32 +68,24 @@ def turns(arms_m: tuple[float, ...]) -> list[PlanarLoad]:
 _AXES = {0.0: "x", 90.0: "z", 180.0: "-x", 270.0: "-z"}
 
 
-def coulomb_checks(
-    engine: Engine, config: ValidationConfig
+def limit_checks(
+    engine: Engine, config: ValidationConfig, group: Literal["coulomb", "torque"]
 ) -> tuple[list[CheckResult], list[LimitRatio]]:
-    """Return the error of the limit 2 mu F in every direction, the worst of all forces."""
-    limits = config.limits
-    ratios = [
-        _ratio(engine, config, "coulomb", load, case, limits.coulomb_shares)
-        for case in limits.cases
-        for load in pulls(limits.directions_deg)
-    ]
-    what = "error of the pull at which the cube slips, against 2 mu F"
-    return _by_load(ratios, what, limits.coulomb_pct), ratios
+    """Return the error of the limits of a group of loads, the worst of all forces.
 
-
-def torque_checks(
-    engine: Engine, config: ValidationConfig
-) -> tuple[list[CheckResult], list[LimitRatio]]:
-    """Return the error of the limits of spin and off-centre loads, the worst of all forces."""
+    "coulomb" is the limit 2 mu F in every direction; "torque" are spin and off-centre loads.
+    """
     limits = config.limits
-    ratios = [
-        _ratio(engine, config, "torque", load, case, limits.torque_shares)
-        for case in limits.torque_cases
-        for load in turns(limits.arms_m)
-    ]
-    what = "error of the load that turns the cube, against the pads' limit surface"
-    return _by_load(ratios, what, limits.torque_pct), ratios
+    if group == "coulomb":
+        loads, cases, shares = pulls(limits.directions_deg), limits.cases, limits.coulomb_shares
+        what = "error of the pull at which the cube slips, against 2 mu F"
+        limit_pct = limits.coulomb_pct
+    else:
+        loads, cases, shares = turns(limits.arms_m), limits.torque_cases, limits.torque_shares
+        what = "error of the load that turns the cube, against the pads' limit surface"
+        limit_pct = limits.torque_pct
+    ratios = [_ratio(engine, config, group, load, case, shares) for case in cases for load in loads]
+    return _by_load(ratios, what, limit_pct), ratios
 
 
 def creep_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:

@@ -25,12 +25,11 @@ from realsim_sim_bridge.validation.labels import (
 from realsim_sim_bridge.validation.loads import with_hand
 from realsim_sim_bridge.validation.report import CheckResult, LimitRatio, ValidationReport
 from realsim_sim_bridge.validation.slip_limits import (
-    coulomb_checks,
     creep_checks,
     curved_check,
     force_check,
+    limit_checks,
     press_checks,
-    torque_checks,
 )
 from realsim_sim_bridge.validation.specimens import DOWN, OPENING_M, SIDE_M, cube_trial, edge_trial
 
@@ -194,8 +193,7 @@ def validate(
                 *press_checks(engine, config),
             ]
         elif part in ("coulomb", "torque"):
-            measure = coulomb_checks if part == "coulomb" else torque_checks
-            found, measured = measure(engine, config)
+            found, measured = limit_checks(engine, config, part)
             checks, ratios = checks + found, ratios + measured
         elif part == "creep":
             checks += [*creep_checks(engine, config), curved_check(engine, config)]
