@@ -17,6 +17,7 @@ from realsim.geometry import se3
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim_calibration.exports import FrameNames, calibration_text, read_calibration
 from realsim_calibration.results import HandEyeReport, Mode
+from refusals import refused
 
 Maker = Callable[..., HandEyeReport]
 FRAMES = FrameNames(robot_base="base", hand="tool0", camera_optical="cam_optical", name="ur5")
@@ -117,8 +118,6 @@ def test_a_damaged_entry_is_named(
 @pytest.mark.parametrize(("text", "says"), [("{", "not valid JSON"), ("[1, 2]", "list")])
 def test_another_file_is_named(text: str, says: str, tmp_path: Path) -> None:
     path = tmp_path / "calibration.json"
-    with pytest.raises(InputError, match="does not exist"):
-        read_calibration(path)
+    refused("does not exist", read_calibration, path)
     path.write_text(text)
-    with pytest.raises(InputError, match=says):
-        read_calibration(path)
+    refused(says, read_calibration, path)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from fault_sessions import faults
-from realsim.errors import InputError, NotRigidError
+from realsim.errors import NotRigidError
 from realsim.geometry import se3
 from realsim_calibration.faults.diagnose import diagnose, prove_reading
 from realsim_calibration.faults.frame_fit import fit_frames, hand_side, mismatch
@@ -17,6 +17,7 @@ from realsim_calibration.faults.rotation_readings import (
     reading_of,
     three_number_conventions,
 )
+from refusals import refused
 
 MIDDLE = faults.BOARD.points_board.mean(0)
 CONVENTIONS = {c.name: c for c in (*three_number_conventions(), *four_number_conventions())}
@@ -197,16 +198,12 @@ def test_a_hand_that_does_not_turn_cannot_be_tested():
 
 def test_bad_input_is_refused_in_words():
     s = session(0)
-    with pytest.raises(InputError, match="at least 4"):
-        diagnose(s.T[:3], s.C[:3])
-    with pytest.raises(InputError, match="hand poses"):
-        diagnose(s.T[:-1], s.C)
+    refused("at least 4", diagnose, s.T[:3], s.C[:3])
+    refused("hand poses", diagnose, s.T[:-1], s.C)
     with pytest.raises(NotRigidError):
         diagnose(2 * s.T, s.C)
-    with pytest.raises(InputError, match="labels"):
-        diagnose(s.T, s.C, labels=["a"])
-    with pytest.raises(InputError, match="no reading"):
-        prove_reading([], s.C)
+    refused("labels", diagnose, s.T, s.C, labels=["a"])
+    refused("no reading", prove_reading, [], s.C)
 
 
 # Readings of a pose file

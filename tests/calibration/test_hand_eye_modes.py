@@ -20,6 +20,7 @@ from realsim_calibration.exports import FrameNames, read_calibration, write_expo
 from realsim_calibration.fit.robot_error import RobotErrorConfig, matching_arm
 from realsim_calibration.report.summary import viewpoint
 from realsim_calibration.results import Clock
+from refusals import refused
 
 CLOCK = Clock(offset_s=0.035, sigma_s=0.0004, applied=True)
 
@@ -42,8 +43,7 @@ def test_a_camera_that_stands_still_is_placed_in_the_base(simulate):
     assert np.abs(se3.log(se3.invert(r.Z) @ sim.T_base_board)).max() < 1e-5
     with pytest.raises(InputError, match="has no place in the hand"):
         _ = r.hand_eye
-    with pytest.raises(InputError, match="inverted"):
-        calibrate_hand_eye_report(views, sim.board, sim.intrinsics0)
+    refused("inverted", calibrate_hand_eye_report, views, sim.board, sim.intrinsics0)
 
 
 def test_boards_counted_from_the_wrong_end_are_mended(simulate):
@@ -124,8 +124,7 @@ def test_perfect_poses_alone_give_the_truth():
         distances = np.linalg.norm(C[:, :3, 3], axis=-1)
         assert np.allclose([p.distance_m for p in seen], distances, atol=1e-5)
         assert max(p.tilt_deg for p in seen) < 90
-    with pytest.raises(InputError, match="12 hand poses and 11 camera poses"):
-        calibrate_from_poses(A, C[1:])
+    refused("12 hand poses and 11 camera poses", calibrate_from_poses, A, C[1:])
     with pytest.raises(InputError, match="behind the camera"):
         calibrate_from_poses(A, se3.invert(C) @ np.diag([1.0, -1.0, -1.0, 1.0]))
 

@@ -18,6 +18,7 @@ from realsim_calibration.inputs import (
     read_image_folder,
     reading_from_text,
 )
+from refusals import refused
 
 READING = reading_from_text("quat_xyzw,m")
 
@@ -98,8 +99,7 @@ def test_counts_that_differ_without_names_are_refused_with_both_sides():
 def test_shifted_numbers_are_refused():
     images = [f"{k}.png" for k in range(1, 25)]
     stems = [str(k) for k in range(24)]
-    with pytest.raises(InputError, match=r"poses \+1: 1.png.*different starts"):
-        pair(images, [None] * 24, stems, stems)
+    refused(r"poses \+1: 1.png.*different starts", pair, images, [None] * 24, stems, stems)
 
 
 @pytest.mark.parametrize(
@@ -111,8 +111,7 @@ def test_shifted_numbers_are_refused():
     ],
 )
 def test_names_that_cannot_pair_are_refused(labels, says):
-    with pytest.raises(InputError, match=says):
-        pair(["a.png", "b.png"], labels, [""] * 3, ["line 1", "line 2", "line 3"])
+    refused(says, pair, ["a.png", "b.png"], labels, [""] * 3, ["line 1", "line 2", "line 3"])
 
 
 # --- folders ----------------------------------------------------------------------------------
@@ -142,8 +141,7 @@ def test_a_reading_must_be_said_and_must_fit(tmp_path):
     file = write_rows(tmp_path / "p.txt", rows(4))
     found = read_image_folder(images, file)
     assert found.reading is None
-    with pytest.raises(InputError, match=r"not said.*quat_xyzw,m; quat_wxyz,m"):
-        found.Ts_base_ee()
+    refused(r"not said.*quat_xyzw,m; quat_wxyz,m", found.Ts_base_ee)
     with pytest.raises(InputError, match="takes 6 numbers"):
         read_image_folder(images, file, reading=reading_from_text("rotvec,m"))
     named = [",".join(map(repr, r.tolist())) for r in rows(4)]
@@ -189,8 +187,7 @@ def test_a_list_of_pairs_decides_and_is_checked(tmp_path):
     for bad, says in (("p/9.txt", "entry 0: the pose file 'p/9.txt' of"), ("../x.txt", "outside")):
         turned[0]["pose"] = bad
         (tmp_path / "cal.json").write_text(json.dumps({"data": turned}))
-        with pytest.raises(InputError, match=says):
-            read_image_folder(images, tmp_path / "cal.json")
+        refused(says, read_image_folder, images, tmp_path / "cal.json")
 
 
 def test_files_that_differ_or_hold_several_poses_are_named(tmp_path):
@@ -198,36 +195,28 @@ def test_files_that_differ_or_hold_several_poses_are_named(tmp_path):
         write_rows(tmp_path / f"{k}.txt", rows(1, k))
     (tmp_path / "1.txt").write_text("1 2 3 0.1 0.2 0.3\n")
     make_images(tmp_path / "i", ["0.png", "1.png", "2.png"])
-    with pytest.raises(InputError, match=r"1.txt holds 6 numbers, 0.txt 7 numbers"):
-        read_image_folder(tmp_path / "i", tmp_path)
+    refused(r"1.txt holds 6 numbers, 0.txt 7 numbers", read_image_folder, tmp_path / "i", tmp_path)
     write_rows(tmp_path / "1.txt", rows(2))
-    with pytest.raises(InputError, match=r"1.txt holds 2 poses; beside 2 other"):
-        read_image_folder(tmp_path / "i", tmp_path)
+    refused(r"1.txt holds 2 poses; beside 2 other", read_image_folder, tmp_path / "i", tmp_path)
 
 
 def test_folders_without_usable_images_say_what_is_there(tmp_path):
-    with pytest.raises(InputError, match="is no folder"):
-        list_images(tmp_path / "none")
+    refused("is no folder", list_images, tmp_path / "none")
     make_images(tmp_path / "colour", ["0.png"])
-    with pytest.raises(InputError, match="images in colour: give that folder"):
-        list_images(tmp_path)
+    refused("images in colour: give that folder", list_images, tmp_path)
     deep = tmp_path / "deep"
     deep.mkdir()
     Image.fromarray(np.zeros((4, 4), np.uint16)).save(deep / "0.png")
-    with pytest.raises(InputError, match="1 images of 16 bit and none of 8"):
-        list_images(deep)
+    refused("1 images of 16 bit and none of 8", list_images, deep)
     save(tmp_path / "colour" / "0.jpg", pixels(0))
-    with pytest.raises(InputError, match="two images of one name"):
-        list_images(tmp_path / "colour")
+    refused("two images of one name", list_images, tmp_path / "colour")
 
 
 def test_images_are_looked_for_two_folders_deep(tmp_path):
-    with pytest.raises(InputError, match=r"holds no images .*Give the folder of the board's"):
-        list_images(tmp_path)
+    refused(r"holds no images .*Give the folder of the board's", list_images, tmp_path)
     for place in ("left/rgb", "right/rgb"):
         make_images(tmp_path / place, ["0.png"])
-    with pytest.raises(InputError, match="images in left/rgb, right/rgb: give one of them"):
-        list_images(tmp_path)
+    refused("images in left/rgb, right/rgb: give one of them", list_images, tmp_path)
 
 
 def test_all_broken_images_are_named_at_once_with_what_to_do(tmp_path):
@@ -260,14 +249,12 @@ def test_results_are_no_pose_of_a_set_with_one_folder_a_pose(tmp_path):
     assert len(found) == 3 and not found.unpaired_images
     for k in (0, 2):
         (tmp_path / f"pose_{k}/image.png").write_text("no image")
-    with pytest.raises(InputError, match="2 of 3 images cannot be used"):
-        read_image_folder(tmp_path, tmp_path)
+    refused("2 of 3 images cannot be used", read_image_folder, tmp_path, tmp_path)
 
 
 def test_board_poses_of_other_count_are_refused(tmp_path):
     a, b = write_rows(tmp_path / "a.txt", rows(5)), write_rows(tmp_path / "b.txt", rows(4))
-    with pytest.raises(InputError, match="5 robot poses and 4 board poses"):
-        read_board_poses(a, b)
+    refused("5 robot poses and 4 board poses", read_board_poses, a, b)
     names = [f"{k}.png" for k in range(5)]
     a = write_rows(tmp_path / "a.txt", rows(5), names)
     b = write_rows(tmp_path / "b.txt", rows(5)[[4, 2, 0]], [names[4], names[2], names[0]])
@@ -305,8 +292,7 @@ def test_images_that_are_no_plain_colour_are_refused(tmp_path):
         (tmp_path / "text.png", "not an image"),
         (tmp_path / "none.png", "does not exist"),
     ):
-        with pytest.raises(InputError, match=says):
-            load_image(path)
+        refused(says, load_image, path)
 
 
 def test_colour_of_16_bit_is_not_cut_down_in_silence(tmp_path):
@@ -314,8 +300,7 @@ def test_colour_of_16_bit_is_not_cut_down_in_silence(tmp_path):
 
     path = tmp_path / "deep_colour.png"
     cv2.imwrite(str(path), np.full((8, 8, 3), 40000, np.uint16))
-    with pytest.raises(InputError, match="more than 8 bits"):
-        load_image(path)
+    refused("more than 8 bits", load_image, path)
 
 
 @settings(max_examples=25, deadline=None)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pose_layouts import LAYOUTS, PAIRS, folder_a_pose, layouts_read, save_images, tiny
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_calibration.inputs import read_board_poses, read_image_folder
+from refusals import refused
 
 GUIDE = Path(__file__).parents[2] / "docs/how-to/calibrate-from-your-own-files.md"
 
@@ -32,13 +32,11 @@ def test_the_guide_lists_every_layout():
 def test_pairs_that_do_not_say_whose_they_are_are_refused(tmp_path):
     for name, text in (("a.json", '[{"A": [1], "B": [2]}]'), ("a.csv", "x,y,z\n1,2,3\n4,5,6\n")):
         (tmp_path / name).write_text(text)
-        with pytest.raises(InputError, match=r"does not say which.*object_wrt_sensor"):
-            read_board_poses(None, tmp_path / name)
+        refused(r"does not say which.*object_wrt_sensor", read_board_poses, None, tmp_path / name)
 
 
 def test_a_pose_folder_with_two_images_is_named(tmp_path):
     Ts = se3.random_transform(np.random.default_rng(0), 4, spread=0.5)
     folder_a_pose(tmp_path, Ts, [tiny(k) for k in range(4)])
     save_images(tmp_path / "pose_02", [tiny(9)], "second.png")
-    with pytest.raises(InputError, match=r"pose_02 holds 2 images.*second.png"):
-        read_image_folder(tmp_path, tmp_path)
+    refused(r"pose_02 holds 2 images.*second.png", read_image_folder, tmp_path, tmp_path)

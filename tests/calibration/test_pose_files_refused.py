@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from pose_rows import folder
 from realsim.errors import InputError
 from realsim_calibration.inputs import read_pose_file
+from refusals import refused
 
 # --- what is refused ---------------------------------------------------------------------------
 
@@ -36,8 +37,7 @@ ROW = "0.5 -0.1 0.4 1.1 2.8 -0.1\n"
 )
 def test_malformed_files_are_refused_by_place(tmp_path, name, content, says):
     (tmp_path / name).write_text(content)
-    with pytest.raises(InputError, match=says):
-        read_pose_file(tmp_path / name)
+    refused(says, read_pose_file, tmp_path / name)
 
 
 def test_bombs_and_pickles_are_refused(tmp_path):
@@ -46,20 +46,17 @@ def test_bombs_and_pickles_are_refused(tmp_path):
     (tmp_path / "bomb.yaml").write_text("\n".join(lines))
     (tmp_path / "loop.yaml").write_text("a: &a [*a]")
     for name in ("bomb.yaml", "loop.yaml"):
-        with pytest.raises(InputError, match=r"unfolds|inside of what"):
-            read_pose_file(tmp_path / name)
+        refused(r"unfolds|inside of what", read_pose_file, tmp_path / name)
     np.save(tmp_path / "a.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     np.savez(tmp_path / "a.npz", a=np.array([{"a": 1}], dtype=object), allow_pickle=True)
     for name in ("a.npy", "a.npz"):
-        with pytest.raises(InputError, match=r"pickled|Python objects"):
-            read_pose_file(tmp_path / name)
+        refused(r"pickled|Python objects", read_pose_file, tmp_path / name)
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(
         header, {"descr": "<f8", "fortran_order": False, "shape": (10**11, 6)}
     )
     (tmp_path / "huge.npy").write_bytes(header.getvalue())
-    with pytest.raises(InputError, match="not a readable npy"):
-        read_pose_file(tmp_path / "huge.npy")
+    refused("not a readable npy", read_pose_file, tmp_path / "huge.npy")
 
 
 @settings(max_examples=40, deadline=None)

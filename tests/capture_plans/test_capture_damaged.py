@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 
-from realsim.errors import InputError
 from realsim.records import CaptureSession
 from realsim.store import SessionStore
 from realsim.store.opening import BEGUN_FILE
@@ -17,6 +16,7 @@ from realsim_capture_plans.capturing.run import CaptureSummary
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
 from realsim_capture_plans.plan_files.plan_json import resolve_plan
 from realsim_capture_plans.planning.record import CapturePlan
+from refusals import refused
 
 QUICK = CaptureConfig(still=SettleConfig(window_s=0.0))
 LAB = {"seed": 3, "objects": 2}
@@ -60,8 +60,7 @@ def test_stored_images_that_changed_are_named_and_not_counted(folder: Path) -> N
     (folder / "depth/000003.png").unlink()
     log = (folder / "capture_log.jsonl").read_bytes()
     for _ in range(2):  # opening it again does not make it sound
-        with pytest.raises(InputError, match=r"rgb/000001\.png: .*depth/000003.*s --repair"):
-            run(folder, views=(0, 1, 2, 3, 4))
+        refused(r"rgb/000001\.png: .*depth/000003.*s --repair", run, folder, views=(0, 1, 2, 3, 4))
     assert (folder / "capture_log.jsonl").read_bytes() == log
     repair_session(folder)
     summary = run(folder, views=(0, 1, 2, 3, 4))
@@ -73,8 +72,7 @@ def test_stored_images_that_changed_are_named_and_not_counted(folder: Path) -> N
 def test_a_session_without_its_manifest_is_not_gone_on_with(folder: Path) -> None:
     (folder / "manifest.jsonl").unlink()
     cut(folder / "rgb/000002.png")
-    with pytest.raises(InputError, match=r"manifest\.jsonl is lost.*--repair"):
-        run(folder, views=(0, 1, 2, 3, 4))
+    refused(r"manifest\.jsonl is lost.*--repair", run, folder, views=(0, 1, 2, 3, 4))
     assert not (folder / "manifest.jsonl").exists()
     assert repair_session(folder).dropped_views == (2,)
     assert run(folder, views=(0, 1, 2, 3, 4)).captured == 2
@@ -84,8 +82,7 @@ def test_a_session_whose_beginning_is_lost_gets_no_more_views(folder: Path) -> N
     (folder / BEGUN_FILE).unlink()
     (folder / "session.json").write_text('{"broken')
     repair_session(folder)
-    with pytest.raises(InputError, match=r"made anew by a repair.*arm_description.*new folder"):
-        run(folder, views=(4,))
+    refused(r"made anew by a repair.*arm_description.*new folder", run, folder, views=(4,))
     store = SessionStore.open(folder)
     assert store.completed == {0, 1, 2, 3} and store.check().sound
     # The way that the message tells.

@@ -16,6 +16,7 @@ from realsim.store.cameras import open_cameras
 from realsim_capture_plans.capturing.capture import capture
 from realsim_capture_plans.capturing.run import CaptureJob
 from realsim_capture_plans.devices.interfaces import DeviceError, Frame
+from refusals import refused
 from tests.capture_plans.test_capture import QUICK, KinematicArm, TableCamera, new_store, plan
 
 LENS = CameraIntrinsics(width=32, height=24, fx=30.0, fy=30.0, cx=15.5, cy=11.5)
@@ -97,23 +98,19 @@ def test_a_capture_goes_on_with_the_cameras_it_was_begun_with(
     fixed = fixed_stores(store, {"left": still})
     job = CaptureJob(views=(0,), fixed=fixed)
     capture(plan(), arm, TableCamera(arm), store, config=QUICK, job=job)
-    with pytest.raises(InputError, match=r"begun with the fixed cameras left, and .* names none"):
-        fixed_stores(store, {})
-    with pytest.raises(InputError, match="names left, right"):
-        fixed_stores(store, {"left": still, "right": StillCamera()})
+    refused(r"begun with the fixed cameras left, and .* names none", fixed_stores, store, {})
+    refused("names left, right", fixed_stores, store, {"left": still, "right": StillCamera()})
     with pytest.raises(InputError, match=r"'left' of .* is still 1, .* connects still 2"):
         fixed_stores(store, {"left": StillCamera(name="still 2")})
 
 
 @pytest.mark.parametrize("text", ["left", "left=", "=12", "left=1,left=2", "left=1,right=1"])
 def test_other_forms_of_the_option_are_refused(text: str) -> None:
-    with pytest.raises(InputError, match="left=SERIAL,right=SERIAL is expected"):
-        serials_of(text)
+    refused("left=SERIAL,right=SERIAL is expected", serials_of, text)
 
 
 def test_the_simulated_lab_has_no_fixed_camera() -> None:
     assert serials_of("left=12, top=34") == {"left": "12", "top": "34"}
-    with pytest.raises(InputError, match="no name of a camera"):
-        serials_of("a/b=12")
+    refused("no name of a camera", serials_of, "a/b=12")
     with ExitStack() as stack, pytest.raises(InputError, match="simulated lab has one camera"):
         open_fixed("left=12", True, stack)

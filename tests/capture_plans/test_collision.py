@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.interop import import_pinocchio
 from realsim.robots.arm import UR5, UR5E, arm_of, find_arm
@@ -14,6 +13,7 @@ from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box, Mount, Shape, WorkCell
 from realsim_capture_plans.collision.model import GROUPS, CollisionModel, interpolate
 from realsim_capture_plans.collision.mount import camera_shape, d405_mount
+from refusals import refused
 
 INF = np.inf
 EVERYWHERE = Box(lower=(-INF, -INF, -INF), upper=(INF, INF, 0.0))
@@ -130,8 +130,7 @@ def test_edges_are_free_where_every_step_is() -> None:
     assert short.sum() > 50
     assert not found.all()
     assert asked.edges_free(free[0], free[0], 0.05).tolist() == [True]
-    with pytest.raises(InputError, match="59 starts and 60 goals"):
-        asked.edges_free(start, free, 0.05)
+    refused("59 starts and 60 goals", asked.edges_free, start, free, 0.05)
 
 
 def test_fixed_pairs_are_not_in_the_clearances() -> None:
@@ -170,34 +169,26 @@ MOUNTS = {
 
 @pytest.mark.parametrize("says", MOUNTS)
 def test_a_mount_that_runs_into_the_wrist_is_named(says: str) -> None:
-    with pytest.raises(InputError, match=says):
-        model(mount=MOUNTS[says])
+    refused(says, model, mount=MOUNTS[says])
 
 
 @pytest.mark.parametrize(("arm", "link"), [("panda", "flange"), ("iiwa14", "link 7")])
 def test_a_camera_inside_another_arms_wrist_is_named(arm: str, link: str) -> None:
     inside = d405_mount(se3.from_translation([0.0, 0.0, -0.02]))
-    with pytest.raises(InputError, match=f"camera .* mm inside the {link}.*T_ee_cam"):
-        model(find_arm(arm).chain, inside)
+    refused(f"camera .* mm inside the {link}.*T_ee_cam", model, find_arm(arm).chain, inside)
 
 
 def test_a_table_through_the_shoulder_is_named() -> None:
     high = replace(CELL, table=replace(EVERYWHERE, upper=(INF, INF, 0.06)))
-    with pytest.raises(InputError, match=r"'table' is inside the arm's shoulder.*by 36 mm"):
-        model(cell=high)
+    refused(r"'table' is inside the arm's shoulder.*by 36 mm", model, cell=high)
     beside = replace(CELL, table=Box(lower=(0.3, -0.8, -INF), upper=(1.0, 0.8, 0.06)))
     assert model(cell=beside).free(HOME[None])[0]
 
 
 def test_a_cell_in_millimetres_and_an_unknown_arm_are_named() -> None:
     far = replace(CELL, obstacles=(("wall", Box(lower=(700, 0, 0), upper=(750, 900, 900))),))
-    with pytest.raises(InputError, match=r"'wall'.*millimetres"):
-        model(cell=far)
-    with pytest.raises(InputError, match=r"no arm 'UR16e'\. There are: .*ur5, ur5e"):
-        model(replace(UR5, name="UR16e"))
-    with pytest.raises(InputError, match="called 'UR5' but its nominal"):
-        model(replace(UR5E, name="UR5"))
-    with pytest.raises(InputError, match="camera 'D999'"):
-        model(mount=replace(d405_mount(), camera="D999", bracket=()))
-    with pytest.raises(InputError, match="clearance_m"):
-        CollisionModel(UR5, d405_mount(), CELL, -0.01)
+    refused(r"'wall'.*millimetres", model, cell=far)
+    refused(r"no arm 'UR16e'\. There are: .*ur5, ur5e", model, replace(UR5, name="UR16e"))
+    refused("called 'UR5' but its nominal", model, replace(UR5E, name="UR5"))
+    refused("camera 'D999'", model, mount=replace(d405_mount(), camera="D999", bracket=()))
+    refused("clearance_m", CollisionModel, UR5, d405_mount(), CELL, -0.01)

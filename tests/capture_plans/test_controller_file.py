@@ -24,6 +24,7 @@ from realsim.robots.controller_file import (
     ur_arms,
 )
 from realsim.robots.kinematics import DhChain
+from refusals import refused
 
 UR10 = DhChain.of(ur_arms()["UR10"], UR5.limits)
 CONF = {
@@ -162,12 +163,9 @@ def test_the_inverse_is_complete_on_real_calibrations(name: str, tmp_path: Path)
 
 
 def test_the_wrong_robot_is_named_with_the_right_one(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"UR5 by 1\d\d mm.*belongs to a UR10"):
-        read(conf(CONF), UR5, tmp_path)
-    with pytest.raises(InputError, match="belongs to a UR5e"):
-        read(ros_yaml(ROS["UR5e"]), UR5, tmp_path)
-    with pytest.raises(InputError, match=r"belongs to a UR5\. "):
-        read(ros_yaml(ROS["UR5"]), UR5E, tmp_path)
+    refused(r"UR5 by 1\d\d mm.*belongs to a UR10", read, conf(CONF), UR5, tmp_path)
+    refused("belongs to a UR5e", read, ros_yaml(ROS["UR5e"]), UR5, tmp_path)
+    refused(r"belongs to a UR5\. ", read, ros_yaml(ROS["UR5"]), UR5E, tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from realsim.errors import DegenerateError, InputError
+from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 from realsim.geometry.parts import part, part_names
@@ -15,6 +15,7 @@ from realsim_capture_plans.lab.placement import (
     place_objects,
     stable_rests,
 )
+from refusals import refused
 
 CENTER = np.array([0.4, -0.1, 0.02])
 
@@ -60,8 +61,7 @@ def test_a_box_falls_on_its_faces_by_their_solid_angles():
 def test_what_rolls_for_ever_is_refused():
     square = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]) * 1e-4
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
-    with pytest.raises(DegenerateError, match="roll"):
-        stable_rests(Mesh(vertices=square, faces=faces), 4e-4)
+    refused("roll", stable_rests, Mesh(vertices=square, faces=faces), 4e-4, error=DegenerateError)
 
 
 def test_layouts_touch_the_table_stay_in_the_disc_and_keep_their_distance():
@@ -78,8 +78,7 @@ def test_layouts_touch_the_table_stay_in_the_disc_and_keep_their_distance():
 
 
 def test_too_many_objects_are_refused_with_the_number_that_fits():
-    with pytest.raises(InputError, match=r"only \d+ of 12 objects fit"):
-        scene(0, n=12, radius_m=0.1, restarts=2, tries=50)
+    refused(r"only \d+ of 12 objects fit", scene, 0, n=12, radius_m=0.1, restarts=2, tries=50)
 
 
 def square(x, y, side=0.02, turn=0.0):

@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_capture_plans.lab import LabConfig, SimulatedLab, load_truth
 from realsim_capture_plans.lab.truth import (
@@ -15,6 +14,7 @@ from realsim_capture_plans.lab.truth import (
     true_intrinsics,
     true_mount,
 )
+from refusals import refused
 
 Q = np.array([0.3, -1.2, 1.4, -1.7, -1.5, 0.4])
 ROD = ("stepped_shaft",)
@@ -81,14 +81,11 @@ def test_truth_survives_the_disk_and_knows_every_view(tmp_path):
 
 
 def test_a_missing_broken_or_foreign_truth_is_refused(tmp_path):
-    with pytest.raises(InputError, match="there is no truth"):
-        load_truth(tmp_path)
+    refused("there is no truth", load_truth, tmp_path)
     (tmp_path / "truth.json").write_text("{")
-    with pytest.raises(InputError, match="not valid JSON"):
-        load_truth(tmp_path)
+    refused("not valid JSON", load_truth, tmp_path)
     (tmp_path / "truth.json").write_text(json.dumps({"version": 99}))
-    with pytest.raises(InputError, match="version"):
-        load_truth(tmp_path)
+    refused("version", load_truth, tmp_path)
 
 
 def test_the_operator_is_off_by_the_configured_amount_in_all_directions():

@@ -28,6 +28,7 @@ from realsim_capture_plans.plan_files.imported import colliding_legs, plan_of_pa
 from realsim_capture_plans.plan_files.joint_paths import read_path
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig, plan_content, plan_of
+from refusals import refused
 
 HOME = np.array([0.1, -1.6, 1.7, -1.7, -1.5, 0.3])
 CENTER = np.array([0.37, 0.02, 0.05])
@@ -101,8 +102,7 @@ def test_csv_comes_back_bit_for_bit(tmp_path: Path) -> None:
 
 def test_csv_of_another_robot_or_mount_is_named(tmp_path: Path) -> None:
     export_csv(a_plan(), tmp_path / "p.csv")
-    with pytest.raises(InputError, match="mm from those of this robot"):
-        imported(tmp_path / "p.csv", UR5E)
+    refused("mm from those of this robot", imported, tmp_path / "p.csv", UR5E)
     with pytest.raises(InputError, match="mm from those of this robot"):
         other = d405_mount(se3.from_translation([0.0, 0.065, 0.035]))
         imported(tmp_path / "p.csv", UR5, mount=other)
@@ -145,8 +145,7 @@ def test_a_seven_joint_plan_goes_out_and_comes_back(tmp_path: Path) -> None:
     export_csv(plan, tmp_path / "p.csv")
     back = imported(tmp_path / "p.csv", plan.chain)
     assert np.array_equal(back.joints, plan.joints) and np.array_equal(back.home, plan.home)
-    with pytest.raises(InputError, match=r"7 joint angles in a row, and a UR5 has 6.*Panda"):
-        imported(tmp_path / "p.csv", UR5)
+    refused(r"7 joint angles in a row, and a UR5 has 6.*Panda", imported, tmp_path / "p.csv", UR5)
     with pytest.raises(InputError, match=r"URScript drives Universal.*Panda.*\.csv"):
         export_urscript(plan, tmp_path / "p.script")
     # Only a flange that stands off the last DH frame is written: files of a UR stay as they were.
@@ -197,14 +196,12 @@ def test_robot_units_and_tool_are_found(
 
 def test_a_path_for_the_other_robot_is_refused_with_both_fits(tmp_path: Path) -> None:
     write_path(tmp_path / "p.json", UR5E)
-    with pytest.raises(InputError, match=r"fit a UR5e.*for a UR5 \d+ mm are left"):
-        imported(tmp_path / "p.json", UR5)
+    refused(r"fit a UR5e.*for a UR5 \d+ mm are left", imported, tmp_path / "p.json", UR5)
 
 
 def test_a_claim_against_the_evidence_is_refused(tmp_path: Path) -> None:
     write_path(tmp_path / "p.json", UR5)
-    with pytest.raises(UnitError, match="joints in deg"):
-        read_path(tmp_path / "p.json", UR5, "rad")
+    refused("joints in deg", read_path, tmp_path / "p.json", UR5, "rad", error=UnitError)
 
 
 def test_without_poses_the_unit_has_to_be_said(tmp_path: Path) -> None:
@@ -212,11 +209,9 @@ def test_without_poses_the_unit_has_to_be_said(tmp_path: Path) -> None:
     data = json.loads((tmp_path / "p.json").read_text())
     del data["cart_pose"]
     (tmp_path / "p.json").write_text(json.dumps(data))
-    with pytest.raises(UnitError, match="--joints-unit"):
-        read_path(tmp_path / "p.json", UR5)
+    refused("--joints-unit", read_path, tmp_path / "p.json", UR5, error=UnitError)
     assert np.abs(read_path(tmp_path / "p.json", UR5, "deg").joints - q).max() < 1e-12
-    with pytest.raises(UnitError, match="look like degrees"):
-        read_path(tmp_path / "p.json", UR5, "rad")
+    refused("look like degrees", read_path, tmp_path / "p.json", UR5, "rad", error=UnitError)
 
 
 HEADER = ",".join(f"q{j}_{{u}}" for j in range(1, 7))
@@ -265,8 +260,7 @@ def test_tables_of_other_programs_are_read(mark: str, form: str, tmp_path: Path)
 def test_no_path_ends_in_a_traceback(tmp_path: Path) -> None:
     for text in ("[]", '{"joints": 3}', '{"joints": [[1]]}', '{"joints": [[0,0,0,0,0,0]]}', "{"):
         (tmp_path / "p.json").write_text(text)
-        with pytest.raises(InputError, match=r"p\.json"):
-            imported(tmp_path / "p.json", UR5)
+        refused(r"p\.json", imported, tmp_path / "p.json", UR5)
 
 
 # --- what is imported is checked ---------------------------------------------------------------
@@ -302,8 +296,7 @@ def test_the_papers_own_paths_are_a_ur5_in_degrees(path: Path) -> None:
     # Two of the files are in millimetres and of a tool 200 mm long.
     long_tool = np.linalg.norm(found.reading.T_ee_tcp[:3, 3]) > 0.1
     assert long_tool == (found.reading.length_unit == "mm")
-    with pytest.raises(InputError, match="of another robot"):
-        read_path(path, UR5E)
+    refused("of another robot", read_path, path, UR5E)
     plan = imported(path, center=[-0.1, -0.67, 0.1])
     assert len(plan) + np.sum(found.via) == len(found.joints)
     assert plan.kind == "imported" and np.all(UR5.limits.contains(plan.joints))

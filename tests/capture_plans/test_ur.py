@@ -23,6 +23,7 @@ from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceErro
 from realsim_capture_plans.devices.ur import UrArm
 from realsim_capture_plans.devices.ur_connection import UrConfig
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
+from refusals import refused
 
 HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 TCP = [0.01, -0.02, 0.12, 0.1, 0.4, -1.2]
@@ -112,11 +113,9 @@ def test_a_goal_or_a_speed_out_of_limits_is_refused_before_anything_moves(
         ([0.0, 0.0, np.nan, 0.0, 0.0, 0.0], "finite"),
         ([0.0] * 5, "6 finite"),
     ):
-        with pytest.raises(InputError, match=said):
-            arm.move(goal)
+        refused(said, arm.move, goal)
     for speed, acceleration in ((3.2, 1.4), (0.0, 1.4), (np.nan, 1.4), (1.0, 5.0), (1.0, -1.0)):
-        with pytest.raises(InputError, match="at most"):
-            arm.move(HOME + 0.1, speed=speed, acceleration=acceleration)
+        refused("at most", arm.move, HOME + 0.1, speed=speed, acceleration=acceleration)
     assert controller.joints() == pytest.approx(HOME.tolist(), abs=0)
 
 
@@ -159,8 +158,7 @@ def test_recovery_before_the_stop_is_cleared_says_what_to_do(
     with pytest.raises(ArmStoppedError):
         arm.move(HOME + 0.1)
     for _ in range(2):
-        with pytest.raises(ArmStoppedError, match=r"What to do: .* pendant"):
-            arm.recover()
+        refused(r"What to do: .* pendant", arm.recover, error=ArmStoppedError)
     assert arm.state().joints == pytest.approx(HOME)  # it can still be read
     controller.clear()
     arm.recover()
@@ -171,11 +169,9 @@ def test_a_protective_stop_is_unlocked_only_when_asked(
     arm: UrArm, controller: LoopbackController
 ) -> None:
     controller.inject("protective_stop")
-    with pytest.raises(ArmStoppedError, match="5 s"):
-        arm.unlock_protective_stop()
+    refused("5 s", arm.unlock_protective_stop, error=ArmStoppedError)
     time.sleep(5.5 / SPEEDUP)
-    with pytest.raises(ArmStoppedError, match="protective stop"):
-        arm.recover()
+    refused("protective stop", arm.recover, error=ArmStoppedError)
     arm.unlock_protective_stop()
     arm.recover()
     arm.move(HOME + 0.1, acceleration=4.0)
@@ -211,10 +207,8 @@ def test_a_lost_connection_is_noticed_and_recovered(
         arm.move(HOME + 1.5, speed=0.05)
     assert caught.value.stop == "connection lost"
     timer.join()
-    with pytest.raises(ArmStoppedError, match=r"refuses|switch it off"):
-        arm.recover()
-    with pytest.raises(ArmStoppedError, match="connection lost"):
-        arm.state()
+    refused(r"refuses|switch it off", arm.recover, error=ArmStoppedError)
+    refused("connection lost", arm.state, error=ArmStoppedError)
     controller.clear()
     arm.recover()
     arm.move(HOME, acceleration=4.0)
@@ -223,8 +217,7 @@ def test_a_lost_connection_is_noticed_and_recovered(
 def test_the_end_of_ur_rtdes_process_is_a_lost_connection_not_a_crash(arm: UrArm) -> None:
     (child,) = [int(p) for p in children(os.getpid()) if b"ur_process" in command_line(p)]
     os.kill(child, signal.SIGKILL)
-    with pytest.raises(ArmStoppedError, match="connection lost"):
-        arm.state()
+    refused("connection lost", arm.state, error=ArmStoppedError)
     arm.recover()
     assert arm.state().joints == pytest.approx(HOME)
 
@@ -269,8 +262,7 @@ def test_a_second_driver_is_refused_and_the_first_one_goes_on(
 
 def test_a_program_of_somebody_else_is_not_stopped(controller: LoopbackController) -> None:
     controller.inject("foreign_program")
-    with pytest.raises(ArmStoppedError, match="another program is running"):
-        UrArm(controller.host)
+    refused("another program is running", UrArm, controller.host, error=ArmStoppedError)
     dashboard = import_module("dashboard_client").DashboardClient(controller.host)
     dashboard.connect(2000)
     assert dashboard.running()
@@ -281,8 +273,7 @@ def test_wrong_addresses_are_told_apart(controller: LoopbackController) -> None:
     with pytest.raises(ArmStoppedError, match=r"refuses.*port 30004") as caught:
         UrArm("127.77.7.7")
     assert caught.value.stop == "connection lost"
-    with pytest.raises(ArmStoppedError, match="no host"):
-        UrArm("no-such-robot.invalid")
+    refused("no host", UrArm, "no-such-robot.invalid", error=ArmStoppedError)
     controller.inject("hang")
     with pytest.raises(ArmStoppedError, match=r"says nothing|not as a UR"):
         UrArm(controller.host, config=CONFIG)
@@ -297,23 +288,17 @@ def test_another_model_than_expected_is_named_with_the_distance(
     gap = 1e3 * np.linalg.norm((UR5.forward(HOME) - UR5E.forward(HOME))[:3, 3])
     with pytest.raises(InputError, match=f"a UR5 is expected.*UR5e.*{gap:.1f} mm from a UR5's"):
         UrArm(controller.host, model="UR5")
-    with pytest.raises(InputError, match=f"{gap:.1f} mm from a UR5's"):
-        UrArm(controller.host, chain=UR5)
-    with pytest.raises(InputError, match=r"a UR5e is expected.*says that it is a UR5,"):
-        UrArm(cb3.host, model="UR5e")
-    with pytest.raises(InputError, match="UR9 is not known"):
-        UrArm(controller.host, model="UR9")
-    with pytest.raises(InputError, match="give one"):
-        UrArm(controller.host, model="UR5e", chain=UR5)
+    refused(f"{gap:.1f} mm from a UR5's", UrArm, controller.host, chain=UR5)
+    refused(r"a UR5e is expected.*says that it is a UR5,", UrArm, cb3.host, model="UR5e")
+    refused("UR9 is not known", UrArm, controller.host, model="UR9")
+    refused("give one", UrArm, controller.host, model="UR5e", chain=UR5)
 
 
 def test_a_tool_offset_that_changes_is_refused(arm: UrArm, controller: LoopbackController) -> None:
     before = arm.state()
     controller.set_tcp([0.0] * 6)
-    with pytest.raises(DeviceError, match=r"TCP.*\[10.00, -20.00, 120.00\] mm"):
-        arm.state()
-    with pytest.raises(DeviceError, match="TCP"):
-        arm.recover()
+    refused(r"TCP.*\[10.00, -20.00, 120.00\] mm", arm.state, error=DeviceError)
+    refused("TCP", arm.recover, error=DeviceError)
     controller.set_tcp(TCP)
     arm.recover()
     moved = se3.invert(before.T_base_ee) @ arm.state().T_base_ee
@@ -322,8 +307,7 @@ def test_a_tool_offset_that_changes_is_refused(arm: UrArm, controller: LoopbackC
 
 def test_software_that_cannot_tell_the_tool_offset_is_refused() -> None:
     with LoopbackController.start(robot="UR5", polyscope="3.5.4.10845") as controller:
-        with pytest.raises(InputError, match=r"PolyScope 3\.5, which cannot tell its tool offset"):
-            UrArm(controller.host)
+        refused(r"PolyScope 3\.5, which cannot tell its tool offset", UrArm, controller.host)
 
 
 def children(pid: int) -> list[int]:

@@ -12,7 +12,6 @@ from realsim import (
     CameraIntrinsics,
     CaptureSession,
     GraspSet,
-    InputError,
     ObjectModel,
     ObjectPose,
     Scene,
@@ -26,6 +25,7 @@ from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore
 from realsim_sim_bridge.annotation.annotate import AnnotationConfig, annotate
 from realsim_sim_bridge.annotation.inputs import table_slab
+from refusals import refused
 
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 TABLE = se3.from_translation([0.5, 0.0, 0.1])
@@ -202,15 +202,11 @@ def test_without_cameras_it_says_calibrate_first(tmp_path: Path) -> None:
     session = CaptureSession(name="raw", intrinsics=INTRINSICS, views=(), depth_unit_m=1e-4)
     store = SessionStore.create(tmp_path / "s", session)
     store.add_view(View(index=4), np.zeros((120, 160, 3), np.uint8))
-    with pytest.raises(InputError, match=r"view 4.*calibrate first"):
-        annotate(store, SCENE, MODELS, GRASPS)
+    refused(r"view 4.*calibrate first", annotate, store, SCENE, MODELS, GRASPS)
     assert not store.has("scene_gt.json")
 
 
 def test_missing_models_and_foreign_grasps_are_named(annotated: SessionStore) -> None:
-    with pytest.raises(InputError, match=r"\[7\].*tall \(1\)"):
-        annotate(annotated, SCENE, {1: MODELS[1]}, GRASPS)
-    with pytest.raises(InputError, match="instance 0 are of object 7"):
-        annotate(annotated, SCENE, MODELS, [grasp_set(0, 7)])
-    with pytest.raises(InputError, match="instance 9"):
-        annotate(annotated, SCENE, MODELS, [grasp_set(9, 7)])
+    refused(r"\[7\].*tall \(1\)", annotate, annotated, SCENE, {1: MODELS[1]}, GRASPS)
+    refused("instance 0 are of object 7", annotate, annotated, SCENE, MODELS, [grasp_set(0, 7)])
+    refused("instance 9", annotate, annotated, SCENE, MODELS, [grasp_set(9, 7)])

@@ -13,7 +13,6 @@ from file_trees import annotation_of
 from realsim import (
     CameraIntrinsics,
     CaptureSession,
-    InputError,
     Mesh,
     ObjectModel,
     ObjectPose,
@@ -32,6 +31,7 @@ from realsim.store import SessionStore
 from realsim_sim_bridge.annotation.annotate import AnnotationConfig, annotate
 from realsim_sim_bridge.annotation.config import maps_of
 from realsim_sim_bridge.annotation.inputs import table_slab
+from refusals import refused
 
 LENS = np.array([-0.12, 0.03, 0.001, -0.002, 0.0])
 CAMERA = CameraIntrinsics(
@@ -196,14 +196,12 @@ def test_maps_that_are_no_longer_wanted_go(tmp_path: Path) -> None:
     assert {p.parent.name for p in store.folder.glob("labels/*/*.png")} == {"depth"}
     assert maps_of("all") == ALL.maps and maps_of("none") == ()
     assert maps_of("normals, instance") == ("instance", "normals")
-    with pytest.raises(InputError, match="no map 'colour'"):
-        maps_of("instance,colour")
+    refused("no map 'colour'", maps_of, "instance,colour")
 
 
 def test_an_image_of_another_size_is_named_with_both_sizes(tmp_path: Path) -> None:
     store = make_session(tmp_path / "s", size=(320, 240))
-    with pytest.raises(InputError, match=r"rgb/000000\.png is 160x120.*320x240"):
-        annotate(store, SCENE, MODELS, [])
+    refused(r"rgb/000000\.png is 160x120.*320x240", annotate, store, SCENE, MODELS, [])
     assert not store.has("scene_gt.json")
 
 

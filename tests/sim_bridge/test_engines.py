@@ -25,6 +25,7 @@ from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_te
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import Closing, Grips, PadModel, Replay, SlipBody, SlipPhysics
 from realsim_sim_bridge.validation.specimens import cube_trial
+from refusals import refused
 
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 
@@ -75,16 +76,12 @@ def test_an_engine_is_known_by_its_name_and_another_is_refused():
     for name in ENGINES:
         assert make_engine(settings_of(name)).name == name
         assert settings_of(name, reference=True).replay == Replay()
-    with pytest.raises(
-        InputError, match="there is no engine 'bullet'; there are: pybullet, mujoco"
-    ):
-        settings_of("bullet")
+    refused("there is no engine 'bullet'; there are: pybullet, mujoco", settings_of, "bullet")
 
 
 def test_without_mujoco_its_package_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)  # what Python itself does for `import` to fail
-    with pytest.raises(InputError, match=r"realsim\[mujoco\]"):
-        make_engine(MujocoSettings())
+    refused(r"realsim\[mujoco\]", make_engine, MujocoSettings())
 
 
 def test_what_is_squeezed_at_a_curved_place_does_not_crawl():
@@ -128,8 +125,7 @@ def test_pads_are_as_stiff_as_they_are_told_whatever_they_hold(engine, mass, ask
 
 def test_a_stiffness_that_cannot_be_is_refused_with_what_can():
     for value in (0.0, -2e5, float("nan"), float("inf"), 2e6):
-        with pytest.raises(InputError, match="1000 to 500000 N/m is accepted"):
-            PadModel(pad_stiffness_n_per_m=value)
+        refused("1000 to 500000 N/m is accepted", PadModel, pad_stiffness_n_per_m=value)
     with pytest.raises(InputError, match=r"4\.667e\+04 N/m or more .* 30 N or less"):
         SlipPhysics(force_n=70.0, pads=PadModel(pad_stiffness_n_per_m=2e4))
     if pytest.importorskip("mujoco"):

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import entropy, spearmanr
 
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import GraspSet
 from realsim_sim_bridge.school.measure_statistics import (
@@ -22,6 +21,7 @@ from realsim_sim_bridge.school.measure_statistics import (
 )
 from realsim_sim_bridge.school.summary import OUTCOMES, outcomes_of, summarise
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
+from refusals import refused
 
 
 def scored_set(rng, n, *, obj_id=1, instance=0, tried=True, **measures):
@@ -119,12 +119,9 @@ def test_each_outcome_is_told_by_base_and_score():
 
 
 def test_impossible_scores_are_named():
-    with pytest.raises(InputError, match="at most its base score"):
-        outcomes_of(by_hand([(True, 0.5, 0.75, 3)]))
-    with pytest.raises(InputError, match="both are known or neither"):
-        outcomes_of(by_hand([(True, math.nan, 0.75, 3)]))
-    with pytest.raises(InputError, match="a base score"):
-        outcomes_of(by_hand([(True, 0.6, 0.5, 3)]))
+    refused("at most its base score", outcomes_of, by_hand([(True, 0.5, 0.75, 3)]))
+    refused("both are known or neither", outcomes_of, by_hand([(True, math.nan, 0.75, 3)]))
+    refused("a base score", outcomes_of, by_hand([(True, 0.6, 0.5, 3)]))
 
 
 def test_rows_and_json_say_the_same():

@@ -45,16 +45,12 @@ class DepthViewReport:
     """Predicted depth of the target's area, harmonic mean [m]."""
     bias_m: float
     """Measured minus predicted depth there [m]."""
-    residual_m: float
-    """The same after correction [m]."""
     unseen_m: float
     """The same after a correction by all other views [m]."""
     noise_m: float
     """1-sigma of a pixel over the target's area [m]."""
     temporal_noise_m: float
     """1-sigma of a pixel over the frames [m]; NaN for a single frame."""
-    tilt_error_deg: float
-    """Angle between measured and predicted plane [deg]."""
     valid_share: float
     """Share of the target's area that has depth."""
     inlier_share: float
@@ -88,8 +84,6 @@ class DepthBiasReport:
     """tau: 1-sigma between views that poses and noise do not explain [1/m]."""
     shift_px: Array
     """(2,) depth pixel u shows what colour pixel u + shift shows [px]."""
-    shift_sd_px: Array
-    """(2,) [px]."""
     noise_exponent: float
     """p of sigma_z ~ z^p over the views; 2 for a stereo camera, NaN = one distance."""
     held_out_m: float
@@ -233,7 +227,6 @@ def _report(
         focal_px=focal, baseline_m=config.baseline_m, middle_m=middle,
         middle_bias_m=float(bias.bias_m(middle)), middle_sd_m=float(bias.sigma_m(middle)),
         scatter_per_m=fit.scatter, shift_px=fit.theta[2:] * shift,
-        shift_sd_px=np.sqrt(np.diag(fit.covariance)[2:]) * shift,
         noise_exponent=_noise_exponent(there, config),
         held_out_m=float(np.sqrt(np.mean([r.unseen_m**2 for r in there]))),
         uncorrected_m=float(np.sqrt(np.mean([r.bias_m**2 for r in there]))),
@@ -247,17 +240,16 @@ def _view_report(d: BoardDepth, fit: ViewFit, used: list[BoardDepth]) -> DepthVi
     if d.reason:
         return DepthViewReport(
             index=d.index, label=d.label, used=False, reason=d.reason, distance_m=nan, bias_m=nan,
-            residual_m=nan, unseen_m=nan, noise_m=nan, temporal_noise_m=nan, tilt_error_deg=nan,
-            valid_share=d.valid_share, inlier_share=d.inlier_share,
+            unseen_m=nan, noise_m=nan, temporal_noise_m=nan, valid_share=d.valid_share,
+            inlier_share=d.inlier_share,
         )  # fmt: skip
     z, k = 1 / d.predicted, next(i for i, other in enumerate(used) if other is d)
-    residual, unseen = (z - 1 / (t[0] * d.measured + t[1]) for t in (fit.theta, fit.without[k]))
+    scale, offset = fit.without[k][:2]
     return DepthViewReport(
         index=d.index, label=d.label, used=True, reason="", distance_m=z,
-        bias_m=1 / d.measured - z, residual_m=-residual, unseen_m=-unseen,
+        bias_m=1 / d.measured - z, unseen_m=1 / (scale * d.measured + offset) - z,
         noise_m=d.noise_per_m * z**2, temporal_noise_m=d.temporal_per_m * z**2,
-        tilt_error_deg=float(np.degrees(d.tilt_error_rad)), valid_share=d.valid_share,
-        inlier_share=d.inlier_share,
+        valid_share=d.valid_share, inlier_share=d.inlier_share,
     )  # fmt: skip
 
 

@@ -425,6 +425,5 @@ def _proof(entries: list[tuple[ReadingFit, Array, bool]]) -> ReadingProof:
     return ReadingProof(
         fits=tuple(entry[0] for entry in entries), best=best.name, best_mode=best.mode,
         equivalent=tuple(f"{s[0].name} ({s[0].mode})" for s in same),
-        runner_up=f"{runner.name} ({runner.mode})" if runner else "", ratio=float(ratio),
-        decisive=decisive, mode_sure=natural, sentence=text.strip(),
+        ratio=float(ratio), decisive=decisive, mode_sure=natural, sentence=text.strip(),
     )  # fmt: skip

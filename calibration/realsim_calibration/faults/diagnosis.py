@@ -143,12 +143,10 @@ class ReadingProof:
     best_mode: Mode
     equivalent: tuple[str, ...]
     """Other readings that give the same poses as the best, "name (mode)"."""
-    runner_up: str
-    """The next best of other poses, "name (mode)"; empty where there is none."""
     ratio: float
-    """Penalised score of the runner-up over that of the best."""
+    """Penalised score of the next best of other poses over that of the best."""
     decisive: bool
-    """Whether the best fits, and far better than the runner-up."""
+    """Whether the best fits, and far better than that one."""
     mode_sure: bool
     """Whether the size of the frames tells where the camera sits."""
     sentence: str

@@ -62,8 +62,6 @@ class MotionCheck:
     """Range of the camera's roll about its optical axis [deg]."""
     sd_mm: Array
     """(3,) best possible 1-sigma of the camera's place along the camera's x, y, z [mm]."""
-    sd_deg: Array
-    """(3,) the same about them [deg]."""
     identical: tuple[tuple[int, int], ...]
     """Pairs of views with the same hand pose."""
     sentences: tuple[str, ...]
@@ -98,7 +96,7 @@ def check_motion(
     rms, axes = principal_turns(relative(se3.invert(C)).turns)
     turns, axes = np.degrees(rms), axes.T
     fit = fit_frames(hand_side(T, eye_in_hand), C, m)
-    sd_deg, sd_mm = _best_sd(hand_side(T, eye_in_hand), C, m, fit)
+    sd_mm = _best_sd(hand_side(T, eye_in_hand), C, m, fit)
     roll = _range_deg(np.arctan2(C[:, 1, 0], C[:, 0, 0]))
     identical = _identical(T)
     found = [
@@ -107,13 +105,12 @@ def check_motion(
         *_identical_sentences(identical, len(T)),
     ]
     return MotionCheck(
-        turns_deg=turns, roll_deg=roll, sd_mm=sd_mm, sd_deg=sd_deg, identical=identical,
-        sentences=tuple(found),
-    )  # fmt: skip
+        turns_deg=turns, roll_deg=roll, sd_mm=sd_mm, identical=identical, sentences=tuple(found)
+    )
 
 
-def _best_sd(A: Array, C: Array, m: Array, fit: FrameFit) -> tuple[Array, Array]:
-    """Return the 1-sigma of X about [deg] and along [mm] the camera's axes; infinite = unknown."""
+def _best_sd(A: Array, C: Array, m: Array, fit: FrameFit) -> Array:
+    """Return the 1-sigma (3,) of X along the camera's axes [mm]; infinite = unknown."""
     q = C[:, :3, :3] @ m + C[:, :3, 3]
     s = fit.length_ratio
     z = fit.Z[:3, 3] + s * fit.Z[:3, :3] @ m
@@ -128,10 +125,8 @@ def _best_sd(A: Array, C: Array, m: Array, fit: FrameFit) -> tuple[Array, Array]
     values, vectors = np.linalg.eigh(H * unit[:, None] * unit)
     inverse = vectors @ np.diag(1.0 / np.maximum(values, UNSEEN)) @ vectors.T
     covariance = inverse * unit[:, None] * unit
-    turn = np.sqrt(np.diag(covariance)[:3])
     Rx = fit.X[:3, :3]
-    place = np.sqrt(np.diag(Rx.T @ covariance[6:9, 6:9] @ Rx)) / s
-    return np.degrees(turn), 1e3 * place
+    return 1e3 * (np.sqrt(np.diag(Rx.T @ covariance[6:9, 6:9] @ Rx)) / s)
 
 
 def _range_deg(angles: Array) -> float:

@@ -42,12 +42,8 @@ class ToolOffset:
     """(4, 4) T_flange_ee of every stretch of views; one where it is constant [m]."""
     groups: Int64
     """(n,) which of the offsets a view has."""
-    T_base_nominal: Array
-    """(4, 4) the nominal base in the controller's; identity where they agree [m]."""
     rms_mm: float
     """What remains [mm]."""
-    rms_deg: float
-    """What remains [deg]."""
     active: bool
     """Whether some offset is more than the nominal kinematics' own error."""
     base_turned: bool
@@ -80,8 +76,8 @@ def tool_offset(Ts_base_ee: ArrayLike, nominal: ArrayLike) -> ToolOffset:
     turned = known and _differs(L)
     sentence, advice = _sentence(L, offsets, groups, (mm, deg), known)
     return ToolOffset(
-        known=known, offsets=offsets, groups=groups, T_base_nominal=L, rms_mm=mm, rms_deg=deg,
-        active=active, base_turned=turned, sentence=sentence, advice=advice,
+        known=known, offsets=offsets, groups=groups, rms_mm=mm, active=active,
+        base_turned=turned, sentence=sentence, advice=advice,
     )  # fmt: skip
 
 

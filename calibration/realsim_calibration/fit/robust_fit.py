@@ -67,7 +67,6 @@ class Solution:
     sigma_px: float
     ratio: Array
     """(2,) lambda of rotation and of translation."""
-    white: Whiteness
     covariance: Array
     """(29, 29) of the shared parameters."""
     information: Array
@@ -164,7 +163,6 @@ def solve(
         state=state,
         sigma_px=sigma,
         ratio=best.ratio,
-        white=white,
         covariance=shared(covariance),
         information=final.information[:SHARED, :SHARED],
         here=state.X @ se3.exp(moved),

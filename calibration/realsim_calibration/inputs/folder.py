@@ -78,7 +78,6 @@ class BoardPosesInput:
     """T_cam_board, or its inverse where read as inverted."""
     pairing: str
     unpaired_robot: tuple[tuple[str, str], ...]
-    unpaired_board: tuple[tuple[str, str], ...]
 
 
 def read_image_folder(
@@ -209,10 +208,6 @@ def read_board_poses(
         unpaired_robot=(
             *((a.where[r], why) for r, why in found.unpaired_poses),
             *((a.where[r], reason) for _, r in lost),
-        ),
-        unpaired_board=(
-            *((b.where[i], why) for i, why in found.unpaired_images),
-            *((b.where[i], reason) for i, _ in lost),
         ),
     )
 

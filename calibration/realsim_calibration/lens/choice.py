@@ -45,8 +45,6 @@ class ModelScore:
     """RMS 2-D error on corners of views that the lens has not seen [px]; NaN = not determined."""
     excess: float
     """Mean over views of log(mean square error / that of the best model); 0 for the best."""
-    excess_se: float
-    """Standard error of that over views."""
     seen_px: float
     """RMS 2-D error in sample [px]."""
     chosen: bool = False
@@ -197,7 +195,6 @@ def score_models(
                 terms=terms[name],
                 held_out_px=float(np.sqrt(held_out)),
                 excess=excess,
-                excess_se=se,
                 seen_px=float(np.sqrt(np.mean(np.sum(fit.residuals**2, -1)))),
                 chosen=pick,
             )

@@ -38,8 +38,6 @@ class Coverage:
     """Distance of the outermost corners from the image's middle, relative to half the diagonal."""
     tilt_deg: Array
     """(views,) angle between the board's normal and the optical axis [deg]."""
-    tilt_azimuth_deg: Array
-    """(views,) direction in the image that the board's normal points to [deg]."""
     distance_m: Array
     """(views,) distance of the board's middle along the optical axis [m]."""
     normal_spread_deg: float
@@ -74,7 +72,6 @@ def measure_coverage(uv: Array, image_size: tuple[int, int], poses: Array) -> Co
         share=share,
         reach=reach,
         tilt_deg=tilt,
-        tilt_azimuth_deg=np.degrees(np.arctan2(normal[:, 1], normal[:, 0])),
         distance_m=poses[:, 2, 3].copy(),
         normal_spread_deg=spread,
         advice=_advice(counts, share, reach, tilt, spread),

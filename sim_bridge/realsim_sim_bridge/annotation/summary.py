@@ -56,8 +56,6 @@ class AnnotationSummary:
     all views; NaN = never seen with a measurement."""
     grasps: int
     """Grasps per view."""
-    seen_grasps: int
-    """Grasps of which both contacts are seen, summed over the views."""
     by_object: tuple[ObjectSummary, ...] = ()
     """The objects in the order of `objects`."""
     empty_views: tuple[int, ...] = ()
@@ -108,7 +106,6 @@ def summary_of(
         all_views: every view of the session.
     """
     by_object = tuple(_object_summary(inputs, o, parts) for o in inputs.objects)
-    entries = [e for part in parts.values() for e in part["objects"]]
     empty = tuple(v for v, part in parts.items() if part["is_empty"])
     return AnnotationSummary(
         views=len(parts),
@@ -119,7 +116,6 @@ def summary_of(
         views_left_out=tuple(v for v in all_views if v not in parts),
         agreement={o.instance: o.agreement for o in by_object},
         grasps=sum(len(g) for g in inputs.grasp_sets),
-        seen_grasps=sum(e["grasps"].get("visible", 0) for e in entries),
         by_object=by_object,
         empty_views=empty,
         flagged_views=tuple(v for v, part in parts.items() if _is_flagged(part)),

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry.mesh import save_ply
 from realsim.geometry.parts import part
 from realsim.models.convex_hulls import hull_volume
 from realsim_sim_bridge.table_scenes.config import PoolConfig
 from realsim_sim_bridge.table_scenes.pool import open_pool, read_object
+from refusals import refused
 
 HULLS = PoolConfig(hull_only=True)
 
@@ -76,35 +76,28 @@ def test_a_mesh_that_cannot_be_used_is_named(
 ) -> None:
     (tmp_path / name).write_bytes(content)
     source = open_pool([str(tmp_path)]).sources[0]
-    with pytest.raises(InputError, match=words):
-        read_object(source, name, HULLS)
+    refused(words, read_object, source, name, HULLS)
 
 
 def test_a_mesh_that_is_too_large_is_named_before_it_is_read(tmp_path: Path) -> None:
     (tmp_path / "huge.stl").write_bytes(bytes(2_000_000))
     source = open_pool([str(tmp_path)]).sources[0]
-    with pytest.raises(InputError, match=r"2 MB; up to 1 MB"):
-        read_object(source, "huge.stl", PoolConfig(most_mb=1.0))
+    refused(r"2 MB; up to 1 MB", read_object, source, "huge.stl", PoolConfig(most_mb=1.0))
     _folder(tmp_path, ("mug",))
-    with pytest.raises(InputError, match="triangles; up to 100"):
-        read_object(source, "mug.ply", PoolConfig(most_faces=100))
+    refused("triangles; up to 100", read_object, source, "mug.ply", PoolConfig(most_faces=100))
 
 
 def test_a_pool_that_is_not_there_is_refused() -> None:
     for text in ("nowhere", "nowhere=2"):
-        with pytest.raises(InputError, match=r"no folder; 'pybullet'"):
-            open_pool([text])
+        refused(r"no folder; 'pybullet'", open_pool, [text])
 
 
 def test_a_folder_without_meshes_is_refused_and_says_what_it_holds(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no mesh \(it holds nothing\)"):
-        open_pool([str(tmp_path)])
+    refused(r"no mesh \(it holds nothing\)", open_pool, [str(tmp_path)])
     (tmp_path / "readme.md").write_text("x")
-    with pytest.raises(InputError, match=r"no mesh \(it holds readme.md\)"):
-        open_pool([str(tmp_path)])
+    refused(r"no mesh \(it holds readme.md\)", open_pool, [str(tmp_path)])
 
 
 def test_a_weight_that_is_not_positive_is_refused() -> None:
     for weight in ("0", "-1", "nan", "inf"):
-        with pytest.raises(InputError, match="not positive"):
-            open_pool([f"pybullet={weight}"])
+        refused("not positive", open_pool, [f"pybullet={weight}"])

@@ -24,6 +24,7 @@ from realsim_sim_bridge.table_scenes.scene import (
     write_models,
 )
 from realsim_sim_bridge.table_scenes.tables import corners
+from refusals import refused
 
 CUBE = [corners((-0.05, -0.05, 0.0), (0.05, 0.05, 0.1))]
 SCENE = TableSceneConfig(objects=(2, 2))
@@ -78,8 +79,7 @@ def test_cameras_that_can_only_stand_in_something_are_refused() -> None:
 
 def test_a_radius_that_cannot_be_is_refused() -> None:
     for radius in ((0.01, 0.05), (2.0, 1.0), (1.0, 9.0), (-1.0, 1.0)):
-        with pytest.raises(InputError, match="least <= most"):
-            ViewConfig(radius_m=radius)
+        refused("least <= most", ViewConfig, radius_m=radius)
 
 
 @pytest.mark.parametrize(("profile", "fov_deg"), [("d435", 69.4), ("d405", 89.3)])
@@ -118,10 +118,8 @@ def test_the_users_own_pictures_cover_table_floor_and_objects(tmp_path: Path) ->
 
 
 def test_a_folder_without_pictures_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"--textures .* holds no image"):
-        own_looks(None, tmp_path)
-    with pytest.raises(InputError, match=r"--hdris .* is no folder"):
-        own_looks(tmp_path / "none", None)
+    refused(r"--textures .* holds no image", own_looks, None, tmp_path)
+    refused(r"--hdris .* is no folder", own_looks, tmp_path / "none", None)
 
 
 # --- models -----------------------------------------------------------------------------------
