@@ -1,6 +1,6 @@
 """What a person should know of a hand-eye calibration: verdicts, each with a sentence of advice."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import numpy as np
@@ -136,10 +136,10 @@ def _sigma(r: HandEyeReport) -> Check:
     )  # fmt: skip
 
 
-def _absolute(r: HandEyeReport) -> tuple[Check, ...]:
+def _absolute(r: HandEyeReport) -> Iterator[Check]:
     """Return the check of X for another arm or a drawing: told, it never decides."""
     if r.X_here_covariance is None:
-        return ()
+        return
     known = r.sigma_mm <= SIGMA_MM[0] and r.sigma_deg <= SIGMA_DEG[0]
     remedies = [
         ""
@@ -149,40 +149,35 @@ def _absolute(r: HandEyeReport) -> tuple[Check, ...]:
         "" if r.board.sd[0] == 0 else "a board whose squares were measured with a calliper",
     ]
     advice = "What would make it smaller: " + "; ".join(text for text in remedies if text) + "."
-    return (
-        Check(
-            name="uncertainty elsewhere",
-            verdict="good" if known else "unknown",
-            sentence="these views cannot show an arm error that is the same in all poses: "
-            "for another arm, a new mount or a drawing the camera's place is known to "
-            f"{r.sigma_mm:.2f} mm and {r.sigma_deg:.3f} deg (1 sigma, worst axis).",
-            advice="" if known else advice,
-            value=r.sigma_mm,
-            unit="mm",
-        ),
+    yield Check(
+        name="uncertainty elsewhere",
+        verdict="good" if known else "unknown",
+        sentence="these views cannot show an arm error that is the same in all poses: "
+        "for another arm, a new mount or a drawing the camera's place is known to "
+        f"{r.sigma_mm:.2f} mm and {r.sigma_deg:.3f} deg (1 sigma, worst axis).",
+        advice="" if known else advice,
+        value=r.sigma_mm,
+        unit="mm",
     )
 
 
-def _stretched(r: HandEyeReport) -> tuple[Check, ...]:
+def _stretched(r: HandEyeReport) -> Iterator[Check]:
     """Return how the robot's map does beyond the poses that it was fitted on."""
     s = r.stretch
     if s is None or r.robot_map is None:
-        return ()
+        return
     helps = s.map_px <= s.plain_px
-    return (
-        Check(
-            name="map beyond its poses",
-            verdict="good" if helps else "warn",
-            sentence=f"the {len(s.views)} outermost views, held out together, are predicted to "
-            f"{s.map_px:.2f} px with the robot's map and to {s.plain_px:.2f} px without.",
-            advice=""
-            if helps
-            else "Keep to the poses of these views, or calibrate with views "
-            "where the arm will work.",
-            value=s.map_px,
-            unit="px",
-            views=s.views,
-        ),
+    yield Check(
+        name="map beyond its poses",
+        verdict="good" if helps else "warn",
+        sentence=f"the {len(s.views)} outermost views, held out together, are predicted to "
+        f"{s.map_px:.2f} px with the robot's map and to {s.plain_px:.2f} px without.",
+        advice=""
+        if helps
+        else "Keep to the poses of these views, or calibrate with views where the arm will work.",
+        value=s.map_px,
+        unit="px",
+        views=s.views,
     )
 
 
@@ -320,21 +315,21 @@ def _robot(r: HandEyeReport) -> Check:
     )  # fmt: skip
 
 
-def _arm(r: HandEyeReport) -> tuple[Check, ...]:
+def _arm(r: HandEyeReport) -> Iterator[Check]:
     if r.joint_offsets is None:
-        return ()
+        return
     inner = np.degrees(r.joint_offsets[1:5])
     value = float(np.abs(inner[:, 0]).max())
     verdict = _verdict(value, JOINT_OFFSET_DEG)
     text = ", ".join(f"{k + 2}: {o:+.3f}+-{s:.3f}" for k, (o, s) in enumerate(inner))
-    return (
-        Check(
-            name="joint zeros",
-            verdict=verdict,
-            sentence=f"zero offsets of joints [deg] {text}.",
-            advice=_advice(verdict, "These look like nominal kinematics: read calibration.conf "
-                           "from the controller."),
-            value=value,
-            unit="deg",
+    yield Check(
+        name="joint zeros",
+        verdict=verdict,
+        sentence=f"zero offsets of joints [deg] {text}.",
+        advice=_advice(
+            verdict,
+            "These look like nominal kinematics: read calibration.conf from the controller.",
         ),
-    )  # fmt: skip
+        value=value,
+        unit="deg",
+    )

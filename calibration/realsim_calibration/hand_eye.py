@@ -1,6 +1,6 @@
 """Hand-eye calibration from views of a target: screening, joint fit, report."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -128,7 +128,7 @@ def _report(
         joint_offsets=solution.joint_offsets,
         sigma_px=solution.sigma_px,
         robot_ratio=float(np.sqrt(np.prod(solution.ratio))),
-        views=_view_reports(views, screened, solution),
+        views=tuple(_view_reports(views, screened, solution)),
         seen_px=_rms([v.seen_px for v in used]),
         held_out_px=_rms([v.unseen_px for v in used]),
         held_out_mm=_rms([v.unseen_mm for v in used]),
@@ -162,29 +162,25 @@ def _rms(values: Sequence[float]) -> float:
 
 def _view_reports(
     views: Sequence[BoardView], screened: Screened, solution: Solution
-) -> tuple[ViewReport, ...]:
-    """Return every given view's part, by index."""
+) -> Iterator[ViewReport]:
+    """Yield every given view's part, by index."""
     used = {c.view.index: v for c, v in zip(screened.candidates, solution.views, strict=True)}
-    rows: list[ViewReport] = []
     for view in sorted(views, key=lambda v: v.index):
         part = used.get(view.index)
         nan = float("nan")
-        rows.append(
-            ViewReport(
-                index=view.index,
-                label=view.label,
-                used=part is not None,
-                reason=screened.rejected.get(view.index, ""),
-                T_base_ee=view.T_base_ee,
-                joints=view.joints,
-                point_ids=view.detection.point_ids,
-                uv=view.detection.uv,
-                residuals=np.zeros((0, 2)) if part is None else part.residuals,
-                seen_px=nan if part is None else part.seen_px,
-                unseen_px=nan if part is None else part.unseen_px,
-                unseen_mm=nan if part is None else part.unseen_mm,
-                unseen_deg=nan if part is None else part.unseen_deg,
-                robot_error=np.zeros(6) if part is None else part.robot_error,
-            )
+        yield ViewReport(
+            index=view.index,
+            label=view.label,
+            used=part is not None,
+            reason=screened.rejected.get(view.index, ""),
+            T_base_ee=view.T_base_ee,
+            joints=view.joints,
+            point_ids=view.detection.point_ids,
+            uv=view.detection.uv,
+            residuals=np.zeros((0, 2)) if part is None else part.residuals,
+            seen_px=nan if part is None else part.seen_px,
+            unseen_px=nan if part is None else part.unseen_px,
+            unseen_mm=nan if part is None else part.unseen_mm,
+            unseen_deg=nan if part is None else part.unseen_deg,
+            robot_error=np.zeros(6) if part is None else part.robot_error,
         )
-    return tuple(rows)

@@ -1,6 +1,6 @@
 """What a person should know of several cameras calibrated together."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -46,80 +46,66 @@ def armless_checks(
     )
 
 
-def _few_views(r: CamerasReport) -> list[Check]:
-    found: list[Check] = []
+def _few_views(r: CamerasReport) -> Iterator[Check]:
     for camera, own in zip(r.rig.cameras, r.cameras, strict=True):
         used = sum(v.used for v in r.views if v.camera == camera.name)
         if used < FEW_VIEWS[0]:
-            found.append(
-                Check(
-                    name="few views", verdict="warn", value=used,
-                    sentence=f"camera '{camera.name}' is placed by {used} "
-                    f"view{'s' * (used != 1)} only (1 sigma {own.sigma_mm:.2f} mm).",
-                    advice="Let it see the board at more instants.",
-                )
+            yield Check(
+                name="few views", verdict="warn", value=used,
+                sentence=f"camera '{camera.name}' is placed by {used} view{'s' * (used != 1)} "
+                f"only (1 sigma {own.sigma_mm:.2f} mm).",
+                advice="Let it see the board at more instants.",
             )  # fmt: skip
-    return found
 
 
-def _pairs(r: CamerasReport) -> list[Check]:
-    found: list[Check] = []
+def _pairs(r: CamerasReport) -> Iterator[Check]:
     for pair in r.pairs:
         if not np.isfinite(pair.apart_mm) or pair.apart_mm <= TOGETHER_MM[0]:
             continue
         bad = pair.apart_mm > TOGETHER_MM[1]
-        found.append(
-            Check(
-                name="pair", verdict="bad" if bad else "warn", value=pair.apart_mm, unit="mm",
-                sentence=f"cameras '{pair.names[0]}' and '{pair.names[1]}' see the board "
-                f"{pair.apart_mm:.2f} mm apart (RMS of {pair.together} instants; worst: "
-                f"{pair.worst}).",
-                advice="Are their images of the same moment? Look at the instant named.",
-            )
+        yield Check(
+            name="pair", verdict="bad" if bad else "warn", value=pair.apart_mm, unit="mm",
+            sentence=f"cameras '{pair.names[0]}' and '{pair.names[1]}' see the board "
+            f"{pair.apart_mm:.2f} mm apart (RMS of {pair.together} instants; worst: "
+            f"{pair.worst}).",
+            advice="Are their images of the same moment? Look at the instant named.",
         )  # fmt: skip
-    return found
 
 
-def _arm(r: CamerasReport) -> list[Check]:
+def _arm(r: CamerasReport) -> Iterator[Check]:
     if not r.bad_arm:
-        return []
+        return
     names = ", ".join(r.bad_arm[:NAMED])
     more = f" and {len(r.bad_arm) - NAMED} more" if len(r.bad_arm) > NAMED else ""
-    return [
-        Check(
-            name="arm poses", verdict="warn", value=len(r.bad_arm),
-            sentence=f"all cameras contradict the arm's pose at {names}{more}; there the cameras "
-            "alone were used.",
-            advice="Was the arm still moving, or is it another instant's pose?",
-        )
-    ]  # fmt: skip
+    yield Check(
+        name="arm poses", verdict="warn", value=len(r.bad_arm),
+        sentence=f"all cameras contradict the arm's pose at {names}{more}; there the cameras "
+        "alone were used.",
+        advice="Was the arm still moving, or is it another instant's pose?",
+    )  # fmt: skip
 
 
-def _odd(r: CamerasReport) -> list[Check]:
+def _odd(r: CamerasReport) -> Iterator[Check]:
     odd = r.disagreeing()
     if not odd:
-        return []
+        return
     names = ", ".join(f"{v.name} ({v.unseen_px:.2f} px)" for v in odd[:NAMED])
     more = f" and {len(odd) - NAMED} more" if len(odd) > NAMED else ""
-    return [
-        Check(
-            name="views that disagree", verdict="warn", value=len(odd),
-            sentence=f"predicted three times worse than their camera's other views: {names}{more}.",
-            advice="Check these images: is one blurred, did the board move, was the arm at rest?",
-            views=tuple(v.instant for v in odd),
-        )
-    ]  # fmt: skip
+    yield Check(
+        name="views that disagree", verdict="warn", value=len(odd),
+        sentence=f"predicted three times worse than their camera's other views: {names}{more}.",
+        advice="Check these images: is one blurred, did the board move, was the arm at rest?",
+        views=tuple(v.instant for v in odd),
+    )  # fmt: skip
 
 
-def _base(r: CamerasReport) -> list[Check]:
+def _base(r: CamerasReport) -> Iterator[Check]:
     if r.reference == ROBOT_BASE:
-        return []
-    return [
-        Check(
-            name="reference", verdict="warn",
-            sentence=f"no arm ties the cameras to a robot: all places are in camera "
-            f"'{r.reference}'.",
-            advice="If you need the robot's base, let the arm carry a board in view "
-            "(--held-board), or add a camera in the hand.",
-        )
-    ]  # fmt: skip
+        return
+    yield Check(
+        name="reference", verdict="warn",
+        sentence=f"no arm ties the cameras to a robot: all places are in camera "
+        f"'{r.reference}'.",
+        advice="If you need the robot's base, let the arm carry a board in view "
+        "(--held-board), or add a camera in the hand.",
+    )  # fmt: skip

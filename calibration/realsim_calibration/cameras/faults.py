@@ -6,7 +6,7 @@ and every mistake of who is where breaks them: cameras exchanged, boards exchang
 board said to be where it is not.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import get_args
@@ -208,20 +208,19 @@ def _contradictions(
     return wrong
 
 
-def _alternatives(rig: Rig) -> list[tuple[str, Rig]]:
-    """Return other readings of a rig, each with the words for it; the likeliest first."""
-    found: list[tuple[str, Rig]] = []
+def _alternatives(rig: Rig) -> Iterator[tuple[str, Rig]]:
+    """Yield other readings of a rig, each with the words for it; the likeliest first."""
     for what, parts in (("camera", rig.cameras), ("board", rig.boards)):
         for a, b in combinations(range(len(parts)), 2):
             words = f"{what}s '{parts[a].name}' and '{parts[b].name}' are exchanged"
             advice = "exchange their folders" if what == "camera" else "exchange the two options"
-            found.append((f"{words} ({advice})", _exchanged(rig, what, a, b)))
+            yield f"{words} ({advice})", _exchanged(rig, what, a, b)
     for c, camera in enumerate(rig.cameras):
         mount: Mount = "fixed" if camera.mount == "hand" else "hand"
         cameras = list(rig.cameras)
         cameras[c] = replace(camera, mount=mount)
         text = f"camera '{camera.name}' is {MOUNTS[mount]} (--cameras {camera.name}={mount})"
-        found.append((text, replace(rig, cameras=tuple(cameras))))
+        yield text, replace(rig, cameras=tuple(cameras))
     for b, board in enumerate(rig.boards):
         for place in get_args(Place):
             if place == board.place:
@@ -229,8 +228,7 @@ def _alternatives(rig: Rig) -> list[tuple[str, Rig]]:
             boards = list(rig.boards)
             boards[b] = replace(board, place=place)
             text = f"board '{board.name}' is {PLACES[place]} (give it as {OPTIONS[place]})"
-            found.append((text, replace(rig, boards=tuple(boards))))
-    return found
+            yield text, replace(rig, boards=tuple(boards))
 
 
 def _exchanged(rig: Rig, what: str, a: int, b: int) -> Rig:

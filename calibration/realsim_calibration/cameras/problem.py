@@ -196,11 +196,7 @@ class RigProblem:
     def poses(self, state: RigState, views: Sequence[int] | None = None) -> Array:
         """Return T_cam_board (views, 4, 4) of views, by default of all."""
         chosen = range(len(self.views)) if views is None else views
-        found: list[Array] = []
-        for k in chosen:
-            X, Z, A, D, to_hand = self._arguments(state, k)[:5]
-            found.append(camera_from_board(X, Z, A, D, to_hand))
-        return np.stack(found)
+        return np.stack([camera_from_board(*self._arguments(state, k)[:5]) for k in chosen])
 
     def shaped_points(self, shape: Array, board: int, xy: Array) -> Array:
         """Return points (n, 3) [m] of places (n, 2) from the middle on a board of a shape (5,)."""
@@ -221,11 +217,10 @@ class RigProblem:
         self, state: RigState, sigmas: Array, roots: Sequence[Array], views: Sequence[int]
     ) -> list[Array]:
         """Return the compressed equations (24, 36) of views, over their cameras' sigmas."""
-        found: list[Array] = []
-        for k in views:
-            rows = view_equations(*self._arguments(state, k, roots[k]))
-            found.append(rows / sigmas[self.views[k].camera])
-        return found
+        return [
+            view_equations(*self._arguments(state, k, roots[k])) / sigmas[self.views[k].camera]
+            for k in views
+        ]
 
     def instant_rows(self, i: int, blocks: Sequence[Array]) -> tuple[Array, Array]:
         """Return F_i (rows, f) and [J_i | E_i | r_i] (rows, S + 7) of an instant's blocks."""

@@ -4,7 +4,7 @@ The middle of the ellipse is not where the dot's middle is seen: perspective and
 `outline_bias` says by how much, for a given map of the board into the image.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -221,12 +221,11 @@ def _fit_change(u: Array, normal: Array, shift: Array, usable: Mask) -> tuple[Ar
 
 def _faults(
     uv: Array, start: Array, A: Array, seen: tuple[Array, Array, Array], shape: tuple[int, ...]
-) -> tuple[str, ...]:
-    """Return why each dot cannot be used, '' where it can."""
+) -> Iterator[str]:
+    """Yield why each dot cannot be used, '' where it can."""
     rms, share, contrast = seen
     small, large = np.linalg.eigvalsh(A).T
     limit = np.array([shape[1] - 1, shape[0] - 1])
-    faults: list[str] = []
     for k in range(len(uv)):
         x_reach = np.linalg.norm(A[k], axis=-1)
         inside = bool(np.all(uv[k] - x_reach >= 0) and np.all(uv[k] + x_reach <= limit))
@@ -242,8 +241,7 @@ def _faults(
              f"outline scatters by {rms[k]:.2f} px (at most {MAX_RESIDUAL_PX:g})"),
             (moved <= 0.5 * large[k], f"outline lies {moved:.1f} px from the blob"),
         )  # fmt: skip
-        faults.append(next((reason for good, reason in checks if not good), ""))
-    return tuple(faults)
+        yield next((reason for good, reason in checks if not good), "")
 
 
 def outline_bias(to_image: Callable[[Array], Array], middles: Array, radius: Array) -> Array:

@@ -8,6 +8,7 @@ they do to its opposite the other way round, so the crossing is unbiased. Intege
 centres.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -133,7 +134,7 @@ def refine_saddles(
         uv, toward, blur = measured.uv, measured.toward, measured.blur
     assert measured is not None
     square = np.linalg.norm(arms, axis=-1).min(-1)
-    faults = _faults(measured, start, square, gray.shape)
+    faults = tuple(_faults(measured, start, square, gray.shape))
     return Saddles(uv=measured.uv, sd_px=measured.sd, blur_px=measured.blur, faults=faults)
 
 
@@ -223,9 +224,8 @@ def _variance(s: Array, weight: Array, rms: Array) -> Array:
     return rms**2 / k * (1 + mean**2 / np.maximum(spread, 1e-9))
 
 
-def _faults(found: _Pass, start: Array, square: Array, shape: tuple[int, ...]) -> tuple[str, ...]:
-    """Return why each corner cannot be used, '' where it can."""
-    faults: list[str] = []
+def _faults(found: _Pass, start: Array, square: Array, shape: tuple[int, ...]) -> Iterator[str]:
+    """Yield why each corner cannot be used, '' where it can."""
     moved = np.linalg.norm(found.uv - start, axis=-1)
     for k in range(len(start)):
         u, v = found.uv[k]
@@ -243,8 +243,7 @@ def _faults(found: _Pass, start: Array, square: Array, shape: tuple[int, ...]) -
             (moved[k] <= MAX_MOVE_SHARE * square[k],
              f"lies {moved[k]:.1f} px from where the board expects it"),
         )  # fmt: skip
-        faults.append(next((reason for good, reason in checks if not good), ""))
-    return tuple(faults)
+        yield next((reason for good, reason in checks if not good), "")
 
 
 def grid_arms(grid: Array) -> Array:

@@ -7,7 +7,9 @@ belongs to another pose, or to none. If instead a stretch fits other frames of i
 the tool or the board was moved.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -217,13 +219,11 @@ def _swaps(table: Array, pose: Rows, own: Array, inside: Mask) -> tuple[tuple[in
     suspects = [int(j) for j in np.flatnonzero(inside & (own > SWAP_FLOOR))]
     usual = float(np.median(own[inside]))
     found: list[tuple[float, int, int]] = []
-    for k, a in enumerate(suspects):
-        for b in suspects[k + 1 :]:
-            exchanged = float(np.hypot(table[pose[a], b], table[pose[b], a]))
-            if exchanged * SWAP_GAIN < np.hypot(own[a], own[b]) and exchanged < max(
-                RATIO * usual, SWAP_FLOOR
-            ):
-                found.append((exchanged, a, b))
+    limit = max(RATIO * usual, SWAP_FLOOR)
+    for a, b in combinations(suspects, 2):
+        exchanged = float(np.hypot(table[pose[a], b], table[pose[b], a]))
+        if exchanged * SWAP_GAIN < np.hypot(own[a], own[b]) and exchanged < limit:
+            found.append((exchanged, a, b))
     taken: set[int] = set()
     pairs: list[tuple[int, int]] = []
     for _, a, b in sorted(found):
@@ -243,15 +243,10 @@ def find_move(A: Array, C: Array, middle: Array) -> Moved | None:
             return None
         seed = fit_frames(A[part], C[part], middle)
         errors = np.minimum(np.diag(mismatch(seed, A, C)), CAP)
-        if part.start is None:
-            cost = (
-                np.cumsum(np.append(0, errors))
-                + np.cumsum(np.append(0, (CAP - errors)[::-1]))[::-1]
-            )
-        else:
-            cost = (
-                np.cumsum(np.append(0, CAP - errors)) + np.cumsum(np.append(0, errors[::-1]))[::-1]
-            )
+        before, after = errors, CAP - errors
+        if part.start is not None:
+            before, after = after, before
+        cost = np.cumsum(np.append(0, before)) + np.cumsum(np.append(0, after[::-1]))[::-1]
         start = int(np.argmin(cost))
         if min(start, n - start) < MIN_STRETCH:
             continue
@@ -274,15 +269,13 @@ def _likeliest(found: list[Moved]) -> Moved | None:
     return replace(chosen, either=other)
 
 
-def _moves_at(A: Array, C: Array, middle: Array, start: int) -> list[Moved]:
-    """Return both kinds of move at a row, each with the score of a model that shares the rest."""
+def _moves_at(A: Array, C: Array, middle: Array, start: int) -> Iterator[Moved]:
+    """Yield both kinds of move at a row, each with the score of a model that shares the rest."""
     halves = [fit_frames(A[s], C[s], middle) for s in (slice(start), slice(start, None))]
-    moves: list[Moved] = []
     for frame in MOVED_FRAMES:
         for fit in halves:
             step, best = _carried(A, C, middle, start, frame, fit)
-            moves.append(Moved(frame=frame, start=start, step=step, score=best.score))
-    return moves
+            yield Moved(frame=frame, start=start, step=step, score=best.score)
 
 
 def _carried(

@@ -8,6 +8,7 @@ numbers; each judged by predicting every view without it
 5. covariance from noise and from what the arm may still hide
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -226,15 +227,12 @@ def _final_fit(
 
 def map_choices(
     model: LinearModel, Ts: Array, sigma: float, ratio: Array, config: "HandEyeConfig"
-) -> list[Choice]:
-    """Return the fits with a map in tool or base axes, weakest first."""
-    choices: list[Choice] = []
+) -> Iterator[Choice]:
+    """Yield the fits with a map in tool or base axes, weakest first."""
     for strength in config.robot.map_strengths:
         for kind in ("ee", "base"):
             basis = map_basis(Ts, kind, strength, config.robot.map_unit)
-            fit = model.fit(basis, ratio, sigma)
-            choices.append(Choice(basis=basis, ratio=ratio, fit=fit))
-    return choices
+            yield Choice(basis=basis, ratio=ratio, fit=model.fit(basis, ratio, sigma))
 
 
 def chosen_of(choices: list[Choice], config: RobotErrorConfig) -> Choice:

@@ -6,6 +6,7 @@ quiet zone, the target. All in millimetres from the top left corner of the page,
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,7 +25,7 @@ from realsim_calibration.sheets.drawing import (
 from realsim_calibration.targets.target_text import describe, format_target
 
 Place = Literal["bottom", "side"]
-Marks = list[Line | Area | Label]
+Mark = Line | Area | Label
 
 EDGE_MM = 6.0
 """White that is left at the page's edge: office printers cannot print on the outer 4 to 5."""
@@ -206,7 +207,7 @@ def _line_pitch(size_pt: float) -> float:
 
 def page_of(artwork: Artwork, layout: Layout, cut_marks: bool) -> Page:
     """Return everything that is printed."""
-    marks: Marks = []
+    marks: list[Mark] = []
     for ruler in layout.rulers:
         marks += _ruler_marks(ruler)
     marks += _axis_marks(layout)
@@ -216,7 +217,7 @@ def page_of(artwork: Artwork, layout: Layout, cut_marks: bool) -> Page:
     return Page(size_mm=layout.page_mm, artwork=artwork, origin_mm=layout.origin_mm, marks=marks)
 
 
-def _ruler_marks(ruler: Ruler) -> Marks:
+def _ruler_marks(ruler: Ruler) -> Iterator[Mark]:
     """Return a ruler: a mark each millimetre at its exact place, a number each centimetre."""
     x0, y0 = ruler.zero_mm
 
@@ -225,29 +226,26 @@ def _ruler_marks(ruler: Ruler) -> Marks:
 
     half = LINE_MM / 2
     length = ruler.length_mm
-    marks: Marks = [Line(start=at(-half, 0), end=at(length + half, 0), width=LINE_MM)]
+    yield Line(start=at(-half, 0), end=at(length + half, 0), width=LINE_MM)
     for k in range(round(length) + 1):
         tall = 3.6 if k % 10 == 0 else 2.6 if k % 5 == 0 else 1.6
-        marks.append(Line(start=at(k, 0), end=at(k, tall), width=LINE_MM))
+        yield Line(start=at(k, 0), end=at(k, tall), width=LINE_MM)
         if k % 10 == 0:
             # Numbers of the upright ruler are turned with it, their feet towards the marks.
             across = 6.0 if ruler.upward else 4.2
-            number = Label(
+            yield Label(
                 at=at(k, across), text=f"{k}", size_pt=NUMBER_PT, centred=True, upward=ruler.upward
             )
-            marks.append(number)
-    marks.append(
-        Label(at=at(length + 3.2, 6.0 if ruler.upward else 4.2), text="mm", size_pt=NUMBER_PT,
-              upward=ruler.upward)
+    yield Label(
+        at=at(length + 3.2, 6.0 if ruler.upward else 4.2), text="mm", size_pt=NUMBER_PT,
+        upward=ruler.upward,
     )  # fmt: skip
-    return marks
 
 
-def _axis_marks(layout: Layout) -> Marks:
+def _axis_marks(layout: Layout) -> Iterator[Mark]:
     """Return the arrows of x and y beside the quiet zone, each with a mark at the origin."""
     left, top = layout.quiet_mm[:2]
     x0, y0 = layout.origin_mm
-    marks: Marks = []
     for name, upright in (("x", False), ("y", True)):
         start, line = (y0, left - 1.2) if upright else (x0, top - 1.2)
 
@@ -256,7 +254,7 @@ def _axis_marks(layout: Layout) -> Marks:
             return (line - out, start + along) if upright else (start + along, line - out)
 
         tip = ARROW_MM
-        marks += [
+        yield from (
             Line(start=at(0, -1.0), end=at(0, 1.0), width=LINE_MM),
             Line(start=at(0, 0), end=at(tip - 1.5, 0), width=LINE_MM),
             Area(corners=(at(tip, 0), at(tip - 2.4, 0.7), at(tip - 2.4, -0.7))),
@@ -264,16 +262,14 @@ def _axis_marks(layout: Layout) -> Marks:
                   size_pt=NUMBER_PT, centred=True),
             Label(at=(line, start + tip + 2.9) if upright else (start + tip + 1.4, line + 0.7),
                   text=name, size_pt=TITLE_PT, font="Helvetica-Bold", centred=upright),
-        ]  # fmt: skip
-    return marks
+        )  # fmt: skip
 
 
-def _text_marks(layout: Layout) -> Marks:
+def _text_marks(layout: Layout) -> Iterator[Mark]:
     """Return the lines of text at the bottom or up the right side."""
     width, height = layout.page_mm
     depth = _text_depth(layout.text)
     bottom = height - EDGE_MM - RULER_MM
-    marks: Marks = []
     done = 0.0
     for text, font, size in layout.text:
         done += _line_pitch(size)
@@ -281,20 +277,15 @@ def _text_marks(layout: Layout) -> Marks:
         at = (EDGE_MM + RULER_MM + TEXT_GAP_MM, bottom - inset - 0.5)
         if layout.place == "side":
             at = (width - EDGE_MM - inset, bottom - TEXT_GAP_MM)
-        marks.append(
-            Label(at=at, text=text, size_pt=size, font=font, upward=layout.place == "side")
-        )
-    return marks
+        yield Label(at=at, text=text, size_pt=size, font=font, upward=layout.place == "side")
 
 
-def _cut_marks(layout: Layout) -> Marks:
+def _cut_marks(layout: Layout) -> Iterator[Mark]:
     """Return marks outside the four corners of the quiet zone, in line with its edges."""
     left, top, right, bottom = layout.quiet_mm
-    marks: Marks = []
     for x, outward_x in ((left, -1.0), (right, 1.0)):
         for y, outward_y in ((top, -1.0), (bottom, 1.0)):
             x0, x1 = (x + outward_x * v for v in (CUT_GAP_MM, AXIS_MM))
             y0, y1 = (y + outward_y * v for v in (CUT_GAP_MM, AXIS_MM))
-            marks.append(Line(start=(x0, y), end=(x1, y), width=LINE_MM))
-            marks.append(Line(start=(x, y0), end=(x, y1), width=LINE_MM))
-    return marks
+            yield Line(start=(x0, y), end=(x1, y), width=LINE_MM)
+            yield Line(start=(x, y0), end=(x, y1), width=LINE_MM)

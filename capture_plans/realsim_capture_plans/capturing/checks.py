@@ -160,6 +160,11 @@ def _steepest(grey: NDArray[Any]) -> list[float]:
     return found
 
 
+def _check(name: str, reason: str, value: str, mark: Mark = "doubt") -> Check:
+    """Return a check that has the mark where there is a reason, else is good."""
+    return Check(name=name, mark=mark if reason else "good", value=value, reason=reason)
+
+
 def check_still(before: ArmState, after: ArmState) -> Check:
     """Did the flange stand still during the exposure?"""
     moved = se3.invert(before.T_base_ee) @ after.T_base_ee
@@ -167,30 +172,26 @@ def check_still(before: ArmState, after: ArmState) -> Check:
     deg = float(np.degrees(se3.angle(moved)))
     wrong = mm > MOTION_MM or deg > MOTION_DEG
     reason = f"the flange moved {mm:.2f} mm, {deg:.3f} deg during the exposure" if wrong else ""
-    return Check(
-        name="still", mark="fault" if wrong else "good", value=f"{mm:.2f} mm", reason=reason
-    )
+    return _check("still", reason, f"{mm:.2f} mm", "fault")
 
 
 def check_exposure(now: Measured, earlier: Sequence[Measured]) -> Check:
     """Is the image neither black nor burnt out, and as bright as the others?"""
-    mark: Mark = "good"
+    mark: Mark = "doubt"
     reason = ""
     usual = _median([m.brightness for m in earlier])
     if now.brightness < LEAST_BRIGHTNESS:
         mark, reason = "fault", f"the image is black (mean {now.brightness:.1f} of 255)"
     elif now.saturated > SATURATED_SHARE:
-        mark = "doubt"
         reason = f"{100 * now.saturated:.0f} % of the pixels are saturated: less light or exposure"
     elif usual is not None and not (
         BRIGHTNESS_OF_MEDIAN <= now.brightness / usual <= 1 / BRIGHTNESS_OF_MEDIAN
     ):
-        mark = "doubt"
         reason = (
             f"the brightness is {now.brightness:.0f}, the other views' {usual:.0f} of 255: is a "
             "lamp off, or something before the lens?"
         )
-    return Check(name="exposure", mark=mark, value=f"{now.brightness:.0f}", reason=reason)
+    return _check("exposure", reason, f"{now.brightness:.0f}", mark)
 
 
 def check_sharpness(now: Measured, earlier: Sequence[Measured]) -> Check:
@@ -202,36 +203,29 @@ def check_sharpness(now: Measured, earlier: Sequence[Measured]) -> Check:
     share = now.sharpness / usual
     wrong = share < SHARPNESS_OF_MEDIAN
     reason = f"blurred: {100 * share:.0f} % of the other views' sharpness" if wrong else ""
-    return Check(
-        name="sharpness",
-        mark="doubt" if wrong else "good",
-        value=f"{100 * share:.0f} %",
-        reason=reason,
-    )
+    return _check("sharpness", reason, f"{100 * share:.0f} %")
 
 
 def check_depth(now: Measured, earlier: Sequence[Measured]) -> Check:
     """Is there depth, and as much in the middle of the image as in the others?"""
-    mark: Mark = "good"
+    mark: Mark = "doubt"
     reason = ""
     usual = _median([m.depth_fill for m in earlier])
     if now.depth_share < LEAST_DEPTH_SHARE:
         mark, reason = "fault", f"only {100 * now.depth_share:.1f} % of the pixels have depth"
     elif usual is not None and now.depth_fill < DEPTH_OF_MEDIAN * usual:
-        mark = "doubt"
         reason = (
             f"depth fills {100 * now.depth_fill:.0f} % of the image's middle, in the other views "
             f"{100 * usual:.0f} %: glare, or nearer than the sensor sees?"
         )
-    return Check(name="depth", mark=mark, value=f"{100 * now.depth_fill:.0f} %", reason=reason)
+    return _check("depth", reason, f"{100 * now.depth_fill:.0f} %", mark)
 
 
 def check_size(frame: Frame, size: tuple[int, int]) -> Check:
     """Does the image have the camera's (height, width)?"""
     found = frame.rgb.shape[:2]
     reason = "" if found == size else f"the image is {found}, not {size} (height, width)"
-    mark: Mark = "fault" if reason else "good"
-    return Check(name="size", mark=mark, value=f"{found[1]}x{found[0]}", reason=reason)
+    return _check("size", reason, f"{found[1]}x{found[0]}", "fault")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -264,8 +258,7 @@ def check_clock(frame: Frame, state: ArmState, before: Earlier | None) -> Check:
             )
         elif step <= 0:
             reason = f"the camera's time stamp did not go on ({step:+.3f} s)"
-    mark: Mark = "fault" if reason else "good"
-    return Check(name="clock", mark=mark, value=f"{frame.time_s:.2f} s", reason=reason)
+    return _check("clock", reason, f"{frame.time_s:.2f} s", "fault")
 
 
 def pose_gap(state: ArmState, T_base_ee: Array) -> tuple[float, float]:
@@ -285,9 +278,7 @@ def check_pose(state: ArmState, T_base_ee: Array) -> Check:
         if wrong
         else ""
     )
-    return Check(
-        name="pose", mark="doubt" if wrong else "good", value=f"{mm:.1f} mm", reason=reason
-    )
+    return _check("pose", reason, f"{mm:.1f} mm")
 
 
 def check_tool(state: ArmState, T_ee_tcp: Array) -> Check:
@@ -302,9 +293,7 @@ def check_tool(state: ArmState, T_ee_tcp: Array) -> Check:
         if wrong
         else ""
     )
-    return Check(
-        name="tool", mark="doubt" if wrong else "good", value=f"{mm:.2f} mm", reason=reason
-    )
+    return _check("tool", reason, f"{mm:.2f} mm")
 
 
 def _median(values: Sequence[float]) -> float | None:

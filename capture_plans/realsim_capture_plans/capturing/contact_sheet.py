@@ -1,6 +1,6 @@
 """All views of a session on one picture, in the order in which they are taken."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -129,16 +129,14 @@ def _head_lines(
     return lines
 
 
-def _broken(text: str, width: int, scale: float) -> list[str]:
-    """Return a text in pieces that fit the width [px]."""
-    pieces: list[str] = []
+def _broken(text: str, width: int, scale: float) -> Iterator[str]:
+    """Yield a text in pieces that fit the width [px]."""
     while text:
         n = len(text)
         while n > 1 and _text_width(text[:n], scale) > width:
             n -= 1
-        pieces.append(text[:n].strip())
+        yield text[:n].strip()
         text = text[n:]
-    return pieces
 
 
 def _text_width(text: str, scale: float) -> int:

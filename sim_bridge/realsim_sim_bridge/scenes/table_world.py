@@ -6,6 +6,7 @@ back: `changeDynamics` loses settings without a word (damping and friction in on
 """
 
 import tempfile
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -79,7 +80,7 @@ class TableWorld:
             RealsimError: the engine did not take a setting.
         """
         self.scene = scene
-        self.notes: list[str] = _of_solids(scene)
+        self.notes = list(_of_solids(scene))
         self.names: dict[int, str] = {}
         """Body number in the engine -> what it is."""
         self.bodies: dict[int, int] = {}
@@ -281,20 +282,18 @@ def _require_taken(name: str, found: float, wanted: float, of: str) -> None:
         )
 
 
-def _of_solids(scene: SchoolScene) -> list[str]:
-    """Return what is doubtful about the objects' shapes: no volume, parts too large."""
-    notes: list[str] = []
+def _of_solids(scene: SchoolScene) -> Iterator[str]:
+    """Yield what is doubtful about the objects' shapes: no volume, parts too large."""
     for obj_id in sorted({o.obj_id for o in scene.scene.objects}):
         solid, name = scene.solids[obj_id], f"'{scene.models[obj_id].name}'"
         if solid.matter.volume_of != "mesh":
-            notes.append(
+            yield (
                 f"the mesh of {name} is not closed and has no volume of its own: that of its "
                 f"{solid.matter.volume_of} stands for it ({1e3 * solid.matter.mass_kg:.0f} g). "
                 "Repair it: `realsim scan import`."
             )
         elif not THIN_RATIO <= solid.parts.volume_ratio <= FAT_RATIO:
-            notes.append(_blown_up(name, solid.parts.volume_ratio))
-    return notes
+            yield _blown_up(name, solid.parts.volume_ratio)
 
 
 def _blown_up(name: str, ratio: float) -> str:

@@ -4,8 +4,9 @@ Only grasps that physics has tried are counted: of the others nobody knows what 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,23 +123,19 @@ def rank_correlations(
     values = {name: _quality(sets, name) for name in QUALITIES}
     known = [name for name in QUALITIES if not np.all(np.isnan(values[name]))]
     found: list[RankCorrelation] = []
-    for k, first in enumerate(known):
-        for second in known[k + 1 :]:
-            both = ~np.isnan(values[first]) & ~np.isnan(values[second])
-            x, y = values[first][both], values[second][both]
-            rho, low, high = spearman(x, y, rng)
-            found.append(
-                RankCorrelation(
-                    first=first, second=second, grasps=len(x), rho=rho, low=low, high=high
-                )
-            )
+    for first, second in combinations(known, 2):
+        both = ~np.isnan(values[first]) & ~np.isnan(values[second])
+        x, y = values[first][both], values[second][both]
+        rho, low, high = spearman(x, y, rng)
+        found.append(
+            RankCorrelation(first=first, second=second, grasps=len(x), rho=rho, low=low, high=high)
+        )
     return tuple(found)
 
 
-def closure_confusions(sets: Sequence[GraspSet]) -> tuple[ClosureConfusion, ...]:
-    """Return the confusion of every way of telling force closure that was measured."""
+def closure_confusions(sets: Sequence[GraspSet]) -> Iterator[ClosureConfusion]:
+    """Yield the confusion of every way of telling force closure that was measured."""
     score = _quality(sets, "score")
-    found: list[ClosureConfusion] = []
     for name in ("dexnet_closure", "closure_friction"):
         value = _quality(sets, name)
         known = ~np.isnan(value) & ~np.isnan(score)
@@ -147,17 +144,14 @@ def closure_confusions(sets: Sequence[GraspSet]) -> tuple[ClosureConfusion, ...]
         closed = value > 0.5 if name == "dexnet_closure" else np.isfinite(value)
         good = score >= 0.5
         levels = value[known & closed] if name == "closure_friction" else value[:0]
-        found.append(
-            ClosureConfusion(
-                closure=name,
-                friction=float(levels.max()) if len(levels) else None,
-                closed_good=int(np.sum(known & closed & good)),
-                closed_bad=int(np.sum(known & closed & ~good)),
-                open_good=int(np.sum(known & ~closed & good)),
-                open_bad=int(np.sum(known & ~closed & ~good)),
-            )
+        yield ClosureConfusion(
+            closure=name,
+            friction=float(levels.max()) if len(levels) else None,
+            closed_good=int(np.sum(known & closed & good)),
+            closed_bad=int(np.sum(known & closed & ~good)),
+            open_good=int(np.sum(known & ~closed & good)),
+            open_bad=int(np.sum(known & ~closed & ~good)),
         )
-    return tuple(found)
 
 
 def label_histogram(sets: Sequence[GraspSet]) -> Int64:

@@ -14,7 +14,7 @@ Source: GraspIT, table "GraspIT v1 Statistics" and equation 3.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -296,7 +296,7 @@ def summarise(
     return replace(
         nominal,
         correlations=rank_correlations(sets, rng or np.random.default_rng(0)),
-        closures=closure_confusions(sets),
+        closures=tuple(closure_confusions(sets)),
         p_hold=p_hold_spread(sets),
         by_paper=_counted_up({name: [_by_paper(s) for s in of] for name, of in by_scene.items()}),
     )
@@ -330,7 +330,7 @@ def _counted_up(by_scene: Mapping[str, Sequence[GraspSet]]) -> SchoolSummary:
         score_bad=_spread(scored[~is_good]).mean,
         per_object=_numbers(list(by_object.values())),
         per_scene=_numbers(list(by_scene.values())),
-        hands=_hands_on_same_objects(by_object),
+        hands=tuple(_hands_on_same_objects(by_object)),
     )
 
 
@@ -346,26 +346,22 @@ def _identity(s: GraspSet) -> tuple[str, ...]:
 
 def _hands_on_same_objects(
     by_object: Mapping[tuple[str, ...], Sequence[GraspSet]],
-) -> tuple[HandResult, ...]:
-    """Return each hand's results on the objects that all hands have tried; nothing of one hand."""
+) -> Iterator[HandResult]:
+    """Yield each hand's results on the objects that all hands have tried; nothing of one hand."""
     names = sorted({s.hand[0] for sets in by_object.values() for s in sets})
     if len(names) < 2:
-        return ()
+        return
     shared = [sets for sets in by_object.values() if {s.hand[0] for s in sets} == set(names)]
-    results: list[HandResult] = []
     for name in names:
         mine = [s for sets in shared for s in sets if s.hand[0] == name]
         scores = _joined([s.scores for s in mine])
         known = ~np.isnan(scores)
         reached = _joined([s.reachable for s in mine])[known]
         scores = scores[known]
-        results.append(
-            HandResult(
-                hand=name, objects=len(shared), judged=len(scores), reached=int(reached.sum()),
-                good=int(np.sum(scores >= GOOD_FROM)), score=_spread(scores).mean,
-            )
+        yield HandResult(
+            hand=name, objects=len(shared), judged=len(scores), reached=int(reached.sum()),
+            good=int(np.sum(scores >= GOOD_FROM)), score=_spread(scores).mean,
         )  # fmt: skip
-    return tuple(results)
 
 
 def outcomes_of(s: GraspSet) -> Int64:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from realsim.arrays import Array, Int32, Mask
+from realsim.arrays import Array, Mask
 from realsim.geometry import se3
 from realsim.records import STAGES, Mesh
 from realsim.robots.hand import Hand, along_approach
@@ -40,15 +40,10 @@ says otherwise, and the engine has to tell."""
 
 def hull_surface(body: SlipBody) -> RaySurface:
     """Return the surface of the convex parts, which may overlap."""
-    vertices: list[Array] = []
-    faces: list[Int32] = []
-    count = 0
-    for part in body.parts:
-        faces.append(ConvexHull(part).simplices + count)
-        vertices.append(part)
-        count += len(part)
+    firsts = np.cumsum([0, *(len(part) for part in body.parts)])
+    faces = [ConvexHull(p).simplices + n for p, n in zip(body.parts, firsts, strict=False)]
     return RaySurface(
-        Mesh(vertices=np.concatenate(vertices), faces=np.concatenate(faces).astype(np.int32))
+        Mesh(vertices=np.concatenate(body.parts), faces=np.concatenate(faces).astype(np.int32))
     )
 
 

@@ -1,5 +1,6 @@
 """A laid-out scene with its looks, as the renderer takes it; and its models as a library."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -211,7 +212,7 @@ def build_scene(
     if rng.uniform() < config.walls and max(environment.sun) == 0:
         room = (*room, walls(table.height_m, farthest_m, rng))
     around = part_looks(table, room, looks, own)
-    names = _unique([o.name for o in layout.objects])
+    names = list(_unique([o.name for o in layout.objects]))
     for instance, laid in enumerate(layout.objects):
         found = read_object(pool.sources[laid.source], laid.key, config.pool, cache)
         keep = config.pool.keep_size
@@ -244,14 +245,12 @@ def build_scene(
     return BuiltScene(synthetic=synthetic, solids=solids, table=table)
 
 
-def _unique(names: list[str]) -> list[str]:
-    """Return the names with a number after those that come again."""
+def _unique(names: list[str]) -> Iterator[str]:
+    """Yield the names with a number after those that come again."""
     seen: dict[str, int] = {}
-    out: list[str] = []
     for name in names:
         seen[name] = seen.get(name, 0) + 1
-        out.append(name if seen[name] == 1 else f"{name}-no{seen[name]}")
-    return out
+        yield name if seen[name] == 1 else f"{name}-no{seen[name]}"
 
 
 def _provenance(layout: Layout, pool: ObjectPool) -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """Grasps through all four stages whose outcome is known: the symmetric box, and too weak a hand."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from realsim.arrays import Array
@@ -14,10 +16,9 @@ from realsim_sim_bridge.validation.report import CheckResult
 from realsim_sim_bridge.validation.specimens import DOWN, SIDE_M, cube_trial
 
 
-def box_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
-    """Return score, slip and turn of the plain cube, held from above, from the side and askew."""
+def box_checks(engine: Engine, config: ValidationConfig) -> Iterator[CheckResult]:
+    """Yield score, slip and turn of the plain cube, held from above, from the side and askew."""
     stages = config.stages
-    checks: list[CheckResult] = []
     for mass in stages.box_masses_kg:
         slips = run_slip_test(
             cube_trial(mass, _approaches(), config.hand),
@@ -33,7 +34,7 @@ def box_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
             turn_deg = np.nan_to_num(np.degrees(slips.slip_rad), nan=np.inf, posinf=np.inf).max(
                 axis=0
             )
-        checks += [
+        yield from (
             CheckResult(
                 group="box", name=f"box {label}, score", what=f"least score of the {size}",
                 measured=float(_scores(slips).min()), unit="", limit=1.0, at_least=True,
@@ -50,8 +51,7 @@ def box_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
                 measured=float(turn_deg.max()), unit="deg", limit=stages.box_turn_deg,
                 detail=_per_stage(turn_deg),
             ),
-        ]  # fmt: skip
-    return checks
+        )  # fmt: skip
 
 
 def _arc_m(config: ValidationConfig) -> float:

@@ -1,5 +1,6 @@
 """A body between two pads under a constant load: how far does it move?"""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -94,15 +95,13 @@ class FrictionPatch:
         return twist
 
 
-def _turns_about(rows: Array, w: Array) -> list[Array]:
-    """Return the twists (3,) with w . t = 1 about each point: corners, which descent is slow at."""
-    twists: list[Array] = []
+def _turns_about(rows: Array, w: Array) -> Iterator[Array]:
+    """Yield the twists (3,) with w . t = 1 about each point: corners, which descent is slow at."""
     for S in rows:
         turn = np.cross(S[0], S[1])
         power = float(w @ turn)
         if abs(power) > 1e-12 * np.linalg.norm(w):
-            twists.append(turn / power)
-    return twists
+            yield turn / power
 
 
 def hand_patch(points_m: Array, force_n: float, friction: float) -> FrictionPatch:

@@ -1,5 +1,6 @@
 """The load at which a held cube slips or turns, against Coulomb's limit; and no creep below it."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -85,7 +86,7 @@ def limit_checks(
         what = "error of the load that turns the cube, against the pads' limit surface"
         limit_pct = limits.torque_pct
     ratios = [_ratio(engine, config, group, load, case, shares) for case in cases for load in loads]
-    return _by_load(ratios, what, limit_pct), ratios
+    return list(_by_load(ratios, what, limit_pct)), ratios
 
 
 def creep_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
@@ -277,23 +278,19 @@ def _case(slip: SlipConfig) -> str:
     return f"{slip.physics.force_n:g} N, mu {slip.physics.friction:g}"
 
 
-def _by_load(ratios: list[LimitRatio], what: str, limit_pct: float) -> list[CheckResult]:
-    """Return one check a load: the worst of its cases."""
-    checks: list[CheckResult] = []
+def _by_load(ratios: list[LimitRatio], what: str, limit_pct: float) -> Iterator[CheckResult]:
+    """Yield one check a load: the worst of its cases."""
     for load in dict.fromkeys(r.load for r in ratios):
         mine = [r for r in ratios if r.load == load]
         worst = max(mine, key=lambda r: r.error)
-        checks.append(
-            CheckResult(
-                group=worst.group,
-                name=f"{worst.group} limit, {load}",
-                what=what,
-                # Rounded, because 0.97 is not 3 % below 1 in binary.
-                measured=round(100.0 * worst.error, 6),
-                unit="%",
-                limit=limit_pct,
-                detail=f"holds {worst.held:g}, slips {worst.slipped:g} at {worst.case}; "
-                f"{len(mine)} cases",
-            )
+        yield CheckResult(
+            group=worst.group,
+            name=f"{worst.group} limit, {load}",
+            what=what,
+            # Rounded, because 0.97 is not 3 % below 1 in binary.
+            measured=round(100.0 * worst.error, 6),
+            unit="%",
+            limit=limit_pct,
+            detail=f"holds {worst.held:g}, slips {worst.slipped:g} at {worst.case}; "
+            f"{len(mine)} cases",
         )
-    return checks
