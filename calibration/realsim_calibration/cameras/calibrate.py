@@ -215,7 +215,7 @@ def _report(
         boards=tuple(
             None if b.place == "free" else Z for b, Z in zip(rig.boards, state.Z, strict=True)
         ),
-        pairs=pair_reports(rig, state.X, covariance, views, A, problem.middles),
+        pairs=tuple(pair_reports(rig, state.X, covariance, views, A, problem.middles)),
         views=views,
         robot_map=solution.robot_map,
         map_name="none" if solution.basis is None else solution.basis.name,

@@ -1,5 +1,6 @@
 """What the calibration of several cameras says of itself: each camera, each pair, each view."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -147,8 +148,8 @@ class CamerasReport:
 def pair_reports(
     rig: Rig, X: Array, covariance: Array, views: tuple[SightingReport, ...], A: Array,
     middles: list[Array],
-) -> tuple[PairReport, ...]:  # fmt: skip
-    """Return every pair of cameras.
+) -> Iterator[PairReport]:  # fmt: skip
+    """Yield every pair of cameras.
 
     T_a_b = (H_a X_a)^-1 H_b X_b with H = A for a camera in the hand; its right perturbation is
     xi_b - Ad(T_a_b^-1) xi_a.
@@ -163,7 +164,6 @@ def pair_reports(
     """
     used = {(v.camera, v.board, v.instant): v.T_cam_board for v in views if v.used}
     boards = {b.name: k for k, b in enumerate(rig.boards)}
-    found: list[PairReport] = []
     for a, b in combinations(range(len(rig.cameras)), 2):
         names = (rig.cameras[a].name, rig.cameras[b].name)
         both = [
@@ -189,10 +189,7 @@ def pair_reports(
         J[:, 6 * a : 6 * a + 6] = -se3.adjoint(se3.invert(T))
         worst = max(apart, key=lambda i: apart[i]) if apart else -1
         rms = float(np.sqrt(np.mean(np.square(list(apart.values()))))) if apart else float("nan")
-        found.append(
-            PairReport(
-                names=names, together=len(apart), T_a_b=T, covariance=J @ covariance @ J.T,
-                apart_mm=rms, worst=rig.instants[worst].name if apart else "",
-            )
+        yield PairReport(
+            names=names, together=len(apart), T_a_b=T, covariance=J @ covariance @ J.T,
+            apart_mm=rms, worst=rig.instants[worst].name if apart else "",
         )  # fmt: skip
-    return tuple(found)

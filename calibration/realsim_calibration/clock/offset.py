@@ -11,7 +11,7 @@ least squares and of the sum of the pairs' scores with their autocorrelation (Ne
 Econometrica 55(3), 1987): neighbours in a stream share what the models leave.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -91,8 +91,6 @@ class ClockOffset:
     """d: a frame stamped t was taken at t - d of the robot's clock [s]."""
     sigma_s: float
     """Its 1-sigma [s]."""
-    correlation: float
-    """Correlation of the turning speeds at the start."""
     jitter_s: float
     """Size of the stamps' jitter [s]."""
     moved_mm: float
@@ -156,13 +154,12 @@ def estimate_clock_offset(
     # Stamps of 1.7e9 s leave a quarter of a microsecond: times from the middle keep all digits.
     zero = tr[0], tc[0]
     tr, tc = tr - zero[0], tc - zero[1]
-    start, correlation = first_offset(tr, A, tc, C)
     fit = _Fit(tr, A, tc, C, zero[1] - zero[0], mode)
-    return replace(fit.run(start), correlation=correlation)
+    return fit.run(first_offset(tr, A, tc, C))
 
 
-def first_offset(tr: Array, A: Array, tc: Array, C: Array) -> tuple[float, float]:
-    """Return the lag at which the turning speeds agree best [s], and their correlation.
+def first_offset(tr: Array, A: Array, tc: Array, C: Array) -> float:
+    """Return the lag at which the turning speeds agree best [s].
 
     Raises:
         InputError: no motion, or no lag stands out.
@@ -198,7 +195,7 @@ def first_offset(tr: Array, A: Array, tc: Array, C: Array) -> tuple[float, float
     left, mid, right = value[k - 1 : k + 2]
     bend = left - 2 * mid + right
     shift = 0.5 * (left - right) / bend if bend < 0 else 0.0
-    return float(lags[k] + np.clip(shift, -1, 1) * (lags[k] - lags[k - 1])), float(value[best])
+    return float(lags[k] + np.clip(shift, -1, 1) * (lags[k] - lags[k - 1]))
 
 
 class _Fit:
@@ -295,7 +292,7 @@ class _Fit:
         moved_mm = float(1e3 * np.sqrt(np.mean(np.sum(moved**2, -1))))
         return ClockOffset(
             offset_s=whole, sigma_s=float(np.sqrt(inverse[12, 12] * factor)),
-            correlation=float("nan"), jitter_s=float(noise.sizes[-1]), moved_mm=moved_mm,
+            jitter_s=float(noise.sizes[-1]), moved_mm=moved_mm,
             scatter_mm=scatter, matters=moved_mm > MATTERS * scatter, mode=self.mode,
             X=X, Z=Z, covariance=inverse[:12, :12], used=used,
         )  # fmt: skip

@@ -30,23 +30,17 @@ GLOBALS = CAMERA_TERMS + BOARD_TERMS
 ROW = GLOBALS + 6
 NEAREST_M = 1e-6
 """A point nearer to the camera's plane than this [m] is behind the camera."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SolverConfig:
-    """Steps of the Levenberg-Marquardt solver."""
-
-    max_iterations: int = 60
-    """Steps of one fit; ten are typical, a start far off takes more."""
-    first_damping: float = 1e-4
-    """Damping of the first step, relative to the diagonal: nearly Gauss-Newton."""
-    most_damping: float = 1e8
-    """Damping at which no step helps any more: the fit has converged."""
-    tolerance: float = 1e-7
-    """Stop at a predicted decrease of the cost below this [sigma^2]: 3e-4 sigmas of any term."""
-    huber_sigmas: float = 3.0
-    """Corners further off than this many sigma lose weight; far enough out to cost 1 % of the
-    information of Gaussian corners."""
+MAX_STEPS = 60
+"""Steps of one fit; ten are typical, a start far off takes more."""
+FIRST_DAMPING = 1e-4
+"""Damping of the first step, relative to the diagonal: nearly Gauss-Newton."""
+MOST_DAMPING = 1e8
+"""Damping at which no step helps any more: the fit has converged."""
+TOLERANCE = 1e-7
+"""Stop at a predicted decrease of the cost below this [sigma^2]: 3e-4 sigmas of any term."""
+HUBER_SIGMAS = 3.0
+"""Corners further off than this many sigma lose weight; far enough out to cost 1 % of the
+information of Gaussian corners."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -344,8 +338,9 @@ def _step(
 
 
 def adjust(
-    state: State, obs: Observations, prior: Prior, sigma_px: float, config: SolverConfig
-) -> LensFit:
+    state: State, obs: Observations, prior: Prior, sigma_px: float,
+    *, tolerance: float = TOLERANCE, most_steps: int = MAX_STEPS,
+) -> LensFit:  # fmt: skip
     """Return the fit of least cost near a state (Levenberg-Marquardt).
 
     Args:
@@ -353,22 +348,23 @@ def adjust(
         obs: the corners.
         prior: beliefs, and the terms that are free.
         sigma_px: 1-sigma of a coordinate of weight 1 [px].
-        config: the solver's steps.
+        tolerance: predicted decrease of the cost at which it stops [sigma^2].
+        most_steps: steps at most.
 
     Raises:
         DegenerateError: the start is invalid, or the equations are singular.
     """
 
     def evaluate(trial: State) -> tuple[_Normal, float]:
-        equations = _normal(trial, obs, sigma_px, config.huber_sigmas)
+        equations = _normal(trial, obs, sigma_px, HUBER_SIGMAS)
         beliefs, _ = prior.residuals(trial.theta)
         return equations, float(equations.costs.sum() + beliefs @ beliefs)
 
     normal, cost = evaluate(state)
     if not np.isfinite(cost):
         raise DegenerateError("camera fit: the start puts corners behind the camera.")
-    damping = config.first_damping
-    for _ in range(config.max_iterations):
+    damping = FIRST_DAMPING
+    for _ in range(most_steps):
         try:
             step, poses, promised = _step(normal, prior, state.theta, damping)
         except np.linalg.LinAlgError as error:
@@ -383,7 +379,7 @@ def adjust(
             damping = max(damping * 0.1, 1e-12)
         else:
             damping = max(damping * 10, 1e-6)
-        if promised < config.tolerance or damping > config.most_damping:
+        if promised < tolerance or damping > MOST_DAMPING:
             break
     S, s, _ = _reduce(normal, 0.0)
     return LensFit(
@@ -393,21 +389,21 @@ def adjust(
 
 
 def refine_poses(
-    state: State, obs: Observations, sigma_px: float, config: SolverConfig
+    state: State, obs: Observations, sigma_px: float, tolerance: float, most_steps: int = MAX_STEPS
 ) -> tuple[State, Array]:
     """Return the state with every pose refined by itself, and the views' robust costs (views,).
 
     The cost of a view with a corner behind the camera is infinite.
     """
     pose = slice(GLOBALS, ROW)
-    damping = np.full(obs.views, config.first_damping)
-    normal = _normal(state, obs, sigma_px, config.huber_sigmas, GLOBALS)
-    for _ in range(config.max_iterations):
+    damping = np.full(obs.views, FIRST_DAMPING)
+    normal = _normal(state, obs, sigma_px, HUBER_SIGMAS, GLOBALS)
+    for _ in range(most_steps):
         block, g = normal.H[:, pose, pose], normal.g[:, pose]
         step = -np.linalg.solve(_damped(block, damping), g[..., None])[..., 0]
         promised = -np.sum(g * step, -1)
         trial = replace(state, poses=state.poses @ se3.exp(step))
-        equations = _normal(trial, obs, sigma_px, config.huber_sigmas, GLOBALS)
+        equations = _normal(trial, obs, sigma_px, HUBER_SIGMAS, GLOBALS)
         better = equations.costs <= normal.costs
         corner = better[obs.view]
         normal = _Normal(
@@ -418,6 +414,6 @@ def refine_poses(
         )
         state = replace(state, poses=np.where(better[:, None, None], trial.poses, state.poses))
         damping = np.where(better, np.maximum(damping * 0.1, 1e-12), np.maximum(damping * 10, 1e-6))
-        if np.all((promised < config.tolerance) | (damping > config.most_damping)):
+        if np.all((promised < tolerance) | (damping > MOST_DAMPING)):
             break
     return state, normal.costs

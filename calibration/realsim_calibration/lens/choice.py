@@ -16,13 +16,11 @@ from realsim_calibration.lens.bundle import (
     GLOBALS,
     LensFit,
     Observations,
-    SolverConfig,
     State,
     adjust,
     points_in_camera,
     refine_poses,
 )
-from realsim_calibration.lens.fit import IntrinsicsConfig
 from realsim_calibration.lens.models import MODELS
 from realsim_calibration.lens.start import is_line
 
@@ -30,6 +28,13 @@ TINY_PX2 = 1e-20
 """Perfect corners have errors of rounding only, which have no logarithm worth comparing [px^2]."""
 HALF_POINTS = 4
 """Corners that each half of a view needs for a pose."""
+FOLD_STEPS = 3
+"""Solver steps of a fold's lens, after one Newton step from the lens of all views."""
+MARGIN_SE = 1.0
+"""Standard errors that the smallest acceptable model may be worse than the best."""
+WORTH = 0.01
+"""Least relative gain in mean square error on unseen views that a larger model must bring: among
+six models one beats the others by a standard error now and then by luck."""
 POSE_TOLERANCE = 1e-3
 """Predicted decrease [sigma^2] at which a left-out view's pose is found."""
 
@@ -74,16 +79,13 @@ def halves(obs: Observations) -> tuple[Mask, Mask]:
     return second, good
 
 
-def predict_unseen(
-    state: State, obs: Observations, sigma_px: float, config: SolverConfig
-) -> tuple[Array, Int64]:
+def predict_unseen(state: State, obs: Observations, sigma_px: float) -> tuple[Array, Int64]:
     """Return squared errors [px^2] of corners predicted from their view's other half, and counts.
 
     Args:
         state: a lens and a board that have not seen these views; poses to start from.
         obs: the views.
         sigma_px: 1-sigma of a coordinate, for the robust weights [px].
-        config: the solver's steps.
 
     Returns:
         (views,) sums and (views,) numbers of corners; 0 where a view is too small to be halved.
@@ -95,7 +97,7 @@ def predict_unseen(
     part, kept = obs.only_views(good), second[good[obs.view]]
     start = state.only_views(good)
     for half in (kept, ~kept):
-        posed, _ = refine_poses(start, part.only_corners(half), sigma_px, config)
+        posed, _ = refine_poses(start, part.only_corners(half), sigma_px, POSE_TOLERANCE)
         rest = part.only_corners(~half)
         total[good] += rest.per_view(_square_errors(posed, rest))
         count[good] += np.diff(rest.offsets)
@@ -122,25 +124,22 @@ def _without(fit: LensFit, train: Mask) -> State:
     return fit.state.moved(step)
 
 
-def held_out_errors(
-    fit: LensFit, obs: Observations, folds: Int64, config: IntrinsicsConfig
-) -> Array:
+def held_out_errors(fit: LensFit, obs: Observations, folds: Int64) -> Array:
     """Return the mean squared error [px^2] of every view (views,), its lens from other folds.
 
     NaN where a view is too small, infinite where the others do not determine the model.
     """
     errors = np.full(obs.views, np.nan)
-    quick = replace(config.solver, max_iterations=config.fold_steps)
-    posing = replace(config.solver, tolerance=POSE_TOLERANCE)
     for fold in range(int(folds.max()) + 1):
         test = folds == fold
         try:
             start = _without(fit, ~test)
             trained = adjust(
-                start.only_views(~test), obs.only_views(~test), fit.prior, fit.sigma_px, quick
-            )
+                start.only_views(~test), obs.only_views(~test), fit.prior, fit.sigma_px,
+                most_steps=FOLD_STEPS,
+            )  # fmt: skip
             state = replace(trained.state, poses=fit.state.poses[test])
-            total, count = predict_unseen(state, obs.only_views(test), fit.sigma_px, posing)
+            total, count = predict_unseen(state, obs.only_views(test), fit.sigma_px)
         except (DegenerateError, np.linalg.LinAlgError):
             errors[test] = np.inf
             continue
@@ -149,14 +148,11 @@ def held_out_errors(
 
 
 def score_models(
-    fits: dict[str, tuple[LensFit, tuple[tuple[str, str], ...]]],
-    obs: Observations,
-    folds: Int64,
-    config: IntrinsicsConfig,
+    fits: dict[str, tuple[LensFit, tuple[tuple[str, str], ...]]], obs: Observations, folds: Int64
 ) -> tuple[ModelScore, ...]:
     """Return the table of models (given smallest first), with the chosen one marked.
 
-    Chosen is the smallest model whose error is within `margin_se` standard errors of the
+    Chosen is the smallest model whose error is within MARGIN_SE standard errors of the
     best's, or not worth the difference. Models are compared view by view, so what is common to
     all of them does not blur the choice, and in logarithms, so that one blurred view does not
     decide it.
@@ -165,7 +161,6 @@ def score_models(
         fits: every model's fit, and its (term, reason) that are held.
         obs: the views.
         folds: (views,) fold of every view.
-        config: how to compare.
     """
     terms = {
         name: tuple(t for t in MODELS[name] if t not in dict(held))
@@ -174,7 +169,7 @@ def score_models(
     known: dict[tuple[str, ...], Array] = {}
     for name, (fit, _) in fits.items():
         if terms[name] not in known:
-            known[terms[name]] = held_out_errors(fit, obs, folds, config)
+            known[terms[name]] = held_out_errors(fit, obs, folds)
     errors = {name: known[terms[name]] for name in fits}
     usable = {n: e for n, e in errors.items() if np.isfinite(e).any() and not np.isinf(e).any()}
     logs = {n: np.log(np.maximum(e[np.isfinite(e)], TINY_PX2)) for n, e in usable.items()}
@@ -187,7 +182,7 @@ def score_models(
             difference = logs[name] - logs[best]
             held_out, excess = float(np.nanmean(errors[name])), float(difference.mean())
             se = float(difference.std(ddof=1) / np.sqrt(len(difference)))
-        pick = name in usable and not chosen and excess <= max(config.margin_se * se, config.worth)
+        pick = name in usable and not chosen and excess <= max(MARGIN_SE * se, WORTH)
         chosen = chosen or pick
         scores.append(
             ModelScore(

@@ -1,6 +1,6 @@
 """Fitting one lens model after the other: sigma from the data, undetermined terms held."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,10 +10,10 @@ from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim_calibration.fit.view_system import camera_record
 from realsim_calibration.lens.bundle import (
     CAMERA_TERMS,
+    HUBER_SIGMAS,
     LensFit,
     Observations,
     Prior,
-    SolverConfig,
     State,
     adjust,
 )
@@ -22,6 +22,22 @@ from realsim_calibration.lens.models import MODELS, TERM_NAMES, free_terms
 
 HOLD_ORDER = ((("k6",), ("k5",), ("k4",), ("k3",), ("k2",), ("k1",)), (("p1", "p2"),))
 """In which order terms are asked whether the views determine them."""
+SIGMA_ROUNDS = 5
+"""Rounds of re-estimating the corners' sigma, at most."""
+SIGMA_SETTLED = 0.02
+"""Relative change of sigma from which on it stays."""
+ROUGH_TOLERANCE = 0.1
+"""Predicted decrease [sigma^2] at which a fit is good enough for re-estimating sigma."""
+SIGMA_FLOOR_PX = 1e-5
+"""Least sigma [px]: perfect corners exist in simulation only."""
+PRIOR_LIMIT = 0.7
+"""A term whose sigma is more than this share of its prior's was not measured: it is held."""
+BORDER_LIMIT_PX = 3.0
+"""A term that moves the image's border by more than this [px], by one sigma with the others
+following, is held: what it says where there are no corners is invented."""
+MEASURED_SIGMAS = 2.0
+"""A term this many sigmas from where it would be held is not held for the border's sake: the
+corners there are contradict holding it."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -33,52 +49,13 @@ class IntrinsicsConfig:
     board_shape: bool = True
     """Whether the print's aspect and bending are estimated: no printed board is flat, and a lens
     fitted to a flat one is wrong by several sigmas."""
-    folds: int = 5
-    """Parts that the views are split into for the choice of the model."""
-    fold_steps: int = 3
-    """Solver steps of a fold's lens, after one Newton step from the lens of all views."""
-    choice_views: int = 100
-    """Views that the model is chosen on where there are more: the choice is clear by then."""
-    margin_se: float = 1.0
-    """Standard errors that the smallest acceptable model may be worse than the best."""
-    worth: float = 0.01
-    """Least relative gain in mean square error on unseen views that a larger model must bring:
-    among six models one beats the others by a standard error now and then by luck."""
-    least_scored_views: int = 5
-    """Views from which on a choice by unseen views means something; below it `few_views_model`."""
-    few_views_model: str = "k1 k2"
-    """Model for fewer views: held-out errors of three views choose at random."""
-    sigma_rounds: int = 5
-    """Rounds of re-estimating the corners' sigma, at most."""
-    sigmasettled: float = 0.02
-    """Relative change of sigma from which on it stays."""
-    rough_tolerance: float = 0.1
-    """Predicted decrease [sigma^2] at which a fit is good enough for re-estimating sigma."""
-    sigma_floor_px: float = 1e-5
-    """Least sigma [px]: perfect corners exist in simulation only."""
-    focal_limit: float = 0.03
-    """A focal length less certain than this, relative, is refused: it is no calibration."""
-    least_spread_deg: float = 6.0
-    """Least angle between the board's normals of some two views, without a start: below it the
-    focal length hangs on assumptions (a centred principal point, square pixels) alone."""
-    prior_limit: float = 0.7
-    """A term whose sigma is more than this share of its prior's was not measured: it is held."""
-    border_limit_px: float = 3.0
-    """A term that moves the image's border by more than this [px], by one sigma with the others
-    following, is held: what it says where there are no corners is invented."""
-    measured_sigmas: float = 2.0
-    """A term this many sigmas from where it would be held is not held for the border's sake: the
-    corners there are contradict holding it."""
-    solver: SolverConfig = field(default_factory=SolverConfig)
 
     def __post_init__(self) -> None:
         """Check the names of the models."""
         if not self.models:
             raise InputError(f"no lens model was given; {', '.join(MODELS)} are known.")
-        for name in (*self.models, self.few_views_model):
+        for name in self.models:
             free_terms(name)
-        if self.folds < 2:
-            raise InputError(f"{self.folds} folds were asked for; at least 2 are needed.")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -95,35 +72,32 @@ class Candidate:
     """(term, reason) of the terms that are held."""
 
 
-def robust_sigma(fit_residuals: Array, weight: Array, floor: float) -> float:
+def robust_sigma(fit_residuals: Array, weight: Array) -> float:
     """Return 1.4826 times the median absolute coordinate [px]."""
     scaled = np.abs(fit_residuals) * np.sqrt(weight)[:, None]
-    return max(MAD_TO_SIGMA * float(np.median(scaled)), floor)
+    return max(MAD_TO_SIGMA * float(np.median(scaled)), SIGMA_FLOOR_PX)
 
 
-def _unit_sigma(fit: LensFit, obs: Observations, config: IntrinsicsConfig) -> float:
+def _unit_sigma(fit: LensFit, obs: Observations) -> float:
     """Return the unit-weight sigma of a robust fit [px]: Huber's weights, degrees of freedom."""
     square = np.sum(fit.residuals**2, -1) * obs.weight
-    limit = config.solver.huber_sigmas * fit.sigma_px
+    limit = HUBER_SIGMAS * fit.sigma_px
     far = np.sqrt(np.maximum(square, limit**2))
     freedom = 2 * len(square) - 6 * obs.views - int(fit.prior.free.sum())
     if freedom <= 0:
         return fit.sigma_px
     sigma = float(np.sqrt(np.sum(square * limit / far) / freedom))
-    return max(sigma, config.sigma_floor_px)
+    return max(sigma, SIGMA_FLOOR_PX)
 
 
-def settle(
-    state: State, obs: Observations, prior: Prior, sigma: float, config: IntrinsicsConfig
-) -> LensFit:
+def settle(state: State, obs: Observations, prior: Prior, sigma: float) -> LensFit:
     """Return the fit with its own sigma: fit roughly until sigma stays, then fit."""
-    rough = replace(config.solver, tolerance=config.rough_tolerance)
-    for _ in range(config.sigma_rounds):
-        fit = adjust(state, obs, prior, sigma, rough)
-        before, sigma, state = sigma, _unit_sigma(fit, obs, config), fit.state
-        if abs(sigma / before - 1) < config.sigmasettled:
+    for _ in range(SIGMA_ROUNDS):
+        fit = adjust(state, obs, prior, sigma, tolerance=ROUGH_TOLERANCE)
+        before, sigma, state = sigma, _unit_sigma(fit, obs), fit.state
+        if abs(sigma / before - 1) < SIGMA_SETTLED:
             break
-    return adjust(state, obs, prior, sigma, config.solver)
+    return adjust(state, obs, prior, sigma)
 
 
 def model_prior(
@@ -140,19 +114,17 @@ def fit_candidates(
     found: dict[str, Candidate] = {}
     state = fit.state
     for name in (name for name in MODELS if name in config.models):
-        full = fit_model(state, obs, model_prior(prior, name, config), fit.sigma_px, config)
+        full = fit_model(state, obs, model_prior(prior, name, config), fit.sigma_px)
         found[name] = _hold_terms(obs, full, name, config)
         state = full.state
     return found
 
 
-def fit_model(
-    state: State, obs: Observations, prior: Prior, sigma: float, config: IntrinsicsConfig
-) -> LensFit:
+def fit_model(state: State, obs: Observations, prior: Prior, sigma: float) -> LensFit:
     """Return the fit of a model, its held terms put where they are held."""
     theta = np.where(prior.free, state.theta, prior.mean)
     start = replace(state, camera=theta[:CAMERA_TERMS], board=theta[CAMERA_TERMS:])
-    return settle(start, obs, prior, sigma, config)
+    return settle(start, obs, prior, sigma)
 
 
 def _hold_terms(obs: Observations, fit: LensFit, model: str, config: IntrinsicsConfig) -> Candidate:
@@ -167,44 +139,38 @@ def _hold_terms(obs: Observations, fit: LensFit, model: str, config: IntrinsicsC
         for names in order:
             if not set(names) <= set(MODELS[model]):
                 continue
-            reasons = {n: _why_refused(fit, covariance, n, obs, config) for n in names}
+            reasons = {n: _why_refused(fit, covariance, n, obs) for n in names}
             if not any(reasons.values()):
                 break
             refused |= {n: r or "it goes with the other one" for n, r in reasons.items()}
             prior = model_prior(fit.prior, model, config, tuple(refused))
-            fit = fit_model(fit.state, obs, prior, fit.sigma_px, config)
+            fit = fit_model(fit.state, obs, prior, fit.sigma_px)
             covariance = global_covariance(fit)
     return Candidate(
         model=model, fit=fit, covariance=covariance, opened=opened, refused=tuple(refused.items())
     )
 
 
-def _why_refused(
-    fit: LensFit,
-    covariance: GlobalCovariance,
-    name: str,
-    obs: Observations,
-    config: IntrinsicsConfig,
-) -> str:
+def _why_refused(fit: LensFit, covariance: GlobalCovariance, name: str, obs: Observations) -> str:
     """Return why a term is held, empty where it is not."""
     term = TERM_NAMES.index(name)
     sd, belief = float(covariance.sd[term]), float(fit.prior.sd[term])
     at = f"held at {fit.prior.mean[term]:g}"
-    if sd > config.prior_limit * belief:
+    if sd > PRIOR_LIMIT * belief:
         return (
             f"the views know it to +-{sd:.2g} only, no better than it is known of any lens "
             f"(+-{belief:.2g}): {at}"
         )
     away = abs(float(fit.state.camera[term] - fit.prior.mean[term]))
-    if name == "k1" or away > config.measured_sigmas * sd:
+    if name == "k1" or away > MEASURED_SIGMAS * sd:
         return ""
     camera = camera_record(fit.state.camera, obs.image_size)
     effect = border_effect(camera, covariance.camera, term)
     if np.isinf(effect) and name.startswith("k"):
         return f"with it the lens folds back before the image's border: {at}"
-    if np.isfinite(effect) and effect > config.border_limit_px:
+    if np.isfinite(effect) and effect > BORDER_LIMIT_PX:
         return (
             f"one sigma of it (+-{sd:.2g}) moves the image's border by {effect:.1f} px "
-            f"({config.border_limit_px:g} px is the limit), because no corners are there: {at}"
+            f"({BORDER_LIMIT_PX:g} px is the limit), because no corners are there: {at}"
         )
     return ""

@@ -23,6 +23,7 @@ from realsim_calibration.lens.choice import ModelScore, fold_of_views, halves, s
 from realsim_calibration.lens.covariance import global_covariance
 from realsim_calibration.lens.coverage import GOOD_TILT_DEG, measure_coverage
 from realsim_calibration.lens.fit import (
+    SIGMA_FLOOR_PX,
     Candidate,
     IntrinsicsConfig,
     fit_candidates,
@@ -44,6 +45,19 @@ TILT_ADVICE = (
     "Add views that tilt the board by 30 deg about two axes (towards you, away from you, to the "
     "left, to the right), or give the factory's intrinsics (`--intrinsics`; `start` in Python)."
 )
+FOLDS = 5
+"""Parts that the views are split into for the choice of the model."""
+CHOICE_VIEWS = 100
+"""Views that the model is chosen on where there are more: the choice is clear by then."""
+LEAST_SCORED_VIEWS = 5
+"""Views from which on a choice by unseen views means something; below it FEW_VIEWS_MODEL."""
+FEW_VIEWS_MODEL = "k1 k2"
+"""Model for fewer views: held-out errors of three views choose at random."""
+FOCAL_LIMIT = 0.03
+"""A focal length less certain than this, relative, is refused: it is no calibration."""
+LEAST_SPREAD_DEG = 6.0
+"""Least angle between the board's normals of some two views, without a start: below it the focal
+length hangs on assumptions (a centred principal point, square pixels) alone."""
 
 
 def calibrate_intrinsics(
@@ -72,10 +86,10 @@ def calibrate_intrinsics(
     corners = gather(detections, target, names, start)
     _require_views(corners, start)
     corners, fit, prior, how = _first_fit(corners, start, config)
-    corners, fit = _clean(corners, fit, start, config)
+    corners, fit = _clean(corners, fit, start)
     _check_focal(corners, fit, start, config)
     candidates = fit_candidates(corners.obs, fit, prior, config)
-    model, scores = _choose_model(corners.obs, candidates, config)
+    model, scores = _choose_model(corners.obs, candidates)
     chosen = candidates[model]
     # What the lens may do where there are no corners is what the wider model would do there.
     wider = candidates[REFERENCE] if _is_wider(REFERENCE, model, candidates) else chosen
@@ -129,18 +143,18 @@ def _first_fit(
     obs = corners.obs
     prior = lens_prior(float(state.camera[0]), obs.image_size, start)
     # The misfit of the closed form is taken for noise.
-    sigma = max(float(np.median(errors)), config.sigma_floor_px)
-    fit = adjust(state, obs, model_prior(prior, "k1", config), sigma, config.solver)
+    sigma = max(float(np.median(errors)), SIGMA_FLOOR_PX)
+    fit = adjust(state, obs, model_prior(prior, "k1", config), sigma)
     # The beliefs about the distortion need the focal length, which is known well enough by now.
     prior = lens_prior(float(fit.state.camera[0]), obs.image_size, start)
-    sigma = robust_sigma(fit.residuals, obs.weight, config.sigma_floor_px)
-    state = choose_twins(fit.state, obs, sigma, config.solver)
-    fit = settle(state, obs, model_prior(prior, "Brown 5", config), sigma, config)
+    sigma = robust_sigma(fit.residuals, obs.weight)
+    state = choose_twins(fit.state, obs, sigma)
+    fit = settle(state, obs, model_prior(prior, "Brown 5", config), sigma)
     return corners, fit, prior, how
 
 
 def _clean(
-    corners: Corners, fit: LensFit, start: CameraIntrinsics | None, config: IntrinsicsConfig
+    corners: Corners, fit: LensFit, start: CameraIntrinsics | None
 ) -> tuple[Corners, LensFit]:
     """Return corners and fit without outlier corners and views, which are named."""
     for _ in range(ROUNDS):
@@ -149,7 +163,7 @@ def _clean(
             break
         corners = cleaned
         _require_views(corners, start)
-        fit = settle(fit.state.only_views(keep_views), corners.obs, fit.prior, fit.sigma_px, config)
+        fit = settle(fit.state.only_views(keep_views), corners.obs, fit.prior, fit.sigma_px)
     return corners, fit
 
 
@@ -165,7 +179,7 @@ def _check_focal(
         return
     coverage = measure_coverage(corners.obs.uv, corners.obs.image_size, fit.state.poses)
     n = corners.obs.views
-    if coverage.normal_spread_deg < config.least_spread_deg:
+    if coverage.normal_spread_deg < LEAST_SPREAD_DEG:
         tilt = float(np.median(coverage.tilt_deg))
         how = (
             "face the board squarely" if tilt < GOOD_TILT_DEG / 2
@@ -173,38 +187,36 @@ def _check_focal(
         )  # fmt: skip
         raise DegenerateError(
             f"camera fit: all {n} views {how} (its normals differ by "
-            f"{coverage.normal_spread_deg:.1f} deg at most, {config.least_spread_deg:g} deg are "
+            f"{coverage.normal_spread_deg:.1f} deg at most, {LEAST_SPREAD_DEG:g} deg are "
             f"needed), so the focal length cannot be told from the distance. {TILT_ADVICE}"
         )
-    simple = settle(
-        fit.state, corners.obs, model_prior(fit.prior, "k1", config), fit.sigma_px, config
-    )
+    prior = model_prior(fit.prior, "k1", config)
+    simple = settle(fit.state, corners.obs, prior, fit.sigma_px)
     camera = simple.state.camera
     relative = float(np.max(global_covariance(simple).sd[:2] / camera[:2]))
-    if not relative < config.focal_limit:
+    if not relative < FOCAL_LIMIT:
         raise DegenerateError(
             f"camera fit: {n} views leave the focal length uncertain by {relative:.1%} (1 sigma; "
-            f"{config.focal_limit:.0%} is the limit), tilts reach "
+            f"{FOCAL_LIMIT:.0%} is the limit), tilts reach "
             f"{float(coverage.tilt_deg.max()):.0f} deg. {TILT_ADVICE}"
         )
 
 
 def _choose_model(
-    obs: Observations, candidates: dict[str, Candidate], config: IntrinsicsConfig
+    obs: Observations, candidates: dict[str, Candidate]
 ) -> tuple[str, tuple[ModelScore, ...]]:
     """Return the model and the table of all; the table is empty where views are too few."""
     order = list(candidates)
     _, good = halves(obs)
-    if int(good.sum()) < config.least_scored_views:
-        fallback = config.few_views_model
-        return fallback if fallback in order else order[0], ()
+    if int(good.sum()) < LEAST_SCORED_VIEWS:
+        return FEW_VIEWS_MODEL if FEW_VIEWS_MODEL in order else order[0], ()
     # Dealing the views out like folds takes some from every part of the image.
-    parts = -(-obs.views // config.choice_views)
+    parts = -(-obs.views // CHOICE_VIEWS)
     keep = fold_of_views(obs, parts) == 0
     some = obs.only_views(keep)
-    folds = fold_of_views(some, min(config.folds, some.views))
+    folds = fold_of_views(some, min(FOLDS, some.views))
     fits = {name: (c.fit.only_views(keep, obs), c.refused) for name, c in candidates.items()}
-    table = score_models(fits, some, folds, config)
+    table = score_models(fits, some, folds)
     return next((s.model for s in table if s.chosen), order[0]), table
 
 

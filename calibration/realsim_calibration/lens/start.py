@@ -24,7 +24,6 @@ from realsim_calibration.lens.bundle import (
     CAMERA_TERMS,
     NEAREST_M,
     Observations,
-    SolverConfig,
     State,
     points_in_camera,
     refine_poses,
@@ -153,14 +152,13 @@ def mirror_poses(poses: Array) -> Array:
     return mirrored
 
 
-def choose_twins(state: State, obs: Observations, sigma_px: float, config: SolverConfig) -> State:
+def choose_twins(state: State, obs: Observations, sigma_px: float) -> State:
     """Return the state with every pose replaced by its mirror twin where that fits better.
 
     The state's own poses should be fitted already.
     """
-    rough = replace(config, max_iterations=TWIN_STEPS, tolerance=TWIN_TOLERANCE)
-    state, costs = refine_poses(state, obs, sigma_px, rough)
+    state, costs = refine_poses(state, obs, sigma_px, TWIN_TOLERANCE, TWIN_STEPS)
     twin = replace(state, poses=mirror_poses(state.poses))
-    twin, twin_costs = refine_poses(twin, obs, sigma_px, rough)
+    twin, twin_costs = refine_poses(twin, obs, sigma_px, TWIN_TOLERANCE, TWIN_STEPS)
     better = twin_costs < costs
     return replace(state, poses=np.where(better[:, None, None], twin.poses, state.poses))

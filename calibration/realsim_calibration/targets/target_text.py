@@ -48,9 +48,9 @@ class _Form:
     """What the counts count, for messages; empty where a single id stands in their place."""
     needed: tuple[str, ...]
     """Keys that must be given."""
-    optional: tuple[str, ...]
+    optional: tuple[str, ...] = ()
     """Keys that may be given."""
-    flags: tuple[str, ...]
+    flags: tuple[str, ...] = ()
     """Words without a value."""
     build: Callable[["_Words"], Target]
 
@@ -178,7 +178,6 @@ FORMS: dict[str, _Form] = {
         usage="charuco:5x7,square=33mm,marker=20mm,dict=6X6_100[,legacy]",
         counted="COLUMNSxROWS of squares",
         needed=("square", "marker", "dict"),
-        optional=(),
         flags=("legacy",),
         build=_charuco,
     ),
@@ -186,15 +185,12 @@ FORMS: dict[str, _Form] = {
         usage="chessboard:8x6,square=21.9mm",
         counted="COLUMNSxROWS of INNER CORNERS",
         needed=("square",),
-        optional=(),
-        flags=(),
         build=_chessboard,
     ),
     "circles": _Form(
         usage="circles:10x10,pitch=25.4mm[,asymmetric][,large-origin]",
         counted="COLUMNSxROWS of dots",
         needed=("pitch",),
-        optional=(),
         flags=("asymmetric", "large-origin"),
         build=_circles,
     ),
@@ -212,7 +208,6 @@ FORMS: dict[str, _Form] = {
         counted="",
         needed=("size",),
         optional=("gap", "family"),
-        flags=(),
         build=_tag,
     ),
 }
