@@ -70,7 +70,7 @@ def _key(function: Any) -> str:
 
 
 def _used_by(function: Any) -> Iterator[Any]:
-    """Yield what a function names, also by way of a module: `lens_loops.bent`."""
+    """Yield what a function names, also by way of a module: `point_loops.bent`."""
     names = sorted(function.__code__.co_names)
     for name in names:
         used = function.__globals__.get(name)

@@ -21,6 +21,7 @@ from realsim.arrays import Array, Array32, Int64, Mask
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry.mesh_shape import is_closed, welded
+from realsim.geometry.point_loops import move
 from realsim.geometry.winding import solid_angle_share
 from realsim.interop import import_open3d
 from realsim.records import Mesh
@@ -90,10 +91,7 @@ def _sample_all(
     n = len(points)
     distances, gradients = np.empty(n), np.empty((n, 3))
     for m in range(n):
-        a, b, c = points[m, 0], points[m, 1], points[m, 2]
-        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
-        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
-        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        x, y, z = move(T, points[m, 0], points[m, 1], points[m, 2])
         d, gx, gy, gz = sample(grid, origin, cell, x, y, z)
         distances[m] = d
         gradients[m, 0], gradients[m, 1], gradients[m, 2] = gx, gy, gz

@@ -1,7 +1,7 @@
 """OpenCV's lens in normalised coordinates: Brown (k1 k2 p1 p2 k3) or rational (k1..k6).
 
 The formulas are plain arithmetic: they take numpy arrays here and in `camera`, and numbers in
-compiled loops, which call `lens_loops`. Nowhere else does the polynomial stand.
+compiled loops, which call `point_loops`. Nowhere else does the polynomial stand.
 """
 
 from typing import Any

@@ -32,6 +32,7 @@ from realsim.records import Mesh, ObjectModel
 
 __all__ = [
     "MassProperties",
+    "box_corners",
     "box_mesh",
     "check_unit",
     "decimated",
@@ -60,6 +61,11 @@ BOX_FACES = np.array(
      [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]], dtype=np.int32,
 )  # fmt: skip
 """(12, 3) of a box's corners in the order z fastest, outward."""
+
+
+def box_corners(low: Array, high: Array) -> Array:
+    """Return the corners (8, 3) of a box along the axes, z fastest."""
+    return low + np.array(list(product((0, 1), repeat=3))) * (high - low)
 
 
 def box_mesh(low: ArrayLike, high: ArrayLike) -> Mesh:

@@ -10,6 +10,7 @@ import numpy as np
 from realsim.arrays import Array, Array32, Int32
 from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
+from realsim.geometry.point_loops import move
 
 Lattice = tuple[Array32, Array, float]
 """Grid, origin and cell of a distance field: `DistanceField.lattice`."""
@@ -113,10 +114,7 @@ def seen_distances(
     places, distances, normals = np.empty((n, 3)), np.empty(n), np.empty((n, 3))
     for i in range(n):
         M, e = Ms[views[i]], eyes[views[i]]
-        a, b, c = points[i, 0], points[i, 1], points[i, 2]
-        x = M[0, 0] * a + M[0, 1] * b + M[0, 2] * c + M[0, 3]
-        y = M[1, 0] * a + M[1, 1] * b + M[1, 2] * c + M[1, 3]
-        z = M[2, 0] * a + M[2, 1] * b + M[2, 2] * c + M[2, 3]
+        x, y, z = move(M, points[i, 0], points[i, 1], points[i, 2])
         places[i, 0], places[i, 1], places[i, 2] = x, y, z
         vx, vy, vz = e[0] - x, e[1] - y, e[2] - z
         far = np.sqrt(vx * vx + vy * vy + vz * vz)

@@ -11,7 +11,7 @@ from realsim.arrays import Array, Int64
 from realsim.geometry import se3
 from realsim.geometry.camera import project, ray_table
 from realsim.geometry.distance_field import DistanceField, raycasting_scene
-from realsim.geometry.mesh import sample_surface
+from realsim.geometry.mesh import box_corners, sample_surface
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose
 
 SAMPLE_SEED = 0
@@ -110,9 +110,7 @@ def pixel_box(
 
     The whole image if a corner of the body's box lies behind the camera; empty if it is outside.
     """
-    low, high = body.bounds_obj
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    corners_cam = se3.transform(T_cam_obj, low + corners * (high - low))
+    corners_cam = se3.transform(T_cam_obj, box_corners(*body.bounds_obj))
     if corners_cam[:, 2].max() <= 0:
         return 0, 0, 0, 0
     if corners_cam[:, 2].min() < 1e-3:

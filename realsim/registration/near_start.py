@@ -12,6 +12,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.geometry import se3
+from realsim.geometry.mesh import box_corners
 from realsim.records import SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.compare import Comparer
@@ -148,9 +149,7 @@ def _preference(body: Body, fit: PoseFit, gain_px: float, config: SearchConfig) 
 
 def distinct_fits(body: Body, fits: list[PoseFit], same_m: float) -> list[PoseFit]:
     """Return the fits that differ: of those within `same_m` at every box corner, the first."""
-    low, high = body.model.mesh.bounds
-    unit = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    corners = low + unit * (high - low)
+    corners = box_corners(*body.model.mesh.bounds)
     kept: list[PoseFit] = []
     places: list[Array] = []
     for f in fits:

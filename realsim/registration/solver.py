@@ -17,8 +17,8 @@ from realsim.arrays import Array, Array32
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.distance_field import sample
-from realsim.geometry.lens_loops import pixel
 from realsim.geometry.normal_equations import add_row
+from realsim.geometry.point_loops import move, move_back, pixel, turn, turn_back
 from realsim.geometry.robust import tukey
 from realsim.geometry.seen_surface import GATE_COS, follow_to_camera
 from realsim.registration.body import Body
@@ -127,22 +127,14 @@ def accumulate_points(
     weight, square, kernels, used = 0.0, 0.0, 0.0, 0
     J = np.empty(6)
     for m in range(len(points)):
-        a = points[m, 0] - T[0, 3]
-        e = points[m, 1] - T[1, 3]
-        f = points[m, 2] - T[2, 3]
-        x = T[0, 0] * a + T[1, 0] * e + T[2, 0] * f
-        y = T[0, 1] * a + T[1, 1] * e + T[2, 1] * f
-        z = T[0, 2] * a + T[1, 2] * e + T[2, 2] * f
+        x, y, z = move_back(T, points[m, 0], points[m, 1], points[m, 2])
         r, gx, gy, gz = sample(grid, origin, cell, x, y, z)
         s = sigmas[m]
         q = r / min(kernel * s, cap)
         if q * q >= 1.0:
             continue
         if gated:
-            ta, te, tf = towards[m, 0], towards[m, 1], towards[m, 2]
-            vx = T[0, 0] * ta + T[1, 0] * te + T[2, 0] * tf
-            vy = T[0, 1] * ta + T[1, 1] * te + T[2, 1] * tf
-            vz = T[0, 2] * ta + T[1, 2] * te + T[2, 2] * tf
+            vx, vy, vz = turn_back(T, towards[m, 0], towards[m, 1], towards[m, 2])
             # Behind or within a thin wall: the distance to the side that the camera saw.
             r, gx, gy, gz, t, facing = follow_to_camera(
                 lattice, (x, y, z), (vx, vy, vz), (r, gx, gy, gz)
@@ -187,12 +179,8 @@ def _accumulate_free_space(
         for m in range(len(samples)):
             s0, s1, s2 = samples[m, 0], samples[m, 1], samples[m, 2]
             a0, a1, a2 = normals[m, 0], normals[m, 1], normals[m, 2]
-            px = M[0, 0] * s0 + M[0, 1] * s1 + M[0, 2] * s2 + M[0, 3]
-            py = M[1, 0] * s0 + M[1, 1] * s1 + M[1, 2] * s2 + M[1, 3]
-            pz = M[2, 0] * s0 + M[2, 1] * s1 + M[2, 2] * s2 + M[2, 3]
-            nx = M[0, 0] * a0 + M[0, 1] * a1 + M[0, 2] * a2
-            ny = M[1, 0] * a0 + M[1, 1] * a1 + M[1, 2] * a2
-            nz = M[2, 0] * a0 + M[2, 1] * a1 + M[2, 2] * a2
+            px, py, pz = move(M, s0, s1, s2)
+            nx, ny, nz = turn(M, a0, a1, a2)
             if pz <= 0.0 or nx * px + ny * py + nz * pz >= 0.0:
                 continue
             x, y = px / pz, py / pz

@@ -19,7 +19,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.compiled import njit
-from realsim.geometry import lens_loops
+from realsim.geometry import point_loops
 from realsim.records import CameraIntrinsics
 
 CAMERA_TERMS = 12
@@ -104,8 +104,8 @@ def _point_rows(
         return
     x, y = p[0] / z, p[1] / z
     r2 = x * x + y * y
-    u, v = lens_loops.bent(lens, x, y)
-    du_dx, du_dy, dv_dy, radial, den = lens_loops.bent_slopes(lens, x, y)
+    u, v = point_loops.bent(lens, x, y)
+    du_dx, du_dy, dv_dy, radial, den = point_loops.bent_slopes(lens, x, y)
     for axis in range(2):
         f = lens[axis] * root
         a = du_dx if axis == 0 else du_dy

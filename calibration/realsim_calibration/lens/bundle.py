@@ -20,7 +20,7 @@ import numpy as np
 from realsim.arrays import Array, Int64, Mask
 from realsim.compiled import njit
 from realsim.errors import DegenerateError
-from realsim.geometry import lens_loops, se3
+from realsim.geometry import point_loops, se3
 
 CAMERA_TERMS = 12
 """fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6."""
@@ -212,15 +212,13 @@ def _accumulate(
         T = poses[i]
         for n in range(offsets[i], offsets[i + 1]):
             px, py, pz = points[n, 0], points[n, 1], points[n, 2]
-            cx = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-            cy = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-            cz = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+            cx, cy, cz = point_loops.move(T, px, py, pz)
             if cz < NEAREST_M:
                 costs[i] = np.inf
                 continue
             x, y = cx / cz, cy / cz
-            bent_x, bent_y = lens_loops.bent(camera, x, y)
-            xx, xy, yy, radial, den = lens_loops.bent_slopes(camera, x, y)
+            bent_x, bent_y = point_loops.bent(camera, x, y)
+            xx, xy, yy, radial, den = point_loops.bent_slopes(camera, x, y)
             residuals[n, 0] = camera[0] * bent_x + camera[2] - measured[n, 0]
             residuals[n, 1] = camera[1] * bent_y + camera[3] - measured[n, 1]
             square = (residuals[n, 0] ** 2 + residuals[n, 1] ** 2) * precision[n]

@@ -14,7 +14,7 @@ import numpy as np
 from realsim.arrays import Array, UInt16
 from realsim.compiled import njit
 from realsim.geometry.camera import ray_table
-from realsim.geometry.lens_loops import pixel
+from realsim.geometry.point_loops import pixel
 from realsim.records import CameraIntrinsics
 
 COUNT_MAX = 65535

@@ -12,6 +12,7 @@ import numpy as np
 from realsim.arrays import Array, Int64, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.mesh import box_corners
 from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.evidence import Cloud, DepthNoise
@@ -71,9 +72,7 @@ class OwnedPoints:
 
 def box_shift_m(body: Body, T_a: Array, T_b: Array) -> float:
     """Return the greatest distance [m] of a corner of the body's box between two poses."""
-    low, high = body.model.mesh.bounds
-    steps = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    corners = low + steps * (high - low)
+    corners = box_corners(*body.model.mesh.bounds)
     apart = se3.transform(T_a, corners) - se3.transform(T_b, corners)
     return float(np.linalg.norm(apart, axis=1).max())
 

@@ -9,6 +9,7 @@ from realsim.arrays import Array, Array32, Int32
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.distance_field import sample
+from realsim.geometry.point_loops import move
 from realsim.records import SupportPlane
 from realsim.registration.body import Body
 
@@ -42,9 +43,7 @@ def claim_points(
         near = best[m]
         if (a - center[0]) ** 2 + (b - center[1]) ** 2 + (c - center[2]) ** 2 > radius * radius:
             continue
-        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
-        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
-        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        x, y, z = move(T, a, b, c)
         # The box is no nearer than the surface: most points need no look at the field.
         ox = max(box[0, 0] - x, x - box[1, 0], 0.0)
         oy = max(box[0, 1] - y, y - box[1, 1], 0.0)

@@ -7,8 +7,8 @@ import numpy as np
 from realsim.arrays import Array, Array32, Int32, Int64
 from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
-from realsim.geometry.lens_loops import pixel
 from realsim.geometry.mesh import sample_surface
+from realsim.geometry.point_loops import move, pixel, turn
 from realsim.geometry.seen_surface import GATE_COS, follow_to_camera
 from realsim.registration.body import Body
 
@@ -100,10 +100,7 @@ def add_to_patches(
     T, eye = pose
     index, corner, size = patches
     for m in range(len(xyz)):
-        a, b, c = xyz[m, 0], xyz[m, 1], xyz[m, 2]
-        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
-        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
-        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        x, y, z = move(T, xyz[m, 0], xyz[m, 1], xyz[m, 2])
         vx, vy, vz = eye[0] - x, eye[1] - y, eye[2] - z
         length = np.sqrt(vx * vx + vy * vy + vz * vz)
         vx, vy, vz = vx / length, vy / length, vz / length
@@ -164,14 +161,8 @@ def look_at_patches(
     gate, tolerance, sigmas, bias, per_m, floor = limits
     M = T_cam_obj
     for m in range(len(centers)):
-        s0, s1, s2 = centers[m, 0], centers[m, 1], centers[m, 2]
-        a0, a1, a2 = normals[m, 0], normals[m, 1], normals[m, 2]
-        px = M[0, 0] * s0 + M[0, 1] * s1 + M[0, 2] * s2 + M[0, 3]
-        py = M[1, 0] * s0 + M[1, 1] * s1 + M[1, 2] * s2 + M[1, 3]
-        pz = M[2, 0] * s0 + M[2, 1] * s1 + M[2, 2] * s2 + M[2, 3]
-        nx = M[0, 0] * a0 + M[0, 1] * a1 + M[0, 2] * a2
-        ny = M[1, 0] * a0 + M[1, 1] * a1 + M[1, 2] * a2
-        nz = M[2, 0] * a0 + M[2, 1] * a1 + M[2, 2] * a2
+        px, py, pz = move(M, centers[m, 0], centers[m, 1], centers[m, 2])
+        nx, ny, nz = turn(M, normals[m, 0], normals[m, 1], normals[m, 2])
         away = np.sqrt(px * px + py * py + pz * pz)
         if pz <= 0.0 or -(nx * px + ny * py + nz * pz) < gate * away:
             continue

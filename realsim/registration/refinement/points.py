@@ -10,6 +10,7 @@ from realsim.arrays import Array, Array32, Int32, Int64, Mask
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.distance_field import sample
+from realsim.geometry.point_loops import move
 from realsim.geometry.seen_surface import FRONT_STEPS, GATE_COS
 from realsim.registration.body import Body
 from realsim.registration.evidence import DepthNoise
@@ -93,8 +94,7 @@ def _sorted_in(
         C = cameras[views[i]]
         f = 1.0 / (scales[views[i]] + offsets[views[i]] * points[i, 2])
         a, b, c = f * points[i, 0], f * points[i, 1], f * points[i, 2]
-        for k in range(3):
-            out[i, k] = C[k, 0] * a + C[k, 1] * b + C[k, 2] * c + C[k, 3]
+        out[i, 0], out[i, 1], out[i, 2] = move(C, a, b, c)
         for k in range(bodies):
             x, y, z = (
                 out[i, 0] - centers[k, 0],
@@ -148,13 +148,8 @@ def _claim(
     distance, owner = nearest
     T = T_obj_world
     for i in index:
-        p, q, r = world[i, 0], world[i, 1], world[i, 2]
-        d, _, _, _ = sample(
-            grid, origin, cell,
-            T[0, 0] * p + T[0, 1] * q + T[0, 2] * r + T[0, 3],
-            T[1, 0] * p + T[1, 1] * q + T[1, 2] * r + T[1, 3],
-            T[2, 0] * p + T[2, 1] * q + T[2, 2] * r + T[2, 3],
-        )  # fmt: skip
+        x, y, z = move(T, world[i, 0], world[i, 1], world[i, 2])
+        d, _, _, _ = sample(grid, origin, cell, x, y, z)
         if abs(d) < distance[i]:
             distance[i], owner[i] = abs(d), number
 

@@ -14,6 +14,7 @@ from realsim.arrays import Array, Array32, Int64
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.distance_field import sample
+from realsim.geometry.point_loops import move_back
 from realsim.records import SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.evidence import Cloud, DepthNoise, average_cloud, without_table
@@ -276,10 +277,7 @@ def _near(
         a, b, c = points[m, 0] - center[0], points[m, 1] - center[1], points[m, 2] - center[2]
         if a * a + b * b + c * c > radius * radius:
             continue
-        a, b, c = points[m, 0] - T[0, 3], points[m, 1] - T[1, 3], points[m, 2] - T[2, 3]
-        x = T[0, 0] * a + T[1, 0] * b + T[2, 0] * c
-        y = T[0, 1] * a + T[1, 1] * b + T[2, 1] * c
-        z = T[0, 2] * a + T[1, 2] * b + T[2, 2] * c
+        x, y, z = move_back(T, points[m, 0], points[m, 1], points[m, 2])
         if abs(sample(grid, origin, cell, x, y, z)[0]) < margin:
             out[n] = m
             n += 1

@@ -19,7 +19,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.distance_field import DistanceField, raycasting_scene
-from realsim.geometry.mesh import sample_surface, symmetry_transforms
+from realsim.geometry.mesh import box_corners, sample_surface, symmetry_transforms
 from realsim.geometry.robust import tukey_weights
 from realsim.interop import import_open3d
 from realsim.records import ObjectModel
@@ -195,8 +195,7 @@ def _shape_of(model: ObjectModel, config: NearSymmetryConfig) -> _Shape:
     middle = (low + high) / 2
     beside = config.beside_share * np.concatenate([np.diag(high - low), -np.diag(high - low)])
     centers = [middle, points.mean(0), *(middle + beside), *declared[:1]]
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    box = low + corners * (high - low)
+    box = box_corners(low, high)
     symmetries = symmetry_transforms(model, math.radians(config.symmetry_step_deg))
     return _Shape(
         points=points,

@@ -14,6 +14,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.geometry import se3
+from realsim.geometry.mesh import box_corners
 from realsim.records import ObjectModel
 
 PARALLEL = 0.99
@@ -84,13 +85,11 @@ class Sameness:
 
 def make_sameness(model: ObjectModel) -> Sameness:
     """Return what of a model matters for the comparison of two poses."""
-    low, high = model.mesh.bounds
-    unit = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     axes = [(np.asarray(a, np.float64) / np.linalg.norm(a), np.asarray(p, np.float64))
             for a, p in model.symmetry_axes]  # fmt: skip
     ball = len(axes) > 1 and any(abs(a @ axes[0][0]) < PARALLEL for a, _ in axes[1:])
     return Sameness(
-        corners=low + unit * (high - low),
+        corners=box_corners(*model.mesh.bounds),
         symmetries=np.asarray(model.symmetries, dtype=np.float64),
         axis=axes[0] if axes and not ball else None,
         ball_center=axes[0][1] if ball else None,

@@ -18,6 +18,7 @@ from realsim.arrays import Array, Array32, Int32, Int64
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.camera import project, ray_table
+from realsim.geometry.mesh import box_corners
 from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.compare import CompareConfig
@@ -213,9 +214,7 @@ def _known(canvas: Canvas) -> tuple[Array32, Array32, Array32, Array32]:
 
 def _boxes(canvas: Canvas, body: Body, Ts_obj_cam: Array) -> Int64:
     """Return the lattice boxes (F, 4) top, bottom, left, right (exclusive) that hold the body."""
-    low, high = body.bounds_obj
-    unit = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    corners = se3.transform(se3.invert(Ts_obj_cam), low + unit * (high - low))  # (F, 8, 3)
+    corners = se3.transform(se3.invert(Ts_obj_cam), box_corners(*body.bounds_obj))  # (F, 8, 3)
     uv = project(canvas.intrinsics, corners) / canvas.stride
     height, width = canvas.rays.shape[:2]
     nearest, farthest = corners[..., 2].min(1), corners[..., 2].max(1)

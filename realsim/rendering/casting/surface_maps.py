@@ -4,6 +4,7 @@ import numpy as np
 
 from realsim.arrays import Array, Array32, Int32, Int64, Mask
 from realsim.compiled import njit
+from realsim.geometry.point_loops import move, turn_back
 
 
 @njit
@@ -39,14 +40,11 @@ def surface_maps(
             if wanted == 0:
                 z = np.float64(depth[v, u])
                 x, y = z * rays[v, u, 0], z * rays[v, u, 1]
-                for k in range(3):
-                    out[v, u, k] = T[k, 0] * x + T[k, 1] * y + T[k, 2] * z + T[k, 3]
+                out[v, u, 0], out[v, u, 1], out[v, u, 2] = move(T, x, y, z)
             else:
                 n = normals[starts[g] + face[v, u]]
                 # R_cam_obj is the transpose of R_obj_cam.
-                x = T[0, 0] * n[0] + T[1, 0] * n[1] + T[2, 0] * n[2]
-                y = T[0, 1] * n[0] + T[1, 1] * n[1] + T[2, 1] * n[2]
-                z = T[0, 2] * n[0] + T[1, 2] * n[1] + T[2, 2] * n[2]
+                x, y, z = turn_back(T, n[0], n[1], n[2])
                 away = x * rays[v, u, 0] + y * rays[v, u, 1] + z > 0.0
                 side = -1.0 if away else 1.0
                 out[v, u, 0], out[v, u, 1], out[v, u, 2] = side * x, side * y, side * z

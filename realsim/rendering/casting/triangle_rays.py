@@ -13,7 +13,7 @@ import numpy as np
 
 from realsim.arrays import Array, Array32, Int32, Mask
 from realsim.compiled import njit
-from realsim.geometry.lens_loops import pixel
+from realsim.geometry.point_loops import move, pixel
 
 Placed = tuple[Array, Array, Int32]
 Sides = tuple[float, float, float, float, float, float, float, float, float]
@@ -60,14 +60,10 @@ def project_vertices(vertices: Array, T_cam_obj: Array, lens: Array) -> tuple[Ar
     seen = np.empty((n, 4))
     reach2 = lens[12] * lens[12]
     for i in range(n):
-        vx, vy, vz = vertices[i, 0], vertices[i, 1], vertices[i, 2]
-        for k in range(3):
-            points[i, k] = (
-                T_cam_obj[k, 0] * vx + T_cam_obj[k, 1] * vy + T_cam_obj[k, 2] * vz + T_cam_obj[k, 3]
-            )
-        z = points[i, 2]
+        x, y, z = move(T_cam_obj, vertices[i, 0], vertices[i, 1], vertices[i, 2])
+        points[i, 0], points[i, 1], points[i, 2] = x, y, z
         if z > NEAREST_M:
-            x, y = points[i, 0] / z, points[i, 1] / z
+            x, y = x / z, y / z
             seen[i, 2], seen[i, 3] = x, y
             if x * x + y * y < reach2:
                 seen[i, 0], seen[i, 1] = _pixel(lens, x, y)

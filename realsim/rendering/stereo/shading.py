@@ -10,6 +10,7 @@ import numpy as np
 
 from realsim.arrays import Array32
 from realsim.compiled import njit
+from realsim.geometry.point_loops import turn
 from realsim.rendering.stereo.light import MAP_ROUGHNESS
 from realsim.rendering.stereo.projector import HALF_HEIGHT, HALF_WIDTH, TEXEL_RAD
 from realsim.rendering.stereo.texture import (
@@ -188,9 +189,7 @@ def _add_mirrored(run, sizes, look, R, light, ambient, scratch):  # pyright: ign
             ry * per_length + twice * ey,
             (per_length + twice * ez),
         )
-        mx = R[0, 0] * hx + R[0, 1] * hy + R[0, 2] * hz
-        my = R[1, 0] * hx + R[1, 1] * hy + R[1, 2] * hz
-        mz = R[2, 0] * hx + R[2, 1] * hy + R[2, 2] * hz
+        mx, my, mz = turn(R, hx, hy, hz)
         seen = _octahedral(reflections, int(look[4]), mx, my, mz)
         if sun > 0:
             along = mx * sun_direction[0] + my * sun_direction[1] + mz * sun_direction[2]

@@ -14,7 +14,7 @@ from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.camera import project, ray_table
 from realsim.geometry.depth import check_depth, depth_noise_per_m, edge_mask
-from realsim.geometry.lens_loops import pixel
+from realsim.geometry.point_loops import pixel
 from realsim.records import CameraIntrinsics
 from realsim.registration.evidence import DepthNoise
 from realsim.scanning.fusion.result import FusionConfig, FusionFrame

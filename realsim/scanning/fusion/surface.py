@@ -18,6 +18,7 @@ from realsim.arrays import Array, Array32, Int32, Int64, Mask, UInt8
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.point_loops import move, turn
 from realsim.scanning.fusion.evidence import Crops, pixel_of
 from realsim.scanning.fusion.result import FusionConfig, FusionFrame
 from realsim.scanning.fusion.volume import Volume
@@ -239,9 +240,7 @@ def _look(
     h, w = depth.shape
     for m in range(len(points)):
         x, y, z = points[m]
-        a = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-        b = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-        c = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+        a, b, c = move(T, x, y, z)
         if c < 0.02:
             continue
         u, v = pixel_of(camera, a, b, c)
@@ -249,9 +248,7 @@ def _look(
         if u < 0 or v < 0 or u >= w or v >= h or depth[v, u] <= 0.0:
             continue
         n = normals[m]
-        mx = T[0, 0] * n[0] + T[0, 1] * n[1] + T[0, 2] * n[2]
-        my = T[1, 0] * n[0] + T[1, 1] * n[1] + T[1, 2] * n[2]
-        mz = T[2, 0] * n[0] + T[2, 1] * n[1] + T[2, 2] * n[2]
+        mx, my, mz = turn(T, n[0], n[1], n[2])
         ray = np.sqrt(a * a + b * b + c * c)
         cosine = -(mx * a + my * b + mz * c) / ray
         d = depth[v, u]

@@ -17,6 +17,7 @@ import numpy as np
 from realsim.arrays import Array, Array32, Int64, UInt8
 from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
+from realsim.geometry.point_loops import turn
 from realsim.scanning.fusion.evidence import Crops, pixel_of
 from realsim.scanning.fusion.result import FusionConfig
 
@@ -92,9 +93,7 @@ def _one_view(  # noqa: PLR0911 - seven ways to see nothing, in a row
         if s < truncation:
             return 0.0, 0.0, False
     elif length > 0.0:
-        mx = T[0, 0] * gx + T[0, 1] * gy + T[0, 2] * gz
-        my = T[1, 0] * gx + T[1, 1] * gy + T[1, 2] * gz
-        mz = T[2, 0] * gx + T[2, 1] * gy + T[2, 2] * gz
+        mx, my, mz = turn(T, gx, gy, gz)
         cosine = -(mx * cx + my * cy + mz * cz) / (ray * length)
         if cosine < least_cos:
             # Edge-on, or the far side of a wall: it can only say that it saw through.

@@ -16,6 +16,8 @@ from realsim.geometry import se3
 from realsim.geometry.camera import project, ray_table
 from realsim.geometry.clouds import voxel_mean
 from realsim.geometry.depth import edge_mask
+from realsim.geometry.mesh import box_corners
+from realsim.geometry.point_loops import move
 from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.evidence import Cloud, DepthFrame, DepthNoise
 from realsim.scanning.scale.config import ScaleConfig
@@ -170,9 +172,7 @@ def _marks(
                 continue
             z = depth[i, j]
             x, y, w = rays[i, j, 0] * z, rays[i, j, 1] * z, rays[i, j, 2] * z
-            px = T[0, 0] * x + T[0, 1] * y + T[0, 2] * w + T[0, 3]
-            py = T[1, 0] * x + T[1, 1] * y + T[1, 2] * w + T[1, 3]
-            height = T[2, 0] * x + T[2, 1] * y + T[2, 2] * w + T[2, 3]
+            px, py, height = move(T, x, y, w)
             least = height_m + 3.0 * max(floor_m, per_m * z * z)
             a, b = int(np.floor((px - origin[0]) / size)), int(np.floor((py - origin[1]) / size))
             inside = 0 <= a < near.shape[0] and 0 <= b < near.shape[1]
@@ -225,8 +225,7 @@ def _image_box(
     low, high = footprint.box
     margin = np.array([0.07, 0.07, 0.0])
     low, high = low - margin, high + margin + [0, 0, 0.01]
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    corners_cam = se3.transform(se3.invert(T_table_cam), low + corners * (high - low))
+    corners_cam = se3.transform(se3.invert(T_table_cam), box_corners(low, high))
     width, height = intrinsics.width, intrinsics.height
     if corners_cam[:, 2].max() <= 0:
         return None

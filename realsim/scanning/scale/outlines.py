@@ -14,8 +14,8 @@ import numpy as np
 from realsim.arrays import Array, Array32, Int64
 from realsim.compiled import njit
 from realsim.geometry import se3
-from realsim.geometry.lens_loops import pixel
 from realsim.geometry.normal_equations import add_row, symmetric
+from realsim.geometry.point_loops import move_back, pixel, turn
 from realsim.geometry.robust import tukey
 from realsim.registration.refinement.equations import Blocks, Offsets
 from realsim.scanning.scale.config import ScaleConfig
@@ -185,10 +185,7 @@ def add_outline(
     J = np.zeros(COLUMNS)
     for i in range(len(points)):
         m = points[i]
-        q0, q1, q2 = m[0] - M[0, 3], m[1] - M[1, 3], m[2] - M[2, 3]
-        a0 = M[0, 0] * q0 + M[1, 0] * q1 + M[2, 0] * q2
-        a1 = M[0, 1] * q0 + M[1, 1] * q1 + M[2, 1] * q2
-        a2 = M[0, 2] * q0 + M[1, 2] * q1 + M[2, 2] * q2
+        a0, a1, a2 = move_back(M, m[0], m[1], m[2])
         if a2 <= 0.02:
             continue
         x, y = a0 / a2, a1 / a2
@@ -216,9 +213,7 @@ def add_outline(
         # Gradient of r in camera axes, the lens taken for straight here.
         h0, h1 = along_u * fx / f, along_v * fy / f
         h2 = -(h0 * x + h1 * y)
-        g0 = M[0, 0] * h0 + M[0, 1] * h1 + M[0, 2] * h2
-        g1 = M[1, 0] * h0 + M[1, 1] * h1 + M[1, 2] * h2
-        g2 = M[2, 0] * h0 + M[2, 1] * h1 + M[2, 2] * h2
+        g0, g1, g2 = turn(M, h0, h1, h2)
         J[0], J[1], J[2] = m[2] * g1 - m[1] * g2, m[0] * g2 - m[2] * g0, m[1] * g0 - m[0] * g1
         J[3], J[4], J[5] = -g0, -g1, -g2
         J[6], J[7] = g0 * m[0] + g1 * m[1] + g2 * m[2], -metre

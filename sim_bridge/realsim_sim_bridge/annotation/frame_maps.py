@@ -12,6 +12,7 @@ from realsim import images
 from realsim.arrays import Array, Array32, Counts, Int32, Int64, Mask
 from realsim.compiled import njit
 from realsim.formats import label_maps
+from realsim.geometry.point_loops import turn_back
 from realsim.images.png import encode_window
 from realsim.rendering.labels import Labels
 from realsim_sim_bridge.annotation.unmodelled import ObjectMasks, Window, union_of
@@ -178,9 +179,7 @@ def _normals(
                 last = number
                 T, n = Ts_obj_cam[g], normals[number]
                 # R_cam_obj is the transpose of R_obj_cam.
-                x = T[0, 0] * n[0] + T[1, 0] * n[1] + T[2, 0] * n[2]
-                y = T[0, 1] * n[0] + T[1, 1] * n[1] + T[2, 1] * n[2]
-                z = T[0, 2] * n[0] + T[1, 2] * n[1] + T[2, 2] * n[2]
+                x, y, z = turn_back(T, n[0], n[1], n[2])
             away = x * rays[v, u, 0] + y * rays[v, u, 1] + z > 0.0
             side = -1.0 if away else 1.0
             a, b, c = np.float32(side * x), np.float32(side * y), np.float32(side * z)
