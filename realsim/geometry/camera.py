@@ -5,7 +5,9 @@ with the analytic 2x2 Jacobian, because OpenCV's fixed-point iteration is tens o
 strong distortion; pixels outside the model's invertible region are reported, never guessed.
 """
 
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, wraps
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +16,7 @@ from realsim.arrays import Array, Array32, Mask
 from realsim.geometry import lens
 from realsim.records import CameraIntrinsics
 
+Kept = TypeVar("Kept")
 NEWTON_STEPS = 12
 """Enough for 4e-13 px on every invertible pixel of the lenses tried (k1 down to -0.3)."""
 
@@ -204,25 +207,40 @@ def pixel_grid(width: int, height: int) -> Array:
     return np.stack([u, v], -1)
 
 
-@lru_cache(maxsize=8)
-def _ray_table(key: tuple[float, ...]) -> Array32:
-    width, height, fx, fy, cx, cy = key[:6]
-    intrinsics = CameraIntrinsics(
-        width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy,
-        distortion=np.array(key[6:]),
-    )  # fmt: skip
-    xy, _ = undistort(intrinsics, pixel_grid(int(width), int(height)))
-    table = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], -1).astype(np.float32)
-    table.setflags(write=False)
-    return table
+def kept_by_camera(
+    most: int,
+) -> Callable[[Callable[[CameraIntrinsics], Kept]], Callable[[CameraIntrinsics], Kept]]:
+    """Keep what a function returns of the `most` cameras that were asked for last."""
+
+    def keeping(make: Callable[[CameraIntrinsics], Kept]) -> Callable[[CameraIntrinsics], Kept]:
+        @lru_cache(maxsize=most)
+        def made(key: tuple[float, ...]) -> Kept:
+            width, height, fx, fy, cx, cy = key[:6]
+            intrinsics = CameraIntrinsics(
+                width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy,
+                distortion=np.array(key[6:]),
+            )  # fmt: skip
+            return make(intrinsics)
+
+        @wraps(make)
+        def kept(intrinsics: CameraIntrinsics) -> Kept:
+            i = intrinsics
+            key = (i.width, i.height, i.fx, i.fy, i.cx, i.cy, *i.distortion.tolist())
+            return made(tuple(float(v) for v in key))
+
+        return kept
+
+    return keeping
 
 
+@kept_by_camera(8)
 def ray_table(intrinsics: CameraIntrinsics) -> Array32:
     """Return the ray (height, width, 3) of every pixel centre in camera axes, z = 1.
 
     Because z is 1, the parameter at which a ray meets a surface IS the depth along z. Pixels that
     the lens model cannot reach are NaN. The table is computed once per camera and kept.
     """
-    i = intrinsics
-    key = (i.width, i.height, i.fx, i.fy, i.cx, i.cy, *i.distortion.tolist())
-    return _ray_table(tuple(float(v) for v in key))
+    xy, _ = undistort(intrinsics, pixel_grid(intrinsics.width, intrinsics.height))
+    table = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], -1).astype(np.float32)
+    table.setflags(write=False)
+    return table

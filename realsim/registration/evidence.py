@@ -133,6 +133,13 @@ class Cloud:
         return Cloud(points=self.points[keep], towards=self.towards[keep], sigmas=self.sigmas[keep])
 
 
+def seen_cloud(points: Array, eyes: Array, sigmas: Array) -> Cloud:
+    """Return points (N, 3) as cameras at `eyes` (3,) or (N, 3) saw them, with their sigmas (N,)."""
+    towards = eyes - points
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    return Cloud(points=points, towards=towards, sigmas=sigmas)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Evidence:
     """The measured points of a scene, sorted by what they may belong to."""
@@ -268,9 +275,7 @@ def _frame_cloud(
     trusted = np.where(edge_mask(z, jump), np.float32(0), z)
     points_cam, _ = points_from_depth(trusted, intrinsics, stride)
     points = se3.transform(frame.T_world_cam, points_cam)
-    towards = frame.T_world_cam[:3, 3] - points
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    return Cloud(points=points, towards=towards, sigmas=noise.sigma(points_cam[:, 2]))
+    return seen_cloud(points, frame.T_world_cam[:3, 3], noise.sigma(points_cam[:, 2]))
 
 
 def _stride(

@@ -21,6 +21,7 @@ from realsim.registration.evidence import (
     correct_frame,
     join_clouds,
     read_frame,
+    seen_cloud,
     without_table,
 )
 from realsim.registration.intake import Intake
@@ -304,8 +305,6 @@ def _points_near(
     out: list[Cloud] = []
     for body, T in zip(*objects, strict=True):
         close = np.linalg.norm(world - body.center(T), axis=1) < body.radius_m + reach
-        some = world[close]
-        towards = view.T_world_cam[:3, 3] - some
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        out.append(Cloud(points=some, towards=towards, sigmas=noise.sigma(p[close, 2])))
+        sigmas = noise.sigma(p[close, 2])
+        out.append(seen_cloud(world[close], view.T_world_cam[:3, 3], sigmas))
     return out

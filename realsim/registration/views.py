@@ -13,7 +13,7 @@ from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics
-from realsim.registration.evidence import Cloud, DepthFrame, DepthNoise
+from realsim.registration.evidence import Cloud, DepthFrame, DepthNoise, seen_cloud
 from realsim.registration.fixed_cameras import FixedCamera
 
 
@@ -144,7 +144,5 @@ def world_cloud(views: Sequence[ViewPoints], noise: DepthNoise) -> Cloud:
     """Return the points of all views in world, where the cameras are said to be."""
     points = np.concatenate([v.world() for v in views])
     eyes = np.concatenate([np.tile(v.T_world_cam[:3, 3], (len(v.points), 1)) for v in views])
-    towards = eyes - points
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     sigmas = np.concatenate([v.noise(noise).sigma(v.points[:, 2]) for v in views])
-    return Cloud(points=points, towards=towards, sigmas=sigmas)
+    return seen_cloud(points, eyes, sigmas)

@@ -35,7 +35,7 @@ from realsim.app.stages import content_key, note, require_sound, take_models
 from realsim.arrays import Array
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, ObjectModel, Scene
-from realsim.registration.refinement.uncertainty import SeenPose
+from realsim.registration.refinement.uncertainty import SeenPose, without_turns
 from realsim.registration.register import Registration
 from realsim.store import SessionStore
 from realsim.store.provenance import is_current
@@ -223,27 +223,11 @@ def seen_at_their_word(
             covariance = unknown if o.covariance is None else o.covariance
             vertices = models[o.obj_id].mesh.vertices
             points = vertices[:: max(1, len(vertices) // PIXEL_POINTS)]
-            shown = without_free_turns(covariance, models[o.obj_id], points)
+            shown = without_turns(covariance, models[o.obj_id].symmetry_axes, points)
             sigma = pixel_sigma(intrinsics, T_cam_obj, shown, points)
             out[index][o.instance] = SeenPose(
                 T_cam_obj=T_cam_obj, covariance=covariance, sigma_px=sigma
             )
-    return out
-
-
-def without_free_turns(covariance: Array, model: ObjectModel, points: Array) -> Array:
-    """Return a covariance (6, 6) without turns about axes of continuous symmetry.
-
-    Nothing is seen of such a turn. Of a twist x, the part P x is left that moves the points (N, 3)
-    least: P = I - s s^T M / (s^T M s), s the turn, M the mean of the points' squared motion.
-    """
-    G = np.concatenate([-se3.hat(points), np.tile(np.eye(3), (len(points), 1, 1))], axis=2)
-    M = np.mean(np.swapaxes(G, 1, 2) @ G, axis=0)
-    out = covariance
-    for axis, place in model.symmetry_axes:
-        turn = np.concatenate([axis, -np.cross(axis, place)])
-        P = np.eye(6) - np.outer(turn, turn @ M) / (turn @ M @ turn)
-        out = P @ out @ P.T
     return out
 
 

@@ -109,14 +109,16 @@ def _seen(refined: Refined, body: Body, k: int, intrinsics: CameraIntrinsics) ->
                 T_cam_obj=se3.invert(refined.cameras[v]) @ refined.poses[k],
                 covariance=_symmetric(back @ centre[v] @ back.T),
                 sigma_px=_sigma_px(
-                    se3.invert(Ms[v]), _without_turns(centre[v], axes, q), q, intrinsics
+                    se3.invert(Ms[v]), without_turns(centre[v], axes, q), q, intrinsics
                 ),
             )
         )
     return out
 
 
-def _without_turns(C: Array, axes: list[tuple[Array, Array]], q: Array) -> Array:
+def without_turns(
+    C: Array, axes: Sequence[tuple[Sequence[float] | Array, Sequence[float] | Array]], q: Array
+) -> Array:
     """Return a covariance (6, 6) without turns about axes of continuous symmetry.
 
     Nothing is seen of such a turn s. Of a twist x the part P x is left that moves the points

@@ -5,7 +5,6 @@ The work is done triangle by triangle (see `triangle_rays`); this file knows mes
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -198,27 +197,17 @@ NEAR_IMAGE = 1.1
 focal lengths off the axis a polynomial bends a hundred times as much as within the image."""
 
 
-@lru_cache(maxsize=16)
-def _lens_array(key: tuple[float, ...]) -> Array:
-    width, height, fx, fy, cx, cy, *coefficients = key
-    i = CameraIntrinsics(
-        width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy,
-        distortion=np.array(coefficients),
-    )  # fmt: skip
-    numbers = [fx, fy, cx, cy, *coefficients, camera.turning_radius(i)]
+@camera.kept_by_camera(16)
+def lens_array(intrinsics: CameraIntrinsics) -> Array:
+    """Return the camera as the kernels take it; see `triangle_rays.project_vertices`."""
+    i = intrinsics
+    numbers = [i.fx, i.fy, i.cx, i.cy, *i.distortion, camera.turning_radius(i)]
     if not i.is_distorted:
         return np.array([*numbers, 0.0, 0.0, np.inf, 0.0])
     rays = camera.ray_table(i)[..., :2].astype(np.float64)
     radius = NEAR_IMAGE * float(np.sqrt(np.nanmax(np.sum(rays * rays, axis=-1))))
     bends = [camera.greatest_bend(i, r) for r in (radius, camera.FARTHEST_RADIUS)]
     return np.array([*numbers, bends[0], 1.0, radius * radius, bends[1]])
-
-
-def lens_array(intrinsics: CameraIntrinsics) -> Array:
-    """Return the camera as the kernels take it; see `triangle_rays.project_vertices`."""
-    i = intrinsics
-    key = (i.width, i.height, i.fx, i.fy, i.cx, i.cy, *i.distortion.tolist())
-    return _lens_array(tuple(float(v) for v in key))
 
 
 def body_of(mesh: Mesh) -> Body:
@@ -303,18 +292,7 @@ class CanvasRays:
         return int(count_outside(placed, mesh.lens, rays, (u0, v0), (i.width, i.height)))
 
 
-@lru_cache(maxsize=4)
-def _kept(key: tuple[float, ...]) -> CanvasRays:
-    width, height, fx, fy, cx, cy = key[:6]
-    intrinsics = CameraIntrinsics(
-        width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy,
-        distortion=np.array(key[6:]),
-    )  # fmt: skip
-    return CanvasRays(intrinsics)
-
-
+@camera.kept_by_camera(4)
 def canvas_rays(intrinsics: CameraIntrinsics) -> CanvasRays:
     """Return the canvas of a camera, kept from view to view."""
-    i = intrinsics
-    key = (i.width, i.height, i.fx, i.fy, i.cx, i.cy, *i.distortion.tolist())
-    return _kept(tuple(float(v) for v in key))
+    return CanvasRays(intrinsics)

@@ -16,7 +16,14 @@ from realsim.records import Scene
 from realsim.records.depth_bias import DepthBias
 from realsim.registration.compare import Comparer, make_comparer, spread_frames
 from realsim.registration.config import RegistrationConfig
-from realsim.registration.evidence import Cloud, DepthFrame, LazyFrame, measure_noise, read_frame
+from realsim.registration.evidence import (
+    Cloud,
+    DepthFrame,
+    LazyFrame,
+    measure_noise,
+    read_frame,
+    seen_cloud,
+)
 from realsim.registration.intake import sampling
 from realsim.registration.views import ViewPoints, sample_view
 from realsim.store import SessionStore
@@ -51,9 +58,7 @@ class MeasuredViews:
         """Return some of the points with their directions and sigmas."""
         points = self.points[index].astype(np.float64)
         eyes = np.stack([v.T_world_cam[:3, 3] for v in self.views])
-        towards = eyes[self.view[index]] - points
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        return Cloud(points=points, towards=towards, sigmas=self.sigmas[index].astype(np.float64))
+        return seen_cloud(points, eyes[self.view[index]], self.sigmas[index].astype(np.float64))
 
     def views_with(self, index: Int64) -> list[ViewPoints]:
         """Return the views with only some of the points."""

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from realsim.arrays import Array, Mask, Rows
 from realsim.errors import InputError
 from realsim.geometry.mesh import face_normals, sample_surface, tensor_mesh, welded_mesh
+from realsim.geometry.mesh_shape import is_closed
 from realsim.interop import import_open3d
 from realsim.records import Mesh
 
@@ -130,7 +131,8 @@ class RaySurface:
     def __init__(self, mesh: Mesh) -> None:
         o3d = import_open3d()
         self.mesh = mesh
-        self.is_closed = _is_closed(mesh)
+        bare = welded_mesh(mesh)
+        self.is_closed = is_closed(bare.vertices, bare.faces.astype(np.int64))
         self.orientation = _orientation(mesh) if self.is_closed else 1.0
         self.face_normals = face_normals(mesh) * self.orientation
         self.size_m = max(float(np.linalg.norm(mesh.extent)), 1e-9)
@@ -274,16 +276,6 @@ def perpendicular(axes: Array) -> tuple[Array, Array]:
 
 
 # --- normals -----------------------------------------------------------------------------------
-
-
-def _is_closed(mesh: Mesh) -> bool:
-    """Return whether every directed edge has its opposite as often: it then bounds a solid."""
-    bare = welded_mesh(mesh)
-    faces, count = bare.faces.astype(np.int64), len(bare.vertices)
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    there = np.sort(edges[:, 0] * count + edges[:, 1])
-    back = np.sort(edges[:, 1] * count + edges[:, 0])
-    return len(faces) > 0 and bool(np.array_equal(there, back))
 
 
 def _orientation(mesh: Mesh) -> float:
