@@ -7,7 +7,7 @@ faces the cameras; a lower parallel one close by wins, because the larger may be
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -177,9 +177,7 @@ def view_table(
         return none
     abc, on = fit
     if np.mean(on) < config.view_share:
-        return ViewTable(
-            index=view.index, share=share, own_share=0.0, height_m=nan, tilt_deg=nan, rms_m=nan
-        )
+        return replace(none, share=share)
     middle = p[on].mean(0)
     rest = p[on, 2] - _heights(p[on], abc)
     return ViewTable(

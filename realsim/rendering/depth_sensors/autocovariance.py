@@ -5,7 +5,7 @@ uncertainty comes from leaving tiles out (a jackknife), whatever the noise looks
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -54,7 +54,7 @@ class TileSums:
         return self.products[keep].sum(0) / np.maximum(self.counts[keep].sum(0), 1)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class NoiseShape:
     """Size and extent of noise."""
 
@@ -166,18 +166,11 @@ def fit_noise(
         return best, None
     order = np.arange(n) % groups
     parts = [
-        _row(_fitted(sums.covariance(order == g), rounding_px2, two, trend_px)[0])
+        astuple(_fitted(sums.covariance(order == g), rounding_px2, two, trend_px)[0])
         for g in range(groups)
     ]
     spread = np.sqrt((groups - 1) * np.var(np.array(parts), axis=0))
-    return best, _shape(*(float(v) for v in spread))
-
-
-_NAMES = ("sigma_px", "radius_px", "aspect", "slow_sigma_px", "slow_radius_px")
-
-
-def _row(shape: NoiseShape) -> list[float]:
-    return [getattr(shape, name) for name in _NAMES]
+    return best, NoiseShape(*(float(v) for v in spread))
 
 
 def _fitted(
@@ -188,7 +181,7 @@ def _fitted(
     rho = covariance / max(total, 1e-12)
     if float(rho[:, 1].mean()) < np.exp(-1 / (4 * WHITE_PX**2)):
         sigma = float(np.sqrt(max(total - rounding, 0)))
-        return _shape(sigma, 0.0, 1.0, 0.0, 0.0), False
+        return NoiseShape(sigma, 0.0, 1.0, 0.0, 0.0), False
     floor = min(rounding / max(total, 1e-12), 0.9)
     one_fit, one_cost = _solve(rho, floor, trend_px, slow=False)
     if two is False:
@@ -249,8 +242,4 @@ def detrended_correlation(radius_u: float, radius_v: float, trend_px: float) -> 
 
 def _scaled(x: list[float], total: float) -> NoiseShape:
     unit = float(np.sqrt(max(total, 0)))
-    return _shape(x[0] * unit, x[1], x[2], x[3] * unit, x[4])
-
-
-def _shape(*values: float) -> NoiseShape:
-    return NoiseShape(**dict(zip(_NAMES, values, strict=True)))
+    return NoiseShape(x[0] * unit, x[1], x[2], x[3] * unit, x[4])

@@ -55,8 +55,9 @@ def shadow_mask(
     seen = (depth > 0) & np.isfinite(table[..., 0])
     points = table[seen] * depth[seen][:, None]
     hidden = np.zeros(len(points), dtype=bool)
-    for x in _eyes(baseline_m, eye_offset_m):
-        hidden |= _hidden_from(scene, points, np.array([x, 0.0, 0.0]), T)
+    for x in (eye_offset_m, eye_offset_m + baseline_m):
+        if x != 0:  # what the camera sees is not hidden from its own place
+            hidden |= _hidden_from(scene, points, np.array([x, 0.0, 0.0]), T)
     if border:
         u = np.nonzero(seen)[1] - intrinsics.fx * baseline_m / points[:, 2]
         hidden |= u < border_margin_px - 0.5
@@ -83,11 +84,6 @@ def require_same_size(
             f"{intrinsics.width}x{intrinsics.height}. Give the intrinsics of the depth pictures, "
             "at their size."
         )
-
-
-def _eyes(baseline_m: float, eye_offset_m: float) -> tuple[float, ...]:
-    """Return the places of the eyes [m] other than the picture's own."""
-    return tuple(x for x in (eye_offset_m, eye_offset_m + baseline_m) if x != 0)
 
 
 def _hidden_from(scene: RayScene, points: Array32, eye: Array, T_world_cam: Array) -> Mask:

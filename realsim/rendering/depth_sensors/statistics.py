@@ -93,9 +93,9 @@ def local_noise(
     d = np.where(known, fB / np.where(known, depth, 1), 0).astype(np.float64)
     # About the middle value the squares of the sums lose no digits.
     d = np.where(known, d - (np.median(d[known]) if known.any() else 0), 0)
-    rms = np.sqrt(np.maximum(_plane_residual(d, window_px), 0) / (window_px**2 - 3))
+    residual, slope_u, slope_v = _plane_fits(d, window_px)
+    rms = np.sqrt(np.maximum(residual, 0) / (window_px**2 - 3))
     highest, lowest = cv2.dilate(d, kernel), cv2.erode(d, kernel)
-    slope_u, slope_v = _plane_slopes(d, window_px)
     span = (np.abs(slope_u) + np.abs(slope_v)) * (window_px - 1)
     flat = full & (highest - lowest - span < 2 * FLAT_PX) & (rms < FLAT_PX)
     median = float(np.median(rms[flat])) if flat.any() else float("nan")
@@ -106,8 +106,8 @@ def local_noise(
     )
 
 
-def _moments(d: Array, n: int) -> tuple[Array, Array, Array, Array]:
-    """Return the box sums of w, u w, v w and w^2, u and v about each box's middle."""
+def _plane_fits(d: Array, n: int) -> tuple[Array, Array, Array]:
+    """Return the sums of squares that planes leave in boxes of n x n, and their slopes in u, v."""
     import cv2
 
     ramp = np.arange(n, dtype=np.float64) - n // 2
@@ -118,19 +118,10 @@ def _moments(d: Array, n: int) -> tuple[Array, Array, Array, Array]:
         filtered = cv2.sepFilter2D(values, cv2.CV_64F, along_u, along_v, borderType=border)
         return np.asarray(filtered, np.float64)
 
-    return sums(d, one, one), sums(d, ramp, one), sums(d, one, ramp), sums(d * d, one, one)
-
-
-def _plane_residual(d: Array, n: int) -> Array:
-    s, su, sv, sww = _moments(d, n)
-    spread = n * float(np.square(np.arange(n) - n // 2).sum())
-    return sww - s * s / n**2 - (su * su + sv * sv) / spread
-
-
-def _plane_slopes(d: Array, n: int) -> tuple[Array, Array]:
-    _, su, sv, _ = _moments(d, n)
-    spread = n * float(np.square(np.arange(n) - n // 2).sum())
-    return su / spread, sv / spread
+    s, su, sv = sums(d, one, one), sums(d, ramp, one), sums(d, one, ramp)
+    spread = n * float(np.square(ramp).sum())
+    residual = sums(d * d, one, one) - s * s / n**2 - (su * su + sv * sv) / spread
+    return residual, su / spread, sv / spread
 
 
 def hole_share(depth_m: ArrayLike, region: Mask) -> float:

@@ -48,6 +48,24 @@ def _axes(x: float, y: float, z: float) -> tuple[float, float, float, float, flo
     return 1.0 + s * x * x * a, s * b, -s * x, b, s + y * y * a, -y
 
 
+@njit(inline="always", error_model="numpy")
+def _leave(
+    points: SurfacePoints,
+    i: int,
+    d: tuple[float, float, float],
+    lift: float,
+    rays: tuple[Array, Array32],
+    j: int,
+) -> None:
+    """Fill ray `j` from point `i` in a direction; one that goes below the face is mirrored up."""
+    origins, directions = rays
+    fx, fy, fz = points.flat[i, 0], points.flat[i, 1], points.flat[i, 2]
+    below = min(d[0] * fx + d[1] * fy + d[2] * fz - 1e-3, 0.0)
+    for k in range(3):
+        directions[j, k] = d[k] - 2 * below * points.flat[i, k]
+        origins[j, k] = points.position[i, k] + lift * points.flat[i, k]
+
+
 @njit(error_model="numpy")
 def ambient_rays(
     sky: SkyArrays,
@@ -70,7 +88,6 @@ def ambient_rays(
     for m in range(len(rows)):
         i = rows[m]
         sx, sy, sz = points.smooth[i, 0], points.smooth[i, 1], points.smooth[i, 2]
-        fx, fy, fz = points.flat[i, 0], points.flat[i, 1], points.flat[i, 2]
         ax, ay, az, bx, by, bz = _axes(sx, sy, sz)
         for k in range(n):
             u1, u2 = shared_pair(i, width, k, n)
@@ -86,14 +103,8 @@ def ambient_rays(
                 y = p * ay + q * by + h * sy
                 z = p * az + q * bz + h * sz
             weights[j] = ray_weight(sky, (x, y, z), x * sx + y * sy + z * sz)
-            # Below the face although above the interpolated surface: mirrored up.
-            below = min(x * fx + y * fy + z * fz - 1e-3, 0.0)
-            directions[j, 0] = x - 2 * below * fx
-            directions[j, 1] = y - 2 * below * fy
-            directions[j, 2] = z - 2 * below * fz
-            origins[j, 0] = points.position[i, 0] + lift * fx
-            origins[j, 1] = points.position[i, 1] + lift * fy
-            origins[j, 2] = points.position[i, 2] + lift * fz
+            # It may be below the face although above the interpolated surface.
+            _leave(points, i, (x, y, z), lift, (origins, directions), j)
 
 
 @njit(error_model="numpy")
@@ -141,7 +152,6 @@ def mirror_rays(
     The lobe of a rough point is wider than the bumps of its normal image turn it: there one ray
     about the bent normal would only be noise, and the ray is that of the smooth surface.
     """
-    origins, directions = rays
     for m in range(len(rows)):
         i = rows[m]
         x, y, z = points.position[i] - eye
@@ -155,14 +165,7 @@ def mirror_rays(
         nx, ny, nz = nx / length, ny / length, nz / length
         along = 2 * (x * nx + y * ny + z * nz)
         x, y, z = x - along * nx, y - along * ny, z - along * nz
-        fx, fy, fz = points.flat[i, 0], points.flat[i, 1], points.flat[i, 2]
-        below = min(x * fx + y * fy + z * fz - 1e-3, 0.0)
-        directions[m, 0] = x - 2 * below * fx
-        directions[m, 1] = y - 2 * below * fy
-        directions[m, 2] = z - 2 * below * fz
-        origins[m, 0] = points.position[i, 0] + lift * fx
-        origins[m, 1] = points.position[i, 1] + lift * fy
-        origins[m, 2] = points.position[i, 2] + lift * fz
+        _leave(points, i, (x, y, z), lift, rays, m)
 
 
 @njit(error_model="numpy")

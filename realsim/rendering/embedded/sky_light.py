@@ -152,21 +152,24 @@ def _lamps(coarse: Array32) -> tuple[Array, float, float]:
     return sums / max(total, 1e-30), total, share
 
 
+@njit(inline="always", error_model="numpy")
+def _unfolded(x: float, y: float) -> tuple[float, float, float]:
+    """Return the unit direction of a place of the octahedral map, x and y from -1 to 1."""
+    z = 1 - abs(x) - abs(y)
+    if z < 0:
+        x, y = (1 - abs(y)) * (1.0 if x >= 0 else -1.0), (1 - abs(x)) * (1.0 if y >= 0 else -1.0)
+    length = np.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
 @njit(error_model="numpy")
 def _fill_octahedron(stack: MapStack, out: Array32) -> None:
     """Fill the octahedral map (n, n) with the luminance of a panorama."""
     n = out.shape[0]
     for i in range(n):
         for j in range(n):
-            x, y = 2 * (j + 0.5) / n - 1, 2 * (i + 0.5) / n - 1
-            z = 1 - abs(x) - abs(y)
-            if z < 0:
-                x, y = (
-                    (1 - abs(y)) * (1.0 if x >= 0 else -1.0),
-                    (1 - abs(x)) * (1.0 if y >= 0 else -1.0),
-                )
-            length = np.sqrt(x * x + y * y + z * z)
-            r, g, b = map_at(stack, 0, x / length, y / length, z / length)
+            x, y, z = _unfolded(2 * (j + 0.5) / n - 1, 2 * (i + 0.5) / n - 1)
+            r, g, b = map_at(stack, 0, x, y, z)
             out[i, j] = 0.2126 * r + 0.7152 * g + 0.0722 * b
 
 
@@ -197,12 +200,7 @@ def lamp_direction(sky: SkyArrays, u1: float, u2: float) -> tuple[float, float, 
     part = (u1 - sky.lamps[low]) / max(sky.lamps[low + 1] - sky.lamps[low], 1e-30)
     if i % 2:
         j, part = n - 1 - j, 1.0 - part
-    x, y = 2 * (j + part) / n - 1, 2 * (i + u2) / n - 1
-    z = 1 - abs(x) - abs(y)
-    if z < 0:
-        x, y = (1 - abs(y)) * (1.0 if x >= 0 else -1.0), (1 - abs(x)) * (1.0 if y >= 0 else -1.0)
-    length = np.sqrt(x * x + y * y + z * z)
-    return x / length, y / length, z / length
+    return _unfolded(2 * (j + part) / n - 1, 2 * (i + u2) / n - 1)
 
 
 @njit(inline="always", error_model="numpy")
