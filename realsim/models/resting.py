@@ -20,43 +20,23 @@ from realsim.records import Mesh
 
 ANY_DENSITY = 1.0
 """The centre of mass of a uniform body does not depend on its density."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class RestingConfig:
-    """What counts as one way of resting."""
-
-    barrier_share: float = 0.0015
-    """Rise of the centre of mass, as a share of the hull's largest extent, below which two minima
-    are one basin. Rolling a 64-sided disc over an edge takes 0.06 %, tipping one of 100 x 12 mm
-    off its rim 0.36 %, turning a hexagonal nut over an edge 7 %."""
-    rolling_share: float = 0.025
-    """Facets of a basin whose centre of mass is at most this share of the largest extent higher
-    than its minimum represent it too. A lying tube whose mesh is bent by 2 % has two or three
-    minima left, while the real tube rolls."""
-    spacing_deg: float = 14.0
-    """Representatives of one rolling basin are at least so far apart [deg]: a pose fit reaches
-    about half of it."""
-    same_deg: float = 8.0
-    """Poses of different basins nearer than this are one [deg]."""
-    most_per_basin: int = 28
-    """Representatives of one basin; of a sphere, which would need 130, the spacing is widened."""
-    least_probability: float = 0.001
-    """Basins rarer than this are left out: nobody sets an object down on a knife's edge."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        shares = (self.barrier_share, self.rolling_share, self.least_probability)
-        if not all(0 <= share < 1 for share in shares):
-            raise InputError(
-                f"barrier_share is {self.barrier_share}, rolling_share {self.rolling_share}, "
-                f"least_probability {self.least_probability}; all are shares: 0 or more, below 1."
-            )
-        if not (0 < self.spacing_deg <= 180 and self.same_deg >= 0 and self.most_per_basin >= 1):
-            raise InputError(
-                f"spacing_deg {self.spacing_deg}, same_deg {self.same_deg}, most_per_basin "
-                f"{self.most_per_basin}; needed are 0 < spacing <= 180, same >= 0, most >= 1."
-            )
+BARRIER_SHARE = 0.0015
+"""Rise of the centre of mass, as a share of the hull's largest extent, below which two minima are
+one basin. Rolling a 64-sided disc over an edge takes 0.06 %, tipping one of 100 x 12 mm off its rim
+0.36 %, turning a hexagonal nut over an edge 7 %."""
+ROLLING_SHARE = 0.025
+"""Facets of a basin whose centre of mass is at most this share of the largest extent higher than
+its minimum represent it too. A lying tube whose mesh is bent by 2 % has two or three minima left,
+while the real tube rolls."""
+SPACING_DEG = 14.0
+"""Representatives of one rolling basin are at least so far apart [deg]: a pose fit reaches about
+half of it."""
+SAME_DEG = 8.0
+"""Poses of different basins nearer than this are one [deg]."""
+MOST_PER_BASIN = 28
+"""Representatives of one basin; of a sphere, which would need 130, the spacing is widened."""
+LEAST_PROBABILITY = 0.001
+"""Basins rarer than this are left out: nobody sets an object down on a knife's edge."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -98,7 +78,7 @@ class _Facets:
     """(E,) greatest height of the centre of mass while rolling from one to the other."""
 
 
-def resting_orientations(mesh: Mesh, config: RestingConfig | None = None) -> tuple[Resting, ...]:
+def resting_orientations(mesh: Mesh) -> tuple[Resting, ...]:
     """Return the ways in which the body rests on a plane, most probable first.
 
     The mesh may be open or in any unit. A body that rolls (a sphere, a lying cylinder) is
@@ -107,23 +87,22 @@ def resting_orientations(mesh: Mesh, config: RestingConfig | None = None) -> tup
     Raises:
         InputError: the mesh is flat, so it has no hull to stand on.
     """
-    config = RestingConfig() if config is None else config
     facets = _facets(mesh)
     extent = float(np.ptp(facets.points, axis=0).max())
-    tolerance = config.barrier_share * extent
+    tolerance = BARRIER_SHARE * extent
     slopes = _slopes(facets)
     order = np.lexsort((-slopes, facets.barriers))
     root = _flood(facets.heights, facets.edges[order], facets.barriers[order], tolerance)
     _, basins = np.unique(root, return_inverse=True)
     share = np.bincount(basins, facets.shares)
     found: list[tuple[int, float, int]] = []
-    for basin in np.flatnonzero(share >= config.least_probability):
+    for basin in np.flatnonzero(share >= LEAST_PROBABILITY):
         members = np.flatnonzero(basins == basin)
-        chosen = _representatives(facets, members, config.rolling_share * extent, config)
+        chosen = _representatives(facets, members, ROLLING_SHARE * extent)
         nearest = np.argmax(facets.normals[members] @ facets.normals[chosen].T, axis=1)
         part = np.bincount(nearest, facets.shares[members], minlength=len(chosen))
         found += [(int(f), float(p), int(basin)) for f, p in zip(chosen, part, strict=True)]
-    found = _merged(facets, found, config)
+    found = _merged(facets, found)
     return tuple(_resting(facets, *f) for f in sorted(found, key=lambda f: (-f[1], f[0])))
 
 
@@ -248,14 +227,14 @@ def _flood(heights: Array, edges: Int64, barriers: Array, tolerance: float) -> I
     return lowest
 
 
-def _representatives(facets: _Facets, members: Int64, reach: float, config: RestingConfig) -> Int64:
+def _representatives(facets: _Facets, members: Int64, reach: float) -> Int64:
     """Return facets that stand for a basin: its minimum, and others as low and far enough away."""
     order = members[np.argsort(facets.heights[members], kind="stable")]
     low = order[facets.heights[order] <= facets.heights[order[0]] + reach]
-    spacing = np.radians(config.spacing_deg)
+    spacing = np.radians(SPACING_DEG)
     while True:
         chosen = _spaced(facets.normals[low], float(np.cos(spacing)))
-        if len(chosen) <= config.most_per_basin:
+        if len(chosen) <= MOST_PER_BASIN:
             return low[chosen]
         spacing *= 1.15
 
@@ -272,11 +251,9 @@ def _spaced(directions: Array, nearest_cos: float) -> Int64:
     return np.array(chosen, dtype=np.int64)
 
 
-def _merged(
-    facets: _Facets, found: list[tuple[int, float, int]], config: RestingConfig
-) -> list[tuple[int, float, int]]:
+def _merged(facets: _Facets, found: list[tuple[int, float, int]]) -> list[tuple[int, float, int]]:
     """Return the poses (facet, probability, basin) with near ones of other basins joined."""
-    limit = np.cos(np.radians(config.same_deg))
+    limit = np.cos(np.radians(SAME_DEG))
     kept: list[tuple[int, float, int]] = []
     for facet, probability, basin in sorted(found, key=lambda f: (-f[1], f[0])):
         normal = facets.normals[facet]

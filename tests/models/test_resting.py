@@ -6,7 +6,7 @@ import pytest
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 from realsim.geometry.parts import part
-from realsim.models.resting import Resting, RestingConfig, resting_orientations
+from realsim.models.resting import SPACING_DEG, Resting, resting_orientations
 from realsim.records import Mesh
 from realsim.scanning.simulated import distorted
 from refusals import refused
@@ -106,7 +106,7 @@ def test_a_lying_cylinder_is_represented_all_around() -> None:
     lying = np.array([d for d in _down(resting) if abs(d[2]) < 0.1])
     angles = np.sort(np.degrees(np.arctan2(lying[:, 1], lying[:, 0])))
     gaps = np.diff(np.append(angles, angles[0] + 360))
-    assert gaps.max() < 2 * RestingConfig().spacing_deg
+    assert gaps.max() < 2 * SPACING_DEG
     assert len({r.basin for r in resting}) == 3
 
 
@@ -139,5 +139,3 @@ def test_a_flat_mesh_and_impossible_settings_are_refused() -> None:
         faces=np.array([[0, 1, 2]], dtype=np.int32),
     )
     refused("flat", resting_orientations, flat)
-    refused("spacing_deg", RestingConfig, spacing_deg=0.0)
-    refused("barrier_share", RestingConfig, barrier_share=-1.0)

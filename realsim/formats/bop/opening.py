@@ -22,7 +22,6 @@ from realsim.formats.bop.rows import (
 from realsim.formats.bop.run_lengths import read_coco_masks
 from realsim.formats.bop.scene import GT_FILE, BopSceneRef, ground_truth_file
 from realsim.formats.bop.source import choose_scene
-from realsim.formats.bop.targets import read_targets, targets_file
 from realsim.formats.evidence import depth_ratio
 from realsim.formats.folders.listing import image_header, shown
 from realsim.records import ObjectModel
@@ -40,9 +39,7 @@ def open_labelled_bop(
     root: Path | str,
     *,
     scene: int | None = None,
-    split: str | None = None,
     camera: str = "",
-    targets_only: bool = False,
     models: Path | str | Mapping[int, ObjectModel] | None = None,
 ) -> BopLabelledScene:
     """Open the scene of a data set that was asked for, or its only one.
@@ -52,23 +49,13 @@ def open_labelled_bop(
     Args:
         root: data set, split or scene.
         scene: its number.
-        split: such as test; None = any.
         camera: type of its camera, where it has several.
-        targets_only: only the images that the data set's list of targets names.
         models: a models folder, or models by object id; None = beside the split.
 
     Raises:
         InputError: no such scene, several, or one that cannot be read; see `open_labelled_scene`.
     """
-    ref = choose_scene(root, scene, camera=camera, split=split)
-    wanted: list[int] | None = None
-    if targets_only:
-        file = targets_file(ref.folder.parent.parent)
-        targets = read_targets(file)
-        wanted = sorted({i for t in targets if t.scene_id == ref.scene_id for i in t.image_ids})
-        if not wanted:
-            raise InputError(f"{file} names no image of scene {ref.scene_id}.")
-    return open_labelled_scene(ref, models=models, image_ids=wanted)
+    return open_labelled_scene(choose_scene(root, scene, camera=camera), models=models)
 
 
 def open_labelled_scene(

@@ -11,7 +11,7 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
-from realsim.models.resting import RestingConfig, resting_orientations, turned_down
+from realsim.models.resting import resting_orientations, turned_down
 from realsim.records import SupportPlane
 from realsim.registration.evidence import Cloud
 from realsim.scanning.scale.height_maps import (
@@ -143,7 +143,7 @@ def starts_near(given: Similarity, rng: np.random.Generator) -> list[Similarity]
 
 def _templates(shape: ScanShape) -> list[Template]:
     """Return the templates of the resting poses, most probable first, and of all directions."""
-    resting = resting_orientations(shape.mesh, RestingConfig())
+    resting = resting_orientations(shape.mesh)
     general = [turned_down(d) for d in _spread_directions(DIRECTIONS)]
     basin = np.array([r.basin for r in resting])
     # A body that rolls is as likely to lie as all its representatives together.
