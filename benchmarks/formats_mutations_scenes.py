@@ -82,15 +82,12 @@ def labelled_session(folder: Path, views: int = 3) -> Any:
 
 
 def make_bop(folder: Path) -> None:
-    """Write a BOP data set: one scene, models, camera.json, targets."""
-    import json
+    """Write a BOP data set: one scene, models, camera.json."""
     import shutil
 
     store = labelled_session(folder / "test" / "000003")
     store.close()
     shutil.move(folder / "test/000003/models", folder / "models")
-    targets = [{"scene_id": 3, "im_id": k, "obj_id": 1, "inst_count": 1} for k in range(3)]
-    (folder / "test_targets_bop19.json").write_text(json.dumps(targets))
     for name in ("session.json", "manifest.jsonl"):
         (folder / "test/000003" / name).unlink(missing_ok=True)
 
@@ -99,11 +96,8 @@ def read_bop(folder: Path) -> Any:
     """Read a BOP data set every way."""
     from realsim.formats.bop.models import load_models
     from realsim.formats.bop.opening import open_labelled_bop
-    from realsim.formats.bop.targets import read_targets
 
-    scene = open_labelled_bop(folder)
-    found = [drain_scene(scene), read_targets(folder / "test_targets_bop19.json")]
-    return [*found, load_models(folder / "models")]
+    return [drain_scene(open_labelled_bop(folder)), load_models(folder / "models")]
 
 
 def read_bop_source(folder: Path) -> Any:

@@ -10,7 +10,6 @@ import pytest
 from realsim.errors import InputError, UnitError
 from realsim.formats.bop.labels import rle_of
 from realsim.formats.bop.opening import open_labelled_bop
-from realsim.formats.bop.targets import read_targets
 from realsim.geometry import se3
 from refusals import refused
 from tests.support.bop_scenes import HEIGHT, MODELS, WIDTH, K, edit, write_boxes
@@ -115,21 +114,6 @@ def test_masks_come_from_run_lengths_where_there_are_no_files(tmp_path, packed):
     less = open_labelled_bop(tmp_path)
     assert less.mask(1, 0, visible=True) is None and less.mask(1, 2, visible=True) is None
     assert any("could not be paired" in note for note in less.notes)
-
-
-def test_targets_choose_images(tmp_path):
-    write_boxes(tmp_path)
-    rows = [{"scene_id": 3, "im_id": 5, "obj_id": 1, "inst_count": 2}, {"scene_id": 4, "im_id": 1}]
-    (tmp_path / "test_targets_bop19.json").write_text(json.dumps(rows))
-    assert open_labelled_bop(tmp_path, targets_only=True).indices == (5,)
-    first, second = read_targets(tmp_path / "test_targets_bop19.json")
-    assert (first.image_ids, first.obj_id, first.count) == ((5,), 1, 2)
-    assert (second.obj_id, second.count) == (None, None)
-    several = tmp_path / "test_targets_multiview_bop25.json"
-    several.write_text(json.dumps([{"scene_id": 3, "im_ids": [5, 9]}]))
-    assert read_targets(several)[0].image_ids == (5, 9)
-    several.write_text(json.dumps([{"scene_id": 3}]))
-    refused("im_id of target 0", read_targets, several)
 
 
 # --- what contradicts itself is found -----------------------------------------------------------

@@ -18,7 +18,6 @@ from realsim.formats.bop.opening import open_labelled_bop, open_labelled_scene
 from realsim.formats.bop.root_files import write_bop_models, write_bop_root
 from realsim.formats.bop.run_lengths import decoded
 from realsim.formats.bop.scene import find_scenes
-from realsim.formats.bop.targets import read_targets
 from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
 from realsim.formats.export_folder import ExportFolder
 from realsim.geometry import se3
@@ -28,12 +27,12 @@ from tests.support.bop_scenes import MODELS, bbox, edit, write_boxes
 DOCUMENTS = ("scene_camera", "scene_gt", "scene_gt_info")
 
 
-def export(scene, out, config=None, **root):
+def export(scene, out, config=None):
     folder = ExportFolder.begin(out, {"what": "a test"})
     written = write_bop_scene(scene, folder, config)
     infos = scene.models_info()
     write_bop_models(scene.models(), folder, infos=infos)
-    write_bop_root(folder, name="copy", **root)
+    write_bop_root(folder, name="copy")
     folder.finish({})
     return written
 
@@ -199,23 +198,22 @@ def test_targets_are_the_visible_objects(tmp_path):
 
     edit(source / "scene_gt_info.json", hide)
     export(open_labelled_bop(tmp_path / "a"), tmp_path / "b")
-    targets = read_targets(tmp_path / "b/test_targets_bop19.json")
-    by_image = {t.image_ids[0]: {} for t in targets}
+    targets = json.loads((tmp_path / "b/test_targets_bop19.json").read_text())
+    by_image = {t["im_id"]: {} for t in targets}
     for t in targets:
-        assert t.scene_id == 3
-        by_image[t.image_ids[0]][t.obj_id] = t.count
+        assert t["scene_id"] == 3
+        by_image[t["im_id"]][t["obj_id"]] = t["inst_count"]
     scene = open_labelled_bop(tmp_path / "a")
     for i in scene.indices:
         seen = [o.obj_id for o in scene.frame(i).objects if o.visible_fraction >= 0.1]
         assert by_image[i] == {k: seen.count(k) for k in set(seen)}
     assert by_image[5][1] == 1
-    assert [t.image_ids[0] for t in read_targets(tmp_path / "b/test_targets_bop24.json")] == [
-        1, 5, 9, 13, 17,
-    ]  # fmt: skip
+    detection = json.loads((tmp_path / "b/test_targets_bop24.json").read_text())
+    assert [t["im_id"] for t in detection] == [1, 5, 9, 13, 17]
     camera = json.loads((tmp_path / "b/camera.json").read_text())
     assert (camera["width"], camera["height"], camera["depth_scale"]) == (96, 72, 0.1)
     assert "cam_R_w2c" in (tmp_path / "b/dataset_info.md").read_text()
-    open_labelled_bop(tmp_path / "b", targets_only=True)
+    open_labelled_bop(tmp_path / "b")
 
 
 # --- interruption -------------------------------------------------------------------------------

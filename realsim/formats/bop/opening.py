@@ -59,17 +59,13 @@ def open_labelled_bop(
 
 
 def open_labelled_scene(
-    ref: BopSceneRef,
-    *,
-    models: Path | str | Mapping[int, ObjectModel] | None = None,
-    image_ids: Sequence[int] | None = None,
+    ref: BopSceneRef, *, models: Path | str | Mapping[int, ObjectModel] | None = None
 ) -> BopLabelledScene:
     """Open a scene of `find_scenes` with its labels.
 
     Args:
         ref: the scene.
         models: a models folder, or models by object id; None = beside the split.
-        image_ids: only these; None = all that have a colour image.
 
     Raises:
         InputError: something is missing, broken, or contradicts something else: counts of rows and
@@ -80,7 +76,7 @@ def open_labelled_scene(
     layout = ref.layout
     notes: list[str] = []
     path = layout.document("scene_camera")
-    cameras = _wanted(read_cameras(path), image_ids, path)
+    cameras = read_cameras(path)
     colour, depth = layout.colour_files(), layout.depth_files()
     missing = [i for i in cameras if i not in colour]
     cameras = {i: row for i, row in cameras.items() if i in colour}
@@ -120,15 +116,6 @@ def open_labelled_scene(
     found = BopLabelledScene(ref, content, notes)
     _check(found, infos)
     return found
-
-
-def _wanted(rows: dict[int, Json], image_ids: Sequence[int] | None, path: Path) -> dict[int, Json]:
-    if image_ids is None:
-        return rows
-    absent = sorted(set(image_ids) - set(rows))
-    if absent:
-        raise InputError(f"image {', '.join(map(str, absent[:12]))} is not in {path}.")
-    return {i: rows[i] for i in sorted(set(image_ids))}
 
 
 def _ground_truth(

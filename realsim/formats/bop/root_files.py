@@ -9,7 +9,6 @@ import numpy as np
 
 from realsim.formats.bop.layout import scene_number
 from realsim.formats.bop.models import INFO_FILE, info_of, model_file, model_files
-from realsim.formats.bop.targets import BOP19, BOP24
 from realsim.formats.bop.writing import SCENES
 from realsim.formats.export_folder import ExportFolder
 from realsim.geometry.mesh import ply_bytes
@@ -17,6 +16,8 @@ from realsim.records import ObjectModel
 
 Json = dict[str, Any]
 MODELS, MODELS_EVAL = "models", "models_eval"
+BOP19, BOP24 = "test_targets_bop19.json", "test_targets_bop24.json"
+"""What the data set asks to be found: localisation, detection."""
 SAME_SHARE = 1e-4
 """Share of the diameter: numbers of models_info.json that differ by less from what the mesh has are
 kept as the source wrote them, to the last digit."""
@@ -94,23 +95,16 @@ def _same_numbers(said: Any, value: Any, limit: float) -> bool:
     return a.shape == b.shape and bool(np.all(np.abs(a - b) <= max(limit, 1e-9)))
 
 
-def write_bop_root(
-    folder: ExportFolder,
-    *,
-    name: str,
-    description: Sequence[str] = (),
-    targets_split: str | None = None,
-) -> None:
+def write_bop_root(folder: ExportFolder, *, name: str) -> None:
     """Write camera.json, dataset_info.md and the lists of targets of the scenes that are whole.
 
-    The lists are of one split, as BOP's are: every image of it, and of its objects those that are
-    visible to a tenth or more (or whose visibility is not known).
+    The lists are of one split, as BOP's are (the only one, else the first that begins with 'test'):
+    every image of it, and of its objects those that are visible to a tenth or more (or whose
+    visibility is not known).
 
     Args:
         folder: the export, all scenes and models written.
         name: of the data set.
-        description: paragraphs for dataset_info.md.
-        targets_split: None = the only split, else the first that begins with 'test'.
     """
     scenes: list[Json] = [row for _, row in folder.rows(SCENES)]
     cameras: dict[str, Json] = {}
@@ -121,10 +115,10 @@ def write_bop_root(
         suffix = f"_{camera_type}" if camera_type else ""
         text = json.dumps(camera, indent=1) + "\n"
         folder.write_document(f"camera{suffix}.json", [text])
-    folder.write_document("dataset_info.md", _description(name, description, scenes))
+    folder.write_document("dataset_info.md", _description(name, scenes))
     splits = sorted({s["split"] for s in scenes if not s["split"].startswith("onboarding")})
     test = [s for s in splits if s.startswith("test")]
-    chosen = targets_split or (splits[0] if len(splits) == 1 else test[0] if test else None)
+    chosen = splits[0] if len(splits) == 1 else test[0] if test else None
     if chosen is None:
         return
     seen: dict[str, Json] = {}
@@ -166,10 +160,8 @@ def _json_list(rows: Iterator[Json]) -> Iterator[str]:
     yield "\n]\n"
 
 
-def _description(name: str, description: Sequence[str], scenes: Sequence[Json]) -> Iterator[str]:
+def _description(name: str, scenes: Sequence[Json]) -> Iterator[str]:
     yield f"# {name}\n\n"
-    for paragraph in description:
-        yield f"{paragraph}\n\n"
     yield (
         "Format: BOP scenewise (bop_toolkit, docs/bop_datasets_format.md). Lengths in mm, poses "
         "row by row: cam_R_m2c and cam_t_m2c from model to camera, cam_R_w2c and cam_t_w2c from "

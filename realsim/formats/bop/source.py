@@ -81,16 +81,13 @@ class BopSource:
             )
 
 
-def choose_scene(
-    root: Path | str, number: int | None, *, camera: str = "", split: str | None = None
-) -> BopSceneRef:
+def choose_scene(root: Path | str, number: int | None, *, camera: str = "") -> BopSceneRef:
     """Return the scene of a dataset that was asked for, or its only one.
 
     Args:
         root: dataset, split or scene.
         number: of the scene; None = the only one.
         camera: type of its camera, where it has several; "" = the only one.
-        split: None = any.
 
     Raises:
         InputError: none, several of which none was chosen, or not that one; lists them.
@@ -98,15 +95,10 @@ def choose_scene(
     scenes = find_scenes(root)
     places = ["/".join([s.split, s.folder.name, *([s.camera] if s.camera else [])]) for s in scenes]
     listed = shown([f"{s.scene_id} ({p})" for s, p in zip(scenes, places, strict=True)], 12)
-    chosen = [
-        s
-        for s in scenes
-        if number in (None, s.scene_id) and camera in ("", s.camera) and split in (None, s.split)
-    ]
+    chosen = [s for s in scenes if number in (None, s.scene_id) and camera in ("", s.camera)]
     if not chosen:
         asked = [f"scene {'of any number' if number is None else number}"]
         asked += [f"camera '{camera}'"] if camera else []
-        asked += [f"split '{split}'"] if split else []
         raise InputError(f"{root} has no {', '.join(asked)}; it has {listed}.")
     if len(chosen) > 1:
         what = "scenes" if number is None else f"scenes of number {number}"
