@@ -29,7 +29,7 @@ def test_what_a_report_says_is_read_as_it_was_written(
 ) -> None:
     path = tmp_path / "r.json"
     path.write_text(json.dumps(document))
-    read = read_stored(path)
+    read = read_stored(path, "A r")
     assert read.verdict == document["verdict"] and set(read.figures) == set(document["figures"])
     assert [o["T_world_obj"] for o in read.objects] == [
         o["T_world_obj"] for o in document["objects"]

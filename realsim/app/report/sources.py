@@ -71,11 +71,7 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 def _source(path: Path, label: str) -> Source:
     if path.is_file():
-        stored = read_stored(path)
-        return Source(
-            label=label, verdict=stored.verdict, figures=stored.figures, objects=stored.objects,
-            series=stored.series, models={},
-        )  # fmt: skip
+        return read_stored(path, label)
     if path.suffix.lower() == ".json" and not path.exists():
         raise InputError(f"the stored report '{path}' is not there.")
     store = open_session(path)
@@ -106,18 +102,12 @@ SERIES_OF_SHARES = ("school.scores", "school.p_hold", "labels.visibility")
 """Series of values between 0 and 1."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class StoredReport:
-    """What a comparison needs of a stored report."""
-
-    verdict: str
-    figures: dict[str, Figure]
-    objects: list[dict[str, Any]]
-    series: dict[str, Any]
-
-
-def read_stored(path: Path) -> StoredReport:
+def read_stored(path: Path, label: str) -> Source:
     """Return a stored report; figures and series that this version does not know are left out.
+
+    Args:
+        path: the file.
+        label: what the report is called.
 
     Raises:
         InputError: it is missing, no report, of a newer version, or a field is not as
@@ -135,12 +125,12 @@ def read_stored(path: Path) -> StoredReport:
             f"'{path}' has the version {version!r:.60}; this realsim reads 1 to {SCHEMA_VERSION}."
         )
     try:
-        return _checked(mapping(told, "the report"))
+        return _checked(mapping(told, "the report"), label)
     except InputError as error:
         raise InputError(f"'{path}' is damaged: {error} Write the report again.") from error
 
 
-def _checked(told: Mapping[str, Any]) -> StoredReport:
+def _checked(told: Mapping[str, Any], label: str) -> Source:
     _text(_of(told, "session", "the report"), "'session'")
     for name, state in mapping(_of(told, "stages", "the report"), "'stages'").items():
         _one_of(state, tuple(STATE_KIND), f"'stages.{name:.60}'")
@@ -151,11 +141,13 @@ def _checked(told: Mapping[str, Any]) -> StoredReport:
     figures = figures_from_json(_of(told, "figures", "the report"))
     for name in ALWAYS:
         _of(figures, name, "'figures'")
-    return StoredReport(
+    return Source(
+        label=label,
         verdict=_one_of(_of(told, "verdict", "the report"), tuple(VERDICTS), "'verdict'"),
         figures=figures,
         objects=_objects(_of(told, "objects", "the report")),
         series=_series(_of(told, "series", "the report")),
+        models={},
     )
 
 
