@@ -52,8 +52,6 @@ class Resting:
     """Height of the body in this pose [units of the mesh]."""
     center_height: float
     """Height of the centre of mass above the plane [units of the mesh]."""
-    shadow_area: float
-    """Area of the hull's vertical shadow on the plane [units of the mesh, squared]."""
     basin: int
     """Number of its basin: representatives of one rolling body share it."""
 
@@ -66,8 +64,6 @@ class _Facets:
     """(H, 3) hull corners about the centre of mass."""
     normals: Array
     """(F, 3) unit, outward."""
-    areas: Array
-    """(F,)."""
     heights: Array
     """(F,) of the centre of mass when the facet lies on the table."""
     shares: Array
@@ -154,7 +150,6 @@ def _facets(mesh: Mesh) -> _Facets:
     return _Facets(
         points=points,
         normals=normals,
-        areas=0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1),
         heights=heights,
         shares=shares,
         edges=edges,
@@ -269,12 +264,10 @@ def _merged(facets: _Facets, found: list[tuple[int, float, int]]) -> list[tuple[
 def _resting(facets: _Facets, facet: int, probability: float, basin: int) -> Resting:
     """Return the record of one facet on the table."""
     R = turned_down(facets.normals[facet])
-    down = facets.normals @ R[2]
     return Resting(
         R=R,
         probability=probability,
         height=float(np.ptp(facets.points @ R[2])),
         center_height=float(facets.heights[facet]),
-        shadow_area=float(facets.areas @ np.maximum(down, 0.0)),
         basin=basin,
     )

@@ -1,6 +1,5 @@
 """GraspNet's grasps: the gripper frame, groups, labels, collisions, rectangles, broken files."""
 
-import io
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from realsim.formats.graspnet.grasp_group import (
     write_grasp_group,
 )
 from realsim.formats.graspnet.grasp_labels import GraspLabels, read_grasp_labels, write_grasp_labels
-from realsim.formats.graspnet.rect import rect_bytes, rect_grasps
+from realsim.formats.graspnet.rect import rect_rows
 from realsim.formats.grasps.scene_grasps import untried_set
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
@@ -229,16 +228,10 @@ def test_a_rectangle_has_the_grippers_opening_and_height_in_pixels():
         a_group(n=2), Ts_a_grasp=T, openings_m=np.full(2, 0.08), depths_m=np.full(2, 0.02),
         obj_ids=np.array([1, 2]),
     )  # fmt: skip
-    rect = rect_grasps(group, camera)
-    assert len(rect) == 1 and rect.obj_ids[0] == 1
-    np.testing.assert_allclose(rect.centers_px[0], [320, 240], atol=1e-9)
-    np.testing.assert_allclose(rect.open_px[0], [320, 240 - 600 * 0.04 / 0.48], atol=1e-9)
-    np.testing.assert_allclose(rect.heights_px[0], 600 * 0.02 / 0.48)
-    sides = np.linalg.norm(np.diff(rect.corners_px()[0], axis=0, append=rect.corners_px()[0][:1]),
-                           axis=1)  # fmt: skip
-    np.testing.assert_allclose(sides, [100, 25, 100, 25])
-    row = np.load(io.BytesIO(rect_bytes(rect)))[0]
-    np.testing.assert_allclose(row, [320, 240, 320, 190, 25, rect.scores[0], 0], atol=1e-4)
+    (row,) = rect_rows(group, camera)
+    side, high = 600 * 0.04 / 0.48, 600 * 0.02 / 0.48
+    expected = [320, 240, 320, 240 - side, high, group.scores[0], 0]
+    np.testing.assert_allclose(row, expected, rtol=1e-12, atol=1e-9)
 
 
 # --- files that are broken ----------------------------------------------------------------------

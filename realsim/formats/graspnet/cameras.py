@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from realsim.arrays import Array
+from realsim.arrays import Array, Array32
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.untrusted.arrays import read_npy
@@ -92,7 +92,7 @@ def read_camera_files(folder: Path) -> CameraFiles:
     return CameraFiles(poses=poses, first=first, K=K)
 
 
-def npy_bytes(array: Array) -> bytes:
+def npy_bytes(array: Array | Array32) -> bytes:
     """Return an array as the bytes of a npy file."""
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)

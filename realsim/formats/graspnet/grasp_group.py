@@ -24,6 +24,7 @@ import numpy as np
 
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
+from realsim.formats.graspnet.cameras import npy_bytes
 from realsim.formats.graspnet.gripper_frame import HEIGHT_M, grasp_poses, graspnet_poses
 from realsim.formats.grasps.scene_grasps import executed, measures_of_json, untried_set
 from realsim.geometry import se3
@@ -235,9 +236,7 @@ def grasp_group_bytes(group: GraspGroup) -> bytes:
     rows[:, 4:13] = Ts[:, :3, :3].reshape(-1, 9)
     rows[:, 13:16] = Ts[:, :3, 3]
     rows[:, 16] = group.obj_ids - 1
-    buffer = io.BytesIO()
-    np.save(buffer, rows, allow_pickle=False)
-    return buffer.getvalue()
+    return npy_bytes(rows)
 
 
 def grasp_group_files(name: str, group: GraspGroup) -> dict[str, bytes]:

@@ -9,7 +9,6 @@ Grasps that physics tried become labels (`tried_labels`), when all scenes are th
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,7 @@ from realsim.formats.graspnet.instances import OBJECT_LIST
 from realsim.formats.graspnet.label_copies import keeps_numbers, label_files, rect_file
 from realsim.formats.graspnet.labelled import GraspnetLabelledScene
 from realsim.formats.graspnet.models import model_files
-from realsim.formats.graspnet.rect import rect_bytes, rect_grasps
+from realsim.formats.graspnet.rect import rect_rows
 from realsim.formats.graspnet.tried_labels import OBJECTS, told_of
 from realsim.formats.graspnet.write_plan import GraspnetWriteConfig, WritePlan, plan_scene
 from realsim.formats.grasps.scene_grasps import SceneGrasps
@@ -139,9 +138,9 @@ def _rectangles(frame: LabelledFrame, grasps: SceneGrasps, plan: WritePlan) -> b
     """Return the rectangles of the grasps that held, of those along the camera's axis."""
     poses = {o.instance: o.T_cam_obj for o in frame.objects if o.instance is not None}
     sets = [s for s in grasps.sets if s.instance in poses]
-    found = rect_grasps(grasp_group(sets, poses, scores="tried"), frame.intrinsics)
-    numbers = np.array([plan.numbers[i] for i in found.obj_ids.tolist()], dtype=np.int64)
-    return rect_bytes(replace(found, obj_ids=numbers + 1))
+    rows = rect_rows(grasp_group(sets, poses, scores="tried"), frame.intrinsics)
+    rows[:, 6] = [plan.numbers[int(n) + 1] for n in rows[:, 6]]
+    return npy_bytes(rows.astype(np.float32))
 
 
 def _order(scene: LabelledScene, frame: LabelledFrame, plan: WritePlan) -> list[int]:
