@@ -100,8 +100,8 @@ def _views(r: HandEyeReport) -> Check:
         name="views",
         verdict=worst,
         sentence=f"{used} of {given} views were used{names}{more}.",
-        advice=_advice(worst, "Take 24 views or more in which the whole target is sharp. The table "
-                       "of views says why the others were dropped."
+        advice=_advice(worst, "Take 24 views or more in which the whole target is sharp."
+                       + " The table of views says why the others were dropped." * bool(gone)
                        + f" Images without it: {empty}; keep one board a folder." * (empty > 0)),
         value=used,
         views=tuple(v.index for v in gone),

@@ -356,7 +356,7 @@ class ReviewedSession:
         from realsim.review.placing.snapping import Snapper
 
         content, standing = self.content(), self.standing
-        excluded = tuple(standing.state.excluded_views())
+        excluded = tuple({*standing.state.excluded_views(), *content.damaged})
         scene = replace(standing.scene, objects=self.with_models(standing.scene.objects))
         with self._loading:
             if self._snapper is None or self._snapper[0] != excluded:

@@ -9,6 +9,7 @@ import pytest
 
 from realsim import CameraIntrinsics, GraspSet, InputError, View
 from realsim.geometry import camera, depth, se3
+from realsim.images import png_bytes
 from realsim.rendering import overlay
 from realsim.review.content import clouds
 from realsim.review.content.config import SceneConfig
@@ -121,6 +122,22 @@ def test_a_missing_model_is_named(tmp_path: Path) -> None:
     (store.folder / "models/obj_000007.ply").unlink()
     with pytest.raises(InputError, match=r"objects 7.*it has 1, 9"):
         SceneContent.load(store, CONFIG)
+
+
+def test_views_with_damaged_images_are_left_out_and_named(
+    tmp_path: Path, shown: SceneContent
+) -> None:
+    store = boxes_session(tmp_path / "boxes")
+    photograph = store.path("rgb/000001.png")
+    photograph.write_bytes(photograph.read_bytes()[:900])
+    store.path("depth/000003.png").write_bytes(b"")
+    store.path("depth/000002.png").write_bytes(png_bytes(np.full((60, 80), 4000, np.uint16)))
+    left = SceneContent.load(SessionStore.open(store.folder), CONFIG)
+    assert sorted(left.damaged) == [1, 2, 3] and sorted(left.thumbnails) == [0, 2, 3]
+    for said, name in zip(left.remarks, ("rgb/000001", "(60, 80)", "depth/000003"), strict=True):
+        assert "is left out" in said and name in said
+    found = nearest_m(left.cloud.points.astype(float), shown.cloud.points.astype(float))
+    assert 0 < len(left.cloud) < len(shown.cloud) and found.max() < CONFIG.voxel_m
 
 
 def test_an_unknown_view_or_model_is_named(shown: SceneContent) -> None:

@@ -38,19 +38,19 @@ def fresh(store: SessionStore, index: int, width_px: int = 40, quality: int = 70
 def test_the_kept_ones_equal_fresh_ones_and_nothing_is_decoded_for_them(
     store: SessionStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = dict(opened(store).of(INDICES))
+    first = dict(opened(store).of(INDICES, {}))
     assert first == {i: fresh(store, i) for i in INDICES}
     before = {p: p.stat().st_mtime_ns for p in (store.folder / FOLDER).iterdir()}
     assert len(before) == len(INDICES)
     for index in INDICES:  # a photograph that were read would be an error
         (store.folder / f"rgb/{index:06d}.png").write_bytes(b"gone")
-    assert dict(Thumbnails(store, 40, 70).of(INDICES)) == first
+    assert dict(Thumbnails(store, 40, 70).of(INDICES, {})) == first
     assert {p: p.stat().st_mtime_ns for p in (store.folder / FOLDER).iterdir()} == before
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped", "emptied", "other", "unsigned", "swapped"])
 def test_a_damaged_or_foreign_one_is_made_anew(store: SessionStore, damage: str) -> None:
-    opened(store).of(INDICES)
+    opened(store).of(INDICES, {})
     file = store.folder / FOLDER / "000001.jpg"
     whole = file.read_bytes()
     data = bytearray(whole)
@@ -61,28 +61,29 @@ def test_a_damaged_or_foreign_one_is_made_anew(store: SessionStore, damage: str)
         "swapped": (store.folder / FOLDER / "000002.jpg").read_bytes(),
     }  # fmt: skip
     file.write_bytes(spoiled[damage])
-    assert opened(store).of([1])[1] == fresh(store, 1)
+    assert opened(store).of([1], {})[1] == fresh(store, 1)
     assert file.read_bytes() == whole
 
 
 def test_one_of_another_photograph_size_or_quality_is_made_anew(store: SessionStore) -> None:
-    opened(store).of(INDICES)
-    assert opened(store, 20).of([0])[0] == fresh(store, 0, 20)
-    assert opened(store, 20, 90).of([0])[0] == fresh(store, 0, 20, 90)
+    opened(store).of(INDICES, {})
+    assert opened(store, 20).of([0], {})[0] == fresh(store, 0, 20)
+    assert opened(store, 20, 90).of([0], {})[0] == fresh(store, 0, 20, 90)
     darker = (store.rgb(3) // 2).astype(np.uint8)
     store.write_bytes("rgb/000003.png", images.png_bytes(darker))
-    assert opened(store).of([3])[3] == thumbnail(darker, 40, 70)
+    assert opened(store).of([3], {})[3] == thumbnail(darker, 40, 70)
 
 
 def test_progress_comes_to_its_end_and_a_missing_photograph_is_named(store: SessionStore) -> None:
     steps: list[tuple[int, int]] = []
     thumbnails = opened(store)
-    thumbnails.of(INDICES, lambda done, of: steps.append((done, of)))
+    thumbnails.of(INDICES, {}, lambda done, of: steps.append((done, of)))
     assert steps == [(k, 4) for k in (1, 2, 3, 4)]
     (store.folder / "rgb/000002.png").write_bytes(b"\x89PNG\r\n\x1a\n damaged")
     (store.folder / FOLDER / "000002.jpg").unlink()
-    with pytest.raises(InputError, match=r"000002\.png"):
-        Thumbnails(store, 40, 70).of(INDICES)
+    damaged: dict[int, str] = {}
+    assert list(Thumbnails(store, 40, 70).of(INDICES, damaged)) == [0, 1, 3]
+    assert list(damaged) == [2] and "000002.png" in damaged[2]
 
 
 # --- the quick decoder ------------------------------------------------------------------------

@@ -130,8 +130,7 @@ def test_layers_are_pictures_in_full_size(photographs: Photographs, content: Sce
     blue = (depth[..., 2].astype(int) - depth[..., 0] > 60).mean()
     right = decoded(photographs.picture(0, "depth", [TALL, FLAT]))
     assert blue > 0.005 > (right[..., 2].astype(int) - right[..., 0] > 60).mean()
-    labels = photographs.outlines(0, wrong)
-    assert labels and not np.array_equal(render, photo)
+    assert photographs.outlines(0, wrong) and not np.array_equal(render, photo)
 
 
 def test_a_view_without_depth_says_nothing_and_one_that_is_not_there_is_refused(
@@ -144,6 +143,19 @@ def test_a_view_without_depth_says_nothing_and_one_that_is_not_there_is_refused(
     assert rows[9]["against"] is None and rows[0]["against"] is not None
     with pytest.raises(InputError, match="view 77"):
         blind.outlines(77, [TALL])
+
+
+def test_views_are_told_as_they_are_compared_and_a_damaged_one_is_left_out(tmp_path: Path) -> None:
+    store = boxes_session(tmp_path / "s")
+    found = Photographs(SceneContent.load(store, SceneConfig()))
+    store.path("depth/000002.png").write_bytes(b"")
+    steps = [found.strip(3, [TALL, FLAT], 0.0) for _ in range(5)]
+    assert [s["compared"] for s in steps] == [1, 2, 3, 4, 4] and steps[0]["of"] == 4
+    assert sum(r["is_compared"] for r in steps[0]["views"]) == 1
+    assert steps[4] == found.strip(3, [TALL, FLAT])
+    assert [r["view"] for r in steps[4]["views"] if "000002.png" in r["trouble"]] == [2]
+    known = Photographs(SceneContent.load(store, SceneConfig())).strip(None, [])
+    assert [r["view"] for r in known["views"] if r["trouble"]] == [2] and known["of"] == 3
 
 
 def test_a_slow_answer_is_asked_again_and_made_once(monkeypatch: pytest.MonkeyPatch) -> None:

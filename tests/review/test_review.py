@@ -11,25 +11,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import viser
 from msgspec.msgpack import encode as msgpack
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
-from websockets.typing import Origin, Subprotocol
+from websockets.typing import Origin
 
 from realsim import InputError, local_pages
 from realsim.local_pages import Door
 from realsim.review import ReviewServer
 from realsim.store import SessionStore
-from tests.support.review_browser import serving
+from tests.support.review_browser import CAMERA, SOCKET, serving
 from tests.support.reviewed_boxes import boxes_session
 
-SOCKET = Subprotocol(f"{viser.__name__}-v{viser.__version__}")
-CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, 1], "fov": 1.0,
-    "near": 0.01, "far": 9.0, "image_height": 80, "image_width": 90, "look_at": [0, 0, 0],
-    "up_direction": [0, 1, 0],
-}  # fmt: skip
 TOKEN = "a-secret-of-more-than-16"
 
 
@@ -197,8 +190,7 @@ def test_nobody_can_ask_for_a_public_tunnel(server: ReviewServer) -> None:
 def test_addresses_that_are_none_are_answered_without_a_traceback(
     server: ReviewServer, head: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    status = raw(server, f"{head}\n").split(" ")[1]
-    assert status in ("400", "404")
+    assert raw(server, f"{head}\n").split(" ")[1] in ("400", "404")
     assert [r for r in caplog.records if r.levelname in ("WARNING", "ERROR")] == []
 
 
@@ -298,8 +290,7 @@ def test_an_open_server_answers_to_its_addresses_and_names_only(locked: ReviewSe
     headers = asked(locked, f"/?token={TOKEN}", Host="192.0.2.7:8080")[1]
     cookie = headers["Set-Cookie"].split(";")[0]
     assert cookie.startswith("realsim_8080=")
-    name = socket.gethostname()
-    for host in ("192.0.2.7:8080", f"{name}:8080"):
+    for host in ("192.0.2.7:8080", f"{socket.gethostname()}:8080"):
         assert asked(locked, Host=host, Cookie=cookie)[0] == 200
     assert asked(locked, Host="somewhere.example:8080", Cookie=cookie)[0] == 403
 

@@ -67,9 +67,8 @@ def test_a_static_page_is_of_one_scene(tmp_path: Path, capsys: pytest.CaptureFix
     torn.write_text('{"format": 2, "id\n')
     boxes_session(tmp_path / "root/b").close()
     console = Console(quiet=True, as_json=True)
-    request = ReviewRequest(folders=(tmp_path / "root",))
     with pytest.raises(InputError, match="writes one scene, and there are 2"):
-        write_page(request, tmp_path / "page.html", console)
+        write_page(ReviewRequest(folders=(tmp_path / "root",)), tmp_path / "page.html", console)
     write_page(ReviewRequest(folders=(tmp_path / "root/a",)), tmp_path / "page.html", console)
     assert (tmp_path / "page.html").read_bytes().lstrip()[:15].lower() == b"<!doctype html>"
     assert "line 1 of" in capsys.readouterr().err

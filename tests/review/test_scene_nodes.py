@@ -79,9 +79,8 @@ def test_a_client_is_sent_the_very_points_photographs_and_poses(
     for index, T in enumerate(CAMERAS):
         np.testing.assert_allclose(positions[f"/cameras/{index:06d}"], T[:3, 3], atol=1e-6)
     for placed in SCENE.objects:
-        np.testing.assert_allclose(
-            positions[f"/objects/{placed.instance}"], placed.T_world_obj[:3, 3], atol=1e-6
-        )
+        where = positions[f"/objects/{placed.instance}"]
+        np.testing.assert_allclose(where, placed.T_world_obj[:3, 3], atol=1e-6)
     sent = [m["updates"].get("_image_data") for m in client.of_type("SceneNodeUpdateMessage")]
     photographs = {bytes(b) for b in sent if isinstance(b, bytes | memoryview)}
     assert photographs == set(shown.thumbnails.values())
@@ -93,14 +92,13 @@ def test_place_and_place_back_leaves_every_node_as_it_was(
     server: viser.ViserServer, nodes: SceneNodes
 ) -> None:
     before = states(server)
-    T = SCENE.object(0).T_world_obj
     moved = se3.random_transform(np.random.default_rng(0))
     nodes.place(0, moved)
     during = states(server)
     changed = {name for name in before if during[name] != before[name]}
     assert changed == {"/objects/0"}
     np.testing.assert_allclose(during["/objects/0"][4:7], moved[:3, 3], atol=1e-9)
-    nodes.place(0, T)
+    nodes.place(0, SCENE.object(0).T_world_obj)
     after = states(server)
     assert after.keys() == before.keys()
     for name, state in after.items():
@@ -111,25 +109,22 @@ def test_place_and_place_back_leaves_every_node_as_it_was(
 def test_switches_show_one_look_at_a_time_and_colours_follow_the_verdict(
     server: viser.ViserServer, nodes: SceneNodes
 ) -> None:
-    def seen(instance: int) -> tuple[bool, bool]:
-        now = states(server)
-        return tuple(
-            now.get(f"/objects/{instance}/{k}", (False, ""))[-2] for k in ("appearance", "verdict")
-        )  # type: ignore[return-value]
+    def seen(instance: int) -> list[bool]:
+        now, of = states(server), f"/objects/{instance}/"
+        return [now.get(of + kind, (False, ""))[-2] for kind in ("appearance", "verdict")]
 
-    assert seen(0) == (True, False)
+    assert seen(0) == [True, False]
     nodes.color_verdict(0, "rejected")  # before it was ever shown so
     nodes.show_objects("verdict")
-    assert seen(0) == seen(3) == (False, True)
-    handles = server.scene._handle_from_node_name  # type: ignore[reportPrivateUsage]
-    judged = cast(Any, handles["/objects/0/verdict"])
+    assert seen(0) == seen(3) == [False, True]
+    judged: Any = server.scene.get_handle_by_name("/objects/0/verdict")
     assert tuple(judged.color) == (222, 76, 10)
     nodes.color_verdict(0, "accepted")
     assert tuple(judged.color) == (0, 170, 130)
     nodes.show_objects("hidden")
-    assert seen(0) == (False, False)
+    assert seen(0) == [False, False]
     nodes.show_objects("appearance")
-    assert seen(0) == (True, False)
+    assert seen(0) == [True, False]
     for switch, name in (
         (nodes.show_cloud, "/cloud"), (nodes.show_cameras, "/cameras"), (nodes.show_table, "/table")
     ):  # fmt: skip

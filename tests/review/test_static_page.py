@@ -126,14 +126,14 @@ def test_a_page_that_is_too_large_is_drawn_with_less(
 def test_what_cannot_be_written_is_refused_and_nothing_is_left(
     content: SceneContent, state: journal.ReviewState, tmp_path: Path
 ) -> None:
-    with pytest.raises(InputError, match="title"):
-        write_static(content, state, tmp_path / "a.html", title="  ")
-    with pytest.raises(InputError, match="folder"):
-        write_static(content, state, tmp_path / "no" / "a.html", title="a")
-    with pytest.raises(InputError, match="positive"):
-        write_static(content, state, tmp_path / "a.html", title="a", most_points=0)
-    with pytest.raises(InputError, match="smaller"):
-        write_static(content, state, tmp_path / "a.html", title="a", most_bytes=1e5)
+    given: list[tuple[str, str, dict[str, Any]]] = [
+        ("a", "title", {"title": "  "}), ("no/a", "folder", {"title": "a"}),
+        ("a", "positive", {"title": "a", "most_points": 0}),
+        ("a", "smaller", {"title": "a", "most_bytes": 1e5}),
+    ]  # fmt: skip
+    for name, words, how in given:
+        with pytest.raises(InputError, match=words):
+            write_static(content, state, tmp_path / name, **how)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -168,8 +168,7 @@ def page(
             viewport={"width": 820, "height": 300}, offline=True, device_scale_factor=0.5
         )
         opened = context.new_page()
-        opened.said = []
-        opened.asked = []
+        opened.said, opened.asked = [], []
         opened.on("console", lambda m: opened.said.append((m.type, m.text)))
         opened.on("pageerror", lambda e: opened.said.append(("error", str(e))))
         opened.on("request", lambda r: opened.asked.append(r.url))
@@ -258,11 +257,8 @@ def test_the_switches_show_and_hide(page: Any) -> None:
 @pytest.mark.slow
 def test_the_slider_leaves_out_worse_grasps(page: Any) -> None:
     def put(value: int) -> None:
-        page.evaluate(
-            "v => { const s = document.getElementById('least'); s.value = v;"
-            "s.dispatchEvent(new Event('input')); }",
-            value,
-        )
+        page.evaluate("v => { const s = document.getElementById('least'); s.value = v;"
+                      "s.dispatchEvent(new Event('input')); }", value)  # fmt: skip
 
     assert becomes(page, "/grasps/0/-1", True) and becomes(page, "/grasps/0/0", True)
     put(2)

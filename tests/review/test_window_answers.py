@@ -11,15 +11,14 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-import viser
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
-from websockets.typing import Subprotocol
 from zstandard import ZstdDecompressor
 
 from realsim import InputError, ObjectModel, ObjectPose, Scene
@@ -31,16 +30,10 @@ from realsim.review.window.place import Place
 from realsim.review.window.window import Window
 from realsim.store import SessionStore, save_grasps, save_scene
 from realsim.store.session_store import rgb_path
-from tests.support.review_browser import serving
+from tests.support.review_browser import CAMERA, SOCKET, serving
 from tests.support.reviewed_boxes import MODELS, SCENE, boxes_session, grasp_set
 
-SOCKET = Subprotocol(f"{viser.__name__}-v{viser.__version__}")
 RED, ORANGE = "realsim-message alarm", "realsim-message refused"
-CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, 1], "fov": 1.0,
-    "near": 0.01, "far": 100.0, "image_height": 480, "image_width": 640, "look_at": [0, 0, 0],
-    "up_direction": [0, 1, 0],
-}  # fmt: skip
 
 
 class Page:
@@ -131,20 +124,16 @@ def test_a_choice_that_is_not_offered_is_refused_and_never_held(
 
 
 def test_numbers_and_texts_are_what_they_say() -> None:
-    class Held:
-        def __init__(self, value: object) -> None:
-            self.value = value
-
     for held, good, bad in (
         (0.5, [1, 0.25], [float("nan"), float("inf"), 10**400, "1", True, None]),
         (True, [False], ["False", 1, None]),
         ("text", ["", "x" * 20_000], [3, None, "x" * 20_001]),
     ):
         for value in good:
-            check_update(Held(held), {"value": value})
+            check_update(SimpleNamespace(value=held), {"value": value})
         for value in bad:
             with pytest.raises(InputError):
-                check_update(Held(held), {"value": value})
+                check_update(SimpleNamespace(value=held), {"value": value})
 
 
 def test_a_full_disk_is_told_and_is_no_bug(
@@ -199,7 +188,7 @@ def test_a_page_with_a_swap_to_a_missing_model_stays_usable(page: Page) -> None:
     page.wait(lambda: "object 99 (its model is missing)" in panel._text.content)
     assert "obj\\_000099.ply" in panel._text.content
     assert window.attempt(lambda: window.select(0)) and window.attempt(lambda: window.select(3))
-    assert window.attempt(window.views.look_at_object)
+    assert window.attempt(window.stand.look_at_object)
     assert not window.attempt(window.correct.begin) and "obj_000099.ply" in page.message
     assert window.attempt(window.correct.require_saved), "nothing was begun"
     assert window.attempt(lambda: window.object.decide("reject"))

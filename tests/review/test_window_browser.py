@@ -177,17 +177,22 @@ def test_keys_move_a_copy_and_saving_writes_one_line(
         page.wait_until(lambda: len(lines(server)) == 2, "the second line")
     line, back = lines(server)
     assert (line.action, line.instance, line.how) == ("move", 3, "steps")
-    assert back.pose is not None and back.how == "icp" and back.checks["agree"] > 0.9
+    assert line.pose is not None and back.pose is not None
+    assert back.how == "icp" and back.checks["agree"] > 0.9
     assert np.linalg.norm(back.pose[:3, 3] - before.T_world_obj[:3, 3]) < 0.002
-    pose = line.pose
-    assert pose is not None
-    step = pose[:3, 3] - before.T_world_obj[:3, 3]
+    step = line.pose[:3, 3] - before.T_world_obj[:3, 3]
     np.testing.assert_allclose(step, [0.015, 0, 0], atol=1e-9)
 
 
 def in_photograph(page: ReviewPage, kind: str, what: str = "innerText") -> Any:
     """Return what an element of the photographs says; None where there is none."""
     return page.page.evaluate(f"(document.querySelector('.rs-photograph {kind}') || {{}}).{what}")
+
+
+REACHED = """[...document.querySelectorAll('.rs-bar button, .rs-panes, .rs-legend i')].every(e => {
+    const r = e.getBoundingClientRect();
+    return e.contains(document.elementFromPoint(r.x + r.width / 2, r.y + r.height / 2)); })"""
+"""Whether nothing stands before the photograph, its buttons and its legend."""
 
 
 def test_the_photographs_open_at_the_worst_view_and_follow_the_object(
@@ -208,7 +213,10 @@ def test_the_photographs_open_at_the_worst_view_and_follow_the_object(
         page.wait_until(
             lambda: in_photograph(page, ".rs-pane", "dataset?.layer") == "depth", "the depth"
         )
-        assert "in front of it" in page.text()
+        assert "in front of it" in page.text() and page.page.evaluate(REACHED)
+        page.page.set_viewport_size({"width": 390, "height": 844})  # a phone
+        page.wait_until(lambda: page.page.evaluate(REACHED), "the whole photograph")
+        page.page.set_viewport_size({"width": 1280, "height": 800})
         page.key("s")
         page.wait_until(lambda: in_photograph(page, ".rs-panes", "children.length") == 3, "three")
         assert "photo=" in page.page.url
@@ -303,7 +311,7 @@ def test_the_mouse_chooses_objects_frustums_grasps_and_three_points(
         window: Any = server.windows[0]
         page.wait_until(lambda: _scene_share(page) > 0.02, "the scene")
         camera = window.client.camera
-        window.views.first_look()
+        window.stand.first_look()
         window.browser.wait()
         page.click_at(camera, [0.46, 0.0, 0.12], "\u25b6 0 tall")
         T_cam = max((v.T_world_cam for v in window.content.views),

@@ -1,9 +1,9 @@
 """The words of the review page: units, whose decision it is, and nothing that a browser obeys."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from realsim import ObjectModel, ObjectPose
 from realsim.geometry import se3
@@ -23,12 +23,9 @@ def entry(comment: str = "", reviewer: str = "ada") -> journal.Entry:
 def test_what_people_write_is_never_taken_for_mark_up() -> None:
     line = entry(NASTY, f"eve {NASTY}")
     model = ObjectModel(obj_id=7, name=NASTY, mesh=MODELS[7].mesh)
-    shown = ObjectPose(
-        obj_id=7, instance=3, T_world_obj=PLACED.T_world_obj, verdict="rejected", reasons=(NASTY,)
-    )
+    shown = replace(PLACED, verdict="rejected", reasons=(NASTY,))
     text = window_text.object_text(shown, shown, model, line)
-    texts = [text, window_text.history_text([line]), window_text.signed(line)]
-    for found in texts:
+    for found in (text, window_text.history_text([line]), window_text.signed(line)):
         assert "<img" not in found and "[a](" not in found and "**b**" not in found
     assert "<img" not in window_text.message_html(NASTY, "refused")
     # Our own mark-up is there all the same.
@@ -59,10 +56,8 @@ def test_the_panel_says_what_was_computed_and_who_said_what() -> None:
 
 def test_certainty_is_in_mm_and_deg_and_leaves_out_the_own_axis() -> None:
     C = np.diag([1.0, 4e-6, 4e-6, 1e-6, 1e-6, 9e-6])
-    placed = ObjectPose(
-        obj_id=TALL, instance=0, T_world_obj=np.eye(4), covariance=C,
-        checks={"probability": 0.987},
-    )  # fmt: skip
+    unknown = ObjectPose(obj_id=TALL, instance=0, T_world_obj=np.eye(4))
+    placed = replace(unknown, covariance=C, checks={"probability": 0.987})
     mesh = MODELS[TALL].mesh
     round_ = ObjectModel(
         obj_id=TALL, name="round", mesh=mesh, symmetry_axes=(((1.0, 0.0, 0.0), (0.0, 0.0, 0.0)),)
@@ -71,7 +66,6 @@ def test_certainty_is_in_mm_and_deg_and_leaves_out_the_own_axis() -> None:
     assert "98.7 %" in text and "3 mm along its worst axis" in text
     assert "0.11 deg" in text and "left out" in text
     assert "57" in window_text.certainty_text(placed, MODELS[TALL])  # 1 rad, with its own axis
-    unknown = ObjectPose(obj_id=TALL, instance=0, T_world_obj=np.eye(4))
     assert "not known" in window_text.certainty_text(unknown, round_)
 
 
@@ -87,12 +81,9 @@ def test_every_check_is_in_one_of_the_two_tables_with_its_unit() -> None:
     assert window_text.checks_table(empty, main=True) == "nothing was measured"
 
 
-@pytest.mark.parametrize(
-    ("share", "words"),
-    [(0.0, "0 %"), (0.5, "50.0 %"), (0.9994, "99.94 %"), (0.999999, "99.99 %"), (1.0, "100 %")],
-)
-def test_100_per_cent_means_that_nothing_is_missing(share: float, words: str) -> None:
-    assert window_text.percent(share) == words
+def test_100_per_cent_means_that_nothing_is_missing() -> None:
+    said = [window_text.percent(share) for share in (0.0, 0.5, 0.9994, 0.999999, 1.0)]
+    assert said == ["0 %", "50.0 %", "99.94 %", "99.99 %", "100 %"]
 
 
 def test_undo_names_whose_line_it_takes_back() -> None:

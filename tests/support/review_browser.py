@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import viser
 from numpy.typing import ArrayLike
+from websockets.typing import Subprotocol
 
 from realsim.arrays import Rgb
 from realsim.geometry import se3
@@ -31,6 +33,14 @@ SMALL = SceneConfig(coarse_points=4_000, shown_points=4_000, most_points=20_000)
 """So little that a processor draws it fast enough."""
 DRAWN = """async () => { for (let k = 0; k < 3 || __viserMutable.messageQueue.length; k++) {
     __viserMutable.requestRender(); await new Promise(requestAnimationFrame); } }"""
+SOCKET = Subprotocol(f"{viser.__name__}-v{viser.__version__}")
+"""What the page's websocket speaks."""
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, 1], "fov": 1.0,
+    "near": 0.01, "far": 100.0, "image_height": 480, "image_width": 640, "look_at": [0, 0, 0],
+    "up_direction": [0, 1, 0],
+}  # fmt: skip
+"""What a page says first."""
 VISIBLE = "e => e.offsetParent !== null"
 
 

@@ -95,12 +95,8 @@ def report_of(
     if errors is not None:
         worst = max(errors.object_mssd_mm.values(), default=0.0)
         found = {**errors.figures(), "object_mssd_max_mm": worst}
-        add(
-            "truth",
-            "Errors against the truth",
-            "",
-            lambda s: truth_section(s, errors.rows(), found),
-        )
+        title = "Errors against the truth"
+        add("truth", title, "", lambda s: truth_section(s, errors.rows(), found))
     add("calibration", "Calibration", "calibrate", lambda s: calibration_section(s, store))
     add("plan", "Plan", "", lambda s: plan_section(s, store))
     add("capture", "Capture", "capture", lambda s: capture_section(s, store))

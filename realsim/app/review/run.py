@@ -103,6 +103,8 @@ def write_page(request: ReviewRequest, path: Path, console: Console) -> None:
     state = review_of(store)
     with console.stage("read", store.session.name) as tick:
         content = SceneContent.load(store, SceneConfig(), tick)
+    for remark in content.remarks:
+        console.warn(_plain(remark))
     with console.stage("write", str(path)) as tick:
         summary = write_static(content, state, path, title=_title(store), progress=tick)
     console.say(f"{summary.path}   {summary.size_bytes / 1e6:.1f} MB, opens without a server")

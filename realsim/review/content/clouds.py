@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from realsim.arrays import Array32, Int32, Int64, Mask, Rgb
+from realsim.errors import InputError
 from realsim.geometry.camera import ray_table
 from realsim.records import View
 from realsim.review.content import quick_png
@@ -71,7 +72,8 @@ def fused_cloud(
     voxel_m: float,
     most: int,
     coarse: int,
-    on_photograph: Callable[[int, Rgb], None] | None = None,
+    damaged: dict[int, str],
+    on_photograph: Callable[[int, Rgb], None],
 ) -> LeveledCloud:
     """Return the measured depth of several views as one coloured cloud in world.
 
@@ -86,10 +88,12 @@ def fused_cloud(
         voxel_m: samples are averaged in voxels of this edge [m].
         most: no more points than this are returned; those seen most often stay.
         coarse: points of the coarse level, about.
+        damaged: is given view -> why for views whose images cannot be read: they are left out.
         on_photograph: called with every photograph (H, W, 3) that is decoded on the way, and the
             number of its view.
     """
     intrinsics = store.session.intrinsics
+    size = intrinsics.height, intrinsics.width
     share = min(SAMPLES_PER_POINT * most, MOST_SAMPLES) / max(1, len(views))
     stride = max(1, round(float(np.sqrt(intrinsics.width * intrinsics.height / share))))
     rays = np.ascontiguousarray(ray_table(strided(intrinsics, stride)).reshape(-1, 3).T)
@@ -98,12 +102,17 @@ def fused_cloud(
     sampled = np.empty(samples.shape, np.uint8)
     n = 0
     for view in views:
-        rgb = quick_png.read_rgb(store.path(rgb_path(view.index)))
-        if on_photograph is not None:
+        deep = store.path(depth_path(view.index))
+        try:
+            rgb = quick_png.read_rgb(store.path(rgb_path(view.index)))
             on_photograph(view.index, rgb)
-        depth_m = quick_png.read_depth(
-            store.path(depth_path(view.index)), store.session.depth_unit_m
-        )
+            depth_m = quick_png.read_depth(deep, store.session.depth_unit_m)
+            if not rgb.shape[:2] == depth_m.shape == size:
+                raise InputError(f"its photograph has {rgb.shape[:2]} pixels, its depth "
+                                 f"{depth_m.shape}, and the session's camera {size}.")  # fmt: skip
+        except InputError as error:
+            damaged[view.index] = str(error)
+            continue
         points, at = _seen(depth_m[::stride, ::stride], rays, view, region)
         samples[n : n + len(points)] = points
         sampled[n : n + len(points)] = rgb[::stride, ::stride].reshape(-1, 3)[at]

@@ -49,6 +49,8 @@ class SceneContent:
     """The measured depth."""
     thumbnails: Mapping[int, bytes]
     """The photographs of the shown views as small JPEGs, by number of the view."""
+    damaged: Mapping[int, str]
+    """View -> why its images cannot be read; nothing is measured by it."""
     grasp_sets: tuple[GraspSet, ...]
     """Grasp sets of the objects of the scene."""
 
@@ -65,7 +67,7 @@ class SceneContent:
 
         Raises:
             InputError: the session is not registered, it has neither objects nor views with a
-                camera pose, a model of its objects is missing, or an image is damaged.
+                camera pose, or a model of its objects is missing.
         """
         scene = load_scene(store)
         views = tuple(v for v in store.session.views if v.T_world_cam is not None)
@@ -84,6 +86,7 @@ class SceneContent:
         thumbnails = Thumbnails(store, config.thumbnail_px, config.thumbnail_quality)
         with_depth = [v for v in views if store.has_depth(v.index)]
         numbers = {v.index for v in shown}
+        damaged: dict[int, str] = {}
 
         def take(index: int, rgb: UInt8) -> None:
             if index in numbers:
@@ -92,7 +95,7 @@ class SceneContent:
         cloud = clouds.fused_cloud(
             store, spread(with_depth, config.most_fused_views), region,
             voxel_m=config.voxel_m, most=config.most_points, coarse=config.coarse_points,
-            on_photograph=take,
+            damaged=damaged, on_photograph=take,
         )  # fmt: skip
         give_back_memory()
         instances = {o.instance for o in scene.objects}
@@ -100,7 +103,8 @@ class SceneContent:
             store=store, scene=scene, models=models, meshes=DisplayMeshes(models, config),
             views=views, shown_views=shown, intrinsics=store.session.intrinsics, region=region,
             look=first_look(region, views, up), cloud=cloud,
-            thumbnails=thumbnails.of([v.index for v in shown], progress),
+            thumbnails=thumbnails.of([v.index for v in shown], damaged, progress),
+            damaged=damaged,
             grasp_sets=tuple(g for g in load_grasps(store) if g.instance in instances),
         )  # fmt: skip
 
@@ -116,6 +120,11 @@ class SceneContent:
         raise InputError(
             f"view {view} has no camera pose; those with one are {_listed(self.views)}."
         )
+
+    @property
+    def remarks(self) -> list[str]:
+        """Which views are left out because their images cannot be read, and why."""
+        return [f"View {k} is left out: {why}" for k, why in sorted(self.damaged.items())]
 
     def grasps_of(self, instance: int) -> GraspSet | None:
         """Return the grasps of an object; None = it has none."""

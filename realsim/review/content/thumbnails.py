@@ -65,25 +65,31 @@ class Thumbnails:
         return found
 
     def of(
-        self, indices: Sequence[int], progress: Callable[[int, int], None] | None = None
+        self,
+        indices: Sequence[int],
+        damaged: dict[int, str],
+        progress: Callable[[int, int], None] | None = None,
     ) -> Mapping[int, bytes]:
         """Return the JPEGs of views; those that are not kept are made, and kept.
 
         Args:
             indices: numbers of the views.
-            progress: called with how many there are, of how many.
-
-        Raises:
-            InputError: a photograph is missing or damaged.
+            damaged: is given view -> why for photographs that are missing or damaged; those of
+                views that stand in it already are not read.
+            progress: called with how many are done, of how many.
         """
         found: dict[int, bytes] = {}
-        for index in indices:
-            jpeg = self.kept(index)
-            if jpeg is None:
-                jpeg = self._make(index, quick_png.read_rgb(self._photographs[index]))
-            found[index] = jpeg
+        for done, index in enumerate(indices, 1):
+            try:
+                jpeg = self.kept(index)
+                if jpeg is None and index not in damaged:
+                    jpeg = self._make(index, quick_png.read_rgb(self._photographs[index]))
+                if jpeg is not None:
+                    found[index] = jpeg
+            except InputError as error:
+                damaged[index] = str(error)
             if progress is not None:
-                progress(len(found), len(indices))
+                progress(done, len(indices))
         return found
 
     def _make(self, index: int, rgb: UInt8) -> bytes:

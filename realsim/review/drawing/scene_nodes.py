@@ -29,7 +29,8 @@ __all__ = ["GraspFilter", "SceneConfig", "SceneNodes"]
 Look = Literal["appearance", "verdict", "faded", "hidden"]
 OnInstance = Callable[[int], None]
 OnGrasp = Callable[[int, int], None]
-FRUSTUM_RGB = (70, 96, 140)
+FRUSTUM_RGB, DAMAGED_RGB = (70, 96, 140), (190, 190, 190)
+"""Colours of a camera, and of one whose images cannot be read."""
 HIGHLIGHT_RGB = (255, 120, 0)
 ELLIPSOID_RGB = (130, 80, 220)
 FADED_RGB, FADED = (150, 155, 165), 0.3
@@ -376,11 +377,11 @@ def add_frustum(
     api: viser.SceneApi, name: str, view: View, content: SceneContent, config: SceneConfig
 ) -> viser.CameraFrustumHandle:
     """Add the camera of a view with its photograph, if it has one."""
-    i = content.intrinsics
+    i, rgb = content.intrinsics, DAMAGED_RGB if view.index in content.damaged else FRUSTUM_RGB
     wxyz, position = viser_wxyz_position(np.asarray(view.T_world_cam))
     handle = api.add_camera_frustum(
         name, 2 * float(np.arctan2(i.height / 2, i.fy)), i.width / i.height,
-        scale=config.frustum_m, thickness=FRUSTUM_LINE_M, color=FRUSTUM_RGB, format="jpeg",
+        scale=config.frustum_m, thickness=FRUSTUM_LINE_M, color=rgb, format="jpeg",
         wxyz=wxyz, position=position, cast_shadow=False, receive_shadow=False,
     )  # fmt: skip
     jpeg = content.thumbnails.get(view.index)

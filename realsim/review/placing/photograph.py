@@ -5,6 +5,7 @@ compared across the surface, not along the ray, so that a slope does not look li
 """
 
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from realsim.arrays import Array, Array32, Int32, Mask, Rgb
+from realsim.errors import InputError
 from realsim.geometry import camera, mesh_shape, se3
 from realsim.pages.pictures import jpeg_bytes
 from realsim.records import CameraIntrinsics, ObjectPose
@@ -123,35 +125,46 @@ class Photographs:
             })  # fmt: skip
         return out
 
-    def strip(self, instance: int | None, objects: Sequence[ObjectPose]) -> dict[str, Any]:
+    def strip(
+        self, instance: int | None, objects: Sequence[ObjectPose], soon_s: float = np.inf
+    ) -> dict[str, Any]:
         """Return all views with what speaks against an object in each, the worst view first.
 
         Args:
             instance: the object; None = none is looked at.
             objects: as they stand.
+            soon_s: after so long [s] and one view no other is compared; the next call goes on.
         """
         content = self._content
         number = next((k for k, o in enumerate(objects) if o.instance == instance), None)
-        found = {v.index: self._scored(v.index, objects) for v in spread(content.views, MOST_VIEWS)}
+        chosen = spread([v for v in content.views if v.index not in content.damaged], MOST_VIEWS)
+        found: dict[int, dict[str, Any]] = {}
+        end, kept = time.monotonic() + soon_s, len(self._scores)
+        for v in chosen:
+            if len(self._scores) == kept or time.monotonic() < end:
+                found[v.index] = self._scored(v.index, objects)
         rows: list[dict[str, Any]] = []
         for v in content.shown_views:
             scored = found.get(v.index, {})
             row: dict[str, Any] = {"view": v.index, "missing": scored.get("missing", [])}
-            row["against"] = None
+            trouble = content.damaged.get(v.index) or scored.get("trouble", "")
+            row |= {"against": None, "is_compared": v.index in found, "trouble": trouble}
             if number is not None:
                 o = objects[number]
                 low, high = content.models[o.obj_id].mesh.bounds
                 row |= self._at(v.index, se3.transform(o.T_world_obj, (low + high)[None] / 2.0))
                 row["radius"] = 0.5 * float(np.linalg.norm(high - low)) * row["px_per_m"]
-                if scored:
+                if "against" in scored:
                     row["against"] = scored["against"][number]
             rows.append(row)
         rows.sort(key=lambda r: -1.0 if r["against"] is None else r["against"], reverse=True)
-        noise_m = float(np.median([f["noise_m"] for f in found.values()]))
+        noises = [f["noise_m"] for f in found.values() if "noise_m" in f]
+        noise_m = float(np.median(noises or [noise_of([])]))
         said = legend(noise_m=noise_m)
         K = content.intrinsics
         return {
             "views": rows, "width": K.width, "height": K.height, "words": said.words,
+            "compared": len(found), "of": len(chosen),
             "legend": [[v, rgb] for v, rgb in zip(said.values_mm, said.rgb.tolist(), strict=True)],
         }  # fmt: skip
 
@@ -250,8 +263,11 @@ class Photographs:
                 stride = max(1, round(self._content.intrinsics.width / STRIP_PX))
                 if len(self._scores) > 8 * MOST_VIEWS:
                     self._scores.clear()
-                found = _scores(self._compared(view, objects, stride), len(objects), stride)
-                self._scores[view, poses] = found
+                try:
+                    compared = self._compared(view, objects, stride)
+                    self._scores[view, poses] = _scores(compared, len(objects), stride)
+                except InputError as error:
+                    self._scores[view, poses] = {"trouble": str(error)}
             return self._scores[view, poses]
 
     def _depth_rgb(self, rgb: Rgb, compared: Compared) -> Rgb:

@@ -8,14 +8,13 @@ from realsim.records import GraspSet, ObjectModel, ObjectPose, Scene
 from realsim.rendering.overlay import VERDICT_RGB
 from realsim.review.content.content import SceneContent
 from realsim.review.content.views import worst_first
-from realsim.review.corrections import corrected_scene, decision_on
+from realsim.review.corrections import DECIDED, corrected_scene, decision_on
 from realsim.review.journal import Entry, ReviewState
 from realsim.review.placing.ellipsoid import rotation_sigmas_deg
 from realsim.review.replaying.grasp_words import one_line
 from realsim.review.scene_list import VERDICT_ORDER
 
 NOT_KNOWN = "not known"
-DECISION_WORDS = {"accept": "accepted", "reject": "rejected"}
 
 
 def counts_words(content: SceneContent, scene: Scene, state: ReviewState) -> str:
@@ -59,11 +58,8 @@ def _judged(corrected: ObjectPose, decision: Entry | None) -> list[str]:
     """Return who judged, and what the program had computed."""
     if decision is None:
         return [f"computed: {corrected.verdict}; judged by nobody"]
-    word = DECISION_WORDS.get(decision.action, decision.action)
-    return [
-        f"{word} by {decision.reviewer}, {decision.time[:10]}",
-        f"computed: {corrected.verdict}",
-    ]
+    said = f"{DECIDED[decision.action]} by {decision.reviewer}, {decision.time[:10]}"
+    return [said, f"computed: {corrected.verdict}"]
 
 
 def _table(

@@ -98,7 +98,7 @@ def write_static(
     words: PageWords | None = None,
     most_points: int = 300_000,
     most_bytes: float = 25e6,
-    progress: Progress | None = None,
+    progress: Progress = lambda done, of: None,
 ) -> StaticSummary:
     """Write a reviewed scene as one HTML file.
 
@@ -126,8 +126,7 @@ def write_static(
     _check_models(content, scene)
     size, page = StaticSize(points=most_points), b""
     for tried in range(TRIES):
-        if progress is not None:
-            progress(tried, TRIES + 1)
+        progress(tried, TRIES + 1)
         size = size.smaller() if tried else size
         page = _page(content, scene, state, size, title, words or PageWords())
         if len(page) <= most_bytes:
@@ -138,8 +137,7 @@ def write_static(
             f"{most_bytes / 1e6:.1f} MB was asked for. The viewer alone needs 1 MB; allow more."
         )
     atomic.write_bytes(path, page)
-    if progress is not None:
-        progress(TRIES + 1, TRIES + 1)
+    progress(TRIES + 1, TRIES + 1)
     return _summary(content, size, path, len(page))
 
 
@@ -202,7 +200,8 @@ def _page(
         page=Page(), policy=Markup(html.escape(POLICY)), version=__version__, title=title.strip(),
         caption=words.caption.strip(), about=counts_words(content, scene, state),
         objects=object_rows(content, scene, state),
-        photos=[(v.index, _data_url(content.thumbnails[v.index])) for v in _cameras(content, size)],
+        photos=[(v.index, _data_url(content.thumbnails[v.index])) for v in _cameras(content, size)
+                if v.index in content.thumbnails],
         left_out=state.excluded_views(), footer=_footer(content, size, words),
         label=label_words(sets) if any(len(g) for g in sets) else "",
         pale="; pale: p_hold of few draws" * any(g.unsure.any() for g in sets),
@@ -285,6 +284,7 @@ def _footer(content: SceneContent, size: StaticSize, words: PageWords) -> list[s
     return [
         f"Drawn: {found.points:,} of {found.points_in_all:,} points, {found.cameras} of "
         f"{found.cameras_in_all} cameras, {found.grasps} of {found.grasps_in_all} grasps.",
+        *[f"The images of view {k} could not be read." for k in sorted(content.damaged)],
         f"{made.astimezone(UTC):%Y-%m-%d %H:%M} UTC",
         *([f"Data: {licence}"] if licence else []),
         MADE_WITH.format(version=__version__),

@@ -92,7 +92,7 @@ class Browser:
         known = {o.instance for o in window.server.sessions[number].registered.objects}
         window.go_to(number, place.instance if place.instance in known else None)
         if place.eye is not None and place.look_at is not None:
-            window.views.look_from(place.eye, place.look_at)
+            window.stand.look_from(place.eye, place.look_at)
         return True
 
     def tell_place(self, scene: str) -> None:

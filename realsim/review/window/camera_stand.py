@@ -48,15 +48,10 @@ class Standpoint:
             camera.position = np.asarray(eye, dtype=np.float64)
             camera.look_at = np.asarray(look_at, dtype=np.float64)
 
-    def look_at(self, center: Array, radius_m: float) -> None:
-        """Look at an object from outside of the scene, where no other stands before it.
-
-        Args:
-            center: (3,) its middle in world [m].
-            radius_m: of the ball about it.
-        """
-        content = self._window.content
-        up = content.look.up
+    def look_at_object(self) -> None:
+        """Look at the selected object from outside of the scene, where no other stands before."""
+        content, up = self._window.content, self._window.content.look.up
+        center, radius_m = self._object()
         offset = center - content.region.center
         if np.linalg.norm(offset - up * (up @ offset)) < NEAR_MIDDLE_M:
             offset = content.look.position - content.region.center
@@ -65,19 +60,21 @@ class Standpoint:
         direction = np.cos(LOOK_DOWN_RAD) * side + np.sin(LOOK_DOWN_RAD) * up
         self.look_from(center + (LOOK_RADII * radius_m + LOOK_M) * direction, center)
 
-    def look_past(self, center: Array, before: Array) -> None:
-        """Look at a place from afar, so that what stands at another one is beside it.
-
-        Args:
-            center: (3,) what is looked at, in world [m].
-            before: (3,) what must not stand in the way, such as an arm's base [m].
-        """
-        content = self._window.content
-        up = content.look.up
-        away = center - before
+    def look_past(self, base: Array) -> None:
+        """Look at the selected object from afar, so that an arm on this base (3,) is beside it."""
+        content, up = self._window.content, self._window.content.look.up
+        center, _ = self._object()
+        away = center - base
         away = away - up * (up @ away)
         away = away / max(float(np.linalg.norm(away)), 1e-9)
         side = se3.exp_so3(BESIDE_RAD * up) @ away
         direction = np.cos(BESIDE_DOWN_RAD) * side + np.sin(BESIDE_DOWN_RAD) * up
         distance = BEHIND_FIRST * float(np.linalg.norm(content.look.position - center))
         self.look_from(center + distance * direction, center)
+
+    def _object(self) -> tuple[Array, float]:
+        """Return the middle (3,) of the selected object in world, and the radius about it [m]."""
+        placed = self._window.placed
+        mesh = self._window.model_of(placed).mesh
+        center = se3.transform(placed.T_world_obj, mesh.bounds.mean(0)[None])[0]
+        return center, 0.5 * float(np.linalg.norm(mesh.extent))

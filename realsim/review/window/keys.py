@@ -49,8 +49,8 @@ KEYS = (
     Key("B", "Put the object back", lambda w: w.correct.put_back()),
     Key("T", "Snap by ICP", lambda w: w.correct.snap()),
     Key("C", "Show the chosen view's photograph", lambda w: w.views.show_chosen()),
-    Key("F", "Look at the object", lambda w: w.views.look_at_object()),
-    Key("H", "Look at the whole scene", lambda w: w.views.first_look()),
+    Key("F", "Look at the object", lambda w: w.stand.look_at_object()),
+    Key("H", "Look at the whole scene", lambda w: w.stand.first_look()),
 )
 STEPS = (
     Step("J", "x", -1),

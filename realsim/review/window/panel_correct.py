@@ -88,14 +88,9 @@ class CorrectPanel:
             "Clicks", ("Last click back", "Shift by one", "Stop"), visible=False
         )
         self._object: viser.GuiDropdownHandle[str] = gui.add_dropdown("It really is", ["-"])
-        self._save = gui.add_button(
-            "Save the pose",
-            color=window_text.verdict_rgb("accepted"),
-            icon=viser.Icon.DEVICE_FLOPPY,
-        )
-        self._back = gui.add_button(
-            "Put back", color=(134, 142, 150), icon=viser.Icon.ARROW_BACK_UP
-        )
+        green, grey = window_text.verdict_rgb("accepted"), window_text.GREY
+        self._save = gui.add_button("Save the pose", color=green, icon=viser.Icon.DEVICE_FLOPPY)
+        self._back = gui.add_button("Put back", color=grey, icon=viser.Icon.ARROW_BACK_UP)
         with gui.add_folder("Symmetry of the model", expand_by_default=False):
             self._marks = gui.add_markdown("")
             self._symmetry = gui.add_dropdown("It is", tuple(SYMMETRIES))
@@ -148,7 +143,7 @@ class CorrectPanel:
             T = placing.nudged(
                 now.T_world_obj, axis, sign * step, kind, FRAMES[self._frame.value],
                 T_world_table=None if plane is None else plane.T_world_table,
-                T_world_cam=self._window.views.eye(),
+                T_world_cam=self._window.stand.eye(),
                 pivot_obj=placing.middle_of(self._model().mesh),
             )  # fmt: skip
             self._put(T, "steps")
@@ -201,7 +196,7 @@ class CorrectPanel:
             if self._now is not None:
                 self._now = None
                 self._copy.hide()
-                self._window.views.moved()
+                self._window.photographs.tell()
             self._tell()
 
     def save(self) -> None:
@@ -316,7 +311,7 @@ class CorrectPanel:
         window, placed = self._window, self._window.placed
         pose = se3.check_rigid(np.reshape(draft.pose, (4, 4)), "the correction that was kept")
         self._show(Correction(start=placed, T_world_obj=pose, obj_id=draft.obj_id, how=draft.how))
-        window.views.moved()
+        window.photographs.tell()
         if journal.subject_of(placed) != draft.stood:
             self._tell_moved()
         else:
@@ -342,7 +337,7 @@ class CorrectPanel:
         if frame == "object":
             return T_world_obj[:3, :3]
         if frame == "camera":
-            return self._window.views.eye()[:3, :3]
+            return self._window.stand.eye()[:3, :3]
         plane = self._window.session.registered.plane
         return np.eye(3) if plane is None else plane.T_world_table[:3, :3]
 
@@ -358,7 +353,7 @@ class CorrectPanel:
         self._now = replace(self._now, T_world_obj=T, how=by, checks=checks)
         self._copy.place(T, self._axes(T))
         self._tell()
-        self._window.views.moved()
+        self._window.photographs.tell()
 
     def _dragged(self, T: Array, is_over: bool) -> None:
         with self._window.lock:
@@ -366,7 +361,7 @@ class CorrectPanel:
                 return
             by = self._now.how if "gizmo" in self._now.how else (*self._now.how, "gizmo")
             self._now = replace(self._now, T_world_obj=T, how=by, checks=())
-            self._window.views.moved()
+            self._window.photographs.tell()
             if is_over:
                 # The gizmo turns with the object; its axes are those that were chosen.
                 self._copy.place(T, self._axes(T))

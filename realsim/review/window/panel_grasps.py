@@ -102,7 +102,7 @@ class GraspsPanel:
             motion = self._player.show(instance, row)
         if motion is not None and len(motion.link_meshes):
             window.show.hide_cameras()
-            window.views.look_past(motion.Ts_world_link[0, 0, :3, 3])
+            window.stand.look_past(motion.Ts_world_link[0, 0, :3, 3])
         if motion is None:
             self._words.content += "\n\nThere is no motion to replay."
 

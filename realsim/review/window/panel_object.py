@@ -27,17 +27,11 @@ class ObjectPanel:
         gui = window.client.gui
         self._text = gui.add_markdown("Click an object in the scene or in the list.")
         self._comment = gui.add_text("Comment", "", multiline=True, hint="Goes with the decision.")
-        accept = gui.add_button(
-            "Accept",
-            color=window_text.verdict_rgb("accepted"),
-            icon=viser.Icon.CHECK,
-            hint="Key Y.",
-        )
-        reject = gui.add_button(
-            "Reject", color=window_text.verdict_rgb("rejected"), icon=viser.Icon.X, hint="Key X."
-        )
+        green, red = window_text.verdict_rgb("accepted"), window_text.verdict_rgb("rejected")
+        accept = gui.add_button("Accept", color=green, icon=viser.Icon.CHECK, hint="Key Y.")
+        reject = gui.add_button("Reject", color=red, icon=viser.Icon.X, hint="Key X.")
         comment = gui.add_button("Comment only", color=(73, 80, 87), icon=viser.Icon.MESSAGE)
-        self._undo = gui.add_button("Undo", color=(134, 142, 150), icon=viser.Icon.ARROW_BACK_UP)
+        self._undo = gui.add_button("Undo", color=window_text.GREY, icon=viser.Icon.ARROW_BACK_UP)
         self._certainty = gui.add_markdown("")
         self._checks = gui.add_markdown("")
         with gui.add_folder("All checks", expand_by_default=False):

@@ -5,20 +5,17 @@ import json
 import zlib
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import viser
-from numpy.typing import ArrayLike
 
-from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.geometry import se3
 from realsim.review.window import window_text
-from realsim.review.window.camera_stand import Standpoint
 
 if TYPE_CHECKING:
     from realsim.review.window.window import Window
 
 NONE = "-"
+SOON_S = 0.5
+"""After so long it is shown which views are compared with the objects so far [s]."""
 OPEN = """<div data-realsim-photograph data-window="{client}" data-state="{state}"
 data-scene="{scene}" data-instance="{instance}" data-name="{name}" data-turn="{turn}"
 data-view="{view}">
@@ -91,7 +88,7 @@ class PhotographLink:
         if what in KINDS:
             return "image/jpeg", found.picture(view, what, objects)
         answers = {
-            "strip": lambda: {"whose": whose} | found.strip(selected, objects),
+            "strip": lambda: {"whose": whose} | found.strip(selected, objects, SOON_S),
             "outlines": lambda: found.outlines(view, objects),
             "spot": lambda: found.spot(view, (numbers[1], numbers[2]), objects),
         }
@@ -108,7 +105,6 @@ class ViewsPanel:
             window: whose panel it is.
         """
         self._window = window
-        self._stand = Standpoint(window)
         gui = window.client.gui
         gui.add_markdown(
             "Click a camera in the scene, or choose one: its photograph opens over the scene, with "
@@ -149,43 +145,7 @@ class ViewsPanel:
             self._view.value = label
         self._window.photographs.open(view)
 
-    def moved(self) -> None:
-        """Draw the outlines anew: an object is being moved."""
-        self._window.photographs.tell()
-
-    def eye(self) -> Any:
-        """Return T_world_cam (4, 4) of the browser's camera."""
-        return self._stand.eye()
-
-    def first_look(self) -> None:
-        """Look at the whole scene."""
-        self._stand.first_look()
-
-    def look_at_object(self) -> None:
-        """Look at the selected object."""
-        window = self._window
-        placed, mesh = window.placed, window.model_of(window.placed).mesh
-        center = se3.transform(placed.T_world_obj, mesh.bounds.mean(0)[None])[0]
-        self._stand.look_at(center, 0.5 * float(np.linalg.norm(mesh.extent)))
-
-    def look_from(self, eye: ArrayLike, look_at: ArrayLike) -> None:
-        """Stand at a place (3,) and look at another (3,), in world [m]."""
-        self._stand.look_from(eye, look_at)
-
-    def look_past(self, base: Array) -> None:
-        """Look at the selected object so that an arm on this base (3,) is not in the way [m]."""
-        window = self._window
-        mesh = window.model_of(window.placed).mesh
-        center = se3.transform(window.placed.T_world_obj, mesh.bounds.mean(0)[None])[0]
-        self._stand.look_past(center, base)
-
     # --- the window's events ----------------------------------------------------------------------
-
-    def opened(self) -> None:
-        """Offer the views of another scene."""
-        views = [v.index for v in self._window.content.views]
-        excluded = self._window.session.standing.state.excluded_views()
-        self._set_options(views, excluded)
 
     def refresh(self) -> None:
         """Show which views are left out."""
@@ -197,9 +157,10 @@ class ViewsPanel:
             + (f": {window_text.escaped(entry.comment)}" if entry.comment else "")
             for view, entry in excluded.items()
         ]
+        lines += [f"- {window_text.escaped(text)}" for text in window.content.remarks]
         self._excluded.content = "\n".join(lines) or "no view is left out"
         self._label_exclude()
-        self.moved()
+        window.photographs.tell()
 
     # --- how --------------------------------------------------------------------------------------
 

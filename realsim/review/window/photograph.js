@@ -6,6 +6,7 @@
   const SVG = "http://www.w3.org/2000/svg";
   let root = null, strip = null, at = 0, layer = "photo", isThree = false, spot = null, lines = true;
   let wanted = window.realsimPlace.photo(), turn = "0";
+  let isLed = false; // to the worst view, until a person chooses one
   let zoom = 0, middle = [0, 0], seen = { state: "", whose: "" }, panes = [], asked = 0;
 
   const shown = () => document.querySelector("[data-realsim-photograph]");
@@ -54,7 +55,10 @@
 
   // --- what is drawn --------------------------------------------------------------------------
   const row = () => strip && strip.views[at];
-  const share = (r) => r.against === null ? "does not see it" : `${Math.round(100 * r.against)} % against`;
+  const isDone = () => strip.compared >= strip.of;
+  const share = (r) => r.trouble ? "cannot be read" : !r.is_compared ? "not compared" + (isDone() ? "" : " yet")
+    : r.against === null ? "does not see it" : `${Math.round(100 * r.against)} % against`;
+  const figure = (r) => r.trouble ? "\u2717" : !r.is_compared ? "\u2026" : r.against === null ? "\u2013" : Math.round(100 * r.against) + " %";
   const caption = () => {
     const name = shown().dataset.name, r = row();
     if (!r) return "";
@@ -94,8 +98,9 @@
       ask(layer, p.row.view).then((picture) => {
         if (p.source !== source || !panes.includes(p)) return picture && URL.revokeObjectURL(picture);
         p.box.classList.remove("rs-wait");
-        if (!picture) return;
         URL.revokeObjectURL(p.image.src);
+        if (!picture) { p.image.removeAttribute("src"); return; } // why is told; no other view's stays
+        if (!p.row.trouble && root.querySelector(".rs-note").classList.contains("rs-bad")) tell("");
         p.image.onload = () => { p.box.dataset.layer = source.split("/").at(-2); };
         p.image.width = strip.width; p.image.height = strip.height; p.image.src = picture;
       });
@@ -149,6 +154,8 @@
     root.classList.toggle("rs-bare", !lines);
     root.dataset.whose = seen.whose; // scene and object that is drawn
     root.querySelector(".rs-caption").textContent = caption();
+    root.querySelector(".rs-compared").textContent = isDone() ? "" : `${strip.compared} of ${strip.of} views compared`;
+    if (row().trouble) tell(row().trouble, true);
     for (const b of root.querySelectorAll("[data-layer]")) b.ariaPressed = String(b.dataset.layer === layer);
     const legend = root.querySelector(".rs-legend");
     legend.replaceChildren();
@@ -167,6 +174,7 @@
     strip = null; panes = []; root.dataset.whose = "";
     for (const part of [".rs-panes", ".rs-strip", ".rs-legend"]) root.querySelector(part).replaceChildren();
     root.querySelector(".rs-caption").textContent = shown().dataset.name;
+    root.querySelector(".rs-compared").textContent = "";
     tell("The views are being compared with the models ...");
   };
   const later = () => {
@@ -174,31 +182,46 @@
     later.timer = setTimeout(() => { if (root) renew(); }, 250);
   };
   const renew = async () => {
-    const turn = ++asked, { state } = shown().dataset, isOther = whose() !== seen.whose, before = row() && row().view;
-    if (isOther) forget();
-    const found = await ask("strip");
-    if (!found || turn !== asked || !root) return;
-    if (found.whose !== whose()) return later(); // another was chosen on the way
-    tell("");
-    seen = { state, whose: found.whose }; strip = found;
-    const kept = strip.views.findIndex((r) => String(r.view) === String(wanted ?? (isOther ? -1 : before)));
-    at = Math.max(kept, 0); wanted = null;
-    if (isOther) { spot = null; zoom = 0; }
-    const list = root.querySelector(".rs-strip");
-    list.replaceChildren();
-    strip.views.forEach((r, k) => {
-      const b = make("button", "", list);
-      b.title = `view ${r.view}: ${share(r)}`;
-      const thumb = make("img", "", b);
-      thumb.loading = "lazy"; thumb.alt = ""; thumb.src = address("thumb", r.view);
-      make("span", "", b, `${r.view}: ${r.against === null ? "\u2013" : Math.round(100 * r.against) + " %"}`);
-      if (r.against > 0.1) b.className = "rs-against";
-      b.onclick = () => go(k);
+    const turn = ++asked, { state } = shown().dataset;
+    let isOther = whose() !== seen.whose;
+    if (isOther) { forget(); isLed = wanted === null; }
+    do { // the server answers with what is compared by then; the views keep their places meanwhile
+      const found = await ask("strip");
+      if (!found || turn !== asked || !root) return;
+      if (found.whose !== whose()) return later(); // another was chosen on the way
+      const before = wanted ?? (strip && row().view), rank = new Map(strip ? strip.views.map((r, k) => [r.view, k]) : []);
+      if (strip && found.compared < found.of) found.views.sort((a, b) => rank.get(a.view) - rank.get(b.view));
+      seen = { state, whose: found.whose }; strip = found;
+      const leads = isLed && (isOther || isDone());
+      at = leads ? 0 : Math.max(strip.views.findIndex((r) => String(r.view) === String(before)), 0);
+      if (isOther) { spot = null; tell(""); }
+      if (isOther || (leads && row().view !== before)) zoom = 0;
+      if (isDone()) isLed = false;
+      wanted = null; isOther = false;
+      list();
+      draw();
+    } while (!isDone());
+  };
+  const list = () => {
+    const box = root.querySelector(".rs-strip"), views = strip.views;
+    if ([...box.children].map((b) => b.dataset.view).join() !== views.map((r) => r.view).join()) {
+      box.replaceChildren();
+      views.forEach((r, k) => {
+        const b = make("button", "", box), thumb = make("img", "", b);
+        b.dataset.view = r.view; b.onclick = () => go(k);
+        thumb.loading = "lazy"; thumb.alt = ""; thumb.src = address("thumb", r.view);
+        make("span", "", b);
+      });
+    }
+    [...box.children].forEach((b, k) => {
+      b.title = `view ${views[k].view}: ${views[k].trouble || share(views[k])}`;
+      b.lastChild.textContent = `${views[k].view}: ${figure(views[k])}`;
+      b.className = views[k].against > 0.1 ? "rs-against" : "";
     });
-    draw();
   };
   const go = (k) => {
     if (!strip) return;
+    isLed = false;
     at = (k + strip.views.length) % strip.views.length;
     const r = row();
     if (!isThree && spot && spot.has(r.view)) middle = spot.get(r.view);
@@ -233,6 +256,7 @@
     press("three views", "key S: the same spot in three views", three);
     press("fit", "key 0", fit);
     make("span", "rs-zoom", bar);
+    make("span", "rs-compared", bar);
     press("close", "key G", close);
     make("div", "rs-legend", root);
     make("div", "rs-note", root);

@@ -27,6 +27,7 @@ from realsim.review.refusals import SessionGone, disk_words
 from realsim.review.reviewed_session import ReviewedSession, Standing
 from realsim.review.window import window_text
 from realsim.review.window.browser import Browser
+from realsim.review.window.camera_stand import Standpoint
 from realsim.review.window.gui_values import refuse_foreign_values
 from realsim.review.window.keys import bind_keys
 from realsim.review.window.panel_correct import CorrectPanel
@@ -91,7 +92,7 @@ class Window:
         gui.main_panel.float(x=-EDGE_PX, y=EDGE_PX, width=PANEL_PX, height=PANEL_HEIGHT_PX)
         self._name = gui.add_text("Your name", reviewer, hint="Decisions are signed with it.")
         self._message = gui.add_html("")
-        self.photographs = PhotographLink(self)
+        self.photographs, self.stand = PhotographLink(self), Standpoint(self)
         self.list = ListPanel(self)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Object"):
@@ -209,7 +210,7 @@ class Window:
             self._open(session)
         self.select(instance)
         if instance is not None:
-            self.views.look_at_object()
+            self.stand.look_at_object()
 
     def renew(self, session: ReviewedSession) -> None:
         """Show a session that has changed on disk in place of what is shown of it."""
@@ -262,7 +263,7 @@ class Window:
                 nodes.on_grasp(self._guarded_call(self.grasps.clicked))
                 self._opened = Opened(session, content, nodes, {})
                 self.selected, self._seen, self._standing = None, None, None
-                for panel in (self.views, self.grasps, self.show):
+                for panel in (self.grasps, self.show):
                     panel.opened()
             # A browser maps a camera by the direction that was up before the batch it comes in:
             # the camera is sent when the browser has answered that it has turned the scene.
@@ -271,11 +272,11 @@ class Window:
                 self.browser.wait()
                 self._up = content.look.up
             with self.lock:
-                self.views.first_look()
+                self.stand.first_look()
             # A browser without a graphics card would draw the fine cloud before it shows anything.
             nodes.refine_cloud(session.config.shown_points, self.browser.wait)
-            if not content.views:
-                self.refuse(window_text.NO_PHOTOGRAPHS)
+            if words := content.remarks if content.views else [window_text.NO_PHOTOGRAPHS]:
+                self.refuse(" ".join(words))
 
     # --- what changed -----------------------------------------------------------------------------
 

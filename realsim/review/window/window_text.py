@@ -19,6 +19,8 @@ from realsim.review.placing.ellipsoid import rotation_sigmas_deg
 from realsim.review.replaying.grasp_words import escaped, one_line
 from realsim.review.scene_list import ObjectRow
 
+GREY = (134, 142, 150)
+"""The colour of buttons that take back."""
 ALARM = "#c92a2a"
 """The red of what is amiss."""
 LEAST_CONTRAST = 4.5
