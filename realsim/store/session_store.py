@@ -186,6 +186,11 @@ class SessionStore:
         """Numbers of the views whose robot line is whole and whose images are there."""
         return {i for i in self._robot if self._is_complete(i)}
 
+    @property
+    def incomplete(self) -> list[int]:
+        """Numbers of the views whose robot line is whole, and an image of which is missing."""
+        return sorted(self._robot.keys() - self.completed)
+
     def _is_complete(self, index: int) -> bool:
         return index in self._robot and all(
             (self.folder / p).is_file() for p in self._files_of(index)

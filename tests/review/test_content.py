@@ -131,10 +131,13 @@ def test_views_with_damaged_images_are_left_out_and_named(
     photograph = store.path("rgb/000001.png")
     photograph.write_bytes(photograph.read_bytes()[:900])
     store.path("depth/000003.png").write_bytes(b"")
+    store.add_view(View(index=7, T_world_cam=CAMERAS[0]), store.rgb(0))
+    store.path("rgb/000007.png").unlink()
     store.path("depth/000002.png").write_bytes(png_bytes(np.full((60, 80), 4000, np.uint16)))
     left = SceneContent.load(SessionStore.open(store.folder), CONFIG)
-    assert sorted(left.damaged) == [1, 2, 3] and sorted(left.thumbnails) == [0, 2, 3]
-    for said, name in zip(left.remarks, ("rgb/000001", "(60, 80)", "depth/000003"), strict=True):
+    assert sorted(left.damaged) == [1, 2, 3, 7] and sorted(left.thumbnails) == [0, 2, 3]
+    names = ("rgb/000001", "(60, 80)", "depth/000003", "View 7")
+    for said, name in zip(left.remarks, names, strict=True):
         assert "is left out" in said and name in said
     found = nearest_m(left.cloud.points.astype(float), shown.cloud.points.astype(float))
     assert 0 < len(left.cloud) < len(shown.cloud) and found.max() < CONFIG.voxel_m

@@ -23,6 +23,7 @@ from realsim.review.content.views import FirstLook, Region, first_look, region_o
 from realsim.store import SessionStore, load_grasps, load_scene
 
 Progress = Callable[[int, int], None]
+MISSING = "an image of it is missing; `realsim check` names the file."
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -50,7 +51,8 @@ class SceneContent:
     thumbnails: Mapping[int, bytes]
     """The photographs of the shown views as small JPEGs, by number of the view."""
     damaged: Mapping[int, str]
-    """View -> why its images cannot be read; nothing is measured by it."""
+    """View -> why its images cannot be read; nothing is measured by it. One whose image is missing
+    is not among the views."""
     grasp_sets: tuple[GraspSet, ...]
     """Grasp sets of the objects of the scene."""
 
@@ -86,7 +88,7 @@ class SceneContent:
         thumbnails = Thumbnails(store, config.thumbnail_px, config.thumbnail_quality)
         with_depth = [v for v in views if store.has_depth(v.index)]
         numbers = {v.index for v in shown}
-        damaged: dict[int, str] = {}
+        damaged = dict.fromkeys(store.incomplete, MISSING)
 
         def take(index: int, rgb: UInt8) -> None:
             if index in numbers:

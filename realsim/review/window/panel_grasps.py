@@ -163,14 +163,11 @@ class GraspsPanel:
 
     def _filter(self, sets: tuple[GraspSet, ...]) -> GraspFilter:
         return GraspFilter(
-            stage=STAGES[self._stage.value],
-            min_label=float(self._least.value),
-            reachable_only=self._reachable.value,
-            visible=self._rows(sets),
+            stage=STAGES[self._stage.value], min_label=float(self._least.value),
+            reachable_only=self._reachable.value, visible=self._rows(sets),
             instance=self._window.selected if self._of.value == THIS else None,
-            failure=self._reasons.get(self._failure.value, ""),
-            show=self._show.value,
-        )
+            failure=self._reasons.get(self._failure.value, ""), show=self._show.value,
+        )  # fmt: skip
 
     def _rows(self, sets: tuple[GraspSet, ...]) -> Mapping[int, frozenset[int]] | None:
         """Return the rows that may be drawn: of objects that are what they were, and that are seen.

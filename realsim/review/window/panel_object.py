@@ -40,7 +40,7 @@ class ObjectPanel:
             self._history = gui.add_markdown("")
         self._deciding = (accept, reject, comment)
         """Not to be pressed before an object is looked at: the list is there first."""
-        for button in self._deciding:
+        for button in (*self._deciding, self._undo):
             button.disabled = True
         accept.on_click(window.guarded(lambda _: self.decide("accept")))
         reject.on_click(window.guarded(lambda _: self.decide("reject")))

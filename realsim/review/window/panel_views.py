@@ -49,17 +49,12 @@ class PhotographLink:
                   for o in window.shown_objects()]  # fmt: skip
         chosen = window.selected is not None
         state = repr((window.session.number, window.selected, stands))
+        name = f"{window.selected} {window.model_of(window.placed).name}" if chosen else ""
         content = OPEN.format(
-            client=window.client.client_id,
-            state=f"{zlib.crc32(state.encode()):08x}",
-            scene=window.session.number,
-            instance=window.selected if chosen else "",
-            name=html.escape(f"{window.selected} {window.model_of(window.placed).name}")
-            if chosen
-            else "",
-            turn=self._turn,
-            view=self._view,
-        )
+            client=window.client.client_id, state=f"{zlib.crc32(state.encode()):08x}",
+            scene=window.session.number, instance=window.selected if chosen else "",
+            name=html.escape(name), turn=self._turn, view=self._view,
+        )  # fmt: skip
         if content != self._html.content:
             self._html.content = content
 

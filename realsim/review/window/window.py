@@ -276,7 +276,8 @@ class Window:
             # A browser without a graphics card would draw the fine cloud before it shows anything.
             nodes.refine_cloud(session.config.shown_points, self.browser.wait)
             if words := content.remarks if content.views else [window_text.NO_PHOTOGRAPHS]:
-                self.refuse(" ".join(words))
+                more = f" {len(words) - 3} more stand in the tab Views." * (len(words) > 3)
+                self.refuse(" ".join(words[:3]) + more)
 
     # --- what changed -----------------------------------------------------------------------------
 
