@@ -111,16 +111,12 @@ def prepare_mesh(
     Raises:
         InputError: the mesh cannot be used, or mass and density are no positive numbers.
     """
-    step("repair")
-    repair = repaired(mesh, config.repair)
-    step("simplify")
-    kept, actions = _thinned(repair.mesh, config.most_faces, "mm")
+    repair = _repaired(mesh, config, "mm", step)
     step("symmetries")
-    symmetries = find_symmetries(kept, config.symmetry)
+    symmetries = find_symmetries(repair.mesh, config.symmetry)
     return _prepared(
-        replace(repair, mesh=kept, actions=(*repair.actions, *actions)), symmetries, config,
-        matter or Matter(), source=source, scale=scale, step=step,
-    )  # fmt: skip
+        repair, symmetries, config, matter or Matter(), source=source, scale=scale, step=step
+    )
 
 
 def prepare_as_it_is(
@@ -166,21 +162,12 @@ def _prepared(
         repair.mesh, density=matter.density, mass_kg=matter.mass_kg, parts=parts
     )
     reasons = (*_reasons(repair, parts, config, scale), *trouble)
-    made = ModelProperties(
-        name="",
-        verdict="doubtful" if reasons else "accepted",
-        reasons=reasons,
-        source=source,
-        before=repair.before,
-        after=repair.after,
-        actions=repair.actions,
+    made = replace(
+        _judged(repair, reasons, config, source, parts),
         symmetries=symmetries,
         matter=properties,
         convex=None if parts is None else convex_note(parts),
         scale=scale,
-        notes=_notes(source, repair, parts),
-        versions=versions(),
-        config=asdict(config),
     )
     return PreparedModel(mesh=repair.mesh, parts=parts, properties=made)
 
@@ -193,26 +180,30 @@ def prepare_unscaled(
     step: Callable[[Step], None] = lambda _: None,
 ) -> PreparedModel:
     """Return a mesh without metric scale, repaired and judged; the rest needs metres."""
-    step("repair")
-    repair = repaired(mesh, config.repair)
-    step("simplify")
-    kept, actions = _thinned(repair.mesh, config.most_faces, "% of the size")
-    reasons = _reasons(repair, None, config, None)
-    return PreparedModel(
-        mesh=kept,
-        parts=None,
-        properties=ModelProperties(
-            name="",
-            verdict="doubtful" if reasons else "accepted",
-            reasons=reasons,
-            source=source,
-            before=repair.before,
-            after=repair.after,
-            actions=(*repair.actions, *actions),
-            notes=_notes(source, repair, None),
-            versions=versions(),
-            config=asdict(config),
-        ),
+    repair = _repaired(mesh, config, "% of the size", step)
+    properties = _judged(repair, _reasons(repair, None, config, None), config, source, None)
+    return PreparedModel(mesh=repair.mesh, parts=None, properties=properties)
+
+
+def _judged(
+    repair: Repair,
+    reasons: tuple[str, ...],
+    config: PrepareConfig,
+    source: ScanSource | None,
+    parts: ConvexParts | None,
+) -> ModelProperties:
+    """Return what is known of a repaired mesh without its size: condition, verdict, origin."""
+    return ModelProperties(
+        name="",
+        verdict="doubtful" if reasons else "accepted",
+        reasons=reasons,
+        source=source,
+        before=repair.before,
+        after=repair.after,
+        actions=repair.actions,
+        notes=_notes(source, repair, parts),
+        versions=versions(),
+        config=asdict(config),
     )
 
 
@@ -231,18 +222,26 @@ def versions() -> dict[str, str]:
     return {"realsim": __version__} | {name: version(name) for name in LIBRARIES}
 
 
-def _thinned(mesh: Mesh, most: int, unit: Literal["mm", "% of the size"]) -> tuple[Mesh, list[str]]:
-    """Return the mesh with at most so many faces, and what that did to its shape."""
-    if len(mesh.faces) <= most:
-        return mesh, []
-    thin = simplified(mesh, most)
-    away = deviation(thin, mesh)
-    painted = "" if mesh.texture is None else ", and the texture became colours of the vertices"
-    said = away * 1e3 if unit == "mm" else 100.0 * away / float(np.max(mesh.extent))
-    return thin, [
-        f"{len(mesh.faces)} faces thinned out to {len(thin.faces)}: the surface moved by up to "
+def _repaired(
+    mesh: Mesh, config: PrepareConfig, unit: Literal["mm", "% of the size"],
+    step: Callable[[Step], None],
+) -> Repair:  # fmt: skip
+    """Return the mesh repaired and with at most so many faces, and what that did to its shape."""
+    step("repair")
+    repair = repaired(mesh, config.repair)
+    step("simplify")
+    whole = repair.mesh
+    if len(whole.faces) <= config.most_faces:
+        return repair
+    thin = simplified(whole, config.most_faces)
+    away = deviation(thin, whole)
+    painted = "" if whole.texture is None else ", and the texture became colours of the vertices"
+    said = away * 1e3 if unit == "mm" else 100.0 * away / float(np.max(whole.extent))
+    action = (
+        f"{len(whole.faces)} faces thinned out to {len(thin.faces)}: the surface moved by up to "
         f"{said:.3g} {unit}{painted}."
-    ]
+    )
+    return replace(repair, mesh=thin, actions=(*repair.actions, action))
 
 
 def _parts(mesh: Mesh, config: PrepareConfig) -> tuple[ConvexParts | None, list[str]]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from realsim.app.first_surfaces import FirstSurfaces
+from realsim.app.report.section import counted
 from realsim.app.upgrade.analytic import LEVEL_HEADER, correlation_line, level_rows
 from realsim.app.upgrade.scene import Record
 from realsim.app.upgrade.tables import (
@@ -114,12 +115,8 @@ def notes_line(notes: Sequence[tuple[str, str]], left_out: int) -> list[str]:
     if not notes:
         return []
     scenes = len({place for place, _ in notes})
-    lost = f"{_counted(left_out, 'scene')} left out; " if left_out else ""
-    return [f"{lost}{_counted(len(notes), 'note')} on {_counted(scenes, 'scene')}: see below."]
-
-
-def _counted(n: int, word: str) -> str:
-    return f"{n} {word}" if n == 1 else f"{n} {word}s"
+    lost = f"{counted(left_out, 'scene')} left out; " if left_out else ""
+    return [f"{lost}{counted(len(notes), 'note')} on {counted(scenes, 'scene')}: see below."]
 
 
 def _frames(out: Path, pictured: Sequence[tuple[Record, Mapping[str, Any]]]) -> list[View]:

@@ -38,5 +38,5 @@ def rect_rows(group: GraspGroup, intrinsics: CameraIntrinsics) -> Array:
     fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
     uv = np.stack([fx * p[..., 0] / p[..., 2] + cx, fy * p[..., 1] / p[..., 2] + cy], axis=-1)
     heights_px = np.linalg.norm(uv[:, 2] - uv[:, 3], axis=-1)
-    last = (heights_px, group.scores[rows], group.obj_ids[rows] - 1.0)
-    return np.column_stack([uv[:, 0], uv[:, 1], *last])
+    numbers = group.obj_ids[rows].astype(np.float64) - 1.0
+    return np.column_stack([uv[:, 0], uv[:, 1], heights_px, group.scores[rows], numbers])
