@@ -12,6 +12,7 @@ from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspnet.opening import open_scene
 from realsim.formats.graspnet.tree import open_graspnet
 from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
+from realsim.formats.renumbered import RenumberedScene
 from realsim.geometry import se3
 from realsim.geometry.mesh import load_mesh
 from realsim.records import Mesh
@@ -137,21 +138,15 @@ def test_grey_images_and_other_formats_become_colour_pngs(source, tmp_path):
     )
 
 
-def test_numbers_are_mapped_beyond_graspnets_noted_and_never_doubled(source, tmp_path):
-    result = write(source, tmp_path / "out", numbers={1: 5, 7: 300, 30: 0})
+def test_numbers_beyond_graspnets_are_noted(source, tmp_path):
+    result = write(RenumberedScene(source, {7: 301}), tmp_path / "out")
     assert any("up to 300" in n for n in result.notes)
     scene = opened(tmp_path / "out")
-    assert scene.object_numbers == (5, 300, 0) and scene.models().keys() == {1, 6, 301}
+    assert 300 in scene.object_numbers and 301 in scene.models()
     label = images.read_image(tmp_path / "out" / HOME / "label/0000.png")
-    assert label.dtype == np.uint16 and set(np.unique(label)) <= {0, 1, 6, 301}
-    assert np.array_equal(scene.mask(0, 1, visible=True), source.mask(0, 1, visible=True))
-    again = write(scene, tmp_path / "again", numbers={6: 0, 301: 6, 1: 29})
-    plain = write(source, tmp_path / "plain")
-    for index in range(3):
-        paths = [w.folder / f"label/{index:04d}.png" for w in (again, plain)]
-        assert np.array_equal(*(images.read_image(p) for p in paths))
-    refused("object 7 has no number", write, source, tmp_path / "missing", numbers={1: 0})
-    refused("would all be number 4", GraspnetWriteConfig, numbers={1: 4, 2: 4})
+    assert label.dtype == np.uint16 and 301 in label
+    plain = images.read_image(write(source, tmp_path / "plain").folder / "label/0000.png")
+    assert np.array_equal(np.where(label == 301, 7, label), plain)
 
 
 def test_missing_masks_and_depth_are_refused_with_what_to_do(source, tmp_path):
@@ -223,7 +218,7 @@ def test_grasp_labels_go_along_with_a_graspnet_source_that_keeps_its_numbers(sou
         after = tmp_path / "again" / name.replace("scene_0003", "scene_0009")
         assert after.read_bytes() == (tmp_path / "out" / name).read_bytes()
     assert not (tmp_path / "again/grasp_label/050_labels.npz").exists()
-    mapped = write(opened(tmp_path / "out"), tmp_path / "mapped", numbers={1: 0, 7: 7, 30: 29})
+    mapped = write(RenumberedScene(opened(tmp_path / "out"), {7: 8}), tmp_path / "mapped")
     assert mapped.counts["copied_labels"] == 0 and not (mapped.folder / "rect").exists()
 
 

@@ -3,8 +3,9 @@
     grasp_label/000_labels.npz, collision_label/scene_0000/collision_labels.npz,
     scenes/scene_0000/{rs_wrt_kn.npy, CAMERA/rect/0000.npy}
 
-They name objects by their numbers, or by their place in the annotation, so they go along only if
-both stay what they are. dex_models are pickles, which run what they hold: they stay behind.
+They name objects by their numbers, or by their place in the annotation: a scene whose objects got
+other ids is no GraspNet source any more. dex_models are pickles, which run what they hold: they
+stay behind.
 """
 
 from pathlib import Path
@@ -16,14 +17,9 @@ from realsim.formats.labelled_scene import LabelledScene
 RS_WRT_KN = "rs_wrt_kn.npy"
 
 
-def keeps_numbers(plan: WritePlan) -> bool:
-    """Return whether objects keep their numbers."""
-    return all(number + 1 == obj_id for obj_id, number in plan.numbers.items())
-
-
 def label_files(scene: LabelledScene, plan: WritePlan) -> dict[str, Path]:
     """Return what goes along with a scene: path in the new tree -> file of the source."""
-    if not isinstance(scene, GraspnetLabelledScene) or not keeps_numbers(plan):
+    if not isinstance(scene, GraspnetLabelledScene):
         return {}
     home = scene.ref.folder.parent
     root = home.parent.parent
@@ -40,8 +36,8 @@ def label_files(scene: LabelledScene, plan: WritePlan) -> dict[str, Path]:
     return {name: file for name, file in files.items() if file.is_file()}
 
 
-def rect_file(scene: LabelledScene, index: int, plan: WritePlan) -> Path | None:
+def rect_file(scene: LabelledScene, index: int) -> Path | None:
     """Return the rectangle grasps of an image, None where there are none to go along."""
-    if not isinstance(scene, GraspnetLabelledScene) or not keeps_numbers(plan):
+    if not isinstance(scene, GraspnetLabelledScene):
         return None
     return scene.rect_file(index)

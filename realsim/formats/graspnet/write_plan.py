@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -33,9 +32,6 @@ class GraspnetWriteConfig:
     number: int | None = None
     """Number of the scene; None = the source's. Needed where scenes of several splits have one
     number."""
-    numbers: Mapping[int, int] | None = None
-    """Object id -> GraspNet's number; None = the id - 1. For ids beyond GraspNet's 0 to 87, and
-    for several data sets in one tree."""
     ignore_distortion: bool = False
     """Write images of a lens with distortion as they are. GraspNet has no place for it, so its
     readers would be wrong by what the notes then say."""
@@ -45,18 +41,13 @@ class GraspnetWriteConfig:
     """Write no label images, for a source without masks."""
 
     def __post_init__(self) -> None:
-        """Check the camera and the numbers."""
+        """Check the camera and the number."""
         if self.camera not in CAMERAS:
             raise InputError(
                 f"GraspNet has no camera '{self.camera}'; {' and '.join(CAMERAS)} are."
             )
         if self.number is not None and not 0 <= self.number <= LARGEST_NUMBER:
             raise InputError(f"scene number {self.number}; 0 to {LARGEST_NUMBER} can be written.")
-        values = sorted((self.numbers or {}).values())
-        twice = [a for a, b in pairwise(values) if a == b]
-        if twice:
-            ids = [i for i, n in (self.numbers or {}).items() if n == twice[0]]
-            raise InputError(f"objects {ids} would all be number {twice[0]}; one number each.")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -68,7 +59,7 @@ class WritePlan:
     indices: tuple[int, ...]
     """Places of the source's images; their places are the written numbers."""
     numbers: Mapping[int, int]
-    """Object id -> GraspNet's number."""
+    """Object id -> GraspNet's number, which is one less."""
     order: tuple[int, ...]
     """Object numbers as object_id_list.txt has them."""
     places: Mapping[tuple[int, int | None], int]
@@ -118,7 +109,7 @@ def plan_scene(scene: LabelledScene, config: GraspnetWriteConfig) -> WritePlan:
         raise InputError(f"{scene.name} has no images.")
     notes = _lens(survey, scene, config)
     notes += _several_cameras(survey)
-    numbers = _numbers(survey, config, notes)
+    numbers = _numbers(survey, notes)
     poses, first = _cameras(scene, survey, config, notes)
     order, places = _object_list(scene, survey, numbers)
     if tuple(range(len(scene.indices))) != tuple(scene.indices):
@@ -181,13 +172,9 @@ def _several_cameras(survey: _Survey) -> list[str]:
     ]
 
 
-def _numbers(survey: _Survey, config: GraspnetWriteConfig, notes: list[str]) -> dict[int, int]:
+def _numbers(survey: _Survey, notes: list[str]) -> dict[int, int]:
     ids = sorted({obj_id for obj_id, _ in survey.instances})
-    table = config.numbers
-    missing = [i for i in ids if table is not None and i not in table]
-    if missing:
-        raise InputError(f"object {missing[0]} has no number in the mapping that was given.")
-    numbers = {i: i - 1 if table is None else int(table[i]) for i in ids}
+    numbers = {i: i - 1 for i in ids}
     wrong = [n for n in numbers.values() if not 0 <= n <= LARGEST_NUMBER]
     if wrong:
         raise InputError(f"object number {wrong[0]}; 0 to {LARGEST_NUMBER} can be written.")
@@ -195,12 +182,9 @@ def _numbers(survey: _Survey, config: GraspnetWriteConfig, notes: list[str]) -> 
     if beyond:
         notes.append(
             f"object numbers up to {max(beyond)} are written; GraspNet-1Billion has 0 to "
-            f"{LARGEST_OFFICIAL}, where loops of graspnetAPI end. Give a mapping to smaller ones "
-            "if its evaluation is to run."
+            f"{LARGEST_OFFICIAL}, where loops of graspnetAPI end. Give the models smaller ids if "
+            "its evaluation is to run."
         )
-    if table is not None:
-        changed = ", ".join(f"{i} as {n:03d}" for i, n in list(numbers.items())[:10])
-        notes.append(f"object ids are written by the mapping given: {changed}.")
     return numbers
 
 
@@ -212,8 +196,7 @@ def _object_list(
     keys = [*known, *(k for k in survey.instances if k[1] is None)]
     places = {key: place for place, key in enumerate(keys)}
     if isinstance(scene, GraspnetLabelledScene):
-        listed = [numbers.get(n + 1, n) for n in scene.object_numbers]
-        return tuple(listed), places
+        return scene.object_numbers, places
     return tuple(numbers[obj_id] for obj_id, _ in keys), places
 
 

@@ -19,7 +19,7 @@ from realsim.formats.graspnet.cameras import FIRST, MATRIX, POSES, npy_bytes
 from realsim.formats.graspnet.frame_files import Loss, frame_files
 from realsim.formats.graspnet.grasp_group import grasp_group
 from realsim.formats.graspnet.instances import OBJECT_LIST
-from realsim.formats.graspnet.label_copies import keeps_numbers, label_files, rect_file
+from realsim.formats.graspnet.label_copies import label_files, rect_file
 from realsim.formats.graspnet.labelled import GraspnetLabelledScene
 from realsim.formats.graspnet.models import model_files
 from realsim.formats.graspnet.rect import rect_rows
@@ -125,21 +125,20 @@ def _write_frame(
     files: dict[str, Content] = {
         f"{camera}/{kind.replace('/', f'/{name}')}": content for kind, content in found.items()
     }
-    rect: Content | None = rect_file(scene, frame.index, plan)
+    rect: Content | None = rect_file(scene, frame.index)
     if rect is None and grasps is not None:
-        rect = _rectangles(frame, grasps, plan)
+        rect = _rectangles(frame, grasps)
     if rect is not None:
         files[f"{camera}/rect/{name}.npy"] = rect
     folder.write_piece(piece, files, {f"{camera}.losses": (name, loss.row())})
     return 1
 
 
-def _rectangles(frame: LabelledFrame, grasps: SceneGrasps, plan: WritePlan) -> bytes:
+def _rectangles(frame: LabelledFrame, grasps: SceneGrasps) -> bytes:
     """Return the rectangles of the grasps that held, of those along the camera's axis."""
     poses = {o.instance: o.T_cam_obj for o in frame.objects if o.instance is not None}
     sets = [s for s in grasps.sets if s.instance in poses]
     rows = rect_rows(grasp_group(sets, poses, scores="tried"), frame.intrinsics)
-    rows[:, 6] = [plan.numbers[int(n) + 1] for n in rows[:, 6]]
     return npy_bytes(rows.astype(np.float32))
 
 
@@ -164,8 +163,7 @@ def _write_cameras(
         f"{camera}/{POSES}": npy_bytes(plan.camera_poses),
         f"{camera}/{FIRST}": npy_bytes(plan.cam0_wrt_table),
     }
-    renumbered = plan.indices != tuple(range(len(plan.indices)))
-    if renumbered or not keeps_numbers(plan):
+    if plan.indices != tuple(range(len(plan.indices))):
         files[f"{camera}/{FRAMES_FILE}"] = json_bytes(
             {
                 "source": scene.name,
@@ -206,32 +204,26 @@ def _write_models(scene: LabelledScene, folder: ExportFolder, plan: WritePlan) -
             f"models/{number:03d}/{p.name}": p for p in sorted(home.iterdir()) if p.is_file()
         }
         folder.write_piece(_model_piece(number), files)
-    needed = {i: n for i, n in plan.numbers.items() if not folder.has(_model_piece(n))}
+    needed = [i for i, n in plan.numbers.items() if not folder.has(_model_piece(n))]
     if needed:
         found = scene.models()
         models = {i: found[i] for i in needed if i in found}
-        write_graspnet_models(models, folder, numbers=needed)
+        write_graspnet_models(models, folder)
     return {n for n in plan.numbers.values() if folder.has(_model_piece(n))}
 
 
-def write_graspnet_models(
-    models: Mapping[int, ObjectModel],
-    folder: ExportFolder,
-    *,
-    numbers: Mapping[int, int] | None = None,
-) -> None:
+def write_graspnet_models(models: Mapping[int, ObjectModel], folder: ExportFolder) -> None:
     """Write models that are not there yet; scenes bring those that they show.
 
     Args:
         models: by object id.
         folder: the export that is being filled.
-        numbers: object id -> GraspNet's number; None = the id - 1.
 
     Raises:
         StorageError: the disk is full.
     """
     for obj_id, model in models.items():
-        number = obj_id - 1 if numbers is None else numbers[obj_id]
+        number = obj_id - 1
         if not folder.has(_model_piece(number)):
             content: dict[str, Content] = {
                 f"models/{number:03d}/{name}": data for name, data in model_files(model).items()
