@@ -5,6 +5,7 @@ square of its own in its mean colour.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,6 +74,17 @@ def visual_files(mesh: Mesh) -> dict[str, bytes]:
         faces = [f"f {a}/{i} {b}/{j} {c}/{k}" for a, i, b, j, c, k in corners.tolist()]
     files[VISUAL] = _text([*lines, "usemtl surface", *faces])
     return files
+
+
+def part_name(k: int) -> str:
+    """Return the name of a convex part."""
+    return f"part_{k:03d}"
+
+
+def mesh_files(home: str, mesh: Mesh, parts: Sequence[Mesh]) -> dict[str, bytes]:
+    """Return the files of a body in a folder: of the mesh that is seen, and of each convex part."""
+    files = {f"{home}/{name}": data for name, data in visual_files(mesh).items()}
+    return files | {f"{home}/{part_name(k)}.obj": part_file(p) for k, p in enumerate(parts)}
 
 
 def part_file(part: Mesh) -> bytes:

@@ -22,8 +22,8 @@ from realsim.formats.robot_scenes.mesh_obj import (
     TEXTURE,
     VISUAL,
     collision_parts,
-    part_file,
-    visual_files,
+    mesh_files,
+    part_name,
 )
 from realsim.formats.robot_scenes.placed_scene import (
     TABLE_NAME,
@@ -74,9 +74,7 @@ def write_mjcf_scene(
         counts[obj_id] = len(parts)
         piece = f"{ASSETS}/{name}"
         if not folder.has(piece):
-            files = {f"{piece}/{n}": data for n, data in visual_files(body.model.mesh).items()}
-            files |= {f"{piece}/{part_name(k)}.obj": part_file(p) for k, p in enumerate(parts)}
-            folder.write_piece(piece, files)
+            folder.write_piece(piece, mesh_files(piece, body.model.mesh, parts))
         if progress is not None:
             progress()
     text = scene_xml(scene, names, counts)
@@ -84,11 +82,6 @@ def write_mjcf_scene(
     shapes = sum(counts.values())
     counted = {"bodies": len(names), "collision shapes": shapes, "cameras": len(scene.cameras)}
     return told(scene, folder.place, counted, without_lens(scene, "MJCF"))
-
-
-def part_name(k: int) -> str:
-    """Return the name of a convex part."""
-    return f"part_{k:03d}"
 
 
 def scene_xml(scene: PlacedScene, names: dict[int, str], counts: dict[int, int]) -> bytes:

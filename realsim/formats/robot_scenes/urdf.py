@@ -16,8 +16,8 @@ from realsim.formats.robot_scenes.mesh_obj import (
     TABLE_RGB,
     VISUAL,
     collision_parts,
-    part_file,
-    visual_files,
+    mesh_files,
+    part_name,
 )
 from realsim.formats.robot_scenes.placed_scene import (
     TABLE_NAME,
@@ -84,9 +84,7 @@ def write_urdf_scene(
         shapes += len(parts)
         piece = f"objects/{name}"
         if not folder.has(piece):
-            meshes = f"objects/meshes/{name}"
-            files = {f"{meshes}/{n}": data for n, data in visual_files(body.model.mesh).items()}
-            files |= {f"{meshes}/{_part_name(k)}": part_file(p) for k, p in enumerate(parts)}
+            files = mesh_files(f"objects/meshes/{name}", body.model.mesh, parts)
             link = body_link(body, name, f"meshes/{name}", len(parts))
             files[f"objects/{name}.urdf"] = _robot(name, [link])
             folder.write_piece(piece, files)
@@ -99,10 +97,6 @@ def write_urdf_scene(
     folder.write_piece(SCENE_FILE, files)
     counts = {"bodies": len(names), "collision shapes": shapes, "cameras": len(scene.cameras)}
     return told(scene, folder.place, counts)
-
-
-def _part_name(k: int) -> str:
-    return f"part_{k:03d}.obj"
 
 
 # --- links --------------------------------------------------------------------------------------
@@ -121,7 +115,7 @@ def body_link(body: RigidBody, name: str, meshes: str, parts: int) -> ET.Element
     _inertial(link, body.mass_kg, body.center_of_mass, body.inertia)
     _mesh_shape(link, "visual", "visual", f"{meshes}/{VISUAL}")
     for k in range(parts):
-        _mesh_shape(link, "collision", f"part_{k:03d}", f"{meshes}/{_part_name(k)}")
+        _mesh_shape(link, "collision", part_name(k), f"{meshes}/{part_name(k)}.obj")
     _contact(link, body.friction)
     return link
 
