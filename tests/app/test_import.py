@@ -110,6 +110,7 @@ def test_depth_that_is_empty_or_not_there_is_told_before_register_asks_for_it(tm
     frames[3] = replace(frames[3], depth_counts=0 * frames[3].depth_counts)
     import_session(Recording(frames), tmp_path / "a", QUIET)
     told = capsys.readouterr().err
+    assert "note: a note with [square] brackets." in told
     assert "empty (at least 99 % of the pixels are 0): 1, of f3." in told
     assert "register" not in told
     bare = [replace(f, depth_counts=None) for f in frames]

@@ -172,5 +172,5 @@ def test_what_a_person_should_look_at_ends_with_1(meshes: Path, tmp_path: Path):
                                  "--unit", "mm")  # fmt: skip
     assert code == 2 and "wrong_side (object 2): accepted" in out and "repaired:" in out
     # One bad mesh does not keep the others out.
-    assert "flat.ply: not imported" in err and "unusable" in out
+    assert "flat.ply: not imported: " in err and "[red]" not in err and "unusable" in out
     assert load_entries(tmp_path / "m") == ["open", "wrong_side"]

@@ -97,7 +97,7 @@ def import_session(
     _make_room(folder, source, key, overwrite=overwrite)
     folder.mkdir(parents=True, exist_ok=True)
     for note in source.notes:
-        console.warn(_plain(note))
+        console.warn(note)
     with only_run_in(folder):
         store = _opened(folder, source, key)
         done = len(store.completed)
@@ -135,11 +135,6 @@ def content_key(source: FrameSource) -> str:
         "content": content,
     }
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
-
-
-def _plain(note: str) -> str:
-    """Return a note whose square brackets are no markup."""
-    return note.replace("[", r"\[")
 
 
 def _make_room(folder: Path, source: FrameSource, key: str, *, overwrite: bool) -> None:

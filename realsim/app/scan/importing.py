@@ -56,7 +56,7 @@ def run_scan_import(request: ImportRequest, console: Console) -> int:
         except RealsimError as error:
             if len(request.meshes) == 1:
                 raise
-            console.warn(f"[red]{_escaped(str(path))}: not imported:[/red] {_escaped(str(error))}")
+            console.warn(f"{path}: not imported: {error}")
             verdict, row = "unusable", (path.name, "", "", "", "", "unusable")
             document = {"verdict": verdict, "why": str(error)}
         verdicts.append(verdict)
@@ -69,12 +69,6 @@ def run_scan_import(request: ImportRequest, console: Console) -> int:
     if "unusable" in verdicts:
         return UNUSABLE
     return LOOK if "doubtful" in verdicts else DONE
-
-
-def _escaped(text: str) -> str:
-    from rich.markup import escape
-
-    return escape(text)
 
 
 def _require_consistent(request: ImportRequest) -> None:
