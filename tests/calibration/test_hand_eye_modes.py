@@ -17,7 +17,7 @@ from realsim_calibration import (
     calibrate_hand_eye_report,
 )
 from realsim_calibration.exports import FrameNames, read_calibration, write_exports
-from realsim_calibration.fit.robot_error import RobotErrorConfig, matching_arm
+from realsim_calibration.fit.robot_error import matching_arm
 from realsim_calibration.report.summary import viewpoint
 from realsim_calibration.results import Clock
 from refusals import refused
@@ -147,10 +147,10 @@ def test_the_arm_is_told_by_joints_and_poses(name):
     Ts = bent.forward(joints) @ tool
     # A Panda and an FR3 are one arm by their numbers; those of other joint counts are passed over.
     arms = [arm, *(c for c in known_chains().values() if c is not arm)]
-    assert matching_arm(joints, Ts, arms, RobotErrorConfig()) is arm
+    assert matching_arm(joints, Ts, arms) is arm
     other = se3.random_transform(rng, 12)
-    assert matching_arm(joints, other, arms, RobotErrorConfig()) is None
-    assert matching_arm(joints[:3], Ts[:3], arms, RobotErrorConfig()) is None
+    assert matching_arm(joints, other, arms) is None
+    assert matching_arm(joints[:3], Ts[:3], arms) is None
 
 
 def test_a_bent_pandas_errors_are_found_in_its_views(simulate):

@@ -9,7 +9,7 @@ from realsim.robots.arm import find_arm
 from realsim_calibration.fit.joint_solve import FLAT, JointConfig, JointProblem, Setup, ViewCorners
 from realsim_calibration.fit.linear_model import LinearModel
 from realsim_calibration.fit.noise_scale import NoiseConfig, largest_ratio, whiteness
-from realsim_calibration.fit.robot_error import RobotErrorConfig, arm_basis, map_basis, map_record
+from realsim_calibration.fit.robot_error import arm_basis, map_basis, map_record
 from realsim_calibration.fit.view_system import (
     camera_from_board,
     camera_vector,
@@ -217,7 +217,7 @@ def test_an_arms_basis_is_the_derivative_of_the_corrected_arm(name):
     joints = rng.uniform(-2, 2, (15, arm.joints))
     tool = se3.from_rt(se3.exp_so3([0.1, 0.2, 0.3]), [0.0, 0.01, 0.2])
     held = arm.forward(joints) @ tool
-    basis = arm_basis(arm, joints, held, RobotErrorConfig())
+    basis = arm_basis(arm, joints, held)
     assert np.allclose(basis.T_flange_tool, tool, atol=1e-12)
     w = rng.normal(size=4 * arm.joints)
     record = map_record(basis, w, held, arm)

@@ -1,7 +1,7 @@
 """What the calibration of several cameras says of itself: each camera, each pair, each view."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -112,20 +112,11 @@ class CamerasReport:
     def all_checks(self) -> tuple[Check, ...]:
         """Checks of the cameras together and of each one, its name before the check's."""
         own = [
-            (camera.name, check)
+            replace(check, name=f"{camera.name}: {check.name}")
             for camera, report in zip(self.rig.cameras, self.cameras, strict=True)
             for check in report.checks
         ]
-        return (
-            *self.checks,
-            *(
-                Check(
-                    name=f"{name}: {c.name}", verdict=c.verdict, sentence=c.sentence,
-                    advice=c.advice, value=c.value, unit=c.unit, views=c.views,
-                )
-                for name, c in own
-            ),
-        )  # fmt: skip
+        return (*self.checks, *own)
 
     @property
     def rejected(self) -> tuple[SightingReport, ...]:

@@ -115,13 +115,13 @@ def solve_rig(
     choices, known = [none], None
     Ts = state.A
     if config.robot_map and problem.arm_used:
-        choices += map_choices(model, Ts, 1.0, np.minimum(ratio, noise.bound), config)
+        choices += map_choices(model, Ts, 1.0, np.minimum(ratio, noise.bound))
         if arm is not None and joints is not None:
-            basis = arm_basis(arm, joints, Ts, config.robot)
-            arm_ratio, known = estimate_arm(model, basis, 1.0, noise, config.robot)
+            basis = arm_basis(arm, joints, Ts)
+            arm_ratio, known = estimate_arm(model, basis, 1.0, noise)
             fit = model.fit(known, arm_ratio, 1.0)
             choices.append(Choice(basis=known, ratio=arm_ratio, fit=fit))
-    best = chosen_of(choices, config.robot)
+    best = chosen_of(choices)
     ratio = best.ratio
     if best.basis is not None and best.basis.kind != "arm":
         ratio = estimate_ratio(model, best.basis, 1.0, most, noise)
@@ -247,7 +247,7 @@ def _hidden(
     """
     if known is not None and arm is not None and joints is not None:
         return np.concatenate([known.columns, sag_columns(arm, joints, known)], -1)
-    columns = hidden_errors(model, none, known, Ts, 1.0, config.robot.hidden_factor)
+    columns = hidden_errors(model, none, known, Ts, 1.0)
     middle = se3.from_translation(Ts[:, :3, 3].mean(0))
     base = np.stack([se3.adjoint(se3.invert(T) @ middle) for T in Ts]) @ columns[0, :, :6]
     base = base * BASE_FACTOR

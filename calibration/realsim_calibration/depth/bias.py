@@ -27,9 +27,23 @@ from realsim.records import CameraIntrinsics, Check, Target
 from realsim.records.depth_bias import DepthBias
 from realsim_calibration.depth.area import BoardDepth, measure_board
 from realsim_calibration.depth.board import DepthBoardView, DepthSetup
-from realsim_calibration.depth.checks import depth_checks, refuse_misaligned, refuse_unit
+from realsim_calibration.depth.checks import (
+    MAX_SHIFT_PX,
+    MIN_RANGE_RATIO,
+    depth_checks,
+    refuse_misaligned,
+    refuse_unit,
+)
 from realsim_calibration.depth.fit import DepthBiasConfig, ViewFit, common_errors, fit_views
 from realsim_calibration.results import BoardShape
+
+MIN_VIEWS = 4
+"""Fewest usable views: two parameters, and something left to judge them by."""
+MAX_SCALE_SD = 0.01
+"""Largest 1-sigma of the scale, board and lens set aside, at which it is told apart from the
+offset."""
+SHIFT_PRIOR_PX = 0.7
+"""Prior of the shift between depth and colour [px]: aligned images agree to a pixel."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -94,13 +108,6 @@ class DepthBiasReport:
     """Every view that was given, in the order of their numbers."""
     checks: tuple[Check, ...]
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """The sentence of every check that is not good."""
-        return tuple(
-            f"{c.sentence} {c.advice}".strip() for c in self.checks if c.verdict in ("warn", "bad")
-        )
-
 
 def estimate_depth_bias(
     views: Sequence[DepthBoardView],
@@ -119,7 +126,7 @@ def estimate_depth_bias(
         views: depth images of the target, with its points in the colour image or its pose.
         target: the target as drawn.
         intrinsics: the calibrated colour camera.
-        config: priors and limits.
+        config: what is known of the camera and the board.
         shape: how the printed target differs from its drawing (of a `HandEyeReport`).
         intrinsics_covariance: (12, 12) of the colour camera; None = `focal_sd`.
         depth_intrinsics: the depth image's own camera; None = depth is aligned to colour.
@@ -138,20 +145,20 @@ def estimate_depth_bias(
     used = [d for d in measured if not d.reason]
     if used:
         refuse_unit(used)
-    if len(used) < config.min_views:
+    if len(used) < MIN_VIEWS:
         reasons = "; ".join(f"view {d.label}: {d.reason}" for d in measured if d.reason)
         raise DegenerateError(
             f"depth bias: {len(used)} of {len(measured)} views show the target in depth; at least "
-            f"{config.min_views} are needed, at 0.2 to 0.5 m. {reasons[:400]} "
+            f"{MIN_VIEWS} are needed, at 0.2 to 0.5 m. {reasons[:400]} "
             "Is the depth aligned to the colour image, and is the board matt and well lit?".strip()
         )
     focal = np.array([setup.depth.fx, setup.depth.fy])
-    loose = fit_views(used, config, config.max_shift_px * 25 / focal)
-    refuse_misaligned(used, loose, focal, config)
-    fit = fit_views(used, config, config.shift_prior_px / focal)
+    loose = fit_views(used, MAX_SHIFT_PX * 25 / focal)
+    refuse_misaligned(used, loose, focal)
+    fit = fit_views(used, SHIFT_PRIOR_PX / focal)
     common = common_errors(used, setup, config, intrinsics_covariance, depth_intrinsics is None)
     report = _report(measured, used, fit, fit.gain @ common, setup, config)
-    return replace(report, checks=depth_checks(report, used, loose, focal, shape, config))
+    return replace(report, checks=depth_checks(report, used, loose, focal, shape))
 
 
 def _setup(
@@ -202,9 +209,7 @@ def _report(
     """Return the report without its checks; common is (4, q), one sigma of each common error."""
     seen, board = fit.covariance[:2, :2], (common @ common.T)[:2, :2]
     m = np.array([d.measured for d in used])
-    separable = bool(
-        m.max() / m.min() >= config.min_range_ratio and np.sqrt(seen[0, 0]) <= config.max_scale_sd
-    )
+    separable = bool(m.max() / m.min() >= MIN_RANGE_RATIO and np.sqrt(seen[0, 0]) <= MAX_SCALE_SD)
     bias = DepthBias(
         scale=float(fit.theta[0]),
         offset_per_m=float(fit.theta[1]),
@@ -227,7 +232,7 @@ def _report(
         focal_px=focal, baseline_m=config.baseline_m, middle_m=middle,
         middle_bias_m=float(bias.bias_m(middle)), middle_sd_m=float(bias.sigma_m(middle)),
         scatter_per_m=fit.scatter, shift_px=fit.theta[2:] * shift,
-        noise_exponent=_noise_exponent(there, config),
+        noise_exponent=_noise_exponent(there),
         held_out_m=float(np.sqrt(np.mean([r.unseen_m**2 for r in there]))),
         uncorrected_m=float(np.sqrt(np.mean([r.bias_m**2 for r in there]))),
         views=rows, checks=(),
@@ -253,10 +258,10 @@ def _view_report(d: BoardDepth, fit: ViewFit, used: list[BoardDepth]) -> DepthVi
     )  # fmt: skip
 
 
-def _noise_exponent(views: Sequence[DepthViewReport], config: DepthBiasConfig) -> float:
+def _noise_exponent(views: Sequence[DepthViewReport]) -> float:
     """Return p of sigma_z ~ z^p over the views; NaN where they stand at one distance."""
     z = np.log([v.distance_m for v in views])
     noise = np.log([max(v.noise_m, 1e-9) for v in views])
-    if np.ptp(z) < np.log(config.min_range_ratio):
+    if np.ptp(z) < np.log(MIN_RANGE_RATIO):
         return float("nan")
     return float(np.polyfit(z, noise, 1)[0])

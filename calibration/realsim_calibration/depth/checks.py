@@ -9,7 +9,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.records import Check
 from realsim_calibration.depth.area import BoardDepth
-from realsim_calibration.depth.fit import DepthBiasConfig, ViewFit
+from realsim_calibration.depth.fit import ViewFit
 from realsim_calibration.results import BoardShape
 
 if TYPE_CHECKING:
@@ -32,6 +32,15 @@ SURE = 2.0
 """Sigmas from which a bias counts as found."""
 LOW_COVERAGE = 0.7
 """Share of the target with depth below which a warning is given: glare, or too near."""
+MIN_RANGE_RATIO = 1.3
+"""Least ratio of the farthest to the nearest view that tells scale from offset."""
+MAX_SHIFT_PX = 4.0
+"""Shift between depth and colour beyond which depth is not aligned [px]; warned of at half."""
+MAX_TILT_DEG = 3.0
+"""Median angle between measured and predicted plane beyond which depth is not aligned [deg]; good
+poses and D405 depth agree to 1 deg."""
+SURE_SIGMAS = 5.0
+"""Sigmas by which a shift or an angle must stand out before it refuses the run."""
 
 
 def refuse_unit(used: Sequence[BoardDepth]) -> None:
@@ -54,28 +63,26 @@ def refuse_unit(used: Sequence[BoardDepth]) -> None:
         )
 
 
-def refuse_misaligned(
-    used: Sequence[BoardDepth], loose: ViewFit, focal: Array, config: DepthBiasConfig
-) -> None:
+def refuse_misaligned(used: Sequence[BoardDepth], loose: ViewFit, focal: Array) -> None:
     """Raise where the depth image does not show what the colour image shows at the same pixel."""
     shift, sd = loose.theta[2:] * focal, np.sqrt(np.diag(loose.covariance)[2:]) * focal
-    far = (np.abs(shift) > config.max_shift_px) & (np.abs(shift) > config.sure_sigmas * sd)
+    far = (np.abs(shift) > MAX_SHIFT_PX) & (np.abs(shift) > SURE_SIGMAS * sd)
     angles = np.degrees([d.tilt_error_rad for d in used])
     noise = np.degrees([d.tilt_noise_rad for d in used])
     angle, usual = float(np.median(angles)), float(np.median(noise))
-    tilted = angle > config.max_tilt_deg and angle > config.sure_sigmas * usual
+    tilted = angle > MAX_TILT_DEG and angle > SURE_SIGMAS * usual
     if not (far.any() or tilted):
         return
     found: list[str] = []
     if tilted:
         found.append(
             f"the measured planes are turned by {angle:.1f} deg against the target's poses "
-            f"(at most {config.max_tilt_deg:g}; {usual:.1f} is noise)"
+            f"(at most {MAX_TILT_DEG:g}; {usual:.1f} is noise)"
         )
     if far.any():
         found.append(
             f"depth is shifted by ({shift[0]:+.0f}, {shift[1]:+.0f}) px against colour "
-            f"(+-{sd.max():.1f}; at most {config.max_shift_px:g})"
+            f"(+-{sd.max():.1f}; at most {MAX_SHIFT_PX:g})"
         )
     raise InputError(
         f"{' and '.join(found)}: is the depth aligned to the colour image? Align it with the "
@@ -91,22 +98,21 @@ def depth_checks(
     loose: ViewFit,
     focal: Array,
     shape: BoardShape | None,
-    config: DepthBiasConfig,
 ) -> tuple[Check, ...]:
     """Return everything that was looked at."""
     return (
-        _range_check(report, config),
+        _range_check(report),
         _bias_check(report),
         _size_check(report, shape),
         _unseen_check(report),
-        _alignment_check(used, loose, focal, config),
+        _alignment_check(used, loose, focal),
         _kind_check(used),
         _coverage_check(report),
         _noise_check(report),
     )
 
 
-def _range_check(report: "DepthBiasReport", config: DepthBiasConfig) -> Check:
+def _range_check(report: "DepthBiasReport") -> Check:
     near, far = report.bias.range_m
     there = f"The views stand {near:.2f} to {far:.2f} m from the target"
     if report.bias.separable:
@@ -120,7 +126,7 @@ def _range_check(report: "DepthBiasReport", config: DepthBiasConfig) -> Check:
         f"{report.middle_m:.2f} m is known: {1e3 * report.middle_bias_m:+.2f} mm "
         f"+- {1e3 * report.middle_sd_m:.2f}.",
         advice=f"Use it near that distance only, or add views so that the farthest is at least "
-        f"{max(config.min_range_ratio, 2.0):g} times as far as the nearest (0.2 to 0.5 m).",
+        f"{max(MIN_RANGE_RATIO, 2.0):g} times as far as the nearest (0.2 to 0.5 m).",
     )  # fmt: skip
 
 
@@ -176,23 +182,21 @@ def _unseen_check(report: "DepthBiasReport") -> Check:
     )  # fmt: skip
 
 
-def _alignment_check(
-    used: Sequence[BoardDepth], loose: ViewFit, focal: Array, config: DepthBiasConfig
-) -> Check:
+def _alignment_check(used: Sequence[BoardDepth], loose: ViewFit, focal: Array) -> Check:
     shift, sd = loose.theta[2:] * focal, np.sqrt(np.diag(loose.covariance)[2:]) * focal
     angle = float(np.median(np.degrees([d.tilt_error_rad for d in used])))
     text = (
         f"Depth lies ({shift[0]:+.1f}, {shift[1]:+.1f}) px from colour (+- {sd.max():.1f}); planes "
         f"agree to {angle:.1f} deg."
     )
-    if sd.max() > config.max_shift_px:
+    if sd.max() > MAX_SHIFT_PX:
         return Check(
             name="depth alignment", verdict="unknown", value=float(sd.max()), unit="px",
             sentence=f"{text} The views are too square-on to see a shift.",
             advice="Tilt the camera by 20 to 40 deg about two axes in some views.",
         )  # fmt: skip
-    off = np.abs(shift) > np.maximum(config.max_shift_px / 2, config.sure_sigmas * sd)
-    warn = bool(off.any()) or angle > config.max_tilt_deg
+    off = np.abs(shift) > np.maximum(MAX_SHIFT_PX / 2, SURE_SIGMAS * sd)
+    warn = bool(off.any()) or angle > MAX_TILT_DEG
     return Check(
         name="depth alignment", verdict="warn" if warn else "good", sentence=text,
         advice="Check the driver's alignment of depth to colour." if warn else "",

@@ -16,27 +16,18 @@ ROUNDS = 15
 """Rounds of reweighting views; five are typical."""
 SMALL = 1e-3
 """Share of a standard deviation that is stepped for a numerical derivative."""
+SCALE_PRIOR_SD = 0.02
+"""Prior of the scale around 1: data sheets promise 1 to 2 %."""
+OFFSET_PRIOR_SD_PER_M = 0.02
+"""Prior of the inverse depth offset [1/m]: 0.23 px of a D405's disparity."""
+HUBER_SIGMAS = 2.0
+"""Views further off than this many sigma lose weight."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DepthBiasConfig:
-    """Priors, limits and what is known of the camera and the board."""
+    """What is known of the camera and the board."""
 
-    min_views: int = 4
-    """Fewest usable views: two parameters, and something left to judge them by."""
-    min_range_ratio: float = 1.3
-    """Least ratio of the farthest to the nearest view that tells scale from offset."""
-    max_scale_sd: float = 0.01
-    """Largest 1-sigma of the scale, board and lens set aside, at which it is told apart from the
-    offset."""
-    scale_prior_sd: float = 0.02
-    """Prior of the scale around 1: data sheets promise 1 to 2 %."""
-    offset_prior_sd_per_m: float = 0.02
-    """Prior of the inverse depth offset [1/m]: 0.23 px of a D405's disparity."""
-    shift_prior_px: float = 0.7
-    """Prior of the shift between depth and colour [px]: aligned images agree to a pixel."""
-    huber_sigmas: float = 2.0
-    """Views further off than this many sigma lose weight."""
     focal_sd: float = 0.003
     """Relative 1-sigma of the focal length where no covariance of the intrinsics is given: a
     factory's."""
@@ -47,13 +38,6 @@ class DepthBiasConfig:
     """Baseline that turns the offset into disparity [m]; the D405's."""
     focal_px: float | None = None
     """Focal length that turns the offset into disparity [px]; None = the depth image's own."""
-    max_shift_px: float = 4.0
-    """Shift between depth and colour beyond which depth is not aligned [px]; warned of at half."""
-    max_tilt_deg: float = 3.0
-    """Median angle between measured and predicted plane beyond which depth is not aligned [deg];
-    good poses and D405 depth agree to 1 deg."""
-    sure_sigmas: float = 5.0
-    """Sigmas by which a shift or an angle must stand out before it refuses the run."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -89,18 +73,17 @@ class ViewFit:
         return few * (jackknife + max(kappa, 1.0) * inverse) / 2
 
 
-def fit_views(used: Sequence[BoardDepth], config: DepthBiasConfig, shift_sd: Array) -> ViewFit:
+def fit_views(used: Sequence[BoardDepth], shift_sd: Array) -> ViewFit:
     """Return the robust fit of scale, offset and shift over views.
 
     Args:
         used: the views.
-        config: priors.
         shift_sd: (2,) prior of the shift [x/z, y/z].
     """
     y = np.array([d.predicted for d in used])
     D = np.array([[d.measured, 1.0, *(-d.predicted_slope)] for d in used])
     pose = np.array([d.by_pose @ d.pose_covariance @ d.by_pose for d in used])
-    sd = np.array([config.scale_prior_sd, config.offset_prior_sd_per_m, *shift_sd])
+    sd = np.array([SCALE_PRIOR_SD, OFFSET_PRIOR_SD_PER_M, *shift_sd])
     prior, start = np.diag(sd**-2), np.array([1.0, 0.0, 0.0, 0.0])
     r = y - D @ start
     scatter2 = float(np.var(r)) + 1e-12
@@ -114,7 +97,7 @@ def fit_views(used: Sequence[BoardDepth], config: DepthBiasConfig, shift_sd: Arr
         free = float(huber.sum() - np.trace(np.linalg.solve(H, H - prior)))
         scatter2 = _paule_mandel(np.sqrt(huber) * r, pose, max(free, 1.0))
         z = np.abs(r) / np.sqrt(pose + scatter2 + 1e-18)
-        huber = np.minimum(1.0, config.huber_sigmas / np.maximum(z, 1e-12))
+        huber = np.minimum(1.0, HUBER_SIGMAS / np.maximum(z, 1e-12))
     gain = np.asarray(np.linalg.solve(H, D.T * weights), np.float64)
     without: list[Array] = []
     for i in range(len(y)):

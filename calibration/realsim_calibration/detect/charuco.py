@@ -13,7 +13,7 @@ from realsim_calibration.detect.homography import (
     fit_trimmed,
     seen_from_front,
 )
-from realsim_calibration.detect.images import gray_image, size_of
+from realsim_calibration.detect.images import gray_image, no_points, size_of
 from realsim_calibration.detect.markers import TWO_BOARDS, decode_markers, several_boards
 from realsim_calibration.detect.saddles import OUTSIDE, Saddles, refine_saddles
 from realsim_calibration.views import TargetDetection
@@ -63,7 +63,7 @@ def find_charuco(
     good, quads, rejected = markers_on_board(ids, quads, board)
     ids, quads = ids[good], quads[good]
     if not len(ids):
-        return _nothing(gray, rejected)
+        return no_points(gray, *rejected)
     point_ids, start, arms = _expected(ids, quads, board)
     uv, sd = np.full((2, len(board.points_board), 2), np.nan)
     tried: dict[int, str] = {}
@@ -77,20 +77,11 @@ def find_charuco(
     rejected += _told({k: fault for k, fault in tried.items() if fault and fault != OUTSIDE})
     good = np.flatnonzero(np.isfinite(uv[:, 0]))
     if len(good) < MIN_POINTS:
-        return _nothing(gray, [*rejected, f"{len(good)} corners are too few"])
+        return no_points(gray, *rejected, f"{len(good)} corners are too few")
     return TargetDetection(
         point_ids=good,
         uv=uv[good],
         sd_px=sd[good, 0],
-        image_size=size_of(gray),
-        rejected=tuple(rejected),
-    )
-
-
-def _nothing(gray: UInt8, rejected: list[str]) -> TargetDetection:
-    return TargetDetection(
-        point_ids=np.zeros(0, np.int64),
-        uv=np.zeros((0, 2)),
         image_size=size_of(gray),
         rejected=tuple(rejected),
     )

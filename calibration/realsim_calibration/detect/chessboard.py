@@ -6,7 +6,7 @@ from realsim.arrays import Array, Mask, UInt8
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import Chessboard
 from realsim_calibration.detect.edges import bilinear
-from realsim_calibration.detect.images import gray_image, size_of
+from realsim_calibration.detect.images import gray_image, no_points, size_of
 from realsim_calibration.detect.saddles import Saddles, grid_arms, refine_saddles
 from realsim_calibration.views import TargetDetection
 
@@ -40,7 +40,7 @@ def find_chessboard(
     gray = gray_image(rgb)
     grid, fault = _whole(gray, board)
     if grid is None:
-        return _nothing(gray, fault)
+        return no_points(gray, fault)
     found = _measured(gray, grid, intrinsics)
     lost = _lost_line(found.good.reshape(grid.shape[:2]))
     exact = _classic(gray, board) if lost else None
@@ -49,10 +49,10 @@ def find_chessboard(
         lost = _lost_line(found.good.reshape(exact.shape[:2]))
     faults = tuple(f"corner {k}: {f}" for k, f in enumerate(found.faults) if f)
     if lost:
-        return _nothing(gray, lost, *faults[:3])
+        return no_points(gray, lost, *faults[:3])
     if found.good.mean() < MIN_SHARE:
         share = f"{int(found.good.sum())} of {len(found.good)} corners could be measured"
-        return _nothing(gray, share, *faults[:3])
+        return no_points(gray, share, *faults[:3])
     return TargetDetection(
         point_ids=np.flatnonzero(found.good),
         uv=found.uv[found.good],
@@ -87,15 +87,6 @@ def _lost_line(good: Mask) -> str:
         if not line.any():
             return f"no corner of the {name} could be measured: is the board cut off or covered?"
     return ""
-
-
-def _nothing(gray: UInt8, *reasons: str) -> TargetDetection:
-    return TargetDetection(
-        point_ids=np.zeros(0, np.int64),
-        uv=np.zeros((0, 2)),
-        image_size=size_of(gray),
-        rejected=tuple(r for r in reasons if r),
-    )
 
 
 def _whole(gray: UInt8, board: Chessboard) -> tuple[Array | None, str]:

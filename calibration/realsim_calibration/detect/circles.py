@@ -11,7 +11,7 @@ from realsim.records.targets import CircleGrid
 from realsim_calibration.detect.edges import bend, straighten
 from realsim_calibration.detect.ellipses import Dots, find_blobs, outline_bias, refine_dots
 from realsim_calibration.detect.homography import apply_homography, fit_homography, seen_from_front
-from realsim_calibration.detect.images import gray_image, size_of
+from realsim_calibration.detect.images import gray_image, no_points, size_of
 from realsim_calibration.detect.lattice import Laid, Node, grow_lattices, lay_pattern
 from realsim_calibration.views import TargetDetection
 
@@ -65,13 +65,7 @@ def find_circles(
             return detection
         reasons.append(reason)
     # The shade that shows more dots explains more.
-    reason = max(reasons, key=_dots_told)
-    return TargetDetection(
-        point_ids=np.zeros(0, np.int64),
-        uv=np.zeros((0, 2)),
-        image_size=size_of(gray),
-        rejected=(reason,),
-    )
+    return no_points(gray, max(reasons, key=_dots_told))
 
 
 def _dots_told(reason: str) -> int:

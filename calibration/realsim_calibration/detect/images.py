@@ -4,6 +4,7 @@ import numpy as np
 
 from realsim.arrays import UInt8
 from realsim.errors import InputError
+from realsim_calibration.views import TargetDetection
 
 MIN_IMAGE_PX = 32
 """Least width and height [px]; no target has its points apart in less."""
@@ -37,3 +38,13 @@ def gray_image(rgb: UInt8) -> UInt8:
 def size_of(gray: UInt8) -> tuple[int, int]:
     """Return width and height [px]."""
     return int(gray.shape[1]), int(gray.shape[0])
+
+
+def no_points(gray: UInt8, *reasons: str) -> TargetDetection:
+    """Return a detection without points, with those of the reasons that are not empty."""
+    return TargetDetection(
+        point_ids=np.zeros(0, np.int64),
+        uv=np.zeros((0, 2)),
+        image_size=size_of(gray),
+        rejected=tuple(r for r in reasons if r),
+    )

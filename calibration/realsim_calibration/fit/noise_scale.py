@@ -18,10 +18,16 @@ import numpy as np
 from realsim.arrays import Array
 from realsim_calibration.fit.joint_solve import JointProblem, JointState
 from realsim_calibration.fit.linear_model import LinearModel
-from realsim_calibration.fit.robot_error import ErrorBasis, RobotErrorConfig
+from realsim_calibration.fit.robot_error import ErrorBasis
 
 CURVATURE_STEP = 0.3
 """Step of a logarithm for the likelihood's curvature: a third of a factor e is about its sigma."""
+HIDDEN_FACTOR = 3.0
+"""Constant error of an unknown arm over its errors that are linear in the pose: 2.7 for the
+rotation and 1.3 for the translation of a UR with random errors of its joints and links."""
+SCALE_LOG_SD = 0.7
+"""1-sigma of the logarithm of the re-estimated scales: a factor of 2 either way. Of an arm's
+24 or more errors a capture shows a dozen, too few to tell the size of the hidden ones alone."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -127,9 +133,8 @@ def estimate_ratio(
 
 
 def estimate_arm(
-    model: LinearModel, basis: ErrorBasis, sigma: float,
-    config: NoiseConfig, errors: RobotErrorConfig,
-) -> tuple[Array, ErrorBasis]:  # fmt: skip
+    model: LinearModel, basis: ErrorBasis, sigma: float, config: NoiseConfig
+) -> tuple[Array, ErrorBasis]:
     """Return lambda (2,) and the arm's basis with its angles and lengths scaled to the views.
 
     Four logarithms: lambda for rotation and translation, angles, lengths. The scales have a prior
@@ -141,13 +146,13 @@ def estimate_arm(
 
     def deviance(x: Array) -> float:
         ratio, price = _ratio_prior(x[:2], config.most, config)
-        prior = float(np.sum((x[2:] / errors.scale_log_sd) ** 2))
+        prior = float(np.sum((x[2:] / SCALE_LOG_SD) ** 2))
         return model.deviance(basis.scaled(factors(x)), ratio, sigma) + prior + price
 
     start = np.array([*[float(np.log(config.bound))] * 2, 0.0, 0.0])
     x = _search(deviance, start, 2 * config.evaluations)
     # So few errors tell their own size only roughly: E[scale^2] is above the likeliest one.
-    x[2:] += [_log_variance(deviance, x, k, errors.scale_log_sd) for k in (2, 3)]
+    x[2:] += [_log_variance(deviance, x, k, SCALE_LOG_SD) for k in (2, 3)]
     return _ratio_prior(x[:2], config.most, config)[0], basis.scaled(factors(x))
 
 
@@ -178,26 +183,23 @@ def _sizes(twists: Array) -> Array:
     return np.array([float(np.sqrt(np.mean(half**2))) for half in halves])
 
 
-def unknown_arm_columns(
-    linear: ErrorBasis, weights: Array, spread: Array, hidden_factor: float
-) -> Array:
+def unknown_arm_columns(linear: ErrorBasis, weights: Array, spread: Array) -> Array:
     """Return errors (views, 6, 78) that an unknown arm may have: what no joints can tell.
 
     Errors linear in the pose (72 columns), of the size that the views show, and a constant error in
     the tool's axes (6 columns), which no camera tells from another place of the camera:
-    `hidden_factor` times as large.
+    HIDDEN_FACTOR times as large.
 
     Args:
         linear: a basis of linear errors.
         weights: (72,) what the views say of its weights: shrunken by the ridge, so that their
             own size is too small ...
         spread: (72, 72) ... by what their covariance says.
-        hidden_factor: see RobotErrorConfig.
     """
     doubt = np.einsum("nrc,cd,nrd->nr", linear.columns, spread, linear.columns)
     shown = _sizes(np.sqrt((linear.columns @ weights) ** 2 + np.maximum(doubt, 0.0)))
     prior = _sizes(np.sqrt(np.sum(linear.columns**2, -1)))
     share = np.repeat(np.minimum(shown / np.maximum(prior, 1e-15), 1.0), 3)
-    constant = np.diag(hidden_factor * np.repeat(shown, 3))
+    constant = np.diag(HIDDEN_FACTOR * np.repeat(shown, 3))
     constant = np.broadcast_to(constant, (len(linear.columns), 6, 6))
     return np.concatenate([constant, linear.columns * share[:, None]], -1)

@@ -23,41 +23,16 @@ LEAST_SPREAD_M = 1e-4
 """Positions that differ by less carry no feature."""
 MIN_ARM_VIEWS = 6
 """Fewer poses do not tell one arm from another."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class RobotErrorConfig:
-    """How large smooth errors are thought to be before the views are looked at."""
-
-    map_unit: float = 5e-4
-    """A weight of a map at strength 1 [rad and m per unit feature]."""
-    map_strengths: tuple[float, ...] = (0.1, 0.3, 1.0)
-    """Ridges that are tried: half a millimetre at the edge of the poses, times these."""
-    map_gain: float = 1.0
-    """A map must predict unseen views better than no map by so many standard errors."""
-    worth: float = 0.05
-    """It must predict better by this share, too: with hundreds of views a gain of one percent is
-    beyond chance and not worth 72 more numbers, which tripled the error where the robot's errors
-    were white."""
-    arm_gain: float = 2.0
-    """It must be better than the arm's own numbers by so many standard errors, which cannot bend as
-    freely."""
-    arm_angle_sd: float = 2e-4
-    """Error of a joint zero or twist [rad]: 0.1-0.3 mm at the tool is left after a factory
-    calibration; re-estimated from the views (`scales`)."""
-    arm_length_sd: float = 1e-4
-    """Error of a link length [m]; re-estimated likewise."""
-    hidden_factor: float = 3.0
-    """Constant error of an unknown arm over its errors that are linear in the pose: 2.7 for the
-    rotation and 1.3 for the translation of a UR with random errors of its joints and links."""
-    arm_fit_m: float = 0.01
-    """An arm is the robot's when its nominal kinematics place the tool this well [m]: real arms
-    differ from nominal by 1 to 3 mm."""
-    arm_margin: float = 3.0
-    """It must place it this many times better than any other arm."""
-    scale_log_sd: float = 0.7
-    """1-sigma of the logarithm of the re-estimated scales: a factor of 2 either way. Of an arm's
-    24 or more errors a capture shows a dozen, too few to tell the size of the hidden ones alone."""
+ARM_ANGLE_SD = 2e-4
+"""Error of a joint zero or twist [rad]: 0.1-0.3 mm at the tool is left after a factory
+calibration; re-estimated from the views (`scales`)."""
+ARM_LENGTH_SD = 1e-4
+"""Error of a link length [m]; re-estimated likewise."""
+ARM_FIT_M = 0.01
+"""An arm is the robot's when its nominal kinematics place the tool this well [m]: real arms
+differ from nominal by 1 to 3 mm."""
+ARM_MARGIN = 3.0
+"""It must place it this many times better than any other arm."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -111,7 +86,10 @@ def map_basis(Ts: Array, kind: Literal["ee", "base"], strength: float, unit: flo
     )
 
 
-def arm_basis(arm: DhArm, joints: Array, Ts: Array, config: RobotErrorConfig) -> ErrorBasis:
+def arm_basis(
+    arm: DhArm, joints: Array, Ts: Array,
+    angle_sd: float = ARM_ANGLE_SD, length_sd: float = ARM_LENGTH_SD,
+) -> ErrorBasis:  # fmt: skip
     """Return the basis of errors of an arm at joints (views, n) and controller poses (views, 4, 4).
 
     The controller's tool frame may stand off the flange: that constant is taken from the poses.
@@ -119,7 +97,7 @@ def arm_basis(arm: DhArm, joints: Array, Ts: Array, config: RobotErrorConfig) ->
     G = tool_in_flange(arm, joints, Ts)
     to_tool = se3.adjoint(se3.invert(G))
     # Of an arm's 4 n errors the first half are angles, the others lengths.
-    unit = np.repeat([config.arm_angle_sd, config.arm_length_sd], 2 * arm.joints)
+    unit = np.repeat([angle_sd, length_sd], 2 * arm.joints)
     columns = to_tool @ arm.error_basis(joints) * unit
     return ErrorBasis(name="arm", kind="arm", columns=columns, unit=unit, T_flange_tool=G)
 
@@ -130,9 +108,7 @@ def tool_in_flange(arm: DhArm, joints: Array, Ts: Array) -> Array:
     return se3.from_rt(se3.mean_rotation(off[:, :3, :3]), np.median(off[:, :3, 3], axis=0))
 
 
-def matching_arm(
-    joints: Array, Ts: Array, arms: Sequence[DhArm], config: RobotErrorConfig
-) -> DhArm | None:
+def matching_arm(joints: Array, Ts: Array, arms: Sequence[DhArm]) -> DhArm | None:
     """Return the arm whose kinematics explain the controller's poses, None where none does.
 
     The tool may stand anywhere on the flange, and the base may be turned: an arm fits when its
@@ -147,7 +123,7 @@ def matching_arm(
     )
     least, best = misfits[0]
     rest = min((m for m, arm in misfits[1:] if not _same_numbers(arm, best)), default=np.inf)
-    return best if least < config.arm_fit_m and rest > config.arm_margin * least else None
+    return best if least < ARM_FIT_M and rest > ARM_MARGIN * least else None
 
 
 def _same_numbers(first: DhArm, second: DhArm) -> bool:

@@ -33,7 +33,6 @@ from realsim_calibration.fit.noise_scale import (
 )
 from realsim_calibration.fit.robot_error import (
     ErrorBasis,
-    RobotErrorConfig,
     arm_basis,
     map_basis,
     map_record,
@@ -45,6 +44,20 @@ if TYPE_CHECKING:
     from realsim_calibration.screening import HandEyeConfig
 
 X = slice(0, 6)
+
+MAP_UNIT = 5e-4
+"""A weight of a map at strength 1 [rad and m per unit feature]."""
+MAP_STRENGTHS = (0.1, 0.3, 1.0)
+"""Ridges that are tried: half a millimetre at the edge of the poses, times these."""
+MAP_GAIN = 1.0
+"""A map must predict unseen views better than no map by so many standard errors."""
+WORTH = 0.05
+"""It must predict better by this share, too: with hundreds of views a gain of one percent is
+beyond chance and not worth 72 more numbers, which tripled the error where the robot's errors
+were white."""
+ARM_GAIN = 2.0
+"""It must be better than the arm's own numbers by so many standard errors, which cannot bend as
+freely."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -127,16 +140,16 @@ def solve(
     known: ErrorBasis | None = None
     if config.robot_map:
         bounded = ratio if fixed else np.minimum(ratio, config.noise.bound)
-        choices += map_choices(model, Ts, sigma, bounded, config)
+        choices += map_choices(model, Ts, sigma, bounded)
     if arm is not None and joints is not None:
         # What is left of the robot's error beside the arm's own is noise: lambda needs no bound.
         noise = replace(config.noise, least=fixed, most=fixed) if fixed else config.noise
-        basis = arm_basis(arm, joints, Ts, config.robot)
-        arm_ratio, known = estimate_arm(model, basis, sigma, noise, config.robot)
+        basis = arm_basis(arm, joints, Ts)
+        arm_ratio, known = estimate_arm(model, basis, sigma, noise)
         fit = model.fit(known, arm_ratio, sigma)
         if config.robot_map:
             choices.append(Choice(basis=known, ratio=arm_ratio, fit=fit))
-    best = chosen_of(choices, config.robot)
+    best = chosen_of(choices)
     if best.basis is not None and best.basis.kind != "arm":
         basis = _mean_strength(best.basis, choices)
         if not fixed:
@@ -152,7 +165,7 @@ def solve(
     state, sigma, roots = _final_fit(problem, state, best, roots)
     model = LinearModel(problem, state, roots)
     final = model.fit(best.basis, best.ratio, sigma)
-    columns = hidden_errors(model, none, known, Ts, sigma, config.robot.hidden_factor)
+    columns = hidden_errors(model, none, known, Ts, sigma)
     independent = white.excess <= 0
     best = replace(best, fit=final)
     here = here_covariance(model, best, independent=independent)
@@ -225,17 +238,15 @@ def _final_fit(
     return state, sigma, roots
 
 
-def map_choices(
-    model: LinearModel, Ts: Array, sigma: float, ratio: Array, config: "HandEyeConfig"
-) -> Iterator[Choice]:
+def map_choices(model: LinearModel, Ts: Array, sigma: float, ratio: Array) -> Iterator[Choice]:
     """Yield the fits with a map in tool or base axes, weakest first."""
-    for strength in config.robot.map_strengths:
+    for strength in MAP_STRENGTHS:
         for kind in ("ee", "base"):
-            basis = map_basis(Ts, kind, strength, config.robot.map_unit)
+            basis = map_basis(Ts, kind, strength, MAP_UNIT)
             yield Choice(basis=basis, ratio=ratio, fit=model.fit(basis, ratio, sigma))
 
 
-def chosen_of(choices: list[Choice], config: RobotErrorConfig) -> Choice:
+def chosen_of(choices: list[Choice]) -> Choice:
     """Return the candidate that predicts unseen views best; sounder ones win within the noise.
 
     A map must beat no map, and the arm's own numbers, by so many standard errors of the paired
@@ -246,11 +257,11 @@ def chosen_of(choices: list[Choice], config: RobotErrorConfig) -> Choice:
     maps = [c for c in choices if c.basis is not None and c.basis.kind != "arm"]
     best = min(maps, key=lambda c: c.fit.score) if maps else none
     if best is not none:
-        worth_it = best.fit.score < (1 - config.worth) * none.fit.score
-        if not worth_it or _gain_in_errors(none, best) < config.map_gain:
+        worth_it = best.fit.score < (1 - WORTH) * none.fit.score
+        if not worth_it or _gain_in_errors(none, best) < MAP_GAIN:
             best = none
     for arm in arms:
-        if _gain_in_errors(arm, best) < config.arm_gain:
+        if _gain_in_errors(arm, best) < ARM_GAIN:
             best = arm
     return best
 
@@ -277,9 +288,8 @@ def _gain_in_errors(sound: Choice, other: Choice) -> float:
 
 
 def hidden_errors(
-    model: LinearModel, none: Choice, known: ErrorBasis | None, Ts: Array, sigma: float,
-    hidden: float,
-) -> Array:  # fmt: skip
+    model: LinearModel, none: Choice, known: ErrorBasis | None, Ts: Array, sigma: float
+) -> Array:
     """Return errors (views, 6, q) that the arm may have, per standard deviation."""
     if known is not None:
         return known.columns
@@ -288,7 +298,7 @@ def hidden_errors(
     spread = np.asarray(
         np.linalg.inv(fit.information)[model.shared :, model.shared :], dtype=np.float64
     )
-    return unknown_arm_columns(scaled, fit.step[model.shared :], spread, hidden)
+    return unknown_arm_columns(scaled, fit.step[model.shared :], spread)
 
 
 def _covariance(

@@ -16,7 +16,7 @@ from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim_calibration.faults.frame_fit import FrameFit, fit_frames, hand_side
 from realsim_calibration.fit.closed_forms import MIN_VIEWS, check_observable
-from realsim_calibration.fit.robot_error import RobotErrorConfig, arm_basis
+from realsim_calibration.fit.robot_error import arm_basis
 from realsim_calibration.pairs.noise import (
     KINDS,
     Linear,
@@ -209,8 +209,7 @@ def robot_parts(A: Array, joints: ArrayLike | None, arm: DhArm | None) -> RobotP
             f"hand-eye: joint angles of shape {q.shape} were given; a {arm.name} and {len(A)} "
             f"pairs need {(len(A), arm.joints)}."
         )
-    unit = RobotErrorConfig(arm_angle_sd=1.0, arm_length_sd=1.0)
-    columns = arm_basis(arm, q, A, unit).columns
+    columns = arm_basis(arm, q, A, 1.0, 1.0).columns
     return RobotParts(joints=columns[..., : arm.joints], arm=columns)
 
 

@@ -23,7 +23,7 @@ from realsim_calibration import (
     find_target,
 )
 from realsim_calibration.depth.bias import DepthBiasReport
-from realsim_calibration.fit.robot_error import RobotErrorConfig, matching_arm
+from realsim_calibration.fit.robot_error import matching_arm
 
 BOARD_FILE = "calibration/board.json"
 DEPTH_FILE = "calibration/depth_bias.json"
@@ -148,7 +148,7 @@ def arm_of_poses(Ts_base_ee: Array, joints: Array, name: str = "") -> DhArm | No
     """Return the arm that poses (N, 4, 4) and joints (N, J) [rad] prove, None where they do not."""
     known = known_chains(joints.shape[1])
     arms = [known[key].bare() for key in sorted(known, key=lambda k: not same_name(k, name))]
-    return matching_arm(joints, Ts_base_ee, arms, RobotErrorConfig())
+    return matching_arm(joints, Ts_base_ee, arms)
 
 
 def write_results(

@@ -157,7 +157,7 @@ def _photographs(section: Section, store: SessionStore) -> None:
     from realsim.app.stages import registered_views, session_models
     from realsim.rendering.overlay import save_png
     from realsim.store import load_grasps, load_scene
-    from realsim_sim_bridge.annotation.pictures import overlay_picture
+    from realsim_sim_bridge.annotation.pictures import overlay_pictures
 
     indices = [v.index for v in store.session.views]
     if not indices or not store.has("registration/scene.json"):
@@ -167,14 +167,15 @@ def _photographs(section: Section, store: SessionStore) -> None:
     known = registered_views(store)
     told = [k for k in indices if known is None or k in known] or indices
     pick = np.unique(np.linspace(0, len(told) - 1, OVERLAY_VIEWS).round().astype(int))
+    shown = [told[k] for k in pick]
     folder = store.folder / "reports"
     is_kept = section.pictures == "kept"
     for path in folder.glob("overlay_*.png") if is_kept else ():
         path.unlink()  # of an earlier report, perhaps of views that took no part since
     section.page.heading("The annotated scene")
     pictures: list[tuple[Picture, str]] = []
-    for index in (told[k] for k in pick):
-        picture = overlay_picture(store, index, scene, models, grasps, GRASPS)
+    drawn = overlay_pictures(store, shown, scene, models, grasps, GRASPS)
+    for index, picture in zip(shown, drawn, strict=True):
         if is_kept:
             save_png(folder / f"overlay_{index:06d}.png", picture)
         pictures.append((picture, f"view {index}"))

@@ -28,15 +28,15 @@ MOST_NAMED = 4
 """Number of invisible objects that the legend names."""
 
 
-def overlay_picture(
+def overlay_pictures(
     store: SessionStore,
-    view_index: int,
+    view_indices: Sequence[int],
     scene: Scene,
     models: Mapping[int, ObjectModel],
     grasp_sets: Sequence[GraspSet],
     max_grasps: int,
-) -> Rgb:
-    """Return the photograph of a view with everything that was annotated on it.
+) -> Iterator[Rgb]:
+    """Yield the photographs of views with everything that was annotated on them.
 
     Colours are explained, and objects out of sight named, in a corner.
 
@@ -46,28 +46,12 @@ def overlay_picture(
     were.
 
     Args:
-        store: the session; the view must be calibrated.
-        view_index: number of the view.
-        scene: where the objects stand.
+        store: the session; the views must be calibrated.
+        view_indices: numbers of the views.
+        scene: where the objects stand; it is prepared once.
         models: obj_id -> model.
         grasp_sets: the scored grasps.
         max_grasps: grasps drawn in all, shared evenly by the objects.
-
-    Raises:
-        InputError: the view has no camera pose.
-    """
-    return next(overlay_pictures(store, [view_index], scene, models, grasp_sets, max_grasps))
-
-
-def overlay_pictures(
-    store: SessionStore,
-    view_indices: Sequence[int],
-    scene: Scene,
-    models: Mapping[int, ObjectModel],
-    grasp_sets: Sequence[GraspSet],
-    max_grasps: int,
-) -> Iterator[Rgb]:
-    """Yield the pictures of several views, the scene being prepared once; see `overlay_picture`.
 
     Raises:
         InputError: a view has no camera pose.

@@ -80,8 +80,12 @@ def given_candidates(
     near, wide = touched & (widths < config.least_width_m), touched & (needed > most)
     wide &= ~near
     rows = np.flatnonzero(touched & ~near & ~wide)
-    placed, reached = _placed(surface, T_table_obj, surroundings, Ts[rows], needed[rows], config,
-                              geometry)  # fmt: skip
+    poses = HandPoses(
+        Ts_obj_grasp=Ts[rows], widths_m=needed[rows], openings_m=open_hand[rows],
+        contact_depths_m=np.zeros(len(rows)),
+    )  # fmt: skip
+    stand = Stand(surface, T_table_obj, surroundings.tree()[0], config, geometry)
+    placed, reached = stand.placed(poses)
     free = reached == FREE
     counts = {
         "given": len(Ts),
@@ -138,23 +142,3 @@ def standing_labels(
         mesh, T_table_obj, surroundings, free.Ts_obj_grasp(), config, geometry
     )
     return free.rows(standing)
-
-
-def _placed(
-    surface: RaySurface,
-    T_table_obj: Array,
-    surroundings: Surroundings,
-    Ts: Array,
-    widths_m: Array,
-    config: CandidateConfig,
-    geometry: Hand,
-) -> tuple[HandPoses, Rows]:
-    """Return the grasps in their first free stand, and how far each got (N,)."""
-    poses = HandPoses(
-        Ts_obj_grasp=Ts,
-        widths_m=widths_m,
-        openings_m=np.full(len(Ts), geometry.max_opening_m),
-        contact_depths_m=np.zeros(len(Ts)),
-    )
-    stand = Stand(surface, T_table_obj, surroundings.tree()[0], config, geometry)
-    return stand.placed(poses)
