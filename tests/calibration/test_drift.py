@@ -6,7 +6,7 @@ import pytest
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_calibration.pairs.drift import Drift, DriftConfig, estimate_drift
+from realsim_calibration.pairs.drift import Drift, estimate_drift
 
 SLIP = np.array([0.004, -0.006, 0.002, 0.003, -0.001, 0.002])
 
@@ -62,9 +62,9 @@ def test_a_slip_within_the_tolerance_holds() -> None:
     """What shifts the objects by a fifth of a millimetre is seen and is of no matter."""
     now = cameras(24, 1)
     claimed = now @ se3.exp([0, 0, 0, -2e-4, 0, 0])
-    found = estimate_drift(claimed, now, 0.45, DriftConfig(tolerance_mm=1.0))
+    found = estimate_drift(claimed, now, 0.45, tolerance_mm=1.0)
     assert not found.moved
-    assert estimate_drift(claimed, now, 0.45, DriftConfig(tolerance_mm=0.1)).moved
+    assert estimate_drift(claimed, now, 0.45, tolerance_mm=0.1).moved
 
 
 def test_a_short_scan_says_that_it_cannot_tell() -> None:

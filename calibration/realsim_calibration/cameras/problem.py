@@ -334,12 +334,7 @@ class RigModel(LinearModel):
         self.J, self.D = rows[:, :, :S], rows[:, :, S : S + 6]
         self.r = rows[:, :, -1] - (self.D @ state.errors[..., None])[..., 0]
         self.unit_sd = problem.unit_robot_sd(state, sigmas)
-        Q, R = np.linalg.qr(self.D, mode="complete")
-        turned = np.swapaxes(Q, 1, 2) @ np.concatenate([self.J, self.r[..., None]], -1)
-        self.robot, self.rest = turned[:, :6], turned[:, 6:]
-        self.turned_D = R[:, :6]
-        flat = self.rest.reshape(-1, S + 1)
-        self.rest_gram = flat.T @ flat
+        self._turn()
         self.prior, self.prior_log_det = problem.information, problem.prior_log_det
         self.offset = np.where(self.prior.any(0), problem.vector(state) - problem.center, 0.0)
         self.freedom = max(self.coordinates - int(problem.free.sum()), 1)

@@ -90,12 +90,7 @@ class LinearModel:
         # The residual as it would be without robot errors.
         self.r = rows[:, :, -1] - (self.D @ state.errors[..., None])[..., 0]
         self.unit_sd = problem.unit_robot_sd(state)
-        Q, R = np.linalg.qr(self.D, mode="complete")
-        turned = np.swapaxes(Q, 1, 2) @ np.concatenate([self.J, self.r[..., None]], -1)
-        self.robot, self.rest = turned[:, :6], turned[:, 6:]
-        self.turned_D = R[:, :6]
-        flat = self.rest.reshape(-1, SHARED + 1)
-        self.rest_gram = flat.T @ flat
+        self._turn()
         center, covariance = problem.prior()
         self.prior = np.zeros((SHARED, SHARED))
         self.prior[12:, 12:] = np.linalg.inv(covariance)
@@ -103,6 +98,15 @@ class LinearModel:
         self.offset = np.zeros(SHARED)
         self.offset[12:] = np.concatenate([state.camera, state.board]) - center
         self.freedom = max(self.coordinates - 12 - int(problem.free.sum()), 1)
+
+    def _turn(self) -> None:
+        """Turn every view's rows so that its robot error is in the first six of them alone."""
+        Q, R = np.linalg.qr(self.D, mode="complete")
+        turned = np.swapaxes(Q, 1, 2) @ np.concatenate([self.J, self.r[..., None]], -1)
+        self.robot, self.rest = turned[:, :6], turned[:, 6:]
+        self.turned_D = R[:, :6]
+        flat = self.rest.reshape(-1, self.shared + 1)
+        self.rest_gram = flat.T @ flat
 
     def _factors(self, ratio: Array) -> Array:
         """Return the Cholesky factors (views, 6, 6) of 1 + R S R^T."""

@@ -1,6 +1,6 @@
 """A folder of images and its poses, paired; what is doubtful about them is said."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -225,24 +225,22 @@ def _warnings(
     same_poses: Sequence[Sequence[str]],
     found: Pairing,
     not_measured: int,
-) -> tuple[str, ...]:
-    """Return the sentences for what is doubtful."""
-    said: list[str] = []
+) -> Iterator[str]:
+    """Yield the sentences for what is doubtful."""
     if same_images:
         groups = "; ".join(", ".join(g) for g in same_images[:6])
-        said.append(
+        yield (
             f"Images are there more than once, byte by byte ({groups}): at least one "
             "of each has the pose of another. Delete the copies with their poses."
         )
     if same_poses:
         groups = "; ".join(", ".join(g) for g in same_poses[:6])
-        said.append(
+        yield (
             f"Poses are there more than once, with the very same numbers ({groups}): a controller "
             "never repeats all digits. Was an old pose stored again?"
         )
     left = len(found.unpaired_images), len(found.unpaired_poses)
     if any(left):
-        said.append(f"Images without a pose: {left[0]}, poses without an image: {left[1]}.")
+        yield f"Images without a pose: {left[0]}, poses without an image: {left[1]}."
     if not_measured:
-        said.append(f"Images left out for a pose of NaN or infinite numbers: {not_measured}.")
-    return tuple(said)
+        yield f"Images left out for a pose of NaN or infinite numbers: {not_measured}."

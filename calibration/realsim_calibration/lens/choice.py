@@ -5,6 +5,7 @@ found from one half of its corners; the other half is predicted, and the other w
 errors always prefer the largest model; this does not.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -149,8 +150,8 @@ def held_out_errors(fit: LensFit, obs: Observations, folds: Int64) -> Array:
 
 def score_models(
     fits: dict[str, tuple[LensFit, tuple[tuple[str, str], ...]]], obs: Observations, folds: Int64
-) -> tuple[ModelScore, ...]:
-    """Return the table of models (given smallest first), with the chosen one marked.
+) -> Iterator[ModelScore]:
+    """Yield the rows of the table of models (given smallest first), the chosen one marked.
 
     Chosen is the smallest model whose error is within MARGIN_SE standard errors of the
     best's, or not worth the difference. Models are compared view by view, so what is common to
@@ -174,7 +175,6 @@ def score_models(
     usable = {n: e for n, e in errors.items() if np.isfinite(e).any() and not np.isinf(e).any()}
     logs = {n: np.log(np.maximum(e[np.isfinite(e)], TINY_PX2)) for n, e in usable.items()}
     best = min(logs, key=lambda n: float(logs[n].mean())) if logs else ""
-    scores: list[ModelScore] = []
     chosen = False
     for name, (fit, _) in fits.items():
         held_out, excess, se = (float("nan"),) * 3
@@ -184,14 +184,11 @@ def score_models(
             se = float(difference.std(ddof=1) / np.sqrt(len(difference)))
         pick = name in usable and not chosen and excess <= max(MARGIN_SE * se, WORTH)
         chosen = chosen or pick
-        scores.append(
-            ModelScore(
-                model=name,
-                terms=terms[name],
-                held_out_px=float(np.sqrt(held_out)),
-                excess=excess,
-                seen_px=float(np.sqrt(np.mean(np.sum(fit.residuals**2, -1)))),
-                chosen=pick,
-            )
+        yield ModelScore(
+            model=name,
+            terms=terms[name],
+            held_out_px=float(np.sqrt(held_out)),
+            excess=excess,
+            seen_px=float(np.sqrt(np.mean(np.sum(fit.residuals**2, -1)))),
+            chosen=pick,
         )
-    return tuple(scores)

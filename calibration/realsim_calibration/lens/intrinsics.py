@@ -216,7 +216,7 @@ def _choose_model(
     some = obs.only_views(keep)
     folds = fold_of_views(some, min(FOLDS, some.views))
     fits = {name: (c.fit.only_views(keep, obs), c.refused) for name, c in candidates.items()}
-    table = score_models(fits, some, folds)
+    table = tuple(score_models(fits, some, folds))
     return next((s.model for s in table if s.chosen), order[0]), table
 
 

@@ -24,18 +24,10 @@ STEPS = 4
 """Steps of the least squares: a slip is small, two are enough."""
 LOOSE = 0.1
 """Prior 1-sigma of slip and frame [rad, m]: holds what a short scan does not determine."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class DriftConfig:
-    """When a camera counts as moved."""
-
-    chance: float = 1e-3
-    """A camera that did not move is called moved with this probability at most."""
-    tolerance_mm: float = 1.0
-    """Moves that shift the objects in the camera by less are of no matter [mm]."""
-    min_views: int = 5
-    """Fewest refined views: two frames are 12 unknowns, a view has 6 numbers."""
+CHANCE = 1e-3
+"""A camera that did not move is called moved with this probability at most."""
+MIN_VIEWS = 5
+"""Fewest refined views: two frames are 12 unknowns, a view has 6 numbers."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -74,7 +66,7 @@ class Drift:
 
 
 def estimate_drift(
-    claimed: ArrayLike, refined: ArrayLike, distance_m: float, config: DriftConfig | None = None
+    claimed: ArrayLike, refined: ArrayLike, distance_m: float, tolerance_mm: float = 1.0
 ) -> Drift:
     """Return how far the camera moved in the hand.
 
@@ -82,18 +74,17 @@ def estimate_drift(
         claimed: (n, 4, 4) T_world_cam by robot and calibration [m].
         refined: (n, 4, 4) T_world_cam by the registered objects [m].
         distance_m: of the objects from the camera [m].
-        config: when it counts as moved.
+        tolerance_mm: moves that shift the objects in the camera by less are of no matter [mm].
 
     Raises:
         InputError: too few views.
     """
     from scipy.stats import f as fisher
 
-    config = config or DriftConfig()
     A, C = np.asarray(claimed, dtype=np.float64), np.asarray(refined, dtype=np.float64)
-    if len(A) != len(C) or len(A) < config.min_views:
+    if len(A) != len(C) or len(A) < MIN_VIEWS:
         raise InputError(
-            f"drift: {len(A)} claimed and {len(C)} refined cameras; at least {config.min_views} "
+            f"drift: {len(A)} claimed and {len(C)} refined cameras; at least {MIN_VIEWS} "
             "views with both are needed. Register a scene with more views (12 are advised)."
         )
     seen = se3.invert(C)
@@ -132,5 +123,5 @@ def estimate_drift(
     return Drift(
         twist=twist, covariance=covariance, shift_mm=shift_mm,
         sigma_mm=float(1e3 * np.sqrt(along @ spread @ along)), chance=chance,
-        moved=chance < config.chance and shift_mm > config.tolerance_mm, views=len(A),
+        moved=chance < CHANCE and shift_mm > tolerance_mm, views=len(A),
     )  # fmt: skip

@@ -21,7 +21,7 @@ A is 1 unless the report knows X better than the information says. Before any vi
 never increases it, and never lowers it below F.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -357,27 +357,23 @@ class _Planned:
         f = (r.intrinsics.fx + r.intrinsics.fy) / 2
         return r.robot_ratio * r.sigma_px / f * np.array([1.0] * 3 + [float(distance)] * 3)
 
-    def rate(self, state: _Knowledge, left: Mask) -> Sequence[NextView]:
-        """Return what each remaining pose would bring, in plan order."""
+    def rate(self, state: _Knowledge, left: Mask) -> Iterator[NextView]:
+        """Yield what each remaining pose would bring, in plan order."""
         where = np.flatnonzero(left)
         if not len(where):
-            return []
+            return
         none = np.zeros((1, SHARED, SHARED))
         covariances = state.covariances(np.concatenate([none, self.informations[where]]))
         rms = state.rms(covariances)
         _, logdet = np.linalg.slogdet(covariances)
-        rows: list[NextView] = []
         for k, C, after, volume in zip(where, covariances[1:], rms[1:], logdet[1:], strict=True):
             g, reason = self.geometry[k], self.reasons[k]
-            rows.append(
-                NextView(
-                    plan_index=int(k), T_base_ee=self.Ts[k], visible=not reason, reason=reason,
-                    visible_share=float(self.inside[k].mean()), distance_m=g.distance_m,
-                    tilt_deg=g.tilt_deg, roll_deg=g.roll_deg,
-                    sigma_mm=float(1e3 * np.sqrt(np.linalg.eigvalsh(C[3:, 3:])[-1])),
-                    sigma_deg=float(np.degrees(np.sqrt(np.linalg.eigvalsh(C[:3, :3])[-1]))),
-                    rms_mm=float(1e3 * after), gain=float(1 - after / rms[0]),
-                    gain_nats=float(logdet[0] - volume) / 2,
-                )
+            yield NextView(
+                plan_index=int(k), T_base_ee=self.Ts[k], visible=not reason, reason=reason,
+                visible_share=float(self.inside[k].mean()), distance_m=g.distance_m,
+                tilt_deg=g.tilt_deg, roll_deg=g.roll_deg,
+                sigma_mm=float(1e3 * np.sqrt(np.linalg.eigvalsh(C[3:, 3:])[-1])),
+                sigma_deg=float(np.degrees(np.sqrt(np.linalg.eigvalsh(C[:3, :3])[-1]))),
+                rms_mm=float(1e3 * after), gain=float(1 - after / rms[0]),
+                gain_nats=float(logdet[0] - volume) / 2,
             )  # fmt: skip
-        return rows

@@ -10,7 +10,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.store import SessionStore, load_hand_eye
 from realsim.store.results import HAND_EYE_FILE
-from realsim_calibration.pairs.drift import Drift, DriftConfig, estimate_drift
+from realsim_calibration.pairs.drift import Drift, estimate_drift
 
 CHECK_FILE = "calibration/check.json"
 """What the last check found."""
@@ -66,7 +66,7 @@ def run_check(source: Path, console: Console, tolerance_mm: float = 1.0) -> bool
         np.array([claimed[k] for k in views]).reshape(-1, 4, 4),
         np.array([cameras.refined[k] for k in views]).reshape(-1, 4, 4),
         float(np.median(away)) if away else 0.5,
-        DriftConfig(tolerance_mm=tolerance_mm),
+        tolerance_mm,
     )
     document = document_of(drift, tolerance_mm)
     store.write_json(CHECK_FILE, document)

@@ -153,28 +153,17 @@ def hold(
         ramp_s: time in which the loads grow [s].
         hold_s: time for which they then stand [s].
     """
-    parts = [
-        _hold(engine, config, hand, body, loads[rows], ramp_s, hold_s)
-        for rows in batches(len(loads), engine.pairs_per_world)
-    ]
-    return Held(
-        **{
-            name: np.concatenate([getattr(p, name) for p in parts])
-            for name in ("shift_m", "turn_rad", "creep_m", "creep_rad", "finger_n")
-        }
-    )
-
-
-def _hold(
-    engine: Engine,
-    config: SlipConfig,
-    hand: Hand,
-    body: SlipBody,
-    loads: Array,
-    ramp_s: float,
-    hold_s: float,
-) -> Held:
-    """Return the same of the pairs of one world."""
+    if len(loads) > engine.pairs_per_world:
+        parts = [
+            hold(engine, config, hand, body, loads[rows], ramp_s=ramp_s, hold_s=hold_s)
+            for rows in batches(len(loads), engine.pairs_per_world)
+        ]
+        return Held(
+            **{
+                name: np.concatenate([getattr(p, name) for p in parts])
+                for name in ("shift_m", "turn_rad", "creep_m", "creep_rad", "finger_n")
+            }
+        )
     n = len(loads)
     upright = np.tile(np.eye(4), (n, 1, 1))
     grips = Grips(
