@@ -117,18 +117,14 @@ def diagnose(
     )  # fmt: skip
     known = None if nominal is None else np.asarray(nominal, dtype=np.float64)[rows]
     found, tried = _search(part, known)
-    found = _with_rows(found, rows)
+    views = tuple(int(rows[k]) for k in found.views)
+    found = replace(found, rows=rows[found.rows], views=views)
     if copied is not None:
         if found.fault in ("none", "tool_offset", "base_turned"):
             found = replace(copied, fit=found.fit)
         else:
             found = replace(found, sentence=f"{found.sentence} Also: {copied.sentence}")
     return _diagnosis(p, found, tried)
-
-
-def _with_rows(h: Hypothesis, rows: Int64) -> Hypothesis:
-    """Return a hypothesis on a part of the views in rows of the whole."""
-    return replace(h, rows=rows[h.rows], views=tuple(int(rows[k]) for k in h.views))
 
 
 def _diagnosis(p: Poses, h: Hypothesis, tried: Sequence[Hypothesis]) -> Diagnosis:

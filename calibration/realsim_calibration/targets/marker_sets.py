@@ -93,17 +93,11 @@ def check_markers(target: Target) -> None:
             )
     elif isinstance(target, CharucoBoard):
         size = dictionary_size(target.dictionary)
-        need = charuco_marker_count(target)
+        # The corner square is black; only OpenCV's legacy pattern of even rows starts with white.
+        need = target.rows * target.columns // 2
         if need > size:
             raise InputError(
                 f"a ChArUco board of {target.columns} x {target.rows} squares needs {need} "
                 f"markers, but {target.dictionary} has {size}. Use fewer squares or a larger "
                 "dictionary."
             )
-
-
-def charuco_marker_count(target: CharucoBoard) -> int:
-    """Return the number of white squares of a ChArUco board, each of which holds a marker."""
-    squares = target.rows * target.columns
-    # The corner square is black; only OpenCV's legacy pattern of even rows starts with white.
-    return squares // 2

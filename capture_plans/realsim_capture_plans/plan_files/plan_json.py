@@ -25,7 +25,6 @@ from realsim_capture_plans.plan_files.evidence import (
 )
 from realsim_capture_plans.planning.record import (
     CapturePlan,
-    expected_poses,
     hash_of,
     plan_content,
     plan_of,
@@ -42,6 +41,8 @@ POSE_RAD = 1e-5
 """The same for orientations [rad]."""
 SAME_JOINT_RAD = 1e-9
 """Corners of the segments may differ from the content's joints by this [rad]."""
+EXPECTED = {"Ts_base_ee": "flange", "Ts_base_cam": "camera"}
+"""Poses (N, 4, 4) in base [m] that a file holds beside the joints, and whose they are."""
 
 
 def plan_to_json(plan: CapturePlan) -> dict[str, Any]:
@@ -52,7 +53,7 @@ def plan_to_json(plan: CapturePlan) -> dict[str, Any]:
         "schema_version": SCHEMA_VERSION,
         "sha256": hash_of(content),
         "content": content,
-        "expected": expected_poses(plan),
+        "expected": {name: getattr(plan, name).tolist() for name in EXPECTED},
         "segments": segments(plan),
     }
 
@@ -193,7 +194,7 @@ def _check_model(plan: CapturePlan, source: str) -> None:
 
 def _check_poses(plan: CapturePlan, expected: dict[str, Any], source: str) -> None:
     """Raise if the file's poses do not follow from its joints, with the likely cause."""
-    for name, what in (("Ts_base_ee", "flange"), ("Ts_base_cam", "camera")):
+    for name, what in EXPECTED.items():
         written = np.array(expected[name], dtype=np.float64)
         own: Array = getattr(plan, name)
         if written.shape != own.shape or not np.all(np.isfinite(written)):

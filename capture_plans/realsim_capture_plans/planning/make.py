@@ -41,9 +41,9 @@ from realsim_capture_plans.planning.viewpoints import (
     look_at_poses,
     on_one_elbow,
     plane_axes,
+    preferred,
     spread_rolls,
     thin_directions,
-    well_seen,
     with_turns,
 )
 
@@ -106,7 +106,7 @@ def hemisphere_plan(
         )
         dense = task.reach(poses, chosen[item], "more ways to the chosen views")
         both = on_one_elbow(one_side.joined(dense), chain, side)
-        return well_seen(both, seen_share(both.Ts_base_cam, task), config.seen_share)
+        return preferred(both, seen_share(both.Ts_base_cam, task) >= config.seen_share)
 
     def choose(ok: Ints) -> Ints:
         return ok[thin_directions(directions[ok], n, directions)]

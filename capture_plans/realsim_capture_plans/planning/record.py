@@ -244,11 +244,6 @@ def plan_content(plan: CapturePlan) -> dict[str, Any]:
     }
 
 
-def expected_poses(plan: CapturePlan) -> dict[str, Any]:
-    """Return the (N, 4, 4) poses of flange and nominal camera in base [m] as JSON values."""
-    return {"Ts_base_ee": plan.Ts_base_ee.tolist(), "Ts_base_cam": plan.Ts_base_cam.tolist()}
-
-
 def segments(plan: CapturePlan) -> list[dict[str, Any]]:
     """Return all that a controller needs for each move, so that it needs nothing else.
 

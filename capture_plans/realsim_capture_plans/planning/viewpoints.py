@@ -281,7 +281,7 @@ def on_one_elbow(found: Candidates, chain: DhChain, side: float) -> Candidates:
         chain: the arm.
         side: +1 or -1, the sign of `bend`.
     """
-    return _preferred(found, bend(chain, found.joints) * side > 0)
+    return preferred(found, bend(chain, found.joints) * side > 0)
 
 
 def better_elbow(found: Candidates, chain: DhChain) -> float:
@@ -291,18 +291,7 @@ def better_elbow(found: Candidates, chain: DhChain) -> float:
     return 1.0 if counts[0] >= counts[1] else -1.0
 
 
-def well_seen(found: Candidates, seen: Array, least: float) -> Candidates:
-    """Return the candidates whose seen share (M,) is enough, and all of items that have no such.
-
-    Args:
-        found: the candidates.
-        seen: (M,) share of the scene's volume inside each one's image.
-        least: share that is enough.
-    """
-    return _preferred(found, seen >= least)
-
-
-def _preferred(found: Candidates, good: Mask) -> Candidates:
+def preferred(found: Candidates, good: Mask) -> Candidates:
     """Return the good candidates (M,), and all of items that have no good one."""
     served = np.zeros(int(found.item.max(initial=0)) + 1, dtype=np.bool_)
     served[found.item[good]] = True

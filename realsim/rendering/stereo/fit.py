@@ -29,6 +29,8 @@ ROUNDS = 5
 """Times that noise and holes are fitted in turn: each changes the other a little."""
 NOISE_STEPS, HOLE_STEPS = 2, 7
 """Simulations per round for either."""
+SEED = 0
+"""Of the simulations; those of the result have the next one."""
 WELL = (50.0, 1e7)
 """Electrons at white that are tried: a phone's smallest pixel in the dark, and no noise."""
 STRIPE_NOISE = (1e-4, 2.0)
@@ -104,8 +106,6 @@ def fit_stereo(
     *,
     unit_m: float | None = None,
     names: Sequence[str] | None = None,
-    start: StereoConfig | None = None,
-    seed: int = 0,
     tick: Callable[[int, int], None] | None = None,
 ) -> FittedStereo:
     """Return the stereo simulator whose planes are as noisy and torn as the measured ones.
@@ -116,8 +116,6 @@ def fit_stereo(
         profile_: the kind of camera.
         unit_m: metres per count of the depth files; None = the profile's.
         names: of the frames, for messages.
-        start: what is kept where the frames say nothing; None = the defaults.
-        seed: of the simulations.
         tick: called with (done, total).
 
     Raises:
@@ -137,14 +135,13 @@ def fit_stereo(
         twins.append(plane_twin(plane, intrinsics, kind.baseline_m, names[k]))
         if tick:
             tick(k + 1, total)
-    search = _Search(_over_distances(twins), kind, kind.depth_unit_m if unit_m is None else unit_m,
-                     seed)  # fmt: skip
-    config = start or StereoConfig()
+    search = _Search(_over_distances(twins), kind, kind.depth_unit_m if unit_m is None else unit_m)
+    config = StereoConfig()
     for step in range(ROUNDS):
         config = search.holes_fitted(search.noise_fitted(config))
         if tick:
             tick(len(frames) + step + 1, total)
-    results = [t.simulated(config, kind, search.unit_m, seed + 1) for t in search.twins]
+    results = [t.simulated(config, kind, search.unit_m, SEED + 1) for t in search.twins]
     shown = tuple(
         TwinFigures(name=t.name, distance_m=t.distance_m, measured=t.measured, simulated=r[0])
         for t, r in zip(search.twins, results, strict=True)
@@ -162,11 +159,10 @@ class _Search:
     twins: list[PlaneTwin]
     profile: DepthProfile
     unit_m: float
-    seed: int
 
     def _tried(self, config: StereoConfig) -> list[PlaneFigures]:
         """Return the figures of every twin."""
-        return [t.simulated(config, self.profile, self.unit_m, self.seed)[0] for t in self.twins]
+        return [t.simulated(config, self.profile, self.unit_m, SEED)[0] for t in self.twins]
 
     def _holes(self, config: StereoConfig) -> float:
         """Return the mean share of holes over the twins."""

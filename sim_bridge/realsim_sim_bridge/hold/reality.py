@@ -330,7 +330,9 @@ def _wins(values: Array, held: Mask, groups: Names) -> tuple[Array, Array]:
     Returns:
         the counts (G, G), and of how many pairs (G, G).
     """
-    ranks, number = _ranks(values), np.unique(groups, return_inverse=True)[1]
+    # Infinite values share a rank, and NaN is the least.
+    ranks = rankdata(np.nan_to_num(values, nan=-np.inf, posinf=1e300, neginf=-1e300))
+    number = np.unique(groups, return_inverse=True)[1]
     kinds = int(number.max()) + 1
     wins = np.empty((kinds, kinds))
     for j in range(kinds):
@@ -348,11 +350,6 @@ def _aucs(wins: Array, pairs: Array, samples: Array) -> Array:
     """
     with np.errstate(invalid="ignore"):
         return np.sum(samples @ wins * samples, -1) / np.sum(samples @ pairs * samples, -1)
-
-
-def _ranks(values: Array) -> Array:
-    """Return ranks from 1; equal values share one, infinite ones too, and NaN is the least."""
-    return rankdata(np.nan_to_num(values, nan=-np.inf, posinf=1e300, neginf=-1e300))
 
 
 def _average_precision(values: Array, held: Mask) -> float:

@@ -73,18 +73,13 @@ def analytic_grasps(
         # Files of labels keep single precision: 0.4 comes back as 0.4.
         closure_friction=np.round(chosen.friction.astype(np.float64), 6)[rows],
         counts={
-            "from": label_name(task.labels_file),
+            "from": "computed" if task.labels_file is None else task.labels_file.name,
             "labels": len(labels.friction),
             "labels_standing": len(standing.friction),
             "labels_chosen": len(chosen.friction),
             "label_index": chosen.index[rows].tolist(),
         },
     )
-
-
-def label_name(file: Path | None) -> str:
-    """Return where labels come from, in a word."""
-    return "computed" if file is None else file.name
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
