@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -208,10 +208,10 @@ def draw_grasps(
     T_cam_obj: ArrayLike,
     grasps: GraspSet,
     indices: Sequence[int] | Int64 | None = None,
+    color_by: Literal["label", "instance"] = "label",
 ) -> Image:
     """Return the picture with grippers drawn far to near, nearer ones with wider lines.
 
-    Their colour is p_hold, of sets without it the score: red, yellow, green (grey = not known).
     Grippers of grasps whose p_hold is not sure are dashed.
 
     Args:
@@ -220,6 +220,8 @@ def draw_grasps(
         T_cam_obj: (4, 4) the grasps' object in camera [m].
         grasps: the grasps.
         indices: which of them; default all.
+        color_by: by p_hold, of sets without it by score, red, yellow, green (grey = not known), or
+            by instance.
     """
     out = rgb.copy()
     chosen = np.arange(len(grasps)) if indices is None else np.asarray(indices, dtype=np.int64)
@@ -230,7 +232,11 @@ def draw_grasps(
         g = int(chosen[k])
         if depth[k] <= 0:
             continue
-        color = score_color(float(labels[g]))
+        color = (
+            score_color(float(labels[g]))
+            if color_by == "label"
+            else instance_color(grasps.instance)
+        )
         # About 2.5 mm thick at its depth, within what reads well: 6 px in a picture 1280 px wide.
         thickest = int(np.clip(intrinsics.width // 213, 3, 6))
         width_px = int(np.clip(np.round(0.0025 * intrinsics.fx / depth[k]), 1, thickest))
