@@ -374,14 +374,8 @@ def common_sinking(
         plane: what they stand on; None = nothing to compare with.
         config: settings.
     """
-    nothing: dict[str, object] = {
-        "share_of_height": None,
-        "rest_mm": None,
-        "objects": 0,
-        "consistent": False,
-    }
     if plane is None or not any(use):
-        return nothing
+        return {"share_of_height": None, "rest_mm": None, "objects": 0, "consistent": False}
     T_table_world = se3.invert(plane.T_world_table)
     rows: list[tuple[float, float]] = []
     for body, T, counts in zip(bodies, poses, use, strict=True):

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.model import DepthSensorModel
+from refusals import refused
 
 CAMERA = CameraIntrinsics(width=160, height=120, fx=160, fy=160, cx=79.5, cy=59.5)
 WHITE = DepthSensorModel(
@@ -73,14 +73,10 @@ def test_a_profile_written_and_loaded_is_the_same(name: str, tmp_path: Path) -> 
 def test_a_wrong_file_is_named(text: str, said: str, tmp_path: Path) -> None:
     path = tmp_path / "sensor.json"
     path.write_text(text)
-    with pytest.raises(InputError, match=said):
-        DepthSensorModel.load(path)
+    refused(said, DepthSensorModel.load, path)
 
 
 def test_wrong_fields_and_profiles_are_named() -> None:
-    with pytest.raises(InputError, match="there is no depth camera 'd999'"):
-        DepthSensorModel.from_profile("d999")
-    with pytest.raises(InputError, match="has no 'noise'"):
-        DepthSensorModel.from_profile("d405", noise=1.0)
-    with pytest.raises(InputError, match="millimetres"):
-        DepthSensorModel(depth_unit_m=1.0)
+    refused("there is no depth camera 'd999'", DepthSensorModel.from_profile, "d999")
+    refused("has no 'noise'", DepthSensorModel.from_profile, "d405", noise=1.0)
+    refused("millimetres", DepthSensorModel, depth_unit_m=1.0)

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.edges import edges_of
 from realsim.rendering.depth_sensors.fit import FittedDepthModel, fit_depth_model
@@ -16,6 +15,7 @@ from realsim.rendering.depth_sensors.fit_pictures import fit_picture
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.plane import find_plane
 from realsim.rendering.depth_sensors.statistics import disparity_step, hole_share, local_noise
+from refusals import refused
 
 CAMERA = CameraIntrinsics(width=400, height=300, fx=380, fy=380, cx=199.5, cy=149.5)
 SOFT = DepthSensorModel.from_profile(
@@ -196,7 +196,5 @@ def test_mistakes_are_named() -> None:
         ([rough], "no plane|bent surface"),
         ([ball.astype(np.float32)], "bent surface|no plane"),
     ):
-        with pytest.raises(InputError, match=said):
-            fit_depth_model(frames, CAMERA, "d405")
-    with pytest.raises(InputError, match="1 frames and 2 names"):
-        fit_depth_model([good], CAMERA, "d405", names=["a", "b"])
+        refused(said, fit_depth_model, frames, CAMERA, "d405")
+    refused("1 frames and 2 names", fit_depth_model, [good], CAMERA, "d405", names=["a", "b"])

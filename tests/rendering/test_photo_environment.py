@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.photo import Lighting, LightSampling, PhotoRenderer, PlacedMesh
+from refusals import refused
 
 LENS = np.array([-0.25, 0.09, 0.0006, -0.0009, 0.0])
 WIDE = CameraIntrinsics(width=160, height=120, fx=110, fy=110, cx=79.2, cy=60.1, distortion=LENS)
@@ -263,7 +263,5 @@ def test_an_empty_scene_and_an_empty_view_show_the_sky() -> None:
 
 
 def test_ray_counts_out_of_range_are_named() -> None:
-    with pytest.raises(InputError, match="ambient rays"):
-        LightSampling(ambient_rays=-1)
-    with pytest.raises(InputError, match="edge samples"):
-        LightSampling(edge_samples=0)
+    refused("ambient rays", LightSampling, ambient_rays=-1)
+    refused("edge samples", LightSampling, edge_samples=0)

@@ -63,6 +63,14 @@ def join_views(views: Sequence[ViewPoints], noise: DepthNoise) -> AllPoints:
     )
 
 
+@njit(inline="always")
+def _square_gap(points: Array32, i: int, centers: Array, k: int) -> float:
+    """Return the square of the distance between a point and a centre."""
+    p, c = points[i], centers[k]
+    x, y, z = p[0] - c[0], p[1] - c[1], p[2] - c[2]
+    return x * x + y * y + z * z
+
+
 @njit
 def _sorted_in(
     points: Array32,
@@ -96,12 +104,7 @@ def _sorted_in(
         a, b, c = f * points[i, 0], f * points[i, 1], f * points[i, 2]
         out[i, 0], out[i, 1], out[i, 2] = move(C, a, b, c)
         for k in range(bodies):
-            x, y, z = (
-                out[i, 0] - centers[k, 0],
-                out[i, 1] - centers[k, 1],
-                out[i, 2] - centers[k, 2],
-            )
-            d = x * x + y * y + z * z
+            d = _square_gap(out, i, centers, k)
             if d < reach[k]:
                 begin[k + 1] += 1
             if d < margin[k]:
@@ -114,12 +117,7 @@ def _sorted_in(
         if not around[i]:
             continue
         for k in range(bodies):
-            x, y, z = (
-                out[i, 0] - centers[k, 0],
-                out[i, 1] - centers[k, 1],
-                out[i, 2] - centers[k, 2],
-            )
-            if x * x + y * y + z * z < reach[k]:
+            if _square_gap(out, i, centers, k) < reach[k]:
                 index[at[k]] = i
                 at[k] += 1
     return out, around, index, begin

@@ -31,23 +31,8 @@ WORDS: dict[str, tuple[str, ...]] = {
 UNUSED = ("ao", "occlusion", "ambientocclusion", "disp", "displacement", "height", "bump", "spec",
           "specular", "opacity", "mask", "translucency", "preview", "thumb")  # fmt: skip
 """Maps that packs hold and materials here have no use for."""
-SIZES = (
-    "1k",
-    "2k",
-    "4k",
-    "8k",
-    "16k",
-    "gl",
-    "dx",
-    "png",
-    "jpg",
-    "tiff",
-    "8bit",
-    "16bit",
-    "v1",
-    "01",
-    "1",
-)
+SIZES = ("1k", "2k", "4k", "8k", "16k", "gl", "dx", "png", "jpg", "tiff", "8bit", "16bit", "v1",
+         "01", "1")  # fmt: skip
 
 
 @dataclass(kw_only=True, slots=True)

@@ -25,6 +25,9 @@ LEAST_RANGE_MM = 0.3
 """They do not end below the noise of a depth camera, which would look like a shape error [mm]."""
 ROUND_MM = (0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 """Ends of the colour bar [mm]."""
+PERCENTS = (10, 20, 33, 50, 70, 80, 90, 95, 98, 100, 102, 105, 110, 125, 150, 200, 300, 500,
+            1000)  # fmt: skip
+"""Where an axis of scales may have ticks."""
 SAME_SCALE = 0.02
 """Candidates whose scale is within this share of the result's are the same solution."""
 
@@ -250,28 +253,7 @@ def _percent_ticks(ax: Any, percent: Array) -> None:
 
     span = max(float(np.abs(np.log(np.append(percent, 100) / 100)).max()), np.log(1.05))
     ax.set_xlim(100 * np.exp(-1.15 * span), 100 * np.exp(1.15 * span))
-    choices = (
-        10,
-        20,
-        33,
-        50,
-        70,
-        80,
-        90,
-        95,
-        98,
-        100,
-        102,
-        105,
-        110,
-        125,
-        150,
-        200,
-        300,
-        500,
-        1000,
-    )
-    inside = [c for c in choices if abs(np.log(c / 100)) <= 1.15 * span]
+    inside = [c for c in PERCENTS if abs(np.log(c / 100)) <= 1.15 * span]
     if span > np.log(1.4):
         inside = [c for c in inside if c not in (95, 98, 102, 105)]
     if span > np.log(2.5):

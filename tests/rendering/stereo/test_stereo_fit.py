@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from grey_planes import grey_plane
-from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.fit_pictures import stereo_fit_picture
 from realsim.rendering.depth_sensors.profiles import profile
 from realsim.rendering.stereo import FittedStereo, StereoCamera, StereoConfig, fit_stereo
+from refusals import refused
 
 CAMERA = CameraIntrinsics(width=420, height=280, fx=640, fy=640, cx=209.5, cy=139.5)
 
@@ -78,18 +78,13 @@ def test_a_fit_is_written_loaded_and_drawn(tmp_path: Path) -> None:
 
 def test_mistakes_are_named(tmp_path: Path) -> None:
     good = frame(StereoConfig(), "d405", 0.3, 0)
-    with pytest.raises(InputError, match="0 frames"):
-        fit_stereo([], CAMERA, "d405")
-    with pytest.raises(InputError, match="millimetres"):
-        fit_stereo([good * 1000], CAMERA, "d405")
-    with pytest.raises(InputError, match="the camera 420x280"):
-        fit_stereo([good[:200]], CAMERA, "d405")
+    refused("0 frames", fit_stereo, [], CAMERA, "d405")
+    refused("millimetres", fit_stereo, [good * 1000], CAMERA, "d405")
+    refused("the camera 420x280", fit_stereo, [good[:200]], CAMERA, "d405")
     other = tmp_path / "sensor.json"
     other.write_text(json.dumps({"format": "realsim depth sensor 1", "model": {}}))
-    with pytest.raises(InputError, match="--simulator stereo"):
-        StereoConfig.load(other)
+    refused("--simulator stereo", StereoConfig.load, other)
     document = replace(StereoConfig(), full_well=5.0).document()
     document["config"]["window_px"] = 6
     other.write_text(json.dumps(document))
-    with pytest.raises(InputError, match="window"):
-        StereoConfig.load(other)
+    refused("window", StereoConfig.load, other)
