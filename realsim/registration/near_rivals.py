@@ -118,21 +118,6 @@ def duel(
     return Duel(contrast=float(np.sign(t)) * CONTRAST_DECIDED * size, T_rival=fitted[1])
 
 
-def duels(
-    bodies: Sequence[Body],
-    poses: Sequence[Array],
-    rivals: Sequence[Array | None],
-    clouds: Sequence[Cloud],
-    misfits_m: Sequence[float],
-    config: RivalConfig,
-) -> list[Duel | None]:
-    """Return the duel of every object that has a rival; arguments as of `duel`, per object."""
-    return [
-        None if R is None else duel(b, T, R, c, float(m), config)
-        for b, T, R, c, m in zip(bodies, poses, rivals, clouds, misfits_m, strict=True)
-    ]
-
-
 def duels_by_print(
     bodies: Sequence[Body],
     rivals: Sequence[Array | None],

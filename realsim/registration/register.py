@@ -8,7 +8,7 @@
 5. Covariance, checks, probability, verdict; the same for the paper's way, ICP in one view.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -43,7 +43,7 @@ from realsim.registration.intake import check_odometry, take_in, without_fixed
 from realsim.registration.judge import Defect, Poses, judge_objects
 from realsim.registration.judging.verdict import CONTRAST_DECIDED
 from realsim.registration.many_views import ManyViews, comparer_on, register_many
-from realsim.registration.near_rivals import Duel, duels, duels_by_print
+from realsim.registration.near_rivals import Duel, duel, duels_by_print
 from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.registration.registered import (
     Registration,
@@ -275,12 +275,20 @@ def _is_lost(fought: Duel | None) -> bool:
 
 def _duels(found: FoundObjects, many: ManyViews, config: RegistrationConfig) -> list[Duel | None]:
     """Return how every pose compares with its near-symmetric rival, cameras refined."""
-    rivals = [
-        None if R is None else T @ se3.invert(b.T_start) @ R
-        for b, T, R in zip(found.bodies, many.refined.poses, found.rivals, strict=True)
+    poses, misfits = many.refined.poses, many.refined.misfit_m[:-1]
+    rivals = _moved_rivals(found, poses)
+    return [
+        None if R is None else duel(b, T, R, cloud, float(m), config.rivals)
+        for b, T, R, cloud, m in zip(found.bodies, poses, rivals, many.clouds, misfits, strict=True)
     ]
-    poses, misfits = list(many.refined.poses), list(many.refined.misfit_m[:-1])
-    return duels(found.bodies, poses, rivals, many.clouds, misfits, config.rivals)
+
+
+def _moved_rivals(found: FoundObjects, poses: Iterable[Array]) -> list[Array | None]:
+    """Return the rival of every object that has one, moved as the object was."""
+    return [
+        None if R is None else T @ se3.invert(b.T_start) @ R
+        for b, T, R in zip(found.bodies, poses, found.rivals, strict=True)
+    ]
 
 
 def _print_duels(
@@ -291,10 +299,7 @@ def _print_duels(
         _contrast(c, d, k) for c, d, k in zip(found.contrasts, fought, many.kept, strict=True)
     ]
     bodies = [moved_body(b, T) for b, T in zip(found.bodies, many.poses, strict=True)]
-    rivals = [
-        None if R is None else T @ se3.invert(b.T_start) @ R
-        for b, T, R in zip(found.bodies, many.poses, found.rivals, strict=True)
-    ]
+    rivals = _moved_rivals(found, many.poses)
     middle = np.mean([b.center(b.T_start) for b in bodies], axis=0)
     some = tuple(spread_frames(many.frames, middle, task.config.rivals.print_views))
     intake = replace(task.intake, frames=some, plane=many.plane)

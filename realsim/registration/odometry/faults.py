@@ -8,7 +8,7 @@ fitted robustly to the pairs they touch, the best one is taken, its effect remov
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -274,10 +274,12 @@ def _mount_or_world(
     Pairs after the change tell: they do not feel a moved world, but a mount that slipped.
     """
     later = np.flatnonzero([e.second >= fault.place for e in edges])
+    # Pairs that feel nothing of the fault may take part.
+    lenient = replace(config, least_gain=-np.inf, explained_share=0.0)
     costs: dict[str, tuple[float, PoseFault]] = {}
     kinds: tuple[Kind, ...] = ("mount", "world")
     for kind in kinds:
-        found = _fit_fault(kind, fault.place, Ts, edges, r, later, noise, _lenient(config))
+        found = _fit_fault(kind, fault.place, Ts, edges, r, later, noise, lenient)
         if found is not None:
             gain, twist = found
             costs[kind] = (gain, _size_of(kind, fault.place, twist, aim))
@@ -290,13 +292,6 @@ def _mount_or_world(
         kind=chosen.kind, place=chosen.place, twist=chosen.twist, mm=chosen.mm, deg=chosen.deg,
         alternative=alike,
     )  # fmt: skip
-
-
-def _lenient(config: FaultConfig) -> FaultConfig:
-    """Return the configuration with which pairs that feel nothing of a fault may take part."""
-    from dataclasses import replace
-
-    return replace(config, least_gain=-np.inf, explained_share=0.0)
 
 
 def _size_of(kind: Kind | str, k: int, twist: Array, aim: Array) -> PoseFault:

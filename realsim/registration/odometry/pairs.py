@@ -60,14 +60,6 @@ class ViewCloud:
     """(S, 3) coarser ones, to be aligned [m]."""
 
 
-def without_plane(
-    points_cam: Array, T_world_cam: Array, plane: SupportPlane, height_m: float
-) -> Array:
-    """Return the points (M, 3), in camera axes, more than `height_m` above the plane."""
-    T_table_cam = se3.invert(plane.T_world_table) @ T_world_cam
-    return points_cam[points_cam @ T_table_cam[2, :3] + T_table_cam[2, 3] > height_m]
-
-
 def view_cloud(
     view: ViewPoints, plane: SupportPlane | None, config: AboveTableConfig, rng: np.random.Generator
 ) -> ViewCloud:
@@ -82,7 +74,7 @@ def view_cloud(
     """
     p = view.points.astype(np.float64)
     p = p[p[:, 2] < config.max_range_m]
-    found = None
+    found = T_table_cam = None
     if plane is not None:
         T_table_cam = se3.invert(plane.T_world_table) @ view.T_world_cam
         found = _refine_table(p, T_table_cam[2, :3], -float(T_table_cam[2, 3]), config)
@@ -90,8 +82,8 @@ def view_cloud(
         found = _largest(p, config, rng)
     if found is None:
         things = np.zeros((0, 3))
-        if plane is not None:
-            things = without_plane(p, view.T_world_cam, plane, config.height_m)
+        if T_table_cam is not None:
+            things = p[p @ T_table_cam[2, :3] + T_table_cam[2, 3] > config.height_m]
         normal, offset = None, 0.0
     else:
         normal, offset = found

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from realsim.arrays import Array, Int64, Mask
+from realsim.arrays import Array, Mask
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.normal_equations import (
@@ -351,7 +351,8 @@ def _apart(
     largest = np.zeros_like(A)
     # Cameras that stand still are no neighbours of any, and each has its own prior.
     hand = np.flatnonzero(task.hand)
-    for order in (hand[o] for o in _orders(task.claimed[hand])):
+    # By how high they look down, and by when they were taken.
+    for order in (hand[np.argsort(-task.claimed[hand, 2, 2])], hand):
         found = []
         for g in np.array_split(order, min(GROUPS, len(order))):
             part = assemble(
@@ -383,8 +384,3 @@ def _smooth_share(task: _Task, state: State, sigmas: Array) -> float:
     np.fill_diagonal(gaps, np.inf)
     x = state.views[task.hand, :6] / np.repeat(sigmas[:2], 3)
     return float(np.clip(np.sum(x * x[gaps.argmin(axis=1)]) / max(np.sum(x * x), 1e-12), 0.0, 1.0))
-
-
-def _orders(cameras: Array) -> tuple[Int64, Int64]:
-    """Return the views (V,) by how high they look down, and by when they were taken."""
-    return np.argsort(-cameras[:, 2, 2]), np.arange(len(cameras))
