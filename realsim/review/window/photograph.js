@@ -222,6 +222,7 @@
   const go = (k) => {
     if (!strip) return;
     isLed = false;
+    if (root.querySelector(".rs-note").classList.contains("rs-bad")) tell(""); // of the view before
     at = (k + strip.views.length) % strip.views.length;
     const r = row();
     if (!isThree && spot && spot.has(r.view)) middle = spot.get(r.view);
