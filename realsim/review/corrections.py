@@ -62,11 +62,8 @@ def check_is_current(scene: Scene, placed: ObjectPose) -> Callable[[ReviewState]
 
 def decision_on(placed: ObjectPose, state: ReviewState) -> Entry | None:
     """Return the last standing accept or reject of this object where it stands, or None."""
-    found = None
-    for entry in state.of(placed.instance):
-        if entry.action in DECIDED and _is_about(entry, placed):
-            found = entry
-    return found
+    latest = reversed(state.of(placed.instance))
+    return next((e for e in latest if e.action in DECIDED and _is_about(e, placed)), None)
 
 
 def pending(scene: Scene, state: ReviewState) -> tuple[Entry, ...]:
@@ -74,11 +71,8 @@ def pending(scene: Scene, state: ReviewState) -> tuple[Entry, ...]:
     lines: list[Entry] = [e for o in scene.objects for e in _chain(o, state)]
     lines += state.excluded_views().values()
     lines += state.marks().values()
-    for placed in corrected_scene(scene, state).objects:
-        decision = decision_on(placed, state)
-        if decision is not None and decision.action == "reject":
-            lines.append(decision)
-    return tuple(lines)
+    decided = (decision_on(o, state) for o in corrected_scene(scene, state).objects)
+    return (*lines, *(d for d in decided if d is not None and d.action == "reject"))
 
 
 def _chain(placed: ObjectPose, state: ReviewState) -> list[Entry]:
@@ -109,9 +103,7 @@ def _corrected(placed: ObjectPose, state: ReviewState) -> ObjectPose:
     step = se3.invert(placed.T_world_obj) @ last.pose
     mm = 1e3 * float(np.linalg.norm(last.pose[:3, 3] - placed.T_world_obj[:3, 3]))
     turned = float(np.rad2deg(se3.angle(step[:3, :3])))
-    words = f"moved by {last.reviewer}"
-    if last.how:
-        words += f" ({last.how})"
+    words = f"moved by {last.reviewer}" + (f" ({last.how})" if last.how else "")
     words += f": {mm:.2g} mm, {turned:.2g} deg from where it was registered"
     now = _after(placed, last)
     obj_id = next((e.obj_id for e in reversed(chain) if e.obj_id is not None), placed.obj_id)
@@ -124,9 +116,8 @@ def _judged(placed: ObjectPose, state: ReviewState) -> ObjectPose:
     decision = decision_on(placed, state)
     if decision is None:
         return placed
-    reason = f"{decision.action}ed by {decision.reviewer}"
-    if decision.comment:
-        reason += f": {decision.comment}"
+    why = f": {decision.comment}" if decision.comment else ""
+    reason = f"{decision.action}ed by {decision.reviewer}{why}"
     return replace(placed, verdict=DECIDED[decision.action], reasons=(*placed.reasons, reason))
 
 

@@ -118,12 +118,11 @@ class ReviewedSession:
             SessionGone: lines that were read are gone.
             InputError: the journal cannot be read.
         """
-        with self._lock:
-            try:
-                state = self._journal.read()
-            except OSError as error:
-                raise InputError(f"the journal cannot be read: {disk_words(error)}.") from error
-            return self._made_of(state)
+        try:
+            state = self._journal.read()
+        except OSError as error:
+            raise InputError(f"the journal cannot be read: {disk_words(error)}.") from error
+        return self._made_of(state)
 
     def _made_of(self, state: ReviewState) -> Standing:
         """Return what this state makes of the registered scene; made once."""

@@ -104,9 +104,7 @@ def worst_first(rows: Sequence[ObjectRow]) -> list[ObjectRow]:
 
 def of_kind(rows: Sequence[ObjectRow], which: Which) -> list[ObjectRow]:
     """Return all objects, those that wait for a person, or those that a person judged."""
-    if which == "all":
-        return list(rows)
-    return [r for r in rows if r.is_decided == (which == "decided")]
+    return [r for r in rows if which == "all" or r.is_decided == (which == "decided")]
 
 
 def next_undecided(

@@ -63,12 +63,7 @@ def symmetry_of(text: str, mesh: Mesh) -> tuple[Array, Axes]:
             )
         turns.append(turn(axis, 2 * np.pi / order))
     rotations = closed([np.eye(3), *turns])
-    return np.array([_about(R, middle) for R in rotations]), tuple(axes)
-
-
-def _about(R: Array, middle: Array) -> Array:
-    """Return the turn (4, 4) about a point that stays."""
-    return se3.from_rt(R, middle - R @ middle)
+    return np.array([se3.from_rt(R, middle - R @ middle) for R in rotations]), tuple(axes)
 
 
 def marked_models(models: Mapping[int, ObjectModel], state: ReviewState) -> dict[int, ObjectModel]:

@@ -9,6 +9,7 @@ the axis, where that turn moves nothing.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -138,7 +139,21 @@ def unit_sphere(divisions: int = 2) -> Mesh:
     """
     if not 0 <= divisions <= 5:
         raise InputError(f"a sphere of {divisions} divisions; 0 to 5 is accepted.")
-    from trimesh.creation import icosphere
-
-    sphere = icosphere(subdivisions=divisions)
-    return Mesh(vertices=np.array(sphere.vertices), faces=np.array(sphere.faces, np.int32))
+    g = (1 + np.sqrt(5)) / 2
+    v = np.array([[0, s, t * g] for s in (-1, 1) for t in (-1, 1)], dtype=np.float64)
+    v = np.concatenate([v, np.roll(v, 1, axis=1), np.roll(v, 2, axis=1)])
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    # Faces are the triples of corners an edge apart, turned outwards.
+    near = v @ v.T > 0.4
+    f = np.array([t for t in combinations(range(12), 3) if near[np.ix_(t, t)].all()])
+    inward = np.linalg.det(v[f]) < 0
+    f[inward] = f[inward, ::-1]
+    for _ in range(divisions):
+        edges = np.sort(f[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        unique, index = np.unique(edges, axis=0, return_inverse=True)
+        (a, b, c), (ab, bc, ca) = f.T, (len(v) + index.reshape(-1, 3)).T
+        rows = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+        f = np.concatenate([np.stack(r, axis=1) for r in rows])
+        v = np.concatenate([v, v[unique].sum(axis=1)])
+        v /= np.linalg.norm(v, axis=1, keepdims=True)
+    return Mesh(vertices=v, faces=f.astype(np.int32))
