@@ -13,6 +13,7 @@ from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_calibration import calibrate
+from refusals import refused
 from typed_commands import invoked
 
 BOARD = "chessboard:7x6,square=20mm"
@@ -100,8 +101,7 @@ def test_a_folder_is_its_own_from_the_first_note_on(lab):
     """A run that ends after the search goes on there; one of other images does not."""
     (lab.parent / "out/calibrated_of.json").unlink()
     (lab.parent / "camera.json").write_text("{}")
-    with pytest.raises(InputError, match=r"camera\.json"):
-        read(lab, intrinsics=lab.parent / "camera.json")
+    refused(r"camera\.json", read, lab, intrinsics=lab.parent / "camera.json")
     require_free_results(lab.parent / "out", lab)
     (lab.parent / "more").mkdir()
     with pytest.raises(
@@ -136,14 +136,12 @@ def test_too_few_views_are_named_with_how_many_are_needed(lab, views):
     for path in sorted(lab.glob("*.png"))[views:]:
         path.unlink()
     write_matrices(lab / "poses.json", hands[:views])
-    with pytest.raises(InputError, match=f"{views} of {views} images.*3 views at least, and 24"):
-        read(lab)
+    refused(f"{views} of {views} images.*3 views at least, and 24", read, lab)
 
 
 def test_fewer_poses_than_images_are_named_with_what_to_do(lab):
     write_matrices(lab / "poses.json", pictures()[1][:7])
-    with pytest.raises(InputError, match=r"10 images and 7 poses.*image's name beside each"):
-        read(lab)
+    refused(r"10 images and 7 poses.*image's name beside each", read, lab)
 
 
 @pytest.mark.parametrize("what", ["corners", "axes"])

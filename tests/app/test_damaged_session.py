@@ -20,6 +20,7 @@ from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore, load_scene
 from realsim.store.arrays_on_disk import is_whole, write_arrays
 from realsim.store.lock import only_run_in
+from refusals import refused
 
 CAMERA = CameraIntrinsics(width=240, height=180, fx=220.0, fy=220.0, cx=120.0, cy=90.0)
 QUIET = Console(quiet=True)
@@ -78,8 +79,7 @@ def test_a_changed_capture_is_refused_even_after_it_was_registered(
         store.path("rgb/000003.png").unlink()
     again = SessionStore.open(store.folder)
     for stage in (register_session, annotate_session):
-        with pytest.raises(InputError, match="not as it was captured"):
-            stage(again, QUIET)
+        refused("not as it was captured", stage, again, QUIET)
 
 
 def test_a_damaged_note_is_no_note(registered: Path, tmp_path: Path) -> None:
@@ -114,8 +114,7 @@ def test_starts_in_millimetres_are_found_out(store: SessionStore) -> None:
     T[:3, 3] = [300.0, 20.0, 52.0]
     wrong = ObjectPose(obj_id=start.obj_id, instance=0, T_world_obj=T)
     stages.save_starts(store, [wrong], "test")
-    with pytest.raises(UnitError, match="millimetres"):
-        register_session(store, QUIET)
+    refused("millimetres", register_session, store, QUIET, error=UnitError)
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from realsim.geometry import se3
 from realsim.records import CaptureSession
 from realsim.robots.arm import find_arm
 from realsim.store import SessionStore
+from refusals import refused
 from sources_in_memory import CAMERA, Recording, frame_of, ten
 from typed_commands import realsim
 from written_bags import recorded, stamp
@@ -58,8 +59,7 @@ def test_another_source_is_refused_until_it_is_said(tmp_path):
     import_session(Recording(ten()), folder, QUIET)
     others = [Recording(ten(), content="b"), Recording(ten(), camera=replace(CAMERA, fx=36.0))]
     for other in others:
-        with pytest.raises(InputError, match=r"another source.*--overwrite"):
-            import_session(other, folder, QUIET)
+        refused(r"another source.*--overwrite", import_session, other, folder, QUIET)
         check_equal(folder, ten())
     import_session(Recording(ten()[:4], content="b"), folder, QUIET, overwrite=True)
     check_equal(folder, ten()[:4])
@@ -196,8 +196,7 @@ def test_poses_are_read_as_said_or_not_at_all(tmp_path):
     rows = [f"{k} {300 + 10 * k} 20 400 0.1 {0.2 * k} 0.3" for k in range(6)]
     (folder / "poses.txt").write_text("\n".join(rows) + "\n")
     request = ImportRequest(source=folder, depth_unit=0.001, poses=folder / "poses.txt")
-    with pytest.raises(InputError, match=r"not clear.*--reading"):
-        open_source(request, QUIET)
+    refused(r"not clear.*--reading", open_source, request, QUIET)
     with pytest.raises(UnitError):
         open_source(replace(request, reading="rotvec,m"), QUIET)
     source = open_source(replace(request, reading="rotvec,rad,mm"), QUIET)
@@ -213,14 +212,12 @@ def test_the_camera_is_found_named_or_asked_for(tmp_path):
     assert open_source(request, QUIET).intrinsics.fx == 35
     bop = {"fx": 35.5, "fy": 35, "cx": 20, "cy": 15, "depth_scale": 1.0, "width": 40, "height": 30}
     (folder / "camera.json").write_text(json.dumps(bop))
-    with pytest.raises(InputError, match=r"several cameras: K\.txt, camera\.json"):
-        open_source(request, QUIET)
+    refused(r"several cameras: K\.txt, camera\.json", open_source, request, QUIET)
     (folder / "K.txt").unlink()
     source = open_source(replace(request, depth_unit=None), QUIET)
     assert source.depth_unit_m == 0.001 and source.intrinsics.fx == 35.5  # as its depth_scale says
     (folder / "camera.json").unlink()
-    with pytest.raises(InputError, match=r"camera of the images \(40x30 px\)"):
-        open_source(request, QUIET)
+    refused(r"camera of the images \(40x30 px\)", open_source, request, QUIET)
     other = tmp_path / "other.txt"
     other.write_text("700 0 320\n0 700 240\n0 0 1\n")
     with pytest.raises(InputError, match="another image size"):

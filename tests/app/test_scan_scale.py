@@ -33,6 +33,7 @@ from realsim.records import CaptureSession, View
 from realsim.scanning.scale.files import ScaleRecord, installed_versions
 from realsim.scanning.scale.measured import length_of, parse_measurement
 from realsim.store import SessionStore
+from refusals import refused
 from scale_fits import UNIT_M, fit_of, known_scan
 
 CONSOLE = Console(quiet=True)
@@ -90,8 +91,7 @@ def record_of(known, fit, inputs) -> ScaleRecord:
 )
 def test_views_that_do_not_do_are_named(known, tmp_path, kept, wanted, said):
     store = session_of(known, tmp_path / "s", **kept)
-    with pytest.raises(InputError, match=said):
-        usable_views(store, wanted)
+    refused(said, usable_views, store, wanted)
     if not kept:
         assert [v.index for v in usable_views(store, (5, 1, 3))] == [1, 3, 5]
         assert len(usable_views(store, ())) == 6
@@ -274,8 +274,7 @@ def test_the_scale_by_a_caliper_alone_is_unchecked(known, mesh_file, tmp_path, c
     (tmp_path / "out/model.ply").unlink()  # as if it had been ended before
     with pytest.raises(SystemExit):
         scale.main(words, standalone_mode=False)
-    with pytest.raises(InputError, match="--overwrite"):
-        scale.main(words, standalone_mode=False)
+    refused("--overwrite", scale.main, words, standalone_mode=False)
     said = capsys.readouterr().out
     assert said.startswith("UNCHECKED: mug") and "model.ply in mm" in said
     assert "--library models --accept-doubtful" in said

@@ -15,6 +15,7 @@ import pytest
 from realsim.errors import InputError
 from realsim.untrusted import archives
 from realsim.untrusted.archives import Member, extract, members
+from refusals import refused
 
 FILES = {"train/000001/scene_gt.json": b"{}", "a" * 140 + ".bin": bytes(range(256)) * 9, "x": b""}
 
@@ -61,8 +62,7 @@ def test_what_was_packed_is_unpacked(tmp_path: Path, kind: str) -> None:
     assert extract(path, out, most_bytes=1e6) == tuple(out / name for name in FILES)
     assert {name: (out / name).read_bytes() for name in FILES} == FILES
     assert (out / "folder").is_dir()
-    with pytest.raises(InputError, match="holds something"):
-        extract(path, out, most_bytes=1e6)
+    refused("holds something", extract, path, out, most_bytes=1e6)
 
 
 @pytest.mark.parametrize("kind", ["zip", "tar", "tar.gz"])
@@ -103,8 +103,7 @@ def test_names_that_lead_out_are_refused(tmp_path: Path, name: str, kind: str) -
     }[kind]
     path = make()
     before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(InputError, match=r"a\.(zip|tar)"):
-        extract(path, inner / "out", most_bytes=1e6)
+    refused(r"a\.(zip|tar)", extract, path, inner / "out", most_bytes=1e6)
     with pytest.raises(InputError):
         members(path)
     assert sorted(tmp_path.rglob("*")) == before
@@ -115,14 +114,12 @@ def test_names_that_lead_out_are_refused(tmp_path: Path, name: str, kind: str) -
 )
 def test_links_and_devices_in_tar_are_refused(tmp_path: Path, kind: bytes) -> None:
     path = _tar(tmp_path / "a.tar", (_info("out", kind=kind, link="/etc"), b""))
-    with pytest.raises(InputError, match="a link, a device"):
-        extract(path, tmp_path / "out", most_bytes=1e6)
+    refused("a link, a device", extract, path, tmp_path / "out", most_bytes=1e6)
 
 
 def test_links_in_zip_are_refused(tmp_path: Path) -> None:
     path = _zip(tmp_path / "a.zip", {"out": b"/etc"}, mode=stat.S_IFLNK | 0o777)
-    with pytest.raises(InputError, match="a link"):
-        extract(path, tmp_path / "out", most_bytes=1e6)
+    refused("a link", extract, path, tmp_path / "out", most_bytes=1e6)
 
 
 def test_files_with_holes_are_refused(tmp_path: Path) -> None:
@@ -132,8 +129,7 @@ def test_files_with_holes_are_refused(tmp_path: Path) -> None:
                         "GNU.sparse.name": "x", "GNU.sparse.realsize": str(10**13)}  # fmt: skip
     data = b"1\n0\n512\n".ljust(512, b"\0")
     _tar(path, (info, data))
-    with pytest.raises(InputError, match=r"a\.tar"):
-        extract(path, tmp_path / "out", most_bytes=1e6)
+    refused(r"a\.tar", extract, path, tmp_path / "out", most_bytes=1e6)
 
 
 @pytest.mark.parametrize("kind", ["zip", "tar.gz"])
@@ -145,8 +141,7 @@ def test_what_unfolds_a_thousandfold_is_refused(tmp_path: Path, kind: str) -> No
     else:
         _tar(path, (_info("x", len(zeros)), zeros), mode="w:gz")
     assert path.stat().st_size < 100_000
-    with pytest.raises(InputError, match="more than is allowed"):
-        extract(path, tmp_path / "out", most_bytes=1e6)
+    refused("more than is allowed", extract, path, tmp_path / "out", most_bytes=1e6)
     assert not (tmp_path / "out").exists()
 
 
@@ -162,8 +157,7 @@ def test_a_bomb_is_refused_by_its_size_whatever_room_there_is(
         monkeypatch.setattr(archives, "_written", lambda *_: pytest.fail("a byte was unpacked"))
     else:
         _tar(path, (_info("x", len(zeros)), zeros), mode="w:gz")
-    with pytest.raises(InputError, match="more than is allowed"):
-        extract(path, tmp_path / "out", most_bytes=1e12)
+    refused("more than is allowed", extract, path, tmp_path / "out", most_bytes=1e12)
     assert not (tmp_path / "out").exists()
 
 
@@ -173,8 +167,7 @@ def test_a_header_that_claims_gigabytes_is_refused(tmp_path: Path, kind: bytes) 
     with gzip.open(path, "wb") as file:
         file.write(_info("x", 8 << 30, kind).tobuf(tarfile.GNU_FORMAT))
         file.write(bytes(4 << 20))
-    with pytest.raises(InputError, match="claims 8589934592 bytes"):
-        members(path)
+    refused("claims 8589934592 bytes", members, path)
 
 
 def test_a_zip_whose_sizes_lie_is_refused(tmp_path: Path) -> None:
@@ -183,8 +176,7 @@ def test_a_zip_whose_sizes_lie_is_refused(tmp_path: Path) -> None:
     raw = path.read_bytes()
     for claim in (999, 1001, 2**31):
         path.write_bytes(raw.replace(struct.pack("<I", 1000), struct.pack("<I", claim)))
-        with pytest.raises(InputError, match=r"a\.zip"):
-            extract(path, tmp_path / "out", most_bytes=1e6)
+        refused(r"a\.zip", extract, path, tmp_path / "out", most_bytes=1e6)
 
 
 def test_a_table_of_contents_of_gigabytes_is_refused(tmp_path: Path) -> None:
@@ -193,12 +185,10 @@ def test_a_table_of_contents_of_gigabytes_is_refused(tmp_path: Path) -> None:
     at = raw.rfind(b"PK\x05\x06")
     raw[at + 12 : at + 16] = struct.pack("<I", 3_000_000_000)
     path.write_bytes(raw)
-    with pytest.raises(InputError, match="table of contents"):
-        members(path)
+    refused("table of contents", members, path)
 
 
 @pytest.mark.parametrize("data", [b"", b"PK", b"\x1f\x8b", b"hello" * 100, bytes(10_000)])
 def test_what_is_no_archive_is_refused(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "a.zip").write_bytes(data)
-    with pytest.raises(InputError, match=r"a\.zip"):
-        members(tmp_path / "a.zip")
+    refused(r"a\.zip", members, tmp_path / "a.zip")

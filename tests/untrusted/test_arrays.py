@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from realsim.errors import InputError
 from realsim.untrusted.arrays import read_npy, read_npz
+from refusals import refused
 
 NUMBERS = st.sampled_from(
     ["?", "i1", "u1", ">i2", "u2", "i4", ">u4", "i8", "u8", "f2", "f4", ">f8"]
@@ -74,33 +74,28 @@ def test_claims_of_a_header_are_refused_before_anything_is_allocated(
     path.write_bytes(CLAIMS[claim])
     tracemalloc.start()
     try:
-        with pytest.raises(InputError, match=r"a\.npy"):
-            read_npy(path)
+        refused(r"a\.npy", read_npy, path)
         assert tracemalloc.get_traced_memory()[1] < 20e6
     finally:
         tracemalloc.stop()
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("x.npy", CLAIMS[claim])
-    with pytest.raises(InputError, match=r"a\.npz"):
-        read_npz(tmp_path / "a.npz")
+    refused(r"a\.npz", read_npz, tmp_path / "a.npz")
 
 
 def test_only_the_named_arrays_are_unpacked_and_a_missing_one_is_told(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     np.savez(path, good=np.arange(3), bad=np.array([{}], dtype=object))
     assert list(read_npz(path, ["good"])) == ["good"]
-    with pytest.raises(InputError, match="no array 'other'; it holds good, bad"):
-        read_npz(path, ["other"])
-    with pytest.raises(InputError, match="objects"):
-        read_npz(path)
+    refused("no array 'other'; it holds good, bad", read_npz, path, ["other"])
+    refused("objects", read_npz, path)
 
 
 def test_an_archive_that_unfolds_a_thousandfold_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     np.savez_compressed(path, x=np.zeros(3_000_000))
     assert path.stat().st_size < 100_000
-    with pytest.raises(InputError, match="unpacks to 24"):
-        read_npz(path, most_bytes=1e6)
+    refused("unpacks to 24", read_npz, path, most_bytes=1e6)
 
 
 def test_a_member_there_twice_or_of_a_size_that_lies_is_refused(tmp_path: Path) -> None:
@@ -110,8 +105,7 @@ def test_a_member_there_twice_or_of_a_size_that_lies_is_refused(tmp_path: Path) 
     with zipfile.ZipFile(twice, "w") as archive, pytest.warns(UserWarning, match="Duplicate"):
         archive.writestr("x.npy", data.getvalue())
         archive.writestr("x.npy", data.getvalue())
-    with pytest.raises(InputError, match="twice"):
-        read_npz(twice)
+    refused("twice", read_npz, twice)
     lies = tmp_path / "lies.npz"
     with zipfile.ZipFile(lies, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("x.npy", data.getvalue())
@@ -119,5 +113,4 @@ def test_a_member_there_twice_or_of_a_size_that_lies_is_refused(tmp_path: Path) 
     raw = lies.read_bytes()
     for claim in (size - 8, size + 8, 2**31):
         lies.write_bytes(raw.replace(size.to_bytes(4, "little"), claim.to_bytes(4, "little")))
-        with pytest.raises(InputError, match=r"lies\.npz"):
-            read_npz(lies)
+        refused(r"lies\.npz", read_npz, lies)
