@@ -219,7 +219,6 @@ def open_session_scene(
     store: SessionStore,
     *,
     labels: Labels = "auto",
-    number: int | None = None,
     split: str = "",
     camera: str = "",
     seen_by: SessionStore | None = None,
@@ -231,7 +230,6 @@ def open_session_scene(
         labels: 'annotated' = what `realsim annotate` wrote; 'imported' = what the data set said
             that the session was imported from; 'auto' = the former where it is there, else the
             latter; 'none' = images and cameras only.
-        number: of the scene; None = that of its data set, or of its folder, or 0.
         split: of the scene; '' = that of its data set, or 'train'.
         camera: what the camera is called; '' = the session has one.
         seen_by: a further camera (`store.cameras`) whose images are taken; None = the session's
@@ -278,7 +276,7 @@ def open_session_scene(
     numbers = {i: i for i in views} if imported is None else imported.number_of_view
     return SessionScene(
         store,
-        number=_number(store, imported) if number is None else number,
+        number=_number(store, imported),
         split=split or (imported.split if imported is not None else _split_of(store)),
         imported=imported if chosen != "none" else None,
         views={numbers.get(i, i): i for i in taken},
