@@ -14,6 +14,7 @@ from realsim.arrays import Array, Array32, Int64, Mask
 from realsim.compiled import njit
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
+from realsim.geometry.point_loops import move
 from realsim.records import SupportPlane
 from realsim.registration.evidence import Cloud
 
@@ -118,12 +119,9 @@ def _table_points(points: Array, T: Array, low: float, high: float) -> Array:
     out = np.empty((len(points), 3))
     n = 0
     for k in range(len(points)):
-        a, b, c = points[k, 0], points[k, 1], points[k, 2]
-        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        x, y, z = move(T, points[k, 0], points[k, 1], points[k, 2])
         if low <= z <= high:
-            out[n, 0] = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
-            out[n, 1] = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
-            out[n, 2] = z
+            out[n, 0], out[n, 1], out[n, 2] = x, y, z
             n += 1
     return out[:n]
 

@@ -17,7 +17,7 @@ import numpy as np
 from realsim.arrays import Array, Array32, Int64, UInt8
 from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
-from realsim.geometry.point_loops import turn
+from realsim.geometry.point_loops import move, turn
 from realsim.scanning.fusion.evidence import Crops, pixel_of
 from realsim.scanning.fusion.result import FusionConfig
 
@@ -70,11 +70,9 @@ def _one_view(  # noqa: PLR0911 - seven ways to see nothing, in a row
     x, y, z = node
     gx, gy, gz, length = normal
     truncation, least_cos, cell = limits
-    cz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+    cx, cy, cz = move(T, x, y, z)
     if cz < NEAREST_M:
         return 0.0, 0.0, False
-    cx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-    cy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
     u, v = pixel_of(camera, cx, cy, cz)
     u, v = u - corner[0], v - corner[1]
     if u < 0 or v < 0 or u >= depth.shape[1] or v >= depth.shape[0]:
