@@ -6,8 +6,6 @@ symmetry count in every command that looks at views or models.
 
 from collections.abc import Collection
 
-from rich.markup import escape
-
 from realsim.app.console import Console
 from realsim.review.journal import JOURNAL_FILE, Entry, ReviewState, read, replay
 from realsim.store import SessionStore
@@ -27,7 +25,7 @@ def review_of(store: SessionStore) -> ReviewState:
     found = read(store.path(JOURNAL_FILE))
     if found.damaged and str(store.folder) not in _told:
         _told.add(str(store.folder))
-        Console(quiet=True).warn(escape(damage_words(store)))
+        Console(quiet=True).warn(damage_words(store))
     return replay(found.entries)
 
 

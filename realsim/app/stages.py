@@ -163,8 +163,6 @@ def session_models(store: SessionStore, console: Console | None = None) -> dict[
         store: the session.
         console: where that is told; None = the terminal's standard error.
     """
-    from rich.markup import escape
-
     from realsim.app.reviewed import review_of
     from realsim.formats.bop.models import load_models
     from realsim.review.symmetric import marked_models
@@ -174,7 +172,7 @@ def session_models(store: SessionStore, console: Console | None = None) -> dict[
     for note in notes:
         if note not in _told:
             _told.add(note)
-            (console or Console(quiet=True)).warn(escape(note))
+            (console or Console(quiet=True)).warn(note)
     return models
 
 

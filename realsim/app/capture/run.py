@@ -429,7 +429,7 @@ def show_summary(summary: CaptureSummary, console: Console, *, dry: bool = False
     if dry:
         console.say("nothing was stored.")
     for text in summary.warnings:
-        console.warn(text.replace("[", "\\["))
+        console.warn(text)
     if summary.left_out:
         console.say("the same command offers the skipped views again.")
 

@@ -438,7 +438,7 @@ def show_demonstrations(result: DemonstrationsResult, console: Console) -> None:
             f"{result.not_attempted} grasps were not attempted: the arm does not get there."
         )
     for note in w.notes[:10]:
-        console.warn(note.replace("[", r"\["))
+        console.warn(note)
     if len(w.notes) > 10:
         console.warn(f"and {len(w.notes) - 10} more notes, in realsim/episodes.jsonl.")
     console.say(f"page      {result.page}")

@@ -372,5 +372,5 @@ def show_export(result: ExportResult, console: Console) -> None:
         f"exported into {result.folder}", ("scene", "frames", "written now", "poses", "more"), rows
     )
     for note in dict.fromkeys(f"{s.name}: {n}" for s in result.scenes for n in s.notes):
-        console.warn(note.replace("[", r"\["))
+        console.warn(note)
     console.say(f"card      {result.card}")

@@ -85,7 +85,7 @@ def import_labels(
             save_imported(store, scene, dict(enumerate(indices)), tick)
     for note in scene.notes:
         if note.startswith("the labels"):  # what they are worth must not be missed
-            console.warn(f"{scene.name}: {note}".replace("[", r"\["))
+            console.warn(f"{scene.name}: {note}")
     poses = sum(len(scene.frame(i).objects) for i in indices)
     missing = sorted(ids - set(models))
     then = f" `realsim register {folder}` refines and judges them." if can_register else ""

@@ -159,4 +159,4 @@ def _written(path: Path, page: Page) -> Path:
 def _tell(console: Console, failed: Sequence[str]) -> None:
     """Print what failed; never on the standard output, which may be a program's."""
     for line in failed:
-        console.warn(line.replace("[", r"\["))
+        console.warn(line)

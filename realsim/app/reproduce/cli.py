@@ -33,7 +33,7 @@ def reproduce_command(console: Console, result: Path, stage: str, workers: int) 
     found = reproduce(result, stage, console, workers)
     for d in found.differing:
         size = f" (by at most {d.greatest:.3g})" if isfinite(d.greatest) else ""
-        console.warn(f"{d.path} differs{size}: {'; '.join(d.words)}".replace("[", r"\["))
+        console.warn(f"{d.path} differs{size}: {'; '.join(d.words)}")
     counts = f"{found.files} files"
     if found.equal:
         console.say(f"{found.stage}: equal, {counts}")

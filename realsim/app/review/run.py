@@ -50,7 +50,7 @@ def run_review(request: ReviewRequest, console: Console) -> None:
         motions=SessionMotions.of_session, remarks=remarks,
     )  # fmt: skip
     for remark in remarks:
-        console.warn(_plain(remark))
+        console.warn(remark)
     with _until_interrupted() as ended:
         server.start()
         try:
@@ -63,7 +63,7 @@ def run_review(request: ReviewRequest, console: Console) -> None:
             gone = [t for t in (s.trouble() for s in server.sessions) if t]
             server.stop()
     for text in gone:
-        console.warn(_plain(text))
+        console.warn(text)
     console.say(f"decisions in this run: {words_of(decisions)}")
     console.say(f"judged by people: {judged} of {objects} objects in {len(stores)} session(s)")
     changed = sorted({str(s.store.folder) for s in server.sessions if s.has_pending})
@@ -104,7 +104,7 @@ def write_page(request: ReviewRequest, path: Path, console: Console) -> None:
     with console.stage("read", store.session.name) as tick:
         content = SceneContent.load(store, SceneConfig(), tick)
     for remark in content.remarks:
-        console.warn(_plain(remark))
+        console.warn(remark)
     with console.stage("write", str(path)) as tick:
         summary = write_static(content, state, path, title=_title(store), progress=tick)
     console.say(f"{summary.path}   {summary.size_bytes / 1e6:.1f} MB, opens without a server")
@@ -200,10 +200,3 @@ def _as_row(entry: Any) -> dict[str, Any]:
 
 def _title(store: SessionStore) -> str:
     return store.session.name or store.folder.resolve().name
-
-
-def _plain(text: str) -> str:
-    """Return text in which rich finds no mark-up."""
-    from rich.markup import escape
-
-    return escape(text)

@@ -85,7 +85,7 @@ def run_stats(
     rows = all_rows(stats)
     console.table(f"Statistics of {_sessions(stats)}", HEADER, rows)
     for line in notes:
-        console.warn(line.replace("[", r"\["))
+        console.warn(line)
     document = document_of(stats, left_out)
     console.result(document)
     if json_file is not None:

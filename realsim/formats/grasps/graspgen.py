@@ -1,4 +1,4 @@
-"""Grasps of one object as a GraspGen JSON file, and such files as grasps.
+"""Grasps of one object as a GraspGen JSON file.
 
     {"object": {"file", "scale"}, "grasps": {"transforms": [4x4, ...], "object_in_gripper": [...]}}
 

@@ -36,10 +36,8 @@ def promote(request: ScaleRequest, named: NamedMesh, found: FoundScale, console:
     if request.library is None or named.origin == "model":
         return
     if found.verdict != "accepted" and not request.accept_doubtful:
-        from rich.markup import escape
-
         console.warn(
-            f"{named.name} was not put into the library {escape(str(request.library))}: its scale "
+            f"{named.name} was not put into the library {request.library}: its scale "
             f"is {found.verdict}. --accept-doubtful puts it there all the same."
         )
         return
