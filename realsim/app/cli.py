@@ -149,7 +149,7 @@ def _run() -> None:
                 err=True,
             )
             sys.exit(TERMINATED if isinstance(reason, Terminated) else 130)
-        if isinstance(stop, SystemError) or (text := refusal(stop)) is None:
+        if isinstance(stop, KeyboardInterrupt | SystemError) or (text := refusal(stop)) is None:
             raise  # a bug: its place is wanted
         click.echo(f"error: {text}", err=True)
         sys.exit(2)
