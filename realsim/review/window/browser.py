@@ -1,6 +1,7 @@
 """What one browser keeps and says: its address, the reviewer's name, corrections not yet saved."""
 
 import contextlib
+import time
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
@@ -12,6 +13,8 @@ if TYPE_CHECKING:
 
 NAME_KEY = "realsim reviewer"
 """Under which the browser keeps the reviewer's name."""
+SHOWN_KEY = "realsim shown"
+"""Of the page: scene and object that it shows, in panel and photograph."""
 DRAFTS_KEY = "realsim corrections"
 """Under which it keeps the corrections that were not saved."""
 NAME_WAIT_S = 60.0
@@ -29,6 +32,8 @@ class Draft(msgspec.Struct, frozen=True, kw_only=True):
     instance: int
     obj_id: int
     """What the object is said to be."""
+    registered: int = -1
+    """What it was by the registration; -1 = not known."""
     stood: str
     """`journal.subject_of` the object as it stood when the reviewer saw it last."""
     how: tuple[str, ...]
@@ -49,6 +54,12 @@ class Browser:
     def wait(self) -> None:
         """Wait until the browser has done what was sent before."""
         self._asked(PLACE_KEY, ANSWER_WAIT_S)
+
+    def wait_for(self, whose: str) -> None:
+        """Wait until the browser shows this scene and object, as of `Window.whose`."""
+        end = time.monotonic() + ANSWER_WAIT_S
+        while self._asked(SHOWN_KEY, ANSWER_WAIT_S) not in ("", whose) and time.monotonic() < end:
+            time.sleep(0.02)
 
     def name(self) -> str:
         """Return the reviewer's name that it keeps; '' = none."""

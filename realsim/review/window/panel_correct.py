@@ -161,6 +161,7 @@ class CorrectPanel:
     def snap(self) -> None:
         """Let the measured depth say where the copy belongs."""
         window = self._window
+        window.require_shown()
         now = self.begin()
         instance = now.start.instance
         with window.working("Snapping to the measured depth", window.session.name) as progress:
@@ -185,6 +186,7 @@ class CorrectPanel:
 
     def put_back(self) -> None:
         """Take the copy away and forget it; nothing was written."""
+        self._window.require_shown()
         if self._now is not None:
             self._forget(self._now.start.instance)
         self.set_aside()
@@ -225,8 +227,9 @@ class CorrectPanel:
         """Refuse a change while the answer to the last one is being computed.
 
         Raises:
-            InputError: it is.
+            InputError: it is, or another object was shown.
         """
+        self._window.require_shown()
         if self._is_busy:
             raise InputError("something is being computed, nothing was done; wait until it is.")
 
@@ -293,6 +296,9 @@ class CorrectPanel:
     def _key(self, instance: int) -> tuple[str, int]:
         return self._window.session.name, instance
 
+    def _registered(self, instance: int) -> int:
+        return self._window.session.registered.object(instance).obj_id
+
     def _forget(self, instance: int) -> None:
         key = self._key(instance)
         browser = self._window.browser
@@ -309,6 +315,10 @@ class CorrectPanel:
     def _resume(self, draft: Draft) -> None:
         """Go on with a correction that was not saved."""
         window, placed = self._window, self._window.placed
+        if draft.registered not in (-1, self._registered(placed.instance)):
+            raise InputError(
+                f"object {placed.instance} is another one since the scene was registered anew."
+            )
         pose = se3.check_rigid(np.reshape(draft.pose, (4, 4)), "the correction that was kept")
         self._show(Correction(start=placed, T_world_obj=pose, obj_id=draft.obj_id, how=draft.how))
         window.photographs.tell()
@@ -422,6 +432,7 @@ class CorrectPanel:
             kept[self._key(now.start.instance)] = Draft(
                 scene=self._window.session.name, instance=now.start.instance, obj_id=now.obj_id,
                 stood=journal.subject_of(now.start), how=now.how,
+                registered=self._registered(now.start.instance),
                 pose=tuple(now.T_world_obj.ravel().tolist()),
             )  # fmt: skip
         self._window.browser.keep_drafts(kept)

@@ -11,6 +11,7 @@
 
   const shown = () => document.querySelector("[data-realsim-photograph]");
   const whose = () => `${shown().dataset.scene}/${shown().dataset.instance}`;
+  window.realsimShown = () => (root && root.dataset.whose) || (shown() ? whose() : "");
   const make = (tag, kind, parent, text) => {
     const e = document.createElement(tag);
     if (kind) e.className = kind;

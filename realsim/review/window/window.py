@@ -7,7 +7,8 @@ another's way. What they share is the journal on the disk, and what was read of 
 import contextlib
 import logging
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Coroutine, Generator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from types import SimpleNamespace
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
 PANEL_PX, PANEL_HEIGHT_PX, EDGE_PX = 300, 530, 8
 """Width and height of the panel on the right, and how far from the window's edges it floats [px]:
 with the list it leaves three quarters of 1280x800 to the scene."""
+ANY = ""
+"""What is meant where nobody pressed anything."""
 log = logging.getLogger(__name__)
 # Viser reads the list of its 5,000 icons anew for every icon, at 10 ms; the archive stays open.
 with contextlib.suppress(AttributeError):  # another viser reads them otherwise
@@ -82,6 +85,10 @@ class Window:
         """Whether a scene is there and an object chosen: keys and buttons wait for it."""
         self._opened: Opened | None = None
         self._busy = threading.Lock()
+        self._hands = ThreadPoolExecutor(1)
+        """What comes from the browser is done one after the other, in the order in which it came."""
+        self._shown, self._meant = "/", ANY
+        """What the browser is known to show, and showed when that came which is being done."""
         self.browser = Browser(self)
         self._seen: object = None
         self._standing: Standing | None = None
@@ -119,6 +126,25 @@ class Window:
             self._go_to_worst()
         if kept := "" if self.reviewer else self.browser.name():
             self._name.value = kept
+        self._in_turn(lambda: None)
+
+    @property
+    def whose(self) -> str:
+        """Number of the scene, and instance of the object that is looked at."""
+        chosen = "" if self.selected is None else self.selected
+        return f"{self.session.number}/{chosen}" if self.is_open else "/"
+
+    def require_shown(self) -> None:
+        """Refuse what was pressed while the browser showed another object than is looked at now.
+
+        Raises:
+            InputError: it did.
+        """
+        if self._meant not in (ANY, self.whose):
+            raise InputError(
+                "another object was chosen just before that was pressed: nothing is done. Look at "
+                "it, and press again."
+            )
 
     def _go_to_worst(self) -> None:
         first = scene_list.first_wanted(self.rows())
@@ -131,6 +157,7 @@ class Window:
         """Forget the browser: it is gone."""
         self._is_closed = True
         self.grasps.close()
+        self._hands.shutdown(wait=False, cancel_futures=True)
 
     # --- what is looked at ------------------------------------------------------------------------
 
@@ -217,8 +244,9 @@ class Window:
         instance = self.selected
         self._open(session)
         known = {o.instance for o in session.registered.objects}
-        self.select(instance if instance in known else None)
         self.say(f"{session.name} has changed on disk; this is how it stands now.")
+        self.select(instance if instance in known else None)
+        self._in_turn(lambda: None)
 
     def select(self, instance: int | None) -> None:
         """Look at an object of this scene."""
@@ -352,6 +380,7 @@ class Window:
         """Say that a line is in the journal, and show it everywhere."""
         done = words or window_text.ACTION_WORDS.get(entry.action, "taken back")
         self.say(f"Recorded: {done}, signed {entry.reviewer}.")
+        self.refresh()  # what comes next begins with it
         self.server.tell()
 
     # --- answers ----------------------------------------------------------------------------------
@@ -381,16 +410,37 @@ class Window:
             log.error("the review page failed", exc_info=error)
             self.alarm(window_text.BUG.format(error))
 
-    def guarded(self, action: Callable[[Any], object]) -> Callable[[Any], None]:
+    def guarded(
+        self, action: Callable[[Any], object]
+    ) -> Callable[[Any], Coroutine[Any, Any, None]]:
         """Return a callback that never ends silently: what goes wrong is said in the panel."""
 
-        def callback(event: Any) -> None:
+        async def callback(event: Any) -> None:
             # What the server itself changes comes with no client; only a person's hand counts.
-            if getattr(event, "client", self) is None or self._is_closed:
-                return
-            self.attempt(lambda: action(event))
+            if getattr(event, "client", self) is not None:
+                self._in_turn(lambda: action(event))
 
         return callback
+
+    def _in_turn(self, action: Callable[[], object]) -> None:
+        """Do something after what came before it."""
+        meant = self._shown
+
+        def work() -> None:
+            self._meant = meant
+            self.attempt(action)
+            self._meant = ANY
+            self.confirm()
+
+        with contextlib.suppress(RuntimeError):  # the browser is gone
+            self._hands.submit(work)
+
+    def confirm(self) -> None:
+        """Wait until the browser shows what is looked at."""
+        here = self.whose
+        if here != self._shown and not self._is_closed:
+            self.browser.wait_for(here)
+            self._shown = here
 
     def attempt(self, action: Callable[[], object]) -> bool:
         """Do something; say what went wrong. Return whether it was done."""
@@ -411,7 +461,7 @@ class Window:
         def callback(*given: Any) -> None:
             # A click that places an object by points chooses nothing.
             if not (self._is_closed or self.correct.points.is_on):
-                self.attempt(lambda: action(*given))
+                self._in_turn(lambda: action(*given))
 
         return callback
 
