@@ -17,20 +17,41 @@
   const fetched = window.fetch;
   window.fetch = (what, ...rest) =>
     String(what.url ?? what).startsWith("data:image/jpeg") ? new Promise(() => {}) : fetched(what, ...rest);
-  // Keys that come before the scene stands wait for it: only then is somebody there to hear them.
+  // Keys wait for the scene, and for the end of what was pressed before. What judges or moves an
+  // object is left out where another one is shown by then.
   const waiting = [], stands = () => document.querySelector("[data-realsim-photograph]");
+  const ACTS = /^[hnpyxzmvbtcfjlkiou]$/i, LOOKS = /^[hnpcf]$/i; // keys.py
+  const whose = () => (window.realsimShown ? window.realsimShown() : "");
+  let busy = null, since = 0, note = null;
+  const handOn = () => {
+    if (!stands() || (busy === stands().dataset.done && Date.now() - since < 5000)) return;
+    busy = null;
+    const next = waiting.shift();
+    if (!next) return;
+    if (next.whose !== null && next.whose !== whose() && ACTS.test(next.key) && !LOOKS.test(next.key)) {
+      if (note) note.remove();
+      note = document.createElement("p");
+      note.className = "realsim-held";
+      note.textContent = `${next.key.toUpperCase()} was pressed while another object was shown: nothing is done. Press again.`;
+      document.body.append(note);
+      setTimeout((old) => old.remove(), 5000, note);
+      return;
+    }
+    if (ACTS.test(next.key)) [busy, since] = [stands().dataset.done, Date.now()];
+    const event = new KeyboardEvent("keydown", { ...next, bubbles: true, cancelable: true });
+    event.isHandedOn = true;
+    document.body.dispatchEvent(event);
+  };
   addEventListener("keydown", (event) => {
     const inText = event.target instanceof Element && event.target.closest("input, textarea");
-    if (stands() || inText || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.isHandedOn || inText || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (stands() && !ACTS.test(event.key)) return;
     event.stopImmediatePropagation();
-    if (waiting.length < 20) waiting.push({ key: event.key, code: event.code, shiftKey: event.shiftKey });
+    if (waiting.length < 20)
+      waiting.push({ key: event.key, code: event.code, shiftKey: event.shiftKey, whose: stands() ? whose() : null });
+    handOn();
   }, true);
-  const heard = setInterval(() => {
-    if (!stands()) return;
-    clearInterval(heard);
-    for (const key of waiting)
-      document.body.dispatchEvent(new KeyboardEvent("keydown", { ...key, bubbles: true, cancelable: true }));
-  }, 100);
+  setInterval(handOn, 25);
   const PLACE = "realsim place", read = Storage.prototype.getItem, write = Storage.prototype.setItem;
   const is = (key) => String(key).endsWith(PLACE);
   // Viser takes its server's address from the page's: at that moment there must be no fragment.

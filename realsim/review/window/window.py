@@ -7,7 +7,7 @@ another's way. What they share is the journal on the disk, and what was read of 
 import contextlib
 import logging
 import threading
-from collections.abc import Callable, Coroutine, Generator
+from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -88,7 +88,9 @@ class Window:
         self._hands = ThreadPoolExecutor(1)
         """What comes from the browser is done one after the other, in the order in which it came."""
         self._shown, self._meant = "/", ANY
-        """What the browser is known to show, and showed when that came which is being done."""
+        """What the browser is known to show, and what it showed when this was pressed."""
+        self.done = 0
+        """How much of what came from the browser is done: it hands on the next key then."""
         self.browser = Browser(self)
         self._seen: object = None
         self._standing: Standing | None = None
@@ -410,9 +412,7 @@ class Window:
             log.error("the review page failed", exc_info=error)
             self.alarm(window_text.BUG.format(error))
 
-    def guarded(
-        self, action: Callable[[Any], object]
-    ) -> Callable[[Any], Coroutine[Any, Any, None]]:
+    def guarded(self, action: Callable[[Any], object]) -> Callable[[Any], Any]:
         """Return a callback that never ends silently: what goes wrong is said in the panel."""
 
         async def callback(event: Any) -> None:
@@ -431,6 +431,8 @@ class Window:
             self.attempt(action)
             self._meant = ANY
             self.confirm()
+            self.done += 1
+            self.photographs.tell()
 
         with contextlib.suppress(RuntimeError):  # the browser is gone
             self._hands.submit(work)
