@@ -22,9 +22,10 @@
   const waiting = [], stands = () => document.querySelector("[data-realsim-photograph]");
   const ACTS = /^[hnpyxzmvbtcfjlkiou]$/i, LOOKS = /^[hnpcf]$/i; // keys.py
   const whose = () => (window.realsimShown ? window.realsimShown() : "");
-  let busy = null, since = 0, note = null;
+  let busy = null, until = 0, note = null, down = [0, 0];
+  const wait = (ms) => { [busy, until] = [stands().dataset.done, Date.now() + ms]; };
   const handOn = () => {
-    if (!stands() || (busy === stands().dataset.done && Date.now() - since < 5000)) return;
+    if (!stands() || (busy === stands().dataset.done && Date.now() < until)) return;
     busy = null;
     const next = waiting.shift();
     if (!next) return;
@@ -37,7 +38,7 @@
       setTimeout((old) => old.remove(), 5000, note);
       return;
     }
-    if (ACTS.test(next.key)) [busy, since] = [stands().dataset.done, Date.now()];
+    if (ACTS.test(next.key)) wait(5000);
     const event = new KeyboardEvent("keydown", { ...next, bubbles: true, cancelable: true });
     event.isHandedOn = true;
     document.body.dispatchEvent(event);
@@ -52,6 +53,14 @@
     handOn();
   }, true);
   setInterval(handOn, 25);
+  // What a click chooses has to be shown, too, before a key counts.
+  addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; }, true);
+  addEventListener("click", (event) => {
+    if (!stands() || !(event.target instanceof Element) || event.target.closest(".rs-photograph")) return;
+    const pressed = event.target.closest("button:not([role=tab]):not([data-realsim-open]), canvas");
+    const isDrag = Math.hypot(event.clientX - down[0], event.clientY - down[1]) > 3;
+    if (pressed && !isDrag) wait(pressed.tagName === "CANVAS" ? 1000 : 3000);
+  }, true);
   const PLACE = "realsim place", read = Storage.prototype.getItem, write = Storage.prototype.setItem;
   const is = (key) => String(key).endsWith(PLACE);
   // Viser takes its server's address from the page's: at that moment there must be no fragment.

@@ -85,10 +85,11 @@ class Window:
         """Whether a scene is there and an object chosen: keys and buttons wait for it."""
         self._opened: Opened | None = None
         self._busy = threading.Lock()
-        self._hands = ThreadPoolExecutor(1)
-        """What comes from the browser is done one after the other, in the order in which it came."""
+        self._hands, self._eyes = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
+        """What comes from the browser is done one after the other, in the order in which it came;
+        meanwhile it is asked what it shows."""
         self._shown, self._meant = "/", ANY
-        """What the browser is known to show, and what it showed when this was pressed."""
+        """What the browser is known to show, and what it showed at this click."""
         self.done = 0
         """How much of what came from the browser is done: it hands on the next key then."""
         self.browser = Browser(self)
@@ -159,7 +160,8 @@ class Window:
         """Forget the browser: it is gone."""
         self._is_closed = True
         self.grasps.close()
-        self._hands.shutdown(wait=False, cancel_futures=True)
+        for pool in (self._hands, self._eyes):
+            pool.shutdown(wait=False, cancel_futures=True)
 
     # --- what is looked at ------------------------------------------------------------------------
 
@@ -412,32 +414,38 @@ class Window:
             log.error("the review page failed", exc_info=error)
             self.alarm(window_text.BUG.format(error))
 
-    def guarded(self, action: Callable[[Any], object]) -> Callable[[Any], Any]:
-        """Return a callback that never ends silently: what goes wrong is said in the panel."""
+    def guarded(
+        self, action: Callable[[Any], object], *, is_key: bool = False
+    ) -> Callable[[Any], Any]:
+        """Return a callback that never ends silently: what goes wrong is said in the panel.
+
+        Args:
+            action: what is done, after what came before it.
+            is_key: whether the page has seen to it that the object is shown that it is meant for.
+        """
 
         async def callback(event: Any) -> None:
             # What the server itself changes comes with no client; only a person's hand counts.
             if getattr(event, "client", self) is not None:
-                self._in_turn(lambda: action(event))
+                self._in_turn(lambda: action(event), ANY if is_key else self._shown)
 
         return callback
 
-    def _in_turn(self, action: Callable[[], object]) -> None:
-        """Do something after what came before it."""
-        meant = self._shown
+    def _in_turn(self, action: Callable[[], object], meant: str = ANY) -> None:
+        """Do something after what came before it; `meant` is what the browser showed then."""
 
         def work() -> None:
             self._meant = meant
             self.attempt(action)
             self._meant = ANY
-            self.confirm()
             self.done += 1
             self.photographs.tell()
+            self._eyes.submit(self._look)
 
         with contextlib.suppress(RuntimeError):  # the browser is gone
             self._hands.submit(work)
 
-    def confirm(self) -> None:
+    def _look(self) -> None:
         """Wait until the browser shows what is looked at."""
         here = self.whose
         if here != self._shown and not self._is_closed:
@@ -463,7 +471,7 @@ class Window:
         def callback(*given: Any) -> None:
             # A click that places an object by points chooses nothing.
             if not (self._is_closed or self.correct.points.is_on):
-                self._in_turn(lambda: action(*given))
+                self._in_turn(lambda: action(*given), self._shown)
 
         return callback
 
