@@ -368,3 +368,24 @@ def test_a_browser_without_webgl_says_so(
             assert told.is_visible()
     finally:
         bare.close()
+
+
+def test_a_key_counts_for_the_object_that_was_shown_when_it_was_pressed(
+    browser: ReviewBrowser, server: ReviewServer
+) -> None:
+    with browser.page(server.url) as page:
+        loaded(page)
+        page.page.evaluate(
+            "for (const key of 'ynyny') document.body.dispatchEvent(new KeyboardEvent('keydown', "
+            "{key, code: 'Key' + key.toUpperCase(), bubbles: true}))"
+        )
+        page.wait_for("pressed while another object was shown")
+        page.wait_message("Recorded")
+        first = lines(server)[0].instance
+        assert {line.instance for line in lines(server)} == {first}, "no other was shown"
+        page.wait_until(lambda: f"0/{first}" != page.page.evaluate("realsimShown()"), "the next")
+        page.page.keyboard.press("x")
+        page.wait_message("rejected")
+    assert [(e.action, e.instance == first) for e in lines(server)] == [
+        ("accept", True), ("reject", False),
+    ]  # fmt: skip
