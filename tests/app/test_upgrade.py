@@ -128,6 +128,8 @@ def test_a_second_run_does_nothing_again_and_takes_in_what_was_mended(upgraded, 
     after = content_and_times(again / "test")
     assert {k: after[k] for k in before} == before
     assert json.loads((again / "upgrade.json").read_text())["summary"]["scenes"] == 2
+    (again / "test/000001/registration/review.json").write_text("{}")
+    assert "registered from its review" in failed_with(copy, again, "--grasps", "1")
 
 
 @pytest.mark.slow

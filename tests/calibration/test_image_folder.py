@@ -181,6 +181,7 @@ def test_a_list_of_pairs_decides_and_is_checked(tmp_path):
         write_rows(tmp_path / "p" / f"{k}.txt", raw[k : k + 1])
     turned = [{"pose": f"p/{k}.txt", "image": f"i/{5 - k}.png"} for k in range(6)]
     (tmp_path / "cal.json").write_text(json.dumps({"data": turned}))
+    (tmp_path / "others.json").write_text('{"pose": 1, "image": 2,')
     for poses in (tmp_path / "p", tmp_path / "cal.json"):
         found = read_image_folder(images, poses, reading=READING)
         assert np.abs(found.Ts_base_ee() - READING.apply(raw[::-1])).max() < 1e-14

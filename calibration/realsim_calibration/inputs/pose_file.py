@@ -191,9 +191,7 @@ def _listings_in(place: Path, folder: Path) -> list[tuple[Path, list[tuple[str, 
         try:
             pairs = _listing(file_tree(path))
         except InputError:
-            if place == folder:
-                continue  # it is read as a pose file, which says what is wrong
-            raise
+            continue  # in the folder it is read as a pose file, which says what is wrong
         if any((place / p).resolve().is_relative_to(folder.resolve()) for p, _ in pairs):
             found.append((path, pairs))
     return found

@@ -61,6 +61,11 @@ def generate_command(
     from realsim.store.atomic import storing
 
     request = _request(**options)
+    if options["pools"] and not options["keep_size"]:
+        console.warn(
+            f"the objects get random sizes of {options['object_sizes']} m, also where that is not "
+            "their own; --keep-size --unit mm keeps those of meshes in millimetres"
+        )
     outcome = generate(out, scenes, request, where, console)
     layouts = finished_layouts(out, scenes, request)
     sheet, page = out / SHEET_FILE, out / PAGE_FILE

@@ -12,9 +12,11 @@ from pathlib import Path
 
 from realsim.app.console import Console
 from realsim.app.outputs import require_outside
+from realsim.app.register.from_review import REVIEW_FILE
 from realsim.app.upgrade.analytic import agreement_of, all_sets
 from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig, scenes_of
 from realsim.app.upgrade.files import (
+    NOTE,
     all_records,
     finished_record,
     gather_models,
@@ -62,12 +64,19 @@ def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Consol
     for ref in refs:
         record = finished_record(out / ref.place, key_of(ref, config))
         if record is None:
+            if (out / ref.place / REVIEW_FILE).is_file():
+                raise InputError(
+                    f"{out / ref.place} was registered from its review, which an upgrade with "
+                    "other options would undo. Give the options of before, or another --out."
+                )
             todo.append(ref)
         else:
             done[ref.place] = record
     skipped = len(done)
     if skipped:
         console.say(f"{skipped} of {len(refs)} scenes are upgraded already, with the same inputs")
+    if again := sum((out / ref.place / NOTE).is_file() for ref in todo):
+        console.warn(f"{again} scenes are upgraded anew: their options or inputs have changed")
     failed: dict[str, str] = {}
     with contextlib.ExitStack() as lock:
         if len(refs) == 1 and todo:
