@@ -161,7 +161,7 @@ class CorrectPanel:
     def snap(self) -> None:
         """Let the measured depth say where the copy belongs."""
         window = self._window
-        window.require_shown()
+        window.hands.require_shown()
         now = self.begin()
         instance = now.start.instance
         with window.working("Snapping to the measured depth", window.session.name) as progress:
@@ -186,7 +186,7 @@ class CorrectPanel:
 
     def put_back(self) -> None:
         """Take the copy away and forget it; nothing was written."""
-        self._window.require_shown()
+        self._window.hands.require_shown()
         if self._now is not None:
             self._forget(self._now.start.instance)
         self.set_aside()
@@ -229,7 +229,7 @@ class CorrectPanel:
         Raises:
             InputError: it is, or another object was shown.
         """
-        self._window.require_shown()
+        self._window.hands.require_shown()
         if self._is_busy:
             raise InputError("something is being computed, nothing was done; wait until it is.")
 

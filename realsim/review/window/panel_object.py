@@ -50,7 +50,7 @@ class ObjectPanel:
     def decide(self, action: Action) -> None:
         """Append a decision about the object as it stands here."""
         window = self._window
-        window.require_shown()
+        window.hands.require_shown()
         window.correct.require_saved()
         placed = window.placed
         comment = self._comment.value
@@ -62,7 +62,7 @@ class ObjectPanel:
     def undo(self) -> None:
         """Take back the last line on this object."""
         window = self._window
-        window.require_shown()
+        window.hands.require_shown()
         entry = window.session.undo(window.placed, self._last, window.reviewer)
         last = self._last
         what = "" if last is None else window_text.undo_label(last).removeprefix("Undo: ")

@@ -54,7 +54,7 @@ class PhotographLink:
             client=window.client.client_id, state=f"{zlib.crc32(state.encode()):08x}",
             scene=window.session.number, instance=window.selected if chosen else "",
             name=html.escape(name), turn=self._turn, view=self._view,
-            done=window.done,
+            done=window.hands.done,
         )  # fmt: skip
         if content != self._html.content:
             self._html.content = content

@@ -8,7 +8,6 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable, Generator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from types import SimpleNamespace
@@ -30,6 +29,7 @@ from realsim.review.window import window_text
 from realsim.review.window.browser import Browser
 from realsim.review.window.camera_stand import Standpoint
 from realsim.review.window.gui_values import refuse_foreign_values
+from realsim.review.window.hands import Hands
 from realsim.review.window.keys import bind_keys
 from realsim.review.window.panel_correct import CorrectPanel
 from realsim.review.window.panel_grasps import GraspsPanel
@@ -42,10 +42,7 @@ if TYPE_CHECKING:
     from realsim.review.server import ReviewServer
 
 PANEL_PX, PANEL_HEIGHT_PX, EDGE_PX = 300, 530, 8
-"""Width and height of the panel on the right, and how far from the window's edges it floats [px]:
-with the list it leaves three quarters of 1280x800 to the scene."""
-ANY = ""
-"""What is meant where nobody pressed anything."""
+"""Width, height and distance from the edges of the right panel [px]; the scene keeps 3/4 of 1280."""
 log = logging.getLogger(__name__)
 # Viser reads the list of its 5,000 icons anew for every icon, at 10 ms; the archive stays open.
 with contextlib.suppress(AttributeError):  # another viser reads them otherwise
@@ -85,14 +82,7 @@ class Window:
         """Whether a scene is there and an object chosen: keys and buttons wait for it."""
         self._opened: Opened | None = None
         self._busy = threading.Lock()
-        self._hands, self._eyes = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
-        """What comes from the browser is done one after the other, in the order in which it came;
-        meanwhile it is asked what it shows."""
-        self._shown, self._meant = "/", ANY
-        """What the browser is known to show, and what it showed at this click."""
-        self.done = 0
-        """How much of what came from the browser is done: it hands on the next key then."""
-        self.browser = Browser(self)
+        self.browser, self.hands = Browser(self), Hands(self)
         self._seen: object = None
         self._standing: Standing | None = None
         self._is_closed = False
@@ -129,25 +119,13 @@ class Window:
             self._go_to_worst()
         if kept := "" if self.reviewer else self.browser.name():
             self._name.value = kept
-        self._in_turn(lambda: None)
+        self.hands.do(lambda: None)
 
     @property
     def whose(self) -> str:
         """Number of the scene, and instance of the object that is looked at."""
         chosen = "" if self.selected is None else self.selected
         return f"{self.session.number}/{chosen}" if self.is_open else "/"
-
-    def require_shown(self) -> None:
-        """Refuse what was pressed while the browser showed another object than is looked at now.
-
-        Raises:
-            InputError: it did.
-        """
-        if self._meant not in (ANY, self.whose):
-            raise InputError(
-                "another object was chosen just before that was pressed: nothing is done. Look at "
-                "it, and press again."
-            )
 
     def _go_to_worst(self) -> None:
         first = scene_list.first_wanted(self.rows())
@@ -160,8 +138,7 @@ class Window:
         """Forget the browser: it is gone."""
         self._is_closed = True
         self.grasps.close()
-        for pool in (self._hands, self._eyes):
-            pool.shutdown(wait=False, cancel_futures=True)
+        self.hands.close()
 
     # --- what is looked at ------------------------------------------------------------------------
 
@@ -250,7 +227,7 @@ class Window:
         known = {o.instance for o in session.registered.objects}
         self.say(f"{session.name} has changed on disk; this is how it stands now.")
         self.select(instance if instance in known else None)
-        self._in_turn(lambda: None)
+        self.hands.do(lambda: None)
 
     def select(self, instance: int | None) -> None:
         """Look at an object of this scene."""
@@ -414,43 +391,15 @@ class Window:
             log.error("the review page failed", exc_info=error)
             self.alarm(window_text.BUG.format(error))
 
-    def guarded(
-        self, action: Callable[[Any], object], *, is_key: bool = False
-    ) -> Callable[[Any], Any]:
-        """Return a callback that never ends silently: what goes wrong is said in the panel.
-
-        Args:
-            action: what is done, after what came before it.
-            is_key: whether the page has seen to it that the object is shown that it is meant for.
-        """
+    def guarded(self, action: Callable[[Any], object], *, is_key: bool = False) -> Any:
+        """Return a callback that never ends silently; `is_key` as of `Hands.do`."""
 
         async def callback(event: Any) -> None:
             # What the server itself changes comes with no client; only a person's hand counts.
             if getattr(event, "client", self) is not None:
-                self._in_turn(lambda: action(event), ANY if is_key else self._shown)
+                self.hands.do(lambda: action(event), is_key=is_key)
 
         return callback
-
-    def _in_turn(self, action: Callable[[], object], meant: str = ANY) -> None:
-        """Do something after what came before it; `meant` is what the browser showed then."""
-
-        def work() -> None:
-            self._meant = meant
-            self.attempt(action)
-            self._meant = ANY
-            self.done += 1
-            self.photographs.tell()
-            self._eyes.submit(self._look)
-
-        with contextlib.suppress(RuntimeError):  # the browser is gone
-            self._hands.submit(work)
-
-    def _look(self) -> None:
-        """Wait until the browser shows what is looked at."""
-        here = self.whose
-        if here != self._shown and not self._is_closed:
-            self.browser.wait_for(here)
-            self._shown = here
 
     def attempt(self, action: Callable[[], object]) -> bool:
         """Do something; say what went wrong. Return whether it was done."""
@@ -471,7 +420,7 @@ class Window:
         def callback(*given: Any) -> None:
             # A click that places an object by points chooses nothing.
             if not (self._is_closed or self.correct.points.is_on):
-                self._in_turn(lambda: action(*given), self._shown)
+                self.hands.do(lambda: action(*given))
 
         return callback
 
