@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from realsim.review.server import ReviewServer
 
 PANEL_PX, PANEL_HEIGHT_PX, EDGE_PX = 300, 530, 8
-"""Width, height and distance from the edges of the right panel [px]; the scene keeps 3/4 of 1280."""
+"""Width, height and distance from the edges of the panel [px]: the scene keeps 3/4 of 1280."""
 log = logging.getLogger(__name__)
 # Viser reads the list of its 5,000 icons anew for every icon, at 10 ms; the archive stays open.
 with contextlib.suppress(AttributeError):  # another viser reads them otherwise
