@@ -24,6 +24,8 @@ BROKEN_PIPE = 141
 """Exit code where the reader of the output has gone, as in `| head` (128 + SIGPIPE)."""
 TERMINATED = 143
 """Exit code of a process that was asked to end (128 + SIGTERM), as shells count."""
+TOLD = (click.Abort, KeyboardInterrupt, SystemError, RealsimError, ImportError, OSError)
+"""What ends a command with a sentence, if it is no bug."""
 NO_COLOUR = "--no-color"
 
 
@@ -129,14 +131,7 @@ def _run() -> None:
         sys.exit(error.exit_code)
     except BrokenPipeError:
         raise
-    except (
-        click.Abort,
-        KeyboardInterrupt,
-        SystemError,
-        RealsimError,
-        ImportError,
-        OSError,
-    ) as stop:
+    except TOLD as stop:
         # click puts its own in the place of the one that knows how far it came, Python where a
         # compiled loop is called, and compiled modules where they are loaded.
         reason: BaseException = stop

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from realsim import ObjectModel, ObjectPose
 from realsim.geometry import se3
 from realsim.review import journal
 from realsim.review.window import window_text
+from realsim.review.window.keys import KEYS, STEPS
 from tests.support.reviewed_boxes import MODELS, SCENE
 
 TALL = 1
@@ -99,3 +101,10 @@ def test_a_line_in_the_history_has_time_name_and_how() -> None:
     first, second = text.split("\n")
     assert "**bob** moved it (steps+icp)" in first and "**ada** rejected: it floats" in second
     assert re.search(r"\d{4}-\d\d-\d\d \d\d:\d\d UTC", first)
+
+
+def test_the_page_holds_back_every_key_that_the_server_knows() -> None:
+    script = Path(window_text.__file__).with_name("page.js").read_text()
+    acts, looks = (re.findall(rf"{name} = /\^\[(\w+)\]", script)[0] for name in ("ACTS", "LOOKS"))
+    assert sorted(acts.upper()) == sorted(key.key for key in (*KEYS, *STEPS))
+    assert set(looks.upper()) == set("HNPCF"), "they judge and move nothing"

@@ -76,7 +76,7 @@ def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Consol
     if skipped:
         console.say(f"{skipped} of {len(refs)} scenes are upgraded already, with the same inputs")
     if again := sum((out / ref.place / NOTE).is_file() for ref in todo):
-        console.warn(f"{again} scenes are upgraded anew: their options or inputs have changed")
+        console.warn(f"options or inputs have changed: {again} of {len(refs)} scenes are done anew")
     failed: dict[str, str] = {}
     with contextlib.ExitStack() as lock:
         if len(refs) == 1 and todo:

@@ -30,7 +30,7 @@ ROUNDS = 5
 NOISE_STEPS, HOLE_STEPS = 2, 7
 """Simulations per round for either."""
 SEED = 0
-"""Of the simulations; those of the result have the next one."""
+"""The seed of the simulations; those of the result have the next one."""
 WELL = (50.0, 1e7)
 """Electrons at white that are tried: a phone's smallest pixel in the dark, and no noise."""
 STRIPE_NOISE = (1e-4, 2.0)
