@@ -1,6 +1,7 @@
 """What one browser keeps and says: its address, the reviewer's name, corrections not yet saved."""
 
 import contextlib
+import time
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
@@ -54,9 +55,11 @@ class Browser:
         """Wait until the browser has done what was sent before."""
         self._asked(PLACE_KEY, ANSWER_WAIT_S)
 
-    def shown(self) -> str:
-        """Return the scene and object that the page shows, as of `Window.whose`; '' = not told."""
-        return self._asked(SHOWN_KEY, ANSWER_WAIT_S)
+    def wait_for(self, whose: str) -> None:
+        """Wait until the browser shows this scene and object, as of `Window.whose`."""
+        end = time.monotonic() + ANSWER_WAIT_S
+        while self._asked(SHOWN_KEY, ANSWER_WAIT_S) not in ("", whose) and time.monotonic() < end:
+            time.sleep(0.02)
 
     def name(self) -> str:
         """Return the reviewer's name that it keeps; '' = none."""

@@ -1,13 +1,11 @@
 """What comes from one browser: done in its order, and for the object that was shown."""
 
 import contextlib
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from realsim.errors import InputError
-from realsim.review.window.browser import ANSWER_WAIT_S
 
 if TYPE_CHECKING:
     from realsim.review.window.window import Window
@@ -70,9 +68,7 @@ class Hands:
             pool.shutdown(wait=False, cancel_futures=True)
 
     def _wait_until_shown(self) -> None:
-        end = time.monotonic() + ANSWER_WAIT_S
-        while (here := self._window.whose) != self._shown:  # another may be chosen meanwhile
-            if self._window.browser.shown() in ("", here) or time.monotonic() > end:
-                self._shown = here
-            else:
-                time.sleep(0.02)
+        here = self._window.whose
+        if here != self._shown:
+            self._window.browser.wait_for(here)
+            self._shown = here
