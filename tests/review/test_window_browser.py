@@ -386,6 +386,19 @@ def test_a_key_counts_for_the_object_that_was_shown_when_it_was_pressed(
         page.wait_until(lambda: f"0/{first}" != page.page.evaluate("realsimShown()"), "the next")
         page.page.keyboard.press("x")
         page.wait_message("rejected")
-    assert [(e.action, e.instance == first) for e in lines(server)] == [
-        ("accept", True), ("reject", False),
+        page.write("Comment", "of the second")
+        page.page.evaluate(CLICKED, [rows(page)[1].splitlines()[0], "Accept"])
+        page.wait_for("Accept was pressed while another object was shown", "accepted by ada")
+        assert page.value("Comment") == ""
+        page.write("Comment", "of the first")
+        page.page.evaluate(CLICKED, ["Comment only"])  # at once: the text is still on its way
+        page.wait_message("comment")
+        page.press("0 tall")
+        page.wait_until(lambda: page.value("Comment") == "of the second", "what was written of it")
+    assert [(e.action, e.instance == first, e.comment) for e in lines(server)] == [
+        ("accept", True, ""), ("reject", False, ""), ("comment", True, "of the first"),
     ]  # fmt: skip
+
+
+CLICKED = """labels => labels.forEach(label => [...document.querySelectorAll('button')]
+    .find(b => b.offsetParent && b.innerText.includes(label)).click())"""

@@ -1,7 +1,6 @@
 """What one browser keeps and says: its address, the reviewer's name, corrections not yet saved."""
 
 import contextlib
-import time
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
@@ -13,8 +12,6 @@ if TYPE_CHECKING:
 
 NAME_KEY = "realsim reviewer"
 """Under which the browser keeps the reviewer's name."""
-SHOWN_KEY = "realsim shown"
-"""Under which the page tells the scene and object that it shows, in panel and photograph."""
 DRAFTS_KEY = "realsim corrections"
 """Under which it keeps the corrections that were not saved."""
 NAME_WAIT_S = 60.0
@@ -54,12 +51,6 @@ class Browser:
     def wait(self) -> None:
         """Wait until the browser has done what was sent before."""
         self._asked(PLACE_KEY, ANSWER_WAIT_S)
-
-    def wait_for(self, whose: str) -> None:
-        """Wait until the browser shows this scene and object, as of `Window.whose`."""
-        end = time.monotonic() + ANSWER_WAIT_S
-        while self._asked(SHOWN_KEY, ANSWER_WAIT_S) not in ("", whose) and time.monotonic() < end:
-            time.sleep(0.02)
 
     def name(self) -> str:
         """Return the reviewer's name that it keeps; '' = none."""

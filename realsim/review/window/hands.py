@@ -1,74 +1,55 @@
-"""What comes from one browser: done in its order, and for the object that was shown."""
+"""What comes from one browser: done in its order, and told to the page, which waits for it."""
 
 import contextlib
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
-from realsim.errors import InputError
-
 if TYPE_CHECKING:
     from realsim.review.window.window import Window
 
-ANY = ""
-"""What is meant by that which nobody clicked."""
+TOLD = '<i data-realsim-hands="{client}/{received}" data-at-work="{at_work}"></i>'
+"""What `page.js` reads: it hands on the next key or click when nothing is at work."""
 
 
 class Hands:
     """Keys and clicks of a browser, one after the other."""
 
     def __init__(self, window: "Window") -> None:
-        """Take whose they are; nothing is shown yet.
+        """Take whose they are; nothing has come yet.
 
         Args:
             window: of the browser.
         """
         self._window = window
-        self._work, self._look = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
-        self._shown, self._meant = "/", ANY
-        """What the browser is known to show, and what it showed at this click."""
-        self.done = 0
-        """How much is done: the page hands on the next key then."""
+        self._work, self._lock = ThreadPoolExecutor(1), threading.Lock()
+        self._html = window.client.gui.add_html("")
+        self._received = self._done = 0
 
-    def do(self, action: Callable[[], object], *, is_key: bool = True) -> None:
-        """Do something after what came before it.
-
-        Args:
-            action: what.
-            is_key: whether it is for any object, or the page sees to that itself.
-        """
-        meant = ANY if is_key else self._shown
+    def do(self, action: Callable[[], object]) -> None:
+        """Do something after what came before it."""
 
         def work() -> None:
-            self._meant = meant
             self._window.attempt(action)
-            self._meant = ANY
-            self.done += 1
             self._window.photographs.tell()
-            self._look.submit(self._wait_until_shown)
+            with self._lock:
+                self._done += 1
+                self._tell()
 
-        with contextlib.suppress(RuntimeError):  # the browser is gone
+        with self._lock, contextlib.suppress(RuntimeError):  # the browser is gone
             self._work.submit(work)
-
-    def require_shown(self) -> None:
-        """Refuse what was clicked while the browser showed another object than is looked at now.
-
-        Raises:
-            InputError: it did.
-        """
-        if self._meant not in (ANY, self._window.whose):
-            raise InputError(
-                "another object was chosen just before that was pressed: nothing is done. Look at "
-                "it, and press again."
-            )
+            self._received += 1
+            self._tell()
 
     def close(self) -> None:
         """Do no more."""
-        for pool in (self._work, self._look):
-            pool.shutdown(wait=False, cancel_futures=True)
+        self._work.shutdown(wait=False, cancel_futures=True)
 
-    def _wait_until_shown(self) -> None:
-        here = self._window.whose
-        if here != self._shown:
-            self._window.browser.wait_for(here)
-            self._shown = here
+    def _tell(self) -> None:
+        if self._window.stands:
+            self._html.content = TOLD.format(
+                client=self._window.client.client_id,
+                received=self._received,
+                at_work=self._received - self._done,
+            )

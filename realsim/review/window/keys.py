@@ -78,7 +78,7 @@ def bind_keys(window: "Window") -> None:
 
 
 def _doing(window: "Window", act: Callable[["Window"], object]) -> Callable[[Any], None]:
-    return window.guarded(lambda _: act(window), is_key=True)
+    return window.guarded(lambda _: act(window))
 
 
 def _nudging(step: Step, kind: Kind) -> Callable[["Window"], object]:

@@ -17,49 +17,74 @@
   const fetched = window.fetch;
   window.fetch = (what, ...rest) =>
     String(what.url ?? what).startsWith("data:image/jpeg") ? new Promise(() => {}) : fetched(what, ...rest);
-  // Keys wait for the scene, and for the end of what was pressed before. What judges or moves an
-  // object is left out where another one is shown by then.
-  const waiting = [], stands = () => document.querySelector("[data-realsim-photograph]");
+  // Keys and clicks are handed on one after the other, each when the server has done the one before
+  // (hands.py). What judges or moves an object is left out where another one is shown by then.
   const ACTS = /^[hnpyxzmvbtcfjlkiou]$/i, LOOKS = /^[hnpcf]$/i; // keys.py
+  const TYPING_MS = 300, PATIENCE_MS = 10000;
+  const waiting = [], stands = () => document.querySelector("[data-realsim-hands]");
+  let awaited = null, until = 0, isSure = false, typed = 0, isHandingOn = false, note = null, down = [0, 0];
   const whose = () => (window.realsimShown ? window.realsimShown() : "");
-  let busy = null, until = 0, note = null, down = [0, 0];
-  const wait = (ms) => { [busy, until] = [stands().dataset.done, Date.now() + ms]; };
+  const say = (text) => {
+    if (note) note.remove();
+    note = document.createElement("p");
+    note.className = "realsim-held";
+    note.textContent = text;
+    document.body.append(note);
+    setTimeout((old) => old.remove(), 5000, note);
+  };
+  const received = () => stands().dataset.realsimHands;
+  // A click into the scene may choose nothing: then no answer comes.
+  const wait = (ms) => { [awaited, until, isSure] = [received(), Date.now() + ms, ms === PATIENCE_MS]; };
   const handOn = () => {
-    if (!stands() || (busy === stands().dataset.done && Date.now() < until)) return;
-    busy = null;
+    if (!stands() || stands().dataset.atWork !== "0" || Date.now() - typed < TYPING_MS) return;
+    if (awaited === received()) {
+      if (Date.now() < until) return;
+      if (isSure && waiting.splice(0).length)
+        say("The server has not answered for 10 s: what was pressed since is left out. Load the page anew.");
+      if (isSure) return;
+    }
     const next = waiting.shift();
     if (!next) return;
-    if (next.whose !== null && next.whose !== whose() && ACTS.test(next.key) && !LOOKS.test(next.key)) {
-      if (note) note.remove();
-      note = document.createElement("p");
-      note.className = "realsim-held";
-      note.textContent = `${next.key.toUpperCase()} was pressed while another object was shown: nothing is done. Press again.`;
-      document.body.append(note);
-      setTimeout((old) => old.remove(), 5000, note);
-      return;
-    }
-    if (ACTS.test(next.key)) wait(5000);
-    const event = new KeyboardEvent("keydown", { ...next, bubbles: true, cancelable: true });
-    event.isHandedOn = true;
-    document.body.dispatchEvent(event);
+    if (next.whose !== null && next.whose !== whose() && !next.looks)
+      return say(`${next.name} was pressed while another object was shown: nothing is done. Press again.`);
+    isHandingOn = true;
+    next.act();
+    isHandingOn = false;
   };
+  const hold = (item) => { if (waiting.length < 20) waiting.push(item); handOn(); };
   addEventListener("keydown", (event) => {
     const inText = event.target instanceof Element && event.target.closest("input, textarea");
-    if (event.isHandedOn || inText || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (isHandingOn || inText || event.ctrlKey || event.metaKey || event.altKey) return;
     if (stands() && !ACTS.test(event.key)) return;
     event.stopImmediatePropagation();
-    if (waiting.length < 20)
-      waiting.push({ key: event.key, code: event.code, shiftKey: event.shiftKey, whose: stands() ? whose() : null });
-    handOn();
+    const { key, code, shiftKey } = event;
+    const act = () => {
+      if (ACTS.test(key)) wait(PATIENCE_MS);
+      document.body.dispatchEvent(new KeyboardEvent("keydown", { key, code, shiftKey, bubbles: true, cancelable: true }));
+    };
+    hold({ name: key.toUpperCase(), looks: LOOKS.test(key) || !ACTS.test(key), whose: stands() ? whose() : null, act });
   }, true);
   setInterval(handOn, 25);
-  // What a click chooses has to be shown, too, before a key counts.
+  addEventListener("input", () => { typed = Date.now(); }, true); // viser sends a text some time after it
   addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; }, true);
   addEventListener("click", (event) => {
-    if (!stands() || !(event.target instanceof Element) || event.target.closest(".rs-photograph")) return;
-    const pressed = event.target.closest("button:not([role=tab]):not([data-realsim-open]), canvas");
+    if (isHandingOn || !stands() || !(event.target instanceof Element)) return;
     const isDrag = Math.hypot(event.clientX - down[0], event.clientY - down[1]) > 3;
-    if (pressed && !isDrag) wait(pressed.tagName === "CANVAS" ? 1000 : 3000);
+    // The scene: what a click chooses there has to be shown before a key counts.
+    if (event.target.closest("canvas") && !isDrag) return wait(1000);
+    const button = event.target.closest("button.mantine-Button-root");
+    if (!button) return;
+    event.stopImmediatePropagation();
+    event.preventDefault();
+    const text = button.textContent;
+    const act = () => {
+      if (!button.isConnected || button.disabled || button.textContent !== text)
+        return say(`${text} was pressed while something else was being done: nothing is done. Press again.`);
+      wait(PATIENCE_MS);
+      button.dispatchEvent(new MouseEvent("click", { bubbles: true, cancelable: true }));
+    };
+    const panel = button.closest("[data-dock-window], .mantine-Paper-root");
+    hold({ name: text, looks: !!(panel && panel.querySelector(".realsim-progress")), whose: whose(), act });
   }, true);
   const PLACE = "realsim place", read = Storage.prototype.getItem, write = Storage.prototype.setItem;
   const is = (key) => String(key).endsWith(PLACE);
@@ -73,7 +98,6 @@
     history.replaceState(null, "", location.pathname + "#" + place);
   };
   Storage.prototype.getItem = function (key) {
-    if (String(key).endsWith("realsim shown")) return window.realsimShown ? window.realsimShown() : "";
     return is(key) ? said().toString() : read.call(this, key);
   };
   Storage.prototype.setItem = function (key, value) {

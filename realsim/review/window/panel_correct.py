@@ -161,7 +161,6 @@ class CorrectPanel:
     def snap(self) -> None:
         """Let the measured depth say where the copy belongs."""
         window = self._window
-        window.hands.require_shown()
         now = self.begin()
         instance = now.start.instance
         with window.working("Snapping to the measured depth", window.session.name) as progress:
@@ -186,7 +185,6 @@ class CorrectPanel:
 
     def put_back(self) -> None:
         """Take the copy away and forget it; nothing was written."""
-        self._window.hands.require_shown()
         if self._now is not None:
             self._forget(self._now.start.instance)
         self.set_aside()
@@ -227,9 +225,8 @@ class CorrectPanel:
         """Refuse a change while the answer to the last one is being computed.
 
         Raises:
-            InputError: it is, or another object was shown.
+            InputError: it is.
         """
-        self._window.hands.require_shown()
         if self._is_busy:
             raise InputError("something is being computed, nothing was done; wait until it is.")
 

@@ -24,6 +24,9 @@ class ObjectPanel:
         self._window = window
         self._last: Entry | None = None
         """The line that Undo takes back, as the reviewer sees it."""
+        self._whose: tuple[int, int | None] = -1, None
+        self._comments: dict[tuple[int, int | None], str] = {}
+        """Scene and instance shown, and what was written of others and is not recorded yet."""
         gui = window.client.gui
         self._text = gui.add_markdown("Click an object in the scene or in the list.")
         self._comment = gui.add_text("Comment", "", multiline=True, hint="Goes with the decision.")
@@ -50,7 +53,6 @@ class ObjectPanel:
     def decide(self, action: Action) -> None:
         """Append a decision about the object as it stands here."""
         window = self._window
-        window.hands.require_shown()
         window.correct.require_saved()
         placed = window.placed
         comment = self._comment.value
@@ -62,15 +64,16 @@ class ObjectPanel:
     def undo(self) -> None:
         """Take back the last line on this object."""
         window = self._window
-        window.hands.require_shown()
         entry = window.session.undo(window.placed, self._last, window.reviewer)
         last = self._last
         what = "" if last is None else window_text.undo_label(last).removeprefix("Undo: ")
         window.decided(entry, f"taken back on {window.model_of(window.placed).name}: {what}")
 
     def selected(self) -> None:
-        """Begin with another object."""
-        self._comment.value = ""
+        """Begin with another object; a comment that was not recorded waits for its object."""
+        self._comments[self._whose] = self._comment.value
+        self._whose = self._window.session.number, self._window.selected
+        self._comment.value = self._comments.pop(self._whose, "")
 
     def refresh(self) -> None:
         """Show the object as the journal has it."""

@@ -18,7 +18,7 @@ SOON_S = 0.5
 """After so long it is shown which views are compared with the objects so far [s]."""
 OPEN = """<div data-realsim-photograph data-window="{client}" data-state="{state}"
 data-scene="{scene}" data-instance="{instance}" data-name="{name}" data-turn="{turn}"
-data-view="{view}" data-done="{done}">
+data-view="{view}">
 <button data-realsim-open class="realsim-open">Photographs at full size (G)</button></div>"""
 
 
@@ -54,7 +54,6 @@ class PhotographLink:
             client=window.client.client_id, state=f"{zlib.crc32(state.encode()):08x}",
             scene=window.session.number, instance=window.selected if chosen else "",
             name=html.escape(name), turn=self._turn, view=self._view,
-            done=window.hands.done,
         )  # fmt: skip
         if content != self._html.content:
             self._html.content = content

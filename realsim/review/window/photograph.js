@@ -11,7 +11,10 @@
 
   const shown = () => document.querySelector("[data-realsim-photograph]");
   const whose = () => `${shown().dataset.scene}/${shown().dataset.instance}`;
-  window.realsimShown = () => (root && root.dataset.whose) || (shown() ? whose() : "");
+  window.realsimShown = () => { // "0/3"; "0/3 0/4" while the photograph is still another object's
+    const here = shown() ? whose() : "", drawn = root && root.dataset.whose;
+    return drawn && drawn !== here ? `${drawn} ${here}` : here;
+  };
   const make = (tag, kind, parent, text) => {
     const e = document.createElement(tag);
     if (kind) e.className = kind;

@@ -82,7 +82,7 @@ class Window:
         """Whether a scene is there and an object chosen: keys and buttons wait for it."""
         self._opened: Opened | None = None
         self._busy = threading.Lock()
-        self.browser, self.hands = Browser(self), Hands(self)
+        self.browser = Browser(self)
         self._seen: object = None
         self._standing: Standing | None = None
         self._is_closed = False
@@ -92,7 +92,8 @@ class Window:
         gui.main_panel.float(x=-EDGE_PX, y=EDGE_PX, width=PANEL_PX, height=PANEL_HEIGHT_PX)
         self._name = gui.add_text("Your name", reviewer, hint="Decisions are signed with it.")
         self._message = gui.add_html("")
-        self.photographs, self.stand = PhotographLink(self), Standpoint(self)
+        self.hands, self.photographs = Hands(self), PhotographLink(self)
+        self.stand = Standpoint(self)
         self.list = ListPanel(self)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Object"):
@@ -120,12 +121,6 @@ class Window:
         if kept := "" if self.reviewer else self.browser.name():
             self._name.value = kept
         self.hands.do(lambda: None)
-
-    @property
-    def whose(self) -> str:
-        """Number of the scene, and instance of the object that is looked at."""
-        chosen = "" if self.selected is None else self.selected
-        return f"{self.session.number}/{chosen}" if self.is_open else "/"
 
     def _go_to_worst(self) -> None:
         first = scene_list.first_wanted(self.rows())
@@ -391,13 +386,13 @@ class Window:
             log.error("the review page failed", exc_info=error)
             self.alarm(window_text.BUG.format(error))
 
-    def guarded(self, action: Callable[[Any], object], *, is_key: bool = False) -> Any:
-        """Return a callback that never ends silently; `is_key` as of `Hands.do`."""
+    def guarded(self, action: Callable[[Any], object]) -> Any:
+        """Return a callback that never ends silently."""
 
         async def callback(event: Any) -> None:
             # What the server itself changes comes with no client; only a person's hand counts.
             if getattr(event, "client", self) is not None:
-                self.hands.do(lambda: action(event), is_key=is_key)
+                self.hands.do(lambda: action(event))
 
         return callback
 
