@@ -258,6 +258,15 @@ def test_a_correction_outlives_a_reload_and_the_edit_of_another(
             other.write("Your name", "bob")
             other.wait_for("ada corrects 3 flat")
             page.wait_for("bob looks at 3 flat")
+        tab = ReviewPage(page.context, server.url)
+        tab.wait_message("Your correction of flat goes on")
+        tab.page.set_viewport_size({"width": 390, "height": 844})  # a phone: the list is out of sight
+        tab.page.locator("[data-realsim-key=n]").click()
+        tab.wait_for("instance 0, object 1")
+        tab.key("l")
+        both = '"instance":3', '"instance":0'
+        page.wait_until(lambda: all(t in str(page.kept()) for t in both), "both corrections")
+        tab.page.close()
         placed = session.standing.scene.object(3)
         aside = se3.from_translation([0.0, 0.02, 0.0]) @ placed.T_world_obj
         session.decide("move", placed, "bob", pose=aside, how="steps")

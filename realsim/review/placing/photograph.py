@@ -267,7 +267,7 @@ class Photographs:
                     compared = self._compared(view, objects, stride)
                     self._scores[view, poses] = _scores(compared, len(objects), stride)
                 except InputError as error:
-                    self._scores[view, poses] = {"trouble": str(error)}
+                    return {"trouble": str(error)}  # the file may come back
             return self._scores[view, poses]
 
     def _depth_rgb(self, rgb: Rgb, compared: Compared) -> Rgb:

@@ -63,8 +63,10 @@ class Browser:
     def keep_drafts(self, drafts: dict[tuple[str, int], Draft]) -> None:
         """Keep the corrections that are not saved, if they are others than before."""
         if drafts != self.drafts:
+            gone = [d for key, d in self.drafts.items() if key not in drafts]
+            new = [d for key, d in drafts.items() if self.drafts.get(key) != d]
             self.drafts = drafts
-            text = msgspec.json.encode(list(drafts.values())).decode()
+            text = msgspec.json.encode({"set": new, "gone": gone}).decode()
             self._window.client.local_storage.set_item(DRAFTS_KEY, text)
 
     def read_drafts(self) -> None:

@@ -37,6 +37,7 @@
   const wait = (ms) => { [awaited, until, isSure] = [received(), Date.now() + ms, ms === PATIENCE_MS]; };
   const handOn = () => {
     if (!stands() || stands().dataset.atWork !== "0" || Date.now() - typed < TYPING_MS) return;
+    if (whose().includes(" ")) return;
     if (awaited === received()) {
       if (Date.now() < until) return;
       if (isSure && waiting.splice(0).length)
@@ -57,13 +58,15 @@
     if (isHandingOn || inText || event.ctrlKey || event.metaKey || event.altKey) return;
     if (stands() && !ACTS.test(event.key)) return;
     event.stopImmediatePropagation();
-    const { key, code, shiftKey } = event;
+    strike(event.key, event.code, event.shiftKey);
+  }, true);
+  const strike = (key, code = "Key" + key.toUpperCase(), shiftKey = false) => {
     const act = () => {
       if (ACTS.test(key)) wait(PATIENCE_MS);
       document.body.dispatchEvent(new KeyboardEvent("keydown", { key, code, shiftKey, bubbles: true, cancelable: true }));
     };
     hold({ name: key.toUpperCase(), looks: LOOKS.test(key) || !ACTS.test(key), whose: stands() ? whose() : null, act });
-  }, true);
+  };
   setInterval(handOn, 25);
   addEventListener("input", () => { typed = Date.now(); }, true); // viser sends a text some time after it
   addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; }, true);
@@ -72,6 +75,8 @@
     const isDrag = Math.hypot(event.clientX - down[0], event.clientY - down[1]) > 3;
     // The scene: what a click chooses there has to be shown before a key counts.
     if (event.target.closest("canvas") && !isDrag) return wait(1000);
+    const step = event.target.closest("[data-realsim-key]");
+    if (step) return strike(step.dataset.realsimKey);
     const button = event.target.closest("button.mantine-Button-root");
     if (!button) return;
     event.stopImmediatePropagation();
@@ -97,10 +102,16 @@
     place = fields.toString();
     history.replaceState(null, "", location.pathname + "#" + place);
   };
+  const name = (draft) => `${draft.instance} ${draft.scene}`;
   Storage.prototype.getItem = function (key) {
     return is(key) ? said().toString() : read.call(this, key);
   };
   Storage.prototype.setItem = function (key, value) {
+    if (String(key).endsWith("realsim corrections")) { // of all tabs; one tells what it changed
+      const told = JSON.parse(value), changed = [...told.set, ...told.gone].map(name);
+      const others = JSON.parse(read.call(this, key) || "[]").filter((d) => !changed.includes(name(d)));
+      value = JSON.stringify([...others, ...told.set]);
+    }
     if (!is(key)) return write.call(this, key, value);
     const fields = new URLSearchParams(value);
     for (const own of ["tab", "photo"]) if (said().get(own)) fields.set(own, said().get(own));

@@ -19,7 +19,9 @@ SOON_S = 0.5
 OPEN = """<div data-realsim-photograph data-window="{client}" data-state="{state}"
 data-scene="{scene}" data-instance="{instance}" data-name="{name}" data-turn="{turn}"
 data-view="{view}">
-<button data-realsim-open class="realsim-open">Photographs at full size (G)</button></div>"""
+<button data-realsim-key="p" class="realsim-step" title="Previous">\u25c0</button>
+<button data-realsim-open class="realsim-open">Photographs at full size (G)</button>
+<button data-realsim-key="n" class="realsim-step" title="Next">\u25b6</button></div>"""
 
 
 class PhotographLink:

@@ -175,7 +175,7 @@
   };
   // Nothing of another object stays: what one view says against it would be read as said of this one.
   const forget = () => {
-    strip = null; panes = []; root.dataset.whose = "";
+    strip = null; panes = []; root.dataset.whose = whose();
     for (const part of [".rs-panes", ".rs-strip", ".rs-legend"]) root.querySelector(part).replaceChildren();
     root.querySelector(".rs-caption").textContent = shown().dataset.name;
     root.querySelector(".rs-compared").textContent = "";
