@@ -260,7 +260,9 @@ def test_a_correction_outlives_a_reload_and_the_edit_of_another(
             page.wait_for("bob looks at 3 flat")
         tab = ReviewPage(page.context, server.url)
         tab.wait_message("Your correction of flat goes on")
-        tab.page.set_viewport_size({"width": 390, "height": 844})  # a phone: the list is out of sight
+        tab.page.set_viewport_size(
+            {"width": 390, "height": 844}
+        )  # a phone: the list is out of sight
         tab.page.locator("[data-realsim-key=n]").click()
         tab.wait_for("instance 0, object 1")
         tab.key("l")
@@ -336,8 +338,11 @@ def test_the_mouse_chooses_objects_frustums_grasps_and_three_points(
         T_grasp = scene.object(0).T_world_obj @ grasps.Ts_obj_grasp[widest]
         finger = [[0.0, 0.52 * grasps.widths_m[widest], -0.5 * FINGER_M]]
         page.click_at(camera, se3.transform(T_grasp, np.array(finger)), "of 40, tall (instance 0)")
+        clicked = int(page.text().partition("Grasp ")[2].split()[0])  # or one that stands before it
         page.press("Next")
-        page.wait_for("The arm does not reach it")
+        page.wait_for(
+            f"Grasp {(clicked + 1) % 40} of 40", ("not reach it", "reaches it")[clicked % 2]
+        )
         page.tick("Show grasps")
         page.press("3 flat")
         page.wait_for("\u25b6 3 flat")
