@@ -119,7 +119,8 @@ def page_of(documents: dict[str, Document]) -> str:
         said |= {k: f"{said[k]} +- {v:.2g}" for k, v in noise}
         asked = [key for key in said if "inf" not in goals.get(key, "inf")]
         lines += ["figure | measured | goal", "---|---|---"]
-        lines += [f"{key} | {said[key]} | {goals[key]}" for key in asked]
+        rows = [f"{key} | {said[key]} | {goals[key]}" for key in asked]
+        lines += [r.replace(">= ", "\u2265").replace("<= ", "\u2264") for r in rows]
         tools = ", ".join(f"{k} {said[k]}" for k in said if any(word in k for word in TOOLS))
         lines += ["", f"Other tools: {tools}." if tools else "", ""]
     return "\n".join(lines)
