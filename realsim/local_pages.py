@@ -388,9 +388,9 @@ def _without_tracebacks(record: logging.LogRecord) -> bool:
 
 def _not_understood(_loop: object, context: Mapping[str, Any]) -> None:
     """Log in one line that a browser sent what is no message of the page."""
-    error = context.get("exception")
-    log.warning("a message from a browser was not understood: %.200r", error or context["message"])
-    log.debug("where it was read:", exc_info=error)
+    if error := context.get("exception"):
+        log.warning("a message from a browser was not understood: %.200r", error)
+    log.debug("the server's loop tells: %s", context.get("message"), exc_info=error)
 
 
 _sockets_log.addFilter(_without_tracebacks)

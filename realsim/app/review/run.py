@@ -4,6 +4,7 @@ import contextlib
 import os
 import signal
 import threading
+import warnings
 import webbrowser
 from collections.abc import Generator
 from dataclasses import dataclass
@@ -51,6 +52,8 @@ def run_review(request: ReviewRequest, console: Console) -> None:
     )  # fmt: skip
     for remark in remarks:
         console.warn(remark)
+    # A browser may leave while its page is changed; viser would tell that in the terminal.
+    warnings.filterwarnings("ignore", "Queued .* on a closed connection", UserWarning)
     with _until_interrupted() as ended:
         server.start()
         try:
