@@ -180,6 +180,20 @@ def test_a_journal_that_vanishes_is_told_in_red_until_it_is_back(page: Page) -> 
     page.wait_message("can be read again", "realsim-message ok")
 
 
+def test_a_scene_that_cannot_be_read_is_told_until_it_can(page: Page) -> None:
+    window = page.window
+    path = page.server.sessions[0].store.path("registration/scene.json")
+    whole = path.read_bytes()
+    path.write_bytes(whole[:100])
+    page.wait_message("scene.json", ORANGE)
+    window.attempt(lambda: window.object.decide("accept"))  # its answer takes the place of that
+    page.wait_message("Recorded", "realsim-message ok")
+    assert "scene.json" in window.list._remarks.content
+    path.write_bytes(whole)
+    page.wait_message("can be read again", "realsim-message ok")
+    assert "scene.json" not in window.list._remarks.content
+
+
 def test_a_page_with_a_swap_to_a_missing_model_stays_usable(page: Page) -> None:
     window, session = page.window, page.server.sessions[0]
     placed = session.standing.scene.object(3)

@@ -86,7 +86,8 @@ class ListPanel:
         style = f"<style>{ROW_STYLE.format(ids=self._ids)}{''.join(styles)}</style>"
         if style != self._style.content:
             self._style.content = style
-        lines = [f"- {window_text.escaped(text)}" for text in window.server.remarks]
+        told = [*window.server.remarks, *filter(None, [window.trouble])]
+        lines = [f"- {window_text.escaped(str(text))}" for text in told]
         if pages > 1:
             lines.insert(0, f"page {self._page + 1} of {pages}")
         self._remarks.content = "\n".join(lines)

@@ -86,7 +86,7 @@ class Window:
         self._seen: object = None
         self._standing: Standing | None = None
         self._is_closed = False
-        self._trouble: Exception | None = None
+        self.trouble: Exception | None = None
         """What kept the journals from being shown when they were looked at last."""
         gui = client.gui
         gui.main_panel.float(x=-EDGE_PX, y=EDGE_PX, width=PANEL_PX, height=PANEL_HEIGHT_PX)
@@ -315,14 +315,15 @@ class Window:
             self.refresh()
         except Exception as error:
             trouble = trouble or error
+        before, self.trouble = self.trouble, trouble
         # It is looked at once a second; a bug is logged once.
-        if trouble is not None and repr(trouble) != repr(self._trouble):
-            self.fail(trouble)
+        if is_new := repr(trouble) != repr(before):
+            self.say("The session can be read again.") if trouble is None else self.fail(trouble)
         elif isinstance(trouble, SessionGone):
             self.alarm(str(trouble))
-        elif trouble is None and self._trouble is not None:
-            self.say("The session can be read again.")
-        self._trouble = trouble
+        if is_new:
+            with contextlib.suppress(Exception):
+                self.refresh(force=True)
 
     def _looked(self) -> None:
         """The browser's camera was moved: the address follows, and frustums make way."""
