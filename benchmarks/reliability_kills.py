@@ -50,7 +50,7 @@ LONG = {
     "board views": f"capture lab --plan views.json --board {BOARD} --simulated",
     "calibrate": "calibrate lab",
     "upgrade": "upgrade bop --out upgraded --grasps 2 --workers 1",
-    "scan": "scan import session/models/obj_000008.ply --unit mm --library models",
+    "scan": "scan import session/models/obj_000008.ply --unit mm --library models --overwrite",
 }
 """In this order: each finds what the ones before it made."""
 QUICK = ("export", "stats")
