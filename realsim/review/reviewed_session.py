@@ -66,7 +66,8 @@ class ReviewedSession:
             InputError: the session is not registered, or a model of an object is missing.
         """
         self.store = store
-        self.name = store.folder.resolve().name
+        self.place = str(store.folder.resolve())
+        self.name = store.folder.resolve().name if before is None else before.name
         """Name of the session; scenes of a data set are told apart by their folders."""
         self.journal_path = store.path(JOURNAL_FILE)
         """Where the decisions stand."""

@@ -1,6 +1,7 @@
 """Which sessions a review is about, and their objects in the order in which they want a look."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,6 +75,14 @@ def sessions_under(folders: Sequence[Path]) -> list[Path]:
     for path in found:
         once.setdefault(path.resolve(), path)
     return list(once.values())
+
+
+def names_of(folders: Sequence[Path]) -> list[str]:
+    """Return what tells folders apart: the ends of their paths, of as many parts as that takes."""
+    parts = [folder.resolve().parts for folder in folders]
+    ends = [["/".join(p[-k:]) for k in range(1, len(p) + 1)] for p in parts]
+    count = Counter(end for row in ends for end in row)
+    return [next((end for end in row if count[end] == 1), row[-1]) for row in ends]
 
 
 def _sessions_in(folder: Path, deepest: int) -> list[Path]:

@@ -76,13 +76,16 @@ class ReviewServer:
         given = [stores] if isinstance(stores, SessionStore) else list(stores)
         if not token:
             local_pages.check_host(host, "the review")
-        names = () if local_pages.is_loopback(host) else local_pages.names_of_this_machine(host)
-        self._door = Door(token=token, names=names)
+        hosts = () if local_pages.is_loopback(host) else local_pages.names_of_this_machine(host)
+        self._door = Door(token=token, names=hosts)
         self._host, self._port, self._reviewer = host, port, reviewer
         self._config = config or SceneConfig()
         self._make_motions = motions
         self._motions: dict[int, Motions | None] = {}
         self._sessions = [ReviewedSession(s, k, self._config) for k, s in enumerate(given)]
+        names = scene_list.names_of([s.folder for s in given])
+        for session, name in zip(self._sessions, names, strict=True):
+            session.name = name
         self.remarks = tuple(remarks)
         """What the reviewers should know."""
         self._warned: set[str] = set()

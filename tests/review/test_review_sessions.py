@@ -86,6 +86,8 @@ def test_sessions_are_found_below_a_folder_and_once(tmp_path: Path) -> None:
     root = tmp_path / "root"
     found = [root / "other", root / "test/000001", root / "test/000002"]
     assert scene_list.sessions_under([root]) == found
+    alike = [root / "train/000002", root / "test/000002", root / "test/000001"]
+    assert scene_list.names_of(alike) == ["train/000002", "test/000002", "000001"]
     assert scene_list.sessions_under([found[2], root, root / "test"]) == [found[2], *found[:2]]
     with pytest.raises(InputError, match="not a folder"):
         scene_list.sessions_under([tmp_path / "nothing"])

@@ -86,7 +86,7 @@ class Page:
 
 
 @contextmanager
-def opened(store: SessionStore) -> Generator[Page]:
+def opened(store: SessionStore | list[SessionStore]) -> Generator[Page]:
     with serving(store, reviewer="ada") as server:
         address = server.url.replace("http", "ws")
         with connect(address, subprotocols=[SOCKET], max_size=None, ping_interval=None) as line:
@@ -226,6 +226,40 @@ def test_keys_change_and_save_nothing_while_a_snap_is_computed(page: Page) -> No
     assert not session.standing.state.entries
     window.correct.enable(True)
     assert window.attempt(lambda: window.correct.nudge("x", -1, "move"))
+
+
+def test_points_are_clicked_anew_when_the_copy_has_moved_and_put_back_is_all_back(
+    page: Page,
+) -> None:
+    window: Any = page.window
+    correct: Any = window.correct
+    correct.by_points()
+    assert correct.points.is_on and window.attempt(lambda: correct.nudge("x", 1, "move"))
+    assert not correct.points.is_on and "begin the three points anew" in page.message
+    own = correct._object.value
+    other = next(o for o in correct._object.options if o != own)
+    page.set(correct._object, other)
+    page.wait(lambda: correct.moved is not None and f"{correct.moved.obj_id}" == other.split()[0])
+    assert window.attempt(correct.put_back) and correct._object.value == own
+    page.set(correct._object, other)
+    page.wait(lambda: correct.moved is not None)
+    assert window.attempt(correct.save)
+    page.wait(lambda: correct._object.value.split()[0] == other.split()[0])
+    assert window.attempt(window.object.undo)
+    page.wait(lambda: correct._object.value == own)
+
+
+def test_scenes_of_one_name_keep_their_own_corrections(tmp_path: Path) -> None:
+    stores = [boxes_session(tmp_path / half / "000050") for half in ("test", "train")]
+    with opened(stores) as page:
+        window = page.window
+        assert [s.name for s in page.server.sessions] == ["test/000050", "train/000050"]
+        here = window.session.number
+        assert window.attempt(lambda: (window.go_to(here, 3), window.correct.nudge("x", 1, "move")))
+        ((place, instance),) = window.browser.drafts
+        assert (place, instance) == (str(stores[here].folder.resolve()), 3)
+        assert window.attempt(lambda: window.go_to(1 - here, 3)) and window.correct.moved is None
+        assert window.attempt(lambda: window.go_to(here, 3)) and window.correct.moved is not None
 
 
 # --- scenes that lack something, or hold much ---------------------------------------------------

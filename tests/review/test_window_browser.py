@@ -234,7 +234,7 @@ def test_the_photographs_open_at_the_worst_view_and_follow_the_object(
         page.write("Your name", "ada")
         page.write("Why", "blurred")
         page.press("Leave it out")
-        page.wait_for("view 0: ada", "blurred", "Take it in again")
+        page.wait_for("view 0: ada", "blurred", "Take it in again (view 0)")
         page.press("Show its photograph")
         page.wait_for("tall \u00b7 view 0")
     assert [(e.action, e.view) for e in lines(server)] == [("exclude", 0)]
@@ -407,12 +407,20 @@ def test_a_key_counts_for_the_object_that_was_shown_when_it_was_pressed(
         page.write("Comment", "of the first")
         page.page.evaluate(CLICKED, ["Comment only"])  # at once: the text is still on its way
         page.wait_message("comment")
+        page.page.get_by_role("button", name="Comment only").click()
+        page.page.keyboard.press("Enter")  # a button that was clicked takes no key
+        page.page.evaluate(HELD)
+        page.page.keyboard.press("v")
+        page.wait_message("Recorded: moved")  # what was held leaves room for the next
         page.press("0 tall")
         page.wait_until(lambda: page.value("Comment") == "of the second", "what was written of it")
     assert [(e.action, e.instance == first, e.comment) for e in lines(server)] == [
         ("accept", True, ""), ("reject", False, ""), ("comment", True, "of the first"),
+        ("comment", True, ""), ("move", True, ""),
     ]  # fmt: skip
 
 
+HELD = """for (let k = 0; k < 40; ++k) document.body.dispatchEvent(new KeyboardEvent('keydown',
+    {key: 'l', code: 'KeyL', bubbles: true, repeat: k > 0}))"""
 CLICKED = """labels => labels.forEach(label => [...document.querySelectorAll('button')]
     .find(b => b.offsetParent && b.innerText.includes(label)).click())"""

@@ -255,7 +255,7 @@ class ReviewBrowser:
 
 
 @contextmanager
-def serving(store: SessionStore, **options: Any) -> Generator[ReviewServer]:
+def serving(store: SessionStore | list[SessionStore], **options: Any) -> Generator[ReviewServer]:
     """Serve a session's review, small and on a free port, for as long as the block lasts."""
     server = ReviewServer(store, port=0, config=SMALL, **options)
     server.start()

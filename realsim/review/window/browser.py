@@ -25,7 +25,7 @@ class Draft(msgspec.Struct, frozen=True, kw_only=True):
     """A correction that is not saved: it outlives a reload and a lost connection."""
 
     scene: str
-    """Name of the session."""
+    """Folder of the session."""
     instance: int
     obj_id: int
     """What the object is said to be."""
@@ -46,7 +46,7 @@ class Browser:
         self._window = window
         self._told = ""
         self.drafts: dict[tuple[str, int], Draft] = {}
-        """Corrections that are not saved, by session and instance."""
+        """Corrections that are not saved, by folder of the session and instance."""
 
     def wait(self) -> None:
         """Wait until the browser has done what was sent before."""

@@ -1,6 +1,7 @@
 """The translucent copy of an object that is being corrected, with arrows and rings to drag."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +21,22 @@ OPACITY = 0.55
 """So that the measured points inside of it are seen, and the copy too."""
 GIZMO_SHARE = 1.1
 """Length of the arrows over the object's longest half axis."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Correction:
+    """An object on its way to another place."""
+
+    start: ObjectPose
+    """As the reviewer found it."""
+    T_world_obj: Array
+    """(4, 4) where it is now [m]."""
+    obj_id: int
+    """What it is said to be."""
+    how: tuple[str, ...] = ()
+    """By what it was moved, each once."""
+    checks: tuple[tuple[str, float], ...] = ()
+    """What was measured of it where it is now."""
 
 
 class MovedCopy:

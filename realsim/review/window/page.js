@@ -52,12 +52,16 @@
     next.act();
     isHandingOn = false;
   };
-  const hold = (item) => { if (waiting.length < 20) waiting.push(item); handOn(); };
+  const hold = (item) => {
+    if (waiting.push(item) > 20) say(`Too much was pressed at once: ${waiting.pop().name} is left out.`);
+    handOn();
+  };
   addEventListener("keydown", (event) => {
     const inText = event.target instanceof Element && event.target.closest("input, textarea");
     if (isHandingOn || inText || event.ctrlKey || event.metaKey || event.altKey) return;
     if (stands() && !ACTS.test(event.key)) return;
     event.stopImmediatePropagation();
+    if (event.repeat && waiting.length) return; // what is held goes on as fast as it is done
     strike(event.key, event.code, event.shiftKey);
   }, true);
   const strike = (key, code = "Key" + key.toUpperCase(), shiftKey = false) => {
@@ -81,6 +85,7 @@
     if (!button) return;
     event.stopImmediatePropagation();
     event.preventDefault();
+    if (event.detail) button.blur(); // pressed by a pointer, it takes no key that comes later
     const text = button.textContent;
     const act = () => {
       if (!button.isConnected || button.disabled || button.textContent !== text)

@@ -3,7 +3,7 @@
 Everything happens on a translucent copy. Nothing is written before "Save the pose".
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -17,7 +17,7 @@ from realsim.review import journal
 from realsim.review.placing import placing
 from realsim.review.window import window_text
 from realsim.review.window.browser import Draft
-from realsim.review.window.moved_copy import MovedCopy
+from realsim.review.window.moved_copy import Correction, MovedCopy
 from realsim.review.window.three_points import PointPlacer
 
 if TYPE_CHECKING:
@@ -39,22 +39,6 @@ SYMMETRIES = {
 WAITING = "Drag the arrows, or use the steps, the buttons, or the keys. Nothing is written yet."
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Correction:
-    """An object on its way to another place."""
-
-    start: ObjectPose
-    """As the reviewer found it."""
-    T_world_obj: Array
-    """(4, 4) where it is now [m]."""
-    obj_id: int
-    """What it is said to be."""
-    how: tuple[str, ...] = ()
-    """By what it was moved, each once."""
-    checks: tuple[tuple[str, float], ...] = ()
-    """What was measured of it where it is now."""
-
-
 class CorrectPanel:
     """Moves a copy of the selected object, and writes one line when it is saved."""
 
@@ -66,7 +50,7 @@ class CorrectPanel:
         """
         self._window = window
         self._now: Correction | None = None
-        self._is_busy = False
+        self._is_busy, self._offered = False, -1
         self._copy = MovedCopy(window, self._dragged)
         self.points = PointPlacer(window, self._by_points, self._asked)
         gui = window.client.gui
@@ -187,6 +171,7 @@ class CorrectPanel:
         """Take the copy away and forget it; nothing was written."""
         if self._now is not None:
             self._forget(self._now.start.instance)
+            self._offer_models()
         self.set_aside()
 
     def set_aside(self) -> None:
@@ -259,10 +244,7 @@ class CorrectPanel:
         window = self._window
         if window.selected is None:
             return
-        names = [_choice(i, m) for i, m in sorted(window.content.models.items())]
-        now = _choice(window.placed.obj_id, window.model_of(window.placed))
-        self._object.options = tuple(dict.fromkeys((*names, now)))
-        self._object.value = now
+        self._offer_models()
         draft = window.browser.drafts.get(self._key(window.selected))
         if draft is not None and self._now is None:
             try:
@@ -281,6 +263,8 @@ class CorrectPanel:
             self._now = replace(now, start=window.placed)
             self._tell()
             self._tell_moved()
+        if now is None and window.placed.obj_id != self._offered:
+            self._offer_models()
         mark = window.standing.state.marks().get(window.placed.obj_id)
         own = window_text.symmetry_words(window.model_of(window.placed))
         self._marks.content = f"the model itself: {own}"
@@ -291,7 +275,15 @@ class CorrectPanel:
     # --- how --------------------------------------------------------------------------------------
 
     def _key(self, instance: int) -> tuple[str, int]:
-        return self._window.session.name, instance
+        return self._window.session.place, instance
+
+    def _offer_models(self) -> None:
+        """Let the object be what it is, or any other."""
+        window = self._window
+        names = [_choice(i, m) for i, m in sorted(window.content.models.items())]
+        now = _choice(window.placed.obj_id, window.model_of(window.placed))
+        self._object.options = tuple(dict.fromkeys((*names, now)))
+        self._object.value, self._offered = now, window.placed.obj_id
 
     def _registered(self, instance: int) -> int:
         return self._window.session.registered.object(instance).obj_id
@@ -328,10 +320,13 @@ class CorrectPanel:
         """Say that the object stands otherwise than when its correction was begun."""
         window, instance = self._window, self._window.placed.instance
         lines = window.standing.state.of(instance)
-        who = lines[-1].reviewer if lines else "somebody"
+        name = window.model_of(window.placed).name
+        what = (
+            f"{lines[-1].reviewer} has changed {name}" if lines else f"{name} was registered anew"
+        )
         window.refuse(
-            f"{who} has changed {window.model_of(window.placed).name} meanwhile. Your copy is "
-            "kept: Save the pose puts yours in the place of theirs, Put back forgets yours."
+            f"{what} meanwhile. Your copy is kept: Save the pose puts yours in the place of what "
+            "stands now, Put back forgets yours."
         )
 
     def _model(self) -> ObjectModel:
@@ -358,6 +353,9 @@ class CorrectPanel:
         assert self._now is not None, "the callers have begun"
         by = self._now.how if how in self._now.how else (*self._now.how, how)
         self._now = replace(self._now, T_world_obj=T, how=by, checks=checks)
+        if self.points.is_on:  # they are clicked on the copy as it stood
+            self._end_clicks()
+            self._window.refuse("The copy has moved: begin the three points anew.")
         self._copy.place(T, self._axes(T))
         self._tell()
         self._window.photographs.tell()
@@ -427,7 +425,7 @@ class CorrectPanel:
         now, kept = self._now, dict(self._window.browser.drafts)
         if now is not None and now.how:
             kept[self._key(now.start.instance)] = Draft(
-                scene=self._window.session.name, instance=now.start.instance, obj_id=now.obj_id,
+                scene=self._window.session.place, instance=now.start.instance, obj_id=now.obj_id,
                 stood=journal.subject_of(now.start), how=now.how,
                 registered=self._registered(now.start.instance),
                 pose=tuple(now.T_world_obj.ravel().tolist()),

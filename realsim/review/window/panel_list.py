@@ -1,7 +1,7 @@
 """The list of all scenes and objects, worst first."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import viser
 
@@ -47,7 +47,7 @@ class ListPanel:
         self._page = 0
         self._rows: list[ObjectRow] = []
         names = [s.name for s in window.server.sessions]
-        self._numbers = {_scene_label(k, n, names): k for k, n in enumerate(names)}
+        self._numbers = {n: k for k, n in enumerate(names)}
         with panel.add_tab("Scenes and objects"):
             self._head = gui.add_html("")
             self._scene = gui.add_dropdown(
@@ -101,7 +101,7 @@ class ListPanel:
         scene = window.server.sessions[row.session].name
         label = window_text.list_label(row, scene, with_scene=len(self._numbers) > 1)
         is_here = window.is_open and row.key == (window.session.number, window.selected)
-        if (scene, row.instance) in window.browser.drafts:
+        if (window.server.sessions[row.session].place, row.instance) in window.browser.drafts:
             label += "\nyour correction is not saved"
         button.label = f"\u25b6 {label}" if is_here else label
         button.visible = True
@@ -123,11 +123,6 @@ class ListPanel:
     def _turned(self) -> None:
         self._page = max(0, self._page + (1 if "better" in self._pages.value else -1))
         self._window.refresh(force=True)
-
-
-def _scene_label(number: int, name: str, names: list[Any]) -> str:
-    """Return a scene's name; with its number where two scenes have one name."""
-    return name if names.count(name) == 1 else f"{name} ({number + 1})"
 
 
 def _uuid(button: viser.GuiButtonHandle) -> str:

@@ -172,9 +172,10 @@ class ViewsPanel:
                 self._view.value = label
 
     def _label_exclude(self) -> None:
-        excluded = self._window.standing.state.excluded_views()
-        is_out = self._numbers.get(self._view.value, -1) in excluded
-        self._exclude.label = "Take it in again" if is_out else "Leave it out"
+        view = self._numbers.get(self._view.value, -1)
+        is_out = view in self._window.standing.state.excluded_views()
+        label = "Take it in again" if is_out else "Leave it out"
+        self._exclude.label = f"{label} (view {view})" if view >= 0 else label
 
     def _toggle(self) -> None:
         window, view = self._window, self.chosen
