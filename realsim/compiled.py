@@ -4,11 +4,16 @@ Numba keeps compiled code beside the source file, so that every clone compiles a
 notice when a function that the loop calls has changed in another file. Here compiled code lies in
 one folder of the user (`$NUMBA_CACHE_DIR`, or `realsim/numba` in `$XDG_CACHE_HOME`). Its name is a
 hash of the loop's file, of each compiled function and constant that it uses, and of the version.
+Where neither that folder nor the one of the source can be written, compiled code lies in a passing
+one, which this process and those that it starts share.
 """
 
+import atexit
 import contextlib
 import hashlib
 import os
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -84,7 +89,12 @@ class _ByContent(caching._CacheLocator):  # pyright: ignore[reportPrivateUsage]
 
     def __init__(self, function: Any) -> None:
         self._stamp = _key(function)
-        self._folder = cache_folder() / function.__module__
+        self._folder = self.root() / function.__module__
+
+    @staticmethod
+    def root() -> Path:
+        """Return the folder of all functions."""
+        return cache_folder()
 
     def get_cache_path(self) -> Any:
         return str(self._folder)
@@ -107,5 +117,17 @@ class _ByContent(caching._CacheLocator):  # pyright: ignore[reportPrivateUsage]
         return None
 
 
+class _ForThisRun(_ByContent):
+    """Find compiled code in a folder that goes when this process ends."""
+
+    @staticmethod
+    @cache
+    def root() -> Path:
+        folder = os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="realsim-numba-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        return Path(folder)
+
+
 _places: Any = caching.CacheImpl._locator_classes  # pyright: ignore[reportPrivateUsage]
 _places.insert(0, _ByContent)
+_places.append(_ForThisRun)

@@ -1,11 +1,15 @@
 """Compiled loops are found again by what they say, wherever the file lies and whoever they call."""
 
 import importlib.util
+import os
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+from realsim.app.config.files import find_config
+from realsim.user_cache import user_cache
 
 CALLED = """
 from realsim.compiled import njit
@@ -35,7 +39,7 @@ BY_MODULE = {"brought": "import realsim_probe_called", "called": "realsim_probe_
 
 def clone(folder: Path, shift: float, way: dict[str, str] = BY_NAME) -> ModuleType:
     """Write both files to a folder, as a clone would, and import them from there."""
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
     loaded: list[ModuleType] = []
     texts = {
         "realsim_probe_called": CALLED.format(shift=shift),
@@ -76,5 +80,19 @@ def test_a_home_that_cannot_be_written_compiles_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").touch()
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
+    for variable in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(variable, str(tmp_path / "file"))
     assert clone(tmp_path / "a", 1.0).outer(2.0) == 7.0
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b/__pycache__").touch()  # nor can anything lie beside the source
+    assert clone(tmp_path / "b", 1.0).outer(2.0) == 7.0
+    assert list(Path(os.environ["NUMBA_CACHE_DIR"]).glob("realsim_probe_loop/*.nbi"))
+
+
+def test_a_user_without_a_home_has_no_files_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    for variable in ("HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "REALSIM_CONFIG"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr("os.getuid", lambda: 2**31 - 7)  # that the system knows nothing of
+    with pytest.raises(NotADirectoryError):
+        user_cache("numba").mkdir(parents=True)
+    assert find_config(None) is None

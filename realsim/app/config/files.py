@@ -9,6 +9,7 @@ from typing import Any
 
 from realsim.errors import InputError
 from realsim.untrusted.toml_text import read_toml
+from realsim.user_cache import home
 
 VARIABLE = "REALSIM_CONFIG"
 """Names the file; empty: none is read."""
@@ -35,8 +36,8 @@ class ConfigFile:
 
 def own_file() -> Path:
     """Return the file of a person's own settings."""
-    home = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
-    return Path(home) / "realsim" / "config.toml"
+    folder = os.environ.get("XDG_CONFIG_HOME") or home() / ".config"
+    return Path(folder) / "realsim" / "config.toml"
 
 
 def find_config(named: Path | None) -> ConfigFile | None:
@@ -53,7 +54,7 @@ def find_config(named: Path | None) -> ConfigFile | None:
             return None
         return read_config(Path(variable), f"{VARIABLE} names", is_named=True)
     for path in (HERE, own_file()):
-        if path.is_file():
+        if os.path.isfile(path):  # no, too, in a home that may not be looked into
             return read_config(path, "", is_named=path != HERE)
     return None
 
