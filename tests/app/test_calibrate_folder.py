@@ -8,7 +8,7 @@ import pytest
 
 from pictured_folders import X, Z, pictures, save_pictures
 from pictured_targets import CAMERA, TARGETS, truth
-from realsim.app.calibrate.folder import FolderRequest, read_views, require_free_results
+from realsim.app.calibrate.folder import FolderRequest, read_views
 from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim.geometry import se3
@@ -102,12 +102,14 @@ def test_a_folder_is_its_own_from_the_first_note_on(lab):
     (lab.parent / "out/calibrated_of.json").unlink()
     (lab.parent / "camera.json").write_text("{}")
     refused(r"camera\.json", read, lab, intrinsics=lab.parent / "camera.json")
-    require_free_results(lab.parent / "out", lab)
-    (lab.parent / "more").mkdir()
-    with pytest.raises(
-        InputError, match=r"made by something else or of something else.*an empty folder"
-    ):
-        require_free_results(lab.parent / "out", lab.parent / "more")
+    call = ("calibrate", "--board", BOARD, "--out", lab.parent / "out", "--intrinsics", "none")
+    assert "replacing" not in invoked(*call, lab).output
+    (lab.parent / "out/calibration_report.html").touch()  # written last: the result is whole
+    assert f"earlier calibration of '{lab}' in" in invoked(*call, lab).output
+    (more := lab.parent / "more").mkdir()
+    own = more.with_name("calibration-more")
+    refusal = str(invoked(*call, more).exception)
+    assert f"calibration of '{lab}'," in refusal and f"--out {own}" in refusal
 
 
 def test_results_that_are_half_replaced_have_no_page(tmp_path):

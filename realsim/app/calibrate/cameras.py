@@ -81,7 +81,7 @@ def run_cameras(source: Path, console: Console, options: dict[str, Any]) -> bool
     if not source.is_dir():
         raise InputError(f"'{source}' is not a folder; one with a folder per camera is expected.")
     out: Path = options["out"]
-    require_free_results(out, source)
+    require_free_results(out, source, console)
     boards = boards_of(options)
     poses = pose_file_of(source, options["poses"], [c.name for c in cameras])
     raw = None if poses is None else read_pose_file(poses, key=options["key"] or None)

@@ -5,6 +5,7 @@ said; where the file leaves several readings open, the images decide, or nothing
 """
 
 import json
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from realsim.errors import InputError
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Target
 from realsim.store.atomic import write_text
+from realsim.untrusted.own_json import read_object
 from realsim_calibration import (
     BoardView,
     Calibration,
@@ -90,14 +92,24 @@ def made_of(images: Path) -> str:
     return json.dumps({"images": str(images.resolve())})
 
 
-def require_free_results(out: Path, source: Path) -> None:
+def require_free_results(out: Path, source: Path, console: Console) -> None:
     """Raise unless results can go to a folder: a new or empty one, or one made of this source."""
     if out.resolve() == source.resolve():
         raise InputError(
             f"--out '{out}' is the data set itself: pictures of the report would replace images of "
             f"the same name. Give a folder of its own, such as {out / 'calibration'}."
         )
+    note, here = out / MADE_OF, str(source.resolve())
+    if note.is_file() and (stands := read_object(note).get("images")) != here:
+        own = out.parent / f"calibration-{Path(here).name}"
+        raise InputError(
+            f"'{out}' holds the calibration of '{stands}', which is not replaced by that of "
+            f"'{here}'. Give this one a folder of its own: --out {shlex.quote(str(own))}"
+        )
     require_free_folder(out, "--out", None, (MADE_OF, (made_of(source),)))
+    if any(out.glob("*_report.html")):
+        console.say(f"replacing the earlier calibration of '{source}' in '{out}'; --out FOLDER "
+                    "keeps both")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

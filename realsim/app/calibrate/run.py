@@ -95,7 +95,7 @@ def _run(source: Path, console: Console, *, live: bool, **options: Any) -> bool:
             "images with robot poses say which target they show: --board "
             "charuco:5x7,square=33mm,marker=20mm,dict=6X6_100, or a file of `realsim board`."
         )
-    request = _request(source, options)
+    request = _request(source, options, console)
     if live:
         from realsim.app.calibrate.live import run_live
 
@@ -174,7 +174,7 @@ def _refuse_folder_options(options: dict[str, Any]) -> None:
         )
 
 
-def _request(source: Path, options: dict[str, Any]) -> Any:
+def _request(source: Path, options: dict[str, Any], console: Console) -> Any:
     """Return the request for a plain folder; relative pose files may lie inside it."""
     from realsim.app.calibrate.folder import FolderRequest, require_free_results
 
@@ -183,7 +183,7 @@ def _request(source: Path, options: dict[str, Any]) -> Any:
             return path
         return source / path if (source / path).exists() else path
 
-    require_free_results(options["out"], source)
+    require_free_results(options["out"], source, console)
     return FolderRequest(
         images=source,
         out=options["out"],
