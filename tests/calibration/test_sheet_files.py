@@ -79,6 +79,8 @@ def test_make_board_writes_sheet_target_and_picture(tmp_path: Path) -> None:
     again = make_board(str(paths[1]), tmp_path / "again.pdf", "A4", cut_marks=True)
     assert again[0].read_bytes() == paths[0].read_bytes()
     assert make_board(line, tmp_path / "new") == paths[:2]
+    typed = make_board("charuco:5x7,square=33mm,marker=2cm,dict=DICT_6X6_100", tmp_path)[0]
+    assert typed.name == "charuco_5x7_square33mm_marker2cm_dictDICT_6X6_100.pdf"
 
 
 def test_a_target_file_that_was_edited_is_not_lost(tmp_path: Path) -> None:

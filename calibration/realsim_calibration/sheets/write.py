@@ -313,7 +313,7 @@ def make_board(
 
     Args:
         what: a line such as 'chessboard:8x6,square=25mm', or the path of a target file.
-        out: the PDF, or a folder in which it gets the target's name.
+        out: the PDF, or a folder in which it gets the name of the line.
         paper: see `write_sheet`.
         preview: whether a picture for the screen is written too.
         cut_marks: whether marks show where the quiet zone may be cut off.
@@ -333,13 +333,13 @@ def make_board(
     if path.suffix.lower() != ".pdf":
         if path.suffix and not path.is_dir():
             raise InputError(f"{path}: give a name that ends in .pdf, or a folder.")
-        path = path / f"{file_name(target)}.pdf"
+        path = path / f"{file_name(format_target(target) if is_file else what)}.pdf"
     report = write_sheet(
         target, path, paper=paper, preview=preview, overwrite=overwrite, cut_marks=cut_marks
     )
     return report.paths
 
 
-def file_name(target: Target) -> str:
-    """Return the target's line as a file name without an ending."""
-    return re.sub(r"[^A-Za-z0-9.\-]+", "_", format_target(target).replace("=", ""))
+def file_name(line: str) -> str:
+    """Return a target's line, as it was typed, as a file name without an ending."""
+    return re.sub(r"[^A-Za-z0-9.\-]+", "_", line.strip().replace("=", ""))[:200]
