@@ -13,6 +13,10 @@ class InputError(RealsimError):
     """Something given from outside (a file, a folder, an argument) cannot be used."""
 
 
+class UnreadableError(InputError):
+    """A file that this user may not read; whether it is sound nobody has seen."""
+
+
 class UnitError(InputError):
     """A length, a depth or an angle does not have the unit that is claimed for it."""
 

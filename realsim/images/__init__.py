@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from realsim.arrays import Array32, UInt8, UInt16
 from realsim.errors import InputError
 from realsim.images import png
+from realsim.untrusted.files import require_permission
 
 PNG_END = b"IEND\xaeB`\x82"
 DEPTH_MAX = 65535
@@ -45,6 +46,7 @@ def _decoded(path: Path, flags: int) -> NDArray[Any]:
 
     if not path.is_file():
         raise InputError(f"{path} does not exist; an image was expected there.")
+    require_permission(path)
     data = path.read_bytes()
     # The end is looked for, so that the message can say 'truncated', whatever the decoder does.
     torn = data.startswith(png.SIGNATURE) and PNG_END not in data[-32:]
@@ -192,6 +194,8 @@ def header_size(
     """
     from PIL import Image
 
+    if isinstance(file, Path) and file.is_file():
+        require_permission(file)
     try:
         with Image.open(file, formats=formats) as image:
             return image.size

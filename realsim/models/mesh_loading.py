@@ -21,6 +21,7 @@ from realsim.models.mesh_atlas import (
     tinted,
     transformed_uv,
 )
+from realsim.untrusted.files import require_permission
 
 GLTF_FORMATS = (".glb", ".gltf")
 TRIMESH_FORMATS = (*GLTF_FORMATS, ".obj", ".ply", ".stl", ".off")
@@ -41,6 +42,7 @@ def load_pieces(path: Path) -> FileContent:
     """
     import trimesh
 
+    require_permission(path)
     kind = path.suffix.lower()
     notes: list[str] = []
     header = _gltf_header(path) if kind in GLTF_FORMATS else {}

@@ -7,7 +7,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from realsim.errors import InputError
+from realsim.errors import InputError, UnreadableError
 from realsim.records import CameraIntrinsics, CaptureSession
 from realsim.untrusted import json_text
 from realsim.untrusted.own_json import from_json, to_json
@@ -82,7 +82,7 @@ def header_to_open(path: Path) -> dict[str, Any]:
     """
     try:
         return checked_header(path)
-    except NewerFormatError:
+    except (NewerFormatError, UnreadableError):
         raise
     except InputError as error:
         raise InputError(

@@ -2,14 +2,30 @@
 
 from pathlib import Path
 
-from realsim.errors import InputError
+from realsim.errors import InputError, UnreadableError
+
+
+def require_permission(path: Path) -> None:
+    """Raise where the permissions of a file, or of a folder above it, keep this user out.
+
+    Raises:
+        UnreadableError: they do.
+    """
+    try:
+        path.open("rb").close()
+    except PermissionError as error:
+        raise UnreadableError(
+            f"you may not read {path}: its permissions or those of a folder above it forbid it. "
+            "Give yourself the right to (`chmod u+r`), or ask its owner for it."
+        ) from error
 
 
 def file_bytes(path: Path, most_bytes: float) -> int:
     """Return the size of a file [bytes].
 
     Raises:
-        InputError: there is no file (but nothing, or a folder), or it has more than `most_bytes`.
+        InputError: there is no file (but nothing, or a folder), it has more than `most_bytes`, or
+            this user may not read it.
     """
     try:
         is_file = path.is_file()
@@ -24,6 +40,7 @@ def file_bytes(path: Path, most_bytes: float) -> int:
             f"{path} has {size / 1e6:.1f} MB; at most {most_bytes / 1e6:g} MB are read. Is it the "
             "file that was meant? Split it if it is."
         )
+    require_permission(path)
     return size
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from msgspec.inspect import type_info
 
 from realsim.arrays import Array
-from realsim.errors import InputError
+from realsim.errors import InputError, UnreadableError
 from realsim.untrusted import json_text
 
 Declared = TypeVar("Declared")
@@ -114,6 +114,8 @@ def read_values(path: Path | str) -> Any:
         raise InputError(f"{path} does not exist; has the step that writes it been run?")
     try:
         return json_text.read_json(path)
+    except UnreadableError:
+        raise
     except InputError as error:
         raise InputError(f"{error} {REMEDY}") from error
 

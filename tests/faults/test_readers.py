@@ -1,14 +1,26 @@
 """The table of readers is the code's; damaged files of our own are read or refused."""
 
+import errno
 import importlib
 import re
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+
+from realsim import images
+from realsim.errors import UnreadableError
+from realsim.formats.folders.listing import image_header
+from realsim.models.mesh_loading import load_pieces
+from realsim.store.header import header_to_open
+from realsim.untrusted.arrays import read_npy
+from realsim.untrusted.own_json import read_values
+from realsim_calibration.inputs.image_files import load_image
+from refusals import refused
 
 ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "benchmarks"))
@@ -72,3 +84,22 @@ def test_a_log_that_was_cut_off_keeps_its_whole_lines_and_goes_on(tmp_path: Path
     assert [line["key"] for line in log.of("typed")] == [[5, 0], [5, 2], [6, 0]]
     assert log.of("typed")[0]["traceback"] == 0  # what was measured again
     assert [*log.todo("typed", 5, 4)] == [1, 3]
+
+
+@pytest.mark.parametrize("read", [
+    images.read_rgb, partial(images.read_depth, unit_m=1e-3), images.image_size, image_header,
+    load_image, read_values, header_to_open, read_npy, load_pieces,
+])  # fmt: skip
+def test_a_file_that_may_not_be_read_is_not_called_damaged(
+    read: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def denied(path: Path, *how: Any, **more: Any) -> Any:
+        if path.name != "file.ply":
+            return opened(path, *how, **more)
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    opened = Path.open
+    (tmp_path / "file.ply").write_bytes(b"whatever")
+    monkeypatch.setattr(Path, "open", denied)  # the administrator, who may be testing, may read all
+    refused("^you may not read .*file.ply: its permissions", read, tmp_path / "file.ply",
+            error=UnreadableError)  # fmt: skip

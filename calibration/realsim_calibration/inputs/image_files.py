@@ -11,6 +11,7 @@ import numpy as np
 
 from realsim.arrays import UInt8
 from realsim.errors import InputError
+from realsim.untrusted.files import require_permission
 from realsim_calibration.inputs.pairing import natural_key
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
@@ -168,6 +169,7 @@ def _opened(path: Path, action: Callable[[Path, Any], Any]) -> Any:
 
     if not path.is_file():
         raise InputError(f"{path} does not exist; an image was expected there.")
+    require_permission(path)
     size = path.stat().st_size
     if not 0 < size <= MAX_BYTES:
         what = "is empty" if size == 0 else f"has {size / 2**20:.0f} MB"

@@ -15,6 +15,7 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.images import MOST_PIXELS
+from realsim.untrusted.files import require_permission
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """Endings of image files."""
@@ -83,6 +84,7 @@ def image_header(path: Path) -> ImageFile:
 
     if not path.is_file():  # opening a pipe would wait for ever
         raise InputError(f"{path} is not a regular file; an image is expected there.")
+    require_permission(path)
     size = path.stat().st_size
     try:
         with Image.open(path) as image:
