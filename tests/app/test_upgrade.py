@@ -13,6 +13,7 @@ from click.testing import Result
 from realsim.app.upgrade.dataset import UpgradeConfig, scenes_of
 from realsim.app.upgrade.outcome import Outcome, decide
 from realsim.app.upgrade.source import told_apart, world_starts
+from realsim.app.upgrade.tables import notes_of
 from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
 from realsim.geometry.parts import part
@@ -176,6 +177,22 @@ def test_two_things_of_one_model_stay_two_in_every_order() -> None:
     assert notes == []
     starts = world_starts(seen, dict.fromkeys(rows, np.eye(4)))
     np.testing.assert_array_equal(starts[1].T_world_obj, T_b)
+
+
+def test_equal_notes_are_one_and_what_all_scenes_share_comes_last() -> None:
+    box = {"name": "box", "grasps": {"why_none": ""}, "reasons": ["hidden"]}
+    records = [
+        {
+            "place": f"test/{k}",
+            "plane": {},
+            "objects": [box],
+            "notes": ["no reference", f"only {k}"],
+        }
+        for k in range(40)
+    ]
+    objects, scenes = notes_of(records)
+    assert objects == ["test/0 box and 39 more: hidden"]
+    assert len(scenes) == 41 and scenes[-1] == "scene test/0 and 39 more: no reference"
 
 
 # --- what becomes of an annotation ------------------------------------------------------------

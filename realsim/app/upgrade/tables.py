@@ -37,6 +37,7 @@ OUTCOMES = tuple(TOLD)
 MOST_ROWS = 60
 """Objects in the console's table, worst first where there are more; upgrade.csv has all."""
 MOST_NOTES = 30
+"""Of objects, and of scenes."""
 
 
 def objects_of(records: Iterable[Record]) -> list[tuple[Record, dict[str, Any]]]:
@@ -137,11 +138,11 @@ def show_upgrade(result: "UpgradeResult", console: Console) -> None:
     console.table("Upgraded scenes", HEADER, [row_of(r, o) for r, o in shown])
     if len(shown) < len(objects):
         console.say(f"the worst {len(shown)} of {len(objects)} objects; {CSV_FILE} has all")
-    notes = list(_notes(result.scenes))
-    for note in notes[:MOST_NOTES]:
-        console.warn(note)
-    if len(notes) > MOST_NOTES:
-        console.warn(f"and {len(notes) - MOST_NOTES} more notes, in {JSON_FILE}")
+    for notes in notes_of(result.scenes):
+        for note in notes[-MOST_NOTES:]:
+            console.warn(note)
+        if len(notes) > MOST_NOTES:
+            console.warn(f"and {len(notes) - MOST_NOTES} more notes, in {JSON_FILE}")
     for place, reason in result.failed.items():
         console.warn(f"scene {place} was left out: {reason}")
     if result.analytic is not None:
@@ -155,16 +156,25 @@ def show_upgrade(result: "UpgradeResult", console: Console) -> None:
     console.say(f"dataset   {result.out}; judge it with: realsim review {result.out}")
 
 
-def _notes(records: Sequence[Record]) -> Iterable[str]:
-    """Yield what a person must know, scene by scene."""
+def notes_of(records: Sequence[Record]) -> tuple[list[str], list[str]]:
+    """Return what a person must know of objects, then of scenes: equal notes as one, rare first."""
+    objects: dict[str, list[str]] = {}
+    scenes: dict[str, list[str]] = {}
     for record in records:
-        place = record["place"]
-        if record["plane"] is None:
-            yield f"scene {place}: no supporting plane was found"
+        place = f"scene {record['place']}"
+        lacks = [] if record["plane"] is not None else ["no supporting plane was found"]
+        for note in (*lacks, *record["notes"]):
+            scenes.setdefault(note, []).append(place)
         for o in record["objects"]:
-            if o["grasps"]["why_none"]:
-                yield f"{place} {o['name']}: no grasp: {o['grasps']['why_none']}"
-            if o["reasons"]:
-                yield f"{place} {o['name']}: {'; '.join(o['reasons'])}"
-        for note in record["notes"]:
-            yield f"scene {place}: {note}"
+            none = o["grasps"]["why_none"]
+            for note in (f"no grasp: {none}" if none else "", "; ".join(o["reasons"])):
+                objects.setdefault(note, []).append(f"{record['place']} {o['name']}")
+    objects.pop("", None)
+
+    def told(found: dict[str, list[str]]) -> list[str]:
+        return [
+            f"{where[0]}{f' and {len(where) - 1} more' if where[1:] else ''}: {note}"
+            for note, where in sorted(found.items(), key=lambda entry: len(entry[1]))
+        ]
+
+    return told(objects), told(scenes)
