@@ -37,6 +37,11 @@ def files_of(folder):
     return {k: v for k, v in bytes_of(folder).items() if not k.endswith(".run.json")}
 
 
+def test_an_export_to_lerobot_names_the_command_that_writes_it(tmp_path):
+    said = invoked("export", tmp_path, "--to", "lerobot", "--out", tmp_path / "out").output
+    assert "`realsim demonstrations SOURCE --out FOLDER`" in " ".join(said.split())
+
+
 @pytest.mark.slow
 def test_what_is_streamed_is_what_is_written(weak_school, written):
     import av

@@ -6,15 +6,28 @@ from typing import Any
 import click
 
 from realsim.app.console import Console
-from realsim.app.meanings import one_of
 from realsim.app.option_values import FOLDER
 from realsim.app.options import Has, command, options, rare
 from realsim.app.outputs import GOES_ON
 
-FORMATS = one_of(
+
+class Formats(click.Choice[str]):
+    """A format that scenes and grasps are written in; of others, the command that writes them."""
+
+    def get_invalid_choice_message(self, value: Any, ctx: click.Context | None) -> str:
+        """Return what is said of a format that is not among them."""
+        if value == "lerobot":
+            return (
+                "a LeRobot data set holds demonstrations. Try grasps (`realsim school SOURCE`), "
+                "then write them: `realsim demonstrations SOURCE --out FOLDER`."
+            )
+        return super().get_invalid_choice_message(value, ctx)
+
+
+FORMATS = Formats((
     "bop graspnet colmap nerfstudio urdf mjcf usd graspit grasp-group acronym graspgen isaac hdf5 "
     "parquet"
-)
+).split())  # fmt: skip
 
 
 @command(
