@@ -1,11 +1,18 @@
 """Labels follow the reviewed scene: an export never hands out those of before the review."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from realsim.app.annotate.current import annotate_session, refresh_labels, what_is_stale
+from realsim.app.annotate.current import (
+    GRASPS,
+    annotate_session,
+    other_grasps_shown,
+    refresh_labels,
+    what_is_stale,
+)
 from realsim.app.console import Console
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.run import run_export
@@ -14,7 +21,7 @@ from realsim.formats.bop.scene import find_scenes, read_scene
 from realsim.geometry import se3
 from realsim.records import ObjectPose, Scene, SupportPlane
 from realsim.review import journal
-from realsim.store import SessionStore, load_scene, save_scene
+from realsim.store import SessionStore, load_scene, provenance, save_scene
 from registered_sessions import table_session, true_poses
 from shared_sessions import copy_of
 
@@ -45,6 +52,19 @@ def say(store: SessionStore, action: journal.Action, placed: ObjectPose | None, 
 def test_what_nobody_touched_is_current_and_not_computed_again(session: SessionStore) -> None:
     assert what_is_stale(session) == ""
     assert not refresh_labels(session, QUIET)
+
+
+def test_frames_are_said_to_show_other_grasps_where_they_do(session: SessionStore) -> None:
+    def tried_and_told(content: bytes) -> str:
+        session.write_bytes("grasps/000000_obj000001.npz", content)
+        return other_grasps_shown(session)
+
+    assert other_grasps_shown(session) == ""
+    assert tried_and_told(b"first") == "show no grasps yet"
+    record, run = provenance.read(session.folder, "annotate")
+    provenance.write(session, replace(record, inputs=provenance.inputs_of(session, GRASPS)), run)
+    assert tried_and_told(b"first") == ""
+    assert tried_and_told(b"anew") == "still show the grasps of before"
 
 
 @pytest.mark.parametrize(

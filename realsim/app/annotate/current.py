@@ -8,9 +8,10 @@ import numpy as np
 
 from realsim.app.console import Console
 from realsim.app.stages import judged_scene, note, registered_views, require_sound, session_models
+from realsim.errors import InputError
 from realsim.many import Workers
 from realsim.records import GraspSet, ObjectPose, Scene
-from realsim.store import SessionStore
+from realsim.store import SessionStore, provenance
 from realsim.store.cameras import open_cameras
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 OBJECTS_FILE = "annotations/objects.json"
 MADE_FROM = (
     "rgb/*", "depth/*", "registration/scene.json", "registration/cameras.json", "models/*",
-    "review/journal.jsonl", "grasps/*.npz",
+    "review/journal.jsonl", *(GRASPS := ("grasps/*.npz",)),
 )  # fmt: skip
 """Files of a session that its labels are made of."""
 SAME = 1e-9
@@ -126,6 +127,18 @@ def what_is_stale(store: SessionStore) -> str:
     if there != views:
         return f"view {min(there ^ views)} is labelled and left out, or the other way round"
     return ""
+
+
+def other_grasps_shown(store: SessionStore) -> str:
+    """Return what labelled frames show instead of the present grasps; '' = these, or no labels."""
+    try:
+        noted = provenance.read(store.folder, "annotate")[0].inputs
+    except InputError:  # labels by `realsim generate`, which tries no grasps
+        noted = {}
+    was = {name: sha256 for name, sha256 in noted.items() if name.startswith("grasps/")}
+    if not store.path("grasps/views").is_dir() or was == provenance.inputs_of(store, GRASPS):
+        return ""
+    return "still show the grasps of before" if was else "show no grasps yet"
 
 
 def _difference(placed: ObjectPose, row: Mapping[str, Any] | None) -> str:

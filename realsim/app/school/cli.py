@@ -87,6 +87,7 @@ def run_command(
 
     Exit codes: 0 done, 1 no grasp could be tried, 2 bad input.
     """
+    from realsim.app.annotate.current import other_grasps_shown
     from realsim.app.many_sessions import one_session
     from realsim.app.school.files import PAGE
     from realsim.app.school.inputs import SchoolRequest
@@ -101,11 +102,9 @@ def run_command(
     for instance, gave_up in outcome.unfinished.items():
         console.warn(f"instance {instance}: given up: {'; '.join(gave_up)}. Run it again.")
     console.say(f"page      {folder / PAGE}")
-    if (folder / "grasps/views").is_dir():
-        console.warn(
-            "the frames still show the grasps of before; write them anew with "
-            f"`realsim annotate {folder}`."
-        )
+    store = outcome.inputs.store
+    if store is not None and (shown := other_grasps_shown(store)):
+        console.warn(f"the frames {shown}; `realsim annotate {folder}` writes these into them.")
     document = as_json(outcome.sets, outcome.models)
     if json_file is not None:
         atomic.write_json(json_file, document)
