@@ -9,7 +9,6 @@ import numpy as np
 
 from realsim import images
 from realsim.errors import InputError
-from realsim.formats.folders.depth_evidence import read_counts
 from realsim.formats.folders.source import file_digest
 from realsim.formats.frame_source import SourceFrame
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
@@ -101,7 +100,7 @@ class LabelledFrames:
                 name=f"image {index} of {self.scene.name}",
                 time_s=float(index),
                 rgb=images.read_rgb(self._colour(index)),
-                depth_counts=None if deep is None else read_counts(deep),
+                depth_counts=None if deep is None else images.read_counts(deep),
                 T_world_cam=self.scene.frame(index).T_world_cam,
             )
 

@@ -103,16 +103,22 @@ def read_depth(path: Path | str, unit_m: float) -> Array32:
     Raises:
         InputError: missing, truncated, or not one channel of 16 bit.
     """
-    import cv2
+    return (read_counts(path) * np.float64(unit_m)).astype(np.float32)
 
-    path = Path(path)
-    counts = _decoded(path, cv2.IMREAD_UNCHANGED)
-    if counts.ndim != 2 or counts.dtype != np.uint16:
+
+def read_counts(path: Path | str) -> UInt16:
+    """Return a 16-bit depth image (H, W) as it is stored.
+
+    Raises:
+        InputError: missing, truncated, or not one channel of 16 bit.
+    """
+    image = read_image(path)
+    if image.ndim != 2 or image.dtype != np.uint16:
         raise InputError(
-            f"{path} has the shape {counts.shape} and the type {counts.dtype}; a depth image is "
-            "one channel of 16 bit. Is it a colour picture of the depth?"
+            f"{path} has the shape {image.shape} and the type {image.dtype}; a depth image is one "
+            "channel of 16 bit. Is it a colour picture of the depth? Convert it, or leave it out."
         )
-    return (counts * np.float64(unit_m)).astype(np.float32)
+    return image
 
 
 def depth_counts(depth_m: NDArray[Any], unit_m: float) -> UInt16:
@@ -134,7 +140,9 @@ def image_size(path: Path | str) -> tuple[int, int]:
     Raises:
         InputError: missing, not an image, or of more than 100 million pixels.
     """
-    size = header_size(Path(path), str(path))
+    path = Path(path)
+    require_permission(path)
+    size = header_size(path, str(path))
     require_few_pixels(*size, str(path))
     return size
 
@@ -194,8 +202,6 @@ def header_size(
     """
     from PIL import Image
 
-    if isinstance(file, Path) and file.is_file():
-        require_permission(file)
     try:
         with Image.open(file, formats=formats) as image:
             return image.size

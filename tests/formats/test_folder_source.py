@@ -16,9 +16,10 @@ from realsim.formats.folders import (
     open_folder,
     read_cam_info,
 )
-from realsim.formats.folders.depth_evidence import coding_of, decoded, depth_evidence, read_counts
+from realsim.formats.folders.depth_evidence import coding_of, decoded, depth_evidence
 from realsim.formats.folders.listing import join_names, join_states
 from realsim.geometry import se3
+from realsim.images import read_counts
 from realsim.records import CameraIntrinsics
 from refusals import refused
 

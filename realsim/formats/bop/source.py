@@ -11,7 +11,6 @@ from realsim import images
 from realsim.arrays import UInt16
 from realsim.errors import InputError
 from realsim.formats.bop.scene import BopScene, BopSceneRef, find_scenes, read_scene
-from realsim.formats.folders.depth_evidence import read_counts
 from realsim.formats.folders.listing import image_header, shown
 from realsim.formats.folders.source import file_digest, require_one_size
 from realsim.formats.frame_source import SourceFrame
@@ -71,7 +70,7 @@ class BopSource:
         """
         scene = self._scene
         for i in self.indices[start:]:
-            counts = read_counts(scene.depth_path(i)) if scene.has_depth(i) else None
+            counts = images.read_counts(scene.depth_path(i)) if scene.has_depth(i) else None
             yield SourceFrame(
                 name=f"image {i} of {scene.ref.folder}",
                 time_s=float(i),
@@ -180,7 +179,7 @@ def _require_sizes(scene: BopScene, indices: Sequence[int]) -> None:
 
 def _median_depth_m(scene: BopScene, indices: Sequence[int]) -> float | None:
     deep = [i for i in indices if scene.has_depth(i)][:TYPICAL_DEPTHS]
-    counts: list[UInt16] = [read_counts(scene.depth_path(i)) for i in deep]
+    counts: list[UInt16] = [images.read_counts(scene.depth_path(i)) for i in deep]
     values = [c[c > 0] for c in counts if np.any(c)]
     if not values:
         return None

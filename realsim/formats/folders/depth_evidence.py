@@ -88,25 +88,10 @@ def decoded(counts: Counts, coding: DepthCoding) -> Counts:
     return back.astype(np.uint16, copy=False)
 
 
-def read_counts(path: Path) -> Counts:
-    """Return a depth image (H, W) as it is stored.
-
-    Raises:
-        InputError: unreadable, or not one channel of 16 bit.
-    """
-    image = images.read_image(path)
-    if image.ndim != 2 or image.dtype != np.uint16:
-        raise InputError(
-            f"{path} has the shape {image.shape} and the type {image.dtype}; a depth image is one "
-            "channel of unsigned 16 bit. Convert it, or leave depth out with --no-depth."
-        )
-    return image
-
-
 def depth_evidence(paths: Sequence[Path]) -> DepthEvidence:
     """Return what some of these depth images, spread over all, show."""
     picks = np.unique(np.linspace(0, len(paths) - 1, SAMPLES).round().astype(int))
-    sampled = [read_counts(paths[int(k)]) for k in picks]
+    sampled = [images.read_counts(paths[int(k)]) for k in picks]
     values = np.concatenate([c[c > 0] for c in sampled])
     total = sum(c.size for c in sampled)
     if not len(values):

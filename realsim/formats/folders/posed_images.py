@@ -16,7 +16,7 @@ from realsim import images
 from realsim.arrays import Array, Array32
 from realsim.errors import InputError
 from realsim.formats.evidence import poses_checked_by_depth
-from realsim.formats.folders.depth_evidence import depth_evidence, read_counts, require_unit
+from realsim.formats.folders.depth_evidence import depth_evidence, require_unit
 from realsim.formats.folders.listing import image_header
 from realsim.formats.folders.source import file_digest, require_one_size
 from realsim.formats.frame_source import SourceFrame
@@ -99,7 +99,7 @@ class PosedImages:
                 name=image.name,
                 time_s=float(k),
                 rgb=images.read_rgb(image.colour),
-                depth_counts=None if deep is None else read_counts(deep),
+                depth_counts=None if deep is None else images.read_counts(deep),
                 T_world_cam=image.T_metric(self.metres_per_unit),
             )
 

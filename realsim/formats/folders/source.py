@@ -15,7 +15,6 @@ from realsim.formats.folders.depth_evidence import (
     coding_of,
     decoded,
     depth_evidence,
-    read_counts,
     require_unit,
 )
 from realsim.formats.folders.listing import (
@@ -122,7 +121,7 @@ class FolderSource:
             row = self.rows[k]
             counts = None
             if row.depth is not None:
-                counts = decoded(read_counts(row.depth.path), self.coding)
+                counts = decoded(images.read_counts(row.depth.path), self.coding)
             known = {
                 name: next(
                     (v for v in (getattr(s, name) for s in row.states) if v is not None), None

@@ -138,12 +138,7 @@ def _depth(scene: LabelledScene, frame: LabelledFrame) -> tuple[Content, float, 
         )
     if abs(unit_m / UNIT_M - 1) < SAME_UNIT and _png_kind(path) == (16, png.GREY):
         return path, 0.0, 0
-    counts = images.read_image(path)
-    if counts.ndim != 2 or counts.dtype != np.uint16:
-        raise InputError(
-            f"{path} has the shape {counts.shape} and the type {counts.dtype}; a depth image is "
-            "one channel of 16 bit."
-        )
+    counts = images.read_counts(path)
     exact = counts * (unit_m / UNIT_M)
     rounded = np.rint(exact)
     # A measurement does not become 'none' by rounding, and none stays none.

@@ -19,7 +19,6 @@ from realsim import images
 from realsim.errors import InputError
 from realsim.formats.coloured_points import require_points, write_points
 from realsim.formats.export_folder import Content, ExportFolder
-from realsim.formats.folders.depth_evidence import read_counts
 from realsim.formats.folders.listing import shown
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene, WrittenScene
 from realsim.formats.nerfstudio.transforms import (
@@ -159,7 +158,7 @@ def _frame(
         entry["depth_file_path"] = name
         files[name] = depth
         if frame.depth_unit_m != unit_m:
-            depth_m = read_counts(depth) * np.float64(frame.depth_unit_m)
+            depth_m = images.read_counts(depth) * np.float64(frame.depth_unit_m)
             files[name] = images.png_bytes(images.depth_counts(depth_m, unit_m))
     assert frame.T_world_cam is not None  # only posed frames come here
     entry["transform_matrix"] = transform_matrix(frame.T_world_cam)

@@ -17,7 +17,6 @@ import numpy as np
 
 from realsim import images
 from realsim.arrays import Array, Array32, Mask, UInt16
-from realsim.formats.folders.depth_evidence import read_counts
 from realsim.formats.graspnet.write_plan import greatest_displacement_px
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
@@ -122,7 +121,7 @@ class UndistortedScene:
         path, camera = self._scene.depth_file(index), self._scene.frame(index).intrinsics
         if path is None or not camera.is_distorted:
             return path
-        return self._kept("depth.png", images.png_bytes(nearest(read_counts(path), camera)))
+        return self._kept("depth.png", images.png_bytes(nearest(images.read_counts(path), camera)))
 
     def mask(self, index: int, k: int, *, visible: bool) -> Mask | None:
         """Return a mask (H, W) as the ideal camera sees it; None = the source has none."""
@@ -185,7 +184,11 @@ class UndistortedScene:
         frame, depth_file = self._scene.frame(index), self._scene.depth_file(index)
         camera, models = frame.intrinsics, self._scene.models()
         shape = cast.labels.ids.shape
-        depth = np.zeros(shape) if depth_file is None else nearest(read_counts(depth_file), camera)
+        depth = (
+            np.zeros(shape)
+            if depth_file is None
+            else nearest(images.read_counts(depth_file), camera)
+        )
         infos: list[dict[str, Any]] = []
         for k, o in enumerate(frame.objects):
             masks = object_masks(cast.labels, k)
