@@ -263,37 +263,33 @@ def check_clock(frame: Frame, state: ArmState, before: Earlier | None) -> Check:
 
 def pose_gap(state: ArmState, T_base_ee: Array) -> tuple[float, float]:
     """Return how far the controller's flange is from another pose (4, 4) [mm], [deg]."""
-    gap = se3.invert(T_base_ee) @ state.T_base_ee
-    return 1e3 * float(np.linalg.norm(gap[:3, 3])), float(np.degrees(se3.angle(gap)))
+    return _step(T_base_ee, state.T_base_ee)
+
+
+def _step(T_from: Array, T_to: Array) -> tuple[float, float]:
+    step = se3.invert(T_from) @ T_to
+    return 1e3 * float(np.linalg.norm(step[:3, 3])), float(np.degrees(se3.angle(step)))
 
 
 def check_pose(state: ArmState, T_base_ee: Array) -> Check:
     """Does the plan's chain put the flange where the controller says it is?"""
     mm, deg = pose_gap(state, T_base_ee)
-    wrong = mm > POSE_MM or deg > POSE_DEG
-    reason = (
+    wrong = (
         f"the controller's flange pose is {mm:.1f} mm, {deg:.2f} deg from the plan's chain: give "
         "the controller's calibration.conf when the plan is made. The poses stored are the "
         "controller's own"
-        if wrong
-        else ""
     )
-    return _check("pose", reason, f"{mm:.1f} mm")
+    return _check("pose", wrong if mm > POSE_MM or deg > POSE_DEG else "", f"{mm:.1f} mm")
 
 
 def check_tool(state: ArmState, T_ee_tcp: Array) -> Check:
     """Is the controller's tool offset what it was at the first view?"""
-    change = se3.invert(T_ee_tcp) @ state.T_ee_tcp
-    mm = 1e3 * float(np.linalg.norm(change[:3, 3]))
-    deg = float(np.degrees(se3.angle(change)))
-    wrong = mm > TOOL_MM or deg > MOTION_DEG
-    reason = (
+    mm, deg = _step(T_ee_tcp, state.T_ee_tcp)
+    wrong = (
         f"the controller's tool offset changed by {mm:.1f} mm, {deg:.2f} deg since the first view; "
         "the flange poses stored do not depend on it, programs at the pendant do"
-        if wrong
-        else ""
     )
-    return _check("tool", reason, f"{mm:.2f} mm")
+    return _check("tool", wrong if mm > TOOL_MM or deg > MOTION_DEG else "", f"{mm:.2f} mm")
 
 
 def _median(values: Sequence[float]) -> float | None:

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from realsim.app.calibrate.board_views import read_board_views, write_results
+from realsim.app.calibrate.board_views import SessionFiles, read_board_views, write_results
 from realsim.app.calibrate.clock import mend_views
-from realsim.app.console import Console
+from realsim.app.console import Console, Tick
 from realsim.app.stages import BOARD_VIEWS, content_key, note, require_sound
 from realsim.errors import InputError
 from realsim.records import HandEye
@@ -36,7 +36,6 @@ def calibrate_session(
         DegenerateError: the views do not determine the hand-eye.
     """
     from realsim.store import load_hand_eye, save_hand_eye
-    from realsim_calibration import calibrate_hand_eye_report
 
     folder = store.folder / BOARD_VIEWS
     if not (folder / "session.json").is_file():
@@ -47,25 +46,13 @@ def calibrate_session(
     views_store = SessionStore.open(folder)
     require_sound(views_store)
     views = views_store.session.views
-    key = (
-        arm
-        + ("" if clock == "auto" else clock)
-        + content_key(
-            folder / "robot.jsonl", store.folder / "calibration/board.json", folder / "session.json"
-        )
-    )
+    made_of = (folder / "robot.jsonl", store.folder / BOARD_FILE, folder / "session.json")
+    key = arm + ("" if clock == "auto" else clock) + content_key(*made_of)
     with console.stage("calibrate", f"{len(views)} board views") as tick:
         if is_current(store, "calibrate", key):
             hand_eye = load_hand_eye(store)
         else:
-            seen, target, known = read_board_views(store, views_store, arm, tick)
-            camera = views_store.session.intrinsics
-            times = np.array([v.time_s for v in views])
-            seen, at = mend_views(seen, times, target, camera, clock, console)
-            report = calibrate_hand_eye_report(seen, target, camera, arm=known)
-            report = replace(report, clock=at)
-            hand_eye = report.hand_eye
-            write_results(report, seen, store, views_store)
+            hand_eye = _fitted(store, views_store, arm, clock, console, tick)
             save_hand_eye(store, hand_eye)
         place_cameras(store, hand_eye)
         read = (BOARD_FILE, f"{BOARD_VIEWS}/robot.jsonl", f"{BOARD_VIEWS}/rgb/*")
@@ -142,18 +129,26 @@ def calibrate_board_only(
         InputError: no calibration/board.json, or a view is not as it was captured.
         DegenerateError: the views do not determine the hand-eye.
     """
-    from realsim_calibration import calibrate_hand_eye_report
-
     files = CalibrationFolder(folder=folder)
     views_store = SessionStore.open(folder / BOARD_VIEWS)
     require_sound(views_store)
     with console.stage("calibrate", f"{len(views_store.session.views)} board views") as tick:
-        seen, target, known = read_board_views(files, views_store, arm, tick)
-        times = np.array([v.time_s for v in views_store.session.views])
-        camera = views_store.session.intrinsics
-        seen, at = mend_views(seen, times, target, camera, clock, console)
-        report = calibrate_hand_eye_report(seen, target, camera, arm=known)
-        report = replace(report, clock=at)
-        write_results(report, seen, files, views_store)
-        files.write_json(HAND_EYE_FILE, hand_eye_to_json(report.hand_eye))
+        hand_eye = _fitted(files, views_store, arm, clock, console, tick)
+        files.write_json(HAND_EYE_FILE, hand_eye_to_json(hand_eye))
+    return hand_eye
+
+
+def _fitted(
+    files: SessionFiles, views_store: SessionStore, arm: str, clock: str,
+    console: Console, tick: Tick,
+) -> HandEye:  # fmt: skip
+    """Calibrate from the board views, and write the report."""
+    from realsim_calibration import calibrate_hand_eye_report
+
+    seen, target, known = read_board_views(files, views_store, arm, tick)
+    camera = views_store.session.intrinsics
+    times = np.array([v.time_s for v in views_store.session.views])
+    seen, at = mend_views(seen, times, target, camera, clock, console)
+    report = replace(calibrate_hand_eye_report(seen, target, camera, arm=known), clock=at)
+    write_results(report, seen, files, views_store)
     return report.hand_eye

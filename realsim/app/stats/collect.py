@@ -25,7 +25,6 @@ FREE_TURN_DEG = 10.0
 """Within which a principal axis of the rotation's covariance is the axis of revolution [deg]: the
 turn about it is free, so its variance is far the greatest, and a registration that is sure to a
 degree tells its axis to that. Beyond, what is least certain is another thing."""
-SCORED = ("mask", "mask_visib", "labels", "grasps", "trajectories", "objects", "depth", "models")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -65,7 +64,7 @@ class SessionFacts:
     sets: tuple[GraspSet, ...]
     """Tried grasps, without their poses, which no figure needs."""
     has: frozenset[str] = field(default_factory=frozenset[str])
-    """Which of SCORED there is."""
+    """What there is of mask, mask_visib, labels, grasps, trajectories, objects, depth, models."""
 
 
 def session_facts(folder: Path) -> SessionFacts:
