@@ -11,8 +11,8 @@ import numpy as np
 
 from realsim.arrays import UInt8
 from realsim.errors import InputError
+from realsim.formats.folders.listing import natural_key
 from realsim.untrusted.files import require_permission
-from realsim_calibration.inputs.pairing import natural_key
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """Endings of image files."""

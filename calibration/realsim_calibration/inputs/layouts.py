@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from realsim.errors import InputError
+from realsim.formats.folders.listing import natural_key
 from realsim_calibration.inputs.image_files import (
     IMAGE_ENDINGS,
     ImageListing,
@@ -18,7 +19,6 @@ from realsim_calibration.inputs.image_files import (
     list_images,
     require_readable,
 )
-from realsim_calibration.inputs.pairing import natural_key
 from realsim_calibration.inputs.pose_file import pose_files_in, read_pose_file, read_single_files
 from realsim_calibration.inputs.raw_poses import RawPoses
 

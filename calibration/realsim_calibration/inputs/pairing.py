@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 from realsim.errors import InputError
+from realsim.formats.folders.listing import natural_key
 
 SHOWN = 6
 """Names of one kind that a message lists."""
@@ -214,12 +215,6 @@ def _shown(names: Sequence[str]) -> str:
 
 
 # --- names in the order people count: 9 before 10 ---------------------------------------------
-
-
-def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Return a sort key by which the numbers in names count as numbers."""
-    parts = re.split(r"(\d+)", name)
-    return [(0, int(p), p) if p.isdecimal() else (1, 0, p.lower()) for p in parts if p]
 
 
 def running_numbers(stems: Sequence[str]) -> list[int] | None:

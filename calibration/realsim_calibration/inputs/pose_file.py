@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from realsim.errors import InputError
+from realsim.formats.folders.listing import natural_key
 from realsim_calibration.inputs.columns import LABEL_NAMES, PoseTable, raw_from_table
-from realsim_calibration.inputs.pairing import natural_key
 from realsim_calibration.inputs.pose_arrays import table_from_npy, table_from_npz
 from realsim_calibration.inputs.pose_text import decoded, table_from_text
 from realsim_calibration.inputs.pose_tree import table_from_tree

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from realsim.errors import InputError
+from realsim.formats.folders.listing import natural_key
 from realsim_calibration.inputs.columns import ACCEPTED, LABEL_NAMES, PoseTable, role_of
-from realsim_calibration.inputs.pairing import natural_key
 from realsim_calibration.inputs.pose_text import IMAGE_ENDING, number_of
 
 _SHAPES = frozenset({(6,), (7,), (12,), (16,), (3, 4), (4, 4)})

@@ -17,10 +17,7 @@ class Formats(click.Choice[str]):
     def get_invalid_choice_message(self, value: Any, ctx: click.Context | None) -> str:
         """Return what is said of a format that is not among them."""
         if value == "lerobot":
-            return (
-                "a LeRobot data set holds demonstrations. Try grasps (`realsim school SOURCE`), "
-                "then write them: `realsim demonstrations SOURCE --out FOLDER`."
-            )
+            return "`realsim demonstrations SOURCE --out FOLDER` writes the grasps that were tried."
         return super().get_invalid_choice_message(value, ctx)
 
 

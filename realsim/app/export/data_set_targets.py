@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from realsim.app.export.target import (
     IMAGES,
+    LABELLED,
     METRES,
     OPENCV,
     PIXEL,
@@ -107,18 +108,7 @@ DATA_SETS: dict[str, Target] = {
         is_pinhole=True,
         holds_cameras=True,
         no_place=(TABLE, TRIED),
-        options=(
-            "labels",
-            "split",
-            "camera",
-            "models",
-            "colour",
-            "jpeg_quality",
-            "masks",
-            "shards",
-            "undistort",
-            "keep_distortion",
-        ),
+        options=(*LABELLED, "split", "colour", "jpeg_quality", "shards"),
     ),
     "graspnet": Target(
         name="GraspNet-1Billion",
@@ -147,15 +137,7 @@ DATA_SETS: dict[str, Target] = {
         write_root=_graspnet_root,
         is_pinhole=True,
         holds_grasps=True,
-        options=(
-            "labels",
-            "camera",
-            "models",
-            "masks",
-            "undistort",
-            "keep_distortion",
-            "table_is_world",
-        ),
+        options=(*LABELLED, "table_is_world"),
     ),
     "colmap": Target(
         name="COLMAP",

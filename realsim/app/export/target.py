@@ -70,7 +70,7 @@ class Target:
     is_pinhole: bool = False
     """Whether its readers know no lens: images are undistorted unless they are to be kept."""
     no_place: tuple[str, ...] = ()
-    """What the format has no place for, of THINGS: it is told where a scene has it."""
+    """What the format has no place for, of TABLE and TRIED: it is told where a scene has it."""
     holds_grasps: bool = False
     """Whether grasps tried by physics go along."""
     holds_cameras: bool = False
@@ -81,9 +81,10 @@ class Target:
 
 IMAGES = ("labels", "camera", "undistort")
 """Options of every format that holds images."""
+LABELLED = (*IMAGES, "models", "masks", "keep_distortion")
+"""Options of every format that holds images with labels."""
 METRES = ("units", "metres")
 OPENCV = ("camera axes", "OpenCV: x right, y down, z forward")
 PIXEL = ("pixels", "integer coordinates are pixel centres")
 TABLE, TRIED = "the table's pose", "grasps tried by physics"
-THINGS = (TABLE, TRIED)
 """What a scene may have beside images, poses and models."""
