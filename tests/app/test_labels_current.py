@@ -6,13 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from realsim.app.annotate.current import (
-    GRASPS,
-    annotate_session,
-    other_grasps_shown,
-    refresh_labels,
-    what_is_stale,
-)
+from realsim.app.annotate import current
+from realsim.app.annotate.current import annotate_session, refresh_labels, what_is_stale
 from realsim.app.console import Console
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.run import run_export
@@ -55,16 +50,15 @@ def test_what_nobody_touched_is_current_and_not_computed_again(session: SessionS
 
 
 def test_frames_are_said_to_show_other_grasps_where_they_do(session: SessionStore) -> None:
-    def tried_and_told(content: bytes) -> str:
-        session.write_bytes("grasps/000000_obj000001.npz", content)
-        return other_grasps_shown(session)
-
-    assert other_grasps_shown(session) == ""
-    assert tried_and_told(b"first") == "show no grasps yet"
+    assert current.other_grasps_shown(session) == ""
+    session.write_bytes("grasps/000000_obj000001.npz", b"first")
+    assert current.other_grasps_shown(session) == "show no grasps yet"
+    now = provenance.inputs_of(session, current.GRASPS)
     record, run = provenance.read(session.folder, "annotate")
-    provenance.write(session, replace(record, inputs=provenance.inputs_of(session, GRASPS)), run)
-    assert tried_and_told(b"first") == ""
-    assert tried_and_told(b"anew") == "still show the grasps of before"
+    provenance.write(session, replace(record, inputs=now), run)
+    assert current.other_grasps_shown(session) == ""
+    session.write_bytes("grasps/000000_obj000001.npz", b"anew")
+    assert current.other_grasps_shown(session) == "still show the grasps of before"
 
 
 @pytest.mark.parametrize(

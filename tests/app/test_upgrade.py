@@ -181,18 +181,11 @@ def test_two_things_of_one_model_stay_two_in_every_order() -> None:
 
 def test_equal_notes_are_one_and_what_all_scenes_share_comes_last() -> None:
     box = {"name": "box", "grasps": {"why_none": ""}, "reasons": ["hidden"]}
-    records = [
-        {
-            "place": f"test/{k}",
-            "plane": {},
-            "objects": [box],
-            "notes": ["no reference", f"only {k}"],
-        }
-        for k in range(40)
-    ]
+    scene = {"plane": {}, "objects": [box]}
+    records = [scene | {"place": f"{k}", "notes": ["no reference", f"{k}"]} for k in range(40)]
     objects, scenes = notes_of(records)
-    assert objects == ["test/0 box and 39 more: hidden"]
-    assert len(scenes) == 41 and scenes[-1] == "scene test/0 and 39 more: no reference"
+    assert objects == ["0 box and 39 more: hidden"] and len(scenes) == 41
+    assert scenes[-1] == "scene 0 and 39 more: no reference"
 
 
 # --- what becomes of an annotation ------------------------------------------------------------

@@ -8,7 +8,6 @@ import numpy as np
 
 from realsim.app.console import Console
 from realsim.app.stages import judged_scene, note, registered_views, require_sound, session_models
-from realsim.errors import InputError
 from realsim.many import Workers
 from realsim.records import GraspSet, ObjectPose, Scene
 from realsim.store import SessionStore, provenance
@@ -131,10 +130,8 @@ def what_is_stale(store: SessionStore) -> str:
 
 def other_grasps_shown(store: SessionStore) -> str:
     """Return what labelled frames show instead of the present grasps; '' = these, or no labels."""
-    try:
-        noted = provenance.read(store.folder, "annotate")[0].inputs
-    except InputError:  # labels by `realsim generate`, which tries no grasps
-        noted = {}
+    record = provenance.file_of("annotate")  # `realsim generate` writes none, and tries no grasps
+    noted: dict[str, str] = store.read_json(record)["inputs"] if store.has(record) else {}
     was = {name: sha256 for name, sha256 in noted.items() if name.startswith("grasps/")}
     if not store.path("grasps/views").is_dir() or was == provenance.inputs_of(store, GRASPS):
         return ""

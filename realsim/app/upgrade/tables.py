@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -157,24 +158,23 @@ def show_upgrade(result: "UpgradeResult", console: Console) -> None:
 
 
 def notes_of(records: Sequence[Record]) -> tuple[list[str], list[str]]:
-    """Return what a person must know of objects, then of scenes: equal notes as one, rare first."""
-    objects: dict[str, list[str]] = {}
-    scenes: dict[str, list[str]] = {}
-    for record in records:
-        place = f"scene {record['place']}"
-        lacks = [] if record["plane"] is not None else ["no supporting plane was found"]
-        for note in (*lacks, *record["notes"]):
-            scenes.setdefault(note, []).append(place)
-        for o in record["objects"]:
-            none = o["grasps"]["why_none"]
-            for note in (f"no grasp: {none}" if none else "", "; ".join(o["reasons"])):
-                objects.setdefault(note, []).append(f"{record['place']} {o['name']}")
-    objects.pop("", None)
+    """Return what a person must know of objects, then of scenes: equal notes once, common last."""
+    of_objects = [
+        (f"{r['place']} {o['name']}", note)
+        for r, o in objects_of(records)
+        for none in [o["grasps"]["why_none"]]
+        for note in (f"no grasp: {none}" if none else "", "; ".join(o["reasons"]))
+    ]
+    of_scenes = [
+        (f"scene {r['place']}", note)
+        for r in records
+        for note in ("no supporting plane was found" if r["plane"] is None else "", *r["notes"])
+    ]
+    return _told_once(of_objects), _told_once(of_scenes)
 
-    def told(found: dict[str, list[str]]) -> list[str]:
-        return [
-            f"{where[0]}{f' and {len(where) - 1} more' if where[1:] else ''}: {note}"
-            for note, where in sorted(found.items(), key=lambda entry: len(entry[1]))
-        ]
 
-    return told(objects), told(scenes)
+def _told_once(notes: Sequence[tuple[str, str]]) -> list[str]:
+    """Return (place, note) in words, each note with its first place and the number of others."""
+    first = {note: place for place, note in reversed(notes)}
+    rows = reversed(Counter(note for _, note in notes).most_common())
+    return [f"{first[n]}{f' and {k - 1} more' if k > 1 else ''}: {n}" for n, k in rows if n]
