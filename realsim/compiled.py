@@ -8,11 +8,9 @@ Where neither that folder nor the one of the source can be written, compiled cod
 one, which this process and those that it starts share.
 """
 
-import atexit
 import contextlib
 import hashlib
 import os
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -89,12 +87,7 @@ class _ByContent(caching._CacheLocator):  # pyright: ignore[reportPrivateUsage]
 
     def __init__(self, function: Any) -> None:
         self._stamp = _key(function)
-        self._folder = self.root() / function.__module__
-
-    @staticmethod
-    def root() -> Path:
-        """Return the folder of all functions."""
-        return cache_folder()
+        self._folder = cache_folder() / function.__module__
 
     def get_cache_path(self) -> Any:
         return str(self._folder)
@@ -120,12 +113,12 @@ class _ByContent(caching._CacheLocator):  # pyright: ignore[reportPrivateUsage]
 class _ForThisRun(_ByContent):
     """Find compiled code in a folder that goes when this process ends."""
 
-    @staticmethod
-    @cache
-    def root() -> Path:
-        folder = os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="realsim-numba-")
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        return Path(folder)
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: Any) -> Any:
+        """Return the place of a function, in the folder that all others are kept in from now on."""
+        cls.kept = tempfile.TemporaryDirectory(prefix="realsim-numba-")
+        os.environ["NUMBA_CACHE_DIR"] = cls.kept.name
+        return super().from_function(py_func, py_file)
 
 
 _places: Any = caching.CacheImpl._locator_classes  # pyright: ignore[reportPrivateUsage]

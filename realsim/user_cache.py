@@ -1,15 +1,12 @@
 """The user's folder for what any run can make again: compiled loops, convex parts, verdicts."""
 
 import os
-from contextlib import suppress
 from pathlib import Path
 
 
 def home() -> Path:
     """Return the user's folder; of a user who has none, one that nothing can lie in."""
-    with suppress(RuntimeError):
-        return Path.home()
-    return Path(os.devnull)
+    return Path(os.path.expanduser("~").lstrip("~") or os.devnull)
 
 
 def user_cache(name: str) -> Path:

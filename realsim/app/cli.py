@@ -166,14 +166,9 @@ def refusal(error: Exception) -> str | None:
                 f"there is no room for {error.filename or 'what is written'} ({error.strerror}). "
                 "Everything stored before is intact. Make room, then run the same command again."
             )
-        if isinstance(error, PermissionError):
-            return (
-                f"you may not read or write {error.filename or 'a file'} ({error.strerror}). "
-                "Change its permissions or its folder's, or ask its owner."
-            )
         where = f" ({error.filename})" if error.filename else ""
         return (
             f"the system refused a file operation: {error.strerror or error}{where}. "
-            "Check that the path exists, that it may be written, and that the disk is not full."
+            "Check that the path exists, that you may use it, and that the disk has room."
         )
     return str(error)

@@ -12,11 +12,11 @@ def require_permission(path: Path) -> None:
         UnreadableError: they do.
     """
     try:
-        path.open("rb").close()
+        if path.is_file():
+            path.open("rb").close()
     except PermissionError as error:
         raise UnreadableError(
-            f"you may not read {path}: its permissions or those of a folder above it forbid it. "
-            "Give yourself the right to (`chmod u+r`), or ask its owner for it."
+            f"you may not read {path}: its permissions forbid it (`chmod u+r` allows its owner)."
         ) from error
 
 

@@ -97,7 +97,7 @@ def test_a_fixed_camera_is_told_by_its_flag(lab):
     assert "--eye-to-hand" in str(e.value) and "--reading" in str(e.value)
 
 
-def test_a_folder_is_its_own_from_the_first_note_on(lab):
+def test_a_folder_is_its_own_from_the_first_note_on(lab, found_before):
     """A run that ends after the search goes on there; one of other images does not."""
     (lab.parent / "out/calibrated_of.json").unlink()
     (lab.parent / "camera.json").write_text("{}")
@@ -105,11 +105,9 @@ def test_a_folder_is_its_own_from_the_first_note_on(lab):
     call = ("calibrate", "--board", BOARD, "--out", lab.parent / "out", "--intrinsics", "none")
     assert "replacing" not in invoked(*call, lab).output
     (lab.parent / "out/calibration_report.html").touch()  # written last: the result is whole
-    assert f"earlier calibration of '{lab}' in" in invoked(*call, lab).output
-    (more := lab.parent / "more").mkdir()
-    own = more.with_name("calibration-more")
-    refusal = str(invoked(*call, more).exception)
-    assert f"calibration of '{lab}'," in refusal and f"--out {own}" in refusal
+    assert f"replacing the calibration of {lab} in" in invoked(*call, lab).output
+    said = str(invoked(*call, found_before.with_name("i")).exception)
+    assert f"calibration of '{lab}'; give --out {lab.with_name('calibration-i')}" in said
 
 
 def test_results_that_are_half_replaced_have_no_page(tmp_path):

@@ -101,15 +101,11 @@ def require_free_results(out: Path, source: Path, console: Console) -> None:
         )
     note, here = out / MADE_OF, str(source.resolve())
     if note.is_file() and (stands := read_object(note).get("images")) != here:
-        own = out.parent / f"calibration-{Path(here).name}"
-        raise InputError(
-            f"'{out}' holds the calibration of '{stands}', which is not replaced by that of "
-            f"'{here}'. Give this one a folder of its own: --out {shlex.quote(str(own))}"
-        )
+        own = shlex.quote(str(out.parent / f"calibration-{Path(here).name}"))
+        raise InputError(f"'{out}' holds the calibration of '{stands}'; give --out {own}")
     require_free_folder(out, "--out", None, (MADE_OF, (made_of(source),)))
     if any(out.glob("*_report.html")):
-        console.say(f"replacing the earlier calibration of '{source}' in '{out}'; --out FOLDER "
-                    "keeps both")  # fmt: skip
+        console.say(f"replacing the calibration of {source} in {out}; --out FOLDER keeps both")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
