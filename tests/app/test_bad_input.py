@@ -1,12 +1,12 @@
 """Every kind of bad input ends with one paragraph that names it, exit code 2, nothing written."""
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from bop_scenes import edit
 from realsim.errors import RealsimError
 from typed_commands import invoked
 from upgradable_datasets import bop_dataset
@@ -25,12 +25,6 @@ def upgrade(dataset: Path, out: Path, *more: str) -> tuple[int, str]:
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception
     return done.exit_code, done.output
-
-
-def edit(path: Path, change: Callable[[dict], None]) -> None:
-    data = json.loads(path.read_text())
-    change(data)
-    path.write_text(json.dumps(data))
 
 
 def scaled_models(root: Path, factor: float) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
+from bop_scenes import edit
 from typed_commands import finished, invoked, refused
 
 SMALL = ("--views", "2", "--size", "160x90", "--objects", "2-3", "--seed", "5", "--workers", "1",
@@ -80,9 +81,7 @@ def test_a_finished_scene_is_kept_and_a_view_that_is_missing_is_made_again(
     assert _content(out) == before
     # What a registration made of the labels is not told as what was generated.
     labels = out / "scene_000000/scene_gt_info.json"
-    rows = json.loads(labels.read_text())
-    rows["0"][0]["visib_fract"] = 0.123
-    labels.write_text(json.dumps(rows))
+    edit(labels, lambda rows: rows["0"][0].update(visib_fract=0.123))
     written = {n: (out / n).read_bytes() for n in ("dataset.json", "index.html")}
     finished("generate", out, *SMALL, "--scenes", "1")
     assert {n: (out / n).read_bytes() for n in written} == written

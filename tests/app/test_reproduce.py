@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
+from bop_scenes import edit
 from realsim.app.reproduce.compare import compare_folders
 from realsim.store import atomic, provenance
 from school_sessions import QUICK, registered
@@ -59,9 +60,7 @@ def test_a_session_is_made_again_with_other_threads_and_left_alone(made: Path, s
 
 def test_what_differs_is_named_with_its_size(copy: Path) -> None:
     path = copy / "annotations/000001.json"
-    value = json.loads(path.read_text())
-    value["digest"], value["spoiled"] = value.get("digest"), 3
-    path.write_text(json.dumps(value))
+    edit(path, lambda value: value.update(digest=value.get("digest"), spoiled=3))
     mask = next((copy / "mask").glob("*.png"))
     mask.unlink()
     result = invoked("reproduce", copy, "annotate", "--workers", 1, "--json")
@@ -84,9 +83,7 @@ def test_changed_inputs_are_named(copy: Path) -> None:
 
 def test_other_versions_are_told_and_it_goes_on(copy: Path) -> None:
     path = copy / provenance.file_of("annotate")
-    record = json.loads(path.read_text())
-    record["versions"]["numpy"] = "1.0"
-    path.write_text(json.dumps(record))
+    edit(path, lambda record: record["versions"].update(numpy="1.0"))
     result = invoked("reproduce", copy, "annotate", "--workers", 1, "--json")
     told = json.loads(result.stdout)
     assert told["other_versions"][0].startswith("numpy 1.0 -> ")
@@ -109,18 +106,15 @@ def test_what_cannot_be_made_again_is_said(copy: Path, tmp_path: Path) -> None:
         path.write_text(json.dumps(json.loads(whole) | change))
         assert told in refused("reproduce", copy, "annotate")
     path = copy / provenance.file_of("register")
-    record = json.loads(path.read_text())
-    record["request"]["from_review"] = True
-    path.write_text(json.dumps(record))
+    edit(path, lambda record: record["request"].update(from_review=True))
     said = refused("reproduce", copy, "register")
     assert "from-review" in said and "realsim register" in said
 
 
 def test_the_card_of_an_export_names_what_has_no_label(copy: Path, tmp_path: Path) -> None:
     file = copy / "registration/report.json"
-    report = json.loads(file.read_text())
-    report["not_placed"] = [{"obj_id": 9, "instance": 4, "reason": "hidden in all views"}]
-    file.write_text(json.dumps(report))
+    hidden = [{"obj_id": 9, "instance": 4, "reason": "hidden in all views"}]
+    edit(file, lambda report: report.update(not_placed=hidden))
     finished("export", copy, "--to", "bop", "--out", tmp_path / "out", "--quiet")
     card = " ".join((tmp_path / "out/README.md").read_text().split())
     assert "object 9 (instance 4) is not placed and has no label" in card

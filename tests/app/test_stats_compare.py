@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from bop_scenes import edit
 from labelled_scenes import SceneInMemory, labelled_scene
 from realsim import images
 from realsim.app.cli import commands
@@ -121,12 +122,6 @@ def changed_copy(releases, tmp_path, change):
     change(copy / "train/000003")
     (row,) = compared(copy, releases[0])
     return row
-
-
-def edit(file, change):
-    content = json.loads(file.read_text())
-    change(content)
-    file.write_text(json.dumps(content))
 
 
 def repaint(file):

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bop_scenes import edit
 from given_plans import plan_through
 from realsim.errors import InputError, UnitError
 from realsim.formats.graspnet.cameras import read_camera_poses
@@ -206,9 +207,7 @@ def test_a_claim_against_the_evidence_is_refused(tmp_path: Path) -> None:
 
 def test_without_poses_the_unit_has_to_be_said(tmp_path: Path) -> None:
     q = write_path(tmp_path / "p.json", UR5)
-    data = json.loads((tmp_path / "p.json").read_text())
-    del data["cart_pose"]
-    (tmp_path / "p.json").write_text(json.dumps(data))
+    edit(tmp_path / "p.json", lambda data: data.pop("cart_pose"))
     refused("--joints-unit", read_path, tmp_path / "p.json", UR5, error=UnitError)
     assert np.abs(read_path(tmp_path / "p.json", UR5, "deg").joints - q).max() < 1e-12
     refused("look like degrees", read_path, tmp_path / "p.json", UR5, "rad", error=UnitError)

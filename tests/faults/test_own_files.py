@@ -1,7 +1,6 @@
 """Files of a session that claim what cannot be: an error names file and value."""
 
 import io
-import json
 import re
 import shutil
 import zipfile
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bop_scenes import edit
 from realsim.errors import InputError
 from realsim.store import SessionStore, load_grasps, load_scene, save_grasps
 from reviewed_boxes import grasp_set
@@ -37,12 +37,6 @@ def with_claim(path: Path, name: str, shape: tuple[int, ...]) -> None:
     with zipfile.ZipFile(path, "w") as file:
         for n, data in parts.items():
             file.writestr(n, data)
-
-
-def edited(path: Path, change: Callable[[Any], None]) -> None:
-    document = json.loads(path.read_text())
-    change(document)
-    path.write_text(json.dumps(document))
 
 
 def first_object(**values: Any) -> Callable[[Any], None]:
@@ -93,7 +87,7 @@ def refusals(session: Path, out: Path) -> list[str]:
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_is_bounded(name: str, session: Path, tmp_path: Path) -> None:
     change, words = SCENES[name]
-    edited(session / SCENE, change)
+    edit(session / SCENE, change)
     with pytest.raises(InputError, match=words) as error:
         load_scene(SessionStore.open(session))
     assert "scene.json" in str(error.value)
@@ -103,7 +97,7 @@ def test_a_scene_is_bounded(name: str, session: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", HEADERS)
 def test_a_header_is_bounded(name: str, session: Path) -> None:
     change, words = HEADERS[name]
-    edited(session / "session.json", change)
+    edit(session / "session.json", change)
     said = refused("stats", session)
     assert "session" in said and re.search(words, said)
 

@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
+from bop_scenes import edit
 from realsim.errors import InputError, NotRigidError, UnitError
 from realsim.formats.bop import labels as bop_labels
 from realsim.formats.bop import models as bop_models
@@ -35,13 +36,6 @@ def make_scene(folder, n=2):
         annotations[i] = [(3, poses[0]), (5, poses[1])]
     bop_labels.write_scene_gt(store, annotations)
     return store, annotations
-
-
-def edited(folder, name, change):
-    path = folder / name
-    data = json.loads(path.read_text())
-    change(data)
-    path.write_text(json.dumps(data))
 
 
 def read(folder):
@@ -212,7 +206,7 @@ BROKEN = {
 def test_broken_scenes_are_named(tmp_path, what):
     make_scene(tmp_path)
     file, change, error, says = BROKEN[what]
-    edited(tmp_path, file, change)
+    edit(tmp_path / file, change)
     with pytest.raises(error, match=says) as raised:
         read(tmp_path)
     assert file in str(raised.value)
@@ -259,7 +253,7 @@ def test_a_truncated_image_is_named(tmp_path):
 def test_models_in_the_wrong_unit_are_found_out(tmp_path):
     models = {1: ObjectModel(obj_id=1, name="die", mesh=box((0.06, 0.06, 0.06)))}
     bop_models.save_models(tmp_path, models)
-    edited(tmp_path, "models_info.json", lambda d: d["1"].update(diameter=0.104))
+    edit(tmp_path / "models_info.json", lambda d: d["1"].update(diameter=0.104))
     refused(r"models_info\.json says 0\.104 mm", bop_models.load_models, tmp_path, error=UnitError)
     from realsim.geometry.mesh import save_ply
 

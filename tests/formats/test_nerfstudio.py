@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from bop_scenes import edit
 from realsim.errors import InputError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.nerfstudio.source import open_nerfstudio
@@ -36,9 +37,7 @@ def data(store, tmp_path):
     path = tmp_path / "data/transforms.json"
 
     def change(f):
-        top = json.loads(path.read_text())
-        f(top)
-        path.write_text(json.dumps(top))
+        edit(path, f)
         return path.parent
 
     return change

@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from bop_scenes import edit
 from realsim.errors import MissingLibraryError
 from realsim.geometry.mesh import ply_bytes
 from realsim.models.reading import read_scan
@@ -90,9 +91,7 @@ def test_a_missing_texture_is_a_note(tmp_path):
     for name, data in gltf.items():
         if not name.endswith((".png", ".jpg", ".jpeg")):
             (tmp_path / ("a.gltf" if name.endswith(".gltf") else name)).write_bytes(data)
-    header = json.loads((tmp_path / "a.gltf").read_text())
-    header["images"] = [{"uri": "gone.png"}]
-    (tmp_path / "a.gltf").write_text(json.dumps(header))
+    edit(tmp_path / "a.gltf", lambda header: header.update(images=[{"uri": "gone.png"}]))
     scan = read_scan(tmp_path / "a.gltf", "m")
     assert scan.mesh.texture is None and any("gone.png" in n for n in scan.notes)
 

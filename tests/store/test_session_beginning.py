@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bop_scenes import edit
 from file_trees import bytes_of
 from realsim.errors import InputError
 from realsim.records import CaptureSession
@@ -33,9 +34,7 @@ def test_a_lost_header_is_made_anew_from_what_is_there(
     if damage == "missing":
         path.unlink()
     elif damage == "value":
-        header = json.loads(path.read_text())
-        header["camera"]["fx"] = 99.0
-        path.write_text(json.dumps(header))
+        edit(path, lambda header: header["camera"].update(fx=99.0))
     elif damage == "other arm":
         header = json.loads(path.read_text())
         path.write_text(json.dumps(header | {"extra": {"arm": "UR5e", "plan_hash": "p" * 64}}))
@@ -78,9 +77,7 @@ def test_the_capture_log_still_tells_the_devices(session: Path) -> None:
     assert extra["arm_description"] == begun["arm"] and extra[RECOVERED]
     assert extra["camera_description"] == {"serial": "17"}
     # Somebody who knows says so by hand: the repair takes it over, and keeps it from then on.
-    header = json.loads((session / "session.json").read_text())
-    del header["extra"][RECOVERED]
-    (session / "session.json").write_text(json.dumps(header))
+    edit(session / "session.json", lambda header: header["extra"].pop(RECOVERED))
     assert repair_session(session).after.sound
     assert RECOVERED not in SessionStore.open(session).extra
     assert read_begun(session) is not None
