@@ -15,7 +15,7 @@ from realsim.app.config.settings import settings_of
 from realsim.app.config.template import template, toml_value
 from realsim.app.option_values import Numbers
 from realsim.app.outputs import OutputFile
-from realsim.errors import InputError
+from refusals import refused
 from typed_commands import finished, realsim
 
 EVERY = walk(commands)
@@ -43,9 +43,7 @@ def read(text: str) -> dict[str, Any]:
 
 
 def refusal(text: str) -> str:
-    with pytest.raises(InputError) as error:
-        read(text)
-    return str(error.value)
+    return refused(".", read, text)
 
 
 def show(*args: str) -> dict[str, Any]:

@@ -20,10 +20,8 @@ pdfium = pytest.importorskip("pypdfium2", reason="rasterising a PDF needs pypdfi
 
 def test_what_does_not_fit_is_told_with_what_does(tmp_path: Path) -> None:
     target = parse_target("charuco:5x7,square=45mm,marker=30mm,dict=6X6_100")
-    with pytest.raises(InputError) as caught:
-        write_sheet(target, tmp_path / "a.pdf", paper="A4")
-    message = str(caught.value)
-    assert "225.0 x 315.0 mm" in message and "--paper A3" in message
+    message = refused("225.0 x 315.0 mm", write_sheet, target, tmp_path / "a.pdf", paper="A4")
+    assert "--paper A3" in message
     proposed = re.search(r"realsim board '([^']+)' --paper A4", message)
     assert proposed is not None
     assert list(tmp_path.iterdir()) == []

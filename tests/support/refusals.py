@@ -10,7 +10,8 @@ from realsim.errors import InputError
 def refused(
     why: str, call: Callable[..., object], *args: object, error: type[Exception] = InputError,
     **options: object,
-) -> None:  # fmt: skip
-    """Assert that `call(*args, **options)` raises an error that says `why` (a pattern)."""
-    with pytest.raises(error, match=why):
+) -> str:  # fmt: skip
+    """Hold that `call(*args, **options)` raises an error that says `why` (a pattern); return it."""
+    with pytest.raises(error, match=why) as caught:
         call(*args, **options)
+    return str(caught.value)

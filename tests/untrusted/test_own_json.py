@@ -34,6 +34,7 @@ from realsim.records.depth_bias import DepthBias
 from realsim.robots.arm import UR5
 from realsim.robots.hand_file import PadFile
 from realsim.untrusted.own_json import OwnFile, Real, from_json, read_own, to_json
+from refusals import refused
 
 few = settings(max_examples=10, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -196,9 +197,8 @@ POSE = {"obj_id": 1, "instance": 0, "T_world_obj": np.eye(4).tolist()}
 def test_what_is_wrong_is_named_with_its_place(tmp_path, values, words):
     path = tmp_path / "note.json"
     path.write_text(json.dumps(values))
-    with pytest.raises(InputError, match=re.escape(words)) as told:
-        read_own(path, Note)
-    assert str(told.value).startswith(str(path))
+    said = refused(re.escape(words), read_own, path, Note)
+    assert said.startswith(str(path))
 
 
 @pytest.mark.parametrize("text", ['{"unit_m": 0.01, "unit_m": 0.02}', '{"unit_m": NaN}', "[" * 200])

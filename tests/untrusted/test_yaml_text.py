@@ -12,6 +12,7 @@ from ruamel.yaml import YAML
 
 from realsim.errors import InputError
 from realsim.untrusted.yaml_text import parsed_yaml, read_yaml
+from refusals import refused
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers(-(10**12), 10**12) | st.floats(-1e9, 1e9)
@@ -76,10 +77,9 @@ LAUGHS = "a0: &a0 [ha, ha]\n" + "".join(
 def test_what_unfolds_runs_or_is_no_number_is_refused(tmp_path: Path, text: str, says: str) -> None:
     path = tmp_path / "a.yaml"
     path.write_text(text)
-    with pytest.raises(InputError, match=r"a\.yaml") as caught:
-        read_yaml(path)
-    assert says in str(caught.value)
-    assert len(str(caught.value)) < 600
+    said = refused(r"a\.yaml", read_yaml, path)
+    assert says in said
+    assert len(said) < 600
 
 
 def test_size_and_emptiness(tmp_path: Path) -> None:
