@@ -19,6 +19,7 @@ from realsim.geometry.colors import light_of_bytes
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.photo import PhotoRenderer
 from realsim.store import SessionStore, save_scene
+from refusals import refused
 from synthetic_scenes import INTRINSICS, MODELS, captured_session, rejected, two_boxes
 from typed_commands import finished
 
@@ -106,18 +107,14 @@ def test_a_rejected_object_is_named(real, tmp_path):
 def test_a_session_that_is_not_registered_is_told_the_command(tmp_path):
     store = captured_session(tmp_path / "s", 1)
     store.remove("registration/scene.json")
-    with pytest.raises(InputError, match="realsim register"):
-        run_render(store.folder, RenderRequest(), QUIET)
+    refused("realsim register", run_render, store.folder, RenderRequest(), QUIET)
 
 
 def test_a_folder_that_holds_something_else_is_refused_before_anything_is_rendered(real, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(InputError, match="not empty"):
-        run_render(real.folder, RenderRequest(out=tmp_path), QUIET)
-    with pytest.raises(InputError, match="the session itself"):
-        run_render(real.folder, RenderRequest(out=real.folder), QUIET)
-    with pytest.raises(InputError, match="is a file"):
-        run_render(real.folder, RenderRequest(out=tmp_path / "mine.txt"), QUIET)
+    refused("not empty", run_render, real.folder, RenderRequest(out=tmp_path), QUIET)
+    refused("the session itself", run_render, real.folder, RenderRequest(out=real.folder), QUIET)
+    refused("is a file", run_render, real.folder, RenderRequest(out=tmp_path / "mine.txt"), QUIET)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
 
 
@@ -146,13 +143,11 @@ def test_views_of_other_options_go_into_another_folder(tmp_path):
     ],
 )  # fmt: skip
 def test_options_that_cannot_be_are_named(options, named):
-    with pytest.raises(InputError, match=named):
-        RenderRequest(**options)
+    refused(named, RenderRequest, **options)
 
 
 def test_a_missing_panorama_and_an_unknown_material_are_named(real, tmp_path):
-    with pytest.raises(InputError, match="--hdri"):
-        RenderRequest(hdri=tmp_path / "none.hdr")
+    refused("--hdri", RenderRequest, hdri=tmp_path / "none.hdr")
     for text in ("table=jelly", "chair=oak", "oak"):
         with pytest.raises(InputError, match="table=KIND"):
             twin_scene(real, two_boxes(), MODELS, RenderRequest(materials=(text,)))

@@ -149,8 +149,7 @@ def test_a_stop_in_mid_move_is_named_and_gone_after_recovery(
     timer.join()
     arm.state()  # it can still be read
     if not what.startswith("reflex"):
-        with pytest.raises(ArmStoppedError, match=said):
-            arm.recover()  # only a person clears this
+        refused(said, arm.recover, error=ArmStoppedError)
         server.tell("clear")
     arm.recover()
     assert 0.005 < np.abs(server.joints() - home).max() < 0.29

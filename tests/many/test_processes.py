@@ -10,6 +10,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.many import WorkerDiedError, open_pool
+from refusals import refused
 
 
 @pytest.fixture(scope="module")
@@ -36,21 +37,18 @@ def test_jobs_run_in_as_many_other_processes_as_asked_for(two):
 def test_a_worker_that_dies_loses_its_own_job_and_is_replaced(two):
     other = two.submit(time.sleep, 0.5)
     dies = two.submit(signal.raise_signal, signal.SIGKILL)
-    with pytest.raises(WorkerDiedError, match=r"killed \(signal SIGKILL\)"):
-        dies.result(timeout=30)
+    refused(r"killed \(signal SIGKILL\)", dies.result, timeout=30, error=WorkerDiedError)
     next_one = two.submit(math.sqrt, 4.0)
     assert next_one.result(timeout=60) == 2.0
     assert other.result(timeout=30) is None
 
 
 def test_how_a_worker_ended_is_told(two):
-    with pytest.raises(WorkerDiedError, match="exit code 7"):
-        two.submit(os._exit, 7).result(timeout=60)
+    refused("exit code 7", two.submit(os._exit, 7).result, timeout=60, error=WorkerDiedError)
 
 
 def test_what_a_job_raises_comes_out_of_its_result(two):
-    with pytest.raises(ValueError, match="math domain error"):
-        two.submit(math.sqrt, -1.0).result(timeout=60)
+    refused("math domain error", two.submit(math.sqrt, -1.0).result, timeout=60, error=ValueError)
     with open_pool(1) as workers, pytest.raises(ValueError, match="math domain error"):
         workers.submit(math.sqrt, -1.0).result()
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from realsim.arrays import Array, Array32
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh_shape import sample_surface
 from realsim.geometry.parts import part
 from realsim.records import Mesh
 from realsim.review.placing.depth_residuals import CloudResiduals, noise_of, residual_rgb
+from refusals import refused
 
 WEDGE = part("wedge").mesh
 FLANGE = part("flange").mesh
@@ -88,14 +88,10 @@ def test_colours_tell_inside_from_outside_also_without_red_green_vision() -> Non
 
 
 def test_what_is_no_cloud_is_refused() -> None:
-    with pytest.raises(InputError, match=r"\(N, 3\)"):
-        CloudResiduals(np.zeros((4, 2)))
-    with pytest.raises(InputError, match="positive"):
-        CloudResiduals(np.zeros((4, 3)), within_m=0.0)
-    with pytest.raises(InputError, match="one of each"):
-        residuals(np.zeros((4, 3)), np.eye(4)[None], [])
-    with pytest.raises(InputError, match="times the noise"):
-        residual_rgb([0.0], 0.0)
+    refused(r"\(N, 3\)", CloudResiduals, np.zeros((4, 2)))
+    refused("positive", CloudResiduals, np.zeros((4, 3)), within_m=0.0)
+    refused("one of each", residuals, np.zeros((4, 3)), np.eye(4)[None], [])
+    refused("times the noise", residual_rgb, [0.0], 0.0)
 
 
 def test_noise_looks_like_noise_and_an_error_does_not() -> None:

@@ -204,8 +204,7 @@ def test_what_is_wrong_is_named_with_its_place(tmp_path, values, words):
 @pytest.mark.parametrize("text", ['{"unit_m": 0.01, "unit_m": 0.02}', '{"unit_m": NaN}', "[" * 200])
 def test_what_is_no_sound_json_is_refused_as_that_of_others(tmp_path, text):
     (tmp_path / "note.json").write_text(text)
-    with pytest.raises(InputError, match="run the step that writes it again"):
-        read_own(tmp_path / "note.json", Note)
+    refused("run the step that writes it again", read_own, tmp_path / "note.json", Note)
 
 
 def new_store(folder):
