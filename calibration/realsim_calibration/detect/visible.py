@@ -21,17 +21,10 @@ from realsim_calibration.detect.saddles import grid_arms, refine_saddles
 SEARCH_PX = 1600
 """Larger pictures are halved until they fit: a diagnosis need not see the smallest marker."""
 LARGEST = (
-    "DICT_APRILTAG_36h11",
-    "DICT_6X6_250",
-    "DICT_5X5_250",
-    "DICT_4X4_250",
-    "DICT_7X7_250",
-    "DICT_ARUCO_ORIGINAL",
-    "DICT_ARUCO_MIP_36h12",
-    "DICT_APRILTAG_25h9",
-    "DICT_APRILTAG_36h10",
+    "DICT_APRILTAG_36h11", "DICT_6X6_250", "DICT_5X5_250", "DICT_4X4_250", "DICT_7X7_250",
+    "DICT_ARUCO_ORIGINAL", "DICT_ARUCO_MIP_36h12", "DICT_APRILTAG_25h9", "DICT_APRILTAG_36h10",
     "DICT_APRILTAG_16h5",
-)
+)  # fmt: skip
 """Dictionaries that hold all smaller ones, the commonest first; of a thousand the
 first 250 codes will do, because every code costs time."""
 MIN_MARKERS = {"DICT_4X4_250": 4, "DICT_APRILTAG_16h5": 4, "DICT_ARUCO_ORIGINAL": 4}

@@ -45,10 +45,9 @@ def calibrate_session(
         )
     views_store = SessionStore.open(folder)
     require_sound(views_store)
-    views = views_store.session.views
     made_of = (folder / "robot.jsonl", store.folder / BOARD_FILE, folder / "session.json")
     key = arm + ("" if clock == "auto" else clock) + content_key(*made_of)
-    with console.stage("calibrate", f"{len(views)} board views") as tick:
+    with console.stage("calibrate", f"{len(views_store.session.views)} board views") as tick:
         if is_current(store, "calibrate", key):
             hand_eye = load_hand_eye(store)
         else:
