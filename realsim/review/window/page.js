@@ -86,15 +86,15 @@
     event.stopImmediatePropagation();
     event.preventDefault();
     if (event.detail) button.blur(); // pressed by a pointer, it takes no key that comes later
-    const text = button.textContent;
+    const text = button.textContent, name = button.innerText.trim().split("\n")[0];
     const act = () => {
       if (!button.isConnected || button.disabled || button.textContent !== text)
-        return say(`${text} was pressed while something else was being done: nothing is done. Press again.`);
+        return say(`${name} was pressed while something else was being done: nothing is done. Press again.`);
       wait(PATIENCE_MS);
       button.dispatchEvent(new MouseEvent("click", { bubbles: true, cancelable: true }));
     };
     const panel = button.closest("[data-dock-window], .mantine-Paper-root");
-    hold({ name: text, looks: !!(panel && panel.querySelector(".realsim-progress")), whose: whose(), act });
+    hold({ name, looks: !!(panel && panel.querySelector(".realsim-progress")), whose: whose(), act });
   }, true);
   const PLACE = "realsim place", read = Storage.prototype.getItem, write = Storage.prototype.setItem;
   const is = (key) => String(key).endsWith(PLACE);
