@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from realsim import errors
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.interop import import_extra, quiet_output
@@ -34,14 +35,20 @@ USD_FORMATS = (".usd", ".usda", ".usdc", ".usdz")
 TEXT_FORMAT = ".usda"
 TRIAL_S = 120
 """How long one file may be read [s]."""
+TRIAL_MB = 1000
+"""How much memory that may take beyond 30 times the file's size [MB]."""
 TRIAL = """
-import sys, pathlib
+import pathlib, resource, sys
 from realsim.errors import RealsimError
 from realsim.models import usd_reading as usd
+path = pathlib.Path(sys.argv[1])
+room = (usd.TRIAL_MB << 20) + 30 * path.stat().st_size
+resource.setrlimit(resource.RLIMIT_DATA, (room, room))
 try:
-    usd._content(usd._Pxr(), pathlib.Path(sys.argv[1]))
-except RealsimError:
-    pass  # it is said in the process that asked
+    usd._content(usd._Pxr(), path)
+except RealsimError as error:
+    print(type(error).__name__, error)
+    sys.exit(3)
 """
 UNITS: tuple[tuple[ScanUnit, float], ...] = (
     ("m", 1.0),
@@ -72,17 +79,20 @@ def _require_survivable(path: Path) -> None:
     """Read a file in a process of its own first: at damaged ones the library ends the process.
 
     Raises:
-        InputError: it does, or needs longer than anybody waits.
+        InputError: it does, needs longer than anybody waits, or says what is wrong with the file.
     """
     try:
         done = subprocess.run(
             [sys.executable, "-c", TRIAL, str(path)], capture_output=True, timeout=TRIAL_S,
-            check=False,
+            check=False, text=True, errors="replace",
         )  # fmt: skip
     except subprocess.TimeoutExpired as error:
         raise InputError(
             f"{path} cannot be read as a USD file: its library takes more than {TRIAL_S} s."
         ) from error
+    if done.returncode == 3:
+        kind, _, words = done.stdout.strip().partition(" ")
+        raise getattr(errors, kind, InputError)(words)
     if done.returncode < 0:
         raise InputError(
             f"{path} is damaged: the library for USD files breaks down at it (signal "

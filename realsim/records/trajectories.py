@@ -44,6 +44,9 @@ class GraspTrajectories:
         for name in ("time_s", "opening_m"):
             object.__setattr__(self, name, frozen(getattr(self, name), np.float64, (s,), name))
         object.__setattr__(self, "phase", frozen(self.phase, np.int64, (s,), "phase"))
+        for name in ("time_s", "opening_m", "joints_rad"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise InputError(f"{name} of the attempts has NaN or infinite numbers.")
         if np.any(np.diff(self.rows) <= 0):
             raise InputError("the rows of attempts do not increase; each grasp has one attempt.")
         counts = np.diff(self.starts)

@@ -92,7 +92,12 @@ def load_trajectories(
             f"{path} belongs to other grasps than those of instance {grasps.instance}: one of the "
             "two was written by another run. Delete it, or run the school again for this object."
         )
-    return GraspTrajectories(**arrays)
+    try:
+        return GraspTrajectories(**arrays)
+    except InputError as error:
+        raise InputError(
+            f"{path}: {error} Delete it, and run the school again for this object."
+        ) from error
 
 
 def _identity(grasps: GraspSet) -> str:

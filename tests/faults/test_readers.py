@@ -3,6 +3,7 @@
 import errno
 import importlib
 import re
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -58,9 +59,24 @@ def test_a_usd_file_at_which_the_library_breaks_down_is_refused() -> None:
     assert found.kind == "refused" and "damaged" in found.detail
 
 
+@pytest.mark.slow
+def test_a_usd_file_for_which_the_library_takes_gigabytes_is_refused_with_less() -> None:
+    pytest.importorskip("pxr")
+    script = (
+        "import resource as r, formats_mutations as m; print(m.replay('mesh usdc', 28_900_964)"
+        ".kind, max(r.getrusage(k).ru_maxrss for k in (r.RUSAGE_SELF, r.RUSAGE_CHILDREN)) >> 10)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=Path(mutations.__file__).parent,
+                          capture_output=True, text=True, check=True)  # fmt: skip
+    kind, peak_mb = done.stdout.split()
+    assert kind == "refused" and int(peak_mb) < 1500  # without a bound 2300
+
+
 @pytest.mark.parametrize(("name", "seed", "kind"), [
     ("graspit", 11_900_056, "read"),  # no grasps beside it
     ("graspit", 12_300_180, "read"),  # 5000 letters name the file of grasps
+    ("colmap binary", 7_900_213, "refused"),  # an image's name is no text
+    ("results of a session", 33_900_205, "refused"),  # a trajectory's time is NaN
 ])  # fmt: skip
 def test_what_was_found_once_stays_read_or_refused(name: str, seed: int, kind: str) -> None:
     assert mutations.replay(name, seed).kind == kind

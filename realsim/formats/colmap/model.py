@@ -324,19 +324,24 @@ def read_model(folder: Path | str) -> ColmapModel:
         ) from error
     found: list[ColmapImage] = []
     unregistered: list[str] = []
-    for _, image in sorted(dict(model.images).items()):
+    for number, image in sorted(dict(model.images).items()):
+        try:
+            name = str(image.name)
+        except UnicodeDecodeError as error:
+            raise InputError(
+                f"the name of image {number} in {folder} is no text (UTF-8); the file is damaged, "
+                "or written with another encoding. Export it again."
+            ) from error
         if not image.has_pose:
-            unregistered.append(str(image.name))
+            unregistered.append(name)
             continue
         T = se3.invert(T_from_rigid3d(image.cam_from_world()))
         if not np.isfinite(T).all():
             raise InputError(
-                f"the pose of {image.name} in {folder} has NaN or infinite numbers; the file is "
+                f"the pose of {name} in {folder} has NaN or infinite numbers; the file is "
                 "damaged. Export it again."
             )
-        found.append(
-            ColmapImage(name=str(image.name), camera_id=int(image.camera_id), T_world_cam=T)
-        )
+        found.append(ColmapImage(name=name, camera_id=int(image.camera_id), T_world_cam=T))
     used = {i.camera_id for i in found}
     cameras = {k: _intrinsics(c, folder) for k, c in dict(model.cameras).items() if k in used}
     return ColmapModel(
