@@ -12,8 +12,8 @@
   const shown = () => document.querySelector("[data-realsim-photograph]");
   const whose = () => `${shown().dataset.scene}/${shown().dataset.instance}`;
   window.realsimShown = () => { // "0/3"; "0/3 0/4" while the photograph is still another object's
-    const here = shown() ? whose() : "", drawn = root && root.dataset.whose;
-    return drawn && drawn !== here ? `${drawn} ${here}` : here;
+    const here = shown() ? whose() : "", named = root && root.dataset.named;
+    return named && named !== here ? `${named} ${here}` : here;
   };
   const make = (tag, kind, parent, text) => {
     const e = document.createElement(tag);
@@ -156,7 +156,7 @@
     place();
     root.classList.toggle("rs-three", isThree);
     root.classList.toggle("rs-bare", !lines);
-    root.dataset.whose = seen.whose; // scene and object that is drawn
+    root.dataset.whose = root.dataset.named = seen.whose; // scene and object that is drawn, and is named
     root.querySelector(".rs-caption").textContent = caption();
     root.querySelector(".rs-compared").textContent = isDone() ? "" : `${strip.compared} of ${strip.of} views compared`;
     if (row().trouble) tell(row().trouble, true);
@@ -175,7 +175,7 @@
   };
   // Nothing of another object stays: what one view says against it would be read as said of this one.
   const forget = () => {
-    strip = null; panes = []; root.dataset.whose = whose();
+    strip = null; panes = []; root.dataset.whose = ""; root.dataset.named = whose();
     for (const part of [".rs-panes", ".rs-strip", ".rs-legend"]) root.querySelector(part).replaceChildren();
     root.querySelector(".rs-caption").textContent = shown().dataset.name;
     root.querySelector(".rs-compared").textContent = "";
