@@ -156,8 +156,8 @@ class DepthSensorModel(SensorRecord):
             raise InputError(f"the depth range {self.min_z_m} to {self.max_z_m} m is empty.")
         for name in NOT_NEGATIVE:
             value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise InputError(f"{name} is {value}; 0 (off) or more is accepted.")
+            if not 0 <= value < 2**63:
+                raise InputError(f"{name} is {value!r:.60}; 0 (off) or more is accepted.")
         if self.edge_dropout + self.edge_flying > 1:
             raise InputError("edge_dropout and edge_flying are shares: together at most 1.")
         for name, least in (("correlation_aspect", 0.05), ("native_pitch_px", 1.0),
