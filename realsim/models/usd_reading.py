@@ -6,6 +6,7 @@ texture or a plain colour; without one, `displayColor`. Surfaces of subdivision 
 cage.
 """
 
+import os
 import signal
 import subprocess
 import sys
@@ -41,15 +42,18 @@ TRIAL = """
 import pathlib, resource, sys
 from realsim.errors import RealsimError
 from realsim.models import usd_reading as usd
-path = pathlib.Path(sys.argv[1])
-room = (usd.TRIAL_MB << 20) + 30 * path.stat().st_size
+path, pxr = pathlib.Path(sys.argv[1]), usd._Pxr()
+held = int(open("/proc/self/status").read().split("VmData:")[1].split()[0]) << 10
+room = held + (usd.TRIAL_MB << 20) + 30 * path.stat().st_size
 resource.setrlimit(resource.RLIMIT_DATA, (room, room))
 try:
-    usd._content(usd._Pxr(), path)
+    usd._content(pxr, path)
 except RealsimError as error:
     print(type(error).__name__, error)
     sys.exit(3)
 """
+ONE_THREAD = {"PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1"}
+"""The stacks of a thread a core would count as memory."""
 UNITS: tuple[tuple[ScanUnit, float], ...] = (
     ("m", 1.0),
     ("cm", 0.01),
@@ -84,7 +88,7 @@ def _require_survivable(path: Path) -> None:
     try:
         done = subprocess.run(
             [sys.executable, "-c", TRIAL, str(path)], capture_output=True, timeout=TRIAL_S,
-            check=False, text=True, errors="replace",
+            check=False, text=True, errors="replace", env=os.environ | ONE_THREAD,
         )  # fmt: skip
     except subprocess.TimeoutExpired as error:
         raise InputError(
