@@ -155,6 +155,16 @@ def test_a_full_disk_is_told_and_is_no_bug(
     assert window.attempt(lambda: window.object.decide("accept"))
 
 
+def test_what_fails_counts_as_done_so_that_the_page_goes_on(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hands: Any = page.window.hands
+    monkeypatch.setattr(page.window.photographs, "tell", lambda: 1 / 0)
+    page.set(page.window.list._step, "Next \u25b6")
+    page.wait(lambda: "bug in realsim" in page.message)
+    page.wait(lambda: 'data-at-work="0"' in hands._html.content)
+
+
 def test_a_failure_whose_refresh_fails_too_does_not_raise(
     page: Page, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -38,7 +38,7 @@ OUTCOMES = tuple(TOLD)
 MOST_ROWS = 60
 """Objects in the console's table, worst first where there are more; upgrade.csv has all."""
 MOST_NOTES = 30
-"""Of objects, and of scenes."""
+"""Notes that the console tells: so many on objects, and on scenes."""
 
 
 def objects_of(records: Iterable[Record]) -> list[tuple[Record, dict[str, Any]]]:

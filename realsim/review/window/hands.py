@@ -31,11 +31,13 @@ class Hands:
         """Do something after what came before it."""
 
         def work() -> None:
-            self._window.attempt(action)
-            self._window.photographs.tell()
-            with self._lock:
-                self._done += 1
-                self._tell()
+            try:
+                self._window.attempt(action)
+                self._window.attempt(self._window.photographs.tell)
+            finally:  # the page waits for it
+                with self._lock:
+                    self._done += 1
+                    self._tell()
 
         with self._lock, contextlib.suppress(RuntimeError):  # the browser is gone
             self._work.submit(work)
