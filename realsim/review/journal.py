@@ -53,6 +53,8 @@ REPEATED = ("reviewer", "action", "subject", "symmetry", "how")
 MOST_POSES = 1000
 """Poses that are held once for all lines that name them."""
 BLOCK_BYTES = 1 << 16
+NO_CHECKS = dict[str, float]()
+"""What most lines have measured; it is held once."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -83,7 +85,7 @@ class Entry:
     """For a mark of symmetry: what `symmetric.symmetry_of` reads, such as z, x:2 or none."""
     how: str = ""
     """For a move: by what, such as gizmo, keyboard, icp or points."""
-    checks: dict[str, float] = field(default_factory=dict[str, float])
+    checks: dict[str, float] = field(default_factory=lambda: NO_CHECKS)
     """For a move: what was measured of the new pose, such as agree."""
 
     def __post_init__(self) -> None:
@@ -129,6 +131,7 @@ class Entry:
             for k, v in dict[Any, Any](said).items()
         ):
             raise InputError("'checks' is no mapping of names to numbers.")
+        object.__setattr__(self, "checks", said or NO_CHECKS)
 
     def _check_fields(self) -> None:
         needed = {

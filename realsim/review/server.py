@@ -265,6 +265,7 @@ class ReviewServer:
             window = self._windows.pop(client.client_id, None)
         if window is not None:
             window.close()
+        gc.collect()  # a window is a circle of parts, and garbage is looked for seldom
         give_back_memory()
 
     def _watch(self) -> None:
