@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import ObjectPose, Scene, Verdict
@@ -100,9 +101,7 @@ def _corrected(placed: ObjectPose, state: ReviewState) -> ObjectPose:
         return placed
     last = chain[-1]
     assert last.pose is not None
-    step = se3.invert(placed.T_world_obj) @ last.pose
-    mm = 1e3 * float(np.linalg.norm(last.pose[:3, 3] - placed.T_world_obj[:3, 3]))
-    turned = float(np.rad2deg(se3.angle(step[:3, :3])))
+    mm, turned = apart(placed.T_world_obj, last.pose)
     words = f"moved by {last.reviewer}" + (f" ({last.how})" if last.how else "")
     words += f": {mm:.2g} mm, {turned:.2g} deg from where it was registered"
     now = _after(placed, last)
@@ -127,6 +126,16 @@ def _is_about(entry: Entry, placed: ObjectPose) -> bool:
         return True
     if entry.pose is None or entry.obj_id != placed.obj_id:
         return False
-    step = se3.invert(entry.pose) @ placed.T_world_obj
-    near = float(np.linalg.norm(entry.pose[:3, 3] - placed.T_world_obj[:3, 3])) < SAME_PLACE_M
-    return near and float(np.rad2deg(se3.angle(step[:3, :3]))) < SAME_PLACE_DEG
+    return is_same_place(entry.pose, placed.T_world_obj)
+
+
+def apart(a: Array, b: Array) -> tuple[float, float]:
+    """Return how far two poses (4, 4) are from each other [mm, deg]."""
+    turn = se3.angle(se3.invert(a)[:3, :3] @ b[:3, :3])
+    return 1e3 * float(np.linalg.norm(b[:3, 3] - a[:3, 3])), float(np.rad2deg(turn))
+
+
+def is_same_place(a: Array, b: Array) -> bool:
+    """Return whether no eye sees two poses (4, 4) [m] apart."""
+    mm, deg = apart(a, b)
+    return mm < 1e3 * SAME_PLACE_M and deg < SAME_PLACE_DEG

@@ -1,17 +1,20 @@
 """`realsim register --from-review`: what reviewers said is where the registration starts from."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from realsim.app import stages
+from realsim.app.register.from_review import review_starts, stayed
+from realsim.app.register.results import load_registered, with_objects
 from realsim.geometry import se3
 from realsim.records import ObjectPose
 from realsim.review import journal
 from realsim.review.corrections import decision_on
-from realsim.store import SessionStore, load_scene
+from realsim.store import SessionStore, load_scene, save_scene
 from shared_sessions import copy_of
 from typed_commands import finished, invoked, refused
 
@@ -80,6 +83,39 @@ def test_the_scene_that_other_commands_use_is_the_reviewed_one(session: SessionS
     assert judged.object(first.instance).verdict == "unchecked"
     assert stages.registered_views(session) == list(range(1, 8))
     assert len(stages.session_models(session)[second.obj_id].symmetries) == 3
+
+
+@pytest.mark.parametrize("upgraded", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_accepted_objects_stay_and_in_an_upgraded_scene_all_that_nobody_moved(
+    session: SessionStore, upgraded: bool
+) -> None:
+    beside = se3.from_translation([0.002, 0.0, 0.0])
+    scene = load_scene(session)
+    first, second = (replace(o, T_world_obj=beside @ o.T_world_obj) for o in scene.objects)
+    save_scene(session, replace(scene, objects=(first, second)))
+    say(session, "accept", first)
+    if upgraded:
+        session.write_json("stages/upgrade.json", {})
+    said = invoked("register", session.folder, "--from-review", "--json", "--quiet").stdout
+    assert f"instance {first.instance} stays where ada accepted it; the fit would put it" in said
+    now = {o.instance: o.T_world_obj for o in load_scene(session).objects}
+    np.testing.assert_array_equal(now[first.instance], first.T_world_obj)
+    assert np.array_equal(now[second.instance], second.T_world_obj) == upgraded
+    assert (f"instance {second.instance} stays where it stood" in said) == upgraded
+
+
+def test_an_accepted_object_seen_by_other_cameras_is_where_it_is_found(
+    session: SessionStore,
+) -> None:
+    result = load_registered(session)
+    say(session, "accept", result.scene.objects[0])
+    starts, beside = review_starts(session, None), se3.from_translation([0.003, 0.0, 0.0])
+    objects = [replace(o, T_world_obj=beside @ o.T_world_obj) for o in result.scene.objects]
+    refined = {k: beside @ T for k, T in result.cameras.refined.items()}
+    for cameras, stays in (result.cameras.refined, True), (refined, False):
+        seen = replace(result, cameras=replace(result.cameras, refined=cameras))
+        kept = stayed(session, starts, with_objects(seen, objects))[0].scene.objects[0]
+        assert np.array_equal(kept.T_world_obj, objects[0].T_world_obj) != stays
 
 
 @pytest.mark.slow

@@ -11,13 +11,27 @@ from typing import Any
 
 import numpy as np
 
-from realsim.app.register.results import STAGE_FILE, VIEWS_FILE
+from realsim.app.register.results import (
+    STAGE_FILE,
+    VIEWS_FILE,
+    Registered,
+    cameras_now,
+    load_cameras,
+    with_objects,
+)
 from realsim.app.reviewed import damage_words, review_of
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose
 from realsim.registration.search.records import Region, Wanted
-from realsim.review.corrections import DECIDED, corrected_scene, decision_on, pending
+from realsim.review.corrections import (
+    DECIDED,
+    apart,
+    corrected_scene,
+    decision_on,
+    is_same_place,
+    pending,
+)
 from realsim.review.journal import Entry, ReviewState
 from realsim.store import SessionStore, load_scene
 from realsim.untrusted.own_json import to_json
@@ -25,11 +39,15 @@ from realsim.untrusted.own_json import to_json
 SCENE_FILE = "registration/scene.json"
 REVIEW_FILE = "registration/review.json"
 EARLIER = "registration/earlier"
+UPGRADE_FILE = "stages/upgrade.json"
+"""There in a scene that `realsim upgrade` made."""
 FORMAT = 1
 HELD_RADIUS_M, HELD_TURN_DEG = 0.005, 5.0
 """How far an object that a person accepted, or that nobody touched, is looked for."""
 MOVED_RADIUS_M, MOVED_TURN_DEG = 0.015, 15.0
 """How far one that a person moved is looked for: a mouse is good to a centimetre."""
+SAME_CAMERAS_M = 0.001
+"""Cameras that see an object nearer than this to where they saw it are the same ones."""
 Row = dict[str, Any]
 
 
@@ -143,6 +161,40 @@ def _wanted(row: Row, models: Mapping[int, ObjectModel]) -> Wanted:
     return Wanted(obj_id=obj_id, instance=row["instance"], region=region, T_start=T)
 
 
+def stayed(
+    store: SessionStore, starts: ReviewStarts, result: Registered
+) -> tuple[Registered, list[str]]:
+    """Return the registration with those objects where they stood that stay, and words on them.
+
+    What a person accepted stays, and in an upgraded scene all that nobody moved: annotations that
+    no fit bettered are among it. Seen by other cameras than before, an object is where it is found.
+    """
+    before, record, state = load_scene(store), load_cameras(store), review_of(store)
+    cameras = cameras_now(store) if record is None else record.session
+    fitted = {o.instance: o for o in result.scene.objects}
+    words: list[str] = []
+    for row in starts.rows:
+        placed = before.object(row["instance"])
+        decision = decision_on(placed, state)
+        stays = store.has(UPGRADE_FILE) or (decision is not None and decision.action == "accept")
+        if row["radius_m"] != HELD_RADIUS_M or not stays:
+            continue
+        at, now = placed.T_world_obj[:, 3], result.cameras.refined
+        steps = [(se3.invert(cameras[k]) - se3.invert(now[k])) @ at for k in now if k in cameras]
+        if not steps or np.median(np.linalg.norm(steps, axis=1)) > SAME_CAMERAS_M:
+            continue
+        found = fitted.get(placed.instance)
+        if found is None or not is_same_place(found.T_world_obj, placed.T_world_obj):
+            fit = "finds it nowhere"
+            if found is not None:
+                mm, deg = apart(placed.T_world_obj, found.T_world_obj)
+                fit = f"would put it {mm:.2g} mm and {deg:.2g} deg from there"
+            who = "where it stood" if decision is None else f"where {decision.reviewer} accepted it"
+            words.append(f"instance {placed.instance} stays {who}; the fit {fit}.")
+        fitted[placed.instance] = placed
+    return with_objects(result, [fitted[k] for k in sorted(fitted)]), words
+
+
 def is_precious(store: SessionStore) -> bool:
     """Return whether the present scene was reviewed, or is not a registration's (a generated one).
 
@@ -182,7 +234,5 @@ def moved_since_accepted(
         if not last or last[-1].action != "accept" or last[-1].pose is None:
             continue
         if decision_on(placed, state) is None and last[-1].obj_id == placed.obj_id:
-            step = se3.invert(last[-1].pose) @ placed.T_world_obj
-            mm = 1e3 * float(np.linalg.norm(last[-1].pose[:3, 3] - placed.T_world_obj[:3, 3]))
-            found.append((placed, last[-1], mm, float(np.rad2deg(se3.angle(step[:3, :3])))))
+            found.append((placed, last[-1], *apart(last[-1].pose, placed.T_world_obj)))
     return found

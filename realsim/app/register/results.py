@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from realsim.arrays import Array
-from realsim.records import Scene, View
+from realsim.geometry import se3
+from realsim.records import ObjectPose, Scene, View
 from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.registration.search.records import NotPlaced
 from realsim.store import SessionStore, load_scene
@@ -181,6 +182,28 @@ def load_registered(store: SessionStore) -> Registered:
             Remark(view=f.get("view"), kind=f["kind"], words=f["words"]) for f in findings
         ),
         report=report,
+    )  # fmt: skip
+
+
+def with_objects(result: Registered, objects: Sequence[ObjectPose]) -> Registered:
+    """Return a registration with other objects: those of its instances, perhaps elsewhere, or more.
+
+    How sure a view is of an object is known only of one that has a covariance.
+    """
+    seen: dict[int, dict[int, SeenPose]] = {}
+    for view, T_world_cam in result.cameras.refined.items():
+        seen[view] = {}
+        for o in objects:
+            T_cam_obj = se3.invert(T_world_cam) @ o.T_world_obj
+            old = result.seen.get(view, {}).get(o.instance)
+            if old is None or o.covariance is None:
+                unknown = np.full((6, 6), np.nan)
+                old = SeenPose(T_cam_obj=T_cam_obj, covariance=unknown, sigma_px=np.nan)
+            seen[view][o.instance] = replace(old, T_cam_obj=T_cam_obj)
+    there = {o.instance for o in objects}
+    return replace(
+        result, scene=replace(result.scene, objects=tuple(objects)), seen=seen,
+        not_placed=tuple(n for n in result.not_placed if n.instance not in there),
     )  # fmt: skip
 
 

@@ -16,6 +16,7 @@ from realsim.app.register.from_review import (
     keep_earlier,
     moved_since_accepted,
     review_starts,
+    stayed,
 )
 from realsim.app.register.inputs import RegisterInputs, read_inputs
 from realsim.app.register.results import (
@@ -86,8 +87,11 @@ def run_register(
     if is_current(store, STAGE, key) and store.has(SCENE_FILE):
         return _as_it_was(store)
     starts = review_starts(store, None) if request.from_review else None
-    told = () if starts is None else starts.words
-    result = _with_review(store, inputs, told, _registered(store, console, request, inputs))
+    result, told = _registered(store, console, request, inputs), list[str]()
+    if starts is not None:
+        result, told = stayed(store, starts, result)
+        told = [*starts.words, *told]
+    result = _with_review(store, inputs, told, result)
     models = inputs.models
     if amend is not None:
         result = amend(result)

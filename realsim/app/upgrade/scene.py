@@ -13,7 +13,7 @@ from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console, Tick
 from realsim.app.register.config import RegisterRequest
 from realsim.app.register.pictures import bias_of
-from realsim.app.register.results import Registered
+from realsim.app.register.results import Registered, with_objects
 from realsim.app.register.run import run_register
 from realsim.app.school.run import school_session
 from realsim.app.school.tables import why_no_grasp
@@ -30,7 +30,6 @@ from realsim.records import CaptureSession, GraspSet, ObjectPose, Scene, View
 from realsim.registration.compare import spread_frames
 from realsim.registration.evidence import LazyFrame
 from realsim.registration.photo import Picture
-from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.store import SessionStore, provenance
 from realsim.store.lock import only_run_in
 from realsim.untrusted.own_json import read_values
@@ -195,20 +194,9 @@ def settled(
             for f in spread_frames(frames, middle, VIEWS)
         ]  # fmt: skip
         outcomes = decide(pictures, source.models, annotations, objects, result.scene.plane)
-    scene = replace(result.scene, objects=_with_outcomes(objects, outcomes))
-    seen: dict[int, dict[int, SeenPose]] = {}
-    for view, rows in result.seen.items():
-        seen[view] = {}
-        for instance, old in rows.items():
-            o = scene.object(instance)
-            known = o.covariance is not None
-            seen[view][instance] = SeenPose(
-                T_cam_obj=se3.invert(cameras[view]) @ o.T_world_obj,
-                covariance=old.covariance if known else np.full((6, 6), np.nan),
-                sigma_px=old.sigma_px if known else float("nan"),
-            )
+    result = with_objects(result, _with_outcomes(objects, outcomes))
     report = dict(result.report) | {"upgrade": {str(o.instance): o.as_json() for o in outcomes}}
-    return replace(result, scene=scene, seen=seen, report=report)
+    return replace(result, report=report)
 
 
 def _with_outcomes(
