@@ -153,7 +153,8 @@ def _numba(outcome: Outcome) -> Finding:
         return Finding(group=GROUP, name=name, kind="ok", found=f"is written to {outcome.told}")
     return Finding(
         group=GROUP, name=name, kind="problem", found=f"cannot be written: {outcome.told}",
-        todo="name a folder that may be written: `export NUMBA_CACHE_DIR=~/.cache/numba`",
+        todo="name a folder that may be written, or every run compiles anew: `export "
+        "NUMBA_CACHE_DIR=FOLDER`",
     )  # fmt: skip
 
 
