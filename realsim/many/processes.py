@@ -6,6 +6,7 @@ is known which job that was; a pool of many breaks as a whole.
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -16,6 +17,7 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import ModuleType
 from typing import Any
 
 from threadpoolctl import threadpool_limits
@@ -27,6 +29,8 @@ from realsim.many.pool import Pool, WorkerDiedError
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """The processes share the cores; threads of their libraries would fight over them, and sums split
 over threads differ in their last bits."""
+_starting = threading.Lock()
+"""Held while a process starts."""
 
 
 @contextmanager
@@ -108,7 +112,7 @@ class _Processes:
             pool = self._pools[place] = ProcessPoolExecutor(
                 max_workers=1, mp_context=get_context("spawn"), initializer=_end_with_parent
             )
-        with _one_thread():
+        with _fresh():
             return pool, pool.submit(called, fn, args)
 
     def _settle(
@@ -154,21 +158,25 @@ def _end_of(process: BaseProcess | None) -> str:
 
 
 @contextmanager
-def _one_thread() -> Generator[None]:
-    """Set the environment that keeps a process which starts within to one thread.
+def _fresh() -> Generator[None]:
+    """Let a process that starts within have one thread, and not run the user's script again.
 
-    The libraries read it when they load: it has to stand before the process starts.
+    Libraries read the environment when they load: it has to stand before the process starts.
     """
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(ONE_THREAD)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+    with _starting:
+        before = {name: os.environ.get(name) for name in ONE_THREAD}
+        script = sys.modules["__main__"]
+        os.environ.update(ONE_THREAD)
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = script
+            for name, value in before.items():
+                if value is None:
+                    os.environ.pop(name, None)
+                else:
+                    os.environ[name] = value
 
 
 def _end_with_parent() -> None:

@@ -3,6 +3,8 @@
 import errno
 import os
 import signal
+import subprocess
+import sys
 from concurrent.futures import Future
 
 import pytest
@@ -78,6 +80,18 @@ def test_a_task_that_kills_three_workers_is_named_and_the_rest_go_on(two, tmp_pa
     assert "3 workers ended in the middle of it" in summary.failed[0].why
     assert "killed (signal SIGKILL), as the system does when" in summary.failed[0].why
     assert summary.done == 2 and len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_script_without_a_guard_is_run_once(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import math\nfrom realsim.many import PoolConfig, Task, open_pool, run_many\n"
+        "print('begun')\nwith open_pool(PoolConfig(workers=2)) as pool:\n"
+        "    done = lambda o: print(o.found())\n"
+        "    run_many([Task(name='root', fn=math.sqrt, args=(4.0,))], pool, done)\n"
+    )
+    ran = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60)
+    assert (ran.stdout, ran.stderr) == ("begun\n2.0\n", "")
 
 
 def test_results_come_in_order_where_that_is_asked_for(two):
