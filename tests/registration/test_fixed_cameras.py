@@ -53,7 +53,7 @@ def things(scene) -> list[PlacedMesh]:
     ]
 
 
-def fixed_camera(scene, eye, seed: int, *, arm: bool = True) -> tuple[FixedFrames, np.ndarray]:
+def fixed_camera(scene, eye, seed: int) -> tuple[FixedFrames, np.ndarray]:
     """A fixed camera with errors of its own, an arm before it in some images; where it stands."""
     rng = np.random.default_rng(seed)
     T = se3.look_at(eye, [0.0, 0.0, 0.02])
@@ -61,7 +61,7 @@ def fixed_camera(scene, eye, seed: int, *, arm: bool = True) -> tuple[FixedFrame
     images = []
     for k in range(IMAGES):
         z = exact.copy()
-        if arm and k % 3 == 0:
+        if k % 3 == 0:
             z[:, 40 * k : 40 * k + 120] = 0.25
         z = z + rng.normal(size=z.shape) * NOISE_PER_M * z**2
         z[rng.random(z.shape) < 0.03] = 0.0

@@ -7,10 +7,18 @@ import numpy as np
 import pytest
 
 from realsim.geometry import se3
+from realsim.geometry.mesh import symmetry_transforms
 from realsim.geometry.metrics import mssd
+from realsim.geometry.parts import part
 from realsim.records import ObjectPose
-from realsim.registration.blind import CovarianceConfig
+from realsim.registration.blind import CovarianceConfig, twist_rad
+from realsim.registration.body import make_body
+from realsim.registration.compare import CompareConfig, make_comparer
+from realsim.registration.evidence import EvidenceConfig, average_cloud, gather, without_table
 from realsim.registration.register import DepthFrame, register_scene
+from realsim.registration.solver import SolverConfig, solve_pose
+from realsim.registration.table_planes import PlaneConfig, find_support_plane
+from realsim.registration.verify import VerifyConfig, verify_objects
 from table_scenes import QUICK
 
 CONFIG = replace(QUICK, covariance=CovarianceConfig(correlation_area_px=1.0))
@@ -90,3 +98,143 @@ def test_covariance_is_of_the_size_of_the_errors(clutter, result):
     # Six degrees of freedom: 1 on average; the floor and the 0.6 mm make it careful, not careless.
     assert np.mean(ratios) < 3.0
     assert np.max(ratios) > 0.005
+
+
+# --- Verification without ground truth: wrong poses are flagged, round axes are named.
+
+
+@pytest.fixture(scope="module")
+def checker(clutter):
+    """(bodies, a function poses -> checks) on the cluttered scene."""
+    bodies = [make_body(t, clutter.models[t.obj_id], 48, 300) for t in clutter.truth]
+    evidence = gather(clutter.intrinsics, clutter.frames, bodies, EvidenceConfig())
+    centers = np.stack([b.center(b.T_start) for b in bodies])
+    cameras = np.stack([f.T_world_cam[:3, 3] for f in clutter.frames])
+    plane, _ = find_support_plane(evidence.support, centers, cameras, PlaneConfig(), 0.001)
+    comparer = make_comparer(
+        clutter.intrinsics, clutter.frames, evidence.noise, plane, CompareConfig()
+    )
+    clouds = [
+        average_cloud(without_table(c, plane, 0.003), np.eye(4), 0.003) for c in evidence.near
+    ]
+
+    def check(poses):
+        return verify_objects(bodies, poses, clouds, comparer, VerifyConfig())
+
+    return bodies, check
+
+
+def test_true_poses_are_accepted(clutter, checker):
+    for c in checker[1]([t.T_world_obj for t in clutter.truth]):
+        assert c.verdict == "accepted", c.reasons
+        assert c.checks["agree"] > 0.97
+        assert abs(c.checks["plane_gap_mm"]) < 1
+        assert c.checks["penetration_mm"] < 1
+
+
+@pytest.mark.parametrize(
+    ("move", "word"),
+    [
+        (se3.from_translation([0.0, 0.0, 0.03]), "over the table"),
+        (se3.from_translation([0.0, 0.0, -0.025]), "sunk"),
+        (se3.from_translation([0.02, 0.01, 0.0]), "agree"),
+    ],
+)
+def test_wrong_poses_are_flagged_with_numbers(clutter, checker, move, word):
+    poses = [t.T_world_obj for t in clutter.truth]
+    for i in range(len(poses)):
+        wrong = [move @ T if j == i else T for j, T in enumerate(poses)]
+        checked = checker[1](wrong)[i]
+        assert checked.verdict in ("rejected", "doubtful")
+        assert any(ch.isdigit() for r in checked.reasons for ch in r)
+        assert any(word in r for r in checked.reasons), checked.reasons
+
+
+def test_solver_stays_at_the_truth_without_noise(make_scene):
+    scene = make_scene([("wedge", (0.0, 0.0), 0.3, (0, 0, 0))], 5, 1, noise_per_m=0.0)
+    truth = scene.truth[0]
+    body = make_body(truth, scene.models[truth.obj_id], 96, 300)
+    evidence = gather(scene.intrinsics, scene.frames, [body], EvidenceConfig(noise_per_m=0.001))
+    cloud = evidence.near[0].select(evidence.near[0].points[:, 2] > 0.002)
+    config = SolverConfig()
+    rough = truth.T_world_obj @ se3.exp([0.05, -0.04, 0.06, 0.003, -0.002, 0.002])
+    fit = solve_pose(body, cloud, rough, config.coarse + config.fine, config)
+    error = se3.log(se3.invert(truth.T_world_obj) @ fit.T_world_obj)
+    assert np.linalg.norm(error[3:]) < 5e-5
+    assert np.linalg.norm(error[:3]) < 1e-3
+    assert isinstance(body.start, ObjectPose)
+
+
+# --- Along what the depth cannot see a pose keeps its start's value; what it sees is corrected.
+
+Z = np.array([0.0, 0.0, 1.0])
+ROUND_PARTS = (
+    ("cylinder_can", (-0.06, 0.05), 0.3, (0.0, 0.0, 0.0)),
+    ("mug", (0.06, 0.05), 1.0, (0.0, 0.0, 0.0)),
+)
+CAN, MUG = 0, 1
+
+
+def off(pose: ObjectPose, model, rng) -> ObjectPose:
+    """The pose 10 mm and 10 deg off: 8 deg about the object's z, 6 deg across it."""
+    across, v = rng.normal(size=3) * [1, 1, 0], rng.normal(size=3)
+    tilt = np.radians(6) * across / np.linalg.norm(across)
+    R = se3.exp_so3(tilt) @ se3.exp_so3(np.radians(8) * Z)
+    C = se3.from_translation(model.mesh.bounds.mean(0))
+    move = C @ se3.from_rt(R, 0.01 * v / np.linalg.norm(v)) @ se3.invert(C)
+    return ObjectPose(
+        obj_id=pose.obj_id, instance=pose.instance, T_world_obj=pose.T_world_obj @ move
+    )
+
+
+@pytest.fixture(scope="module")
+def case(make_scene):
+    """(scene, starts, registration); no model declares a symmetry."""
+    scene = make_scene(ROUND_PARTS, 6, 4)
+    plain = {
+        k: replace(m, symmetries=np.eye(4)[None], symmetry_axes=()) for k, m in scene.models.items()
+    }
+    scene = replace(scene, models=plain)
+    rng = np.random.default_rng(1)
+    starts = [off(t, plain[t.obj_id], rng) for t in scene.truth]
+    return scene, starts, registered(scene, scene.frames, starts)
+
+
+def registered(scene, frames, starts):
+    return register_scene("round", scene.intrinsics, frames, scene.models, starts, QUICK)
+
+
+def error_mm(scene, instance: int, name: str, T) -> float:
+    """MSSD over the part's full symmetry group, in steps that move no rim by 0.1 mm."""
+    group = symmetry_transforms(part(name), 0.002)
+    model = scene.models[scene.truth[instance].obj_id]
+    return 1e3 * mssd(scene.truth[instance].T_world_obj, T, model.mesh.vertices, group)
+
+
+def turn_deg(T_a, T_b) -> float:
+    """Turn about the object's z from a to b."""
+    return float(np.degrees(twist_rad(T_a[:3, :3].T @ T_b[:3, :3], Z)))
+
+
+def test_a_can_keeps_its_turn_and_finds_its_place(case):
+    scene, starts, result = case
+    T = result.scene.object(CAN).T_world_obj
+    assert abs(turn_deg(starts[CAN].T_world_obj, T)) < 0.5
+    assert error_mm(scene, CAN, "cylinder_can", T) < 1.0
+    assert result.scene.object(CAN).checks["blind_axes"] == 1
+    assert result.scene.object(CAN).verdict == "accepted"
+    blind = result.report["objects"][CAN]["blind"]
+    assert blind["start_kept"]
+    assert abs(blind["axes"][0]["axis_obj"][2]) > 0.999
+    # The model declares nothing; its shape does.
+    assert blind["axes"][0]["declared"]
+    assert "body of revolution" in result.report["objects"][CAN]["symmetry"]
+
+
+def test_a_handle_is_seen_and_its_turn_corrected(case):
+    scene, starts, result = case
+    T = result.scene.object(MUG).T_world_obj
+    assert result.scene.object(MUG).checks["blind_axes"] == 0
+    assert result.report["objects"][MUG]["blind"] == {}
+    assert abs(turn_deg(starts[MUG].T_world_obj, T)) > 7
+    assert abs(turn_deg(scene.truth[MUG].T_world_obj, T)) < 0.5

@@ -1,16 +1,28 @@
-"""The joint choice: known answers on a real scene's images, with right and wrong poses mixed."""
+"""Scores of rendered poses: laws of the z-buffers, and that the truth gains most."""
 
 from functools import lru_cache
 
 import numpy as np
+import pytest
 
 from realsim.geometry import se3
+from realsim.geometry.mesh import symmetry_transforms
+from realsim.geometry.metrics import mssd
+from realsim.geometry.parts import part
 from realsim.records import ObjectPose, SupportPlane
-from realsim.registration.body import make_body
+from realsim.registration.body import Body, footprint, make_body
 from realsim.registration.evidence import DepthNoise
 from realsim.registration.search.candidates import Candidate, Sought, candidate
-from realsim.registration.search.sameness import make_sameness
-from realsim.registration.search.scoring import Canvas, ScoreConfig, compose, make_canvas
+from realsim.registration.search.sameness import distinct, make_sameness
+from realsim.registration.search.scoring import (
+    Canvas,
+    ScoreConfig,
+    compose,
+    likelihoods,
+    make_canvas,
+    render,
+    score,
+)
 from realsim.registration.search.selection import (
     SelectionConfig,
     Slot,
@@ -18,18 +30,83 @@ from realsim.registration.search.selection import (
     select_any,
     select_pair,
 )
-from table_scenes import named_scene
+from table_scenes import named_scene, part_models, small_scene
 
-NAMES = ("mug", "wedge", "gear", "wedge")
+SEED = 3
 NOISE = DepthNoise(per_m=0.08 / (648 * 0.018), floor_m=2e-4)
 PLANE = SupportPlane(T_world_table=np.eye(4), rms_m=1e-3, inliers=1000)
-CONFIG = SelectionConfig()
+CONFIG = ScoreConfig(columns=80, frames=6)
+
+
+@lru_cache(maxsize=1)
+def canvas() -> Canvas:
+    scene = small_scene(SEED)
+    return make_canvas(scene.intrinsics, scene.frames[:6], NOISE, PLANE, CONFIG)
+
+
+@lru_cache(maxsize=1)
+def bodies() -> list[tuple[Body, np.ndarray]]:
+    scene = small_scene(SEED)
+    return [
+        (make_body(ObjectPose(obj_id=p.obj_id, instance=0, T_world_obj=np.eye(4)),
+                   scene.models[p.obj_id], 24, 50), p.T_world_obj)
+        for p in scene.truth
+    ]  # fmt: skip
+
+
+def test_a_render_is_the_footprint_of_every_frame():
+    scene, (body, T) = small_scene(SEED), bodies()[0]
+    got = render(canvas(), body, T)
+    seen: dict[int, float] = {}
+    width = canvas().rays.shape[1]
+    for n, frame in enumerate(scene.frames[:6]):
+        f = footprint(body, scene.intrinsics, se3.invert(frame.T_world_cam) @ T, canvas().stride)
+        at = (f.rows // canvas().stride) * width + f.columns // canvas().stride
+        seen |= dict(zip((n * canvas().cells_per_frame + at).tolist(), f.z, strict=True))
+    compared = {c: z for c, z in seen.items()
+                if canvas().measured[c] > 0 and z < canvas().table[c]}  # fmt: skip
+    assert len(compared) > 200
+    assert dict(zip(got.cells.tolist(), got.z, strict=True)).keys() == compared.keys()
+    np.testing.assert_allclose(got.z, [compared[c] for c in got.cells.tolist()], atol=1e-6)
+
+
+def test_gains_of_a_whole_scene_do_not_depend_on_the_order():
+    rendered = [render(canvas(), b, T) for b, T in bodies()]
+    cells = np.arange(len(canvas().table), dtype=np.int32)
+    empty = likelihoods(canvas(), canvas().table, cells).sum()
+    full = likelihoods(canvas(), compose(canvas().table, rendered), cells).sum()
+    for order in ([0, 1, 2, 3, 4], [4, 2, 0, 3, 1]):
+        total = 0.0
+        for k in range(5):
+            before = compose(canvas().table, [rendered[i] for i in order[:k]])
+            total += score(canvas(), rendered[order[k]], before).gain
+        assert total == pytest.approx(full - empty, abs=1e-6 * abs(full))
+
+
+@pytest.mark.parametrize("n", (0, 3))
+def test_the_truth_gains_more_than_anything_beside_it(n: int):
+    body, T = bodies()[n]
+    others = compose(
+        canvas().table, [render(canvas(), b, P) for k, (b, P) in enumerate(bodies()) if k != n]
+    )
+    right = score(canvas(), render(canvas(), body, T), others)
+    assert right.agree > 0.9
+    assert right.per_cell > 0.3
+    for shift in ([0.008, 0, 0], [0, -0.008, 0], [0, 0, 0.006]):
+        moved = render(canvas(), body, se3.from_translation(shift) @ T)
+        assert score(canvas(), moved, others).gain < right.gain
+
+
+# --- The joint choice: known answers on a real scene's images, with right and wrong poses mixed.
+
+CHOSEN = ("mug", "wedge", "gear", "wedge")
+CHOICE = SelectionConfig()
 
 
 @lru_cache(maxsize=1)
 def material() -> tuple[Canvas, list[Candidate], list[int]]:
     """The canvas, a pool with the right poses first, and which object each pose is of."""
-    scene = named_scene(1, NAMES)
+    scene = named_scene(1, CHOSEN)
     rng = np.random.default_rng(0)
     canvas = make_canvas(
         scene.intrinsics, scene.frames[:8], NOISE, PLANE, ScoreConfig(columns=80, frames=8)
@@ -55,13 +132,13 @@ def slots() -> list[Slot]:
     """One per object; the two wedges share theirs."""
     _, pool, ids = material()
     return [
-        frozenset(n for n, i in enumerate(ids) if i == pool[k].obj_id) for k in range(len(NAMES))
+        frozenset(n for n, i in enumerate(ids) if i == pool[k].obj_id) for k in range(len(CHOSEN))
     ]
 
 
 def test_the_right_poses_are_chosen():
     canvas, pool, _ = material()
-    got = select(canvas, pool, slots(), CONFIG)
+    got = select(canvas, pool, slots(), CHOICE)
     assert {c for c in got.chosen} == {0, 1, 2, 3}
     assert got.chosen[0] == 0
     assert got.chosen[2] == 2
@@ -73,22 +150,22 @@ def test_the_right_poses_are_chosen():
 def test_two_of_one_model_never_share_a_pose():
     canvas, pool, _ = material()
     only = [frozenset([1]), frozenset([1])]
-    got = select(canvas, pool, only, CONFIG)
+    got = select(canvas, pool, only, CHOICE)
     assert sorted(map(str, got.chosen)) == ["1", "None"]
 
 
 def test_a_bad_first_choice_is_mended():
     canvas, pool, ids = material()
     bad = [n for n in range(len(pool)) if n >= 4 and ids[n] == pool[0].obj_id][1]
-    got = select(canvas, pool, slots(), CONFIG, [bad, None, None, None])
+    got = select(canvas, pool, slots(), CHOICE, [bad, None, None, None])
     assert got.chosen[0] == 0
 
 
 def test_wrong_poses_alone_are_refused():
     canvas, pool, _ = material()
-    got = select_any(canvas, pool[4:], CONFIG)
-    assert all(s is not None and s.per_cell >= CONFIG.least_per_cell_unknown for s in got.scores)
-    empty = select(canvas, pool, [frozenset()], CONFIG)
+    got = select_any(canvas, pool[4:], CHOICE)
+    assert all(s is not None and s.per_cell >= CHOICE.least_per_cell_unknown for s in got.scores)
+    empty = select(canvas, pool, [frozenset()], CHOICE)
     assert empty.chosen == (None,)
     assert empty.scores == (None,)
 
@@ -100,9 +177,52 @@ def test_two_that_stand_in_each_others_places_change_them():
     there = [n for n in range(4, len(pool)) if ids[n] == pool[gear].obj_id][mug]
     others = compose(canvas.table, [pool[1].rendered, pool[3].rendered])
     pair = (slots()[mug], slots()[gear])
-    assert select_pair(canvas, pool, pair, (here, there), others, CONFIG) == (mug, gear)
-    assert select_pair(canvas, pool, pair, (here, None), others, CONFIG) == (mug, gear)
-    assert select_pair(canvas, pool, pair, (mug, gear), others, CONFIG) is None
+    assert select_pair(canvas, pool, pair, (here, there), others, CHOICE) == (mug, gear)
+    assert select_pair(canvas, pool, pair, (here, None), others, CHOICE) == (mug, gear)
+    assert select_pair(canvas, pool, pair, (mug, gear), others, CHOICE) is None
     # One of which there is no acceptable pose cannot have the other's place.
     alone = (frozenset([here]), slots()[gear])
-    assert select_pair(canvas, pool, alone, (None, gear), others, CONFIG) is None
+    assert select_pair(canvas, pool, alone, (None, gear), others, CHOICE) is None
+
+
+# --- Distance of poses modulo symmetry: zero for symmetric poses, the plain distance without.
+
+
+@pytest.mark.parametrize("obj_id", sorted(part_models())[::6])
+def test_symmetric_poses_are_the_same(obj_id: int):
+    model = part_models()[obj_id]
+    rng = np.random.default_rng(obj_id)
+    same = make_sameness(model)
+    T = se3.random_transform(rng)
+    turned = T @ symmetry_transforms(model, 0.3)
+    assert same.distances(T, turned).max() < 1e-9
+    # Turned by any angle about the axis, not only by the sampled ones.
+    for axis, point in model.symmetry_axes:
+        p, a = np.array(point), np.array(axis) / np.linalg.norm(axis)
+        R = se3.exp_so3(rng.uniform(-3, 3) * a)
+        S = se3.from_rt(R, p - R @ p) @ model.symmetries[-1]
+        assert same.distance(T, T @ S) < 1e-9
+        assert same.angle_deg(T[:3, :3], (T @ S)[:3, :3]) < 1e-4
+
+
+@pytest.mark.parametrize("name", ["gear", "bottle"])
+def test_it_is_the_sampled_distance_with_the_sampling_gone(name: str):
+    model = part(name)
+    same = make_sameness(model)
+    rng = np.random.default_rng(2)
+    T = se3.random_transform(rng)
+    other = T @ se3.exp(np.concatenate([0.05 * rng.normal(size=3), 0.004 * rng.normal(size=3)]))
+    sampled = mssd(T, other, same.corners, symmetry_transforms(model, 0.005))
+    got = same.distance(T, other)
+    # The twist is the turn that fits best in the mean, not at the worst corner.
+    assert 0.9 * sampled - 3e-4 < got < 1.35 * sampled
+
+
+def test_distinct_keeps_the_first_of_those_alike():
+    model = part("gear")
+    T = se3.from_translation([0.1, 0, 0])
+    alike = T @ model.symmetries[5]
+    apart = se3.from_translation([0.0, 0.01, 0]) @ T
+    same = make_sameness(model)
+    assert distinct(same, [T, alike, apart, apart @ model.symmetries[2]], 0.002) == [0, 2]
+    assert distinct(same, [], 0.002) == []

@@ -76,9 +76,8 @@ def test_trusted_pixels_are_those_of_the_definition(stride: int, reach: int):
     assert view.area_px == stride**2
 
 
-@pytest.mark.parametrize("distortion", [(-0.05, 0.02, 0.001, -0.002, 0.0)])
-def test_a_point_is_seen_where_its_pixel_is(distortion: tuple[float, ...]):
-    camera = replace(CAMERA, distortion=np.array(distortion))
+def test_a_point_is_seen_where_its_pixel_is():
+    camera = replace(CAMERA, distortion=np.array([-0.05, 0.02, 0.001, -0.002, 0.0]))
     depth = np.full((90, 160), 0.4, np.float32)
     view = sample_view(camera, frame(depth), NOISE, SampleConfig(stride=7))
     assert len(view.points) > 200 and view.points.dtype == np.float32
