@@ -10,7 +10,7 @@ from realsim.geometry import se3
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.labels import LabelRenderer, Labels, PlacedMesh
 from realsim.rendering.rays import BACKGROUND
-from realsim_sim_bridge.annotation.config import AnnotationConfig, OccluderConfig
+from realsim_sim_bridge.annotation.config import AnnotationConfig
 from realsim_sim_bridge.annotation.frame import frame_files
 from realsim_sim_bridge.annotation.inputs import FrameInputs, FrameView, table_slab
 
@@ -44,10 +44,8 @@ def grasps_of_the_book() -> GraspSet:
     )  # fmt: skip
 
 
-def inputs_of(occluder: OccluderConfig | None = None) -> FrameInputs:
-    config = AnnotationConfig(
-        plane_clearance_m=0.0, maps=("instance",), occluder=occluder or OccluderConfig()
-    )
+def inputs_of() -> FrameInputs:
+    config = AnnotationConfig(plane_clearance_m=0.0, maps=("instance",))
     return FrameInputs(
         config=config, intrinsics=CAMERA, depth_unit_m=1e-4, objects=SCENE.objects, models=MODELS,
         grasp_sets=(grasps_of_the_book(),), digest="",
@@ -67,10 +65,10 @@ def rendered(T: Array, *things: PlacedMesh) -> Labels:
     return LabelRenderer([*INPUTS.placed(), *things]).render(CAMERA, T)
 
 
-def annotated(T: Array, depth_m: Depth, inputs: FrameInputs = INPUTS):
+def annotated(T: Array, depth_m: Depth):
     """Return the objects' entries by name, and the visible masks by name."""
     view = FrameView(index=0, T_world_cam=T, digest="")
-    frame = frame_files(inputs, view, depth_m)
+    frame = frame_files(INPUTS, view, depth_m)
     entries = {e["name"]: e for e in frame.part["objects"]}
     import cv2
 

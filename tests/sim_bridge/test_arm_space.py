@@ -1,5 +1,7 @@
 """The arm's spheres, the obstacles, and the promise that a free move keeps its distance."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import trimesh
@@ -9,12 +11,17 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.arm import find_arm
 from realsim.robots.coal_geometry import Body, Geometry
-from realsim.robots.compiled_chain import in_dh_frame
+from realsim.robots.compiled_chain import follow_lines, in_dh_frame
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.arm.arm_space import FREE, IN_ITSELF, IN_TABLE, ArmSpace, ArmSpaceConfig
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
+from realsim_sim_bridge.arm.joint_path import PlannerConfig, connect
 from realsim_sim_bridge.arm.link_spheres import Spheres, arm_spheres, hand_spheres, solid_points
 from realsim_sim_bridge.arm.obstacles import least_distance, obstacles_of
+from realsim_sim_bridge.arm.timing import TimingConfig, straight_times, timed_path
+from realsim_sim_bridge.slip.bullet_shapes import hand_urdf
+from realsim_sim_bridge.slip.world import PadModel
+from realsim_sim_bridge.validation.arm_urdf import PANDA_LINKS, arm_urdf
 
 HAND = find_hand()
 PANDA = GraspingArm(find_arm("panda"), HAND)
@@ -181,3 +188,234 @@ def test_what_stops_a_configuration_is_named():
 def test_clearances_that_cannot_be_checked_are_refused():
     with pytest.raises(InputError, match="clearances"):
         ArmSpaceConfig(clearance_m=0.0)
+
+
+# --- An arm with a hand: kinematics both ways, how far it reaches, and its URDF.
+FOUR_ARMS = ("panda", "ur5", "iiwa14", "xarm6")
+
+
+def random_turns(n, seed=0, arm=PANDA):
+    low, high = np.maximum(arm.limits.lower, -np.pi), np.minimum(arm.limits.upper, np.pi)
+    return np.random.default_rng(seed).uniform(low, high, (n, arm.joints))
+
+
+def test_the_ready_pose_is_franka_s():
+    # Franka's documentation: O_T_EE without a hand is (0.3069, 0, 0.5903), pointing down.
+    T = PANDA.forward(READY)
+    assert np.allclose(T[:3, 3], [0.3069, 0.0, 0.5903 + HAND.mount_z_m], atol=1e-4)
+    assert np.allclose(T[:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", FOUR_ARMS)
+def test_inverse_solutions_reach_the_pose_within_the_limits(name):
+    arm = GraspingArm(find_arm(name), HAND)
+    Ts = arm.forward(random_turns(20, arm=arm))
+    owner, q = arm.inverse(Ts, 16, 0.01, arm.arm.home)
+    assert np.all(np.diff(owner) >= 0) and len(set(owner.tolist())) >= 17
+    assert np.allclose(arm.forward(q), Ts[owner], atol=1e-9)
+    assert arm.within_limits(q, 0.01).all()
+
+
+@pytest.mark.parametrize("name", FOUR_ARMS)
+def test_the_swinging_joint_s_axis_in_the_grasp_frame_stays_when_it_turns(name):
+    arm = GraspingArm(find_arm(name), HAND)
+    q, j = random_turns(5, arm=arm), arm.swing_joint
+    axis, point, left = arm.swing_in_grasp(q)
+    T, turned = arm.forward(q), arm.forward(q + 0.3 * np.eye(arm.joints)[j])
+    world_axis, world_point = T[:, :3, :3] @ axis[..., None], se3.transform(T, point[:, None])
+    assert np.allclose(turned[:, :3, :3] @ axis[..., None], world_axis, atol=1e-12)
+    assert np.allclose(se3.transform(turned, point[:, None]), world_point, atol=1e-12)
+    assert np.allclose(q[:, j, None] + left, [arm.limits.lower[j], arm.limits.upper[j]])
+
+
+@pytest.mark.parametrize("name", FOUR_ARMS)
+def test_the_wrist_s_distance_is_within_its_bounds_wherever_the_arm_is(name):
+    arm = GraspingArm(find_arm(name), HAND)
+    q = random_turns(3000, seed=1, arm=arm)
+    least = arm.wrist_distance(arm.forward(q))
+    assert np.all(least <= arm.wrist_reach_m + 1e-9) and least.max() > 0.95 * arm.wrist_reach_m
+    if name == "panda":  # whose wrist is frame 6's origin, its shoulder frame 2's
+        assert arm.wrist_reach_m == pytest.approx(np.hypot(0.316, 0.0825) + np.hypot(0.384, 0.0825))
+        frames = arm.frames(q)
+        true = np.linalg.norm(frames[:, 5, :3, 3] - frames[:, 1, :3, 3], axis=1)
+        assert np.all(true >= least - 1e-12) and np.min(true - least) < 1e-3
+
+
+def test_followed_lines_are_straight_and_their_slopes_are_derivatives():
+    q = PANDA.inverse(PANDA.forward(READY)[None], 12, 0.1, READY)[1][:6]
+    Ts = PANDA.forward(q)
+    along = np.tile([0.6, 0.0, -0.8], (len(q), 1))
+    distances = np.linspace(0.0, 0.1, 6)
+    joints, slopes, error = follow_lines(PANDA.numbers, q, Ts, along, distances)
+    assert np.all(error < 1e-9) and np.array_equal(joints[:, 0], q)
+    wanted = Ts[:, None, :3, 3] + distances[:, None] * along[:, None]
+    assert np.allclose(PANDA.forward(joints)[..., :3, 3], wanted, atol=1e-9)
+    assert np.allclose(PANDA.forward(joints)[..., :3, :3], Ts[:, None, :3, :3], atol=1e-9)
+    h = 1e-6
+    moved = (PANDA.forward(joints + h * slopes) - PANDA.forward(joints))[..., :3, 3] / h
+    assert np.allclose(moved, along[:, None], atol=1e-4)
+
+
+@pytest.mark.parametrize("name", FOUR_ARMS)
+def test_pybullet_has_the_same_forward_kinematics(tmp_path, name):
+    import pybullet
+
+    arm = GraspingArm(find_arm(name), HAND)
+    path, n = tmp_path / "arm.urdf", arm.joints
+    links = (PANDA_LINKS[1],) * (n + 1)
+    path.write_text(arm_urdf(arm.arm, HAND, hand_urdf(HAND, PadModel()), links), encoding="utf-8")
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        body = pybullet.loadURDF(str(path), useFixedBase=True, physicsClientId=client)
+        names = [
+            pybullet.getJointInfo(body, i, physicsClientId=client)[12].decode()
+            for i in range(pybullet.getNumJoints(body, physicsClientId=client))
+        ]
+        last = names.index("palm")
+        for q in random_turns(20, arm=arm):
+            for i in range(n):
+                pybullet.resetJointState(body, i, q[i], physicsClientId=client)
+            state = pybullet.getLinkState(
+                body, last, computeForwardKinematics=True, physicsClientId=client
+            )
+            R = np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)
+            T = se3.from_rt(R, state[4])
+            # It reads a URDF's vectors as float32.
+            assert np.allclose(T, arm.forward(q), rtol=0, atol=1e-6)
+        for i in range(n):
+            info = pybullet.getJointInfo(body, i, physicsClientId=client)
+            limits = (arm.limits.lower[i], arm.limits.upper[i], arm.limits.speed[i])
+            assert np.allclose((*info[8:10], info[11]), limits)
+    finally:
+        pybullet.disconnect(client)
+
+
+# --- Paths round obstacles and the time along them.
+
+PANDA = GraspingArm(find_arm("panda"), find_hand())
+SIDE, LOW = np.eye(7)[0], np.eye(7)[1]
+LEFT, RIGHT = READY - 0.9 * SIDE + 0.5 * LOW, READY + 0.9 * SIDE + 0.5 * LOW
+OPEN = 0.08
+
+
+def walled(height):
+    """A wall in front of the arm, between left and right."""
+    x, z = np.meshgrid(np.linspace(0.25, 0.9, 66), np.linspace(0.0, height, 60))
+    points = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
+    obstacles = obstacles_of(points, np.full(len(points), 3), np.zeros(len(points), bool))
+    T = se3.from_translation([0.0, 0.0, 0.02])
+    return ArmSpace(T, obstacles, ArmSpaceConfig(), PANDA)
+
+
+def is_free(space, path):
+    return space.blame_moves(path[None], np.array([OPEN]), with_hand=True)[0] == FREE
+
+
+def plan(space, seed=0, **config):
+    rng = np.random.default_rng(seed)
+    return connect(LEFT, RIGHT, space, OPEN, PlannerConfig(**config), rng)
+
+
+def test_the_planner_goes_round_what_blocks_the_straight_move():
+    space = walled(0.35)
+    assert not is_free(space, np.stack([LEFT, RIGHT]))
+    path = plan(space)
+    assert path is not None and len(path) > 2
+    assert np.array_equal(path[0], LEFT) and np.array_equal(path[-1], RIGHT)
+    assert is_free(space, path) and PANDA.within_limits(path).all()
+
+
+def test_a_plan_depends_on_its_seed_alone():
+    space = walled(0.35)
+    first = plan(space, seed=3)
+    for other in (0, 1, 2):
+        plan(space, seed=other)
+    np.random.seed(5)  # noqa: NPY002 - the generator of the whole process is not used
+    assert np.array_equal(first, plan(walled(0.35), seed=3))
+    assert not np.array_equal(first, plan(space, seed=4))
+
+
+def test_the_planner_gives_up_on_a_closed_wall():
+    space = walled(1.6)
+    assert is_free(space, LEFT[None]) and is_free(space, RIGHT[None])
+    assert plan(space, iterations=15) is None
+
+
+# --- time ---------------------------------------------------------------------------------------
+
+
+def assert_limits_hold(q, t, config):
+    """Divided differences are means of the derivatives: they may not exceed a limit either."""
+    velocity, acceleration = config.limits(PANDA.limits)
+    dt = np.diff(t)[:, None]
+    speed = np.diff(q, axis=0) / dt
+    assert np.all(np.abs(speed) <= velocity * (1 + 1e-6))
+    change = np.diff(speed, axis=0) / ((dt[1:] + dt[:-1]) / 2)
+    assert np.all(np.abs(change) <= acceleration * (1 + 1e-6))
+
+
+def test_straight_moves_take_as_long_as_topp_ra_says():
+    import toppra
+    import toppra.algorithm
+    import toppra.constraint
+
+    toppra.setup_logging("ERROR")
+    config = TimingConfig()
+    velocity, acceleration = config.limits(PANDA.limits)
+    rng = np.random.default_rng(0)
+    for scale in (0.05, 0.5, 2.0):
+        start, end = READY, READY + scale * rng.uniform(-1, 1, 7)
+        _, mine = straight_times((end - start)[None], PANDA.limits, config)
+        solver = toppra.algorithm.TOPPRA(
+            [
+                toppra.constraint.JointVelocityConstraint(np.stack([-velocity, velocity], 1)),
+                toppra.constraint.JointAccelerationConstraint(
+                    np.stack([-acceleration, acceleration], 1)
+                ),
+            ],
+            toppra.SplineInterpolator(np.array([0.0, 1.0]), np.stack([start, end])),
+            gridpoints=np.linspace(0, 1, 801),
+            parametrizer="ParametrizeConstAccel",
+        )
+        assert mine[0] == pytest.approx(solver.compute_trajectory().duration, rel=5e-3)
+
+
+@pytest.mark.parametrize("rounding", [True, False])
+def test_limits_hold_along_a_path_with_corners(rounding):
+    rng = np.random.default_rng(1)
+    for _ in range(2):
+        corners = READY + rng.uniform(-0.5, 0.5, (4, 7))
+        config = TimingConfig(sample_hz=200.0)
+        q, duration = timed_path(corners, lambda path: rounding, PANDA.limits, config)
+        t = np.arange(len(q)) / 200.0
+        assert t[-1] < duration <= t[-1] + 1 / 200.0 + 1e-9
+        assert np.allclose(q[0], corners[0])
+        q, t = np.concatenate([q, corners[-1:]]), np.append(t, duration)
+        assert_limits_hold(q, t, config)
+        distance = np.linalg.norm(q[:, None] - corners, axis=2).min(axis=0)
+        assert distance[-1] < 0.02 and (rounding or distance.max() < 0.02)
+
+
+def test_a_rounded_path_is_used_only_where_it_is_free_and_is_quicker():
+    corners = READY + np.array([[0, 0], [0.6, 0], [0.6, 0.6]]) @ np.eye(2, 7)
+    asked = []
+
+    def ask(path):
+        asked.append(path)
+        return True
+
+    config = TimingConfig()
+    rounded, quick = timed_path(corners, ask, PANDA.limits, config)
+    stopping, slow = timed_path(corners, lambda path: False, PANDA.limits, config)
+    assert len(asked) == 1 and quick < slow
+    # What was checked is what is driven.
+    dense = np.concatenate([np.linspace(a, b, 50) for a, b in pairwise(asked[0])])
+    assert np.linalg.norm(rounded[:, None] - dense, axis=2).min(axis=1).max() < 0.01
+    legs = np.concatenate([np.linspace(a, b, 400) for a, b in pairwise(corners)])
+    assert np.linalg.norm(stopping[:, None] - legs, axis=2).min(axis=1).max() < 0.002
+
+
+def test_timings_that_make_no_sense_are_refused():
+    for wrong in ({"velocity_share": 0.0}, {"acceleration_share": 1.5}, {"sample_hz": 0.0}):
+        with pytest.raises(InputError):
+            TimingConfig(**wrong)

@@ -4,39 +4,42 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
 
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim.robots.hand import find_hand
+from realsim.robots.robot_files import names_of
 from realsim_sim_bridge.grasping.antipodal import RaySurface
-from realsim_sim_bridge.grasping.candidates import CandidateConfig, Surroundings, sample_candidates
+from realsim_sim_bridge.grasping.candidates import (
+    CandidateConfig,
+    Surroundings,
+    sample_candidates,
+    standing_object,
+)
 from realsim_sim_bridge.grasping.force_closure import (
     ClosureConfig,
     finger_wrenches,
     force_closure,
     largest_balls,
 )
-from realsim_sim_bridge.grasping.pad_contacts import pad_contacts
+from realsim_sim_bridge.grasping.hand_free import boxes_free, lowest_corner
+from realsim_sim_bridge.grasping.pad_contacts import pad_contacts, pad_heights
 from refusals import refused
-from trimesh_solids import cup, solid, wedge
+from trimesh_solids import box, cup, wedge
 
 HAND = find_hand()
-
-
-def box(*size):
-    return solid(trimesh.creation.box(size or (0.05, 0.05, 0.05)))
+CUBE = (0.05, 0.05, 0.05)
 
 
 def moved(mesh, T):
     return Mesh(vertices=se3.transform(T, mesh.vertices), faces=mesh.faces)
 
 
-def grasps(mesh, limit=80, seed=0):
+def grasps(mesh):
     T = se3.from_translation([0.0, 0.0, -mesh.vertices[:, 2].min()])
-    config, rng = CandidateConfig(surface_points=200), np.random.default_rng(seed)
-    found = sample_candidates(mesh, T, Surroundings(), config, HAND, rng, limit)
+    config, rng = CandidateConfig(surface_points=200), np.random.default_rng(0)
+    found = sample_candidates(mesh, T, Surroundings(), config, HAND, rng, 80)
     return found.Ts_obj_grasp, found.openings_m
 
 
@@ -90,7 +93,7 @@ def test_the_quality_is_the_hull_s_by_qhull():
 
 def test_a_centred_grasp_of_a_cube_has_the_quality_of_the_formula():
     """Torsion (gamma) and the friction of both fingers at their arm (r) share the normal force."""
-    closure = force_closure(box(), np.eye(4)[None], np.array([0.06]))
+    closure = force_closure(box(CUBE), np.eye(4)[None], np.array([0.06]))
     length = np.sqrt(3) * 0.025
     gamma = closure.contacts.levers_m[0, 0] / length
     r = np.cos(np.pi / 8) * 0.025 / length
@@ -99,7 +102,7 @@ def test_a_centred_grasp_of_a_cube_has_the_quality_of_the_formula():
 
 def test_the_lever_of_a_pad_on_a_flat_face_is_that_of_an_evenly_loaded_patch():
     contacts = pad_contacts(
-        RaySurface(box()), np.eye(4)[None], np.array([0.06]), HAND, rays=7, softness_m=5e-4
+        RaySurface(box(CUBE)), np.eye(4)[None], np.array([0.06]), HAND, rays=7, softness_m=5e-4
     )
     xz = np.random.default_rng(0).uniform(-0.5, 0.5, (200000, 2)) * [0.02, 0.0176]
     assert contacts.levers_m == pytest.approx(np.linalg.norm(xz, axis=1).mean(), rel=0.02)
@@ -123,7 +126,7 @@ def test_a_wedge_closes_from_the_tangent_of_its_half_angle_on(angle_deg):
 
 def test_a_finger_that_touches_nothing_closes_nothing():
     Ts = np.stack([np.eye(4), se3.from_translation([0.0, 0.0, 0.2])])
-    closure = force_closure(box(), Ts, np.array([0.06, 0.06]))
+    closure = force_closure(box(CUBE), Ts, np.array([0.06, 0.06]))
     assert closure.contacts.both.tolist() == [True, False]
     assert closure.axis_contacts.both.tolist() == [True, False]
     assert np.isnan(closure.contacts.points[1]).all()
@@ -132,9 +135,128 @@ def test_a_finger_that_touches_nothing_closes_nothing():
 
 
 def test_impossible_input_is_named():
-    refused("2 openings for 1 grasps", force_closure, box(), np.eye(4)[None], np.zeros(2))
+    refused("2 openings for 1 grasps", force_closure, box(CUBE), np.eye(4)[None], np.zeros(2))
     for change in ({"friction": 0.0}, {"cone_edges": 6}, {"levels": (0.2, -1.0)}, {"pad_rays": 0}):
         with pytest.raises(InputError, match="force closure"):
             replace(ClosureConfig(), **change)
     flat = Mesh(vertices=np.eye(3), faces=np.array([[0, 1, 2]]))
     refused("flat", force_closure, flat, np.eye(4)[None], np.array([0.06]))
+
+
+# --- Antipodal candidates: their geometry, what is filtered, and that chance is the seed's alone.
+
+
+def candidates(mesh, height=0.025, surroundings=None, hand=HAND):
+    T, config = se3.from_translation([0.0, 0.0, height]), CandidateConfig(surface_points=400)
+    rng = np.random.default_rng(0)
+    return sample_candidates(mesh, T, surroundings or Surroundings(), config, hand, rng, 60)
+
+
+def test_contacts_lie_on_the_surface_and_inside_both_friction_cones():
+    found = candidates(box(CUBE))
+    assert 0 < len(found.widths_m) <= 60
+    y, z = found.Ts_obj_grasp[:, :3, 1], found.Ts_obj_grasp[:, :3, 2]
+    middle = found.Ts_obj_grasp[:, :3, 3] + found.contact_depths_m[:, None] * z
+    for side in (-0.5, 0.5):
+        contact = middle + side * found.widths_m[:, None] * y
+        # On a box the outermost coordinate is the face's.
+        assert np.allclose(np.abs(contact).max(axis=1), 0.025, atol=1e-6)
+        face = np.argmax(np.abs(contact), axis=1)
+        assert np.all(np.abs(np.take_along_axis(y, face[:, None], 1)) >= np.sqrt(0.5) - 1e-6)
+
+
+@pytest.mark.parametrize("name", sorted(names_of("hand")))
+def test_every_hand_s_pads_close_on_the_contacts(name):
+    """The pads, where the law has them at that width, touch the faces; the linkage is free."""
+    hand, mesh = find_hand(name), box(CUBE)
+    found = candidates(mesh, hand=hand)
+    assert len(found) > 20
+    depths = found.contact_depths_m - hand.z_pad(found.widths_m)
+    for depth in np.unique(depths.round(9)):
+        assert np.abs(np.array([0.0, 0.003, 0.006]) - depth).min() < 1e-9
+    closure = force_closure(
+        mesh, found.Ts_obj_grasp, found.openings_m, None, hand,
+        contact_depths_m=found.contact_depths_m,
+    )  # fmt: skip
+    width = np.linalg.norm(np.diff(closure.axis_contacts.points, axis=1)[:, 0], axis=-1)
+    np.testing.assert_allclose(width, found.widths_m, atol=1e-6)
+    surface = RaySurface(mesh)
+    heights = pad_heights(surface, found.Ts_obj_grasp, found.openings_m, hand)
+    facing = np.abs(found.Ts_obj_grasp[:, :3, 1]).max(axis=1) > 1 - 1e-9  # flat on both faces
+    np.testing.assert_allclose(heights[facing], hand.z_pad(found.widths_m[facing]), atol=1e-4)
+    corners = mesh.vertices
+    bars = hand.bar_boxes(found.widths_m)
+    assert boxes_free(bars, found.Ts_obj_grasp, corners, 0.0).all()
+
+
+def test_each_filter_s_counts_add_up_to_what_came_in():
+    near = standing_object(box(CUBE), se3.from_translation([0.09, 0.0, 0.025]), 1, 500)
+    c = candidates(box((0.05, 0.05, 0.09)), height=0.045, surroundings=near).counts
+    assert c["surface_points"] == c["points_without_pair"] + c["antipodal_points"] == 400
+    assert c["exits"] == sum(
+        c[k] for k in ("too_near", "too_wide", "outside_cone", "antipodal_pairs")
+    )
+    assert c["turned"] == CandidateConfig().rotations * c["antipodal_pairs"]
+    assert c["turned"] == sum(
+        c[k] for k in ("hand_in_table", "hand_in_object", "hand_in_neighbour", "free")
+    )
+    assert c["free"] == c["not_chosen"] + c["kept"] and c["kept"] == 60
+    assert min(c[f"hand_in_{what}"] for what in ("table", "object", "neighbour")) > 0
+
+
+def test_hands_are_free_of_table_object_and_neighbours():
+    near = np.random.default_rng(0).uniform([0.05, -0.05, 0.0], [0.07, 0.05, 0.08], (2000, 3))
+    neighbours = Surroundings(points=near, instances=np.ones(2000, dtype=np.int64))
+    found = candidates(box(CUBE), surroundings=neighbours)
+    assert found.counts["hand_in_neighbour"] > 0
+    Ts = se3.from_translation([0.0, 0.0, 0.025]) @ found.Ts_obj_grasp
+    boxes = HAND.boxes(found.openings_m)
+    assert lowest_corner(boxes, Ts).min() > 0
+    assert boxes_free(boxes, Ts, near, 0.0).all()
+
+
+def test_boxes_free_agrees_with_looking_at_each_point():
+    rng = np.random.default_rng(1)
+    Ts, points = se3.random_transform(rng, 40, spread=0.05), rng.normal(scale=0.08, size=(60, 3))
+    boxes = HAND.boxes(rng.uniform(0.0, 0.08, 40))
+    local = np.stack([se3.transform(T, points) for T in se3.invert(Ts)])
+    inside = (local[:, :, None] > boxes[:, None, :, 0] - 1e-3) & (
+        local[:, :, None] < boxes[:, None, :, 1] + 1e-3
+    )
+    expected = ~inside.all(axis=-1).any(axis=(1, 2))
+    assert np.array_equal(boxes_free(boxes, Ts, points, 1e-3), expected)
+    assert 0 < expected.sum() < 40
+
+
+def test_contacts_nearer_to_the_tips_let_the_fingers_clear_a_table():
+    plate = box((0.04, 0.04, 0.02))
+    T = se3.from_translation([0.0, 0.0, 0.01])
+    found = {}
+    for depths in ((0.0,), (0.0, 0.003, 0.006)):
+        config = CandidateConfig(surface_points=300, contact_depths_m=depths)
+        rng = np.random.default_rng(0)
+        found[depths] = sample_candidates(plate, T, Surroundings(), config, HAND, rng, 10**6)
+    centred, shifted = found.values()
+    assert shifted.counts["free"] > 1.5 * centred.counts["free"]
+    assert set(shifted.contact_depths_m.tolist()) == {0.0, 0.003, 0.006}
+    # Who can stand centred does.
+    assert np.sum(shifted.contact_depths_m == 0.0) == centred.counts["free"]
+
+
+def test_a_thin_neighbour_that_points_miss_stops_the_hand_by_its_triangles():
+    sheet = box((0.0004, 0.2, 0.2))
+    T = se3.from_translation([0.04, 0.0, 0.1])
+    exact = standing_object(sheet, T, 1, 4)
+    points = Surroundings(points=exact.points[:4], instances=exact.instances[:4])
+    with_triangles, with_points = (
+        candidates(box(CUBE), surroundings=s).counts for s in (exact, points)
+    )
+    assert with_triangles["hand_in_neighbour"] > 1.3 * with_points["hand_in_neighbour"] > 0
+
+
+def test_impossible_settings_are_named():
+    for wrong in (
+        {"surface_points": 0}, {"rotations": 0}, {"friction": float("nan")}, {"spread_m": 0.0},
+        {"contact_depths_m": ()}, {"opening_margins_m": (0.001,)},
+    ):  # fmt: skip
+        refused("candidates", CandidateConfig, **wrong)

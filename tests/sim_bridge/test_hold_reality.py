@@ -7,7 +7,6 @@ import pytest
 
 from graspa_folders import box_grasps, write_graspa
 from realsim.formats.grasps.graspa import read_graspa
-from realsim.robots.hand import find_hand
 from realsim.untrusted.own_json import read_own
 from realsim_sim_bridge.hold.calibration import (
     SHIPPED,
@@ -27,9 +26,6 @@ from realsim_sim_bridge.hold.reality import (
     reality_of,
 )
 from refusals import refused
-
-HAND = find_hand()
-
 
 # --- calibration ----------------------------------------------------------------------------------
 

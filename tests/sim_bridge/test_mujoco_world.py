@@ -46,10 +46,10 @@ def world(body=None, given=None, physics=None, engine=ENGINE):
     return engine.world(body or cube(), given or grips(), physics or SlipPhysics(), find_hand())
 
 
-def constant(force, steps, n=1, ramp=100):
-    """Return wrenches (n, steps, 6) of a force that grows within `ramp` steps."""
+def constant(force, steps, n=1):
+    """Return wrenches (n, steps, 6) of a force that grows within 100 steps."""
     wrenches = np.zeros((n, steps, 6))
-    rise = np.minimum(1.0, np.arange(steps) / max(ramp, 1)) if ramp else np.ones(steps)
+    rise = np.minimum(1.0, np.arange(steps) / 100)
     wrenches[:, :, 3:] = rise[:, None] * np.asarray(force)
     return wrenches
 

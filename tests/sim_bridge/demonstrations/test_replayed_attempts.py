@@ -16,7 +16,7 @@ from refusals import refused
 
 pytestmark = pytest.mark.slow  # the school of all of them takes long
 
-CLOSE, LIFT = PHASES.index("close"), PHASES.index("lift")
+LIFT = PHASES.index("lift")
 
 
 @pytest.fixture(scope="module")
