@@ -22,14 +22,12 @@ def cameras(n: int, seed: int) -> Array:
     return np.array(Ts)
 
 
-def drift(
-    slip: Array, seed: int = 0, n: int = 12, noise: tuple[float, float] = (5e-4, 3e-4)
-) -> Drift:
+def drift(slip: Array, seed: int = 0, noise: tuple[float, float] = (5e-4, 3e-4)) -> Drift:
     """Return what is found of a slip; the objects' frame is off by a centimetre, too."""
     rng = np.random.default_rng(50 + seed)
-    now = cameras(n, seed)
+    now = cameras(12, seed)
     claimed = now @ se3.exp(-slip)
-    claimed = claimed @ se3.exp(rng.normal(size=(n, 6)) * np.repeat(noise, 3))
+    claimed = claimed @ se3.exp(rng.normal(size=(12, 6)) * np.repeat(noise, 3))
     frame = se3.exp([0.01, -0.02, 0.03, 0.01, 0.005, -0.01])
     return estimate_drift(claimed, frame @ now, 0.45)
 

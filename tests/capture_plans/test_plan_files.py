@@ -20,6 +20,7 @@ from realsim_capture_plans.plan_files import plan_json
 from realsim_capture_plans.plan_files.plan_json import load_plan, plan_to_json, save_plan
 from realsim_capture_plans.planning.ordering import move_seconds
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig, hash_of
+from refusals import refused as refused_by
 
 HOME = np.array([0.1, -1.6, 1.7, -1.7, -1.5, 0.3])
 CENTER = np.array([0.37, 0.02, 0.05])
@@ -47,9 +48,7 @@ def rewritten(plan: CapturePlan, change: Callable[[dict[str, Any]], None]) -> di
 
 def refused(data: Any, path: Path) -> str:
     path.write_text(json.dumps(data))
-    with pytest.raises(RealsimError) as caught:
-        load_plan(path)
-    return str(caught.value)
+    return refused_by(".", load_plan, path, error=RealsimError)
 
 
 @pytest.mark.parametrize("chain", [UR5E, replace(UR5, delta_d=[0, 11.2, -92.5, 81.3, 0, 0])])
@@ -100,24 +99,17 @@ def test_another_program_drives_the_plan_from_the_segments_alone(tmp_path: Path)
 
 
 def test_a_plan_of_another_robot_is_named(tmp_path: Path) -> None:
-    def swap(data: dict[str, Any]) -> None:
-        data["content"] = plan_to_json(a_plan(UR5E))["content"]
-
-    text = refused(rewritten(a_plan(UR5), swap), tmp_path / "p.json")
+    other = plan_to_json(a_plan(UR5E))["content"]
+    text = refused(rewritten(a_plan(), lambda d: d.update(content=other)), tmp_path / "p.json")
     assert "fit a UR5" in text and "UR5e" in text and "p.json" in text
 
-    def rename(data: dict[str, Any]) -> None:
-        data["content"]["robot"] = "UR5e"
-
-    text = refused(rewritten(a_plan(UR5), rename), tmp_path / "p.json")
-    assert "those of a UR5" in text
+    renamed = rewritten(a_plan(), lambda d: d["content"].update(robot="UR5e"))
+    assert "those of a UR5" in refused(renamed, tmp_path / "p.json")
 
 
 def test_joints_of_another_arm_are_named(tmp_path: Path) -> None:
-    def one_more(data: dict[str, Any]) -> None:
-        data["content"]["joints"][2].append(0.0)
-
-    text = refused(rewritten(a_plan(), one_more), tmp_path / "p.json")
+    one_more = rewritten(a_plan(), lambda d: d["content"]["joints"][2].append(0.0))
+    text = refused(one_more, tmp_path / "p.json")
     assert "view 2 has 7 joint angles" in text and "a UR5, has 6 joints" in text
 
 
@@ -125,8 +117,7 @@ def test_degrees_and_millimetres_are_named(tmp_path: Path) -> None:
     path = tmp_path / "p.json"
 
     def degrees(data: dict[str, Any]) -> None:
-        content = data["content"]
-        content["joints"] = np.degrees(content["joints"]).tolist()
+        data["content"]["joints"] = np.degrees(data["content"]["joints"]).tolist()
 
     text = refused(rewritten(a_plan(), degrees), path)
     assert "degrees" in text and "view" in text
@@ -149,11 +140,9 @@ def test_degrees_and_millimetres_are_named(tmp_path: Path) -> None:
 
     assert "in millimetres; metres" in refused(rewritten(a_plan(), millimetres), path)
 
-    def far(data: dict[str, Any]) -> None:
-        data["content"]["center_world"] = [370.0, 20.0, 50.0]
-
-    assert "center_world" in (text := refused(rewritten(a_plan(), far), path))
-    assert "millimetres" in text
+    far = rewritten(a_plan(), lambda d: d["content"].update(center_world=[370.0, 20.0, 50.0]))
+    text = refused(far, path)
+    assert "center_world" in text and "millimetres" in text
 
     def turned(data: dict[str, Any]) -> None:
         Ts = np.array(data["expected"]["Ts_base_ee"])
@@ -174,10 +163,8 @@ def test_one_changed_view_is_the_one_that_is_named(tmp_path: Path) -> None:
 
     assert "segment of view 6" in refused(rewritten(a_plan(), bend), tmp_path / "p.json")
 
-    def hurry(data: dict[str, Any]) -> None:
-        data["segments"][6]["speed_rad_s"] = 3.0
-
-    assert "segment of view 6" in refused(rewritten(a_plan(), hurry), tmp_path / "p.json")
+    hurried = rewritten(a_plan(), lambda d: d["segments"][6].update(speed_rad_s=3.0))
+    assert "segment of view 6" in refused(hurried, tmp_path / "p.json")
 
 
 def test_no_file_ends_in_a_traceback(tmp_path: Path) -> None:

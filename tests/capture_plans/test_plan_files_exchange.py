@@ -37,11 +37,11 @@ MOUNT = d405_mount()
 REAL = Path(os.environ.get("REALSIM_DATA", "../shared/data")) / "motion" / "koch_ur5_paths"
 
 
-def a_plan(chain: DhChain = UR5, n: int = 9) -> CapturePlan:
+def a_plan() -> CapturePlan:
     rng = np.random.default_rng(0)
     return plan_through(
-        HOME + rng.normal(0, 0.3, (n, 6)), HOME, CENTER, config=PlanConfig(table_height_m=-0.02),
-        chain=chain, mount=MOUNT, reference_view=3,
+        HOME + rng.normal(0, 0.3, (9, 6)), HOME, CENTER, config=PlanConfig(table_height_m=-0.02),
+        mount=MOUNT, reference_view=3,
         vias=((0, HOME + rng.normal(0, 0.2, (2, 6))), (4, HOME + rng.normal(0, 0.2, (1, 6)))),
     )  # fmt: skip
 
@@ -53,21 +53,15 @@ def write_path(
     degrees: bool = True,
     scale: float = 1.0,
     tool: np.ndarray | None = None,
-    n: int = 12,
-    spread: float = 0.4,
 ) -> np.ndarray:
     """A path file with tool poses; returns its joints [rad]."""
-    q = HOME + np.random.default_rng(1).normal(0, spread, (n, 6))
+    q = HOME + np.random.default_rng(1).normal(0, 0.4, (12, 6))
     T = chain.forward(q) @ (np.eye(4) if tool is None else tool)
     poses = [
         dict(zip("xyzabc", [*(scale * t[:3, 3]), *se3.log_so3(t[:3, :3])], strict=True)) for t in T
     ]
-    flags = ["1", "1", *["0"] * (n - 3), "1"]
-    data = {
-        "joints": (np.degrees(q) if degrees else q).tolist(),
-        "cart_pose": poses,
-        "via_points": flags,
-    }
+    joints = (np.degrees(q) if degrees else q).tolist()
+    data = {"joints": joints, "cart_pose": poses, "via_points": ["1", "1", *["0"] * 9, "1"]}
     path.write_text(json.dumps(data))
     return q
 
