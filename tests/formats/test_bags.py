@@ -1,5 +1,6 @@
 """Whole recordings, written by rosbags in three containers and read back."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -155,10 +156,8 @@ def test_joints_are_not_made_up_in_a_gap(tmp_path: Path) -> None:
 
 
 def test_two_arms_are_listed(tmp_path: Path) -> None:
-    def change(bag: Bag) -> None:
-        bag.joints(np.ones(6), stamp(2), prefix="right_")
-
-    path = recorded(tmp_path, change=change).path
+    right = partial(Bag.joints, q=np.ones(6), t=stamp(2), prefix="right_")
+    path = recorded(tmp_path, change=right).path
     message = refused(path)
     assert "several arms" in message and "joint_prefix='right_'" in message
     assert open_bag(path, BagChoice(joint_prefix="")).arm.joints is not None

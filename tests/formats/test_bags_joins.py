@@ -135,10 +135,10 @@ def test_chains_are_composed_and_edges_follow_their_twist() -> None:
     assert tree.times_ns("a", "d").tolist() == [S, round(1.1 * S)]
 
 
-def ur_tree(base: str, tool: str, T: Any, link: str | None = "wrist_3_link") -> TfTree:
+def ur_tree(base: str, tool: str, T: Any) -> TfTree:
     tree = TfTree()
-    send(tree, base, link or "link6", T, 1.0, False)
-    send(tree, link or "link6", tool, np.eye(4), 0.0, True)
+    send(tree, base, "wrist_3_link", T, 1.0, False)
+    send(tree, "wrist_3_link", tool, np.eye(4), 0.0, True)
     tree.finish()
     return tree
 

@@ -46,11 +46,8 @@ def test_a_scene_is_read_as_it_was_written(tmp_path):
 def test_alike_things_keep_their_numbers_from_view_to_view(tmp_path):
     folder = write_boxes(tmp_path)
 
-    def swap(data):  # the rows of an image have no order to rely on
-        data["5"] = data["5"][::-1]
-
-    for name in ("scene_gt.json", "scene_gt_info.json"):
-        edit(folder / name, swap)
+    for name in ("scene_gt.json", "scene_gt_info.json"):  # an image's rows have no order
+        edit(folder / name, lambda data: data["5"].reverse())
     scene = open_labelled_bop(tmp_path)
     world = {}
     for i in scene.indices:

@@ -90,10 +90,9 @@ def test_every_frame_gets_its_own_parts(tmp_path, colour, depth):
     assert [f.time_s for f in source.frames(3)] == [3, 4, 5]
 
 
-@pytest.mark.parametrize("seed", range(1))
-def test_gaps_and_order_do_not_change_what_belongs_together(tmp_path, seed):
+def test_gaps_and_order_do_not_change_what_belongs_together(tmp_path):
     """Law: whatever files are taken away, each frame that is left is joined as before."""
-    rng = random.Random(seed)
+    rng = random.Random(0)
     numbers = range(12)
     gone = [set(rng.sample(numbers, 2)) for _ in range(3)]
     for k in numbers:

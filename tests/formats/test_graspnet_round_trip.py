@@ -1,5 +1,8 @@
 """GraspNet's tree, out and in again: equal to the last digit that the format keeps."""
 
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,16 +10,19 @@ from scipy.spatial.transform import Rotation
 from file_trees import bytes_of
 from labelled_scenes import MODELS, TABLE, labelled_scene
 from realsim import images
-from realsim.errors import InputError
+from realsim.errors import InputError, NotRigidError, UnitError
 from realsim.formats.bop.models import save_models
 from realsim.formats.bop.opening import open_labelled_bop
 from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
 from realsim.formats.export_folder import ExportFolder
-from realsim.formats.graspnet.annotations import read_objects
+from realsim.formats.graspnet.annotations import annotation_bytes, read_objects
+from realsim.formats.graspnet.meta import meta_bytes, read_meta
 from realsim.formats.graspnet.opening import open_scene
+from realsim.formats.graspnet.single_frame import open_graspnet_frame
 from realsim.formats.graspnet.tree import open_graspnet
 from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
 from realsim.geometry import se3
+from refusals import refused
 
 SINGLE_M, SINGLE_RAD = 1e-7, 1e-6
 HOME = "scenes/scene_0003/realsense"
@@ -163,3 +169,214 @@ def test_a_table_that_is_upside_down_is_named(tmp_path):
     np.save(file, np.linalg.inv(np.load(file)))
     with pytest.raises(InputError, match="seems to be inverted: as the pose of camera 0"):
         open_scene(open_graspnet(tmp_path / "tree").scenes[0])
+
+
+# --- A GraspNet tree that does not mean what the format says is refused with the evidence.
+
+
+@pytest.fixture
+def root(tree, tmp_path):
+    return Path(shutil.copytree(tree, tmp_path / "root"))
+
+
+def home(root):
+    return root / "scenes/scene_0003/realsense"
+
+
+def change_annotations(root, change):
+    """Write all annotations with their objects' texts changed; without the meta files."""
+    shutil.rmtree(home(root) / "meta", ignore_errors=True)
+    for path in sorted((home(root) / "annotations").iterdir()):
+        rows = [change(dict(o.fields)) for o in read_objects(path)]
+        path.write_bytes(annotation_bytes(rows))
+
+
+def change_meta(root, **changed):
+    for path in sorted((home(root) / "meta").iterdir()):
+        m = read_meta(path)
+        values = {
+            "numbers": m.numbers, "poses": m.poses, "K": m.K, "factor_depth": m.factor_depth,
+        }  # fmt: skip
+        path.write_bytes(meta_bytes(**values | changed))
+
+
+def test_inverted_camera_poses_are_named_with_both_spreads(root):
+    path = home(root) / "camera_poses.npy"
+    np.save(path, se3.invert(np.load(path)))
+    refused(r"inverted poses.*wander by \d+\.\d mm.*by 0\.\d mm", opened, root)
+
+
+def test_camera_poses_of_another_recording_are_named(root):
+    path = home(root) / "camera_poses.npy"
+    np.save(path, np.roll(np.load(path), 1, axis=0))
+    refused("contradicts the annotations", opened, root)
+
+
+def test_millimetres_are_named_wherever_they_are(root):
+    path = home(root) / "camera_poses.npy"
+    metres = np.load(path)
+    mm = metres.copy()
+    mm[:, :3, 3] *= 1000
+    np.save(path, mm)
+    refused("millimetres", opened, root, error=UnitError)
+    np.save(path, metres)
+    poses = read_meta(home(root) / "meta/0000.mat").poses
+    poses[..., 3] *= 1000
+    (home(root) / "meta/0000.mat").write_bytes(meta_bytes((0, 6, 29), poses, np.eye(3), 1000.0))
+    refused("millimetres", opened, root, error=UnitError)
+
+    def in_mm(fields):
+        t = np.array(fields["pos_in_world"].split(), float) * 1000
+        return fields | {"pos_in_world": " ".join(f"{x:.4f}" for x in t)}
+
+    change_annotations(root, in_mm)
+    refused("millimetres", opened, root, error=UnitError)
+
+
+def swapped(fields):
+    w, x, y, z = fields["ori_in_world"].split()
+    return fields | {"ori_in_world": f"{x} {y} {z} {w}"}
+
+
+def test_quaternions_in_another_order_are_named_by_the_views_and_by_the_meta_files(root):
+    kept = home(root).parent / "kept"
+    shutil.copytree(home(root) / "meta", kept)
+    change_annotations(root, swapped)
+    refused(r"x y z w: over 6 images.*turn by \d+\.\d deg", opened, root)
+    shutil.copytree(kept, home(root) / "meta")
+    refused(r"0000\.xml and .*0000\.mat disagree.*x y z w", opened, root)
+
+
+def test_depth_of_another_unit_is_named_with_the_factor_that_would_fit(root):
+    change_meta(root, factor_depth=10000.0)
+    said = refused(r"counts per metre \(factor_depth", opened, root, error=UnitError)
+    assert 900 < float(said.split("about ")[1].split()[0]) < 1050
+
+
+def test_two_files_that_disagree_are_both_named(root):
+    path = home(root) / "meta/0000.mat"
+    m = read_meta(path)
+    poses = m.poses.copy()
+    poses[1, 0, 3] += 0.0003
+    path.write_bytes(meta_bytes(m.numbers, poses, m.K, 1000.0))
+    refused(r"0000\.xml and .*0000\.mat disagree about object 006", opened, root)
+    path.write_bytes(meta_bytes((0, 7, 29), m.poses, m.K, 1000.0))
+    refused(r"do not have the same objects: \[0, 6, 29\] and", opened, root)
+    path.write_bytes(meta_bytes(m.numbers[::-1], m.poses[::-1], m.K, 1000.0))
+    assert [o.obj_id for o in opened(root).frame(0).objects] == [1, 7, 30]
+    path.write_bytes(meta_bytes(m.numbers, m.poses, m.K + np.diag([1.0, 0, 0]), 1000.0))
+    refused(r"camK\.npy and intrinsic_matrix .* 1\.00 px", opened, root)
+
+
+def test_counts_that_differ_are_named(root):
+    path = home(root) / "camera_poses.npy"
+    poses = np.load(path)
+    np.save(path, poses[:4])
+    refused("holds 4 poses, and there are 6 images", opened, root)
+    np.save(path, np.concatenate([poses, poses[:1]]))
+    (home(root) / "rgb/0002.png").unlink()
+    notes = " ".join(opened(root).notes)
+    assert "1 annotation(s) without image: 2" in notes
+    assert "2 pose(s) in camera_poses.npy without image: 2, 6" in notes
+    refused("no image 2", opened(root).frame, 2)
+
+
+def test_labels_elsewhere_are_refused_and_strange_values_counted(root):
+    folder = home(root) / "label"
+    labels = {p: images.read_image(p) for p in sorted(folder.iterdir())}
+    for path, label in labels.items():
+        own = label.copy()
+        own[label == 30] = 77
+        path.write_bytes(images.png_bytes(own))
+    notes = " ".join(opened(root).notes)
+    assert "of 3 of 3 images looked at have values without an object: 77" in notes
+    assert "3 annotated objects have no labelled pixel" in notes
+    for path, label in labels.items():
+        path.write_bytes(images.png_bytes(np.roll(label, (60, 80), axis=(0, 1))))
+    refused(r"only 1 are where their poses .*number \+ 1\)", opened, root)
+    values = np.zeros(256, np.uint8)
+    values[[1, 7, 30]] = 0, 6, 29  # without the one that is added
+    for path, label in labels.items():
+        path.write_bytes(images.png_bytes(values[label]))
+    refused(r"only 0 are .* 6 if a value is the number itself", opened, root)
+    for path, label in labels.items():
+        path.write_bytes(images.png_bytes(label[::2].copy()))
+    refused("160x60 pixels", opened, root)
+
+
+def test_equal_objects_are_told_apart_by_where_they_stand_and_have_no_masks(root):
+    (home(root).parent / "object_id_list.txt").unlink()
+
+    def as_one(fields):
+        return fields | {"obj_id": "6"} if fields["obj_id"] == "29" else fields
+
+    change_annotations(root, as_one)
+    odd = home(root) / "annotations/0001.xml"
+    odd.write_bytes(annotation_bytes([o.fields for o in read_objects(odd)][::-1]))
+    scene = opened(root)
+    for index, order in ((0, [0, 1, 2]), (1, [2, 1, 0]), (5, [0, 1, 2])):
+        assert [o.instance for o in scene.frame(index).objects] == order
+    assert scene.mask(0, 0, visible=True).any() and scene.mask(0, 1, visible=True) is None
+    assert any("told apart by where they stand" in n for n in scene.notes)
+
+
+def test_incomplete_trees_are_read_and_what_is_missing_is_said(root):
+    for name in ("camera_poses.npy", "cam0_wrt_table.npy", "camK.npy"):
+        (home(root) / name).unlink()
+    shutil.rmtree(root / "models")
+    shutil.rmtree(home(root) / "label")
+    shutil.rmtree(home(root) / "annotations")
+    scene = opened(root)
+    frame = scene.frame(4)
+    assert frame.T_world_cam is None and scene.T_world_table is None and not scene.models()
+    assert scene.mask(4, 0, visible=True) is None and len(frame.objects) == 3
+    notes = " ".join(scene.notes)
+    for what in ("camera_poses.npy", "folder 'models'", "no label image", "no annotation"):
+        assert what in notes
+    shutil.rmtree(home(root) / "meta")
+    refused("no scene of GraspNet", opened, root)
+
+
+def test_a_tree_is_found_from_its_root_its_scenes_a_scene_and_a_camera(root):
+    shutil.copytree(home(root), home(root).parent / "kinect")
+    for place in (root, root / "scenes", home(root).parent):
+        found = open_graspnet(place).scenes
+        assert [r.name for r in found] == ["scene_0003-kinect", "scene_0003-realsense"]
+        assert all(r.models == root / "models" for r in found)
+    (ref,) = open_graspnet(home(root)).scenes
+    assert ref.camera == "realsense" and open_scene(ref).split == "train"
+    assert [r.camera for r in open_graspnet(root, cameras=["kinect"]).scenes] == ["kinect"]
+    refused("no scene 4; it has 3", open_graspnet, root, scenes=[4])
+    refused("no camera 'azure'", open_graspnet, root, cameras=["azure"])
+
+
+def test_a_meta_file_with_a_mirrored_pose_is_refused(root):
+    m = read_meta(home(root) / "meta/0000.mat")
+    poses = m.poses.copy()
+    poses[0, :, :3] *= -1
+    (home(root) / "meta/0000.mat").write_bytes(meta_bytes(m.numbers, poses, m.K, 1000.0))
+    with pytest.raises(NotRigidError):
+        opened(root)
+
+
+def frame_folder(root, folder):
+    folder.mkdir()
+    for kind, name in (("rgb", "color.png"), ("depth", "depth.png")):
+        shutil.copy(home(root) / kind / "0000.png", folder / name)
+    shutil.copy(home(root) / "meta/0000.mat", folder / "meta.mat")
+    return folder
+
+
+def test_one_frame_on_its_own_is_read_and_its_depth_is_checked(root, tmp_path):
+    folder = frame_folder(root, tmp_path / "one")
+    scene = open_graspnet_frame(folder, models=root / "models")
+    tree = opened(root)
+    assert [o.obj_id for o in scene.frame(0).objects] == [1, 7, 30] and scene.indices == (0,)
+    for a, b in zip(scene.frame(0).objects, tree.frame(0).objects, strict=True):
+        assert np.array_equal(a.T_cam_obj, b.T_cam_obj)
+    assert scene.models().keys() == {1, 7, 30} and scene.mask(0, 0, visible=True) is None
+    m = read_meta(folder / "meta.mat")
+    (folder / "meta.mat").write_bytes(meta_bytes(m.numbers, m.poses, m.K, 100.0))
+    refused("counts per metre", open_graspnet_frame, folder, error=UnitError)
+    (folder / "depth.png").unlink()
+    refused(r"has no depth\.png", open_graspnet_frame, folder)

@@ -16,18 +16,6 @@ def write(scene, folder):
 
 
 @pytest.fixture(scope="module")
-def scene():
-    return placed_scenes.placed_scene()
-
-
-@pytest.fixture(scope="module")
-def folder(scene, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("mjcf") / "scene"
-    write(scene, folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def model(folder):
     return mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
 

@@ -20,18 +20,6 @@ def write(scene, folder):
     return placed_scenes.written(write_urdf_scene, scene, folder)
 
 
-@pytest.fixture(scope="module")
-def scene():
-    return placed_scenes.placed_scene()
-
-
-@pytest.fixture(scope="module")
-def folder(scene, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("urdf") / "scene"
-    write(scene, folder)
-    return folder
-
-
 @pytest.fixture
 def loaded(folder):
     """Return the engine, the script's module and the bodies that it loaded."""

@@ -19,18 +19,6 @@ def write(scene, folder):
 
 
 @pytest.fixture(scope="module")
-def scene():
-    return placed_scenes.placed_scene()
-
-
-@pytest.fixture(scope="module")
-def folder(scene, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("usd") / "scene"
-    write(scene, folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def stage(folder):
     return Usd.Stage.Open(str(folder / "scene.usda"))
 

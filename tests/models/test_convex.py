@@ -197,8 +197,8 @@ def test_settings_that_bound_nothing_are_refused():
 # --- the file -----------------------------------------------------------------------------------
 
 
-def some_parts(rng=None):
-    rng = rng or np.random.default_rng(2)
+def some_parts():
+    rng = np.random.default_rng(2)
     return tuple(hull_vertices(0.02 * rng.normal(size=(20, 3)) + [0.1 * k, 0, 0]) for k in range(4))
 
 

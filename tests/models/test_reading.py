@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from realsim.errors import InputError, UnitError
+from realsim.errors import UnitError
 from realsim.geometry.mesh import mass_properties, ply_bytes, sample_surface, save_ply
 from realsim.geometry.parts import part
 from realsim.models.inspect import inspect_mesh
@@ -233,10 +233,12 @@ def test_without_a_unit_the_message_says_what_each_would_be(tmp_path):
     mesh = as_trimesh(turned(textured_box((0.98, 0.5, 0.3)), np.eye(3)))
     for name in ("a.stl", "a.glb"):
         mesh.export(tmp_path / name)
-        with pytest.raises(
-            InputError, match=r"980 mm as m, 9\.8 mm as cm, 0\.98 mm as mm.*--unit none"
-        ):
-            read_scan(tmp_path / name, None)
+        refused(
+            r"980 mm as m, 9\.8 mm as cm, 0\.98 mm as mm.*--unit none",
+            read_scan,
+            tmp_path / name,
+            None,
+        )
 
 
 def test_impossible_sizes_are_refused(tmp_path):

@@ -19,11 +19,11 @@ SHARP = Lighting(psf_px=0.0)
 WHITE_SKY = Environment(panorama=np.ones((8, 16, 3), np.float32))
 
 
-def unit_square(uv: bool = True) -> Mesh:
+def unit_square() -> Mesh:
     return Mesh(
         vertices=np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]) - [0.5, 0.5, 0],
         faces=np.array([[0, 1, 2], [0, 2, 3]]),
-        uv=np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]) if uv else None,
+        uv=np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]),
     )
 
 

@@ -55,13 +55,12 @@ def test_a_mesh_elsewhere_explains_less_than_nothing():
         assert seen.cover < 0.25
 
 
-@pytest.mark.parametrize("name", ["bowl"])
-def test_the_outline_of_an_open_vessel_overlaps_seen_from_above(name: str):
+def test_the_outline_of_an_open_vessel_overlaps_seen_from_above():
     """Its floor lies nearer to the table than what is told from it, and must not count as missed.
 
     Where such a view falls under `view_share` of the usual overlap, a right view is left out.
     """
-    shape, evidence, state = truth(name, "lab")
+    shape, evidence, state = truth("bowl", "lab")
     seen = explain(shape, evidence, state, every=2)
     assert evidence.views[0].index == 0
     assert seen.view_agree[0] > 0.95

@@ -7,6 +7,10 @@ import numpy as np
 
 from plain_meshes import box
 from realsim import CameraIntrinsics, ObjectModel, images
+from realsim.formats.bop.root_files import write_bop_models, write_bop_root
+from realsim.formats.bop.writing import write_bop_scene
+from realsim.formats.export_folder import ExportFolder
+from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer
@@ -115,3 +119,22 @@ def labelled_scene(
         counts = images.depth_counts(seen.depth_m, unit_m)
         (folder / f"{index}.depth.png").write_bytes(images.png_bytes(counts))
     return SceneInMemory(folder=folder, frames=frames, masks=masks, T_world_table=TABLE.copy())
+
+
+def written_bop(folder, *scenes):
+    """Write scenes as a finished BOP data set; return its folder."""
+    export = ExportFolder.begin(folder, {})
+    for scene in scenes:
+        write_bop_scene(scene, export)
+        write_bop_models(scene.models(), export)
+    write_bop_root(export, name="three boxes")
+    export.finish({"README.md": b"three boxes\n"})
+    return folder
+
+
+def written_graspnet(folder, scene):
+    """Write a scene as a finished GraspNet tree; return its folder."""
+    export = ExportFolder.begin(folder, {})
+    write_graspnet_scene(scene, export, GraspnetWriteConfig())
+    export.finish({})
+    return folder

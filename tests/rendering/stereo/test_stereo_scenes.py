@@ -93,13 +93,12 @@ def test_dark_things_far_away_are_lost_by_structured_light() -> None:
     assert fill(0.01, 0.6) > 0.9 and fill(0.01, 2.0) < 0.1
 
 
-@pytest.mark.parametrize("name", ["d435"])
-def test_the_same_seed_gives_the_same_bytes_and_another_does_not(name: str) -> None:
-    camera = StereoCamera(CARD_BEFORE_WALL, profile(name), RICH)
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not() -> None:
+    camera = StereoCamera(CARD_BEFORE_WALL, profile("d435"), RICH)
     first, again, other = (
         camera.measure(CAMERA, np.eye(4), np.random.default_rng(seed)) for seed in (5, 5, 6)
     )
-    fresh = StereoCamera(CARD_BEFORE_WALL, profile(name), RICH).measure(
+    fresh = StereoCamera(CARD_BEFORE_WALL, profile("d435"), RICH).measure(
         CAMERA, np.eye(4), np.random.default_rng(5)
     )
     for b in (again, fresh):
