@@ -2,17 +2,26 @@
 
 import json
 import shutil
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
+import realsim_calibration
 from pictured_folders import X, Z, pictures, save_pictures
 from pictured_targets import CAMERA, TARGETS, truth
+from realsim.app.calibrate import run
+from realsim.app.calibrate.board_views import arm_of_poses
 from realsim.app.calibrate.folder import FolderRequest, read_views
+from realsim.app.calibrate.show import show_next_views
 from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.robots.arm import find_arm
 from realsim_calibration import calibrate
+from realsim_calibration.planning import view_proposals
 from refusals import refused
 from typed_commands import invoked
 
@@ -213,3 +222,55 @@ def test_pictures_that_show_nothing_are_named_for_their_fault(lab, spoil, said):
     assert "Give --board as it was printed" not in text
     if "blurred" in text:
         assert 9.0 < float(text.split("spread over ")[1].split()[0]) < 16.0
+
+
+# --- What `realsim calibrate` prints of further views: those that gain something, and nothing else.
+
+
+@pytest.mark.parametrize(("sigma_mm", "gains"), [(15.77, False), (15.7, False), (9.0, True)])
+def test_views_that_gain_nothing_are_not_promised(monkeypatch, capsys, sigma_mm, gains):
+    report = SimpleNamespace(
+        here_mm=15.77, here_deg=0.4, sigma_mm=40.0, sigma_deg=0.9,
+        used=(SimpleNamespace(joints=None),)
+    )  # fmt: skip
+    view = SimpleNamespace(
+        distance_m=0.3, tilt_deg=25.0, roll_deg=15.0, sigma_mm=sigma_mm, sigma_deg=0.399
+    )
+    monkeypatch.setattr(view_proposals, "propose_views", lambda report: [view])
+    monkeypatch.setattr(realsim_calibration, "choose_next_views", lambda *a: [view])
+    show_next_views(report, Console())
+    said = " ".join(capsys.readouterr().out.split())
+    assert ("Further views that would help most" in said) == gains
+    assert ("gain nothing: sigma stays at 15.77 mm" in said) == (not gains)
+    assert gains or "joint angles with the poses" in said
+    monkeypatch.setattr(realsim_calibration, "choose_next_views", lambda *a: [])
+    show_next_views(report, Console())
+    assert capsys.readouterr().out == ""
+
+
+# --- `realsim calibrate` keeps BLAS to one thread: several wait for each other on small matrices.
+
+
+def test_blas_has_one_thread_while_it_calibrates(monkeypatch, tmp_path):
+    seen = []
+
+    def look(source: Path, console: Console, **options: object) -> bool:
+        seen.extend(lib["num_threads"] for lib in threadpool_info() if lib["user_api"] == "blas")
+        return True
+
+    monkeypatch.setattr(run, "_run", look)
+    with threadpool_limits(2, user_api="blas"):
+        assert run.run_calibrate(tmp_path, Console(quiet=True), live=False)
+    assert seen and set(seen) == {1}
+
+
+# --- Joints beside poses prove the arm, with images and without.
+
+
+def test_joints_prove_the_arm_whose_poses_they_give():
+    chain = find_arm("ur5").chain.bare()
+    joints = np.random.default_rng(0).uniform(-2, 2, (12, 6))
+    Ts = np.stack([chain.forward(q) for q in joints])
+    found = arm_of_poses(Ts, joints)
+    assert found is not None and found.name == chain.name
+    assert arm_of_poses(Ts, joints[::-1]) is None

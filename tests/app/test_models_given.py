@@ -4,15 +4,13 @@ import shutil
 
 import pytest
 
-from labelled_scenes import MODELS, labelled_scene
+from labelled_scenes import MODELS, labelled_scene, written_graspnet
 from realsim.app.console import Console
 from realsim.app.school.inputs import SchoolRequest, read_inputs
 from realsim.app.upgrade.dataset import UpgradeConfig, open_scene, scenes_of
 from realsim.app.upgrade.source import prepare
 from realsim.errors import InputError
 from realsim.formats.bop.models import load_models, save_models
-from realsim.formats.export_folder import ExportFolder
-from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
 from typed_commands import finished, refused
 
 
@@ -20,9 +18,7 @@ from typed_commands import finished, refused
 def frame(tmp_path_factory):
     """One image as graspnet-baseline's demo has it, its meshes in two layouts elsewhere."""
     home = tmp_path_factory.mktemp("frame")
-    folder = ExportFolder.begin(home / "tree", {})
-    write_graspnet_scene(labelled_scene(home / "images", [0]), folder, GraspnetWriteConfig())
-    folder.finish({})
+    written_graspnet(home / "tree", labelled_scene(home / "images", [0]))
     camera, image = home / "tree/scenes/scene_0003/realsense", home / "frame"
     image.mkdir()
     names = (("rgb", "png", "color"), ("depth", "png", "depth"), ("meta", "mat", "meta"))

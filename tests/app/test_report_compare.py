@@ -110,11 +110,10 @@ def test_pose_differences_know_symmetries_and_no_order(name: str) -> None:
     np.testing.assert_allclose(pose_difference(T @ T_a, T @ T_b, model), mine, atol=1e-6)
 
 
-def row(instance: int, obj_id: int, T: np.ndarray | None = None) -> dict[str, object]:
-    T = np.eye(4) if T is None else T
+def row(instance: int, obj_id: int) -> dict[str, object]:
     return {
         "instance": instance, "obj_id": obj_id, "name": f"m{obj_id}", "verdict": "accepted",
-        "sigma_mm": None, "sigma_deg": None, "probability": None, "T_world_obj": T.tolist(),
+        "sigma_mm": None, "sigma_deg": None, "probability": None, "T_world_obj": np.eye(4).tolist(),
     }  # fmt: skip
 
 

@@ -75,4 +75,5 @@ def test_what_cannot_be_is_refused(trials: Path, words: tuple[str, ...], told: s
 
 
 def test_a_folder_of_another_layout_is_refused(tmp_path: Path) -> None:
-    assert "no folder 'layouts'" in refused("reality", tmp_path)
+    said = refused("reality", tmp_path)
+    assert "no folder 'layouts'" in said and "GRASPA" in said

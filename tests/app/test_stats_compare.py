@@ -7,23 +7,17 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from bop_scenes import edit
-from labelled_scenes import SceneInMemory, labelled_scene
+from labelled_scenes import SceneInMemory, labelled_scene, written_bop, written_graspnet
 from realsim import images
-from realsim.app.cli import commands
 from realsim.app.stats.compare import diff_scenes
-from realsim.formats.bop.root_files import write_bop_models
-from realsim.formats.bop.writing import write_bop_scene
-from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspnet.collision_labels import write_collision_labels
 from realsim.formats.graspnet.grasp_labels import GraspLabels, write_grasp_labels
-from realsim.formats.graspnet.write_plan import GraspnetWriteConfig
-from realsim.formats.graspnet.writing import write_graspnet_scene
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from tried_grasps import tried_set
+from typed_commands import finished
 
 MOVE = se3.from_rt(se3.exp_so3([0.0, 0.0, np.radians(0.5)]), [0.002, 0.0, 0.0])
 
@@ -38,15 +32,6 @@ def moved(frame):
     return (replace(first, T_cam_obj=first.T_cam_obj @ MOVE), *others)
 
 
-def written(folder, *scenes):
-    export = ExportFolder.begin(folder, {})
-    for scene in scenes:
-        write_bop_scene(scene, export)
-        write_bop_models(scene.models(), export)
-    export.finish({})
-    return folder
-
-
 @pytest.fixture(scope="module")
 def releases(tmp_path_factory):
     home = tmp_path_factory.mktemp("releases")
@@ -56,13 +41,11 @@ def releases(tmp_path_factory):
     del new.frames[2]
     more = labelled_scene(home / "c", [0])
     more.number, more.name = 9, "train-000009"
-    return written(home / "old", old), written(home / "new", new, more)
+    return written_bop(home / "old", old), written_bop(home / "new", new, more)
 
 
 def compared(new, old, *options):
-    words = [str(w) for w in ("stats", new, "--compare", old, "--json", *options)]
-    result = CliRunner().invoke(commands, words, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    result = finished("stats", new, "--compare", old, "--json", *options)
     return json.loads(result.stdout)["comparison"]
 
 
@@ -177,9 +160,7 @@ def test_other_models_and_tables_are_told(releases, tmp_path):
     mesh.write_bytes(mesh.read_bytes()[:-1] + b"\1")
     (copy / "camera.json").write_text("{}")
     edit(copy / "models/models_info.json", lambda rows: rows["30"].update(diameter=1.0))
-    words = [str(w) for w in ("stats", copy, "--compare", releases[0], "--json")]
-    result = CliRunner().invoke(commands, words, catch_exceptions=False)
-    files = json.loads(result.stdout)["files"]
+    files = json.loads(finished("stats", copy, "--compare", releases[0], "--json").stdout)["files"]
     assert files == ["camera.json", "models/flat.ply", "models/models_info.json"]
 
 
@@ -245,9 +226,7 @@ def test_a_width_or_a_score_alone_is_a_change(tmp_path, name, by):
 def test_labels_of_graspnets_format_are_compared(tmp_path):
     scene = labelled_scene(tmp_path / "s", [0])
     for name in ("old", "new"):
-        export = ExportFolder.begin(tmp_path / name, {})
-        write_graspnet_scene(scene, export, GraspnetWriteConfig())
-        export.finish({})
+        written_graspnet(tmp_path / name, scene)
     index = [[0, 3, 1, 2], [0, 5, 0, 0], [1, 3, 1, 2]]
     labels = GraspLabels(
         points=np.array([[0.01, 0.0, 0.02], [0.0, 0.01, 0.02]]), index=np.array(index, np.int32),
@@ -272,7 +251,6 @@ def test_labels_of_graspnets_format_are_compared(tmp_path):
 def test_two_data_sets_without_a_scene_in_common_are_told_so(releases, tmp_path):
     other = labelled_scene(tmp_path / "c", [0])
     other.number, other.name = 9, "train-000009"
-    written(tmp_path / "other", other)
-    words = [str(w) for w in ("stats", tmp_path / "other", "--compare", releases[0])]
-    result = CliRunner().invoke(commands, words, catch_exceptions=False)
+    written_bop(tmp_path / "other", other)
+    result = finished("stats", tmp_path / "other", "--compare", releases[0])
     assert "no scene is in both: 000009 beside 000003" in result.output

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bop_scenes import edit
 from file_trees import bytes_of
 from realsim.records import CameraIntrinsics, CaptureSession, View
-from realsim.store import SessionStore
+from realsim.store import SessionStore, atomic
 from realsim.store.manifest import NAME as MANIFEST
+from realsim.store.opening import BEGUN_FILE, RECOVERED, finish_beginning, read_begun
 from realsim.store.session_check import check_session
 from realsim.store.session_repair import repair_session
 from refusals import refused
@@ -210,3 +212,202 @@ def test_many_views_are_listed_for_bop_when_the_store_is_closed(
     SessionStore.open(tmp_path)
     assert len(json.loads((tmp_path / "scene_camera.json").read_text())) == 49
     assert os.listdir(tmp_path / "rgb")
+
+
+# --- What a session was begun with outlives its header.
+
+
+@pytest.mark.parametrize(
+    ("damage", "beginning"),
+    [("missing", "kept"), ("junk", "lost"), ("value", "damaged"), ("other arm", "kept")],
+)
+def test_a_lost_header_is_made_anew_from_what_is_there(
+    session: Path, damage: str, beginning: str
+) -> None:
+    before = SessionStore.open(session)
+    if beginning == "lost":
+        before.remove(BEGUN_FILE)
+    if beginning == "damaged":
+        flip(session / BEGUN_FILE, 400)
+    path = session / "session.json"
+    if damage == "missing":
+        path.unlink()
+    elif damage == "value":
+        edit(path, lambda header: header["camera"].update(fx=99.0))
+    elif damage == "other arm":
+        header = json.loads(path.read_text())
+        path.write_text(json.dumps(header | {"extra": {"arm": "UR5e", "plan_hash": "p" * 64}}))
+    else:
+        path.write_bytes(b"{]")
+    assert not check_session(session).sound
+    repaired = repair_session(session)
+    assert repaired.after.sound and "made anew" in repaired.notes[0]
+    after = SessionStore.open(session)
+    assert after.session.depth_unit_m == 1e-4 and after.extra["plan_hash"] == "p" * 64
+    assert np.array_equal(after.session.intrinsics.K, CAMERA.K)
+    assert np.array_equal(after.session.intrinsics.distortion, CAMERA.distortion)
+    for index in range(VIEWS):
+        now, then = (s.session.view(index).T_world_cam for s in (after, before))
+        assert now is not None and then is not None
+        np.testing.assert_allclose(now, then, atol=1e-12)
+    if beginning == "kept":
+        # Law: what the session was begun with is what it is after the repair, and opening and
+        # repairing again change nothing.
+        assert after.extra == before.extra and after.created == before.created
+        assert after.session.name == "whole"
+    else:
+        assert after.extra.get("camera") == ("D405 17" if damage == "value" else None)
+        unknown = damage in ("missing", "junk")
+        assert after.extra.get(RECOVERED, False) == unknown
+        assert (session / BEGUN_FILE).exists() != unknown  # no copy of what is not known
+        assert unknown == any("capture adds no views" in n for n in repaired.notes)
+    again = bytes_of(session)
+    assert repair_session(session).notes == () and bytes_of(session) == again
+
+
+def test_the_capture_log_still_tells_the_devices(session: Path) -> None:
+    store = SessionStore.open(session)
+    begun = {"event": "begun", "arm": {"model": "UR5", "serial": "1"}, "camera": {"serial": "17"}}
+    store.write_bytes("capture_log.jsonl", (json.dumps(begun) + "\n").encode())
+    store.remove(BEGUN_FILE)
+    (session / "session.json").write_text('{"broken')
+    repair_session(session)
+    extra = SessionStore.open(session).extra
+    assert extra["arm_description"] == begun["arm"] and extra[RECOVERED]
+    assert extra["camera_description"] == {"serial": "17"}
+    # Somebody who knows says so by hand: the repair takes it over, and keeps it from then on.
+    edit(session / "session.json", lambda header: header["extra"].pop(RECOVERED))
+    assert repair_session(session).after.sound
+    assert RECOVERED not in SessionStore.open(session).extra
+    assert read_begun(session) is not None
+
+
+def test_a_damaged_header_says_how_to_go_on(session: Path) -> None:
+    path = session / "session.json"
+    for data in ('{"broken', "[]", '{"format": "x"}', '{"format": "realsim session"}', None):
+        if data is None:
+            path.unlink()
+        else:
+            path.write_text(data)
+        refused(r"session\.json.*`realsim check .*/s --repair`", SessionStore.open, session)
+    record = CaptureSession(name="x", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    refused(r"holds views of a session .* --repair", SessionStore.create, session, record)
+    header = json.loads(atomic.json_bytes({"format": "realsim session", "format_version": 99}))
+    path.write_text(json.dumps(header))
+    said = refused("newer realsim", SessionStore.open, session)
+    assert "--repair" not in said
+
+
+@pytest.mark.parametrize("listed", [-1, 0, 20, 10_000])
+def test_a_header_that_a_kill_kept_from_its_name_gets_it_or_goes(tmp_path: Path, listed: int):
+    whole = CaptureSession(name="new", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    SessionStore.create(tmp_path, whole).close()
+    header, manifest = tmp_path / "session.json", tmp_path / "manifest.jsonl"
+    line = next(x for x in manifest.read_text().splitlines(True) if '"session.json"' in x)
+    for path in tmp_path.iterdir():
+        if path != header:
+            path.unlink()
+    header.rename(tmp_path / ".session.json.999999999.part")
+    if listed < 0:  # asked to end: the bytes are gone, and the list has them
+        (tmp_path / ".session.json.999999999.part").unlink()
+        manifest.write_text(line)
+    elif listed:
+        manifest.write_text(line[:listed])  # the last line may be torn
+    finish_beginning(tmp_path)
+    if listed < len(line):
+        assert list(tmp_path.iterdir()) == []
+    else:
+        assert SessionStore.open(tmp_path).session.name == "new"
+
+
+# --- What a check notes: lost checksums, second lines, clocks that go back.
+
+
+@pytest.mark.parametrize("left", [None, b'{"path": "half'])
+def test_views_without_a_manifest_are_not_taken_for_sound(
+    session: Path, left: bytes | None
+) -> None:
+    (session / MANIFEST).unlink()
+    if left is not None:
+        (session / MANIFEST).write_bytes(left)
+    path = session / "rgb/000001.png"
+    path.write_bytes(path.read_bytes()[:-300])
+    before = bytes_of(session)
+    refused(r"manifest\.jsonl is lost.*--repair", SessionStore.open, session)
+    assert bytes_of(session) == before
+    report = check_session(session)
+    assert not report.sound and report.damaged_views == (1,)
+    assert len(report.unproven) == 17 and "calibration/" in dict(report.beside)
+    repaired = repair_session(session)
+    assert repaired.after.sound and repaired.dropped_views == (1,)
+    assert SessionStore.open(session).completed == set(range(VIEWS)) - {1}
+    assert repaired.after.unproven == ()
+
+
+def test_a_file_that_lost_its_checksum_is_named(session: Path) -> None:
+    add(SessionStore.open(session), 6)
+    path = session / MANIFEST
+    lines = path.read_bytes().splitlines(keepends=True)
+    at = next(k for k, line in enumerate(lines) if b"depth/000006" in line)
+    path.write_bytes(b"".join(lines[:at]) + lines[at][:60])
+    report = check_session(session)
+    assert report.sound and "depth/000006.png" in report.unproven
+    kinds = {f.path: f.kind for f in report.findings}
+    assert kinds["depth/000006.png"] == "unproven" and kinds[MANIFEST] == "torn"
+    assert "the checksum of depth/000006.png is lost" in report.findings[0].found
+    repaired = repair_session(session)
+    assert any("depth/000006.png" in n and "nothing can tell" in n for n in repaired.notes)
+    assert repaired.after.findings == () and repaired.after.unproven == ()
+    # What cannot be read is not listed by opening, and stays damage.
+    path.write_bytes(b"".join(lines[:at]))
+    image = session / "depth/000006.png"
+    image.write_bytes(image.read_bytes()[:-300])
+    assert check_session(session).damaged_views == (6,)
+    store = SessionStore.open(session)
+    assert [f.path for f in store.stored_faults()] == ["depth/000006.png"]
+    assert check_session(session).damaged_views == (6,)
+
+
+def test_a_second_line_of_a_view_is_noted_unless_it_was_retaken(session: Path) -> None:
+    path = session / "robot.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join([*lines, lines[2]]))
+    report = check_session(session)
+    assert report.sound and len(report.views) == VIEWS
+    (note,) = [f for f in report.findings if f.kind == "repeated"]
+    assert "view 2 has 2 lines (3, 7)" in note.found and "1 of them repeat" in note.found
+    path.write_bytes(b"".join(lines))
+    store = SessionStore.open(session)
+    store.write_json("retaken/000003_1.json", {"index": 3})
+    for name in ("rgb/000003.png", "depth/000003.png"):
+        store.remove(name)
+    rgb, counts = images_of(3, 1)
+    store.add_view(View(index=3, time_s=200.0), rgb, depth_counts=counts)
+    assert check_session(session).findings == ()
+
+
+def test_time_that_goes_back_where_a_run_began_is_no_note(tmp_path: Path) -> None:
+    session = CaptureSession(name="t", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(tmp_path, session)
+    for index, time_s in enumerate((5.0, 6.0, 2.0, 3.0)):
+        store.add_view(View(index=index, time_s=time_s), images_of(index)[0])
+
+    def log(*events: str | int) -> None:
+        lines = [
+            {"event": "stored", "view": e} if isinstance(e, int) else {"event": e} for e in events
+        ]
+        store.write_bytes(
+            "capture_log.jsonl", "".join(json.dumps(x) + "\n" for x in lines).encode()
+        )
+
+    for known in (("begun", 0, 1, "ended", "begun", 2, 3), ("begun", 0, 1, "recovered", 2, 3),
+                  ("begun", 0, "begun", 2, 3)):  # fmt: skip
+        log(*known)
+        assert check_session(tmp_path).findings == ()
+    log("begun", 0, 1, 2, 3)  # one run: its camera's clock went back
+    assert [f.kind for f in check_session(tmp_path).findings] == ["time"]
+    log("begun", 0, 1, "begun", 2, 3, "begun", 1)  # taken again, and stored last
+    store.remove("rgb/000001.png")
+    store.write_json("retaken/000001_1.json", {"index": 1})
+    store.add_view(View(index=1, time_s=1.0), images_of(1, 1)[0])
+    assert check_session(tmp_path).findings == ()

@@ -29,10 +29,8 @@ def empty_session(name="table"):
     return CaptureSession(name=name, intrinsics=CAMERA, views=(), depth_unit_m=UNIT)
 
 
-def make_view(index, with_robot=True):
+def make_view(index):
     rng = np.random.default_rng(index)
-    if not with_robot:
-        return View(index=index)
     return View(
         index=index,
         T_base_ee=se3.random_transform(rng),
