@@ -19,6 +19,7 @@ from realsim.review.drawing import grasp_drawing
 from realsim.review.drawing.grasp_drawing import GraspFilter, passing
 from realsim.review.window.panel_grasps import legend_html
 from realsim.store import SessionStore
+from refusals import refused
 from tests.support.reviewed_boxes import CAMERAS, boxes_session, grasp_set
 
 CONFIG = SceneConfig(voxel_m=0.004, coarse_points=200, piece_points=700, thumbnail_px=40)
@@ -120,8 +121,7 @@ def test_a_strided_camera_sees_the_same_points() -> None:
 def test_a_missing_model_is_named(tmp_path: Path) -> None:
     store = boxes_session(tmp_path / "boxes")
     (store.folder / "models/obj_000007.ply").unlink()
-    with pytest.raises(InputError, match=r"objects 7.*it has 1, 9"):
-        SceneContent.load(store, CONFIG)
+    refused(r"objects 7.*it has 1, 9", SceneContent.load, store, CONFIG)
 
 
 def test_views_with_damaged_images_are_left_out_and_named(
@@ -144,8 +144,7 @@ def test_views_with_damaged_images_are_left_out_and_named(
 
 
 def test_an_unknown_view_or_model_is_named(shown: SceneContent) -> None:
-    with pytest.raises(InputError, match=r"view 77.*0, 1, 2, 3"):
-        shown.pose_of(77)
+    refused(r"view 77.*0, 1, 2, 3", shown.pose_of, 77)
     with pytest.raises(InputError, match="8"):
         _ = shown.meshes[8]
     np.testing.assert_array_equal(shown.pose_of(2), CAMERAS[2])
