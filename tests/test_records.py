@@ -9,7 +9,6 @@ from realsim.errors import NotRigidError
 from realsim.records import (
     CameraIntrinsics,
     CaptureSession,
-    GraspSet,
     Mesh,
     ObjectModel,
     ObjectPose,
@@ -18,25 +17,10 @@ from realsim.records import (
     View,
 )
 from refusals import refused
+from tried_grasps import plain_grasps
 
 CAMERA = CameraIntrinsics(width=64, height=48, fx=60, fy=60, cx=32, cy=24)
 TRIANGLE = Mesh(vertices=np.eye(3), faces=np.array([[0, 1, 2]]))
-
-
-def grasps(n=2, **changes):
-    values = {
-        "obj_id": 1,
-        "instance": 0,
-        "Ts_obj_grasp": np.tile(np.eye(4), (n, 1, 1)),
-        "widths_m": np.full(n, 0.04),
-        "scores": np.full(n, np.nan),
-        "base_scores": np.full(n, np.nan),
-        "slip_m": np.full((n, 4), np.nan),
-        "slip_rad": np.full((n, 4), np.nan),
-        "reachable": np.ones(n, bool),
-        "failures": ("",) * n,
-    }
-    return GraspSet(**(values | changes))
 
 
 def test_arrays_are_private_read_only_copies():
@@ -79,8 +63,8 @@ def test_records_can_be_compared_and_hashed_as_things():
         (lambda: Mesh(vertices=np.eye(3), faces=[[0, 1, 2]], colors=np.ones((2, 3))), "colors"),
         (lambda: ObjectModel(obj_id=0, name="mug", mesh=TRIANGLE), "ids start at 1"),
         (lambda: ObjectModel(obj_id=1, name="mug", mesh=TRIANGLE, density=0), "density"),
-        (lambda: grasps(failures=("",)), "1 failure notes for 2 grasps"),
-        (lambda: grasps(widths_m=np.ones(3)), "widths_m"),
+        (lambda: plain_grasps(2, failures=("",)), "1 failure notes for 2 grasps"),
+        (lambda: plain_grasps(2, widths_m=np.ones(3)), "widths_m"),
         (
             lambda: Scene(
                 name="s",
@@ -122,7 +106,7 @@ def test_tag_corners_are_where_the_board_says():
 
 
 def test_only_scores_from_one_half_are_good():
-    g = grasps(4, scores=np.array([0.5, 0.49, np.nan, 1.0]))
+    g = plain_grasps(4, scores=np.array([0.5, 0.49, np.nan, 1.0]))
     assert g.good.tolist() == [True, False, False, True]
 
 

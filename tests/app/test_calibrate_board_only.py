@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from click.testing import Result
 
+from begun_sessions import begun
 from file_trees import bytes_of
 from photographed_boards import photograph
 from realsim.app.calibrate.run import require_no_bag
@@ -15,7 +16,7 @@ from realsim.app.calibrate.session import keep_board
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.records import CameraIntrinsics, CaptureSession, TagBoard, View
+from realsim.records import CameraIntrinsics, TagBoard, View
 from realsim.store import SessionStore, load_hand_eye
 from realsim.store.atomic import json_bytes
 from realsim_calibration.targets.target_file import target_to_json
@@ -47,8 +48,7 @@ def hand_poses(rng: np.random.Generator) -> tuple[Array, Array]:
 def board_views(folder: Path, **header: str) -> Path:
     """Write what `realsim capture --board` leaves in a new session's folder; return that."""
     rng = np.random.default_rng(0)
-    session = CaptureSession(name="lab", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder / "calibration/capture", session, header)
+    store = begun(folder / "calibration/capture", CAMERA, header)
     depth = np.zeros((CAMERA.height, CAMERA.width), np.uint16)
     for k, (hand, T_cam_board) in enumerate(zip(*hand_poses(rng), strict=True)):
         view = View(index=k, T_base_ee=hand, time_s=float(k))
@@ -103,9 +103,8 @@ def test_with_objects_the_same_command_says_the_same_and_places_their_cameras(
 ) -> None:
     folder = Path(shutil.copytree(calibrated[0], tmp_path / "lab"))
     before = (folder / "calibration/hand_eye.json").read_bytes()
-    session = CaptureSession(name="lab", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
     rng = np.random.default_rng(1)
-    store = SessionStore.create(folder, session)
+    store = begun(folder, CAMERA)
     hand = hand_poses(rng)[0][3]
     grey = np.full((CAMERA.height, CAMERA.width, 3), 120, np.uint8)
     store.add_view(View(index=0, T_base_ee=hand, time_s=0.0), grey)

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from begun_sessions import begun
 from franka_server import FrankaServer
 from given_plans import plan_through
 from realsim.app.doctor.devices import robot_findings
 from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.interop import import_pyrealsense2
-from realsim.records import CaptureSession
 from realsim.robots.arm import UR5, UR5E, find_arm
 from realsim.store import SessionStore
 from realsim_capture_plans.capturing import contact_sheet as sheets
@@ -120,8 +120,7 @@ def test_another_session_and_a_strangers_folder_are_left_alone(plans: Path, tmp_
 
 def test_an_imported_session_is_not_gone_on_with(plans: Path, tmp_path: Path) -> None:
     camera = SessionStore.open(scene_session(plans)).session.intrinsics
-    session = CaptureSession(name="bag", intrinsics=camera, views=(), depth_unit_m=1e-4)
-    SessionStore.create(tmp_path / "s", session, extra={"import": {"source": "a.bag"}}).close()
+    begun(tmp_path / "s", camera, {"import": {"source": "a.bag"}}).close()
     done = realsim("capture", tmp_path / "s", "--plan", plans / "plan.json", "--simulated")
     assert done.returncode == 2 and "was imported, not captured" in done.stderr
 

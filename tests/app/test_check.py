@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from click.testing import Result
 
-from realsim.records import CameraIntrinsics, CaptureSession, View
+from begun_sessions import begun
+from realsim.records import CameraIntrinsics, View
 from realsim.store import SessionStore
 from realsim.store.lock import only_run_in
 from typed_commands import invoked, realsim
@@ -18,9 +19,8 @@ CAMERA = CameraIntrinsics(width=40, height=30, fx=40, fy=40, cx=19.5, cy=14.5)
 @pytest.fixture
 def session(tmp_path: Path) -> Path:
     folder = tmp_path / "table"
-    record = CaptureSession(name="table", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
     for place, views in ((folder, 4), (folder / "calibration/capture", 2)):
-        store = SessionStore.create(place, record)
+        store = begun(place, CAMERA)
         store.write_json("plan.json", {"content": {"joints": [[0.0] * 6] * 5}})
         for index in range(views):
             rgb = np.random.default_rng(index).integers(0, 256, (30, 40, 3), dtype=np.uint8)

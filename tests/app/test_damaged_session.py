@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from begun_sessions import add_drawn, begun
 from realsim.app import stages
 from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
@@ -15,7 +16,7 @@ from realsim.errors import InputError, UnitError
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.parts import part
-from realsim.records import CameraIntrinsics, CaptureSession, Mesh, ObjectPose, View
+from realsim.records import CameraIntrinsics, Mesh, ObjectPose
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore, load_scene
 from realsim.store.arrays_on_disk import is_whole, write_arrays
@@ -34,15 +35,10 @@ def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     corners = np.array([[-0.4, -0.4, 0], [0.4, -0.4, 0], [0.4, 0.4, 0], [-0.4, 0.4, 0]])
     table = Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]]))
     renderer = LabelRenderer([PlacedMesh(0, model.mesh, T), PlacedMesh(-1, table, np.eye(4))])
-    session = CaptureSession(name="box", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
     folder = tmp_path_factory.mktemp("damaged") / "s"
-    store = SessionStore.create(folder, session, {"gravity_up_world": [0, 0, 1]})
-    for k in range(4):
-        eye = [0.35 * np.cos(1.5 * k), 0.35 * np.sin(1.5 * k), 0.35]
-        T_world_cam = se3.look_at(eye, [0, 0, 0.04])
-        depth = renderer.render(CAMERA, T_world_cam).depth_m
-        rgb = np.full((180, 240, 3), 90, np.uint8)
-        store.add_view(View(index=k, T_world_cam=T_world_cam), rgb, depth)
+    store = begun(folder, CAMERA, {"gravity_up_world": [0, 0, 1]})
+    eyes = [[0.35 * np.cos(1.5 * k), 0.35 * np.sin(1.5 * k), 0.35] for k in range(4)]
+    add_drawn(store, renderer, [se3.look_at(eye, [0, 0, 0.04]) for eye in eyes])
     save_models(store.folder / "models", {model.obj_id: model})
     stages.save_starts(store, [ObjectPose(obj_id=model.obj_id, instance=0, T_world_obj=T)], "test")
     return folder

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
+from begun_sessions import begun
 from realsim.app.console import Console
 from realsim.app.importing.session import import_session
 from realsim.app.importing.source import ImportRequest, kinds_of, open_source, run_import
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
-from realsim.records import CaptureSession
 from realsim.robots.arm import find_arm
 from realsim.store import SessionStore
 from refusals import refused
@@ -71,8 +71,7 @@ def test_nobodys_folder_and_no_captured_session_is_touched(tmp_path):
     (tmp_path / "a/thesis.tex").write_text("precious")
     with pytest.raises(InputError, match=r"not empty.*thesis\.tex"):
         import_session(Recording(ten()), tmp_path / "a", QUIET, overwrite=True)
-    captured = CaptureSession(name="real", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    SessionStore.create(tmp_path / "b", captured).close()
+    begun(tmp_path / "b", CAMERA).close()
     with pytest.raises(InputError, match="never replaced"):
         import_session(Recording(ten()), tmp_path / "b", QUIET, overwrite=True)
     with pytest.raises(InputError, match="is a file"):

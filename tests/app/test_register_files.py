@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from begun_sessions import add_drawn, begun, light_things
 from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
 from realsim.app.register.colour import colour_remark
@@ -25,7 +26,7 @@ from realsim.app.register.results import (
 from realsim.app.report.session import write_report
 from realsim.app.stages import judged_scene, registered_views
 from realsim.geometry import se3
-from realsim.records import CameraIntrinsics, CaptureSession, ObjectPose, View, bop_units
+from realsim.records import CameraIntrinsics, ObjectPose, bop_units
 from realsim.store import SessionStore, atomic
 from registered_sessions import CAMERA, models_of, registered_by_hand, table_renderer, true_cameras
 from shared_sessions import copy_of
@@ -253,15 +254,10 @@ def test_an_interrupted_registration_is_finished_by_whoever_comes_next(store: Se
 def coloured(folder: Path, shift_px: int) -> SessionStore:
     """Return a session whose colour lies `shift_px` to the right of its depth."""
     camera = replace(CAMERA, width=640, height=480, fx=600.0, fy=600.0, cx=320.0, cy=240.0)
-    session = CaptureSession(name="colour", intrinsics=camera, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder, session)
-    renderer = table_renderer()
-    for k, T in enumerate(true_cameras(VIEWS)):
-        labels = renderer.render(camera, T)
-        grey = np.roll(np.where(labels.ids >= 0, 200, 90).astype(np.uint8), shift_px, axis=1)
-        rgb = np.repeat(grey[..., None], 3, axis=2)
-        store.add_view(View(index=k, T_world_cam=T), rgb, labels.depth_m)
-    return store
+    return add_drawn(
+        begun(folder, camera), table_renderer(), true_cameras(VIEWS),
+        lambda ids: np.roll(light_things(ids), shift_px, axis=1),
+    )  # fmt: skip
 
 
 def test_depth_that_does_not_lie_on_colour_is_said_in_pixels(tmp_path: Path) -> None:

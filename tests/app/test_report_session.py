@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 import pytest
 
+from begun_sessions import begun
 from page_tags import Tags
-from realsim import CaptureSession
 from realsim.app.annotate.run import run_annotate
 from realsim.app.console import Console
 from realsim.app.register.files import write_result
@@ -176,8 +176,7 @@ def test_what_reviewers_decided_is_told(store: SessionStore) -> None:
 
 
 def test_a_hostile_name_is_only_text(tmp_path: Path) -> None:
-    session = CaptureSession(name=HOSTILE, intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(tmp_path / "s", session, {"camera": HOSTILE, "x": "</script><b>"})
+    store = begun(tmp_path / "s", CAMERA, {"camera": HOSTILE, "x": "</script><b>"}, name=HOSTILE)
     text = write_report(store, None, notes=[HOSTILE]).read_text("utf-8")
     Tags(text)
     assert "<script>alert" not in text and "<b>" not in text.partition("</div>")[2]

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from realsim import CameraIntrinsics, CaptureSession, Mesh, ObjectModel, ObjectPose, Scene, View
+from begun_sessions import add_drawn, begun
+from realsim import CameraIntrinsics, Mesh, ObjectModel, ObjectPose, Scene
 from realsim.app.report.sliders import registration_pairs
 from realsim.app.stages import save_starts
 from realsim.formats.bop.models import save_models
@@ -30,14 +31,10 @@ def pose(x: float) -> ObjectPose:
 
 @pytest.fixture
 def store(tmp_path: Path) -> SessionStore:
-    session = CaptureSession(name="one", intrinsics=INTRINSICS, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(tmp_path / "one", session)
+    store = begun(tmp_path / "one", INTRINSICS)
     renderer = LabelRenderer([PlacedMesh(2, block(), pose(0.0).T_world_obj)])
-    for index, a in enumerate((0.0, 1.5, 3.0, 4.5)):
-        T = se3.look_at([0.3 * np.cos(a), 0.3 * np.sin(a), 0.25], [0.0, 0.0, 0.02])
-        labels = renderer.render(INTRINSICS, T)
-        rgb = np.repeat(np.where(labels.ids == 2, 200, 60)[..., None], 3, -1).astype(np.uint8)
-        store.add_view(View(index=index, T_world_cam=T), rgb, labels.depth_m)
+    eyes = [[0.3 * np.cos(a), 0.3 * np.sin(a), 0.25] for a in (0.0, 1.5, 3.0, 4.5)]
+    add_drawn(store, renderer, [se3.look_at(eye, [0.0, 0.0, 0.02]) for eye in eyes])
     save_scene(store, Scene(name="one", objects=(pose(0.0),), plane=None))
     save_models(store.folder / "models", {1: ObjectModel(obj_id=1, name="b", mesh=block())})
     return store

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from begun_sessions import begun
 from realsim.app.console import Console
 from realsim.app.scan.scale.cli import RESULT, scale
 from realsim.app.scan.scale.files import Place, write_result
@@ -29,7 +30,7 @@ from realsim.geometry.parts import object_model
 from realsim.models.library import ModelLibrary
 from realsim.models.library_prepare import PrepareConfig, prepare_unscaled
 from realsim.models.library_records import ScaleNote
-from realsim.records import CaptureSession, View
+from realsim.records import View
 from realsim.scanning.scale.files import ScaleRecord, installed_versions
 from realsim.scanning.scale.measured import length_of, parse_measurement
 from realsim.store import SessionStore
@@ -52,9 +53,7 @@ def fit(known):
 def session_of(known, folder: Path, *, depth=True, posed=True) -> SessionStore:
     """A captured session of the known views."""
     camera = known.views.intrinsics
-    store = SessionStore.create(
-        folder, CaptureSession(name="mugs", intrinsics=camera, views=(), depth_unit_m=1e-4)
-    )
+    store = begun(folder, camera)
     for f in known.views.frames:
         rgb = np.full((camera.height, camera.width, 3), 40 * f.index % 200, np.uint8)
         store.add_view(View(index=f.index), rgb, f.depth_m if depth else None)

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from begun_sessions import begun
 from realsim.app.console import Console
 from realsim.app.scan.sfm.run import SfmRequest, run_scan_sfm
 from realsim.geometry import se3
-from realsim.records import CameraIntrinsics, CaptureSession, View
+from realsim.records import CameraIntrinsics, View
 from realsim.store import SessionStore
 
 CAMERA = CameraIntrinsics(width=400, height=300, fx=330.0, fy=330.0, cx=199.5, cy=149.5)
@@ -59,8 +60,7 @@ def cameras(count: int = VIEWS) -> np.ndarray:
 
 
 def session(folder: Path, Ts: np.ndarray) -> SessionStore:
-    about = CaptureSession(name="prints", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder, about, {"plan_hash": "p" * 64})
+    store = begun(folder, CAMERA, {"plan_hash": "p" * 64})
     for k, T in enumerate(Ts):
         view = View(index=k, T_base_ee=T, joints=np.zeros(6), time_s=float(k))
         store.add_view(view, photo(T))

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from begun_sessions import begun
 from realsim.app.annotate.current import annotate_session, what_is_stale
 from realsim.app.console import Console
 from realsim.app.register.config import RegisterRequest
@@ -18,7 +19,7 @@ from realsim.formats.bop.opening import open_labelled_bop
 from realsim.formats.bop.scene import find_scenes, read_scene
 from realsim.geometry import se3
 from realsim.images import read_grey
-from realsim.records import CameraIntrinsics, CaptureSession, View
+from realsim.records import CameraIntrinsics, View
 from realsim.store import SessionStore, load_scene
 from realsim.store.cameras import camera_folder, camera_folders, open_cameras, session_of_camera
 from registered_sessions import table_renderer, table_session, true_poses
@@ -37,8 +38,7 @@ def add_fixed(session: SessionStore, name: str, *, posed: bool = True) -> Sessio
     """Add a fixed camera that is said to stand 2.4 mm and 0.2 deg beside where it does."""
     seen = table_renderer().render(CAMERA, T_TRUE)
     rgb = np.where((seen.ids >= 0)[..., None], 190, 80).astype(np.uint8).repeat(3, -1)
-    header = CaptureSession(name=name, intrinsics=CAMERA, views=(), depth_unit_m=2e-4)
-    store = SessionStore.create(camera_folder(session.folder, name), header)
+    store = begun(camera_folder(session.folder, name), CAMERA, name=name, unit_m=2e-4)
     rng = np.random.default_rng(4)
     said = T_TRUE @ se3.exp(np.array([3e-3, -2e-3, 1e-3, 1e-3, 2e-3, -1e-3]))
     for k in range(IMAGES):

@@ -13,9 +13,9 @@ from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
 from realsim.app.stats.collect import session_facts
 from realsim.app.stats.statistics import all_rows, same_content, statistics_of
-from realsim.records import GraspSet
 from realsim.store import load_scene, save_grasps, save_scene
 from synthetic_scenes import captured_session
+from tried_grasps import plain_grasps
 from typed_commands import finished, refused
 
 QUIET = Console(quiet=True)
@@ -31,15 +31,13 @@ GRASPS = {
 
 def grasp_set(instance, obj_id):
     score, base, reachable, friction = (np.array(x) for x in zip(*GRASPS[instance], strict=True))
-    n = len(score)
     stage = np.arange(4) / 4
     slip = np.where(stage < base[:, None], 1e-3, np.where(stage == base[:, None], np.inf, np.nan))
     slip[~reachable.astype(bool)] = np.nan
-    return GraspSet(
-        obj_id=obj_id, instance=instance, Ts_obj_grasp=np.tile(np.eye(4), (n, 1, 1)),
-        widths_m=np.full(n, 0.04), scores=score, base_scores=base, slip_m=slip, slip_rad=slip,
-        reachable=reachable.astype(bool), failures=("",) * n,
-        measures={"closure_friction": friction},
+    return plain_grasps(
+        len(score), obj_id=obj_id, instance=instance, widths_m=np.full(len(score), 0.04),
+        scores=score, base_scores=base, slip_m=slip, slip_rad=slip,
+        reachable=reachable.astype(bool), measures={"closure_friction": friction},
     )  # fmt: skip
 
 

@@ -18,11 +18,12 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from begun_sessions import begun
 from given_plans import joints_looking_at, plan_through
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry.camera import ray_table
-from realsim.records import CameraIntrinsics, CaptureSession
+from realsim.records import CameraIntrinsics
 from realsim.robots.arm import UR5, UR5E, find_arm
 from realsim.robots.limits import JointLimits
 from realsim.store import SessionStore, atomic
@@ -127,8 +128,7 @@ def plan() -> CapturePlan:
 
 
 def new_store(folder: Path, plan_hash: str) -> SessionStore:
-    session = CaptureSession(name="test", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    return SessionStore.create(folder, session, extra={"plan_hash": plan_hash})
+    return begun(folder, CAMERA, {"plan_hash": plan_hash})
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from realsim.records import CaptureSession
+from begun_sessions import begun
 from realsim.store import SessionStore
 from realsim.store.opening import BEGUN_FILE
 from realsim.store.session_repair import repair_session
@@ -37,11 +37,8 @@ def lab() -> SimulatedLab:
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     camera = lab().camera
-    session = CaptureSession(
-        name="s", intrinsics=camera.intrinsics, views=(), depth_unit_m=camera.depth_unit_m
-    )
     extra = {"plan_hash": plan().content_hash, "camera": camera.name, "arm": "UR5", "lab": LAB}
-    SessionStore.create(tmp_path / "s", session, extra)
+    begun(tmp_path / "s", camera.intrinsics, extra, unit_m=camera.depth_unit_m)
     run(tmp_path / "s", views=(0, 1, 2, 3))
     return tmp_path / "s"
 

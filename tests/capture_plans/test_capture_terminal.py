@@ -19,8 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from begun_sessions import begun
 from given_plans import plan_through
-from realsim.records import CameraIntrinsics, CaptureSession
+from realsim.records import CameraIntrinsics
 from realsim.robots.arm import find_arm
 from realsim.store import SessionStore
 from realsim_capture_plans.capturing.capture import CaptureJob, capture
@@ -67,8 +68,7 @@ class SlowCamera:
 
 
 def captured_by_a_person(folder: Path) -> None:
-    session = CaptureSession(name="test", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder, session, {"plan_hash": plan().content_hash})
+    store = begun(folder, CAMERA, {"plan_hash": plan().content_hash})
     with TerminalOperator("test") as operator:
         job = CaptureJob(operator=operator)
         capture(plan(), SimulatedArm(), SlowCamera(), store, job=job)

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from begun_sessions import begun
 from given_plans import joints_looking_at, plan_through
 from realsim.arrays import Array
-from realsim.records import CameraIntrinsics, CaptureSession, Mesh
+from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.robots.arm import find_arm
 from realsim.store import SessionStore
@@ -232,10 +233,8 @@ def bench(
     a = arm or SimulatedArm()
     there, on_table = lab()
     camera = SimulatedDepthCamera(there.config, there.truth, a, lambda: on_table)
-    session = CaptureSession(
-        name="test", intrinsics=camera.intrinsics, views=(), depth_unit_m=camera.depth_unit_m
-    )
-    store = SessionStore.create(folder, session, {"plan_hash": plan().content_hash})
+    extra = {"plan_hash": plan().content_hash}
+    store = begun(folder, camera.intrinsics, extra, unit_m=camera.depth_unit_m)
     return Bench(arm=a, camera=SpoiltCamera(a, camera, spoil), store=store)
 
 

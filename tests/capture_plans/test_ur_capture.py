@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from begun_sessions import begun
 from given_plans import plan_through
 from realsim.geometry import se3
-from realsim.records import CaptureSession
 from realsim.robots.arm import UR5
 from realsim.store import SessionStore
 from realsim_capture_plans.capturing.capture import CaptureJob, capture
@@ -72,12 +72,8 @@ def test_a_capture_with_a_protective_stop_on_its_way_stores_every_view(tmp_path:
     with LoopbackController.start(robot="UR5", speedup=10, **words) as controller:
         with UrArm(controller.host, model="UR5") as arm:
             camera = SimulatedDepthCamera(lab.config, lab.truth, arm, lambda: lab._on_table)
-            session = CaptureSession(
-                name="ur", intrinsics=camera.intrinsics, views=(), depth_unit_m=1e-4
-            )
-            store = SessionStore.create(
-                tmp_path / "session", session, extra={"plan_hash": plan.content_hash}
-            )
+            extra = {"plan_hash": plan.content_hash}
+            store = begun(tmp_path / "session", camera.intrinsics, extra)
             controller.inject("protective_stop", at_progress=0.4)
             with pytest.raises(ArmStoppedError, match="protective stop"):
                 capture(plan, arm, camera, store)  # nobody can be asked

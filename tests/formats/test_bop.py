@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
+from begun_sessions import begun
 from bop_scenes import edit
 from realsim.errors import InputError, NotRigidError, UnitError
 from realsim.formats.bop import labels as bop_labels
@@ -13,8 +14,7 @@ from realsim.formats.bop import models as bop_models
 from realsim.formats.bop import scene as bop
 from realsim.geometry import se3
 from realsim.geometry.mesh import symmetry_transforms
-from realsim.records import CameraIntrinsics, CaptureSession, Mesh, ObjectModel, View
-from realsim.store import SessionStore
+from realsim.records import CameraIntrinsics, Mesh, ObjectModel, View
 from refusals import refused
 from trimesh_solids import box
 
@@ -23,8 +23,7 @@ CAMERA = CameraIntrinsics(width=64, height=48, fx=60, fy=60, cx=32, cy=24)
 
 def make_scene(folder, n=2):
     """Return a session with n images and the annotations that were written into it."""
-    session = CaptureSession(name="s", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder, session)
+    store = begun(folder, CAMERA)
     rng = np.random.default_rng(0)
     annotations = {}
     for i in range(n):

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
+from begun_sessions import begun
 from realsim.formats.bop.source import open_bop
 from realsim.geometry import se3
-from realsim.records import CameraIntrinsics, CaptureSession, View
+from realsim.records import CameraIntrinsics, View
 from realsim.store import SessionStore
 from refusals import refused
 
@@ -17,8 +18,7 @@ CAMERA = CameraIntrinsics(
 
 
 def make_scene(folder: Path, n: int = 4) -> SessionStore:
-    session = CaptureSession(name="s", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder, session)
+    store = begun(folder, CAMERA)
     rng = np.random.default_rng(0)
     for i in range(n):
         T = se3.look_at(rng.uniform(0.3, 0.5, 3), [0, 0, 0])

@@ -13,7 +13,7 @@ from realsim.formats.graspit.grasps import WorldGrasps, read_grasp_file
 from realsim.formats.graspit.scene import read_graspit_scene
 from realsim.formats.graspit.writing import paired_grasps, write_graspit
 from realsim.geometry import se3
-from realsim.records import GraspSet
+from tried_grasps import plain_grasps
 
 
 def tried(instance, obj_id, middle, n=12):
@@ -21,11 +21,10 @@ def tried(instance, obj_id, middle, n=12):
     z = np.array([0.0, 0.0, -1.0])
     R = np.stack([np.cross([0.0, 1.0, 0.0], z), [0.0, 1.0, 0.0], z], axis=1)
     at = np.asarray(middle) + np.linspace(-0.005, 0.005, n)[:, None] * [0, 0, 1]
-    return GraspSet(
-        obj_id=obj_id, instance=instance, Ts_obj_grasp=se3.from_rt(np.tile(R, (n, 1, 1)), at),
-        widths_m=np.full(n, 0.05), scores=np.ones(n), base_scores=np.ones(n),
-        slip_m=np.zeros((n, 4)), slip_rad=np.zeros((n, 4)), reachable=np.ones(n, dtype=bool),
-        failures=("",) * n,
+    Ts = se3.from_rt(np.tile(R, (n, 1, 1)), at)
+    return plain_grasps(
+        Ts, obj_id=obj_id, instance=instance, scores=np.ones(n), base_scores=np.ones(n),
+        slip_m=np.zeros((n, 4)), slip_rad=np.zeros((n, 4)),
     )  # fmt: skip
 
 

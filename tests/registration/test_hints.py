@@ -6,9 +6,10 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from begun_sessions import begun
 from realsim.errors import InputError, NotRigidError, UnitError
 from realsim.geometry import se3
-from realsim.records import CaptureSession, SupportPlane, View
+from realsim.records import SupportPlane, View
 from realsim.registration.hint_regions import SLACK_M
 from realsim.registration.hints import (
     Box,
@@ -22,7 +23,6 @@ from realsim.registration.hints import (
     read_starts,
     region_of,
 )
-from realsim.store import SessionStore
 from refusals import refused
 from table_faults import seen_instances
 from table_scenes import part_models, small_scene
@@ -175,8 +175,7 @@ def test_typed_nonsense_is_an_error(text, words):
 @pytest.fixture
 def store(tmp_path):
     scene, _, _ = setting()
-    session = CaptureSession(name="table", intrinsics=scene.intrinsics, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(tmp_path / "session", session)
+    store = begun(tmp_path / "session", scene.intrinsics)
     grey = np.zeros((180, 320, 3), np.uint8)
     for f in scene.frames:
         store.add_view(View(index=f.index, T_world_cam=f.T_world_cam), grey, f.depth_m)

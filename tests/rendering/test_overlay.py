@@ -10,6 +10,7 @@ from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, GraspSet
 from realsim.rendering import overlay
 from refusals import refused
+from tried_grasps import plain_grasps
 
 CAMERA = CameraIntrinsics(width=320, height=240, fx=300, fy=300, cx=159.5, cy=119.5,
                           distortion=np.array([-0.1, 0.05, 0.001, 0.0]))  # fmt: skip
@@ -18,12 +19,7 @@ T_CAM_OBJ = se3.from_translation([0.0, 0.0, 0.4])
 
 def grasps(scores: list[float], Ts: np.ndarray | None = None) -> GraspSet:
     n = len(scores)
-    T = np.tile(np.eye(4), (n, 1, 1)) if Ts is None else Ts
-    return GraspSet(
-        obj_id=1, instance=0, Ts_obj_grasp=T, widths_m=np.full(n, 0.06), scores=np.array(scores),
-        base_scores=np.zeros(n), slip_m=np.zeros((n, 4)), slip_rad=np.zeros((n, 4)),
-        reachable=np.ones(n, bool), failures=("",) * n,
-    )  # fmt: skip
+    return plain_grasps(n if Ts is None else Ts, widths_m=np.full(n, 0.06), scores=scores)
 
 
 def black() -> np.ndarray:

@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from begun_sessions import add_drawn, begun
 from plain_meshes import box
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.parts import part
-from realsim.records import CaptureSession, ObjectPose, Scene, SupportPlane, View
+from realsim.records import ObjectPose, Scene, SupportPlane
 from realsim.records.depth_bias import DepthBias
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.review.placing.measured_views import depth_bias_of, usable_views
@@ -120,12 +121,7 @@ def tube_session(folder: Path) -> tuple[SessionStore, ObjectPose]:
     T = se3.from_translation([0.0, 0.0, -TUBE.mesh.bounds[0, 2]])
     table = PlacedMesh(-1, box((1.0, 1.0, 0.02)), se3.from_translation([0.0, 0.0, -0.01]))
     renderer = LabelRenderer([PlacedMesh(0, TUBE.mesh, T), table])
-    session = CaptureSession(name="tube", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder, session)
-    for k, T_cam in enumerate(true_cameras(3)):
-        labels = renderer.render(CAMERA, T_cam)
-        rgb = np.zeros((*labels.ids.shape, 3), np.uint8)
-        store.add_view(View(index=k, T_world_cam=T_cam), rgb, labels.depth_m)
+    store = add_drawn(begun(folder, CAMERA), renderer, true_cameras(3))
     return store, ObjectPose(obj_id=TUBE.obj_id, instance=0, T_world_obj=T)
 
 

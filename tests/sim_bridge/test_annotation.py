@@ -6,18 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from begun_sessions import begun
 from file_trees import annotation_of
 from plain_meshes import box
-from realsim import (
-    CameraIntrinsics,
-    CaptureSession,
-    GraspSet,
-    ObjectModel,
-    ObjectPose,
-    Scene,
-    SupportPlane,
-    View,
-)
+from realsim import CameraIntrinsics, GraspSet, ObjectModel, ObjectPose, Scene, SupportPlane, View
 from realsim.formats.bop import scene as bop
 from realsim.geometry import se3
 from realsim.records.grasps import joined_measure
@@ -26,6 +18,7 @@ from realsim.store import SessionStore
 from realsim_sim_bridge.annotation.annotate import AnnotationConfig, annotate
 from realsim_sim_bridge.annotation.inputs import table_slab
 from refusals import refused
+from tried_grasps import plain_grasps
 
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 TABLE = se3.from_translation([0.5, 0.0, 0.1])
@@ -60,11 +53,9 @@ CAMERAS = {
 def grasp_set(instance: int, obj_id: int, n: int = 6) -> GraspSet:
     rng = np.random.default_rng(instance)
     Ts = se3.from_rt(np.diag([1.0, -1.0, -1.0]), rng.normal(scale=0.01, size=(n, 3)))
-    nan4 = np.full((n, 4), np.nan)
-    return GraspSet(
-        obj_id=obj_id, instance=instance, Ts_obj_grasp=Ts, widths_m=np.full(n, 0.05),
-        scores=np.append(rng.uniform(size=n - 1), np.nan), base_scores=np.zeros(n), slip_m=nan4,
-        slip_rad=nan4, reachable=rng.uniform(size=n) < 0.5, failures=("",) * n,
+    return plain_grasps(
+        Ts, obj_id=obj_id, instance=instance, scores=np.append(rng.uniform(size=n - 1), np.nan),
+        base_scores=np.zeros(n), reachable=rng.uniform(size=n) < 0.5,
     )  # fmt: skip
 
 
@@ -76,8 +67,7 @@ GRASPS = [
 
 def make_session(folder: Path) -> SessionStore:
     """Return a session of three views."""
-    session = CaptureSession(name="boxes", intrinsics=INTRINSICS, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder, session)
+    store = begun(folder, INTRINSICS)
     placed = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in SCENE.objects]
     placed.append(PlacedMesh(-1, table_slab(AnnotationConfig(plane_clearance_m=0.0)), TABLE))
     renderer = LabelRenderer(placed)
@@ -199,8 +189,7 @@ def test_a_rejected_object_leaves_and_takes_its_masks_along(tmp_path: Path) -> N
 
 
 def test_without_cameras_it_says_calibrate_first(tmp_path: Path) -> None:
-    session = CaptureSession(name="raw", intrinsics=INTRINSICS, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(tmp_path / "s", session)
+    store = begun(tmp_path / "s", INTRINSICS)
     store.add_view(View(index=4), np.zeros((120, 160, 3), np.uint8))
     refused(r"view 4.*calibrate first", annotate, store, SCENE, MODELS, GRASPS)
     assert not store.has("scene_gt.json")

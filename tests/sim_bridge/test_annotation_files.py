@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from begun_sessions import add_drawn, begun
 from file_trees import annotation_of
 from realsim import (
     CameraIntrinsics,
-    CaptureSession,
     Mesh,
     ObjectModel,
     ObjectPose,
@@ -59,23 +59,19 @@ SCENE = Scene(
     ),
     plane=SupportPlane(T_world_table=np.eye(4)),
 )  # fmt: skip
-CAMERAS = {
-    0: se3.look_at([0.2, 0.1, 0.4], [0, 0, 0]),
-    1: se3.look_at([-0.1, 0.3, 0.2], [0, 0, 0]),
-    2: se3.look_at([0.1, 0.0, 0.25], [0.17, 0.03, 0]),  # objects leave the picture
-    3: se3.look_at([0.3, 0.0, 0.3], [2.0, 0.0, 0.0]),  # no object at all
-}
+CAMERAS = [
+    se3.look_at([0.2, 0.1, 0.4], [0, 0, 0]),
+    se3.look_at([-0.1, 0.3, 0.2], [0, 0, 0]),
+    se3.look_at([0.1, 0.0, 0.25], [0.17, 0.03, 0]),  # objects leave the picture
+    se3.look_at([0.3, 0.0, 0.3], [2.0, 0.0, 0.0]),  # no object at all
+]
 
 
 def make_session(folder: Path, size: tuple[int, int] | None = None) -> SessionStore:
-    session = CaptureSession(name="boxes", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder, session)
+    store = begun(folder, CAMERA)
     placed = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in SCENE.objects]
     renderer = LabelRenderer([*placed, PlacedMesh(-1, table_slab(ALL), np.eye(4))])
-    for index, T in CAMERAS.items():
-        labels = renderer.render(CAMERA, T)
-        rgb = np.full((120, 160, 3), 90, np.uint8)
-        store.add_view(View(index=index, T_world_cam=T), rgb, labels.depth_m)
+    add_drawn(store, renderer, CAMERAS)
     if size is not None:
         store.set_cameras(replace(CAMERA, width=size[0], height=size[1]), {})
     return store
@@ -142,7 +138,7 @@ def test_object_coordinates_project_to_their_own_pixels(done: SessionStore, view
 def test_bop_files_masks_and_annotations_say_the_same(done: SessionStore) -> None:
     info, coco = done.read_json("scene_gt_info.json"), done.read_json("scene_gt_coco.json")
     found = {(a["image_id"], a["category_id"]): a for a in coco["annotations"]}
-    for view in CAMERAS:
+    for view in range(len(CAMERAS)):
         for k, e in enumerate(part(done, view)["objects"]):
             visible, whole = mask(done, "mask_visib", view, k), mask(done, "mask", view, k)
             assert not np.any(visible & ~whole)
@@ -207,8 +203,7 @@ def test_an_image_of_another_size_is_named_with_both_sizes(tmp_path: Path) -> No
 
 def test_a_camera_inside_an_object_and_pixels_without_a_ray_are_told(tmp_path: Path) -> None:
     folded = replace(CAMERA, distortion=np.array([-0.9, 0.1, 0.0, 0.0, 0.0]))
-    session = CaptureSession(name="odd", intrinsics=folded, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(tmp_path / "s", session)
+    store = begun(tmp_path / "s", folded)
     big = ObjectModel(obj_id=2, name="crate", mesh=box((0.4, 0.4, 0.4)))
     scene = replace(SCENE, objects=(SCENE.objects[0],), plane=None)
     T = scene.objects[0].T_world_obj @ se3.from_translation([0.05, 0.05, 0.05])

@@ -13,6 +13,7 @@ from realsim.rendering.rays import BACKGROUND
 from realsim_sim_bridge.annotation.config import AnnotationConfig
 from realsim_sim_bridge.annotation.frame import frame_files
 from realsim_sim_bridge.annotation.inputs import FrameInputs, FrameView, table_slab
+from tried_grasps import plain_grasps
 
 CAMERA = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
 Depth = Array32
@@ -35,13 +36,10 @@ SCENE = Scene(
 
 def grasps_of_the_book() -> GraspSet:
     """Return a grasp from above in the middle of the book."""
-    nan4 = np.full((1, 4), np.nan)
-    return GraspSet(
-        obj_id=2, instance=2, widths_m=np.array([0.11]), scores=np.ones(1),
-        Ts_obj_grasp=se3.from_rt(np.diag([1.0, -1.0, -1.0]), [0, 0, 0.01])[None],
-        base_scores=np.ones(1), slip_m=nan4, slip_rad=nan4, reachable=np.ones(1, bool),
-        failures=("",),
-    )  # fmt: skip
+    T = se3.from_rt(np.diag([1.0, -1.0, -1.0]), [0, 0, 0.01])
+    return plain_grasps(
+        T[None], obj_id=2, instance=2, widths_m=[0.11], scores=np.ones(1), base_scores=np.ones(1)
+    )
 
 
 def inputs_of() -> FrameInputs:

@@ -22,6 +22,7 @@ from realsim_sim_bridge.annotation.frame_labels import (
     unknown_occluder,
 )
 from realsim_sim_bridge.annotation.unmodelled import object_masks
+from tried_grasps import plain_grasps
 
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 SIDE = 0.05
@@ -29,11 +30,9 @@ SIDE = 0.05
 
 def grasp_set(Ts: Array, width: float = SIDE) -> GraspSet:
     n = len(Ts)
-    nan4 = np.full((n, 4), np.nan)
-    return GraspSet(
-        obj_id=1, instance=0, Ts_obj_grasp=Ts, widths_m=np.full(n, width),
-        scores=np.linspace(0, 1, n), base_scores=np.zeros(n), slip_m=nan4, slip_rad=nan4,
-        reachable=np.arange(n) % 2 == 0, failures=("",) * n,
+    return plain_grasps(
+        Ts, widths_m=np.full(n, width), scores=np.linspace(0, 1, n), base_scores=np.zeros(n),
+        reachable=np.arange(n) % 2 == 0,
     )  # fmt: skip
 
 

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scipy.stats import entropy, spearmanr
 
 from realsim.geometry import se3
-from realsim.records import GraspSet
 from realsim_sim_bridge.school.measure_statistics import (
     LEAST_GRASPS,
     p_hold_entropy_bits,
@@ -22,6 +21,7 @@ from realsim_sim_bridge.school.measure_statistics import (
 from realsim_sim_bridge.school.summary import OUTCOMES, outcomes_of, summarise
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from refusals import refused
+from tried_grasps import plain_grasps
 
 
 def scored_set(rng, n, *, obj_id=1, instance=0, tried=True, **measures):
@@ -35,11 +35,9 @@ def scored_set(rng, n, *, obj_id=1, instance=0, tried=True, **measures):
     base, scores = score_stages(slip_m, slip_rad, np.full(n, tried), ScoreLimits())
     if not tried:
         reachable, slip_m, slip_rad = np.zeros(n, bool), slip_m * np.nan, slip_rad * np.nan
-    return GraspSet(
-        obj_id=obj_id, instance=instance, widths_m=np.full(n, 0.03), scores=scores,
-        Ts_obj_grasp=se3.random_transform(rng, n) if n else np.zeros((0, 4, 4)),
-        base_scores=base, slip_m=slip_m, slip_rad=slip_rad, reachable=reachable,
-        failures=("",) * n, measures=measures,
+    return plain_grasps(
+        se3.random_transform(rng, n) if n else 0, obj_id=obj_id, instance=instance, scores=scores,
+        base_scores=base, slip_m=slip_m, slip_rad=slip_rad, reachable=reachable, measures=measures,
     )  # fmt: skip
 
 
@@ -88,12 +86,10 @@ def by_hand(rows):
     slip = np.full((n, 4), np.nan)
     for row, (_, _, _, stages) in zip(slip, rows, strict=True):
         row[:stages] = 0.001
-    return GraspSet(
-        obj_id=1, instance=0, Ts_obj_grasp=np.tile(np.eye(4), (n, 1, 1)),
-        widths_m=np.zeros(n), scores=np.array([r[2] for r in rows]),
-        base_scores=np.array([r[1] for r in rows]), slip_m=slip, slip_rad=slip,
-        reachable=np.array([r[0] for r in rows]), failures=("",) * n,
-    )  # fmt: skip
+    reachable, base, scores, _ = (np.array(column) for column in zip(*rows, strict=True))
+    return plain_grasps(
+        n, scores=scores, base_scores=base, slip_m=slip, slip_rad=slip, reachable=reachable
+    )
 
 
 def test_each_outcome_is_told_by_base_and_score():

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
-from realsim.records import GraspSet
 from realsim_sim_bridge.school import ScoreLimits, recompute_scores
 from realsim_sim_bridge.slip.score import limits_of, score_paper, score_stages
+from tried_grasps import plain_grasps
 
 NAN, INF = np.nan, np.inf
 TEN = np.radians(10.0)
@@ -84,18 +84,13 @@ def test_scores_lie_in_the_unit_interval_and_never_rise_with_slip():
 
 
 def stored(slip_m, reachable, scores):
-    n = len(slip_m)
-    return GraspSet(
-        obj_id=1,
-        instance=0,
-        Ts_obj_grasp=np.tile(np.eye(4), (n, 1, 1)),
-        widths_m=np.full(n, 0.05),
+    return plain_grasps(
+        len(slip_m),
         scores=scores,
         base_scores=scores,
         slip_m=slip_m,
         slip_rad=np.where(np.isnan(slip_m), NAN, 0.0),
         reachable=reachable,
-        failures=("",) * n,
         parameters={"config": {"score": asdict(ScoreLimits())}},
     )
 

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from begun_sessions import begun
 from bop_scenes import edit
 from file_trees import bytes_of
-from realsim.records import CameraIntrinsics, CaptureSession, View
+from realsim.records import CameraIntrinsics, View
 from realsim.store import SessionStore, atomic
 from realsim.store.manifest import NAME as MANIFEST
 from realsim.store.opening import BEGUN_FILE, RECOVERED, finish_beginning, read_begun
@@ -179,8 +180,7 @@ def test_a_sub_session_is_repaired_too(session: Path) -> None:
 
 
 def test_depth_counts_are_stored_as_they_are(tmp_path: Path) -> None:
-    session = CaptureSession(name="c", intrinsics=CAMERA, views=(), depth_unit_m=2.5e-4)
-    store = SessionStore.create(tmp_path, session)
+    store = begun(tmp_path, CAMERA, unit_m=2.5e-4)
     rgb, counts = images_of(0)
     counts[0, :3] = [0, 1, 65535]
     store.add_view(View(index=0), rgb, depth_counts=counts)
@@ -199,9 +199,8 @@ def test_many_views_are_listed_for_bop_when_the_store_is_closed(
 ) -> None:
     monkeypatch.setattr("realsim.store.session_store.EAGER_VIEWS", 16)
     camera = CameraIntrinsics(width=2, height=2, fx=2, fy=2, cx=0.5, cy=0.5)
-    session = CaptureSession(name="m", intrinsics=camera, views=(), depth_unit_m=1e-4)
     rgb = np.zeros((2, 2, 3), np.uint8)
-    with SessionStore.create(tmp_path, session) as store:
+    with begun(tmp_path, camera) as store:
         for index in range(48):
             store.add_view(View(index=index), rgb)
             listed = len(json.loads((tmp_path / "scene_camera.json").read_text()))
@@ -290,8 +289,7 @@ def test_a_damaged_header_says_how_to_go_on(session: Path) -> None:
         else:
             path.write_text(data)
         refused(r"session\.json.*`realsim check .*/s --repair`", SessionStore.open, session)
-    record = CaptureSession(name="x", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    refused(r"holds views of a session .* --repair", SessionStore.create, session, record)
+    refused(r"holds views of a session .* --repair", begun, session, CAMERA)
     header = json.loads(atomic.json_bytes({"format": "realsim session", "format_version": 99}))
     path.write_text(json.dumps(header))
     said = refused("newer realsim", SessionStore.open, session)
@@ -300,8 +298,7 @@ def test_a_damaged_header_says_how_to_go_on(session: Path) -> None:
 
 @pytest.mark.parametrize("listed", [-1, 0, 20, 10_000])
 def test_a_header_that_a_kill_kept_from_its_name_gets_it_or_goes(tmp_path: Path, listed: int):
-    whole = CaptureSession(name="new", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    SessionStore.create(tmp_path, whole).close()
+    begun(tmp_path, CAMERA, name="new").close()
     header, manifest = tmp_path / "session.json", tmp_path / "manifest.jsonl"
     line = next(x for x in manifest.read_text().splitlines(True) if '"session.json"' in x)
     for path in tmp_path.iterdir():
@@ -387,8 +384,7 @@ def test_a_second_line_of_a_view_is_noted_unless_it_was_retaken(session: Path) -
 
 
 def test_time_that_goes_back_where_a_run_began_is_no_note(tmp_path: Path) -> None:
-    session = CaptureSession(name="t", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(tmp_path, session)
+    store = begun(tmp_path, CAMERA)
     for index, time_s in enumerate((5.0, 6.0, 2.0, 3.0)):
         store.add_view(View(index=index, time_s=time_s), images_of(index)[0])
 

@@ -6,9 +6,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from begun_sessions import begun
 from realsim import store as stores
 from realsim.geometry import se3
-from realsim.records import CameraIntrinsics, CaptureSession
+from realsim.records import CameraIntrinsics
 from realsim.store.trajectories import load_trajectories, save_trajectories
 from refusals import refused
 from tried_grasps import assert_same, attempts_of, tried_set
@@ -28,8 +29,7 @@ def test_attempts_come_back_bit_for_bit(tmp_path_factory, seed):
 
 def test_in_a_session_they_are_listed_with_their_checksum(tmp_path):
     camera = CameraIntrinsics(width=64, height=48, fx=50, fy=50, cx=32, cy=24)
-    session = CaptureSession(name="s", intrinsics=camera, views=(), depth_unit_m=1e-3)
-    store = stores.SessionStore.create(tmp_path, session)
+    store = begun(tmp_path, camera, unit_m=1e-3)
     rng = np.random.default_rng(2)
     s = tried_set(rng, 20)
     t = attempts_of(rng, s)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from begun_sessions import begun, light_things
 from realsim.app.register.files import write_result
 from realsim.app.register.results import CameraChange, Registered, Remark
 from realsim.arrays import Array
@@ -12,7 +13,6 @@ from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import (
     CameraIntrinsics,
-    CaptureSession,
     Mesh,
     ObjectModel,
     ObjectPose,
@@ -86,14 +86,12 @@ def table_session(
         posed: False leaves the cameras' poses out, as of a camera led by hand.
     """
     rng, renderer = np.random.default_rng(seed), table_renderer()
-    session = CaptureSession(name="two objects", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder, session, {"gravity_up_world": [0, 0, 1]})
+    store = begun(folder, CAMERA, {"gravity_up_world": [0, 0, 1]})
     for k, T in enumerate(true_cameras(views, posed=posed)):
         labels = renderer.render(CAMERA, T)
-        rgb = np.where((labels.ids >= 0)[..., None], 200, 90).astype(np.uint8).repeat(3, -1)
         twist = rng.normal(size=6) * np.repeat(sigma, 3)
         claimed = T @ se3.exp(twist) if posed else None
-        store.add_view(View(index=k, T_world_cam=claimed), rgb, labels.depth_m)
+        store.add_view(View(index=k, T_world_cam=claimed), light_things(labels.ids), labels.depth_m)
     save_models(store.folder / "models", models_of())
     return store
 

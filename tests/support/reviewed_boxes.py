@@ -8,21 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from begun_sessions import begun
 from plain_meshes import box
-from realsim import (
-    CameraIntrinsics,
-    CaptureSession,
-    GraspSet,
-    ObjectModel,
-    ObjectPose,
-    Scene,
-    SupportPlane,
-    View,
-)
+from realsim import CameraIntrinsics, GraspSet, ObjectModel, ObjectPose, Scene, SupportPlane, View
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore, save_grasps, save_scene
+from tried_grasps import plain_grasps
 
 INTRINSICS = CameraIntrinsics(
     width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5,
@@ -63,11 +56,10 @@ def grasp_set(obj_id: int, instance: int, n: int = 40) -> GraspSet:
     stages = np.append(np.arange(n - 1) % 5, np.nan) / 4
     words = {0.0: "close: the object slipped 7.5 mm", 0.25: "lift: the object was lost",
              0.5: "oscillate: it turned", 0.75: "pendulum: it turned", 1.0: ""}  # fmt: skip
-    nan4 = np.full((n, 4), np.nan)
-    return GraspSet(
-        obj_id=obj_id, instance=instance, Ts_obj_grasp=Ts, widths_m=rng.uniform(0.02, 0.08, n),
-        scores=np.append(np.linspace(0, 1, n - 1), np.nan), base_scores=stages, slip_m=nan4,
-        slip_rad=nan4, reachable=np.arange(n) % 2 == 0,
+    return plain_grasps(
+        Ts, obj_id=obj_id, instance=instance, widths_m=rng.uniform(0.02, 0.08, n),
+        scores=np.append(np.linspace(0, 1, n - 1), np.nan), base_scores=stages,
+        reachable=np.arange(n) % 2 == 0,
         failures=tuple(words.get(float(s), "no inverse kinematics") for s in stages),
     )  # fmt: skip
 
@@ -91,8 +83,7 @@ def _make(folder: Path, larger: int) -> None:
         width=larger * K.width, height=larger * K.height, fx=larger * K.fx, fy=larger * K.fy,
         cx=larger * (K.cx + 0.5) - 0.5, cy=larger * (K.cy + 0.5) - 0.5, distortion=K.distortion,
     )  # fmt: skip
-    session = CaptureSession(name="boxes", intrinsics=camera, views=(), depth_unit_m=DEPTH_UNIT_M)
-    store = SessionStore.create(folder, session)
+    store = begun(folder, camera, name="boxes", unit_m=DEPTH_UNIT_M)
     table = PlacedMesh(-1, box((1.0, 1.0, 0.02), RED), se3.from_translation([0.5, 0.0, -0.01]))
     placed = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in SCENE.objects]
     renderer = LabelRenderer([*placed, table])

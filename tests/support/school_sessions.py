@@ -6,11 +6,12 @@ import numpy as np
 from click.testing import Result
 
 import typed_commands
+from begun_sessions import begun
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.parts import part
-from realsim.records import CaptureSession, ObjectPose, Scene, SupportPlane
-from realsim.store import SessionStore, save_scene
+from realsim.records import ObjectPose, Scene, SupportPlane
+from realsim.store import save_scene
 from registered_sessions import CAMERA
 
 GRASPS = 5
@@ -54,8 +55,7 @@ def standing(name: str, x: float, angle: float) -> np.ndarray:
 
 def registered(folder: Path) -> Path:
     """Write a registered session of the scene and return its folder."""
-    session = CaptureSession(name="two", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder, session)
+    store = begun(folder, CAMERA)
     save_models(folder / "models", {part(n).obj_id: part(n) for n in NAMES})
     save_scene(store, scene())
     return folder

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from begun_sessions import begun
 from realsim.geometry import se3
-from realsim.records import CameraIntrinsics, CaptureSession, View
+from realsim.records import CameraIntrinsics, View
 from realsim.store import SessionStore
 
 CAMERA = CameraIntrinsics(
@@ -34,15 +35,15 @@ def add(store: SessionStore, index: int, take: int = 0) -> None:
 
 
 def make_whole(folder: Path) -> None:
-    session = CaptureSession(name="whole", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder, session, {"plan_hash": "p" * 64, "camera": "D405 17"})
+    extra = {"plan_hash": "p" * 64, "camera": "D405 17"}
+    store = begun(folder, CAMERA, extra, name="whole")
     store.write_json("plan.json", {"sha256": "p" * 64, "content": {"joints": [[0] * 6] * 8}})
     for index in range(VIEWS):
         add(store, index)
     Ts = se3.random_transform(np.random.default_rng(5), VIEWS)
     store.set_cameras(CAMERA, {k: Ts[k] for k in range(VIEWS)})
     store.write_json("calibration/hand_eye.json", {"a": list(range(50))})
-    inner = SessionStore.create(folder / "calibration/capture", session, {"plan_hash": "q"})
+    inner = begun(folder / "calibration/capture", CAMERA, {"plan_hash": "q"})
     for index in range(3):
         add(inner, index)
 

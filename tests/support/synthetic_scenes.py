@@ -5,23 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from begun_sessions import begun
 from plain_meshes import box
-from realsim import (
-    CameraIntrinsics,
-    CaptureSession,
-    ObjectModel,
-    ObjectPose,
-    Scene,
-    SupportPlane,
-    View,
-)
+from realsim import CameraIntrinsics, ObjectModel, ObjectPose, Scene, SupportPlane, View
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.photo import PhotoRenderer
 from realsim.rendering.rays import PlacedMesh
-from realsim.store import SessionStore, save_scene
+from realsim.store import save_scene
 from realsim_sim_bridge.synthetic.cameras import hemisphere_cameras
 from realsim_sim_bridge.synthetic.scene import SyntheticScene
 
@@ -80,10 +73,7 @@ def cameras(count=3, seed=0):
 def captured_session(folder, count=3, scene=None):
     """Write a session as a robot would have captured it, and register it exactly."""
     scene = two_boxes() if scene is None else scene
-    session = CaptureSession(
-        name="captured", intrinsics=INTRINSICS, views=(), depth_unit_m=DEPTH_UNIT_M
-    )
-    store = SessionStore.create(folder, session, {"camera": "simulated D405"})
+    store = begun(folder, INTRINSICS, {"camera": "simulated D405"}, unit_m=DEPTH_UNIT_M)
     shown = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in scene.objects]
     renderer = PhotoRenderer([*shown, table()])
     rng = np.random.default_rng(5)

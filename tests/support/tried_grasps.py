@@ -36,6 +36,23 @@ def tried_set(rng, n=20, *, obj_id=7, instance=2, measures=tuple(MEASURES)):
     )  # fmt: skip
 
 
+def plain_grasps(Ts_obj_grasp, **known):
+    """Return grasps, or this many at the object's origin, of which only `known` is known.
+
+    They are 5 cm wide, of object 1's instance 0, reachable, and nobody has tried them.
+    """
+    if isinstance(Ts_obj_grasp, int):
+        Ts_obj_grasp = np.tile(np.eye(4), (Ts_obj_grasp, 1, 1))
+    n = len(Ts_obj_grasp)
+    unknown = np.full((n, 4), np.nan)
+    plain = {
+        "obj_id": 1, "instance": 0, "Ts_obj_grasp": Ts_obj_grasp, "widths_m": np.full(n, 0.05),
+        "scores": unknown[:, 0], "base_scores": unknown[:, 0], "slip_m": unknown,
+        "slip_rad": unknown, "reachable": np.ones(n, bool), "failures": ("",) * n,
+    }  # fmt: skip
+    return GraspSet(**(plain | known))
+
+
 def attempts_of(rng, grasps, joints=7):
     """Return attempts at about half of the grasps; one of them has no sample."""
     rows = np.flatnonzero(rng.random(len(grasps)) < 0.5)

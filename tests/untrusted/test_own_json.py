@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import Meta
 
+from begun_sessions import begun
 from realsim import store as stores
 from realsim.arrays import Array
 from realsim.errors import InputError
@@ -19,7 +20,6 @@ from realsim.geometry import se3
 from realsim.records import (
     ArmErrorMap,
     CameraIntrinsics,
-    CaptureSession,
     GraspSet,
     HandEye,
     ObjectPose,
@@ -208,10 +208,7 @@ def test_what_is_no_sound_json_is_refused_as_that_of_others(tmp_path, text):
 
 
 def new_store(folder):
-    session = CaptureSession(
-        name="s", intrinsics=camera(np.random.default_rng(0)), views=(), depth_unit_m=1e-3
-    )
-    return stores.SessionStore.create(folder, session)
+    return begun(folder, camera(np.random.default_rng(0)), unit_m=1e-3)
 
 
 def test_results_live_in_the_session(tmp_path):

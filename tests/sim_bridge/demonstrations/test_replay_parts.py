@@ -9,7 +9,6 @@ import pytest
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
-from realsim.records import GraspSet
 from realsim_sim_bridge.demonstrations.falling import fall
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of, tried_body
 from realsim_sim_bridge.demonstrations.slip_replay import RecordedEngine, replay_grasp
@@ -19,17 +18,13 @@ from realsim_sim_bridge.school.sweep import SweepConfig
 from realsim_sim_bridge.slip.engines import make_engine, settings_of
 from realsim_sim_bridge.slip.world import SlipBody
 from school_scenes import CONFIG, at, model, scene, small_worlds
+from tried_grasps import plain_grasps
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.025
 
 
 def grasps_with(parameters):
-    nothing = np.zeros((0, 4))
-    return GraspSet(
-        obj_id=1, instance=0, Ts_obj_grasp=np.zeros((0, 4, 4)), widths_m=np.zeros(0),
-        scores=np.zeros(0), base_scores=np.zeros(0), slip_m=nothing, slip_rad=nothing,
-        reachable=np.zeros(0, bool), failures=(), parameters=parameters,
-    )  # fmt: skip
+    return plain_grasps(0, parameters=parameters)
 
 
 def box_body(half=0.025, mass=0.1):
