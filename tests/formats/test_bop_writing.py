@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from file_trees import bytes_of
+from labelled_scenes import ChangedScene
 from realsim.errors import InputError
 from realsim.formats.bop.models import load_models
 from realsim.formats.bop.opening import open_labelled_bop, open_labelled_scene
@@ -113,28 +115,16 @@ def test_a_camera_suffix_and_an_onboarding_folder_come_back(tmp_path):
             BopWriteConfig(**wrong)
 
 
-class Moved:
-    """A scene whose objects were put elsewhere."""
-
-    def __init__(self, scene, by):
-        self.scene, self.by = scene, by
-
-    def __getattr__(self, name):
-        return getattr(self.scene, name)
-
-    def frame(self, index):
-        from dataclasses import replace
-
-        frame = self.scene.frame(index)
-        objects = tuple(replace(o, T_cam_obj=self.by @ o.T_cam_obj) for o in frame.objects)
-        return replace(frame, objects=objects)
-
-
 def test_a_pose_that_changed_is_written_and_the_rest_of_its_row_kept(tmp_path):
     write_boxes(tmp_path / "a")
     scene = open_labelled_bop(tmp_path / "a")
     shift = se3.from_translation([0, 0, 0.004])
-    export(Moved(scene, shift), tmp_path / "b")
+
+    def put_elsewhere(frame):
+        moved = tuple(replace(o, T_cam_obj=shift @ o.T_cam_obj) for o in frame.objects)
+        return replace(frame, objects=moved)
+
+    export(ChangedScene(scene, put_elsewhere), tmp_path / "b")
     again = open_labelled_bop(tmp_path / "b")
     for o, p in zip(scene.frame(5).objects, again.frame(5).objects, strict=True):
         np.testing.assert_allclose(

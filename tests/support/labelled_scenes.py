@@ -88,6 +88,19 @@ class SceneInMemory:
         return self
 
 
+class ChangedScene:
+    """A labelled scene whose frames are what `change` makes of them."""
+
+    def __init__(self, scene, change):
+        self.scene, self.change = scene, change
+
+    def __getattr__(self, name):
+        return getattr(self.scene, name)
+
+    def frame(self, index):
+        return self.change(self.scene.frame(index))
+
+
 def labelled_scene(
     folder, indices=range(6), *, intrinsics=INTRINSICS, unit_m=DEPTH_UNIT_M, places=PLACES
 ):

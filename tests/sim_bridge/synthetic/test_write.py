@@ -1,7 +1,11 @@
 """Synthetic views as a session: labels against a fresh render, exact poses, what is refused."""
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -213,3 +217,37 @@ def test_what_cannot_be_rendered_is_refused(tmp_path):
     refused(r"\(N, 4, 4\)", write, tmp_path / "s", Ts=np.eye(4))
     refused("no depth 'laser'", SyntheticConfig, depth="laser")
     refused("no depth camera", SyntheticConfig, profile="d999")
+
+
+# --- several processes, and processes that are killed ---------------------------------------------
+
+SCRIPT = """
+import sys
+from synthetic_scenes import INTRINSICS, cameras, synthetic_scene
+from realsim_sim_bridge.synthetic.write import write_session
+
+if __name__ == "__main__":
+    write_session(
+        sys.argv[1], synthetic_scene(), INTRINSICS, cameras(3), workers=2,
+        progress=lambda done, of: print(done, of, flush=True),
+    )
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_run_of_two_processes_ends_with_the_bytes_of_one_that_was_not(tmp_path):
+    write(tmp_path / "whole", 3, SyntheticConfig())
+    (tmp_path / "script.py").write_text(SCRIPT)
+    support = Path(__file__).parents[2] / "support"
+    for steps in (2, 4):
+        process = subprocess.Popen(
+            [sys.executable, tmp_path / "script.py", tmp_path / "s"],
+            env=os.environ | {"PYTHONPATH": str(support)}, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert process.stdout is not None
+        for _ in range(steps):
+            process.stdout.readline()
+        process.kill()
+        process.wait()
+    write(tmp_path / "s", 3, SyntheticConfig(), workers=2)
+    assert content(tmp_path / "s") == content(tmp_path / "whole")
