@@ -133,6 +133,17 @@ def numbers_of(text: str) -> tuple[int, ...]:
     return tuple(numbers)
 
 
+def ranges_of(numbers: Sequence[int]) -> str:
+    """Return numbers as '1-3, 7'."""
+    ranges: list[list[int]] = []
+    for k in sorted(numbers):
+        if ranges and ranges[-1][1] == k - 1:
+            ranges[-1][1] = k
+        else:
+            ranges.append([k, k])
+    return ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in ranges)
+
+
 def port_in_use(host: str, port: int) -> bool:
     """Return whether another program listens at the port."""
     try:

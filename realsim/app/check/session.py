@@ -11,6 +11,7 @@ from realsim.app.check.checksums import checksum_list
 from realsim.app.check.dataset import is_dataset
 from realsim.app.check.dataset_tables import run_dataset_check
 from realsim.app.console import Console
+from realsim.app.option_values import ranges_of
 from realsim.errors import InputError
 from realsim.store.lock import only_run_in
 from realsim.store.session_check import CheckReport, check_session, is_session
@@ -88,9 +89,9 @@ def _show_tables(report: CheckReport, console: Console) -> None:
         views += f" of {report.planned} planned"
     rows = [["views sound", views]]
     if report.damaged_views:
-        rows.append(["views damaged", _numbers(report.damaged_views)])
+        rows.append(["views damaged", ranges_of(report.damaged_views)])
     if report.planned is not None and report.not_captured:
-        rows.append(["views not captured", _numbers(report.not_captured)])
+        rows.append(["views not captured", ranges_of(report.not_captured)])
     rows.append(["files as written", f"{report.files_ok}"])
     if report.unproven:
         rows.append(["files without checksum", _names(report.unproven)])
@@ -137,14 +138,3 @@ def _unproven(report: CheckReport) -> int:
 def _names(paths: Sequence[str]) -> str:
     """Return how many files, and the names of the first."""
     return f"{len(paths)}: {', '.join(paths[:NAMED])}{', ...' if len(paths) > NAMED else ''}"
-
-
-def _numbers(views: Sequence[int]) -> str:
-    """Return view numbers as ranges: 3, 7-9."""
-    ranges: list[list[int]] = []
-    for k in sorted(views):
-        if ranges and ranges[-1][1] == k - 1:
-            ranges[-1][1] = k
-        else:
-            ranges.append([k, k])
-    return ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in ranges)

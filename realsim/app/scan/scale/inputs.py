@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from realsim import __version__
+from realsim.app.option_values import ranges_of
 from realsim.app.stages import content_key
 from realsim.errors import InputError
 from realsim.formats.bop.models import INFO_FILE
@@ -217,7 +218,7 @@ def usable_views(store: SessionStore, wanted: Sequence[int]) -> list[View]:
     if unknown:
         raise InputError(
             f"{where} has no view {', '.join(map(str, unknown[:8]))}; its views are "
-            f"{_ranges([v.index for v in views]) or 'none'}."
+            f"{ranges_of([v.index for v in views]) or 'none'}."
         )
     asked = [v for v in views if not wanted or v.index in set(wanted)]
     with_depth = [v for v in asked if store.has_depth(v.index)]
@@ -235,25 +236,13 @@ def usable_views(store: SessionStore, wanted: Sequence[int]) -> list[View]:
     if len(posed) < LEAST_VIEWS:
         raise InputError(
             f"{where} has {len(posed)} of {len(asked)} views with depth and a camera pose "
-            f"({_ranges([v.index for v in posed])}); at least {LEAST_VIEWS} from different sides "
+            f"({ranges_of([v.index for v in posed])}); at least {LEAST_VIEWS} from different sides "
             "are needed. Capture more, calibrate the others, or widen --only-views."
         )
     if wanted or len(posed) <= MOST_VIEWS:
         return posed
     pick = np.unique(np.linspace(0, len(posed) - 1, MOST_VIEWS).round().astype(int))
     return [posed[k] for k in pick]
-
-
-def _ranges(numbers: Sequence[int]) -> str:
-    """Return numbers as '1-3, 7'."""
-    text: list[str] = []
-    ordered = sorted(numbers)
-    for k, n in enumerate(ordered):
-        if k and n == ordered[k - 1] + 1:
-            text[-1] = f"{text[-1].partition('-')[0]}-{n}"
-        else:
-            text.append(str(n))
-    return ", ".join(text)
 
 
 def fit_config(store: SessionStore) -> "ScaleConfig":

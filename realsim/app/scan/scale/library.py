@@ -1,57 +1,39 @@
 """A scaled model goes into the library, with the note of who says how large it is."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from realsim.app.console import Console
 from realsim.app.scan.scale.inputs import NamedMesh, ScaleRequest
-from realsim.records import Verdict
 
 if TYPE_CHECKING:
     from realsim.models.library import ModelLibrary
     from realsim.models.library_records import LibraryModel, ScaleNote
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class FoundScale:
-    """What goes into the library: the scale, and what is to be thought of it."""
-
-    scale: float
-    sigma_percent: float
-    verdict: Verdict
-    reasons: tuple[str, ...]
-    session: str
-    how: str
-
-
-def promote(request: ScaleRequest, named: NamedMesh, found: FoundScale, console: Console) -> None:
+def promote(request: ScaleRequest, named: NamedMesh, note: "ScaleNote", console: Console) -> None:
     """Put the scaled model into the library that is named, if its scale may be used.
 
     Raises:
         InputError: the folder is no library, another model has the name, or the mesh is unusable.
     """
     from realsim.models.library import ModelLibrary
-    from realsim.models.library_records import ScaleNote
 
     if request.library is None or named.origin == "model":
         return
-    if found.verdict != "accepted" and not request.accept_doubtful:
+    if note.verdict != "accepted" and not request.accept_doubtful:
         console.warn(
             f"{named.name} was not put into the library {request.library}: its scale "
-            f"is {found.verdict}. --accept-doubtful puts it there all the same."
+            f"is {note.verdict}. --accept-doubtful puts it there all the same."
         )
         return
     library = ModelLibrary.create(request.library)
     for e in library.entries():
         scale = None if e.properties is None else e.properties.scale
-        is_same = e.name == named.name and scale is not None and scale.scale == found.scale
+        is_same = e.name == named.name and scale is not None and scale.scale == note.scale
         if is_same and e.obj_id is not None and not request.overwrite:
             console.say(f"library   {request.library}: {e.name} ({e.obj_id}) is there already")
             return
-    note = ScaleNote(
-        scale=found.scale, sigma_percent=found.sigma_percent, verdict=found.verdict,
-        reasons=found.reasons, session=found.session, how=found.how,
-    )  # fmt: skip
     with console.stage("library", named.name):
         added = _added(library, request, named, note)
     console.say(f"library   {request.library}: {added.model.name} ({added.model.obj_id})")

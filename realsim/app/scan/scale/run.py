@@ -29,10 +29,12 @@ from realsim.app.scan.scale.inputs import (
     read_mesh,
     usable_views,
 )
-from realsim.app.scan.scale.library import FoundScale, promote
+from realsim.app.scan.scale.library import promote
 from realsim.app.scan.scale.show import CALIPER, model_lines, show_fit, show_measured
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.json_values import json_value
+from realsim.models.library_records import ScaleNote
 from realsim.records import Mesh, Verdict, View
 from realsim.scanning.scale.files import ScaleRecord, installed_versions, json_lines
 from realsim.scanning.scale.measured import smallest_box
@@ -80,19 +82,15 @@ def run_scale(request: ScaleRequest, console: Console) -> bool:
         write_file(request.json, result_bytes(record, box_mm))
     console.result(json.loads(result_bytes(record, box_mm)))
     _say_where(request, named, place.folder / MODEL_FILE, fit.verdict, console)
-    found = FoundScale(
+    found = ScaleNote(
         scale=fit.scale, sigma_percent=fit.sigma_percent, verdict=fit.verdict, reasons=fit.reasons,
         session=store.session.name, how="fit and measured" if record.measured else "fit",
     )  # fmt: skip
     promote(request, named, found, console)
-    if is_accepted(fit) and not record.measured:
+    is_accepted = fit.verdict == "accepted"
+    if is_accepted and not record.measured:
         console.say(CALIPER)
-    return is_accepted(fit)
-
-
-def is_accepted(fit: ScaleFit) -> bool:
-    """Whether the scale can be used as it is."""
-    return fit.verdict == "accepted"
+    return is_accepted
 
 
 # --- the fit ----------------------------------------------------------------------------------
@@ -218,7 +216,7 @@ def _by_measurement(request: ScaleRequest, console: Console) -> bool:
         "mesh": {"name": named.name, "where": named.where, "sha256": named.sha256},
         "versions": installed_versions(),
     }  # fmt: skip
-    text = json_lines(_lists(values)).encode("utf-8")
+    text = json_lines(json_value(values)).encode("utf-8")
     if request.out is not None:
         files = {FILE: text} | model_files(named.mesh, scale)  # a run that is ended leaves no model
         if all((request.out / name).exists() for name in files) and not request.overwrite:
@@ -231,19 +229,9 @@ def _by_measurement(request: ScaleRequest, console: Console) -> bool:
     console.result(json.loads(text))
     model = None if request.out is None else request.out / MODEL_FILE
     _say_where(request, named, model, "unchecked", console)
-    found = FoundScale(
+    found = ScaleNote(
         scale=scale, sigma_percent=100 * sigma / scale, verdict="unchecked", reasons=(reason,),
         session="", how="measured",
     )  # fmt: skip
     promote(request, named, found, console)
     return False
-
-
-def _lists(value: Any) -> Any:
-    """Return values with tuples as lists, as JSON has them."""
-    if isinstance(value, dict):
-        items: Any = value.items()  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
-        return {k: _lists(v) for k, v in items}
-    if isinstance(value, list | tuple):
-        return [_lists(v) for v in value]  # pyright: ignore[reportUnknownVariableType]
-    return value

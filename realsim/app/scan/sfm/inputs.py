@@ -9,8 +9,6 @@ from realsim.records import CameraIntrinsics
 from realsim.scanning.sfm.result import Poses
 from realsim.store import SessionStore
 
-POSES: dict[str, Poses] = {"unknown": "unknown", "known": "known", "refined": "refined"}
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SfmRequest:
@@ -20,7 +18,7 @@ class SfmRequest:
     """A session or a folder of photographs."""
     out: Path | None = None
     """Where to write; None: SESSION/scans/sfm, or IMAGES/sfm."""
-    poses: str | None = None
+    poses: Poses | None = None
     """'unknown', 'known', 'refined'; None: 'refined' where the session has poses."""
     intrinsics: Path | None = None
     """File with the intrinsics of a plain folder."""
@@ -101,10 +99,8 @@ def _session_inputs(request: SfmRequest) -> SfmInputs:
         raise InputError("a session has its own camera; --intrinsics is for photographs.")
     views = store.session.views
     posed = sum(v.T_world_cam is not None for v in views)
-    poses: Poses = "refined" if posed == len(views) else "unknown"
+    poses = request.poses or ("refined" if posed == len(views) else "unknown")
     notes: list[str] = []
-    if request.poses is not None:
-        poses = POSES[request.poses]
     if not posed and poses != "unknown":
         raise InputError(
             f"session '{request.images}' is not calibrated: none of its {len(views)} views has a "
