@@ -1,8 +1,9 @@
 """The board views of a session: read them for the calibration, leave its results beside them."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +14,8 @@ from realsim.geometry.dh import DhArm
 from realsim.records import Target
 from realsim.robots.arm import find_arm, known_chains
 from realsim.robots.robot_files import same_name
-from realsim.store import SessionStore
-from realsim.untrusted.own_json import to_json
+from realsim.store import SessionStore, atomic
+from realsim.untrusted.own_json import read_values, to_json
 from realsim_calibration import (
     BoardView,
     DepthBoardView,
@@ -32,25 +33,20 @@ RESULTS = "calibration"
 """Folder of the session that takes report, pictures and exports."""
 
 
-class SessionFiles(Protocol):
-    """Files of a session by their paths inside it: a `SessionStore`, or a session not begun yet."""
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CalibrationFolder:
+    """The folder of a session that is not begun: its files have no list of checksums yet."""
 
-    @property
-    def folder(self) -> Path:
-        """The session's folder."""
-        ...
-
-    def has(self, relative: str) -> bool:
-        """Return whether there is this file."""
-        ...
-
-    def read_json(self, relative: str) -> Any:
-        """Return the values of a JSON file."""
-        ...
+    folder: Path
+    """What will be the session's folder."""
 
     def write_json(self, relative: str, value: Any) -> None:
-        """Write plain JSON values."""
-        ...
+        """Write plain JSON values, whole or not at all."""
+        atomic.write_json(self.folder / relative, value)
+
+
+SessionFiles = SessionStore | CalibrationFolder
+"""Files of a session by their paths inside it."""
 
 
 def read_board_views(
@@ -69,12 +65,12 @@ def read_board_views(
     """
     from realsim_calibration.targets.target_file import target_from_json
 
-    if not store.has(BOARD_FILE):
+    if not (store.folder / BOARD_FILE).is_file():
         raise InputError(
             f"session '{store.folder}' has no {BOARD_FILE}, so the printed target is not known. "
             "`realsim board` writes one beside every sheet: copy it there."
         )
-    target = target_from_json(store.read_json(BOARD_FILE))
+    target = target_from_json(read_values(store.folder / BOARD_FILE))
     views, camera = views_store.session.views, views_store.session.intrinsics
     taken_with = str(views_store.extra.get("arm", ""))
     named = find_arm(arm).chain if arm else None
@@ -160,15 +156,6 @@ def write_results(
 
     folder = store.folder / RESULTS
     (folder / "report" / PAGE_NAME).unlink(missing_ok=True)  # written last: not whole without it
-    depth = _depth_bias(report, seen, store, views_store)
-    write_exports(report, folder / "exports", frames=FrameNames())
-    write_calibration_report(report, folder / "report", images=views_store.rgb, depth_report=depth)
-
-
-def _depth_bias(
-    report: HandEyeReport, seen: Sequence[BoardView], store: SessionFiles, views_store: SessionStore
-) -> DepthBiasReport | None:
-    """Return the depth camera's bias and note it in the session; None where it cannot be told."""
     used = {v.index for v in report.used}
     views = [
         DepthBoardView(
@@ -177,6 +164,15 @@ def _depth_bias(
         for v in seen
         if v.index in used
     ]
+    depth = note_depth_bias(store, views, report)
+    write_exports(report, folder / "exports", frames=FrameNames())
+    write_calibration_report(report, folder / "report", images=views_store.rgb, depth_report=depth)
+
+
+def note_depth_bias(
+    store: SessionFiles, views: Sequence[DepthBoardView], report: HandEyeReport
+) -> DepthBiasReport | None:
+    """Return the depth camera's bias and note it in the session; None where it cannot be told."""
     try:
         found = estimate_depth_bias(
             views, report.target, report.intrinsics, shape=report.board,

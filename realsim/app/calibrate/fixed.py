@@ -2,13 +2,12 @@
 
 from pathlib import Path
 
-from realsim.app.calibrate.board_views import DEPTH_FILE, depth_bias_to_json
+from realsim.app.calibrate.board_views import note_depth_bias
 from realsim.app.console import Console
 from realsim.app.register.results import keep_refined
-from realsim.errors import RealsimError
 from realsim.store import SessionStore
 from realsim.store.cameras import camera_folders, open_cameras
-from realsim_calibration import DepthBoardView, HandEyeReport, estimate_depth_bias
+from realsim_calibration import DepthBoardView
 from realsim_calibration.cameras.results import CamerasReport
 
 
@@ -33,7 +32,9 @@ def place_fixed(
         console.say(f"camera {camera.name} of the session is placed ({len(claimed)} views).")
         if camera.name in seen:
             numbers = [v.index for v in board_views.session.views]
-            _note_depth(store, _with_depth(report, camera.name, seen[camera.name], numbers), own)
+            views = _with_depth(report, camera.name, seen[camera.name], numbers)
+            if views:
+                note_depth_bias(store, views, own)
 
 
 def _with_depth(
@@ -51,18 +52,3 @@ def _with_depth(
         if v.used and v.camera == name and v.board in boards
         and images.has_depth(numbers[v.instant])
     ]  # fmt: skip
-
-
-def _note_depth(store: SessionStore, views: list[DepthBoardView], own: HandEyeReport) -> None:
-    """Note a fixed camera's depth bias, or why it cannot be told; nothing without depth images."""
-    if not views:
-        return
-    try:
-        found = estimate_depth_bias(
-            views, own.target, own.intrinsics, shape=own.board,
-            intrinsics_covariance=own.intrinsics_covariance,
-        )  # fmt: skip
-    except RealsimError as error:
-        store.write_json(DEPTH_FILE, {"known": False, "why": str(error)})
-        return
-    store.write_json(DEPTH_FILE, {"known": True, **depth_bias_to_json(found)})

@@ -1,23 +1,26 @@
 """The hand-eye of a session, also of one with board views only: before the board is taken away."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from realsim.app.calibrate.board_views import SessionFiles, read_board_views, write_results
+from realsim.app.calibrate.board_views import (
+    CalibrationFolder,
+    SessionFiles,
+    read_board_views,
+    write_results,
+)
 from realsim.app.calibrate.clock import mend_views
 from realsim.app.console import Console, Tick
 from realsim.app.stages import BOARD_VIEWS, content_key, note, require_sound
 from realsim.errors import InputError
 from realsim.records import HandEye
 from realsim.store import SessionStore
-from realsim.store.atomic import json_bytes, write_bytes
+from realsim.store.atomic import write_json
 from realsim.store.provenance import is_current
 from realsim.store.results import BOARD_FILE, HAND_EYE_FILE, hand_eye_to_json
 from realsim.store.session_check import is_session
-from realsim.untrusted.own_json import read_values
 
 
 def calibrate_session(
@@ -75,30 +78,6 @@ def place_cameras(store: SessionStore, hand_eye: HandEye) -> None:
     store.set_cameras(hand_eye.intrinsics, keep_refined(store, cameras))
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CalibrationFolder:
-    """The folder of a session that is not begun: its files have no list of checksums yet."""
-
-    folder: Path
-    """What will be the session's folder."""
-
-    def has(self, relative: str) -> bool:
-        """Return whether there is this file."""
-        return (self.folder / relative).is_file()
-
-    def read_json(self, relative: str) -> Any:
-        """Return the values of a JSON file.
-
-        Raises:
-            InputError: it is missing or not JSON.
-        """
-        return read_values(self.folder / relative)
-
-    def write_json(self, relative: str, value: Any) -> None:
-        """Write plain JSON values, whole or not at all."""
-        write_bytes(self.folder / relative, json_bytes(value))
-
-
 def keep_board(folder: Path, board: str) -> None:
     """Write the target of board views that came without one, such as those of a recording.
 
@@ -108,7 +87,7 @@ def keep_board(folder: Path, board: str) -> None:
     from realsim.app.calibrate.folder import target_of
     from realsim_calibration.targets.target_file import target_to_json
 
-    CalibrationFolder(folder=folder).write_json(BOARD_FILE, target_to_json(target_of(board)))
+    write_json(folder / BOARD_FILE, target_to_json(target_of(board)))
 
 
 def has_board_views_only(folder: Path) -> bool:
