@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,26 +34,17 @@ def settle(
     Raises:
         InputError: the scene cannot be read, or an object has no volume.
     """
-    from realsim_sim_bridge.scenes.stable_state import HEADERS, stable_state, stand_rows
-    from realsim_sim_bridge.scenes.stand_picture import stand_picture
-    from realsim_sim_bridge.scenes.table_world import TableWorld
+    from realsim_sim_bridge.scenes.stable_state import HEADERS, stand_rows
 
     with tempfile.TemporaryDirectory() as scratch:
         folder = out or Path(scratch)  # convex parts take minutes: in a folder that stays, once
         inputs = read_inputs(source, None if is_session(source) else folder, request, console)
-        scene = school_scene(inputs, console)
-        scene = with_supports(scene, request.supports)
-        with (
-            console.stage("settle", f"{len(scene.scene.objects)} objects"),
-            TableWorld(scene, cache=inputs.folder / CACHE) as world,
-        ):
-            report = stable_state(world)
-    console.table(f"Objects of {scene.scene.name}", list(HEADERS), stand_rows(report))
+        report, picture = _settled(inputs, console, request.supports)
+    console.table(f"Objects of {inputs.scene.name}", list(HEADERS), stand_rows(report))
     for note in report.notes:
         console.warn(note)
     for a, b, depth_m in report.inside:
         console.say(f"{a} and {b} are {1e3 * depth_m:.1f} mm inside one another.")
-    picture = stand_picture(scene, report)
     if inputs.store is not None and out is None:
         inputs.store.write_bytes(f"reports/{PICTURE}", picture)
         console.say(f"picture   {inputs.folder / 'reports' / PICTURE}")
@@ -71,17 +63,8 @@ def warn_of_falls(inputs: SchoolInputs, console: Console) -> None:
 
     Grasps of an object that jumps or falls are tried all the same: the slip test holds it alone.
     """
-    from realsim_sim_bridge.scenes.stable_state import stable_state
-    from realsim_sim_bridge.scenes.stand_picture import stand_picture
-    from realsim_sim_bridge.scenes.table_world import TableWorld
-
     try:
-        scene = school_scene(inputs, console)
-        with (
-            console.stage("settle", f"{len(scene.scene.objects)} objects"),
-            TableWorld(scene, cache=inputs.folder / CACHE) as world,
-        ):
-            report = stable_state(world)
+        report, picture = _settled(inputs, console)
     except InputError as error:  # an object without volume: the School says so of that object alone
         console.warn(f"whether the objects stand could not be looked at: {error}")
         return
@@ -90,11 +73,31 @@ def warn_of_falls(inputs: SchoolInputs, console: Console) -> None:
             console.warn(f"'{o.name}' does not stand ({o.verdict}): {o.sentence}")
     for a, b, depth_m in report.inside:
         console.warn(f"{a} and {b} are {1e3 * depth_m:.1f} mm inside one another.")
-    picture = stand_picture(scene, report)
     if inputs.store is not None:
         inputs.store.write_bytes(f"reports/{PICTURE}", picture)
     else:
         atomic.write_bytes(inputs.folder / "reports" / PICTURE, picture)
+
+
+def _settled(
+    inputs: SchoolInputs, console: Console, supports: Sequence[Path] = ()
+) -> tuple["StandReport", bytes]:
+    """Return what becomes of a scene, with a picture of it.
+
+    Raises:
+        InputError: no table, no object, one without volume, or no file of a support.
+    """
+    from realsim_sim_bridge.scenes.stable_state import stable_state
+    from realsim_sim_bridge.scenes.stand_picture import stand_picture
+    from realsim_sim_bridge.scenes.table_world import TableWorld
+
+    scene = with_supports(school_scene(inputs, console), supports)
+    with (
+        console.stage("settle", f"{len(scene.scene.objects)} objects"),
+        TableWorld(scene, cache=inputs.folder / CACHE) as world,
+    ):
+        report = stable_state(world)
+    return report, stand_picture(scene, report)
 
 
 def school_scene(inputs: SchoolInputs, console: Console) -> "SchoolScene":
@@ -103,8 +106,6 @@ def school_scene(inputs: SchoolInputs, console: Console) -> "SchoolScene":
     Raises:
         InputError: no table, no object, or one without volume.
     """
-    from dataclasses import replace
-
     from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, known_solids
 
     kept = tuple(o for o in inputs.scene.objects if o.verdict != "rejected")
@@ -128,8 +129,6 @@ def with_supports(scene: "SchoolScene", urdfs: Sequence[Path]) -> "SchoolScene":
     Raises:
         InputError: a file does not exist.
     """
-    from dataclasses import replace
-
     from realsim_sim_bridge.scenes.school_scene import Support
 
     plane = scene.scene.plane
