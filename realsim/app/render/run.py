@@ -1,10 +1,9 @@
 """`realsim render`: from a registered session to synthetic views, their figures and pictures."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from realsim.app.console import Console, Tick
+from realsim.app.console import Console
 from realsim.app.render.compare import (
     PAGE_FILE,
     SHEET_FILE,
@@ -18,7 +17,7 @@ from realsim.app.render.request import RenderRequest, WantedViews, wanted_views
 from realsim.app.render.scene import TwinScene, require_shown, twin_scene
 from realsim.errors import InputError
 from realsim.images import image_size
-from realsim.records import GraspSet, ObjectModel, Scene
+from realsim.records import ObjectModel, Scene
 from realsim.store import SessionStore
 from realsim.store.session_store import rgb_path
 from realsim_sim_bridge.synthetic.claim import require_claimable
@@ -60,9 +59,9 @@ def run_render(session: Path, request: RenderRequest, console: Console) -> Rende
     """
     from threadpoolctl import threadpool_limits
 
-    from realsim.app.stages import judged_scene, open_session, require_sound, session_models
+    from realsim.app.stages import judged_scene, note, open_session, require_sound, session_models
     from realsim.rendering.overlay import save_png
-    from realsim.store import load_grasps
+    from realsim.store import load_grasps, provenance
 
     store = open_session(session)
     scene = judged_scene(store)
@@ -78,7 +77,11 @@ def run_render(session: Path, request: RenderRequest, console: Console) -> Rende
         with console.stage("light and table", "from the photographs"):
             look = twin_scene(store, scene, models, request)
         with console.stage("render", f"{len(wanted.Ts_world_cam)} views") as tick:
-            summary = _written(store, folder, look, wanted, request, grasps, tick)
+            summary = write_session(
+                folder, look.synthetic, wanted.intrinsics, wanted.Ts_world_cam,
+                request.config(store), request.seed, grasps, tick, request.where,
+                models_from=store.folder / "models",
+            )  # fmt: skip
         twin = SessionStore.open(folder)
         figures = None
         if wanted.real is not None:
@@ -91,31 +94,12 @@ def run_render(session: Path, request: RenderRequest, console: Console) -> Rende
             look=look, real=wanted.real, sheet=twin.path(SHEET_FILE), page=twin.path(PAGE_FILE),
         )  # fmt: skip
         write_page(outcome)
-    from realsim.app.stages import note
-    from realsim.store import provenance
-
     read = ("rgb/*", "registration/scene.json", "models/*", "review/journal.jsonl")
     note(
         twin, "render", console, request=request, config=request.config(store),
         inputs=provenance.inputs_of(store, read),
     )  # fmt: skip
     return outcome
-
-
-def _written(
-    store: SessionStore,
-    folder: Path,
-    look: TwinScene,
-    wanted: WantedViews,
-    request: RenderRequest,
-    grasps: Sequence[GraspSet],
-    tick: Tick,
-) -> SyntheticSummary:
-    """Render and label the views in a folder of their own."""
-    return write_session(
-        folder, look.synthetic, wanted.intrinsics, wanted.Ts_world_cam, request.config(store),
-        request.seed, grasps, tick, request.where, models_from=store.folder / "models",
-    )  # fmt: skip
 
 
 def _require_sizes(store: SessionStore, wanted: WantedViews) -> None:

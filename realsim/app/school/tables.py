@@ -49,6 +49,7 @@ def school_table(sets: Sequence[GraspSet], models: Names) -> tuple[list[str], Ro
 
 def _figures(sets: Sequence[GraspSet]) -> list[str]:
     """Return the figures of a row of the school's table."""
+    from realsim_sim_bridge.school.cross_check import agreement_of
     from realsim_sim_bridge.school.measure_statistics import p_hold_spread
 
     spread = p_hold_spread(sets)
@@ -56,7 +57,7 @@ def _figures(sets: Sequence[GraspSet]) -> list[str]:
     passed = [int(np.sum(base >= (k + 1) / len(STAGES))) for k in range(len(STAGES))]
     scores = _joined(sets, lambda s: s.scores)
     margins = _joined(sets, lambda s: s.measures.get("margin", np.zeros(0)))
-    held, same = agreement_counts(sets)
+    engines = agreement_of(sets)
     return [
         str(sum(len(s) for s in sets)),
         str(sum(int(s.reachable.sum()) for s in sets)),
@@ -65,7 +66,7 @@ def _figures(sets: Sequence[GraspSet]) -> list[str]:
         _mean(scores),
         "-" if spread is None else f"{spread.mean:.2f}",
         _mean(margins),
-        f"{100 * same / held:.0f}" if held else "-",
+        f"{100 * engines.agree / engines.count:.0f}" if engines.count else "-",
     ]
 
 
@@ -78,14 +79,6 @@ def _mean(values: Array) -> str:
     """Return the mean of what was measured, or a dash."""
     known = values[~np.isnan(values)]
     return f"{known.mean():.2f}" if len(known) else "-"
-
-
-def agreement_counts(sets: Sequence[GraspSet]) -> tuple[int, int]:
-    """Return how many grasps two engines tried, and of how many both say the same label."""
-    from realsim_sim_bridge.school.cross_check import agreement_of
-
-    found = agreement_of(sets)
-    return found.count, found.agree
 
 
 def filter_rows(sets: Sequence[GraspSet], models: Names) -> Rows:
