@@ -33,19 +33,10 @@ from realsim.store import SessionStore
 from realsim.store.atomic import write_bytes, write_text
 from realsim.store.cameras import open_cameras
 from realsim_calibration import calibrate_intrinsics, estimate_board_pose, prove_reading
+from realsim_calibration.cameras import page
 from realsim_calibration.cameras.calibrate import calibrate_cameras
 from realsim_calibration.cameras.faults import FEW_VIEWS
 from realsim_calibration.cameras.files import document, write_cameras
-from realsim_calibration.cameras.page import (
-    ODD_HEADER,
-    PAGE,
-    PAIR_HEADER,
-    camera_header,
-    camera_rows,
-    cameras_page,
-    odd_rows,
-    pair_rows,
-)
 from realsim_calibration.cameras.results import CamerasReport
 from realsim_calibration.cameras.rig import Instant, Rig, RigBoard, RigCamera, Sighting
 from realsim_calibration.faults.diagnosis import ReadingProof
@@ -307,8 +298,8 @@ def write_files(report: CamerasReport, out: Path) -> list[Path]:
     """Write all files, and last the page, which tells that all are there; return it first."""
     from realsim_calibration.exports import FrameNames, write_exports
 
-    (out / PAGE).unlink(missing_ok=True)
-    files = [out / PAGE, write_cameras(report, out / CAMERAS_FILE)]
+    (out / page.PAGE).unlink(missing_ok=True)
+    files = [out / page.PAGE, write_cameras(report, out / CAMERAS_FILE)]
     for camera, own in zip(report.rig.cameras, report.cameras, strict=True):
         moved = any(
             rig_board.target is own.target and rig_board.place == "hand"
@@ -319,7 +310,7 @@ def write_files(report: CamerasReport, out: Path) -> list[Path]:
             # The board does not hang on the hand: what the files call the hand is the base.
             names = replace(names, hand=names.robot_base)
         files += write_exports(own, out / camera.name / "exports", frames=names)
-    write_bytes(out / PAGE, cameras_page(report).encode())
+    write_bytes(out / page.PAGE, page.cameras_page(report).encode())
     return files
 
 
@@ -331,12 +322,12 @@ def _told(report: CamerasReport, files: list[Path], console: Console) -> bool:
             console.warn(
                 f"'{old}' is of an earlier run: camera '{old.parent.name}' is not in this one."
             )
-    console.table("Cameras", camera_header(report), camera_rows(report))
+    console.table("Cameras", page.camera_header(report), page.camera_rows(report))
     if report.pairs:
-        console.table("Pairs", PAIR_HEADER, pair_rows(report))
-    odd = odd_rows(report)
+        console.table("Pairs", page.PAIR_HEADER, page.pair_rows(report))
+    odd = page.odd_rows(report)
     if odd:
-        console.table("Views that disagree", ODD_HEADER, odd)
+        console.table("Views that disagree", page.ODD_HEADER, odd)
     show_checks(report.all_checks, console)
     console.say(f"report: {files[0]}")
     console.say(f"{len(files) - 1} files for programs beside it, a folder for each camera")

@@ -4,13 +4,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from realsim.app.calibrate.show import (
-    report_document,
-    show_hand_eye,
-    show_next_views,
-    show_report,
-    warn_of_far_views,
-)
+from realsim.app.calibrate import show
 from realsim.app.console import Console
 from realsim.errors import InputError
 
@@ -103,11 +97,11 @@ def _run(source: Path, console: Console, *, live: bool, **options: Any) -> bool:
     from realsim.app.calibrate.folder import calibrate_folder
 
     result, files = calibrate_folder(request, console)
-    show_report(result.hand_eye, result.checks, console)
-    show_next_views(result.hand_eye, console)
+    show.show_report(result.hand_eye, result.checks, console)
+    show.show_next_views(result.hand_eye, console)
     console.say(f"report: {files[0]}")
     console.say(f"for ROS, URDF, OpenCV and NumPy: {request.out / 'exports'}")
-    console.result(report_document(result.hand_eye, result.checks, files))
+    console.result(show.report_document(result.hand_eye, result.checks, files))
     return not any(c.verdict == "bad" for c in result.checks)
 
 
@@ -145,8 +139,8 @@ def _run_session(source: Path, console: Console, arm: str, clock: str) -> bool:
     else:
         store = open_session(source)
         hand_eye = calibrate_session(store, console, arm, clock)
-        warn_of_far_views(hand_eye, store.session.views, console)
-    show_hand_eye(hand_eye, console)
+        show.warn_of_far_views(hand_eye, store.session.views, console)
+    show.show_hand_eye(hand_eye, console)
     console.say(f"report and pictures: {source / 'calibration' / 'report'}")
     if board_only:
         console.say(

@@ -45,20 +45,11 @@ def generate_command(
 
     Exit codes: 0 done, 1 a scene could not be made, 2 bad input.
     """
+    from realsim.app.generate import tables
     from realsim.app.generate.page import PAGE_FILE, SHEET_FILE, write_page, write_sheet
     from realsim.app.generate.run import generate
-    from realsim.app.generate.tables import (
-        dataset_of,
-        finished_layouts,
-        kept_dataset,
-        notes_of,
-        show,
-        summary_of,
-        tables_of,
-        write_dataset,
-    )
     from realsim.app.stages import note
-    from realsim.store.atomic import storing
+    from realsim.store.atomic import storing, write_json
 
     request = _request(**options)
     if options["pools"] and not options["keep_size"]:
@@ -67,20 +58,22 @@ def generate_command(
             "their own; --keep-size --unit mm keeps those of meshes in millimetres"
         )
     outcome = generate(out, scenes, request, where, console)
-    layouts = finished_layouts(out, scenes, request)
+    layouts = tables.finished_layouts(out, scenes, request)
     sheet, page = out / SHEET_FILE, out / PAGE_FILE
-    dataset = kept_dataset(out, request, layouts) if page.is_file() and not outcome.made else None
+    dataset = (
+        tables.kept_dataset(out, request, layouts) if page.is_file() and not outcome.made else None
+    )
     if dataset is None:
-        dataset = dataset_of(out, request, layouts)
+        dataset = tables.dataset_of(out, request, layouts)
         with storing(out, "the data set's tables and pictures"):
             sheet = write_sheet(out, layouts, request.views.count)
             page = write_page(
-                out, layouts, request.views.count, tables_of(out, dataset), summary_of(dataset),
-                notes_of(dataset, outcome),
+                out, layouts, request.views.count, tables.tables_of(out, dataset),
+                tables.summary_of(dataset), tables.notes_of(dataset, outcome),
             )  # fmt: skip
-            write_dataset(out, dataset)
+            write_json(out / tables.DATASET_FILE, dataset)
     note(out, "generate", console, request={"scenes": scenes}, config=request.told)
-    show(out, dataset, outcome, console)
+    tables.show(out, dataset, outcome, console)
     if sheet is not None:
         console.say(f"pictures  {sheet}")
         console.say(f"page      {page}")

@@ -11,7 +11,7 @@ from realsim.app.generate.request import GenerateRequest
 from realsim.app.generate.run import GenerateOutcome
 from realsim.app.generate.scene import is_finished, load_layout, stored_costs
 from realsim.errors import InputError
-from realsim.store import atomic, provenance
+from realsim.store import provenance
 from realsim.untrusted.own_json import read_object
 from realsim_sim_bridge.table_scenes.sample import Layout
 from realsim_sim_bridge.table_scenes.scene import scene_name
@@ -241,8 +241,3 @@ def show(out: Path, dataset: dict[str, Any], outcome: GenerateOutcome, console: 
 
 def _percent(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.0f} %"
-
-
-def write_dataset(out: Path, dataset: dict[str, Any]) -> None:
-    """Write dataset.json."""
-    atomic.write_json(out / DATASET_FILE, dataset)

@@ -19,26 +19,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from realsim.app.register.results import (
-    CAMERAS_FILE,
-    FOLDER,
-    FORMAT_VERSION,
-    NEXT_FILE,
-    REPORT_FILE,
-    SCENE_FILE,
-    SINGLE_FILE,
-    STAGE_FILE,
-    TABLE_FILE,
-    VIEWS_FILE,
-    CameraChange,
-    Json,
-    Registered,
-    Remark,
-    cameras_from_json,
-    cameras_now,
-    is_same_cameras,
-    poses_from_json,
-)
+from realsim.app.register import results
+from realsim.app.register.results import CameraChange, Json, Registered, Remark
 from realsim.app.register.uncertainty import sigmas
 from realsim.arrays import Array
 from realsim.geometry import se3
@@ -63,14 +45,14 @@ def documents(
         "findings": [{"view": r.view, "kind": r.kind, "words": r.words} for r in result.remarks],
     }
     return {
-        CAMERAS_FILE: _cameras_to_json(result.cameras),
-        VIEWS_FILE: _seen_to_json(result, models),
-        TABLE_FILE: _table_to_json(result.scene, models),
-        f"{FOLDER}/scene_gt.json": _bop_objects(result),
-        f"{FOLDER}/scene_camera.json": _bop_cameras(result, store),
-        SINGLE_FILE: to_json(result.single_view),
-        REPORT_FILE: json_value(_without_costs(report)),
-        SCENE_FILE: to_json(result.scene),
+        results.CAMERAS_FILE: _cameras_to_json(result.cameras),
+        results.VIEWS_FILE: _seen_to_json(result, models),
+        results.TABLE_FILE: _table_to_json(result.scene, models),
+        f"{results.FOLDER}/scene_gt.json": _bop_objects(result),
+        f"{results.FOLDER}/scene_camera.json": _bop_cameras(result, store),
+        results.SINGLE_FILE: to_json(result.single_view),
+        results.REPORT_FILE: json_value(_without_costs(report)),
+        results.SCENE_FILE: to_json(result.scene),
     }
 
 
@@ -98,7 +80,7 @@ def costs_of(report: Json) -> list[Json]:
 def _cameras_to_json(cameras: CameraChange) -> Json:
     """Return the cameras before and after."""
     return {
-        "format_version": FORMAT_VERSION,
+        "format_version": results.FORMAT_VERSION,
         "claimed": _poses_to_json(cameras.claimed),
         "refined": _poses_to_json(cameras.refined),
     }
@@ -126,7 +108,7 @@ def _seen_to_json(result: Registered, models: Mapping[int, ObjectModel]) -> Json
             }
         views[str(index)] = rows
     return {
-        "format_version": FORMAT_VERSION,
+        "format_version": results.FORMAT_VERSION,
         "covariance_of": "right perturbation of T_cam_obj, rotation first [rad, m]",
         "views": views,
     }
@@ -147,7 +129,7 @@ def _table_to_json(scene: Scene, models: Mapping[int, ObjectModel]) -> Json:
         name = models[o.obj_id].name if o.obj_id in models else ""
         rows.append({"name": name} | row | {"T_table_obj": to_json(T)})
     return {
-        "format_version": FORMAT_VERSION,
+        "format_version": results.FORMAT_VERSION,
         "name": scene.name,
         "frame": "world" if plane is None else "table",
         "T_world_table": to_json(T_world_table),
@@ -215,14 +197,14 @@ def write_result(
         models: obj_id -> model, for the names.
         pictures: path -> bytes of pictures and page.
     """
-    before = cameras_now(store)
+    before = results.cameras_now(store)
     value = {"before": _poses_to_json(before), "files": documents(result, store, models)}
-    store.remove(STAGE_FILE)  # from here on the old result is not known to be whole
-    store.write_bytes(NEXT_FILE, atomic.json_bytes(value, indent=None))
+    store.remove(results.STAGE_FILE)  # from here on the old result is not known to be whole
+    store.write_bytes(results.NEXT_FILE, atomic.json_bytes(value, indent=None))
     finish_interrupted(store)
     cameras = open_cameras(store) if result.fixed else {}
     for name, change in result.fixed.items():
-        cameras[name].write_json(CAMERAS_FILE, _cameras_to_json(change))
+        cameras[name].write_json(results.CAMERAS_FILE, _cameras_to_json(change))
         cameras[name].set_cameras(cameras[name].session.intrinsics, change.session)
     for path, data in pictures.items():
         store.write_bytes(path, data)
@@ -231,7 +213,7 @@ def write_result(
 def write_claims(store: SessionStore, claimed: Mapping[int, Array]) -> None:
     """Give a session without cameras those that were found for it, before any refinement."""
     change = CameraChange(claimed=dict(claimed), refined={})
-    store.write_json(CAMERAS_FILE, _cameras_to_json(change))
+    store.write_json(results.CAMERAS_FILE, _cameras_to_json(change))
     store.set_cameras(store.session.intrinsics, claimed)
 
 
@@ -240,23 +222,23 @@ def finish_interrupted(store: SessionStore) -> bool:
 
     Not where the cameras have been calibrated anew since: the result is of the old ones.
     """
-    if not store.has(NEXT_FILE):
+    if not store.has(results.NEXT_FILE):
         return False
-    value = store.read_json(NEXT_FILE)
+    value = store.read_json(results.NEXT_FILE)
     files: Json = value["files"]
-    change = cameras_from_json(files[CAMERAS_FILE])
-    now = cameras_now(store)
+    change = results.cameras_from_json(files[results.CAMERAS_FILE])
+    now = results.cameras_now(store)
     known = any(
-        is_same_cameras(now, cameras)
-        for cameras in (poses_from_json(value["before"]), change.session)
+        results.is_same_cameras(now, cameras)
+        for cameras in (results.poses_from_json(value["before"]), change.session)
     )
     if known:
         # The order is that of trust: the scene comes last, when its cameras are in place.
         for path, content in files.items():
-            if path == SCENE_FILE:
+            if path == results.SCENE_FILE:
                 store.set_cameras(store.session.intrinsics, change.session)
             # On one line: covariances, a number a line, would be a hundred thousand lines.
-            indent = None if path in (VIEWS_FILE, f"{FOLDER}/scene_gt.json") else 1
+            indent = None if path in (results.VIEWS_FILE, f"{results.FOLDER}/scene_gt.json") else 1
             store.write_bytes(path, atomic.json_bytes(content, indent=indent))
-    store.remove(NEXT_FILE)
+    store.remove(results.NEXT_FILE)
     return known

@@ -2,23 +2,9 @@
 
 from collections.abc import Mapping
 
+from realsim.app.register import tables
 from realsim.app.register.pictures import GAIN, MAP, OVERLAY, RESIDUALS
 from realsim.app.register.results import Registered
-from realsim.app.register.tables import (
-    MISSING_HEADER,
-    OBJECT_HEADER,
-    VIEW_HEADER,
-    camera_line,
-    check_rows,
-    depth_line,
-    missing_rows,
-    object_rows,
-    odometry_line,
-    places_line,
-    summary_line,
-    table_line,
-    view_rows,
-)
 from realsim.pages import VERDICT_KIND, Cell, Page
 from realsim.records import ObjectModel
 from realsim.store import SessionStore
@@ -63,27 +49,30 @@ def page_bytes(
         title=f"Registration of {result.scene.name}",
         about=f"{taken} of {n} views, method {_method(result)}",
     )
-    page.section("Objects", f"{summary_line(result)}. {table_line(result)} {places_line(result)}")
+    page.section(
+        "Objects",
+        f"{tables.summary_line(result)}. {tables.table_line(result)} {tables.places_line(result)}",
+    )
     if result.scene.objects:
         rows: list[list[object]] = [
             [name, Cell(verdict, kind=VERDICT_KIND[verdict]), *rest]
-            for name, verdict, *rest in object_rows(result, models)
+            for name, verdict, *rest in tables.object_rows(result, models)
         ]
-        page.table(OBJECT_HEADER, rows)
+        page.table(tables.OBJECT_HEADER, rows)
     if result.not_placed:
         page.section("Not placed")
-        page.table(MISSING_HEADER, missing_rows(result, models))
+        page.table(tables.MISSING_HEADER, tables.missing_rows(result, models))
     if result.remarks:
         page.section("Views and scene")
-        page.table(VIEW_HEADER, view_rows(result))
-    lines = (camera_line(result), depth_line(result), odometry_line(result))
+        page.table(tables.VIEW_HEADER, tables.view_rows(result))
+    lines = (tables.camera_line(result), tables.depth_line(result), tables.odometry_line(result))
     page.section("Cameras", " ".join(t for t in lines if t))
     for file, (title, caption) in CAPTIONS.items():
         if file in pictures:
             page.section(title)
             page.picture(pictures[file], caption)
     page.section("Checks without ground truth")
-    page.table(*check_rows(result.scene.objects, models))
+    page.table(*tables.check_rows(result.scene.objects, models))
     return page.encode()
 
 

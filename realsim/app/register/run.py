@@ -6,31 +6,12 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from realsim.app.console import Console
+from realsim.app.register import from_review, results
 from realsim.app.register.colour import colour_remark
 from realsim.app.register.config import RegisterRequest
 from realsim.app.register.files import costs_of, finish_interrupted, remark_of, write_result
-from realsim.app.register.from_review import (
-    REVIEW_FILE,
-    instances_ever,
-    is_precious,
-    keep_earlier,
-    moved_since_accepted,
-    review_starts,
-    stayed,
-)
 from realsim.app.register.inputs import RegisterInputs, read_inputs
-from realsim.app.register.results import (
-    PAGE_FILE,
-    PICTURES,
-    SCENE_FILE,
-    CameraChange,
-    Registered,
-    Remark,
-    cameras_now,
-    is_same_cameras,
-    load_cameras,
-    load_registered,
-)
+from realsim.app.register.results import CameraChange, Registered, Remark
 from realsim.app.reviewed import damage_words, review_of, stray_words
 from realsim.app.stages import content_key, note, require_sound, take_models
 from realsim.arrays import Array
@@ -84,12 +65,12 @@ def run_register(
     with console.stage("register", "cameras" if request.hand_held else "inputs") as tick:
         inputs = read_inputs(store, request, tick)
     key = inputs.key if amend is None else content_key(inputs.key, "amended")
-    if is_current(store, STAGE, key) and store.has(SCENE_FILE):
+    if is_current(store, STAGE, key) and store.has(results.SCENE_FILE):
         return _as_it_was(store)
-    starts = review_starts(store, None) if request.from_review else None
+    starts = from_review.review_starts(store, None) if request.from_review else None
     result, told = _registered(store, console, request, inputs), list[str]()
     if starts is not None:
-        result, told = stayed(store, starts, result)
+        result, told = from_review.stayed(store, starts, result)
         told = [*starts.words, *told]
     result = _with_review(store, inputs, told, result)
     models = inputs.models
@@ -102,14 +83,14 @@ def run_register(
             console.say(f"models {', '.join(map(str, copied))} copied from {request.library}")
     with console.stage("register", "pictures and page"):
         pictures = _pictures(store, result, models)
-        kept = keep_earlier(store) if is_precious(store) else None
+        kept = from_review.keep_earlier(store) if from_review.is_precious(store) else None
         if kept is not None:
             console.say(f"the scene that was there stays in {kept}")
         write_result(store, result, models, pictures)
         if starts is not None:
-            store.write_json(REVIEW_FILE, starts.to_json())
+            store.write_json(from_review.REVIEW_FILE, starts.to_json())
         else:
-            store.remove(REVIEW_FILE)
+            store.remove(from_review.REVIEW_FILE)
     note(
         store, STAGE, console, request=asdict(request) | {"amended": amend is not None},
         config=inputs.settings(), inputs=READ, key=key, more_times=costs_of(result.report),
@@ -121,16 +102,16 @@ def _with_review(
     store: SessionStore, inputs: RegisterInputs, told: Sequence[str], result: Registered
 ) -> Registered:
     """Return the result with what came of the review, and what it means for its decisions."""
+    state = review_of(store)
     remarks = [Remark(view=None, kind="review", words=w) for w in told]
     remarks += [
         Remark(view=None, kind="review", words=(
             f"instance {placed.instance} was accepted by {entry.reviewer}, {mm:.2g} mm and "
             f"{deg:.2g} deg from here: that decision counts no longer, look at it again."
         ))
-        for placed, entry, mm, deg in moved_since_accepted(result.scene.objects, review_of(store))
+        for placed, entry, mm, deg in from_review.moved_since_accepted(result.scene.objects, state)
     ]  # fmt: skip
-    state = review_of(store)
-    instances = instances_ever(store) | {o.instance for o in result.scene.objects}
+    instances = from_review.instances_ever(store) | {o.instance for o in result.scene.objects}
     views = {v.index for v in store.session.views}
     models = {int(p.stem[4:]) for p in store.path("models").glob("obj_[0-9]*.*")}
     strays = stray_words(state, instances, views, models | set(inputs.models))
@@ -142,10 +123,12 @@ def _with_review(
 
 def _as_it_was(store: SessionStore) -> Registered:
     """Return the registration that is there, its cameras in place."""
-    record = load_cameras(store)
-    if record is not None and not is_same_cameras(cameras_now(store), record.session):
+    record = results.load_cameras(store)
+    if record is not None and not results.is_same_cameras(
+        results.cameras_now(store), record.session
+    ):
         store.set_cameras(store.session.intrinsics, record.session)
-    return load_registered(store)
+    return results.load_registered(store)
 
 
 def _registered(
@@ -267,5 +250,5 @@ def _pictures(
     from realsim.app.register.pictures import draw_pictures
 
     pictures = draw_pictures(store, result, models)
-    named = {f"{PICTURES}/{name}": data for name, data in pictures.items()}
-    return named | {PAGE_FILE: page_bytes(store, result, models, pictures)}
+    named = {f"{results.PICTURES}/{name}": data for name, data in pictures.items()}
+    return named | {results.PAGE_FILE: page_bytes(store, result, models, pictures)}

@@ -7,21 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from realsim.app.register import tables
 from realsim.app.register.results import Registered, is_same_pose, load_registered, stand_alone
-from realsim.app.register.tables import (
-    MISSING_HEADER,
-    VIEW_HEADER,
-    camera_line,
-    check_rows,
-    depth_line,
-    missing_rows,
-    named,
-    odometry_line,
-    places_line,
-    table_line,
-    view_rows,
-    worst_first,
-)
 from realsim.app.register.uncertainty import sigmas
 from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count
@@ -73,7 +60,7 @@ def registration_section(section: Section, store: SessionStore, state: ReviewSta
     scene, models = judged_scene(store), session_models(store)
     stored = load_registered(store) if store.has("registration/report.json") else None
     result = stand_alone(scene) if stored is None else replace(stored, scene=scene)
-    section.objects = [_object(o, models, state, result) for o in worst_first(result)]
+    section.objects = [_object(o, models, state, result) for o in tables.worst_first(result)]
     _figures(section, result)
     verdicts = [o.verdict for o in scene.objects]
     told = [f"{verdicts.count(v)} {v}" for v in VERDICT_KIND if v in verdicts]
@@ -85,7 +72,7 @@ def registration_section(section: Section, store: SessionStore, state: ReviewSta
         _object_table(section)
         drawn(section, "the plots", lambda: _plots(section, result))
     if result.not_placed:
-        section.page.table(MISSING_HEADER, missing_rows(result, models))
+        section.page.table(tables.MISSING_HEADER, tables.missing_rows(result, models))
     _views(section, store, result, state)
     drawn(section, "the pictures", lambda: _pictures(section, store))
     _check_table(section, scene.objects, models)
@@ -93,13 +80,13 @@ def registration_section(section: Section, store: SessionStore, state: ReviewSta
 
 def _lines(result: Registered) -> list[str]:
     if not result.report:
-        return [table_line(result)]
+        return [tables.table_line(result)]
     return [
-        table_line(result),
-        camera_line(result),
-        depth_line(result),
-        odometry_line(result),
-        places_line(result),
+        tables.table_line(result),
+        tables.camera_line(result),
+        tables.depth_line(result),
+        tables.odometry_line(result),
+        tables.places_line(result),
     ]
 
 
@@ -203,7 +190,7 @@ def _findings(section: Section, result: Registered, models: Mapping[int, ObjectM
         elif row["verdict"] in ("doubtful", "unchecked"):
             section.say("warn", f"Object {name} is {row['verdict']}: {why or 'not checked'}")
     for missing in result.not_placed:
-        name = named(missing.instance, missing.obj_id, models)
+        name = tables.named(missing.instance, missing.obj_id, models)
         section.say("warn", f"Object {name} is not placed: {missing.reason}")
     for remark in result.remarks:
         where = "Scene" if remark.view is None else f"View {remark.view}"
@@ -297,7 +284,7 @@ def _views(section: Section, store: SessionStore, result: Registered, state: Rev
             section.page.text(f"None: {counted(len(used), 'view')} took part.")
     if result.remarks:
         section.page.heading("What is wrong with views, and with the scene")
-        section.page.table(VIEW_HEADER, view_rows(result))
+        section.page.table(tables.VIEW_HEADER, tables.view_rows(result))
 
 
 def _pictures(section: Section, store: SessionStore) -> None:
@@ -321,4 +308,4 @@ def _check_table(
 ) -> None:
     """Add every check of every object: a row a check, as columns they are wider than a screen."""
     if any(o.checks for o in objects):
-        section.page.table(*check_rows(objects, models), folded="All checks of all objects")
+        section.page.table(*tables.check_rows(objects, models), folded="All checks of all objects")

@@ -7,16 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from realsim.app.console import Console
-from realsim.app.report.compare_page import (
-    OBJECT_HEADER,
-    Comparison,
-    as_json,
-    comparison_of,
-    comparison_page,
-    figure_header,
-    figure_rows,
-    object_rows,
-)
+from realsim.app.report import compare_page
 from realsim.app.report.limits import Limit, broken, limit_of, read_limits
 from realsim.app.report.session import hidden_of, page_of, report_of, write_report_of
 from realsim.app.report.sources import sources_of
@@ -113,7 +104,7 @@ def _say_one(console: Console, document: dict[str, Any]) -> None:
 def _several(request: ReportRequest, limits: Sequence[Limit], console: Console) -> bool:
     """Compare several sessions."""
     with console.stage("report", f"{len(request.sources)} sessions"):
-        comparison = comparison_of(sources_of(request.sources))
+        comparison = compare_page.comparison_of(sources_of(request.sources))
     failed = [
         f"limit: {s.label}: {text}"
         for s in comparison.sources
@@ -124,8 +115,8 @@ def _several(request: ReportRequest, limits: Sequence[Limit], console: Console) 
             unit = f" {d.first.meaning.unit}".rstrip() if d.first is not None else ""
             failed.append(f"worse: {other.label}: {d.name} by {d.shown}{unit}")
     if request.out is not None:
-        _written(request.out, comparison_page(comparison))
-    console.result(as_json(comparison) | {"failed": failed})
+        _written(request.out, compare_page.comparison_page(comparison))
+    console.result(compare_page.as_json(comparison) | {"failed": failed})
     if not (console.as_json or console.quiet):
         _say_several(console, comparison)
         if request.out is not None:
@@ -134,19 +125,19 @@ def _several(request: ReportRequest, limits: Sequence[Limit], console: Console) 
     return not failed
 
 
-def _say_several(console: Console, c: Comparison) -> None:
+def _say_several(console: Console, c: compare_page.Comparison) -> None:
     """Print the tables."""
     for s in c.sources:
         console.say(f"{s.label}: {VERDICTS[s.verdict][0].lower()}")
-    rows = figure_rows(c, all_figures=False)
+    rows = compare_page.figure_rows(c, all_figures=False)
     if rows:
-        console.table("Figures that differ", figure_header(c), rows)
+        console.table("Figures that differ", compare_page.figure_header(c), rows)
     else:
         console.say("every figure is the same.")
     for other, found in zip(c.sources[1:], c.objects, strict=True):
         if found:
             title = f"Objects of {c.sources[0].letter} and {other.letter}"
-            console.table(title, OBJECT_HEADER, object_rows(found))
+            console.table(title, compare_page.OBJECT_HEADER, compare_page.object_rows(found))
 
 
 def _written(path: Path, page: Page) -> Path:

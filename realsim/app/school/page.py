@@ -2,24 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
-from realsim.app.school.tables import (
-    FILTER_HEADER,
-    LEVELS,
-    REASON_HEADER,
-    SUMMARY_HEADER,
-    Names,
-    agreement_line,
-    doubts,
-    filter_rows,
-    level_tables,
-    named,
-    not_tried,
-    p_hold_line,
-    reason_rows,
-    school_table,
-    setting_lines,
-    survivors,
-)
+from realsim.app.school import tables
+from realsim.app.school.tables import Names
 from realsim.geometry import se3
 from realsim.pages import Page
 from realsim.pages.plots import png
@@ -55,14 +39,16 @@ def margins_png(sets: Sequence[GraspSet], models: Names) -> bytes:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 3.6), dpi=110, layout="constrained")
-    axes = [figure.add_subplot(1, len(LEVELS), k + 1) for k in range(len(LEVELS))]
+    axes = [figure.add_subplot(1, len(tables.LEVELS), k + 1) for k in range(len(tables.LEVELS))]
     drawn = 0
-    for ax, (measure, levels_of, what) in zip(axes, LEVELS, strict=True):
+    for ax, (measure, levels_of, what) in zip(axes, tables.LEVELS, strict=True):
         every: list[float] = []
         for s in sets:
-            levels, share = survivors(s, measure, levels_of)
+            levels, share = tables.survivors(s, measure, levels_of)
             if len(levels):
-                ax.plot(levels, share, "o-", label=named(s, models), linewidth=1.2, markersize=3)
+                ax.plot(
+                    levels, share, "o-", label=tables.named(s, models), linewidth=1.2, markersize=3
+                )
                 every += levels.tolist()
                 drawn += 1
         ax.set_xscale("log")
@@ -119,13 +105,13 @@ def page_bytes(
         title=f"Robot School of {name}",
         about=f"{sum(len(s) for s in sets)} grasps on {len(sets)} objects",
     )
-    page.section("Objects", " ".join([*setting_lines(sets), MEANING]))
-    page.table(*school_table(sets, models))
+    page.section("Objects", " ".join([*tables.setting_lines(sets), MEANING]))
+    page.table(*tables.school_table(sets, models))
     for words in (
-        agreement_line(sets),
-        p_hold_line(sets),
-        *not_tried(sets, models),
-        *doubts(sets, models),
+        tables.agreement_line(sets),
+        tables.p_hold_line(sets),
+        *tables.not_tried(sets, models),
+        *tables.doubts(sets, models),
     ):
         if words:
             page.text(words, "note")
@@ -133,13 +119,13 @@ def page_bytes(
         if pictures.get(file):
             page.section(title)
             page.picture(pictures[file], caption)
-    for what, header, rows in level_tables(sets, models):
+    for what, header, rows in tables.level_tables(sets, models):
         page.section(f"Share [%] of the tested grasps that pass, by {what}")
         page.table(header, rows)
     page.section("Why grasps stopped")
-    page.table(REASON_HEADER, reason_rows(sets))
+    page.table(tables.REASON_HEADER, tables.reason_rows(sets))
     page.section("What the filters took", "Candidates before the arm and physics had their say.")
-    page.table(FILTER_HEADER, filter_rows(sets, models))
+    page.table(tables.FILTER_HEADER, tables.filter_rows(sets, models))
     page.section("Summary", "As in the paper's table: by its limits, but for 'nominal' rows.")
-    page.table(SUMMARY_HEADER, summarise(sets).to_rows())
+    page.table(tables.SUMMARY_HEADER, summarise(sets).to_rows())
     return page.encode()

@@ -10,20 +10,9 @@ from typing import Any
 
 from realsim.app.console import Console
 from realsim.app.export.sources import session_folders
-from realsim.app.stats import landscape
+from realsim.app.stats import landscape, statistics
 from realsim.app.stats.collect import SessionFacts, session_facts
-from realsim.app.stats.statistics import (
-    NOTHING,
-    OBJECT_HEADER,
-    SESSION_HEADER,
-    Cell,
-    Statistics,
-    all_rows,
-    object_table,
-    same_content,
-    session_table,
-    statistics_of,
-)
+from realsim.app.stats.statistics import Cell, Statistics
 from realsim.errors import InputError, RealsimError
 from realsim.many import Outcome, Sent, Task, Workers, at_most, open_pool, run_many
 from realsim.pages import Page
@@ -80,9 +69,9 @@ def run_stats(
         tasks = [Task(name=n, fn=session_facts, args=(Sent(f),)) for n, f in by.items()]
         with open_pool(at_most(where, len(tasks))) as pool:
             run_many(tasks, pool, keep, in_order=True)
-    stats = statistics_of(facts)
-    notes = [*left_out, *same_content(stats)]
-    rows = all_rows(stats)
+    stats = statistics.statistics_of(facts)
+    notes = [*left_out, *statistics.same_content(stats)]
+    rows = statistics.all_rows(stats)
     console.table(f"Statistics of {_sessions(stats)}", HEADER, rows)
     for line in notes:
         console.warn(line)
@@ -125,11 +114,11 @@ def document_of(stats: Statistics, left_out: Sequence[str] = ()) -> dict[str, An
         left_out: what is said of the others.
     """
     return {
-        "notes": [*left_out, *same_content(stats)],
-        "statistics": {name: here for name, here, _ in all_rows(stats)},
+        "notes": [*left_out, *statistics.same_content(stats)],
+        "statistics": {name: here for name, here, _ in statistics.all_rows(stats)},
         "school": stats.school.to_json(),
-        "sessions": _records(SESSION_HEADER, session_table(stats)),
-        "objects": _records(OBJECT_HEADER, object_table(stats)),
+        "sessions": _records(statistics.SESSION_HEADER, statistics.session_table(stats)),
+        "objects": _records(statistics.OBJECT_HEADER, statistics.object_table(stats)),
         "landscape": dict(
             zip(landscape.LANDSCAPE_HEADER, landscape.landscape_row(stats), strict=True)
         ),
@@ -163,9 +152,9 @@ def _write_all(
 ) -> None:
     out.mkdir(parents=True, exist_ok=True)
     tables: tuple[tuple[Sequence[str], Sequence[Sequence[Cell]]], ...] = (
-        (HEADER, all_rows(stats)),
-        (SESSION_HEADER, session_table(stats)),
-        (OBJECT_HEADER, object_table(stats)),
+        (HEADER, statistics.all_rows(stats)),
+        (statistics.SESSION_HEADER, statistics.session_table(stats)),
+        (statistics.OBJECT_HEADER, statistics.object_table(stats)),
     )
     atomic.write_json(out / DOCUMENT, document)  # first: by it the folder is known as ours
     for name, (header, rows) in zip(TABLES, tables, strict=True):
@@ -189,15 +178,15 @@ def _write_page(path: Path, stats: Statistics, notes: list[str]) -> None:
         page.section(title)
         page.pictures(pictures, width_px=width_px, kind="plots")
     page.section("Statistics, row by row as in the paper", PAPER_TEXT)
-    page.table(HEADER, all_rows(stats))
+    page.table(HEADER, statistics.all_rows(stats))
     page.section("Beside other data sets", landscape.LANDSCAPE_TEXT)
     page.table(landscape.LANDSCAPE_HEADER, [*landscape.LANDSCAPE, landscape.landscape_row(stats)])
     page.section("Grasps beside those of other data sets", landscape.GRASPS_TEXT)
     page.table(landscape.GRASPS_HEADER, [*landscape.GRASPS, landscape.grasps_row(stats)])
     page.section("Sessions")
-    page.table(_words(SESSION_HEADER), _shown(session_table(stats)))
+    page.table(_words(statistics.SESSION_HEADER), _shown(statistics.session_table(stats)))
     page.section("Objects")
-    page.table(_words(OBJECT_HEADER), _shown(object_table(stats)))
+    page.table(_words(statistics.OBJECT_HEADER), _shown(statistics.object_table(stats)))
     atomic.write_bytes(path, page.encode())
 
 
@@ -209,7 +198,7 @@ def _words(header: Sequence[str]) -> list[str]:
 def _shown(rows: Sequence[Sequence[Cell]]) -> list[list[str]]:
     def cell(value: Cell) -> str:
         if isinstance(value, float):
-            return NOTHING if math.isnan(value) else f"{value:.3f}"
+            return statistics.NOTHING if math.isnan(value) else f"{value:.3f}"
         return str(value)
 
     return [[cell(c) for c in row] for row in rows]

@@ -9,18 +9,9 @@ import numpy as np
 
 from realsim.app.first_surfaces import FirstSurfaces
 from realsim.app.report.section import counted
+from realsim.app.upgrade import tables
 from realsim.app.upgrade.analytic import LEVEL_HEADER, correlation_line, level_rows
 from realsim.app.upgrade.scene import Record
-from realsim.app.upgrade.tables import (
-    HEADER,
-    PAGE,
-    TOLD,
-    objects_of,
-    row_of,
-    summary_line,
-    summary_of,
-    worst_first,
-)
 from realsim.arrays import Image, Int32
 from realsim.pages import Page, View
 from realsim.records import ObjectModel
@@ -55,12 +46,12 @@ def write_page(
     out: Path, records: Sequence[Record], failed: Mapping[str, str], analytic: Record | None
 ) -> None:
     """Write OUT/upgrade.html."""
-    summary = summary_of(records)
-    ranked = worst_first(objects_of(records))
+    summary = tables.summary_of(records)
+    ranked = tables.worst_first(tables.objects_of(records))
     pictured = [(r, o) for r, o in ranked if o["shown"] is not None]
     notes = [(place, f"was left out: {why}") for place, why in failed.items()]
     notes += [(str(r["place"]), str(note)) for r in records for note in r["notes"]]
-    page = Page(title="Upgraded data set", about=summary_line(summary))
+    page = Page(title="Upgraded data set", about=tables.summary_line(summary))
     for line in notes_line(notes, len(failed)):
         page.text(line, "note")
     frames = _frames(out, pictured)
@@ -95,7 +86,7 @@ def write_page(
         "pose that was not written.",
     )
     page.table(
-        HEADER, [row_of(r, o) for r, o in shown],
+        tables.HEADER, [tables.row_of(r, o) for r, o in shown],
         colors=[VERDICT_RGB.get(o["verdict"], (150, 150, 150)) for _, o in shown],
     )  # fmt: skip
     if analytic is not None:
@@ -107,7 +98,7 @@ def write_page(
         first = f"The first {ROWS} of {len(notes)}; upgrade.json has all."
         page.section("Notes", "" if len(notes) <= ROWS else first)
         page.table(["scene", "note"], notes[:ROWS])
-    write_bytes(out / PAGE, page.encode())
+    write_bytes(out / tables.PAGE, page.encode())
 
 
 def notes_line(notes: Sequence[tuple[str, str]], left_out: int) -> list[str]:
@@ -154,7 +145,7 @@ def _pair(out: Path, record: Record, o: Mapping[str, Any]) -> View:
     moved = f"moved by {o['moved_mm']:.1f} mm and {o['moved_deg']:.1f} deg"
     right, became = {  # what stands right of the handle, and what is said of the annotation
         "improved": ("improved", f"improved, {moved}"), "kept": ("kept", "kept"),
-        "rejected": ("new pose refused", TOLD["rejected"]),
+        "rejected": ("new pose refused", tables.TOLD["rejected"]),
     }[o["outcome"]]  # fmt: skip
     label = (
         f"{record['place']} image {o['shown']['image']}, {o['name']}: annotation {became}; the "

@@ -13,17 +13,9 @@ from pathlib import Path
 from realsim.app.console import Console
 from realsim.app.outputs import require_outside
 from realsim.app.register.from_review import REVIEW_FILE
+from realsim.app.upgrade import files
 from realsim.app.upgrade.analytic import agreement_of, all_sets
 from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig, scenes_of
-from realsim.app.upgrade.files import (
-    NOTE,
-    all_records,
-    finished_record,
-    gather_models,
-    key_of,
-    labels_of,
-    write_root_files,
-)
 from realsim.app.upgrade.pool import upgrade_scenes
 from realsim.app.upgrade.scene import Record, SceneJob, read_source, upgrade_scene
 from realsim.app.upgrade.tables import show_upgrade, write_tables
@@ -62,7 +54,7 @@ def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Consol
     done: dict[str, Record] = {}
     todo: list[SceneRef] = []
     for ref in refs:
-        record = finished_record(out / ref.place, key_of(ref, config))
+        record = files.finished_record(out / ref.place, files.key_of(ref, config))
         if record is None:
             if (out / ref.place / REVIEW_FILE).is_file():
                 raise InputError(
@@ -75,7 +67,7 @@ def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Consol
     skipped = len(done)
     if skipped:
         console.say(f"{skipped} of {len(refs)} scenes are upgraded already, with the same inputs")
-    if again := sum((out / ref.place / NOTE).is_file() for ref in todo):
+    if again := sum((out / ref.place / files.NOTE).is_file() for ref in todo):
         console.warn(f"options or inputs have changed: {again} of {len(refs)} scenes are done anew")
     failed: dict[str, str] = {}
     with contextlib.ExitStack() as lock:
@@ -99,8 +91,8 @@ def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Consol
 
 def _job(ref: SceneRef, config: UpgradeConfig, out: Path, workers: Workers) -> SceneJob:
     return SceneJob(
-        ref=ref, config=config, out=out, workers=workers, key=key_of(ref, config),
-        labels=labels_of(ref),
+        ref=ref, config=config, out=out, workers=workers, key=files.key_of(ref, config),
+        labels=files.labels_of(ref),
     )  # fmt: skip
 
 
@@ -124,11 +116,11 @@ def _write_together(out: Path, failed: dict[str, str], console: Console) -> Reco
     """
     from realsim.app.upgrade.page import write_page
 
-    records = all_records(out)
+    records = files.all_records(out)
     places = [str(r["place"]) for r in records]
     with console.stage("together", f"{len(records)} scenes"):
-        gather_models(out, places)
-        write_root_files(out, places)
+        files.gather_models(out, places)
+        files.write_root_files(out, places)
         analytic = agreement_of(all_sets(out, places))
         write_tables(out, records, failed, analytic)
         write_page(out, records, failed, analytic)

@@ -3,16 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from realsim.app.scan.scale.show import (
-    MEANING,
-    MEASURED_HEADER,
-    VIEW_HEADER,
-    limit_rows,
-    limits_title,
-    measured_rows,
-    scale_rows,
-    view_rows,
-)
+from realsim.app.scan.scale import show
 from realsim.arrays import Array
 from realsim.pages import VERDICT_KIND, Page
 from realsim.scanning.scale.files import ScaleRecord
@@ -58,19 +49,19 @@ def page_bytes(
         about=f"session {session}, {len(fit.views)} views" if session else "",
     )
     page.verdict(
-        VERDICT_KIND[fit.verdict], fit.verdict.upper(), f"– {MEANING[fit.verdict]}",
+        VERDICT_KIND[fit.verdict], fit.verdict.upper(), f"– {show.MEANING[fit.verdict]}",
         [[reason] for reason in fit.reasons],
     )  # fmt: skip
     page.section("The scale")
-    page.table(["figure", "value"], scale_rows(fit, box_mm))
+    page.table(["figure", "value"], show.scale_rows(fit, box_mm))
     for note in fit.notes:
         page.text(note, "note")
     if fit.limits:
-        page.section(limits_title(fit), "Each alone, as a 1-sigma of the scale.")
-        page.table(["limit", "alone", "why"], limit_rows(fit))
+        page.section(show.limits_title(fit), "Each alone, as a 1-sigma of the scale.")
+        page.table(["limit", "alone", "why"], show.limit_rows(fit))
     if record.measured:
         page.section("Measured by hand", "Against the fit without them.")
-        page.table(MEASURED_HEADER, measured_rows(record.measured))
+        page.table(show.MEASURED_HEADER, show.measured_rows(record.measured))
         for c in record.measured:
             if c.agrees:
                 page.text(c.text)
@@ -79,7 +70,7 @@ def page_bytes(
             page.section(title)
             page.picture((folder / file).read_bytes(), caption)
     page.section("Views")
-    page.table(VIEW_HEADER, view_rows(fit, worst=None))
+    page.table(show.VIEW_HEADER, show.view_rows(fit, worst=None))
     if fit.checks:
         page.section("Checks without ground truth")
         page.table(["check", "value"], [[k, f"{v:.4g}"] for k, v in fit.checks.items()])
