@@ -171,18 +171,20 @@ class Console:
         """Say what the stage does now: shown with its next step."""
         self._doing = words
 
-    def say(self, text: str) -> None:
-        """Print one line of result."""
+    def say(self, *texts: str) -> None:
+        """Print lines of the result."""
         if not (self.quiet and (self.as_json or self._told is not None)):
-            self._out.print(text, soft_wrap=True, markup=False)
+            for text in texts:
+                self._out.print(text, soft_wrap=True, markup=False)
 
-    def warn(self, text: str) -> None:
-        """Print one line that the user must not miss."""
+    def warn(self, *texts: str) -> None:
+        """Print lines that the user must not miss."""
         from rich.markup import escape
 
         if self._told is not None:
-            self._told.notes.append(text)
-        self._err.print(f"[yellow]note:[/yellow] {escape(text)}", soft_wrap=True)
+            self._told.notes += texts
+        for text in texts:
+            self._err.print(f"[yellow]note:[/yellow] {escape(text)}", soft_wrap=True)
 
     def result(self, document: object) -> None:
         """Print the command's whole result as JSON, if it was asked for; once in a command.

@@ -35,6 +35,5 @@ def board_command(console: Console, what: str, out: Path, paper: str, **options:
     from realsim_calibration.sheets import make_board
 
     files = make_board(what, out, paper, **options)
-    for path in files:
-        console.say(str(path))
+    console.say(*map(str, files))
     console.result({"target": what, "paper": paper, "files": list(files)})

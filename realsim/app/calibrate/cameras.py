@@ -77,8 +77,7 @@ def run_cameras(source: Path, console: Console, options: dict[str, Any]) -> bool
     poses = pose_file_of(source, options["poses"], [c.name for c in cameras])
     raw = None if poses is None else read_pose_file(poses, key=options["key"] or None)
     frames = frames_of(source, cameras, raw)
-    for sentence in frames.left_out:
-        console.warn(sentence)
+    console.warn(*frames.left_out)
     cameras = with_intrinsics(cameras, options["intrinsics"])
     write_text(out / MADE_OF, made_of(source))
     sightings = _sightings(frames, cameras, boards, out, console)

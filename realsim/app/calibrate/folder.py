@@ -156,8 +156,7 @@ def read_views(request: FolderRequest, console: Console) -> FolderViews:
         request.images, request.poses or request.images, reading=reading, key=request.key or None
     )
     console.say(f"Images with poses: {len(folder)}. {folder.pairing}")
-    for note in (*folder.warnings, *folder.poses.notes):
-        console.warn(note)
+    console.warn(*folder.warnings, *folder.poses.notes)
     for name, reason in (*folder.unpaired_images, *folder.unpaired_poses):
         console.warn(f"{name} was left out: {reason}")
     write_text(request.out / MADE_OF, made_of(request.images))

@@ -428,8 +428,7 @@ def show_summary(summary: CaptureSummary, console: Console, *, dry: bool = False
     console.table("Dry run" if dry else "Capture", ["", "", "which"], rows)
     if dry:
         console.say("nothing was stored.")
-    for text in summary.warnings:
-        console.warn(text)
+    console.warn(*summary.warnings)
     if summary.left_out:
         console.say("the same command offers the skipped views again.")
 

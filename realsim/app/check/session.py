@@ -123,8 +123,7 @@ def show_repair(report: RepairReport, console: Console) -> None:
         console.say(f"{report.before.folder}: nothing was damaged, nothing was taken out")
     for path, place in report.moved:
         console.say(f"{path} -> {place}")
-    for note in report.notes:
-        console.say(note)
+    console.say(*report.notes)
     for inner in report.inner:
         show_repair(inner, console)
     if not report.after.sound:

@@ -64,8 +64,7 @@ def show_command(
         console.table("In force", ["option", "value", "from"], table)
     else:
         console.say("every option has its default; `realsim config show COMMAND` lists them.")
-    for line in strange_variables(every):
-        console.warn(line)
+    console.warn(*strange_variables(every))
     console.result({"file": None if file is None else file.path, "options": shown})
 
 

@@ -437,8 +437,7 @@ def show_demonstrations(result: DemonstrationsResult, console: Console) -> None:
         console.say(
             f"{result.not_attempted} grasps were not attempted: the arm does not get there."
         )
-    for note in w.notes[:10]:
-        console.warn(note)
+    console.warn(*w.notes[:10])
     if len(w.notes) > 10:
         console.warn(f"and {len(w.notes) - 10} more notes, in realsim/episodes.jsonl.")
     console.say(f"page      {result.page}")

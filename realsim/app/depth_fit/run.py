@@ -91,8 +91,7 @@ def run_depth_fit(source: Path, request: DepthFitRequest, console: Any) -> None:
         _show_stereo(fit, kind, console)
     else:
         _show_disparity(fit, console)
-    for note in fit.notes:
-        console.say(note)
+    console.say(*fit.notes)
     document = fit.document()
     write_json(out, document)
     write_bytes(out.with_suffix(".png"), picture)

@@ -371,6 +371,5 @@ def show_export(result: ExportResult, console: Console) -> None:
     console.table(
         f"exported into {result.folder}", ("scene", "frames", "written now", "poses", "more"), rows
     )
-    for note in dict.fromkeys(f"{s.name}: {n}" for s in result.scenes for n in s.notes):
-        console.warn(note)
+    console.warn(*dict.fromkeys(f"{s.name}: {n}" for s in result.scenes for n in s.notes))
     console.say(f"card      {result.card}")

@@ -234,8 +234,7 @@ def show(out: Path, dataset: dict[str, Any], outcome: GenerateOutcome, console: 
             console.table(table.title, [*table.header, ""], rows)
         else:
             console.table(table.title, table.header, table.rows)
-    for note in notes_of(dataset, outcome):
-        console.warn(note)
+    console.warn(*notes_of(dataset, outcome))
     console.say(summary_of(dataset) if dataset["scenes"] else "no scene was made.")
 
 

@@ -96,8 +96,7 @@ def import_session(
     folder = Path(folder)
     _make_room(folder, source, key, overwrite=overwrite)
     folder.mkdir(parents=True, exist_ok=True)
-    for note in source.notes:
-        console.warn(note)
+    console.warn(*source.notes)
     with only_run_in(folder):
         store = _opened(folder, source, key)
         done = len(store.completed)

@@ -259,8 +259,7 @@ def open_source(request: ImportRequest, console: Console) -> FrameSource:
 
 def _open_folder(request: ImportRequest, console: Console) -> FrameSource:
     source, notes = open_image_folder(request)
-    for note in notes:
-        console.say(note)
+    console.say(*notes)
     return source
 
 

@@ -229,8 +229,7 @@ def run_convert(
     document = _document(plan, plan.metrics)  # asks for the arm, before anything is written
     files = writer(plan, dest)
     free = show_colliding(plan, console) if plan.kind == "imported" else True
-    for path in files:
-        console.say(str(path))
+    console.say(*map(str, files))
     console.result(document | {"files": files})
     return free
 
@@ -369,8 +368,7 @@ def show_plan(plan: CapturePlan, metrics: dict[str, float], console: Console) ->
         if goal.met is False:
             missed.append(f"{meaning.text}: {value:.4g} {meaning.unit}, good is {goal.text}")
     console.table("How good it is", ("metric", "value", "good", ""), rows)
-    for line in missed:
-        console.warn(line)
+    console.warn(*missed)
     if plan.mount.T_ee_cam[2, 2] < LOOKING_BACK:
         console.warn(
             f"the camera of mount '{plan.mount.name}' looks back along the arm. If it looks away "

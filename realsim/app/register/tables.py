@@ -243,9 +243,7 @@ def show_registered(
         table_line(result), camera_line(result), photograph_line(result), depth_line(result),
         odometry_line(result),
     )  # fmt: skip
-    for line in (*symmetry_lines(result), *lines, places_line(result)):
-        if line:
-            console.say(line)
+    console.say(*filter(None, (*symmetry_lines(result), *lines, places_line(result))))
     console.say(next_line(folder, result))
 
 

@@ -144,8 +144,7 @@ def show_render(outcome: RenderOutcome, console: Console) -> None:
     console.table("Synthetic views", ["what", "value"], rows)
     if outcome.figures is not None:
         console.table(_figures_title(outcome.figures), FIGURES_HEADER, outcome.figures.rows())
-    for note in notes_of(outcome):
-        console.warn(note)
+    console.warn(*notes_of(outcome))
     console.say(f"picture   {outcome.sheet}")
     console.say(f"page      {outcome.page}")
     console.say(f"session   {outcome.twin.folder}")

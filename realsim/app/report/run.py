@@ -77,7 +77,7 @@ def _one(request: ReportRequest, limits: Sequence[Limit], console: Console) -> b
     if not (console.as_json or console.quiet):
         _say_one(console, document)
         console.say(f"report    {path}")
-    _tell(console, failed)
+    console.warn(*failed)
     return not failed
 
 
@@ -121,7 +121,7 @@ def _several(request: ReportRequest, limits: Sequence[Limit], console: Console) 
         _say_several(console, comparison)
         if request.out is not None:
             console.say(f"page      {request.out}")
-    _tell(console, failed)
+    console.warn(*failed)
     return not failed
 
 
@@ -145,9 +145,3 @@ def _written(path: Path, page: Page) -> Path:
 
     atomic.write_bytes(path, page.encode(math.inf))
     return path
-
-
-def _tell(console: Console, failed: Sequence[str]) -> None:
-    """Print what failed; never on the standard output, which may be a program's."""
-    for line in failed:
-        console.warn(line)

@@ -50,8 +50,7 @@ def run_review(request: ReviewRequest, console: Console) -> None:
         stores, host=request.host, port=request.port, token=token, reviewer=request.reviewer,
         motions=SessionMotions.of_session, remarks=remarks,
     )  # fmt: skip
-    for remark in remarks:
-        console.warn(remark)
+    console.warn(*remarks)
     # A browser may leave while its page is changed; viser would tell that in the terminal.
     warnings.filterwarnings("ignore", "Queued .* on a closed connection", UserWarning)
     with _until_interrupted() as ended:
@@ -65,8 +64,7 @@ def run_review(request: ReviewRequest, console: Console) -> None:
             url = server.url
             gone = [t for t in (s.trouble() for s in server.sessions) if t]
             server.stop()
-    for text in gone:
-        console.warn(text)
+    console.warn(*gone)
     console.say(f"decisions in this run: {words_of(decisions)}")
     console.say(f"judged by people: {judged} of {objects} objects in {len(stores)} session(s)")
     changed = sorted({str(s.store.folder) for s in server.sessions if s.has_pending})
@@ -106,8 +104,7 @@ def write_page(request: ReviewRequest, path: Path, console: Console) -> None:
     state = review_of(store)
     with console.stage("read", store.session.name) as tick:
         content = SceneContent.load(store, SceneConfig(), tick)
-    for remark in content.remarks:
-        console.warn(remark)
+    console.warn(*content.remarks)
     with console.stage("write", str(path)) as tick:
         summary = write_static(content, state, path, title=_title(store), progress=tick)
     console.say(f"{summary.path}   {summary.size_bytes / 1e6:.1f} MB, opens without a server")

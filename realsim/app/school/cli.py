@@ -205,8 +205,7 @@ def export_command(
     from realsim.app.school.export import export
 
     files = export(source, target, out, least_score)
-    for path in files:
-        console.say(str(path))
+    console.say(*map(str, files))
     console.result({"format": target, "files": files})
 
 

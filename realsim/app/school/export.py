@@ -144,9 +144,7 @@ def summarise(sources: Sequence[Path], json_file: Path | None, console: Console)
         console.warn(
             "these scenes were tried at different settings; their scores are no one thing:"
         )
-    for line in (*settings, agreement_line(sets), p_hold_line(sets)):
-        if line:
-            console.say(line)
+    console.say(*filter(None, (*settings, agreement_line(sets), p_hold_line(sets))))
     if json_file is not None:
         atomic.write_json(json_file, summary.to_json())
     console.result(summary.to_json())

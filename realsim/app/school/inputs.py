@@ -200,8 +200,7 @@ def _of_source(source: Path, out: Path, request: SchoolRequest, console: Console
     found = load_scene_source(
         source, Matter(cache=out / CACHE), models=request.models, order=request.quaternions
     )
-    for note in found.notes:
-        console.warn(note)
+    console.warn(*found.notes)
     return SchoolInputs(
         scene=found.scene, models=found.models, solids=dict(found.solids), folder=out, store=None
     )

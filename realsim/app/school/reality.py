@@ -59,8 +59,7 @@ def judge(
     config = _config(options)
     with console.stage("reality", "trials") as tick:
         judged = judge_trials(objects, config, options["cache"], tick)
-    for note in judged.notes:
-        console.warn(note)
+    console.warn(*judged.notes)
     fitted = None
     if fit is not None:
         fitted = calibrate(judged, str(folder.resolve().name))

@@ -41,8 +41,7 @@ def settle(
         inputs = read_inputs(source, None if is_session(source) else folder, request, console)
         report, picture = _settled(inputs, console, request.supports)
     console.table(f"Objects of {inputs.scene.name}", list(HEADERS), stand_rows(report))
-    for note in report.notes:
-        console.warn(note)
+    console.warn(*report.notes)
     for a, b, depth_m in report.inside:
         console.say(f"{a} and {b} are {1e3 * depth_m:.1f} mm inside one another.")
     if inputs.store is not None and out is None:

@@ -278,14 +278,11 @@ SUMMARY_HEADER = ["property", "here", "in the paper"]
 def show_school(sets: Sequence[GraspSet], models: Names, console: Console) -> None:
     """Print the outcome of a run."""
     console.table("Robot School", *school_table(sets, models))
-    for words in (*not_tried(sets, models), *doubts(sets, models)):
-        console.warn(words)
+    console.warn(*not_tried(sets, models), *doubts(sets, models))
     stopped = reason_rows(sets)
     if stopped:
         console.table("Why grasps stopped", REASON_HEADER, stopped)
-    for line in (*setting_lines(sets), agreement_line(sets), p_hold_line(sets)):
-        if line:
-            console.say(line)
+    console.say(*filter(None, (*setting_lines(sets), agreement_line(sets), p_hold_line(sets))))
 
 
 def as_json(sets: Sequence[GraspSet], models: Names) -> dict[str, Any]:

@@ -109,8 +109,7 @@ def compare_releases(new: Sequence[Path], old: Path, console: Console) -> dict[s
         if name not in after or name not in before:
             diffs.append(SceneDiff(scene=name, state="added" if name in after else "lost"))
             continue
-        for stale in filter(None, map(_stale_words, (after[name], before[name]))):
-            console.warn(stale)
+        console.warn(*filter(None, map(_stale_words, (after[name], before[name]))))
         with console.stage("compare", name):
             diffs.append(diff_scenes(name, before[name].open(), after[name].open()))
             places = (before[name].folder, after[name].folder)

@@ -73,8 +73,7 @@ def run_stats(
     notes = [*left_out, *statistics.same_content(stats)]
     rows = statistics.all_rows(stats)
     console.table(f"Statistics of {_sessions(stats)}", HEADER, rows)
-    for line in notes:
-        console.warn(line)
+    console.warn(*notes)
     document = document_of(stats, left_out)
     console.result(document)
     if json_file is not None:

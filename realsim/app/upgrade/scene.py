@@ -93,12 +93,12 @@ class SceneConsole(Console):
         ):
             yield tick
 
-    def say(self, text: str) -> None:
+    def say(self, *texts: str) -> None:
         """Leave it out: the record and the session have it."""
 
-    def warn(self, text: str) -> None:
+    def warn(self, *texts: str) -> None:
         """Keep one line that the user must not miss."""
-        self.told.append(text)
+        self.told += texts
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
         """Leave the table out."""

@@ -140,8 +140,7 @@ def show_upgrade(result: "UpgradeResult", console: Console) -> None:
     if len(shown) < len(objects):
         console.say(f"the worst {len(shown)} of {len(objects)} objects; {CSV_FILE} has all")
     for notes in notes_of(result.scenes):
-        for note in notes[-MOST_NOTES:]:
-            console.warn(note)
+        console.warn(*notes[-MOST_NOTES:])
         if len(notes) > MOST_NOTES:
             console.warn(f"and {len(notes) - MOST_NOTES} more notes, in {JSON_FILE}")
     for place, reason in result.failed.items():

@@ -177,8 +177,7 @@ def _say_where(
 ) -> None:
     """Say where the scaled model lies, and how it gets into a library if it does not."""
     stored = request.library is not None or named.origin == "model"
-    for line in model_lines(named, model, verdict, is_stored=stored):
-        console.say(line)
+    console.say(*model_lines(named, model, verdict, is_stored=stored))
 
 
 # --- without a session ------------------------------------------------------------------------
