@@ -223,11 +223,11 @@ def test_the_camera_is_found_named_or_asked_for(tmp_path):
 
 def test_the_kind_is_known_by_the_content(tmp_path):
     (tmp_path / "recording").write_bytes(b"#ROSBAG V2.0\n")
-    assert [f.kind for f in kinds_of(tmp_path / "recording")] == ["bag"]
+    assert list(kinds_of(tmp_path / "recording")) == ["bag"]
     (tmp_path / "x.dat").write_bytes(b"\x89MCAP0\r\n...")
-    assert "MCAP" in kinds_of(tmp_path / "x.dat")[0].why
+    assert "MCAP" in kinds_of(tmp_path / "x.dat")["bag"]
     folder = make_folder(tmp_path / "in")
-    assert [f.kind for f in kinds_of(folder)] == ["folder"]
+    assert list(kinds_of(folder)) == ["folder"]
     (folder / "scene_camera.json").write_text("{}")
     (folder / "cameras.txt").write_text("")
     (folder / "images.txt").write_text("")

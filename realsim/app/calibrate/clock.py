@@ -6,7 +6,6 @@ need no offset.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -264,10 +263,3 @@ def mend_views(
         if arm.inside[k]
     ]  # fmt: skip
     return mended, clock
-
-
-def read_logs(robot: Path, board: Path, key: str) -> tuple[RawPoses, RawPoses]:
-    """Return two pose files."""
-    from realsim_calibration.inputs import read_pose_file
-
-    return read_pose_file(robot, key=key or None), read_pose_file(board, board=True)

@@ -337,13 +337,14 @@ def _from_logs(
     request: FolderRequest, console: Console
 ) -> tuple[Array, Array, Array | None, list[str], Clock | None] | None:
     """Return the pairs of two logs with time stamps, None where they are paired otherwise."""
-    from realsim.app.calibrate.clock import pair_pose_logs, read_logs
-    from realsim_calibration.inputs import reading_from_text
+    from realsim.app.calibrate.clock import pair_pose_logs
+    from realsim_calibration.inputs import read_pose_file, reading_from_text
 
     assert request.board_poses is not None
     if request.clock == "off" or request.poses is None:
         return None
-    robot, board = read_logs(request.poses, request.board_poses, request.key)
+    robot = read_pose_file(request.poses, key=request.key or None)
+    board = read_pose_file(request.board_poses, board=True)
     reading = reading_from_text(request.reading) if request.reading else robot.stated
     if reading is None or board.stated is None:
         return None

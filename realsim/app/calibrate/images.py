@@ -1,12 +1,11 @@
 """The target in the images of a folder: found once and noted, and refused where it is nowhere."""
 
 import hashlib
-import json
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from realsim.interop import cores
 from realsim.records import CameraIntrinsics, Target
 from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid
 from realsim.store.atomic import write_json
+from realsim.untrusted.own_json import read_own, to_json
 from realsim_calibration import TargetDetection, find_target
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def find_in_images(
                 for k, one in enumerate(search):
                     note, seen, is_new = one.result()
                     if is_new:  # by one thread: equal images have one note
-                        write_json(note, _detection_json(seen))
+                        write_json(note, to_json(seen))
                     found.append(seen)
                     tick(k + 1, len(images))
             except BaseException as error:
@@ -140,28 +140,11 @@ def require_views(folder: "FolderInput", detections: Sequence[TargetDetection], 
     )
 
 
-def _detection_json(found: TargetDetection) -> dict[str, Any]:
-    return {
-        "point_ids": found.point_ids.tolist(),
-        "uv": found.uv.tolist(),
-        "image_size": list(found.image_size),
-        "sd_px": None if found.sd_px is None else found.sd_px.tolist(),
-        "rejected": list(found.rejected),
-    }
-
-
 def _noted(path: Path) -> TargetDetection | None:
     """Return a detection noted earlier; a damaged note is no note."""
     try:
-        d = json.loads(path.read_text())
-        return TargetDetection(
-            point_ids=np.array(d["point_ids"], dtype=np.int64),
-            uv=np.array(d["uv"], dtype=np.float64),
-            image_size=(int(d["image_size"][0]), int(d["image_size"][1])),
-            sd_px=None if d["sd_px"] is None else np.array(d["sd_px"], dtype=np.float64),
-            rejected=tuple(d["rejected"]),
-        )
-    except (OSError, ValueError, KeyError, TypeError, InputError):
+        return read_own(path, TargetDetection)
+    except InputError:
         return None
 
 

@@ -104,12 +104,9 @@ def _value(option: click.Option, value: Any, where: str) -> Any:
     Raises:
         InputError: it is of another kind, or out of range.
     """
-    if option.multiple:
+    if option.multiple or option.nargs > 1:
         several = cast("list[Any]", value) if isinstance(value, list) else [value]
-        return [_one(option, each, where) for each in several]
-    if option.nargs > 1:
-        several = cast("list[Any]", value) if isinstance(value, list) else [value]
-        if len(several) != option.nargs:
+        if not option.multiple and len(several) != option.nargs:
             raise InputError(
                 f"{where} = {_shown(value)} cannot be used; a list of {option.nargs} is accepted."
             )

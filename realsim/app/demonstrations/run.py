@@ -7,7 +7,7 @@ import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -294,10 +294,11 @@ def export_demonstrations(
     with only_run_in(out):
         done = itertools.count(1)
         with console.stage("demonstrations", f"{len(episodes)} attempts") as tick:
-            encoding = _Encoding(source, request, episodes, where or PoolConfig(workers=1), console)
+            pool = where or PoolConfig(workers=1)
+            encode = partial(_encode, source, request, episodes, pool, console)
             written = write_lerobot(
                 episodes, folder, episodes_per_file=request.episodes_per_file,
-                progress=lambda: tick(next(done), len(episodes)), encode=encoding.encode,
+                progress=lambda: tick(next(done), len(episodes)), encode=encode,
             )  # fmt: skip
         with console.stage("page"):
             folder.write_piece("page", page_file(folder.folder, attempts.config.rate_hz, PAGE))
@@ -340,48 +341,43 @@ def _episodes(
     return attempts, LeRobotDemonstrations(attempts, name, chosen, depth=request.depth)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Encoding:
-    """Episodes rendered and encoded by this process, or by others that open the source again."""
+def _encode(
+    source: Path, request: DemonstrationRequest, episodes: "LeRobotDemonstrations",
+    where: PoolConfig, console: Console, numbers: "Sequence[int]", take: "Take",
+) -> None:  # fmt: skip
+    """Hand the episodes of these numbers on, in order; say after the first what all cost.
 
-    source: Path
-    request: DemonstrationRequest
-    episodes: "LeRobotDemonstrations"
-    where: PoolConfig
-    console: Console
+    They are rendered and encoded by this process, or by others that open the source again.
+    """
+    costs: list[float] = []
 
-    def encode(self, numbers: "Sequence[int]", take: "Take") -> None:
-        """Hand the episodes of these numbers on, in order; say after the first what all cost."""
-        costs: list[float] = []
+    def cost(cpu_s: float) -> None:
+        costs.append(cpu_s)
+        if len(costs) == 1 and len(numbers) > 1:
+            minutes = cpu_s * (len(numbers) - 1) / 60.0
+            console.say(
+                f"the first of {len(numbers)} attempts took {cpu_s:.1f} CPU s; the others "
+                f"will take about {minutes:.1f} CPU min."
+            )
 
-        def cost(cpu_s: float) -> None:
-            costs.append(cpu_s)
-            if len(costs) == 1 and len(numbers) > 1:
-                minutes = cpu_s * (len(numbers) - 1) / 60.0
-                self.console.say(
-                    f"the first of {len(numbers)} attempts took {cpu_s:.1f} CPU s; the others "
-                    f"will take about {minutes:.1f} CPU min."
-                )
-
-        where = at_most(self.where, len(numbers))
-        if where.workers == 1 and not where.address:
-            for k in numbers:
-                begun = time.process_time()
-                episode = encoded(self.episodes, k)
-                cost(time.process_time() - begun)
-                take(k, episode)
-            return
-
-        def done(outcome: Outcome) -> None:
-            k, episode, cpu_s = outcome.found()
-            cost(cpu_s)
+    where = at_most(where, len(numbers))
+    if where.workers == 1 and not where.address:
+        for k in numbers:
+            begun = time.process_time()
+            episode = encoded(episodes, k)
+            cost(time.process_time() - begun)
             take(k, episode)
+        return
 
-        sent = Sent(self.source)
-        tasks = (Task(name=f"attempt {k}", fn=_encoded, args=(sent, self.request, k))
-                 for k in numbers)  # fmt: skip
-        with open_pool(where) as pool:
-            run_many(tasks, pool, done, in_order=True)
+    def done(outcome: Outcome) -> None:
+        k, episode, cpu_s = outcome.found()
+        cost(cpu_s)
+        take(k, episode)
+
+    sent = Sent(source)
+    tasks = (Task(name=f"attempt {k}", fn=_encoded, args=(sent, request, k)) for k in numbers)
+    with open_pool(where) as pool:
+        run_many(tasks, pool, done, in_order=True)
 
 
 def _encoded(

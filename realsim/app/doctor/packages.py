@@ -24,9 +24,7 @@ class Package:
     @property
     def how(self) -> str:
         """The command that gets it."""
-        if not self.extra:
-            return REINSTALL
-        return offer(self.extra)
+        return offer(self.extra) if self.extra else REINSTALL
 
 
 _REQUIRED = (

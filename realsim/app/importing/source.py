@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,14 +66,6 @@ BAG_OPTIONS = {
 """What the fields of BagChoice are called in the request, and on the command line."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class KindFit:
-    """A kind that a path may be, and what speaks for it."""
-
-    kind: str
-    why: str
-
-
 def run_import(
     request: ImportRequest, out: Path, console: Console, *, overwrite: bool = False
 ) -> ImportSummary:
@@ -99,8 +91,8 @@ def run_import(
     return summary
 
 
-def kinds_of(path: Path) -> list[KindFit]:
-    """Return every kind that a path's content fits, with the evidence.
+def kinds_of(path: Path) -> dict[str, str]:
+    """Return every kind that a path's content fits -> what speaks for it.
 
     Raises:
         InputError: there is no such path.
@@ -109,33 +101,33 @@ def kinds_of(path: Path) -> list[KindFit]:
         raise InputError(f"{path} does not exist; a recording, a folder or a data set is expected.")
     if path.is_file():
         return _of_file(path)
-    fits: list[KindFit] = []
+    fits: dict[str, str] = {}
     bags = sorted(p.name for p in path.iterdir() if p.suffix.lower() in BAG_ENDINGS)
     if (path / "metadata.yaml").is_file() and bags:
-        fits.append(KindFit(kind="bag", why=f"it has metadata.yaml and {shown(bags)}"))
+        fits["bag"] = f"it has metadata.yaml and {shown(bags)}"
     elif bags:
-        fits.append(KindFit(kind="bag", why=f"it holds {shown(bags)}"))
+        fits["bag"] = f"it holds {shown(bags)}"
     cameras = f"{Path(CAMERA_FILE).stem}*.json"
     for pattern in (cameras, f"*/{cameras}", f"*/*/{cameras}"):
         if any(path.glob(pattern)):
-            fits.append(KindFit(kind="bop", why=f"it has {pattern}"))
+            fits["bop"] = f"it has {pattern}"
             break
     if _is_graspnet(path):
-        fits.append(KindFit(kind="graspnet", why="it has annotations/*.xml, or meta.mat"))
+        fits["graspnet"] = "it has annotations/*.xml, or meta.mat"
     from realsim.formats.colmap.model import find_model
     from realsim.formats.nerfstudio.transforms import find_transforms
 
     if find_transforms(path) is not None:
-        fits.append(KindFit(kind="nerfstudio", why="it has transforms.json"))
+        fits["nerfstudio"] = "it has transforms.json"
     model = find_model(path)
     if model is not None:
         place = model.relative_to(path).as_posix()
         where = "in it" if place == "." else f"in {place}"
-        fits.append(KindFit(kind="colmap", why=f"cameras and images of a model are {where}"))
+        fits["colmap"] = f"cameras and images of a model are {where}"
     if not fits:
         found = _images_below(path)
         if found:
-            fits.append(KindFit(kind="folder", why=f"it holds image files ({found})"))
+            fits["folder"] = f"it holds image files ({found})"
     return fits
 
 
@@ -149,14 +141,11 @@ def _is_graspnet(path: Path) -> bool:
     )
 
 
-def _of_file(path: Path) -> list[KindFit]:
+def _of_file(path: Path) -> dict[str, str]:
     with path.open("rb") as file:
         head = file.read(max(len(magic) for magic, _ in MAGIC))
-    return [
-        KindFit(kind="bag", why=f"its first bytes are those of {what}")
-        for magic, what in MAGIC
-        if head.startswith(magic)
-    ]
+    found = next((what for magic, what in MAGIC if head.startswith(magic)), None)
+    return {} if found is None else {"bag": f"its first bytes are those of {found}"}
 
 
 def _check_bag_file(path: Path) -> None:
@@ -217,10 +206,11 @@ def kind_of(request: ImportRequest, console: Console) -> str:
         what = "a file" if path.is_file() else "a folder"
         raise InputError(f"{path} is {what} of no known kind; {ACCEPTED}")
     if len(fits) > 1:
-        listed = "; ".join(f"{f.kind}: {f.why}" for f in fits)
+        listed = "; ".join(f"{kind}: {why}" for kind, why in fits.items())
         raise InputError(f"{path} may be several things ({listed}). Say which: --kind KIND.")
-    console.say(f"{path} is read as {fits[0].kind}: {fits[0].why}.")
-    return fits[0].kind
+    ((kind, why),) = fits.items()
+    console.say(f"{path} is read as {kind}: {why}.")
+    return kind
 
 
 def require_fitting(request: ImportRequest, kind: str) -> None:

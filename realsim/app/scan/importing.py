@@ -4,15 +4,11 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from realsim.app.console import Console
 from realsim.app.scan.library import say_model, verdict_row
 from realsim.errors import InputError, RealsimError
 from realsim.models.model_records import ScanUnit, UpAxis
-
-if TYPE_CHECKING:
-    from realsim.models.library_prepare import PrepareConfig
 
 DONE, LOOK, UNUSABLE = 0, 1, 2
 
@@ -105,6 +101,7 @@ def _import_one(
     from realsim.models.library_prepare import (
         STEPS,
         Matter,
+        PrepareConfig,
         Step,
         prepare_mesh,
         prepare_unscaled,
@@ -116,7 +113,7 @@ def _import_one(
 
     name = _name(path, request)
     _check_place(name, request)
-    config = _config(request)
+    config = PrepareConfig(most_faces=request.faces, with_parts=not request.no_parts)
     steps = ("read", *STEPS, "picture")
     with console.stage("import", path.name) as tick:
 
@@ -147,12 +144,6 @@ def _import_one(
     document: dict[str, object] = {"verdict": p.verdict, "name": name, "obj_id": obj_id}
     document["properties"] = to_json(p)
     return p.verdict, verdict_row(name, obj_id, p), document
-
-
-def _config(request: ImportRequest) -> "PrepareConfig":
-    from realsim.models.library_prepare import PrepareConfig
-
-    return PrepareConfig(most_faces=request.faces, with_parts=not request.no_parts)
 
 
 def _name(path: Path, request: ImportRequest) -> str:

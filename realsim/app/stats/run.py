@@ -14,6 +14,7 @@ from realsim.app.stats import landscape, statistics
 from realsim.app.stats.collect import SessionFacts, session_facts
 from realsim.app.stats.statistics import Cell, Statistics
 from realsim.errors import InputError, RealsimError
+from realsim.json_values import json_value
 from realsim.many import Outcome, Sent, Task, Workers, at_most, open_pool, run_many
 from realsim.pages import Page
 from realsim.store import atomic
@@ -126,14 +127,8 @@ def document_of(stats: Statistics, left_out: Sequence[str] = ()) -> dict[str, An
 
 
 def _records(header: Sequence[str], rows: Sequence[Sequence[Cell]]) -> list[dict[str, Any]]:
-    return [_record(header, row) for row in rows]
-
-
-def _record(header: Sequence[str], row: Sequence[Cell]) -> dict[str, Any]:
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in zip(header, row, strict=True)
-    }
+    """Return table rows as JSON objects, with null for what is not known."""
+    return [json_value(dict(zip(header, row, strict=True))) for row in rows]
 
 
 def csv_bytes(header: Sequence[str], rows: Sequence[Sequence[Cell]]) -> bytes:

@@ -6,7 +6,6 @@ OUT/SPLIT/SCENE/grasps_analytic/grasps.h5
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,8 @@ import numpy as np
 from realsim import __version__
 from realsim.app.console import Console
 from realsim.app.stages import content_key, judged_scene, session_models
-from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig
+from realsim.app.upgrade.dataset import SceneJob
 from realsim.errors import InputError
-from realsim.many import Workers
 from realsim.records import GraspSet, ObjectModel
 from realsim.store import SessionStore, atomic
 from realsim.untrusted.own_json import read_object
@@ -32,20 +30,7 @@ LABEL_SEED = 0
 """Seed of the surface points: the labels of a model are the same in every scene."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class AnalyticJob:
-    """What is tried on a scene, and where labels are."""
-
-    ref: SceneRef
-    """GraspNet's own labels are used where the data set has them."""
-    config: UpgradeConfig
-    out: Path
-    """Folder of the whole upgrade, where computed labels are kept."""
-    workers: Workers
-    """Who tries them."""
-
-
-def try_analytic(store: SessionStore, job: AnalyticJob, console: Console) -> list[GraspSet]:
+def try_analytic(store: SessionStore, job: SceneJob, console: Console) -> list[GraspSet]:
     """Try analytic grasps on every object of a session that has been tried; finished ones stay.
 
     The sets' closure_friction is the label's.
@@ -93,14 +78,14 @@ def _is_finished(folder: Path, key: str) -> bool:
         return False
 
 
-def labels_file(model: ObjectModel, job: AnalyticJob) -> Path:
+def labels_file(model: ObjectModel, job: SceneJob) -> Path:
     """Return the file of an object's labels: the data set's, else one that was computed."""
     from realsim.formats.graspnet.grasp_labels import write_grasp_labels
     from realsim_sim_bridge.grasping.analytic import analytic_labels
 
     name = LABELS.format(model.obj_id - 1)
-    if job.ref.kind == "graspnet" and (job.ref.root / name).is_file():
-        return job.ref.root / name
+    if job.ref.kind == "graspnet" and (job.given.root / name).is_file():
+        return job.given.root / name
     path, note = job.out / name, job.out / f"{name}.json"
     mesh = model.mesh
     key = content_key(__version__, mesh.vertices.tolist(), mesh.faces.tolist())

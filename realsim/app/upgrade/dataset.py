@@ -86,6 +86,34 @@ class SceneRef:
     """Folder of the models."""
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SceneJob:
+    """One scene to be upgraded; goes to another process as it is."""
+
+    ref: SceneRef
+    config: UpgradeConfig
+    out: Path
+    """Folder of the whole upgrade."""
+    workers: Workers
+    """Who tries its grasps."""
+    key: str
+    """A hash of everything that the result depends on."""
+    labels: tuple[str, ...]
+    """Files of grasp labels in the data set."""
+    at: SceneRef | None = None
+    """Where the data set's files are on another machine; None = where `ref` says."""
+
+    @property
+    def given(self) -> SceneRef:
+        """Where the data set's files are."""
+        return self.at or self.ref
+
+    @property
+    def folder(self) -> Path:
+        """Where the upgraded scene goes."""
+        return self.out / self.ref.place
+
+
 def scenes_of(dataset: Path, config: UpgradeConfig) -> list[SceneRef]:
     """Return the scenes that are asked for.
 

@@ -5,7 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from realsim.app.console import Console
-from realsim.app.upgrade.scene import Record, SceneJob, read_source, upgrade_scene
+from realsim.app.upgrade.dataset import SceneJob
+from realsim.app.upgrade.scene import Record, read_source, upgrade_scene
 from realsim.many import Outcome, Sent, Task, Worked, Workers, at_most, open_pool, run_many
 
 

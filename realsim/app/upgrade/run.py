@@ -15,9 +15,9 @@ from realsim.app.outputs import require_outside
 from realsim.app.register.from_review import REVIEW_FILE
 from realsim.app.upgrade import files
 from realsim.app.upgrade.analytic import agreement_of, all_sets
-from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig, scenes_of
+from realsim.app.upgrade.dataset import SceneJob, SceneRef, UpgradeConfig, scenes_of
 from realsim.app.upgrade.pool import upgrade_scenes
-from realsim.app.upgrade.scene import Record, SceneJob, read_source, upgrade_scene
+from realsim.app.upgrade.scene import Record, read_source, upgrade_scene
 from realsim.app.upgrade.tables import show_upgrade, write_tables
 from realsim.errors import InputError
 from realsim.many import Workers

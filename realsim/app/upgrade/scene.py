@@ -2,8 +2,7 @@
 
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,14 +17,13 @@ from realsim.app.register.run import run_register
 from realsim.app.school.run import school_session
 from realsim.app.school.tables import why_no_grasp
 from realsim.app.stages import note, save_starts
-from realsim.app.upgrade.analytic import AnalyticJob, agreement_of, try_analytic
-from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig, open_scene
+from realsim.app.upgrade.analytic import agreement_of, try_analytic
+from realsim.app.upgrade.dataset import SceneJob, open_scene
 from realsim.app.upgrade.files import NOTE, keep_imported
 from realsim.app.upgrade.outcome import VIEWS, Outcome, decide
 from realsim.app.upgrade.source import SceneSource, moved_from_start, prepare, world_starts
 from realsim.formats.grasps.scene_grasps import executed
 from realsim.geometry import se3
-from realsim.many import Workers
 from realsim.records import CaptureSession, GraspSet, ObjectPose, Scene, View
 from realsim.registration.compare import spread_frames
 from realsim.registration.evidence import LazyFrame
@@ -44,34 +42,6 @@ UNDECIDED: Record = {
     "edge_px_new": None, "visible": None, "proposed_mm": None, "T_world_obj_proposed": None,
 }  # fmt: skip
 """Columns for an object whose annotation lies in no image that took part."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SceneJob:
-    """One scene to be upgraded; goes to another process as it is."""
-
-    ref: SceneRef
-    config: UpgradeConfig
-    out: Path
-    """Folder of the whole upgrade."""
-    workers: Workers
-    """Who tries its grasps."""
-    key: str
-    """A hash of everything that the result depends on."""
-    labels: tuple[str, ...]
-    """Files of grasp labels in the data set."""
-    at: SceneRef | None = None
-    """Where the data set's files are on another machine; None = where `ref` says."""
-
-    @property
-    def given(self) -> SceneRef:
-        """Where the data set's files are."""
-        return self.at or self.ref
-
-    @property
-    def folder(self) -> Path:
-        """Where the upgraded scene goes."""
-        return self.out / self.ref.place
 
 
 class SceneConsole(Console):
@@ -145,8 +115,7 @@ def upgrade_scene(job: SceneJob, source: SceneSource, shown: Console | None) -> 
         )  # fmt: skip
         analytic: list[GraspSet] = []
         if job.config.analytic:
-            asked = AnalyticJob(ref=job.given, config=job.config, out=job.out, workers=job.workers)
-            analytic = try_analytic(store, asked, console)
+            analytic = try_analytic(store, job, console)
         annotate_session(store, console)
         notes = [*source.notes, *registration_notes(store), *console.told]
         with console.stage("report"):
