@@ -10,9 +10,10 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
+import numpy as np
 
 from realsim.app.command import COMMAND_KEY
 from realsim.app.console import Console
@@ -23,8 +24,15 @@ from realsim.store.cameras import session_of_camera
 from realsim.store.opening import require_header
 from realsim.untrusted.own_json import to_json
 
+T = TypeVar("T")
 BOARD_VIEWS = "calibration/capture"
 """Where in a session the views of the tag board lie: a session of their own."""
+
+
+def evenly(items: Sequence[T], most: int) -> list[T]:
+    """Return at most `most` of the items, evenly spread over their order."""
+    places = np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)
+    return [items[k] for k in places]
 
 
 def open_session(folder: Path) -> SessionStore:

@@ -125,7 +125,7 @@ def loop_errors(store: SessionStore, truth_folder: Path) -> LoopErrors:
 
 def _mask_ious(store: SessionStore, truth: LabTruth) -> tuple[dict[int, float], int]:
     """Return the mean IoU of every instance's written visible masks with the true ones."""
-    from realsim.app.stages import session_models
+    from realsim.app.stages import evenly, session_models
     from realsim.rendering.labels import LabelRenderer, PlacedMesh
 
     models = session_models(store)
@@ -136,9 +136,9 @@ def _mask_ious(store: SessionStore, truth: LabTruth) -> tuple[dict[int, float], 
     # A view that the registration left out has no masks.
     labelled = [k for k in sorted(cameras) if store.has(f"annotations/{k:06d}.json")]
     indices = labelled or sorted(cameras)
-    pick = np.unique(np.linspace(0, len(indices) - 1, IOU_VIEWS).round().astype(int))
+    picked = evenly(indices, IOU_VIEWS)
     values: dict[int, list[float]] = {o.instance: [] for o in truth.objects}
-    for index in (indices[k] for k in pick):
+    for index in picked:
         labels = renderer.render(truth.intrinsics, cameras[index])
         entries = store.read_json(f"annotations/{index:06d}.json")["objects"]
         written = {entry["instance"]: k for k, entry in enumerate(entries)}
@@ -149,4 +149,4 @@ def _mask_ious(store: SessionStore, truth: LabTruth) -> tuple[dict[int, float], 
             iou = mask_iou(labels.visible(i), mine)
             if np.isfinite(iou):
                 found.append(iou)
-    return {i: float(np.mean(v)) for i, v in values.items() if v}, len(pick)
+    return {i: float(np.mean(v)) for i, v in values.items() if v}, len(picked)

@@ -7,14 +7,7 @@ import numpy as np
 import pytest
 from click.testing import Result
 
-from realsim.app.calibrate.clock import (
-    arm_at,
-    clock_option,
-    is_stream,
-    mend_views,
-    pair_pose_logs,
-    read_logs,
-)
+from realsim.app.calibrate.clock import arm_at, clock_option, is_stream, mend_views, pair_pose_logs
 from realsim.app.console import Console
 from realsim.arrays import Array
 from realsim.errors import InputError
@@ -23,6 +16,7 @@ from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics, Chessboard
 from realsim_calibration import BoardView, detection_of, solve_pose_pairs
 from realsim_calibration.exports import read_calibration
+from realsim_calibration.inputs import read_pose_file
 from realsim_calibration.results import Clock
 from typed_commands import invoked
 
@@ -67,7 +61,10 @@ def calibrate(folder: Path, out: Path, *more: str) -> Result:
 
 def test_two_logs_are_joined_by_their_offset(logs: Path) -> None:
     """400 robot poses and 70 board poses give 70 pairs that fit one place of the camera."""
-    robot, board = read_logs(logs / "robot.csv", logs / "board.csv", "")
+    robot, board = (
+        read_pose_file(logs / "robot.csv"),
+        read_pose_file(logs / "board.csv", board=True),
+    )
     assert robot.stated is not None and board.stated is not None
     readings = robot.stated, board.stated
     quiet = Console(quiet=True)
@@ -238,7 +235,8 @@ def test_what_a_log_does_not_know_is_left_out_and_named(
 
     def pairs(name: str, how: Change) -> tuple[int, str]:
         folder = changed(logs, tmp_path / name, how)
-        robot, board = read_logs(folder / "robot.csv", folder / "board.csv", "")
+        robot = read_pose_file(folder / "robot.csv")
+        board = read_pose_file(folder / "board.csv", board=True)
         assert robot.stated is not None and board.stated is not None
         readings = robot.stated, board.stated
         found = pair_pose_logs(robot, board, readings, "eye_in_hand", "auto", Console())

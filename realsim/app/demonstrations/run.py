@@ -17,6 +17,7 @@ from realsim.app.console import Console
 from realsim.app.outputs import require_outside
 from realsim.app.school.files import stored_grasps
 from realsim.app.school.inputs import CACHE, SchoolInputs, SchoolRequest, is_session, weighed
+from realsim.app.stages import evenly
 from realsim.errors import InputError
 from realsim.formats.export_folder import STATE, ExportFolder
 from realsim.formats.grasps.scene_grasps import SceneGrasps
@@ -238,10 +239,7 @@ def chosen_attempts(source: "DemonstrationSource", request: DemonstrationRequest
             f"no attempt is a {request.outcome} among the {len(source)} that there are; ask for "
             "--outcome all."
         )
-    if request.limit is not None and request.limit < len(numbers):
-        at = np.linspace(0, len(numbers) - 1, request.limit).round().astype(int)
-        numbers = [numbers[k] for k in np.unique(at)]
-    return numbers
+    return numbers if request.limit is None else evenly(numbers, request.limit)
 
 
 def _named(text: str) -> tuple[int, int]:

@@ -1,13 +1,13 @@
 """Runs `realsim depth-fit`: frames of a session or a folder in; a sensor's JSON and picture out."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from realsim.app.outputs import require_free_file
+from realsim.app.stages import evenly
 from realsim.arrays import Array32
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from realsim.rendering.depth_sensors.fit import FittedDepthModel
     from realsim.rendering.stereo.fit import FittedStereo
 
-Item = TypeVar("Item")
 CAMERA_NAMES = ("camera.json", "intrinsics.json", "cam_K.txt", "camera.yaml", "intrinsics.yaml")
 """Files beside depth images that may hold their camera."""
 MOST_FRAMES = 12
@@ -154,7 +153,7 @@ def _of_session(source: Path, wanted: tuple[int, ...]) -> DepthFrames:
         ]
         if not indices:
             raise InputError(f"{source} has no views with depth{' among them' if wanted else ''}.")
-        indices = _spread(indices, bool(wanted))
+        indices = indices if wanted else evenly(indices, MOST_FRAMES)
         return DepthFrames(
             depths_m=tuple(store.depth_m(i) for i in indices),
             names=tuple(f"view {i}" for i in indices),
@@ -179,7 +178,7 @@ def _of_folder(
         paths = [p for k, p in enumerate(paths) if k in wanted]
         if not paths:
             raise InputError(f"--only-views names none of the images of {place} (from 0 on).")
-    paths = _spread(paths, bool(wanted))
+    paths = paths if wanted else evenly(paths, MOST_FRAMES)
     depths = tuple(_depth_of(p, unit_m) for p in paths)
     height, width = depths[0].shape
     beside = [f / n for f in (source, place) for n in CAMERA_NAMES if (f / n).is_file()]
@@ -224,11 +223,3 @@ def _depth_of(path: Path, unit_m: float) -> Array32:
             "(rows, columns) and the type uint16 are taken."
         )
     return (counts * np.float64(unit_m)).astype(np.float32)
-
-
-def _spread(items: Sequence[Item], chosen: bool) -> list[Item]:
-    """Return all items that were asked for, otherwise at most MOST_FRAMES evenly among them."""
-    if chosen or len(items) <= MOST_FRAMES:
-        return list(items)
-    places = np.linspace(0, len(items) - 1, MOST_FRAMES).round().astype(int)
-    return [items[k] for k in places]

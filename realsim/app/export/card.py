@@ -28,6 +28,20 @@ SIZES = (
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class SceneTrust:
+    """What registration and review say of a session."""
+
+    verdicts: Mapping[str, int] = field(default_factory=dict[str, int])
+    """Verdict of registration and review -> objects."""
+    findings: Sequence[str] = ()
+    """What registration found out about the scene as a whole."""
+    pose_sigma_mm: float | None = None
+    """Median standard deviation of the objects' positions [mm]."""
+    instances: int | None = None
+    """Things that stand in it; None = nobody has said."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class SceneFacts:
     """What is known of one scene beside what its writer says."""
 
@@ -36,12 +50,7 @@ class SceneFacts:
     """Where its labels come from: 'annotated by realsim', 'as imported', 'the data set's own'."""
     instances: int
     """Things that stand in it."""
-    verdicts: Mapping[str, int] = field(default_factory=dict[str, int])
-    """Verdict of registration and review -> objects."""
-    findings: Sequence[str] = ()
-    """What registration found out about the scene as a whole."""
-    pose_sigma_mm: float | None = None
-    """Median standard deviation of the objects' positions [mm]."""
+    trust: SceneTrust = field(default_factory=SceneTrust)
     grasps_tried: int = 0
     grasps_good: int = 0
 
@@ -166,11 +175,12 @@ def _counts(card: DatasetCard) -> str:
 def _trust(card: DatasetCard) -> str:
     rows: list[list[object]] = []
     for s in card.scenes:
-        verdicts = ", ".join(f"{n} {v}" for v, n in sorted(s.verdicts.items())) or "none given"
-        sigma = "not known" if s.pose_sigma_mm is None else f"{s.pose_sigma_mm:.2f}"
+        trust = s.trust
+        verdicts = ", ".join(f"{n} {v}" for v, n in sorted(trust.verdicts.items())) or "none given"
+        sigma = "not known" if trust.pose_sigma_mm is None else f"{trust.pose_sigma_mm:.2f}"
         rows.append([s.written.name, s.labels, verdicts, sigma])
     text = _table(("scene", "labels", "verdicts", "1 sigma of positions [mm], median"), rows)
-    found = [f"- {s.written.name}: {n}" for s in card.scenes for n in s.findings]
+    found = [f"- {s.written.name}: {n}" for s in card.scenes for n in s.trust.findings]
     checked = [
         f"- {s.written.name}: {n.removeprefix(CHECKED).strip()}"
         for s in card.scenes

@@ -286,23 +286,19 @@ def _opened(source: SourceScene, ids: Mapping[int, int]) -> LabelledScene:
 def _facts(
     source: SourceScene, scene: LabelledScene, written: WrittenScene, target: Target
 ) -> SceneFacts:
-    trust, holds_grasps = trust_in(source), target.holds_grasps
-    grasps = scene.grasps()
+    trust, things = trust_in(source), 0
+    grasps = scene.grasps() if target.holds_grasps else None
     sets = () if grasps is None else grasps.sets
     words = LABELS[scene.labels] if isinstance(scene, SessionScene) else OWN_LABELS
-    things: set[object] = set()
     if trust.instances is None and scene.indices:
-        first = scene.frame(scene.indices[0])
-        things = {(k, o.obj_id) for k, o in enumerate(first.objects)}
+        things = len(scene.frame(scene.indices[0]).objects)
     return SceneFacts(
         written=written,
         labels=words,
-        instances=len(things) if trust.instances is None else trust.instances,
-        verdicts=trust.verdicts,
-        pose_sigma_mm=trust.pose_sigma_mm,
-        findings=trust.findings,
-        grasps_tried=sum(int(executed(s).sum()) for s in sets) if holds_grasps else 0,
-        grasps_good=sum(int(s.good.sum()) for s in sets) if holds_grasps else 0,
+        instances=things if trust.instances is None else trust.instances,
+        trust=trust,
+        grasps_tried=sum(int(executed(s).sum()) for s in sets),
+        grasps_good=sum(int(s.good.sum()) for s in sets),
     )
 
 
@@ -326,9 +322,7 @@ def _card(
         format=target.name,
         conventions=target.conventions,
         scenes=[replace(f, written=_inside(f.written, out)) for f in facts],
-        objects={i: m.name for i, m in models.items()}
-        if target.kind in ("dataset", "scene")
-        else {},
+        objects={i: m.name for i, m in models.items()} if target.kind in HOLD_OBJECTS else {},
         loading=_loading(target, out, inside),
         command=command,
         sources=[s.resolve().name for s in request.sources],

@@ -1,13 +1,15 @@
 """What an export can be made of: sessions, folders of them, BOP and GraspNet data sets."""
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from realsim.app.export.card import SceneTrust
 from realsim.app.export.request import ExportRequest
 from realsim.app.register.fixed import CALIBRATED
 from realsim.app.stages import BOARD_VIEWS
@@ -47,17 +49,6 @@ class SourceScene:
     is_further: bool = False
     """Whether it is a further camera of a session: what is said of the scene is said there."""
     open: Callable[[], LabelledScene]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SceneTrust:
-    """What registration and review say of a session."""
-
-    verdicts: Mapping[str, int] = field(default_factory=dict[str, int])
-    pose_sigma_mm: float | None = None
-    findings: tuple[str, ...] = ()
-    """What registration found out about the scene as a whole."""
-    instances: int | None = None
 
 
 def source_scenes(request: ExportRequest, *, all_cameras: bool = False) -> list[SourceScene]:
@@ -256,16 +247,13 @@ def trust_in(scene: SourceScene) -> SceneTrust:
     if not store.has("registration/scene.json"):
         return SceneTrust()
     judged: Scene = judged_scene(store)
-    verdicts: dict[str, int] = {}
-    for o in judged.objects:
-        verdicts[o.verdict] = verdicts.get(o.verdict, 0) + 1
     sigmas = [
         1e3 * float(np.sqrt(np.linalg.eigvalsh(o.covariance[3:, 3:])[-1]))
         for o in judged.objects
         if o.covariance is not None
     ]
     return SceneTrust(
-        verdicts=verdicts,
+        verdicts=Counter(o.verdict for o in judged.objects),
         pose_sigma_mm=float(np.median(sigmas)) if sigmas else None,
         findings=tuple(_findings(store, {o.instance for o in judged.objects})),
         instances=len(judged.objects),

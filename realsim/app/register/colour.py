@@ -2,9 +2,8 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from realsim.app.register.results import Remark
+from realsim.app.stages import evenly
 from realsim.store import SessionStore
 
 VIEWS = 5
@@ -27,9 +26,8 @@ def colour_remark(store: SessionStore, views: Sequence[int]) -> Remark | None:
         pooled_alignment,
     )
 
-    pick = np.unique(np.linspace(0, len(views) - 1, VIEWS).round().astype(int)) if views else ()
     findings: list[AlignmentFinding] = []
-    for index in (views[k] for k in pick):
+    for index in evenly(views, VIEWS):
         rgb = store.rgb(index)
         if rgb.min() < rgb.max():  # else no colour was recorded
             findings.append(check_alignment(rgb, store.depth_m(index), store.session.intrinsics))

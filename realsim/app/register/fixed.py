@@ -9,7 +9,7 @@ import numpy as np
 
 from realsim.app.register.config import BIAS_FILE, OFF, RegisterRequest, load_depth_bias
 from realsim.app.register.results import CameraChange, claimed_cameras
-from realsim.app.stages import require_sound
+from realsim.app.stages import evenly, require_sound
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.records.depth_bias import DepthBias
@@ -74,8 +74,7 @@ def read_fixed(
         else:
             require_sound(camera)
             _require_still(name, claimed)
-            some = np.unique(np.linspace(0, len(deep) - 1, MOST_IMAGES).round().astype(int))
-            views = [deep[k] for k in some]
+            views = evenly(deep, MOST_IMAGES)
             found[name] = _input(name, (store, camera), claimed, views, request)
     return found, told
 

@@ -14,7 +14,7 @@ from realsim.app.register.fixed import FixedInput, read_fixed
 from realsim.app.register.from_review import review_starts
 from realsim.app.register.results import claimed_cameras, load_cameras
 from realsim.app.reviewed import exclusion_words, review_of
-from realsim.app.stages import content_key, session_models, take_models
+from realsim.app.stages import content_key, evenly, session_models, take_models
 from realsim.arrays import Array, Array32
 from realsim.errors import InputError, UnitError
 from realsim.records import ObjectModel, View
@@ -340,9 +340,8 @@ def _views(
             f"session '{store.folder}' has {len(store.session.views)} views{and_excluded}, and "
             "none with depth and a camera pose; registration needs at least one."
         )
-    if request.views is not None and request.views < len(usable):
-        pick = np.unique(np.linspace(0, len(usable) - 1, request.views).round().astype(int))
-        usable = [usable[k] for k in pick]
+    if request.views is not None:
+        usable = evenly(usable, request.views)
     return tuple(usable), tuple(left_out)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from realsim.app.first_surfaces import FirstSurfaces
 from realsim.app.register.results import Registered
+from realsim.app.stages import evenly
 from realsim.arrays import Array, Image, Int32
 from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel, ObjectPose
@@ -78,7 +79,7 @@ def draw_pictures(
         return {}
     scene = FirstSurfaces([*placed_objects(result, models), *_table(result)])
     looks: list[_Look] = []
-    for index in spread_views(result, VIEWS):
+    for index in evenly(sorted(result.cameras.refined), VIEWS):
         ids, depth = scene.look(store.session.intrinsics, result.cameras.refined[index])
         looks.append(_Look(index=index, ids=ids, depth_m=depth, window=window_of(ids)))
     pictures = {
@@ -90,13 +91,6 @@ def draw_pictures(
     if gain is not None:
         pictures[GAIN] = jpeg(gain, QUALITY)
     return pictures
-
-
-def spread_views(result: Registered, n: int) -> list[int]:
-    """Return at most n of the views that took part, spread evenly."""
-    views = sorted(result.cameras.refined)
-    pick = np.unique(np.linspace(0, len(views) - 1, min(n, len(views))).round().astype(int))
-    return [views[k] for k in pick]
 
 
 def window_of(ids: Int32) -> Window:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from realsim.app.stages import evenly
 from realsim.arrays import Array32, Int32, Mask, Rgb, UInt8
 from realsim.formats.bop.labels import mask_path
 from realsim.geometry.metrics import mask_iou
@@ -80,12 +81,6 @@ class TwinFigures:
         ]  # fmt: skip
 
 
-def compared_views(real: Sequence[int]) -> list[tuple[int, int]]:
-    """Return (synthetic view, real view) of the twins that are compared and shown."""
-    pick = np.unique(np.linspace(0, len(real) - 1, MOST_VIEWS).round().astype(int))
-    return [(int(k), real[int(k)]) for k in pick]
-
-
 def compare_twins(
     store: SessionStore, twin: SessionStore, real: Sequence[int], camera: str
 ) -> TwinFigures:
@@ -98,7 +93,7 @@ def compare_twins(
         camera: the depth profile: its baseline turns depth into disparity.
     """
     intrinsics, baseline_m = store.session.intrinsics, profile(camera).baseline_m
-    pairs = compared_views(real)
+    pairs = evenly(list(enumerate(real)), MOST_VIEWS)
     ious: list[float] = []
     edges: tuple[list[Array32], ...] = ([], [])
     noise: tuple[list[float], list[float]] = ([], [])
@@ -214,8 +209,7 @@ FULL = 65535.0
 
 def shown_views(count: int) -> list[int]:
     """Return the synthetic views that are shown, spread over all."""
-    pick = np.unique(np.linspace(0, count - 1, SHEET_VIEWS).round().astype(int))
-    return [int(k) for k in pick]
+    return evenly(range(count), SHEET_VIEWS)
 
 
 def sheet(twin: SessionStore, store: SessionStore | None, real: Sequence[int] | None) -> Rgb:

@@ -8,6 +8,7 @@ import numpy as np
 from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count
 from realsim.app.report.section import READING, Section, attempted, counted, drawn
+from realsim.app.stages import evenly
 from realsim.arrays import UInt8
 from realsim.store import SessionStore
 from realsim.store.atomic import complete_lines
@@ -155,8 +156,7 @@ def _sheet(section: Section, store: SessionStore) -> None:
     indices = [v.index for v in store.session.views]
     if len(indices) < 2:
         return
-    pick = np.unique(np.linspace(0, len(indices) - 1, SHEET_VIEWS).round().astype(int))
-    shown = [indices[k] for k in pick]
+    shown = evenly(indices, SHEET_VIEWS)
     small = [_thumbnail(store.rgb(k)) for k in shown]
     sheet = contact_sheet(small, columns=4, captions=[f"view {k}" for k in shown])
     if section.pictures == "kept":

@@ -154,7 +154,7 @@ def _named_frames(section: Section, rows: list[tuple[int, Any]]) -> None:
 
 def _photographs(section: Section, store: SessionStore) -> None:
     """Add annotated photographs spread over the session."""
-    from realsim.app.stages import registered_views, session_models
+    from realsim.app.stages import evenly, registered_views, session_models
     from realsim.rendering.overlay import save_png
     from realsim.store import load_grasps, load_scene
     from realsim_sim_bridge.annotation.pictures import overlay_pictures
@@ -166,8 +166,7 @@ def _photographs(section: Section, store: SessionStore) -> None:
     grasps = load_grasps(store.folder / "grasps")
     known = registered_views(store)
     told = [k for k in indices if known is None or k in known] or indices
-    pick = np.unique(np.linspace(0, len(told) - 1, OVERLAY_VIEWS).round().astype(int))
-    shown = [told[k] for k in pick]
+    shown = evenly(told, OVERLAY_VIEWS)
     folder = store.folder / "reports"
     is_kept = section.pictures == "kept"
     for path in folder.glob("overlay_*.png") if is_kept else ():

@@ -8,11 +8,9 @@ registration did not change is the same in both.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from realsim.app.register.inputs import STARTS_FILE
 from realsim.app.register.results import claimed_cameras, is_same_pose
-from realsim.app.stages import registered_views, session_models
+from realsim.app.stages import evenly, registered_views, session_models
 from realsim.arrays import Array, UInt8
 from realsim.geometry import se3
 from realsim.pages import View
@@ -60,9 +58,8 @@ def registration_pairs(store: SessionStore) -> tuple[list[View], str]:
         (o, started.get(o.instance, o.T_world_obj)) for o in after
     ]
     kept: list[tuple[ObjectPose, Array]] = [(o, o.T_world_obj) for o in after]
-    pick = np.unique(np.linspace(0, len(seen) - 1, VIEWS).round().astype(int))
     pairs: list[View] = []
-    for view in (seen[k] for k in pick):
+    for view in evenly(seen, VIEWS):
         assert view.T_world_cam is not None
         pairs.append(
             View(

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from realsim import images
+from realsim.app.stages import evenly
 from realsim.app.upgrade.dataset import GT, SceneRef, UpgradeConfig
 from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
@@ -71,7 +72,7 @@ def prepare(scene: LabelledScene, ref: SceneRef, config: UpgradeConfig) -> Scene
     from realsim.formats.bop.models import require_meshes
     from realsim.formats.graspnet.models import require_meshes as require_graspnet
 
-    indices = _chosen(scene.indices, config.views)
+    indices = tuple(evenly(scene.indices, config.views or len(scene.indices)))
     frames = {i: scene.frame(i) for i in indices}
     intrinsics, depth_unit_m = _one_camera(frames, scene.name)
     poses = _start_poses(scene, frames, ref, config)
@@ -90,14 +91,6 @@ def prepare(scene: LabelledScene, ref: SceneRef, config: UpgradeConfig) -> Scene
         digests=digests, seen=seen, Ts_world_cam=Ts_world_cam,
         models={k: models[k] for k in used}, notes=[*scene.notes, *notes],
     )  # fmt: skip
-
-
-def _chosen(indices: Sequence[int], views: int | None) -> tuple[int, ...]:
-    """Return at most so many images, spread evenly."""
-    if views is None or views >= len(indices):
-        return tuple(indices)
-    pick = np.unique(np.linspace(0, len(indices) - 1, views).round().astype(int))
-    return tuple(indices[k] for k in pick)
 
 
 def _one_camera(frames: Mapping[int, LabelledFrame], name: str) -> tuple[CameraIntrinsics, float]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from realsim import __version__
 from realsim.app.option_values import ranges_of
-from realsim.app.stages import content_key
+from realsim.app.stages import content_key, evenly
 from realsim.errors import InputError
 from realsim.formats.bop.models import INFO_FILE
 from realsim.records import Mesh, View
@@ -239,10 +239,7 @@ def usable_views(store: SessionStore, wanted: Sequence[int]) -> list[View]:
             f"({ranges_of([v.index for v in posed])}); at least {LEAST_VIEWS} from different sides "
             "are needed. Capture more, calibrate the others, or widen --only-views."
         )
-    if wanted or len(posed) <= MOST_VIEWS:
-        return posed
-    pick = np.unique(np.linspace(0, len(posed) - 1, MOST_VIEWS).round().astype(int))
-    return [posed[k] for k in pick]
+    return posed if wanted else evenly(posed, MOST_VIEWS)
 
 
 def fit_config(store: SessionStore) -> "ScaleConfig":
