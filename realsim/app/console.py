@@ -8,7 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -108,6 +108,25 @@ class Console:
         self.times.append(
             StageTime(name=name, cpu_s=cpu_seconds() - cpu, wall_s=time.perf_counter() - wall)
         )
+
+    @contextmanager
+    def steps(self, name: str) -> Generator[Progress]:
+        """Show one step of a stage after another: a step's bar ends when the next begins.
+
+        Yields:
+            A function to call with (step, done, total).
+        """
+        with ExitStack() as stack:
+            bars: dict[str, Tick] = {}
+
+            def tell(step: str, done: int, total: int) -> None:
+                if step not in bars:
+                    stack.close()
+                    bars.clear()
+                    bars[step] = stack.enter_context(self.stage(name, step))
+                bars[step](done, total)
+
+            yield tell
 
     @contextmanager
     def _bar(self, label: str) -> Generator[Tick]:

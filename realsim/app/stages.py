@@ -18,7 +18,7 @@ import numpy as np
 from realsim.app.command import COMMAND_KEY
 from realsim.app.console import Console
 from realsim.errors import InputError
-from realsim.records import ObjectModel, ObjectPose, Scene
+from realsim.records import HandEye, ObjectModel, ObjectPose, Scene
 from realsim.store import SessionStore, provenance
 from realsim.store.cameras import session_of_camera
 from realsim.store.opening import require_header
@@ -33,6 +33,17 @@ def evenly(items: Sequence[T], most: int) -> list[T]:
     """Return at most `most` of the items, evenly spread over their order."""
     places = np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)
     return [items[k] for k in places]
+
+
+def arm_sigma_mm(hand_eye: HandEye) -> float | None:
+    """Return the error of the arm's positions along each axis [mm]; None = it was not found.
+
+    The check's figure is the length of the error.
+    """
+    robot = next((k for k in hand_eye.checks if k.name == "robot poses" and k.unit == "mm"), None)
+    if robot is None or not np.isfinite(robot.value):
+        return None
+    return float(robot.value / np.sqrt(3))
 
 
 def open_session(folder: Path) -> SessionStore:

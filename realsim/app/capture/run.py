@@ -421,7 +421,7 @@ def show_summary(summary: CaptureSummary, console: Console, *, dry: bool = False
         ["there already", summary.skipped, ""],
         ["frames taken again", len(summary.rejected), _reasons(summary.rejected)],
         ["stored with a note", len(summary.noted), _reasons(summary.noted)],
-        ["skipped", len(summary.left_out), _numbers(summary.left_out)],
+        ["skipped", len(summary.left_out), ", ".join(map(str, summary.left_out))],
         ["seconds", f"{summary.seconds:.1f}", ""],
     ]
     rows = [row for row in rows if row[1] or row[0] in ("visited", "captured")]
@@ -437,7 +437,3 @@ def _reasons(found: tuple[tuple[int, str], ...], most: int = 6) -> str:
     """Return 'view: reason' of the first few."""
     lines = [f"{k}: {reason}" for k, reason in found[:most]]
     return "\n".join(lines + ([f"and {len(found) - most} more"] if len(found) > most else []))
-
-
-def _numbers(views: tuple[int, ...]) -> str:
-    return ", ".join(map(str, views))

@@ -27,7 +27,7 @@ from realsim.formats.lerobot.spool import EncodedEpisode, encoded, import_av
 from realsim.geometry import se3
 from realsim.many import Outcome, PoolConfig, Sent, Task, at_most, open_pool, run_many
 from realsim.models.library_records import KnownSolid
-from realsim.records import ObjectModel, Scene
+from realsim.records import Scene
 from realsim.untrusted.own_json import read_object
 
 if TYPE_CHECKING:
@@ -301,7 +301,8 @@ def export_demonstrations(
         with console.stage("page"):
             folder.write_piece("page", page_file(folder.folder, attempts.config.rate_hz, PAGE))
         result = _result(out, attempts, written)
-        card = demonstrations_card(request, written, _names(attempts), result.successes, out)
+        names = {m.obj_id: m.name for m in attempts.scenery.models.values()}
+        card = demonstrations_card(request, written, names, result.successes, out)
         from realsim.app.stages import made_of
         from realsim.store import provenance
 
@@ -410,12 +411,6 @@ def _asked(
         "attempts": digest.hexdigest(),
         "request": asdict(request),
     }
-
-
-def _names(attempts: "DemonstrationSource") -> dict[int, str]:
-    """Return the names of the objects by id."""
-    models: Sequence[ObjectModel] = tuple(attempts.scenery.models.values())
-    return {m.obj_id: m.name for m in models}
 
 
 def show_demonstrations(result: DemonstrationsResult, console: Console) -> None:

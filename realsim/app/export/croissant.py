@@ -69,7 +69,7 @@ def _distribution(sums: Mapping[str, tuple[int, str]]) -> tuple[list[dict[str, A
     kinds: dict[tuple[str, str], list[str]] = {}
     for name in sums:
         path = PurePosixPath(name)
-        kinds.setdefault((_kind(path), path.suffix), []).append(name)
+        kinds.setdefault((path.parent.name or "files", path.suffix), []).append(name)
     found: list[dict[str, Any]] = []
     images: list[str] = []
     for (kind, suffix), names in sorted(kinds.items()):
@@ -101,11 +101,6 @@ def _pattern(names: Sequence[str], kind: str, suffix: str) -> str:
     """Return what finds the files of a kind: as many folders above as the first has."""
     above = len(PurePosixPath(names[0]).parts) - 2
     return "*/" * above + f"{kind}/*{suffix}"
-
-
-def _kind(path: PurePosixPath) -> str:
-    """Return the folder that says what a file is: rgb, depth, annotations ..."""
-    return path.parent.name or "files"
 
 
 def _records(images: Sequence[str]) -> dict[str, Any]:

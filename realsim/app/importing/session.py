@@ -102,7 +102,8 @@ def import_session(
         done = len(store.completed)
         if done:
             console.say(f"{done} of {len(source)} frames are in {folder} already: going on.")
-        taken = _thumbnails(source)
+        size = (source.intrinsics.width, source.intrinsics.height)
+        taken = Thumbnails(cell_size(len(source), size)[1:])
         try:
             with console.stage("import", source.name) as tick:
                 empty = _write_frames(source, store, done, tick, taken)
@@ -192,13 +193,6 @@ def _opened(folder: Path, source: FrameSource, key: str) -> SessionStore:
     )
     described = {**source.extra, "key": key, "notes": list(source.notes)}
     return SessionStore.create(folder, session, extra={KEY: described})
-
-
-def _thumbnails(source: FrameSource) -> Thumbnails:
-    """Return an empty set of small pictures for the contact sheet of so many frames."""
-    camera = source.intrinsics
-    _, w, h = cell_size(len(source), (camera.width, camera.height))
-    return Thumbnails((w, h))
 
 
 def _write_frames(

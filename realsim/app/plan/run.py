@@ -2,14 +2,13 @@
 
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from realsim.app.console import Console, Tick
+from realsim.app.console import Console
 from realsim.app.outputs import require_free_file, require_free_folder
 from realsim.app.plan.request import Place, PlanRequest
 from realsim.errors import InputError
@@ -47,8 +46,6 @@ LEAST_SHARE = 0.75
 """A plan that reaches less of the directions is told where it would reach more."""
 NAMED_LEGS = 12
 """Colliding pieces of moves that are printed one by one."""
-Progress = Callable[[str, int, int], None]
-"""Called with (what, done, total)."""
 
 
 def run_plan(request: PlanRequest, console: Console, *, advise: bool) -> bool:
@@ -95,25 +92,11 @@ def make_plan(
     boxes = request.place.boxes()
     maker = calibration_plan if request.board else hemisphere_plan
     rng = np.random.default_rng(request.seed)
-    with ExitStack() as stack:
+    with console.steps("plan") as tell:
         return maker(
             request.count, request.center(config), mount, config, rng, chain=chain,
-            obstacles=boxes, progress=_progress(console, stack),
+            obstacles=boxes, progress=tell,
         )  # fmt: skip
-
-
-def _progress(console: Console, stack: ExitStack) -> Progress:
-    """Return a function that draws one bar after the other."""
-    bars: dict[str, Tick] = {}
-
-    def tell(what: str, done: int, total: int) -> None:
-        if what not in bars:
-            stack.close()  # the bar before is done
-            bars.clear()
-            bars[what] = stack.enter_context(console.stage("plan", what))
-        bars[what](done, total)
-
-    return tell
 
 
 def show_advice(

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from realsim.app.stages import arm_sigma_mm
 from realsim.errors import InputError
 from realsim.records.depth_bias import DepthBias
 from realsim.store import SessionStore
@@ -69,11 +70,6 @@ def config_of(store: SessionStore, request: RegisterRequest) -> "RegistrationCon
     if not store.has("calibration/hand_eye.json"):
         return config
     hand_eye, c = load_hand_eye(store), config.covariance
-    robot = next((k for k in hand_eye.checks if k.name == "robot poses" and k.unit == "mm"), None)
-    arm_mm = None
-    if robot is not None and np.isfinite(robot.value):
-        # The check's figure is the length of the error; the fit wants it along each axis.
-        arm_mm = float(robot.value / np.sqrt(3))
     # Where cameras are not refined, an error of the hand-eye moves every object alike.
     covariance = replace(
         c,
@@ -83,8 +79,8 @@ def config_of(store: SessionStore, request: RegisterRequest) -> "RegistrationCon
         systematic_rotation_deg=float(np.hypot(c.systematic_rotation_deg, hand_eye.sigma_deg)),
     )
     return replace(
-        config, covariance=covariance, arm_sigma_mm=arm_mm, hand_eye_sigma_mm=hand_eye.sigma_mm,
-        hand_eye_sigma_deg=hand_eye.sigma_deg,
+        config, covariance=covariance, arm_sigma_mm=arm_sigma_mm(hand_eye),
+        hand_eye_sigma_mm=hand_eye.sigma_mm, hand_eye_sigma_deg=hand_eye.sigma_deg,
     )  # fmt: skip
 
 

@@ -104,8 +104,8 @@ def read_inputs(
         ids = {w.obj_id for w in wanted}
         available = {k: m for k, m in available.items() if k in ids}
     _check_solids(available)
-    if wanted is not None:
-        _take(store, request, [w.obj_id for w in wanted])
+    if wanted and request.library is not None:
+        take_models(store, request.library, sorted({w.obj_id for w in wanted}))
     fixed, fixed_out = read_fixed(store, request)
     config = config_of(store, request)
     constants = asdict(replace(config, field_folder=None, bias=DepthBias.none()))
@@ -171,12 +171,6 @@ def _check_solids(models: Mapping[int, ObjectModel]) -> None:
                 f"object {k} ('{model.name}') cannot be registered: {error} Leave it out, or give "
                 "it its thickness."
             ) from error
-
-
-def _take(store: SessionStore, request: RegisterRequest, obj_ids: Sequence[int]) -> None:
-    """Copy the models that the session needs and has not."""
-    if request.library is not None and obj_ids:
-        take_models(store, request.library, sorted(set(obj_ids)))
 
 
 def _wanted(

@@ -45,9 +45,9 @@ def page_bytes(
         pictures: file name -> JPEG or PNG; those that are missing are left out.
     """
     n, taken = len(store.session.views), len(result.cameras.refined)
+    method = result.report.get("asked", {}).get("method", "joint")
     page = Page(
-        title=f"Registration of {result.scene.name}",
-        about=f"{taken} of {n} views, method {_method(result)}",
+        title=f"Registration of {result.scene.name}", about=f"{taken} of {n} views, method {method}"
     )
     page.section(
         "Objects",
@@ -74,8 +74,3 @@ def page_bytes(
     page.section("Checks without ground truth")
     page.table(*tables.check_rows(result.scene.objects, models))
     return page.encode()
-
-
-def _method(result: Registered) -> str:
-    """Return the method by name."""
-    return str(result.report.get("asked", {}).get("method", "joint"))

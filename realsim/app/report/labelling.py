@@ -8,7 +8,6 @@ import numpy as np
 from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count
 from realsim.app.report.section import Section, drawn
-from realsim.arrays import Array
 from realsim.pages import Cell, Picture
 from realsim.store import SessionStore
 
@@ -54,14 +53,10 @@ def labels_section(section: Section, store: SessionStore) -> None:
     shares = np.array([o["visib_fract"] for _, o in rows if o["px_count_all"] > 0], np.float64)
     section.series["labels.visibility"] = [round(float(v), 4) for v in shares]
     if len(shares):
-        drawn(section, "the plot", lambda: _plot(section, shares))
+        said = "1 = no other object in front of it."
+        drawn(section, "the plot", lambda: section.page.plots([(drawing.visibility(shares), said)]))
     _named_frames(section, rows)
     drawn(section, "the annotated photographs", lambda: _photographs(section, store))
-
-
-def _plot(section: Section, shares: Array) -> None:
-    picture = drawing.visibility(shares)
-    section.page.plots([(picture, "1 = no other object in front of it.")])
 
 
 def _figures(section: Section, frames: Mapping[int, Any], rows: list[tuple[int, Any]]) -> None:

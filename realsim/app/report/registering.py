@@ -1,6 +1,6 @@
 """The section on registration: every object's verdict, probability and sigma; cameras; views."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -75,7 +75,9 @@ def registration_section(section: Section, store: SessionStore, state: ReviewSta
         section.page.table(tables.MISSING_HEADER, tables.missing_rows(result, models))
     _views(section, store, result, state)
     drawn(section, "the pictures", lambda: _pictures(section, store))
-    _check_table(section, scene.objects, models)
+    if any(o.checks for o in scene.objects):  # a row a check: as columns they are too wide
+        checks = tables.check_rows(scene.objects, models)
+        section.page.table(*checks, folded="All checks of all objects")
 
 
 def _lines(result: Registered) -> list[str]:
@@ -301,11 +303,3 @@ def _pictures(section: Section, store: SessionStore) -> None:
         # The sliders show the outlines already.
         if (folder / name).is_file() and not (pairs and name == "overlay.jpg"):
             section.page.picture((folder / name).read_bytes(), caption)
-
-
-def _check_table(
-    section: Section, objects: Sequence[ObjectPose], models: Mapping[int, ObjectModel]
-) -> None:
-    """Add every check of every object: a row a check, as columns they are wider than a screen."""
-    if any(o.checks for o in objects):
-        section.page.table(*tables.check_rows(objects, models), folded="All checks of all objects")

@@ -105,8 +105,9 @@ def write_page(request: ReviewRequest, path: Path, console: Console) -> None:
     with console.stage("read", store.session.name) as tick:
         content = SceneContent.load(store, SceneConfig(), tick)
     console.warn(*content.remarks)
+    title = store.session.name or store.folder.resolve().name
     with console.stage("write", str(path)) as tick:
-        summary = write_static(content, state, path, title=_title(store), progress=tick)
+        summary = write_static(content, state, path, title=title, progress=tick)
     console.say(f"{summary.path}   {summary.size_bytes / 1e6:.1f} MB, opens without a server")
     console.result(summary)
 
@@ -196,7 +197,3 @@ def _until_interrupted() -> Generator[threading.Event]:
 def _as_row(entry: Any) -> dict[str, Any]:
     names = ("id", "time", "reviewer", "action", "instance", "obj_id", "view", "comment", "how")
     return {name: getattr(entry, name) for name in names}
-
-
-def _title(store: SessionStore) -> str:
-    return store.session.name or store.folder.resolve().name

@@ -7,11 +7,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 from realsim import __version__
 from realsim.app.option_values import ranges_of
-from realsim.app.stages import content_key, evenly
+from realsim.app.stages import arm_sigma_mm, content_key, evenly
 from realsim.errors import InputError
 from realsim.formats.bop.models import INFO_FILE
 from realsim.records import Mesh, View
@@ -251,14 +249,9 @@ def fit_config(store: SessionStore) -> "ScaleConfig":
     if not store.has("calibration/hand_eye.json"):
         return config
     hand_eye = load_hand_eye(store)
-    robot = next((c for c in hand_eye.checks if c.name == "robot poses" and c.unit == "mm"), None)
-    arm_mm = None
-    if robot is not None and np.isfinite(robot.value):
-        # The check's figure is the length of the error; the fit wants it along each axis.
-        arm_mm = float(robot.value / np.sqrt(3))
     return replace(
         config, hand_eye_sigma_mm=hand_eye.sigma_mm, hand_eye_sigma_deg=hand_eye.sigma_deg,
-        arm_sigma_mm=arm_mm,
+        arm_sigma_mm=arm_sigma_mm(hand_eye),
     )  # fmt: skip
 
 

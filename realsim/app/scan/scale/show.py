@@ -31,11 +31,6 @@ CALIPER = (
 Rows = list[list[str]]
 
 
-def verdict_line(name: str, fit: ScaleFit) -> str:
-    """Return the verdict and what it means."""
-    return f"{fit.verdict.upper()}: {name}: {MEANING[fit.verdict]}"
-
-
 def size_rows(box_mm: Sequence[float] | Array, size_mm: Sequence[float] | Array) -> Rows:
     """Return the size: the smallest box first, which does not depend on the mesh's axes."""
     x, y, z = (f"{v:.1f}" for v in size_mm)
@@ -115,7 +110,7 @@ def show_fit(
     name: str, fit: ScaleFit, checks: Sequence[MeasuredCheck], box_mm: Array, console: Console
 ) -> None:
     """Print everything about a fit, its verdict first; box_mm (3,) is the smallest box [mm]."""
-    console.say(verdict_line(name, fit))
+    console.say(f"{fit.verdict.upper()}: {name}: {MEANING[fit.verdict]}")
     for reason in fit.reasons:
         console.say(f"  - {reason}")
     console.table(f"Scale of {name}", ["figure", "value"], scale_rows(fit, box_mm))

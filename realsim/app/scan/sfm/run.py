@@ -1,12 +1,10 @@
 """`realsim scan sfm`: photographs to metric cameras and points, depth images to a mesh."""
 
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from realsim.app.console import Console, Tick
+from realsim.app.console import Console
 from realsim.app.scan.sfm.dense import mesh_from_depth
 from realsim.app.scan.sfm.inputs import SfmInputs, SfmRequest, sfm_inputs, sfm_masks
 from realsim.errors import InputError
@@ -43,7 +41,7 @@ def run_scan_sfm(request: SfmRequest, console: Console) -> bool:
             f"--dense was asked for, and '{request.images}' has no depth images: a mesh is fused "
             "from measured depth, not from photographs. Leave --dense out, or capture with depth."
         )
-    out = request.out or _default_out(request, inputs)
+    out = request.out or request.images / (PLACE if inputs.store is not None else "sfm")
     if out.exists() and not out.is_dir():
         raise InputError(f"'{out}' is a file; give --out a folder that may be made or filled.")
     out.mkdir(parents=True, exist_ok=True)
@@ -68,31 +66,6 @@ def run_scan_sfm(request: SfmRequest, console: Console) -> bool:
     return result.verdict == "accepted" and dense_good
 
 
-def _default_out(request: SfmRequest, inputs: SfmInputs) -> Path:
-    return request.images / (PLACE if inputs.store is not None else "sfm")
-
-
-@contextmanager
-def _steps(console: Console) -> Generator[Callable[[str, int, int], None]]:
-    """Show one progress bar after another: a step's bar ends when the next begins."""
-    from contextlib import ExitStack
-
-    with ExitStack() as stack:
-        shown = ""
-        tick: Tick | None = None
-
-        def progress(step: str, done: int, total: int) -> None:
-            nonlocal shown, tick
-            if step != shown:
-                stack.close()
-                tick = stack.enter_context(console.stage("sfm", STEPS.get(step, step)))
-                shown = step
-            if tick is not None:
-                tick(done, total)
-
-        yield progress
-
-
 def _reconstructed(
     request: SfmRequest, inputs: SfmInputs, config: SfmConfig, out: Path, console: Console
 ) -> SfmResult:
@@ -100,11 +73,11 @@ def _reconstructed(
     from realsim.scanning.sfm.reconstruct import reconstruct, with_depth
 
     import_pycolmap()  # before anything else does
-    with _steps(console) as progress:
+    with console.steps("sfm") as tell:
         result = reconstruct(
             inputs.paths, inputs.intrinsics, config, poses=inputs.poses,
             Ts_world_cam=inputs.Ts_world_cam, masks=sfm_masks(request, inputs), folder=out,
-            progress=progress,
+            progress=lambda step, done, total: tell(STEPS.get(step, step), done, total),
         )  # fmt: skip
     return with_depth(result, inputs.depth_of, config) if inputs.has_depth else result
 
