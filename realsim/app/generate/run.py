@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from realsim import many
 from realsim.app.console import Console
 from realsim.app.generate.request import (
     LAYOUTS,
@@ -13,16 +14,6 @@ from realsim.app.generate.request import (
     require_usable,
 )
 from realsim.app.generate.scene import CACHE, SceneCosts, is_finished, make_scene_of
-from realsim.many import (
-    Outcome,
-    PoolConfig,
-    Task,
-    Worked,
-    WorkerDiedError,
-    at_most,
-    open_pool,
-    run_many,
-)
 from realsim.store.lock import only_run_in
 from realsim_sim_bridge.synthetic.frame import require_renderer
 from realsim_sim_bridge.table_scenes.scene import scene_name
@@ -41,7 +32,7 @@ class GenerateOutcome:
 
 
 def generate(
-    out: Path, scenes: int, request: GenerateRequest, where: PoolConfig, console: Console
+    out: Path, scenes: int, request: GenerateRequest, where: many.PoolConfig, console: Console
 ) -> GenerateOutcome:
     """Make the scenes 0 to `scenes` - 1 of a request.
 
@@ -59,7 +50,7 @@ def generate(
         claim(out, request)
         kept = [k for k in range(scenes) if is_finished(out, k, request)]
         due = [k for k in range(scenes) if k not in kept]
-        pool = at_most(where, len(due))
+        pool = many.at_most(where, len(due))
         # Scenes fewer than workers: the rest help with the views.
         each = 1 if where.address else max(1, where.processes // pool.processes)
         plural = "" if scenes == 1 else "s"
@@ -77,7 +68,7 @@ def _made(
     out: Path,
     due: list[int],
     request: GenerateRequest,
-    where: PoolConfig,
+    where: many.PoolConfig,
     workers: int,
     tick: Callable[[], None],
 ) -> tuple[list[SceneCosts], dict[int, str]]:
@@ -92,24 +83,24 @@ def _made(
         return made, failed
     numbers = {scene_name(k): k for k in due}
 
-    def done(outcome: Outcome) -> None:
+    def done(outcome: many.Outcome) -> None:
         if outcome.error is None:
             made.append(outcome.value)
-        elif isinstance(outcome.error, WorkerDiedError):
+        elif isinstance(outcome.error, many.WorkerDiedError):
             failed[numbers[outcome.task.name]] = (
                 f"{outcome.why}. Run the same command again: it goes on from here."
             )
         else:
             failed[numbers[outcome.task.name]] = outcome.why
 
-    with open_pool(where) as pool:
-        run_many(scene_tasks(out, due, request, workers), pool, done, tick=lambda _: tick())
+    with many.open_pool(where) as pool:
+        many.run_many(scene_tasks(out, due, request, workers), pool, done, tick=lambda _: tick())
     return made, failed
 
 
 def scene_tasks(
     out: Path, due: Sequence[int], request: GenerateRequest, workers: int
-) -> Iterator[Task]:
+) -> Iterator[many.Task]:
     """Yield the tasks that make scenes; each changes its own files in the folder.
 
     Args:
@@ -120,8 +111,8 @@ def scene_tasks(
     """
     for k in due:
         name = scene_name(k)
-        own = Worked(out, only=(f"{name}/*", f"{LAYOUTS}/{name}.*", f"{CACHE}/*"))
-        yield Task(name=name, fn=make_scene_of, args=(own, k, *request.carried(), workers))
+        own = many.Worked(out, only=(f"{name}/*", f"{LAYOUTS}/{name}.*", f"{CACHE}/*"))
+        yield many.Task(name=name, fn=make_scene_of, args=(own, k, *request.carried(), workers))
 
 
 def _ticker(

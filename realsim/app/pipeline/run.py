@@ -13,19 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from realsim.app.console import Console
+from realsim.app.pipeline import chain
 from realsim.app.pipeline.campaign import Campaign, Step
-from realsim.app.pipeline.chain import (
-    SCENE,
-    Command,
-    Ended,
-    are_same,
-    begun_anew,
-    ends_of,
-    result_of,
-    run_chain,
-    run_command,
-    take_away,
-)
+from realsim.app.pipeline.chain import Command, Ended
 from realsim.errors import InputError, RealsimError
 from realsim.formats.export_folder import FINISHED
 from realsim.many import Outcome, PoolConfig, Task, Worked, open_pool, run_many
@@ -168,7 +158,7 @@ def _run_of_all(
                 place = before if out.exists() else before.rename(out)
                 console.warn(f"the earlier {out.name} stays in {place}.")
             if end.is_done and before.is_dir():
-                kept = take_away(before, out)
+                kept = chain.take_away(before, out)
                 if kept is not None:
                     console.warn(
                         f"files in the earlier {out.name} that no command wrote, or that were "
@@ -301,16 +291,16 @@ def _run_scenes(
     kept = {s.name: tuple(takewhile(lambda e: e.is_done, s.ends)) for s in due}
     total, ended, written = len(due), 0, time.monotonic()
     share = max(1, where.processes // max(1, total))
-    commands = [_command(step, [SCENE], share) for step in campaign.of_a_scene]
+    commands = [_command(step, [chain.SCENE], share) for step in campaign.of_a_scene]
 
     def tasks() -> Iterator[Task]:
         for s in due:
             _require_room(campaign.out)
             log = _log(campaign, s.name)
-            record = ends_of(campaign.out / RECORDS / f"{s.name}.json")
-            left = begun_anew(commands, campaign.of_a_scene, record)[len(kept[s.name]) :]
+            record = chain.ends_of(campaign.out / RECORDS / f"{s.name}.json")
+            left = chain.begun_anew(commands, campaign.of_a_scene, record)[len(kept[s.name]) :]
             args = (left, Worked(s.folder.resolve()), _folder(campaign), log)
-            yield Task(name=s.name, fn=run_chain, args=args)
+            yield Task(name=s.name, fn=chain.run_chain, args=args)
 
     def keep(outcome: Outcome) -> None:
         nonlocal ended, written
@@ -360,7 +350,7 @@ def _words_of_all(
 def _run(campaign: Campaign, step: Step, words: Sequence[str], workers: int) -> Ended:
     command = _command(step, words, workers)
     folder = _folder(campaign)
-    return run_command(command, folder, folder, _log(campaign, step.stage))
+    return chain.run_command(command, folder, folder, _log(campaign, step.stage))
 
 
 def _known(campaign: Campaign, name: str, place: Path) -> SceneState:
@@ -368,12 +358,12 @@ def _known(campaign: Campaign, name: str, place: Path) -> SceneState:
     scene = SceneState(name=name, folder=place)
     if not place.is_dir():
         return scene
-    ends = ends_of(campaign.out / RECORDS / f"{name}.json")
-    commands = [_command(step, [SCENE], 1) for step in campaign.of_a_scene]
-    same = are_same(commands, ends)
+    ends = chain.ends_of(campaign.out / RECORDS / f"{name}.json")
+    commands = [_command(step, [chain.SCENE], 1) for step in campaign.of_a_scene]
+    same = chain.are_same(commands, ends)
     ends = ends[: same.index(False)] if False in same else ends[: len(same)]
     for k, end in enumerate(ends):
-        now = result_of(place, end.stage) if end.result else ""
+        now = chain.result_of(place, end.stage) if end.result else ""
         if now == end.result:
             continue
         if now.split()[:1] in ([], end.result.split()[:1]):  # no record, or that of this campaign
