@@ -264,6 +264,11 @@ class Console:
                     self._out.print(Text(f"  {name}: {cell}" if name else f"  {cell}"))
 
 
+def shortened(lines: Sequence[str], most: int, rest: str) -> list[str]:
+    """Return at most so many lines, and one that says how many more there are: {} in `rest`."""
+    return [*lines[:most], *[rest.format(len(lines) - most)] * (len(lines) > most)]
+
+
 def duration(seconds: float) -> str:
     """Return a time as people say it: 40 s, 12 min, 3 h 20 min."""
     if seconds < 90:

@@ -46,6 +46,12 @@ def arm_sigma_mm(hand_eye: HandEye) -> float | None:
     return float(robot.value / np.sqrt(3))
 
 
+def hint_of(folder: Path) -> str:
+    """Return which sessions lie in a folder that is none, as the end of a message."""
+    inner = sorted(p.parent for p in folder.glob("*/session.json"))
+    return f" Did you mean {', '.join(map(str, inner))}?" if inner else ""
+
+
 def open_session(folder: Path) -> SessionStore:
     """Open a session, or say what is missing.
 
@@ -64,11 +70,9 @@ def open_session(folder: Path) -> SessionStore:
             f"give '{session}', which takes all of its cameras along."
         )
     if not (folder / "session.json").is_file():
-        inner = sorted(p.parent.name for p in folder.glob("*/session.json"))
-        hint = f" Did you mean {', '.join(str(folder / n) for n in inner)}?" if inner else ""
         raise InputError(
-            f"'{folder}' holds no session.json, so it is not a session.{hint} Give a folder that "
-            "`realsim demo`, `capture`, `import`, `generate` or `upgrade` has filled."
+            f"'{folder}' holds no session.json, so it is not a session.{hint_of(folder)} Give a "
+            "folder that `realsim demo`, `capture`, `import`, `generate` or `upgrade` has filled."
         )
     return SessionStore.open(folder)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from realsim.app.console import shortened
 from realsim.app.report.sliders import registration_pairs
 from realsim.arrays import Image
 from realsim.pages import Page, Picture, View
@@ -18,6 +19,7 @@ from realsim.store.atomic import write_bytes
 
 
 if TYPE_CHECKING:
+    from realsim_sim_bridge.annotation.annotate import AnnotationSummary
     from realsim_sim_bridge.annotation.summary import ObjectSummary
 
 HEADER = [
@@ -43,9 +45,6 @@ def _percent(share: float, digits: int = 0) -> str:
     """Return a share in percent, or a dash where nothing was measured."""
     return "-" if np.isnan(share) else f"{100 * share:.{digits}f}"
 
-
-if TYPE_CHECKING:
-    from realsim_sim_bridge.annotation.annotate import AnnotationSummary
 
 PAGE_FILE = "reports/annotated.html"
 MAP_VIEWS = 6
@@ -83,7 +82,7 @@ def write_page(
     """
     flagged = set(summary.flagged_views)
     page = Page(title=f"Annotation of {store.session.name}", about=summary.told())
-    for note in _notes(summary):
+    for note in shortened(summary.notes, MOST_NOTES, "And {} more, in annotations/."):
         page.text(note, "note")
     page.section("Photographs and labels", _which(summary, views) + LEGEND)
     page.sliders(
@@ -122,14 +121,6 @@ def _unseen(store: SessionStore, view: int) -> str:
     part: Any = store.read_json(part_path(view))
     names = [str(e["name"]) for e in part["objects"] if not e["px_count_visib"]]
     return f" (not visible: {', '.join(names)})" if names else ""
-
-
-def _notes(summary: "AnnotationSummary") -> list[str]:
-    """Return what the reader must know first."""
-    notes = list(summary.notes[:MOST_NOTES])
-    if len(summary.notes) > MOST_NOTES:
-        notes.append(f"And {len(summary.notes) - MOST_NOTES} more, in annotations/.")
-    return notes
 
 
 def _add_sections(

@@ -8,7 +8,7 @@ import numpy as np
 
 from realsim.app.annotate.current import annotate_session
 from realsim.app.annotate.page import HEADER, object_row, write_page
-from realsim.app.console import Console
+from realsim.app.console import Console, shortened
 from realsim.app.stages import judged_scene, open_session, registered_views, session_models
 from realsim.arrays import Image
 from realsim.many import Workers
@@ -64,10 +64,8 @@ def show_summary(summary: "AnnotationSummary", console: Console) -> None:
     console.say(str(summary))
     if summary.by_object:
         console.table("objects", HEADER, [object_row(o) for o in summary.by_object])
-    for note in summary.notes[:MOST_NOTES]:
+    for note in shortened(summary.notes, MOST_NOTES, "and {} more, in annotations/."):
         console.say(f"note: {note}")
-    if len(summary.notes) > MOST_NOTES:
-        console.say(f"note: and {len(summary.notes) - MOST_NOTES} more, in annotations/.")
 
 
 def draw(store: SessionStore, summary: "AnnotationSummary", console: Console) -> tuple[Path, Path]:

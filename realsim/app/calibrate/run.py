@@ -58,6 +58,7 @@ def run_calibrate(source: Path, console: Console, *, live: bool, **options: Any)
 def _run(source: Path, console: Console, *, live: bool, **options: Any) -> bool:
     """Calibrate what `source` holds; return whether no check is bad."""
     from realsim.app.calibrate.session import has_board_views_only, keep_board
+    from realsim.app.stages import hint_of
     from realsim.store.opening import require_header
     from realsim.store.results import BOARD_FILE
 
@@ -82,11 +83,9 @@ def _run(source: Path, console: Console, *, live: bool, **options: Any) -> bool:
             "with robot poses is expected."
         )
     if not options["board"] and options["board_poses"] is None:
-        inner = sorted(p.parent.name for p in source.glob("*/session.json"))
-        hint = f" Did you mean {', '.join(str(source / n) for n in inner)}?" if inner else ""
         raise InputError(
-            f"'{source}' holds no session.json, so it is not a session.{hint} For a folder of "
-            "images with robot poses say which target they show: --board "
+            f"'{source}' holds no session.json, so it is not a session.{hint_of(source)} For a "
+            "folder of images with robot poses say which target they show: --board "
             "charuco:5x7,square=33mm,marker=20mm,dict=6X6_100, or a file of `realsim board`."
         )
     request = _request(source, options, console)

@@ -13,7 +13,7 @@ import numpy as np
 from realsim.app.calibrate.board_views import BOARD_FILE
 from realsim.app.capture.devices import open_devices
 from realsim.app.capture.fixed import fixed_stores, open_fixed
-from realsim.app.console import Console
+from realsim.app.console import Console, shortened
 from realsim.app.stages import BOARD_VIEWS, save_starts
 from realsim.arrays import UInt8
 from realsim.errors import InputError
@@ -435,5 +435,4 @@ def show_summary(summary: CaptureSummary, console: Console, *, dry: bool = False
 
 def _reasons(found: tuple[tuple[int, str], ...], most: int = 6) -> str:
     """Return 'view: reason' of the first few."""
-    lines = [f"{k}: {reason}" for k, reason in found[:most]]
-    return "\n".join(lines + ([f"and {len(found) - most} more"] if len(found) > most else []))
+    return "\n".join(shortened([f"{k}: {reason}" for k, reason in found], most, "and {} more"))

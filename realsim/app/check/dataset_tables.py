@@ -6,7 +6,7 @@ from pathlib import Path
 from realsim.app.check.agreement import ObjectAgreement, SceneAgreement
 from realsim.app.check.checksums import ChecksumReport, check_checksums, checksum_list
 from realsim.app.check.dataset import checked_scenes, is_dataset
-from realsim.app.console import Console
+from realsim.app.console import Console, shortened
 
 HEADER = [
     "scene, object", "frames", "mask IoU", "worst", "visible IoU", "worst", "depth [mm]", "hidden",
@@ -14,6 +14,7 @@ HEADER = [
 ]  # fmt: skip
 MOST_ROWS = 60
 MOST_FINDINGS = 40
+MORE = "... and {} more (--json has them all)"
 """Lines on the console; `--json` has all."""
 
 
@@ -59,10 +60,7 @@ def run_dataset_check(folder: Path, *, console: Console) -> bool:
 def show_checksums(report: ChecksumReport, console: Console) -> None:
     """Print which files are not as they were written."""
     faults = report.faults()
-    for line in faults[:MOST_FINDINGS]:
-        console.say(f"damaged: {line}")
-    if len(faults) > MOST_FINDINGS:
-        console.say(f"... and {len(faults) - MOST_FINDINGS} more (--json has them all)")
+    console.say(*shortened([f"damaged: {line}" for line in faults], MOST_FINDINGS, MORE))
     good = report.listed - len(faults)
     console.say(f"{good} of {report.listed} files are as they were written ({report.file})")
 
@@ -78,10 +76,7 @@ def show_agreement(folder: Path, scenes: Sequence[SceneAgreement], console: Cons
         console.say(f"... and {len(rows) - MOST_ROWS} more objects (--json has them all)")
     lines = [f"{s.place}: {f}" for s in scenes for f in s.findings]
     lines += [f"{s.place} object {o.obj_id} {o.name}: {f}" for s, o in rows for f in o.faults]
-    for line in lines[:MOST_FINDINGS]:
-        console.say(f"disagrees: {line}")
-    if len(lines) > MOST_FINDINGS:
-        console.say(f"... and {len(lines) - MOST_FINDINGS} more (--json has them all)")
+    console.say(*shortened([f"disagrees: {line}" for line in lines], MOST_FINDINGS, MORE))
     for note in dict.fromkeys(f"{s.place}: {n}" for s in scenes for n in s.notes):
         console.say(f"note: {note}")
     good = sum(s.agrees for s in scenes)

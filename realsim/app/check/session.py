@@ -12,6 +12,7 @@ from realsim.app.check.dataset import is_dataset
 from realsim.app.check.dataset_tables import run_dataset_check
 from realsim.app.console import Console
 from realsim.app.option_values import ranges_of
+from realsim.app.stages import hint_of
 from realsim.errors import InputError
 from realsim.store.lock import only_run_in
 from realsim.store.session_check import CheckReport, check_session, is_session
@@ -41,12 +42,10 @@ def run_check(folder: Path, console: Console, *, repair: bool, decode: bool) -> 
             )
         return run_dataset_check(folder, console=console)
     if not folder.is_dir() or not is_session(folder):
-        inner = sorted(p.parent.name for p in folder.glob("*/session.json"))
-        hint = f" Did you mean {', '.join(str(folder / n) for n in inner)}?" if inner else ""
         raise InputError(
             f"'{folder}' is not a session: it has none of session.json, manifest.jsonl and "
             f"robot.jsonl; it is no annotated data set of BOP or GraspNet, and no SHA256SUMS lists "
-            f"its files.{hint}"
+            f"its files.{hint_of(folder)}"
         )
     if not repair:
         report = check_session(folder, decode=decode)

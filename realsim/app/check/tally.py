@@ -11,6 +11,7 @@ import numpy as np
 
 from realsim.app.check import agreement
 from realsim.app.check.agreement import ObjectAgreement
+from realsim.app.console import shortened
 from realsim.arrays import Array
 
 LISTED = 5
@@ -187,8 +188,5 @@ def stray_depth(tallies: Sequence[Tally]) -> list[str]:
 
 def _listed(found: Sequence[tuple[float, str]]) -> list[str]:
     """Return what was found of single images: the worst one by one, the rest counted."""
-    worst = sorted(found, key=lambda f: -f[0])
-    told = [text for _, text in worst[:LISTED]]
-    if len(worst) > LISTED:
-        told.append(f"... and {len(worst) - LISTED} images more, off by less than these")
-    return told
+    worst = [text for _, text in sorted(found, key=lambda f: -f[0])]
+    return shortened(worst, LISTED, "... and {} images more, off by less than these")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from realsim.app.console import Console
+from realsim.app.console import Console, shortened
 from realsim.app.outputs import require_outside
 from realsim.app.school.files import stored_grasps
 from realsim.app.school.inputs import CACHE, SchoolInputs, SchoolRequest, is_session, weighed
@@ -426,7 +426,5 @@ def show_demonstrations(result: DemonstrationsResult, console: Console) -> None:
         console.say(
             f"{result.not_attempted} grasps were not attempted: the arm does not get there."
         )
-    console.warn(*w.notes[:10])
-    if len(w.notes) > 10:
-        console.warn(f"and {len(w.notes) - 10} more notes, in realsim/episodes.jsonl.")
+    console.warn(*shortened(w.notes, 10, "and {} more notes, in realsim/episodes.jsonl."))
     console.say(f"page      {result.page}")

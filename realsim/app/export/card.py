@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from realsim import __version__
+from realsim.app.console import shortened
 from realsim.formats.labelled_scene import WrittenScene
 
 CARD_FILE = "README.md"
@@ -93,7 +94,7 @@ def card_bytes(card: DatasetCard) -> bytes:
         for n in s.written.notes
         if not n.startswith(CHECKED)
     ]
-    parts.append(_section("What was changed or lost on the way", _shortened(notes)))
+    parts.append(_section("What was changed or lost on the way", _joined(notes)))
     if card.objects:
         parts.append(_section("Objects", _table(("id", "name"), sorted(card.objects.items()))))
     parts.append(_section("Loading", f"```python\n{card.loading.strip()}\n```\n"))
@@ -196,13 +197,11 @@ def _trust(card: DatasetCard) -> str:
 
 
 def _listed(title: str, lines: Sequence[str]) -> str:
-    return f"\n{title}:\n\n{_shortened(lines)}\n" if lines else ""
+    return f"\n{title}:\n\n{_joined(lines)}\n" if lines else ""
 
 
-def _shortened(notes: Sequence[str], most: int = 60) -> str:
-    unique = list(dict.fromkeys(notes))
-    more = [f"- and {len(unique) - most} more notes."] if len(unique) > most else []
-    return "\n".join([*unique[:most], *more])
+def _joined(notes: Sequence[str], most: int = 60) -> str:
+    return "\n".join(shortened(list(dict.fromkeys(notes)), most, "- and {} more notes."))
 
 
 def _licence(card: DatasetCard) -> str:

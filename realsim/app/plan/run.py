@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from realsim.app.console import Console
+from realsim.app.console import Console, shortened
 from realsim.app.outputs import require_free_file, require_free_folder
 from realsim.app.plan.request import Place, PlanRequest
 from realsim.errors import InputError
@@ -364,10 +364,8 @@ def show_colliding(plan: CapturePlan, console: Console) -> bool:
     from realsim_capture_plans.plan_files.imported import colliding_legs
 
     legs = colliding_legs(plan)
-    for line in legs[:NAMED_LEGS]:
-        console.warn(f"not free: {line}")
-    if len(legs) > NAMED_LEGS:
-        console.warn(f"not free: {len(legs) - NAMED_LEGS} more")
+    told = [f"not free: {line}" for line in legs]
+    console.warn(*shortened(told, NAMED_LEGS, "not free: {} more"))
     if legs:
         console.warn(
             f"{len(legs)} straight pieces of moves do not keep {1e3 * plan.config.clearance_m:g} "

@@ -63,15 +63,10 @@ class Difference:
             return None
         if value == 0 or (sigma is not None and abs(value) <= SIGMAS * sigma):
             return "same"
-        better = CATALOGUE[self.name].better
-        if better == "none":
-            return "other" if sigma is not None else "unknown"
-        if sigma is None:
-            return "unknown"
-        return "better" if (value > 0) == (better == "higher") else "worse"
+        return "unknown" if sigma is None else self.tends or "other"
 
     @property
-    def tends(self) -> str:
+    def tends(self) -> Literal["better", "worse", ""]:
         """Return which way it goes, where that says something."""
         better = CATALOGUE[self.name].better
         if self.value is None or self.value == 0 or better == "none":

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from realsim.app.console import shortened
 from realsim.errors import InputError
 from realsim.formats.export_folder import SUMS_FILE
 from realsim.images import read_image
@@ -61,9 +62,8 @@ def _compare(first: Path, second: Path, name: str) -> FileDifference | None:
         rows = []
     if not rows:
         return FileDifference(path=name, words=(f"{_unlike(a, b)} of {len(a)} bytes differ",))
-    words = [f"{field}: {was} -> {now}" for field, was, now, _ in rows[:MOST_FIELDS]]
-    if len(rows) > MOST_FIELDS:
-        words.append(f"and {len(rows) - MOST_FIELDS} more")
+    told = [f"{field}: {was} -> {now}" for field, was, now, _ in rows]
+    words = shortened(told, MOST_FIELDS, "and {} more")
     sizes = [size for *_, size in rows if math.isfinite(size)]
     return FileDifference(path=name, words=tuple(words), greatest=max(sizes) if sizes else math.nan)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from realsim.app.console import Console
+from realsim.app.console import Console, shortened
 from realsim.app.export.croissant import CROISSANT_FILE
 from realsim.app.reproduce.compare import FileDifference, compare_folders
 from realsim.errors import InputError
@@ -143,10 +143,9 @@ def _require_again(folder: Path, record: Provenance, run: Run) -> None:
             )
     changed = provenance.changed_inputs(folder, record, run)
     if changed:
-        listed = "".join(f"\n  {line}" for line in changed[:8])
-        more = f"\n  and {len(changed) - 8} more" if len(changed) > 8 else ""
+        listed = "".join(f"\n  {line}" for line in shortened(changed, 8, "and {} more"))
         raise InputError(
-            f"{len(changed)} inputs of this result are not what they were (sha256):{listed}{more}\n"
+            f"{len(changed)} inputs of this result are not what they were (sha256):{listed}\n"
             f"Restore them, or run {record.stage} again.{command}"
         )
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from realsim.app.console import Console
+from realsim.app.console import Console, shortened
 from realsim.models.library_records import ModelProperties
 from realsim.records import Mesh
 
@@ -49,10 +49,8 @@ def list_library(folder: Path, console: Console) -> None:
             f"scale NAME SESSION --library {folder} --overwrite` scales it anew."
         )
     doubtful = [e.name for e in entries if e.properties and e.properties.verdict == "doubtful"]
-    for name in doubtful[:NEAR_SHOWN]:
-        console.say(f"{name} is doubtful: `realsim scan show {folder} {name}` says why.")
-    if len(doubtful) > NEAR_SHOWN:
-        console.say(f"... and so are {len(doubtful) - NEAR_SHOWN} more.")
+    told = [f"{n} is doubtful: `realsim scan show {folder} {n}` says why." for n in doubtful]
+    console.say(*shortened(told, NEAR_SHOWN, "... and so are {} more."))
     unknown = [e for e in entries if e.properties is None and e.obj_id is not None]
     if unknown:
         console.say(
@@ -180,10 +178,8 @@ def run_library_check(folder: Path, console: Console) -> bool:
     console.result({"sound": sound, "findings": [asdict(f) for f in findings]})
     if console.as_json:
         return sound
-    for f in findings[:SHOWN]:
-        console.say(f"{f.kind:<9} {f.path}: {f.text}")
-    if len(findings) > SHOWN:
-        console.say(f"... and {len(findings) - SHOWN} more; --json has all.")
+    told = [f"{f.kind:<9} {f.path}: {f.text}" for f in findings]
+    console.say(*shortened(told, SHOWN, "... and {} more; --json has all."))
     counted = _counted(library.entries())
     console.say(f"{counted} in {folder}: {'sound' if sound else 'not sound'}")
     return sound

@@ -139,7 +139,7 @@ def read_inputs(
     Raises:
         InputError: nothing usable there, a folder missing or not wanted, or an unknown object.
     """
-    from realsim.app.stages import open_session
+    from realsim.app.stages import hint_of, open_session
 
     if is_session(source):
         if out is not None:
@@ -158,11 +158,10 @@ def read_inputs(
             f"'{source}' is no session, so its results need a folder: add --out FOLDER."
         )
     if out is None:
-        inner = sorted(p.parent for p in source.glob("*/session.json")) if source.is_dir() else []
-        hint = f" Did you mean {', '.join(map(str, inner))}?" if inner else ""
         raise InputError(
-            f"'{source}' holds no session.json, so it is not a session.{hint} Give a session, or "
-            "a BOP scene, a GraspNet scene or a scene.yaml with --out FOLDER for its results."
+            f"'{source}' holds no session.json, so it is not a session.{hint_of(source)} Give a "
+            "session, or a BOP scene, a GraspNet scene or a scene.yaml with --out FOLDER for its "
+            "results."
         )
     if out.exists() and not out.is_dir():
         raise InputError(f"--out '{out}' is a file; a folder for the results is expected.")
