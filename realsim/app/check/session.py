@@ -101,15 +101,9 @@ def _show_tables(report: CheckReport, console: Console) -> None:
     console.table(f"Session {report.folder}", ["", ""], rows)
     found = sorted(report.findings, key=lambda f: not f.is_damage)
     if found:
-        header = ["file", "", "found"]
-        console.table(
-            "Damage and notes",
-            header,
-            [
-                [f.path, f.kind if f.is_damage else f"note: {f.kind}", f.found]
-                for f in found[:SHOWN]
-            ],
-        )
+        kinds = [f.kind if f.is_damage else f"note: {f.kind}" for f in found]
+        rows = [[f.path, kind, f.found] for f, kind in zip(found, kinds, strict=True)]
+        console.table("Damage and notes", ["file", "", "found"], rows[:SHOWN])
         if len(found) > SHOWN:
             console.say(f"... and {len(found) - SHOWN} more (--json has them all)")
     for inner in report.inner:

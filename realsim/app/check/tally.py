@@ -129,13 +129,8 @@ def _stray_places(obj_id: int, tally: Tally) -> Iterator[tuple[float, str]]:
         if len(points) == 2:  # which of the two is off, nothing can tell
             off = float(np.linalg.norm(points[1] - points[0]))
             if off > agreement.STRAY_MM:
-                yield (
-                    off,
-                    (
-                        f"images {images[0]} and {images[1]}: object {obj_id} stands {off:.1f} mm "
-                        "apart in them"
-                    ),
-                )
+                both = f"images {images[0]} and {images[1]}"
+                yield off, f"{both}: object {obj_id} stands {off:.1f} mm apart in them"
         if len(points) < agreement.FEWEST_IMAGES:
             continue
         for k, point in enumerate(points):
@@ -176,13 +171,8 @@ def stray_depth(tallies: Sequence[Tally]) -> list[str]:
         off = float(of_image[k]) - middle
         if abs(off) > max(agreement.STRAY_MM, agreement.STRAY_SPREADS * spread):
             way = "farther" if off > 0 else "nearer"
-            found.append(
-                (
-                    abs(off),
-                    f"depth of image {image} is {abs(off):.0f} mm {way} than that of the others: "
-                    f"scale {float(np.median(scale[image])):.3f}",
-                )
-            )
+            told = f"depth of image {image} is {abs(off):.0f} mm {way} than that of the others: "
+            found.append((abs(off), f"{told}scale {float(np.median(scale[image])):.3f}"))
     return _listed(found)
 
 

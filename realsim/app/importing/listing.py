@@ -39,15 +39,8 @@ def list_source(request: ImportRequest, console: Console) -> None:
             console.say(f"{what}: {text}")
         console.result({"source": request.source, "kind": kind, "holds": dict(rows)})
         return
-    if kind == "bop":
-        header, rows = _bop_rows(request)
-    elif kind == "graspnet":
-        header, rows = _graspnet_rows(request.source)
-    elif kind == "nerfstudio":
-        header, rows = _nerfstudio_rows(request.source)
-    else:
-        header, rows = _colmap_rows(request.source)
-    _show(request, kind, header, rows, console)
+    rows_of = {"bop": _bop_rows, "graspnet": _graspnet_rows, "nerfstudio": _nerfstudio_rows}
+    _show(request, kind, *rows_of.get(kind, _colmap_rows)(request.source), console)
 
 
 def _show(
@@ -63,11 +56,11 @@ def _show(
     console.result({"source": request.source, "kind": kind, "holds": holds})
 
 
-def _bop_rows(request: ImportRequest) -> tuple[Sequence[str], list[Sequence[object]]]:
+def _bop_rows(root: Path) -> tuple[Sequence[str], list[Sequence[object]]]:
     from realsim.formats.bop.scene import find_scenes, read_scene
 
     rows: list[Sequence[object]] = []
-    for ref in find_scenes(request.source):
+    for ref in find_scenes(root):
         place = f"{ref.split}/{ref.folder.name}"
         try:
             scene = read_scene(ref)

@@ -263,17 +263,13 @@ def _regions(
     if plane is None:
         return _Regions(ids=ids, table=np.zeros_like(table))
     points = ray_table(camera) * labels.depth_m[..., None]
-    T_table_cam = se3.invert(plane.T_world_table) @ _pose(view)
+    T_table_world = se3.invert(plane.T_world_table)
+    T_table_cam = T_table_world @ _pose(view)
     on_table = points @ T_table_cam[:2, :3].T + T_table_cam[:2, 3]
-    corners = np.concatenate(
-        [
-            se3.transform(
-                se3.invert(plane.T_world_table) @ o.T_world_obj,
-                synthetic.models[o.obj_id].mesh.vertices,
-            )[:, :2]
-            for o in synthetic.shown
-        ]
-    )
+    corners = np.concatenate([
+        se3.transform(T_table_world @ o.T_world_obj, synthetic.models[o.obj_id].mesh.vertices)
+        for o in synthetic.shown
+    ])[:, :2]  # fmt: skip
     low, high = corners.min(0) - NEAR_TABLE_M, corners.max(0) + NEAR_TABLE_M
     near = np.all((on_table > low) & (on_table < high), axis=-1)
     apart = cv2.dilate((labels.ids >= 0).astype(np.uint8), kernel) == 0

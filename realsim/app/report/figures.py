@@ -15,7 +15,7 @@ from realsim.untrusted.values import mapping, number
 NOT_A_FIGURE = "has no figure of this name"
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Figure:
     """One figure of one session."""
 

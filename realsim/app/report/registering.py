@@ -150,9 +150,7 @@ def _figures(section: Section, result: Registered) -> None:
     per_view = _view_sigmas(result)
     if per_view:
         middle = {k: float(np.median(v)) for k, v in sorted(per_view.items())}
-        section.add(
-            Figure(name="registration.view_sigma_px", value=float(np.median(list(middle.values()))))
-        )
+        section.add(Figure("registration.view_sigma_px", float(np.median(list(middle.values())))))
         section.series["registration.view_sigma_px"] = {
             "view": list(middle), "value": [round(v, 5) for v in middle.values()],
         }  # fmt: skip
@@ -163,9 +161,7 @@ def _figures(section: Section, result: Registered) -> None:
             value = float(np.median([m[key] for m in moved]))
             section.add(Figure(name=f"registration.{name}", value=value))
     if "hand_eye_mm" in found:
-        section.add(
-            Figure(name="registration.hand_eye_shift_mm", value=float(found["hand_eye_mm"]))
-        )
+        section.add(Figure("registration.hand_eye_shift_mm", float(found["hand_eye_mm"])))
     plane = result.scene.plane
     if plane is not None:
         section.add(Figure(name="registration.plane_rms_mm", value=1e3 * plane.rms_m))

@@ -92,14 +92,9 @@ def _figures(section: Section, sets: list[GraspSet]) -> None:
     )
     mm, _ = _kept(sets)
     if len(mm):
-        sigma = _mean_error(mm)
         # The median of n normal values scatters 1.2533 times as much as their mean.
-        section.add(
-            Figure(
-                name="school.slip_mm", value=float(np.median(mm)),
-                sigma=None if sigma is None else 1.2533 * sigma,
-            )
-        )  # fmt: skip
+        sigma = None if (error := _mean_error(mm)) is None else 1.2533 * error
+        section.add(Figure("school.slip_mm", float(np.median(mm)), sigma))
     section.series["school.scores"] = [round(float(v), 4) for v in scores]
     if (p := p_hold_spread(sets)) is not None:
         told = np.concatenate([s.labels[labelled(s)] for s in sets if s.label == "p_hold"])

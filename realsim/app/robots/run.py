@@ -71,24 +71,11 @@ def check_robot(name: str, page: Path | None, console: Console) -> bool:
 def _check_page(robot: RobotArm | Hand, findings: list[Finding]) -> Page:
     page = Page(title=f"realsim robots: {robot.name}", about=f"{robot.title}; {_told(robot)}")
     wrong = [f for f in findings if not f.is_right]
-    page.verdict(
-        "bad" if wrong else "good",
-        f"{len(wrong)} wrong." if wrong else "Nothing is wrong.",
-        "",
-        [[f.what, f.advice] for f in wrong],
-    )
+    kind, title = ("bad", f"{len(wrong)} wrong.") if wrong else ("good", "Nothing is wrong.")
+    page.verdict(kind, title, "", [[f.what, f.advice] for f in wrong])
     page.picture(robot_picture(robot), robot.title)
-    page.table(
-        ["what", "found", ""],
-        [
-            [
-                f.what,
-                f.found,
-                Cell("right", kind="good") if f.is_right else Cell("wrong", kind="bad"),
-            ]
-            for f in findings
-        ],
-    )
+    marks = {True: Cell("right", kind="good"), False: Cell("wrong", kind="bad")}
+    page.table(["what", "found", ""], [[f.what, f.found, marks[f.is_right]] for f in findings])
     return page
 
 

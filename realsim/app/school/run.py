@@ -73,11 +73,8 @@ def config_of(request: SchoolRequest, scene: Scene) -> "SchoolConfig":
     engine = settings_of(request.engine)
     make_engine(engine)  # not in a worker, minutes later: what is not installed is said at once
     config = replace(config, slip=replace(config.slip, physics=physics, engine=engine))
-    candidates = config.candidates
-    if request.points is not None:
-        candidates = replace(candidates, surface_points=request.points)
-    if request.rotations is not None:
-        candidates = replace(candidates, rotations=request.rotations)
+    asked = {"surface_points": request.points, "rotations": request.rotations}
+    candidates = replace(config.candidates, **{k: n for k, n in asked.items() if n is not None})
     config = replace(config, candidates=candidates)
     if request.cross_check:
         second = settings_of("mujoco" if request.engine == "pybullet" else "pybullet")
