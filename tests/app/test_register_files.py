@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 from begun_sessions import add_drawn, begun, light_things
 from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
-from realsim.app.register.colour import colour_remark
 from realsim.app.register.files import documents, finish_interrupted, write_result
 from realsim.app.register.results import (
     NEXT_FILE,
@@ -23,6 +22,7 @@ from realsim.app.register.results import (
     load_registered,
     load_seen,
 )
+from realsim.app.register.run import colour_remark
 from realsim.app.report.session import write_report
 from realsim.app.stages import judged_scene, registered_views
 from realsim.geometry import se3

@@ -7,13 +7,12 @@ import numpy as np
 
 from realsim.app.console import Console
 from realsim.app.register import from_review, results
-from realsim.app.register.colour import colour_remark
 from realsim.app.register.config import RegisterRequest
 from realsim.app.register.files import costs_of, finish_interrupted, remark_of, write_result
 from realsim.app.register.inputs import RegisterInputs, read_inputs
 from realsim.app.register.results import CameraChange, Registered, Remark
 from realsim.app.reviewed import damage_words, review_of, stray_words
-from realsim.app.stages import content_key, note, require_sound, take_models
+from realsim.app.stages import content_key, evenly, note, require_sound, take_models
 from realsim.arrays import Array
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, ObjectModel, Scene
@@ -30,6 +29,11 @@ READ = (
 """Files of a session that a registration is made of."""
 BESIDE = "the depth does not lie on the photographs, and labels would lie beside the object"
 """Why no pose is accepted then."""
+COLOUR_VIEWS = 5
+"""So many views, spread over the session, are held against their photographs: a third of a second
+each where they do not fit, a tenth where they do."""
+QUIET_KINDS = ("aligned", "unknown")
+"""Kinds of findings that need no words."""
 Amend = Callable[[Registered], Registered]
 PIXEL_POINTS = 40
 """Vertices of a mesh over which the pixel uncertainty is averaged."""
@@ -158,6 +162,32 @@ def _registered(
     )  # fmt: skip
     scene = replace(result.scene, objects=objects)
     return replace(result, scene=scene, remarks=(*result.remarks, off))
+
+
+def colour_remark(store: SessionStore, views: Sequence[int]) -> Remark | None:
+    """Return what is wrong with how depth lies on colour; None = nothing, or it cannot be told.
+
+    Args:
+        store: the session.
+        views: numbers of views with depth.
+    """
+    from realsim.registration.depth_alignment import (
+        AlignmentFinding,
+        check_alignment,
+        pooled_alignment,
+    )
+
+    findings: list[AlignmentFinding] = []
+    for index in evenly(views, COLOUR_VIEWS):
+        rgb = store.rgb(index)
+        if rgb.min() < rgb.max():  # else no colour was recorded
+            findings.append(check_alignment(rgb, store.depth_m(index), store.session.intrinsics))
+    if not findings:
+        return None
+    found = pooled_alignment(findings)
+    return (
+        None if found.kind in QUIET_KINDS else Remark(view=None, kind=found.kind, words=found.words)
+    )
 
 
 def as_registered(
