@@ -1,8 +1,8 @@
 """Pictures of generated scenes for people: a contact sheet, and a page that switches layers."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -94,7 +94,7 @@ def write_page(
         shown += layers(store, sheet_views(views, each), name)
     thumbnails = [
         View(f"{scene_name(layout.number)}, {layout.table}, {len(layout.objects)} objects",
-             {"": _picture(out, layout, sheet_views(views, 1)[0])})
+             {"": partial(_picture, out, layout, sheet_views(views, 1)[0])})
         for layout in layouts
     ]  # fmt: skip
     page = Page(title=f"Generated scenes: {out.name}", about=about)
@@ -113,13 +113,9 @@ def write_page(
     return out / PAGE_FILE
 
 
-def _picture(out: Path, layout: Layout, view: int) -> Any:
-    """Return what reads a scene's picture when it is needed."""
-
-    def read() -> Rgb:
-        return fitted(read_rgb(out / scene_name(layout.number) / f"rgb/{view:06d}.png"))
-
-    return read
+def _picture(out: Path, layout: Layout, view: int) -> Rgb:
+    """Return a photograph of a scene, small."""
+    return fitted(read_rgb(out / scene_name(layout.number) / f"rgb/{view:06d}.png"))
 
 
 def _spread(layouts: Sequence[Layout], most: int) -> list[Layout]:
