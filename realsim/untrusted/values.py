@@ -19,8 +19,8 @@ EXACT_WHOLE = 2**53
 """Up to here every whole number is a double."""
 LONGEST_TEXT = 10_000
 """Characters of a name, a path or a remark."""
-LONGEST_PART = 255
-"""Bytes of a folder's or a file's name."""
+LONGEST_PART, LONGEST_PATH = 250, 2000
+"""Bytes of a name and of a path in a data set; a system takes them with an ending and a folder."""
 
 
 def number(value: Any, name: str, low: float = -math.inf, high: float = math.inf) -> float:
@@ -141,25 +141,41 @@ def path_inside(folder: Path, value: Any, name: str) -> Path:
     """Return the path that a file names, if it stays inside the folder, links resolved.
 
     Raises:
-        InputError: it is no text, absolute, goes up with '..', or a link leads out; no system has
-            files of such a name.
+        InputError: as of `relative_path`, or a link leads out.
     """
-    given = text(value, name)
-    parts = PurePosixPath(given.replace("\\", "/"))
-    escapes = parts.is_absolute() or ".." in parts.parts or given[1:2] == ":"
+    path = folder / relative_path(value, name)
     try:
-        path = folder / parts
-        escapes = escapes or not path.resolve().is_relative_to(folder.resolve())
-        if any(len(os.fsencode(part)) > LONGEST_PART for part in parts.parts):
-            raise ValueError("too long")
+        if path.resolve().is_relative_to(folder.resolve()):
+            return path
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"{name} is {_shown(value)}; no file has such a name.") from error
-    if escapes:
-        raise InputError(
-            f"{name} is {_shown(value)}, which leads out of {folder}. Files are only read from "
-            "inside the data set: copy the file there and name it relative to the folder."
-        )
+    raise InputError(_LEADS_OUT.format(name, _shown(value), folder))
+
+
+def relative_path(value: Any, name: str) -> PurePosixPath:
+    """Return the path that a file names, relative to a folder that it does not leave by itself.
+
+    Raises:
+        InputError: it is no text, absolute, goes up with '..', or no system has files of such a
+            name.
+    """
+    given = text(value, name)
+    path = PurePosixPath(given.replace("\\", "/"))
+    try:
+        sizes = [len(os.fsencode(part)) for part in path.parts]
+    except ValueError:
+        sizes = [LONGEST_PATH]
+    if max(sizes, default=0) > LONGEST_PART or sum(sizes) > LONGEST_PATH or "\0" in given:
+        raise InputError(f"{name} is {_shown(value)}; no file has such a name.")
+    if path.is_absolute() or ".." in path.parts or given[1:2] == ":":
+        raise InputError(_LEADS_OUT.format(name, _shown(value), "the data set"))
     return path
+
+
+_LEADS_OUT = (
+    "{} is {}, which leads out of {}. Files are only read from inside the data set: copy the file "
+    "there and name it relative to the folder."
+)
 
 
 def _shown(value: Any) -> str:

@@ -220,6 +220,12 @@ def test_frames_that_cannot_be_are_refused(tmp_path, frames, said):
     refused(said, open_nerfstudio, ngp(tmp_path / "x", frames, fl_x=40))
 
 
+@pytest.mark.parametrize("images", [None, "."])
+def test_a_name_that_no_file_has_is_refused(tmp_path, images):
+    folder = ngp(tmp_path / "x", lambda rows: [r | {"file_path": "9" * 252} for r in rows], fl_x=40)
+    refused("no file has such a name", open_nerfstudio, folder, images_folder=images)
+
+
 def test_an_image_that_is_not_there_is_named(tmp_path):
     folder = ngp(tmp_path / "x", fl_x=40)
     (folder / "r_1.png").unlink()

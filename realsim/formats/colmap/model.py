@@ -21,6 +21,7 @@ from realsim.formats.plausible_camera import require_plausible
 from realsim.geometry import se3
 from realsim.interop import T_from_rigid3d, opencv_from_colmap_px
 from realsim.records import CameraIntrinsics
+from realsim.untrusted import values
 
 COUNT = struct.Struct("<Q")
 """Number of records at the beginning of every file."""
@@ -332,6 +333,7 @@ def read_model(folder: Path | str) -> ColmapModel:
                 f"the name of image {number} in {folder} is no text (UTF-8); the file is damaged, "
                 "or written with another encoding. Export it again."
             ) from error
+        values.relative_path(name, f"the name of image {number} in {folder}")
         if not image.has_pose:
             unregistered.append(name)
             continue

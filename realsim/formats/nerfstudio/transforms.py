@@ -323,10 +323,12 @@ def read_transforms(path: Path | str, *, images_folder: Path | None = None) -> T
 
 def _image_file(folder: Path, name: str, images_folder: Path | None, where: str) -> Path | None:
     """Return the image that a frame names; NeRF's own files leave the ending out."""
+    said = f"'file_path' of {where}"
     if images_folder is not None:
-        path = images_folder / PurePosixPath(name.replace("\\", "/")).name
+        base = PurePosixPath(name.replace("\\", "/")).name
+        path = images_folder / values.relative_path(base, said)
     else:
-        path = values.path_inside(folder, name, f"'file_path' of {where}")
+        path = values.path_inside(folder, name, said)
     if path.is_file():
         return path
     if path.suffix.lower() in ENDINGS:
