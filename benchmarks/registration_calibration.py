@@ -40,10 +40,9 @@ from realsim.registration.evidence import (
     measure_noise,
     without_table,
 )
-from realsim.registration.judging.held_out import HeldOutConfig, half_fit, held_out, owned_points
+from realsim.registration.judging.held_out import half_fit, held_out, owned_points
 from realsim.registration.judging.ownership import make_claims, owners
 from realsim.registration.judging.surface_residuals import (
-    ResidualConfig,
     error_level_m,
     residual_checks,
     surface_residuals,
@@ -221,24 +220,21 @@ def wrong(
 def judged(r: Round, bodies: list[Body], poses: list[Array]) -> list[dict[str, float]]:
     """Return all checks of all objects."""
     middle = np.mean([b.center(T) for b, T in zip(bodies, poses, strict=True)], axis=0)
-    config, halves = ResidualConfig(), HeldOutConfig()
     frames = spread_frames(r.frames, middle, VerifyConfig().frames)
     comparer = make_comparer(r.scene.intrinsics, frames, r.noise, r.plane, CompareConfig())
-    owned = owned_points(bodies, poses, r.scene.intrinsics, r.views, r.Ts, r.noise, r.plane, halves)
+    owned = owned_points(bodies, poses, r.scene.intrinsics, r.views, r.Ts, r.noise, r.plane)
     checked = verify_objects(bodies, poses, [o.cloud for o in owned], comparer, VerifyConfig())
     held = support_checks(bodies, poses, r.plane)
     features = [c.checks | s for c, s in zip(checked, held, strict=True)]
     if len(r.views) == 1:
         return features
     residuals = surface_residuals(
-        bodies, poses, r.scene.intrinsics, r.views, r.Ts, r.noise, r.plane, config
+        bodies, poses, r.scene.intrinsics, r.views, r.Ts, r.noise, r.plane
     )
-    level = error_level_m(residuals, config)
-    tested_on = held_out(
-        bodies, owned, len(r.views), half_fit(bodies, poses, owned, halves), halves
-    )
+    level = error_level_m(residuals)
+    tested_on = held_out(bodies, owned, len(r.views), half_fit(bodies, poses, owned))
     return [
-        f | residual_checks(s, level, config) | h.checks()
+        f | residual_checks(s, level) | h.checks()
         for f, s, h in zip(features, residuals, tested_on, strict=True)
     ]
 

@@ -22,11 +22,10 @@ from realsim.geometry.depth import points_from_depth
 from realsim.geometry.mesh import sample_surface
 from realsim.interop import import_open3d
 from realsim.records import ObjectPose
+from realsim.registration import single_view as ours
 from realsim.registration.body import Body, make_body
 from realsim.registration.evidence import DepthFrame
-from realsim.registration.single_view import SingleViewConfig, fit_single_view
 
-CONFIG = SingleViewConfig()
 SAMPLES = 4000
 """Points of the whole model, for the variants that seek the scene's points on it."""
 LEAST_POINTS = 50
@@ -56,7 +55,7 @@ def rivals(g: Given) -> Done:
 def _result(g: Given, body: Body, frame: DepthFrame, variant: str) -> ObjectPose:
     """Return a variant's pose; the start where it finds nothing to fit."""
     methods: dict[str, Callable[[Given, Body, DepthFrame], Array]] = {
-        "p2l": lambda g, b, f: fit_single_view(b, g.scene.intrinsics, f, CONFIG),
+        "p2l": lambda g, b, f: ours.fit_single_view(b, g.scene.intrinsics, f),
         "p2p": lambda g, b, f: _icp(g, b, f, "p2p"),
         "gicp": lambda g, b, f: _icp(g, b, f, "gicp"),
         "p2l to CAD": _scene_to_model,
@@ -75,8 +74,8 @@ def _icp(g: Given, body: Body, frame: DepthFrame, how: str) -> Array:
     T = se3.invert(frame.T_world_cam) @ body.T_start
     source = _cloud(_seen_from(body, T))
     target = _cloud(_crop(g, body, frame, T))
-    for reach, tukey in zip(CONFIG.reach_m, CONFIG.tukey_m, strict=True):
-        criteria = registration.ICPConvergenceCriteria(1e-7, 1e-7, CONFIG.steps)
+    for reach, tukey in zip(ours.REACH_M, ours.TUKEY_M, strict=True):
+        criteria = registration.ICPConvergenceCriteria(1e-7, 1e-7, ours.STEPS)
         if how == "gicp":
             method = registration.TransformationEstimationForGeneralizedICP(
                 1e-3, registration.TukeyLoss(k=tukey)
@@ -99,9 +98,9 @@ def _scene_to_model(g: Given, body: Body, frame: DepthFrame) -> Array:
     model = _cloud(points)
     model.normals = o3d.utility.Vector3dVector(normals)
     T = se3.invert(T)
-    for reach, tukey in zip(CONFIG.reach_m, CONFIG.tukey_m, strict=True):
+    for reach, tukey in zip(ours.REACH_M, ours.TUKEY_M, strict=True):
         method = registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=tukey))
-        criteria = registration.ICPConvergenceCriteria(1e-7, 1e-7, CONFIG.steps)
+        criteria = registration.ICPConvergenceCriteria(1e-7, 1e-7, ours.STEPS)
         T = np.array(
             registration.registration_icp(scene, model, reach, T, method, criteria).transformation
         )
@@ -124,13 +123,13 @@ def _crop(g: Given, body: Body, frame: DepthFrame, T_cam_obj: Array) -> Array:
     """Return the measured points (N, 3) around the start, the true table cut off, in the camera."""
     points, _ = points_from_depth(frame.depth_m, g.scene.intrinsics, 1)
     height = se3.transform(frame.T_world_cam, points)[:, 2]
-    near = np.linalg.norm(points - body.center(T_cam_obj), axis=1) < body.radius_m + CONFIG.crop_m
+    near = np.linalg.norm(points - body.center(T_cam_obj), axis=1) < body.radius_m + ours.CROP_M
     points = points[near & (height > 0.003)]
     if len(points) < LEAST_POINTS:
         raise DegenerateError(
             f"view {frame.index} holds {len(points)} points near {body.model.name}."
         )
-    return points[:: max(1, len(points) // CONFIG.target_points)]
+    return points[:: max(1, len(points) // ours.TARGET_POINTS)]
 
 
 def _cloud(points: Array) -> Any:

@@ -41,7 +41,7 @@ from realsim.records import CameraIntrinsics, Mesh, ObjectModel, ObjectPose
 from realsim.records.depth_bias import DepthBias
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import DepthFrame
-from realsim.registration.photo import PhotoConfig, Picture, outline_of, shifted
+from realsim.registration.photo import Picture, outline_of, shifted
 from realsim.registration.register import Registration, register_scene
 from realsim.rendering.photo import Lighting, PhotoRenderer
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
@@ -213,17 +213,17 @@ def _line(r: Judged) -> str:
 
 def _edges(frame: Frame, found: Registration) -> tuple[list[float], list[float]]:
     """Return the medians of the accepted poses, shifted onto the photograph, and as published."""
-    objects, config = found.scene.objects, PhotoConfig()
+    objects = found.scene.objects
     given = {p.instance: p.T_world_obj for p in frame.annotations}
     meshes = [frame.models[o.obj_id].mesh for o in objects]
-    moved = shifted(frame.picture, meshes, [o.T_world_obj for o in objects], config)
+    moved = shifted(frame.picture, meshes, [o.T_world_obj for o in objects])
     out: tuple[list[float], list[float]] = ([], [])
     for kind, poses in zip(out, (moved, [given[o.instance] for o in objects]), strict=True):
         depths = [frame.picture.depth_of(m, T) for m, T in zip(meshes, poses, strict=True)]
         for k, o in enumerate(objects):
             if o.verdict == "accepted":
                 others = np.min([*depths[:k], *depths[k + 1 :]], axis=0)
-                kind.append(outline_of(frame.picture, depths[k], others, config).median_px)
+                kind.append(outline_of(frame.picture, depths[k], others).median_px)
     return out
 
 

@@ -117,26 +117,22 @@ def axis_name(vector: Array) -> str:
     return f"{kind} ({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f}) of the object"
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class BlindConfig:
-    """When and how a blind direction is set back to the start."""
-
-    tolerated_loss: float = 0.04
-    """Greatest share of the rendered gain that may be lost. Scanned cans in real frames lose 2 to
-    5 % when turned about their axis (dents, and the fit was the best of many); a box or a jug
-    loses 15 % and more."""
-    least_turn_share: float = 0.5
-    """A blind motion whose turn (times the radius) is less than this share of it is a shift."""
-    declared_deg: float = 5.0
-    """A declared continuous symmetry within this angle of a blind turn is the same axis."""
-    declared_m: float = 0.005
-    """It must also pass the fitted axis this near [m]."""
-    rounds: int = 3
-    """Alternations of setting back and fitting the rest; the third moves nothing by 0.02 mm."""
-    passes: int = 30
-    """Greatest number of turns through several blind axes until nothing is left."""
-    settled_deg: float = 1e-4
-    """A pass that turns less than this ends them."""
+TOLERATED_LOSS = 0.04
+"""Greatest share of the rendered gain that may be lost. Scanned cans in real frames lose 2 to
+5 % when turned about their axis (dents, and the fit was the best of many); a box or a jug
+loses 15 % and more."""
+LEAST_TURN_SHARE = 0.5
+"""A blind motion whose turn (times the radius) is less than this share of it is a shift."""
+DECLARED_DEG = 5.0
+"""A declared continuous symmetry within this angle of a blind turn is the same axis."""
+DECLARED_M = 0.005
+"""It must also pass the fitted axis this near [m]."""
+START_ROUNDS = 3
+"""Alternations of setting back and fitting the rest; the third moves nothing by 0.02 mm."""
+START_PASSES = 30
+"""Greatest number of turns through several blind axes until nothing is left."""
+SETTLED_DEG = 1e-4
+"""A pass that turns less than this ends them."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -163,7 +159,7 @@ class Kept:
     """Empty if nothing is blind."""
 
 
-def blind_axes(body: Body, motions: Array, config: BlindConfig) -> list[BlindAxis]:
+def blind_axes(body: Body, motions: Array) -> list[BlindAxis]:
     """Return the turns and shifts in the blind motions (6, K), declared axes in place of fitted.
 
     The blind motions are a subspace; the singular vectors of its rotation part split it into turns
@@ -176,24 +172,24 @@ def blind_axes(body: Body, motions: Array, config: BlindConfig) -> list[BlindAxi
     axes: list[BlindAxis] = []
     for motion in mixing @ motions.T:
         turning = float(np.linalg.norm(motion[:3]))
-        if turning >= config.least_turn_share:
+        if turning >= LEAST_TURN_SHARE:
             a = motion[:3] / turning
             point = body.center_obj + np.cross(a, motion[3:] * body.radius_m / turning)
-            axes.append(_declared(body.model, a, point, config))
+            axes.append(_declared(body.model, a, point))
         else:
             d = motion[3:] / np.linalg.norm(motion[3:])
             axes.append(BlindAxis(turn=False, axis=d, point=body.center_obj, declared=False))
     return axes
 
 
-def _declared(model: ObjectModel, axis: Array, point: Array, config: BlindConfig) -> BlindAxis:
+def _declared(model: ObjectModel, axis: Array, point: Array) -> BlindAxis:
     """Return the model's continuous symmetry that this turn is, or the turn as it was found."""
     for direction, origin in model.symmetry_axes:
         a = np.asarray(direction, dtype=np.float64)
         a = a / np.linalg.norm(a)
         off = point - np.asarray(origin, dtype=np.float64)
         distance = float(np.linalg.norm(off - (off @ a) * a))
-        if abs(a @ axis) > np.cos(np.radians(config.declared_deg)) and distance < config.declared_m:
+        if abs(a @ axis) > np.cos(np.radians(DECLARED_DEG)) and distance < DECLARED_M:
             return BlindAxis(turn=True, axis=a, point=point - off + (off @ a) * a, declared=True)
     return BlindAxis(turn=True, axis=axis, point=point, declared=False)
 
@@ -210,7 +206,7 @@ def twist_rad(R: Array, axis: Array) -> float:
 
 
 def nearest_to_start(
-    T_fit: Array, T_start: Array, center_obj: Array, axes: list[BlindAxis], config: BlindConfig
+    T_fit: Array, T_start: Array, center_obj: Array, axes: list[BlindAxis]
 ) -> Array:
     """Return of the poses T_fit S, S any blind motion, the one nearest to the start.
 
@@ -219,7 +215,7 @@ def nearest_to_start(
     """
     T = T_fit
     turns = [a for a in axes if a.turn]
-    for _ in range(config.passes):
+    for _ in range(START_PASSES):
         most = 0.0
         for a in turns:
             angle = twist_rad(T_start[:3, :3].T @ T[:3, :3], a.axis)
@@ -227,7 +223,7 @@ def nearest_to_start(
             back = se3.from_rt(se3.exp_so3(-angle * a.axis), np.zeros(3))
             T = T @ P @ back @ se3.invert(P)
             most = max(most, abs(angle))
-        if most < np.radians(config.settled_deg):
+        if most < np.radians(SETTLED_DEG):
             break
     apart = T_start - T
     gap = T[:3, :3].T @ (apart[:3, :3] @ center_obj + apart[:3, 3])
@@ -241,7 +237,8 @@ def keep_start(
     body: Body,
     fit: PoseFit,
     data: tuple[Cloud, Comparer, FreeSpace | None],
-    configs: tuple[BlindConfig, CovarianceConfig, SolverConfig],
+    covariance: CovarianceConfig,
+    solver: SolverConfig,
 ) -> Kept:
     """Return the fit with its blind directions as they were at the start.
 
@@ -249,36 +246,36 @@ def keep_start(
         body: the object; its start is what is kept.
         fit: of the points that do not see those directions.
         data: the object's points, the frames to render in, and the images of free space.
-        configs: see `BlindConfig`; of the covariance, which says what is blind; of the solver.
+        covariance: what says what is blind.
+        solver: settings of the fits.
     """
     cloud, comparer, free_space = data
-    config, covariance, solver = configs
     motions = blind_motions(body, fit, covariance)
-    axes = blind_axes(body, motions, config)
+    axes = blind_axes(body, motions)
     if not axes:
         return Kept(fit=fit, axes=(), report={})
     T, new = fit.T_world_obj, fit
-    for _ in range(config.rounds):
-        T = nearest_to_start(T, body.T_start, body.center_obj, axes, config)
+    for _ in range(START_ROUNDS):
+        T = nearest_to_start(T, body.T_start, body.center_obj, axes)
         new = solve_pose(body, cloud, T, solver.fine[-1:], solver, free_space)
         T = new.T_world_obj
-    T = nearest_to_start(T, body.T_start, body.center_obj, axes, config)
+    T = nearest_to_start(T, body.T_start, body.center_obj, axes)
     stride = comparer.stride_of(body, fit.T_world_obj)
     before = comparer.gain(body, fit.T_world_obj, stride)[0]
     after = comparer.gain(body, T, stride)[0]
     still = blind_motions(body, new, covariance).shape[1] >= motions.shape[1]
-    taken = still and after >= before - config.tolerated_loss * abs(before)
+    taken = still and after >= before - TOLERATED_LOSS * abs(before)
     kept = new.at(T) if taken else fit
     report = {
         "axes": [_axis_report(a, body, fit.T_world_obj, kept.T_world_obj) for a in axes],
         "gain_px": [before, after],
         "start_kept": bool(taken),
-        "why_not": "" if taken else _why_not(still, before, after, config),
+        "why_not": "" if taken else _why_not(still, before, after),
     }
     return Kept(fit=kept, axes=tuple(axes), report=report)
 
 
-def _why_not(still: bool, before: float, after: float, config: BlindConfig) -> str:
+def _why_not(still: bool, before: float, after: float) -> str:
     """Return why the fit stands although it left the start along a blind direction."""
     if not still:
         return "with the start's value the points do determine this direction, and speak against it"
@@ -287,7 +284,7 @@ def _why_not(still: bool, before: float, after: float, config: BlindConfig) -> s
     share = (before - after) / abs(before)
     return (
         f"the start's value would lose {100 * share:.1f} % of the rendered gain "
-        f"(at most {100 * config.tolerated_loss:g} %)"
+        f"(at most {100 * TOLERATED_LOSS:g} %)"
     )
 
 

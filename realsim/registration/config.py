@@ -5,25 +5,17 @@ from pathlib import Path
 from typing import Literal
 
 from realsim.records.depth_bias import DepthBias
-from realsim.registration.blind import BlindConfig, CovarianceConfig
+from realsim.registration.blind import CovarianceConfig
 from realsim.registration.compare import CompareConfig
 from realsim.registration.evidence import EvidenceConfig
 from realsim.registration.find_table import TableSearchConfig
-from realsim.registration.judging.held_out import HeldOutConfig
-from realsim.registration.judging.scene_checks import SceneCheckConfig
-from realsim.registration.judging.surface_residuals import ResidualConfig
 from realsim.registration.judging.verdict import VerdictConfig
-from realsim.registration.near_rivals import RivalConfig
 from realsim.registration.near_start import JointConfig, SearchConfig
-from realsim.registration.odometry.cross_check import CheckConfig
-from realsim.registration.photo_fit import PhotoFitConfig
 from realsim.registration.refinement.config import RefineConfig
-from realsim.registration.rivals_around import AroundConfig
 from realsim.registration.search.find import FindConfig
-from realsim.registration.single_view import SingleViewConfig
 from realsim.registration.solver import SolverConfig
 from realsim.registration.table_planes import PlaneConfig
-from realsim.registration.verify import OffsetConfig, SinkingConfig, VerifyConfig
+from realsim.registration.verify import VerifyConfig
 from realsim.registration.view_agreement import ViewCheckConfig
 from realsim.registration.views import SampleConfig
 
@@ -35,43 +27,8 @@ METHODS: tuple[Method, ...] = ("joint", "top-down")
 class JudgingConfig:
     """How poses are judged without ground truth."""
 
-    residuals: ResidualConfig = field(default_factory=ResidualConfig)
-    held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
     verdict: VerdictConfig = field(default_factory=VerdictConfig)
-    scene: SceneCheckConfig = field(default_factory=SceneCheckConfig)
     views: ViewCheckConfig = field(default_factory=ViewCheckConfig)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SecondLookConfig:
-    """When a joint fit is made again."""
-
-    on_table_m: float = 0.003
-    """A point so near to the plane is on it [m]."""
-    beside_m: float = 0.012
-    """A point so far from all objects is beside them [m]."""
-    cell_m: float = 0.01
-    """Cells by which areas on the plane are measured [m]."""
-    least_beside: float = 1.0
-    """Least area of a table that is seen beside the placed objects, as a share of what all wanted
-    ones cover: an invented one lies on the objects, or on some that were not placed."""
-    odd_m: float = 0.0015
-    """A view is odd whose camera was moved by so much, seen at the objects [m]."""
-    odd_factor: float = 3.5
-    """It was moved by so many times the median of all views, too. One view whose depth lay 9 px
-    beside its image moved 4.2 times as far, because it pulls the others along. Of 144 sound views
-    none moved more than 3.0 times as far, nor by more than 0.9 mm."""
-    most_odd: float = 0.25
-    """Share of the views that may be odd: of more, the others are no measure."""
-    moved_m: float = 0.0015
-    """If all cameras were moved by so much in the median, that is told [m]: an arm is not so
-    coarse."""
-    unsure_m: float = 0.003
-    """If by more, which is what a right pose may be off, no pose is accepted [m]: cameras follow a
-    model of another size, and then everything fits it."""
-    explained_sigmas: float = 5.0
-    """So many sigmas per axis of what the arm, or a hand that holds the camera, is said to be off
-    by are no reason to doubt."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -124,21 +81,11 @@ class RegistrationConfig:
     odometry_deg: float = 15.0
     """Only where views lie this near to their neighbours [deg]: 24 views all around, 20 degrees
     apart, raised false alarms."""
-    kinematics: CheckConfig = field(default_factory=CheckConfig)
-    """How."""
     find: FindConfig = field(default_factory=FindConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)
     joint: JointConfig = field(default_factory=JointConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
-    blind: BlindConfig = field(default_factory=BlindConfig)
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
     verify: VerifyConfig = field(default_factory=VerifyConfig)
-    rivals: RivalConfig = field(default_factory=RivalConfig)
-    second_look: SecondLookConfig = field(default_factory=SecondLookConfig)
-    photo_fit: PhotoFitConfig = field(default_factory=PhotoFitConfig)
-    around: AroundConfig = field(default_factory=AroundConfig)
     judging: JudgingConfig = field(default_factory=JudgingConfig)
-    offset: OffsetConfig = field(default_factory=OffsetConfig)
-    sinking: SinkingConfig = field(default_factory=SinkingConfig)
-    single_view: SingleViewConfig = field(default_factory=SingleViewConfig)

@@ -33,7 +33,7 @@ from realsim.registration.intake import Intake
 from realsim.registration.near_start import BestStart, joint_fit, search
 from realsim.registration.photo import Picture
 from realsim.registration.photo_fit import PhotoFit, photo_fit
-from realsim.registration.rivals_around import Around, Images, around
+from realsim.registration.rivals_around import AROUND_RAYS, OFFSET_NOISES, Around, Images, around
 from realsim.registration.solver import FreeSpace
 from realsim.registration.table_planes import find_support_plane
 
@@ -153,8 +153,7 @@ def with_photograph(
         rgb=frame.read_rgb(),
     )  # fmt: skip
     together = max(1.0, config.covariance.correlation_area_px / few.stride**2)
-    fit = photo_fit(picture, bodies, [k.fit for k in few.kept], together,
-                    intake.noise, config.photo_fit)  # fmt: skip
+    fit = photo_fit(picture, bodies, [k.fit for k in few.kept], together, intake.noise)
     if not fit.taken:
         return intake, few, fit
     bias = DepthBias(scale=1.0, offset_per_m=fit.offset_per_m)
@@ -219,9 +218,9 @@ def few_around(
     comparer = make_comparer(
         intake.intrinsics, [read_frame(f) for f in intake.frames], intake.noise,
         few.plane if few.plane is not None else intake.plane,
-        replace(config.compare, rays=config.around.rays),
+        replace(config.compare, rays=AROUND_RAYS),
     )  # fmt: skip
-    offset = config.around.offset_noises * intake.noise.per_m
+    offset = OFFSET_NOISES * intake.noise.per_m
     images = Images(
         comparer=comparer, area_px=config.refine.noise.area_at(intake.intrinsics.width),
         offset_per_m=offset if taken is None else taken.offset_sigma_per_m,
@@ -230,8 +229,7 @@ def few_around(
     agreements = [(1.0, "")] * len(bodies) if taken is None else taken.agreements
     at = [(b, k.fit.T_world_obj) for b, k in zip(bodies, few.kept, strict=True)]
     tried = [
-        around(b, k.fit, cloud, [*at[:n], *at[n + 1 :]], start, edge, images,
-               (config.around, config.solver))
+        around(b, k.fit, cloud, [*at[:n], *at[n + 1 :]], start, edge, images, config.solver)
         for n, (b, k, cloud, start, edge) in enumerate(
             zip(bodies, few.kept, few.clouds, claimed, edges, strict=True)
         )
@@ -289,9 +287,8 @@ def _joint(
     fits, own, history = joint_fit(
         bodies, poses, clouds, (comparers, spaces), (config.joint, config.solver)
     )
-    constants = (config.blind, config.covariance, config.solver)
     kept = [
-        keep_start(body, fit, data, constants)
+        keep_start(body, fit, data, config.covariance, config.solver)
         for body, fit, data in zip(
             bodies, fits, zip(own, comparers, spaces, strict=True), strict=True
         )

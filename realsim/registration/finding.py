@@ -23,7 +23,15 @@ from realsim.registration.many_views import ManyViews
 from realsim.registration.odometry.cross_check import KinematicsCheck
 from realsim.registration.reports import search_report
 from realsim.registration.search.find import find_objects
-from realsim.registration.search.flat_search import FlatPose, cover, is_free, seek_flat, table_map
+from realsim.registration.search.flat_search import (
+    FLAT_HEIGHT_M,
+    SAME_PLACE_M,
+    FlatPose,
+    cover,
+    is_free,
+    seek_flat,
+    table_map,
+)
 from realsim.registration.search.records import NotPlaced, Placed, Region, SearchResult, Wanted
 
 Progress = Callable[[int, int], None]
@@ -241,13 +249,13 @@ def with_flat(
     Objects of which nothing was claimed are sought: those that were not placed, and those that lie
     elsewhere than a search of single images said.
     """
-    config, plane = task.config.find.flat, many.plane
+    plane = many.plane
     free = {w.instance: w.obj_id for w in asked if w.region is None and w.T_start is None}
     placed = {b.start.instance: (b, T) for b, T in zip(found.bodies, many.poses, strict=True)}
     sought = [
         placed[i][0] if i in placed else _body(task, obj_id, i, np.eye(4))
         for i, obj_id in free.items()
-        if min(task.models[obj_id].mesh.extent) < config.most_m
+        if min(task.models[obj_id].mesh.extent) < FLAT_HEIGHT_M
     ]
     if plane is None or not sought:
         return None
@@ -255,25 +263,25 @@ def with_flat(
     if placed:
         middle = np.mean([body.center(T) for body, T in placed.values()], axis=0)
     area_px = task.config.refine.noise.area_at(task.intake.intrinsics.width)
-    map_ = table_map(many.hand_views, plane, task.intake.noise, middle, area_px, config)
+    map_ = table_map(many.hand_views, plane, task.intake.noise, middle, area_px)
     flat = {b.start.instance for b in sought}
     for instance, (body, T) in placed.items():
         if instance not in flat:
-            map_ = cover(map_, body, T, config)
+            map_ = cover(map_, body, T)
     changed = False
-    poses = [(seek_flat(body, map_, config), body) for body in sought]
+    poses = [(seek_flat(body, map_), body) for body in sought]
     while left := [(p, b) for p, b in poses if p is not None]:
         pose, body = max(left, key=lambda one: one[0].explained)
-        map_ = cover(map_, body, pose.T_world_obj, config)
+        map_ = cover(map_, body, pose.T_world_obj)
         # What the best one covers is no place for another.
         poses = [
-            (p if is_free(map_, b, p.T_world_obj, config) else seek_flat(b, map_, config), b)
+            (p if is_free(map_, b, p.T_world_obj) else seek_flat(b, map_), b)
             for p, b in left
             if b is not body
         ]
         if body.start.instance in placed:
             T = placed[body.start.instance][1]
-            if mssd_symmetric(T, pose.T_world_obj, body.model) < config.same_m:
+            if mssd_symmetric(T, pose.T_world_obj, body.model) < SAME_PLACE_M:
                 continue
         changed = True
         found = _with_body(found, moved_body(body, pose.T_world_obj), pose)

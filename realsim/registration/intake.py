@@ -190,7 +190,7 @@ def check_odometry(
     if views[0].area_px > fine.stride**2:
         views = sample_views(intake.intrinsics, intake.frames, intake.noise, fine)
     try:
-        return check_kinematics(views, intake.plane, config.kinematics), None
+        return check_kinematics(views, intake.plane), None
     except InputError as error:
         words = f"odometry was not tried: {error}"
         return None, ViewFinding(index=None, kind="odometry", words=words, exclude=False)

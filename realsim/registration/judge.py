@@ -25,7 +25,7 @@ from realsim.registration.judging.surface_residuals import (
 from realsim.registration.judging.verdict import probability_right, verdict_of
 from realsim.registration.refinement.flat import is_flat
 from realsim.registration.rivals_around import Around
-from realsim.registration.search.flat_search import cover, explained_at, table_map
+from realsim.registration.search.flat_search import FLAT_HEIGHT_M, cover, explained_at, table_map
 from realsim.registration.table_planes import support_checks
 from realsim.registration.verify import Checked, verify_objects
 
@@ -106,7 +106,7 @@ def judge_objects(
     usable = [c.verdict != "rejected" for c in checked] if one else None
     findings = scene_findings(
         given.bodies, given.poses, probabilities, scene_cloud(intake, given.cameras, given.plane),
-        comparer, config.judging.scene, given.with_starts, usable,
+        comparer, given.with_starts, usable,
     )  # fmt: skip
     findings = [*given.known, *findings]
     objects = [
@@ -120,26 +120,24 @@ def _features(
     intake: Intake, given: Poses, checked: Sequence[Checked], config: RegistrationConfig
 ) -> list[dict[str, float | None]]:
     """Return everything that is known of every object, by name."""
-    j = config.judging
     residuals = surface_residuals(
         given.bodies, given.poses, intake.intrinsics, intake.all_views, given.cameras, intake.noise,
-        given.plane, j.residuals,
+        given.plane,
     )  # fmt: skip
-    level = error_level_m(residuals, j.residuals)
+    level = error_level_m(residuals)
     held = support_checks(given.bodies, given.poses, given.plane, FLAT_SIGMAS * given.table_off_m)
     halves: list[dict[str, float]] = [{} for _ in given.bodies]
     if len(intake.views) >= config.refine_from and given.bodies:
         owned = owned_points(
             given.bodies, given.poses, intake.intrinsics, intake.views,
-            given.cameras[: len(intake.views)], intake.noise, given.plane, j.held_out,
+            given.cameras[: len(intake.views)], intake.noise, given.plane,
         )  # fmt: skip
-        fit = half_fit(given.bodies, given.poses, owned, j.held_out)
-        found = held_out(given.bodies, owned, len(intake.views), fit, j.held_out)
+        fit = half_fit(given.bodies, given.poses, owned)
+        found = held_out(given.bodies, owned, len(intake.views), fit)
         halves = [h.checks() for h in found]
     flat = flat_checks(intake, given, config)
     surfaces = [
-        residual_checks(r, level, j.residuals)
-        | {"size_error": size_error(r, b.center_obj, level) or 0.0}
+        residual_checks(r, level) | {"size_error": size_error(r, b.center_obj, level) or 0.0}
         for r, b in zip(residuals, given.bodies, strict=True)
     ]
     if len(intake.views) == 1:
@@ -162,23 +160,23 @@ def flat_checks(intake: Intake, given: Poses, config: RegistrationConfig) -> lis
     A card that is slid over the table agrees with all depth to its thickness; the mean heights of
     all views tell where it lies. Nothing of other objects, and nothing of too few views.
     """
-    rules, plane = config.find.flat, given.plane
+    plane = given.plane
     checks: list[dict[str, float]] = [{} for _ in given.bodies]
     if plane is None or len(intake.views) < config.refine_from:
         return checks
     T_table = se3.invert(plane.T_world_table)
     both = list(zip(given.bodies, given.poses, strict=True))
-    flat = [k for k, (b, T) in enumerate(both) if is_flat(b, T_table @ T, rules.most_m)]
+    flat = [k for k, (b, T) in enumerate(both) if is_flat(b, T_table @ T, FLAT_HEIGHT_M)]
     if not flat:
         return checks
     middle = np.mean([b.center(T) for b, T in both], axis=0)
     area_px = config.refine.noise.area_at(intake.intrinsics.width)
-    map_ = table_map(intake.views, plane, intake.noise, middle, area_px, rules)
+    map_ = table_map(intake.views, plane, intake.noise, middle, area_px)
     for k in flat:
         rest = map_
         for body, T in (*both[:k], *both[k + 1 :]):
-            rest = cover(rest, body, T, rules)
-        share = explained_at(rest, *both[k], given.table_off_m, rules)
+            rest = cover(rest, body, T)
+        share = explained_at(rest, *both[k], given.table_off_m)
         # What is hidden all around lies there as well as anywhere.
         checks[k]["explained"] = 0.0 if share is None else share
     return checks

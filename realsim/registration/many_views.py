@@ -210,11 +210,10 @@ def _keep_blind(
     still = solve_pose(body, cloud, T, config.solver.fine[-1:], config.solver).at(T)
     if claimed is None:
         return Kept(fit=still, axes=(), report={})
-    constants = (config.blind, config.covariance, config.solver)
-    kept = keep_start(claimed, still, (cloud, comparer, None), constants)
+    kept = keep_start(claimed, still, (cloud, comparer, None), config.covariance, config.solver)
     if kept.report.get("start_kept"):
         axes = list(kept.axes)
-        T = nearest_to_start(T, claimed.T_start, body.center_obj, axes, config.blind)
+        T = nearest_to_start(T, claimed.T_start, body.center_obj, axes)
     return replace(kept, fit=still.at(T))
 
 

@@ -10,7 +10,7 @@ photographs, and depth hardly decides, the print does.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +22,7 @@ from realsim.registration.body import Body
 from realsim.registration.compare import make_comparer
 from realsim.registration.evidence import Cloud, read_frame
 from realsim.registration.judging.verdict import CONTRAST_DECIDED
-from realsim.registration.photo import PhotoConfig, Picture, paint_of, print_errors
+from realsim.registration.photo import Picture, paint_of, print_errors
 from realsim.registration.search.near_symmetry import near_symmetries
 from realsim.registration.solver import SolverConfig, solve_pose
 
@@ -31,44 +31,39 @@ if TYPE_CHECKING:
     from realsim.registration.intake import Intake
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class RivalConfig:
-    """When one of two near-symmetric poses is decided for."""
-
-    cell_m: float = 0.005
-    """Cells of the surface whose residuals count as independent [m]."""
-    floor_m: float = 1e-4
-    """What residuals are compared with at least [m]: no mesh and no camera is better."""
-    cap_m: float = 0.003
-    """Larger residuals count as this [m]: points of a neighbour."""
-    t: float = 4.0
-    """Standard errors by which the rival must be worse."""
-    ratio: float = 0.25
-    """Share of the mean square by which it must be worse, too."""
-    same_m: float = 0.001
-    """Fitted poses nearer than this are one [m]."""
-    least_cells: int = 12
-    """Fewer cells decide nothing."""
-    print_spread: float = 12.0
-    """A mesh whose colours vary by less has no print [of 255]."""
-    print_gap: float = 0.1
-    """By so much the correlation with the photograph must differ."""
-    print_rivals: int = 12
-    """Near symmetries that the print is asked about, those that fit best."""
-    beside_share: float = 0.7
-    """Poses nearer than this are one to the print [share of half the box's diagonal]."""
-    print_views: int = 4
-    """Photographs that are asked, of many, spread around the objects."""
-    least_print: float = 0.25
-    """A print that correlates by less at both poses is not the object's, or not seen."""
-    print_loss: float = 0.5
-    """A rival that loses more of the rendered gain, not fitted yet, is none to the print."""
-    photo: PhotoConfig = field(default_factory=PhotoConfig)
-    """How the photograph is read."""
-    print_from: float = 4.0 * CONTRAST_DECIDED
-    """Depth that decides by more than this contrast is not asked again by the print."""
-    solver: SolverConfig = field(default_factory=SolverConfig)
-    """The fits."""
+CELL_M = 0.005
+"""Cells of the surface whose residuals count as independent [m]."""
+FLOOR_M = 1e-4
+"""What residuals are compared with at least [m]: no mesh and no camera is better."""
+CAP_M = 0.003
+"""Larger residuals count as this [m]: points of a neighbour."""
+STANDARD_ERRORS = 4.0
+"""Standard errors by which the rival must be worse."""
+WORSE_SHARE = 0.25
+"""Share of the mean square by which it must be worse, too."""
+SAME_M = 0.001
+"""Fitted poses nearer than this are one [m]."""
+LEAST_CELLS = 12
+"""Fewer cells decide nothing."""
+PRINT_SPREAD = 12.0
+"""A mesh whose colours vary by less has no print [of 255]."""
+PRINT_GAP = 0.1
+"""By so much the correlation with the photograph must differ."""
+PRINT_RIVALS = 12
+"""Near symmetries that the print is asked about, those that fit best."""
+BESIDE_SHARE = 0.7
+"""Poses nearer than this are one to the print [share of half the box's diagonal]."""
+PRINT_VIEWS = 4
+"""Photographs that are asked, of many, spread around the objects."""
+LEAST_PRINT = 0.25
+"""A print that correlates by less at both poses is not the object's, or not seen."""
+PRINT_LOSS = 0.5
+"""A rival that loses more of the rendered gain, not fitted yet, is none to the print."""
+"""How the photograph is read."""
+PRINT_FROM = 4.0 * CONTRAST_DECIDED
+"""Depth that decides by more than this contrast is not asked again by the print."""
+SOLVER = SolverConfig()
+"""The fits."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -82,9 +77,7 @@ class Duel:
     """(4, 4) the rival, fitted."""
 
 
-def duel(
-    body: Body, T: Array, T_rival: Array, cloud: Cloud, misfit_m: float, config: RivalConfig
-) -> Duel | None:
+def duel(body: Body, T: Array, T_rival: Array, cloud: Cloud, misfit_m: float) -> Duel | None:
     """Return how clearly a pose is better than its rival; None = too few points to say.
 
     Args:
@@ -93,28 +86,24 @@ def duel(
         T_rival: (4, 4) the other, near enough to be fitted.
         cloud: the object's averaged points, cameras refined.
         misfit_m: by how much the object's mesh is off everywhere [m].
-        config: settings.
     """
-    fitted = [
-        solve_pose(body, cloud, X, config.solver.fine, config.solver).T_world_obj
-        for X in (T, T_rival)
-    ]
-    if mssd_symmetric(fitted[0], fitted[1], body.model) < config.same_m:
+    fitted = [solve_pose(body, cloud, X, SOLVER.fine, SOLVER).T_world_obj for X in (T, T_rival)]
+    if mssd_symmetric(fitted[0], fitted[1], body.model) < SAME_M:
         # On better points the two are one: the rival was no more than an unfinished fit.
         return Duel(contrast=None, T_rival=fitted[1])
-    squares = [_squares(body, X, cloud, misfit_m, config) for X in fitted]
-    cells = np.floor(se3.transform(se3.invert(T), cloud.points) / config.cell_m).astype(np.int64)
+    squares = [_squares(body, X, cloud, misfit_m) for X in fitted]
+    cells = np.floor(se3.transform(se3.invert(T), cloud.points) / CELL_M).astype(np.int64)
     _, of = np.unique(cells, axis=0, return_inverse=True)
     of = of.reshape(-1)
     count = np.bincount(of)
-    if len(count) < config.least_cells:
+    if len(count) < LEAST_CELLS:
         return None
     means = [np.bincount(of, weights=s) / count for s in squares]
     worse = means[1] - means[0]
     error = float(np.std(worse, ddof=1) / np.sqrt(len(worse)))
     t = float(worse.mean()) / max(error, 1e-12)
     ratio = float(worse.mean() / min(means[0].mean(), means[1].mean()))
-    size = min(abs(t) / config.t, abs(ratio) / config.ratio)
+    size = min(abs(t) / STANDARD_ERRORS, abs(ratio) / WORSE_SHARE)
     return Duel(contrast=float(np.sign(t)) * CONTRAST_DECIDED * size, T_rival=fitted[1])
 
 
@@ -134,11 +123,11 @@ def duels_by_print(
         intake: the frames.
         config: settings.
     """
-    rules, poses = config.rivals, [b.T_start for b in bodies]
+    poses = [b.T_start for b in bodies]
     out, fought = list(contrasts), list[Duel | None]([None] * len(poses))
     asked = [
         n for n, (c, R) in enumerate(zip(contrasts, rivals, strict=True))
-        if R is not None and c is not None and c < rules.print_from
+        if R is not None and c is not None and c < PRINT_FROM
         and paint_of(bodies[n].model.mesh) is not None
     ]  # fmt: skip
     pictures = [
@@ -154,12 +143,12 @@ def duels_by_print(
     )  # fmt: skip
     for n in asked:
         near = near_symmetries(bodies[n].model, config.find.near, config.field_folder)
-        others = [poses[n] @ S for S in near[: rules.print_rivals]]
+        others = [poses[n] @ S for S in near[:PRINT_RIVALS]]
         others += [R for R in (rivals[n],) if R is not None]
         stride = comparer.stride_of(bodies[n], poses[n])
-        least = (1.0 - rules.print_loss) * comparer.gain(bodies[n], poses[n], stride)[0]
+        least = (1.0 - PRINT_LOSS) * comparer.gain(bodies[n], poses[n], stride)[0]
         others = [R for R in others if comparer.gain(bodies[n], R, stride)[0] >= least]
-        said = print_duel(bodies, poses, n, others, pictures, rules) if others else None
+        said = print_duel(bodies, poses, n, others, pictures) if others else None
         if said is None or said.contrast is None:
             continue
         # A print that does not decide can raise a doubt, and settles none.
@@ -176,7 +165,6 @@ def print_duel(
     number: int,
     rivals: Sequence[Array],
     pictures: Sequence[Picture],
-    config: RivalConfig,
 ) -> Duel | None:
     """Return how clearly the print of an object in the photographs is that of its pose.
 
@@ -186,14 +174,13 @@ def print_duel(
         number: which of them has rivals.
         rivals: (4, 4) each.
         pictures: the photographs.
-        config: settings.
 
     Returns:
         The duel with the best rival; contrast 0 = two rivals are alike. None = the object has no
         print, or it is found at no pose.
     """
     paint = paint_of(bodies[number].model.mesh)
-    if paint is None or float(paint.colors.std(0).max()) < config.print_spread:
+    if paint is None or float(paint.colors.std(0).max()) < PRINT_SPREAD:
         return None
     sets: list[list[tuple[float, Array]]] = [[] for _ in range(1 + len(rivals))]
     for picture in pictures:
@@ -204,40 +191,40 @@ def print_duel(
         for found, T in zip(sets, (poses[number], *rivals), strict=True):
             own = picture.depth_of(bodies[number].model.mesh, T)
             others = np.min([*rest, np.full_like(own, np.inf)], axis=0)
-            found.append(print_errors(picture, paint, T, own, others, config.photo))
+            found.append(print_errors(picture, paint, T, own, others))
     values = np.nan_to_num([np.mean([r for r, _ in found]) for found in sets])
     best = int(np.argmax(values))
-    if values[best] < config.least_print:
+    if values[best] < LEAST_PRINT:
         return None
     Ts, body = [poses[number], *rivals], bodies[number]
     # Those that lie beside the best are no other side of the object: fits bring them together.
-    beside = config.beside_share * body.radius_m
+    beside = BESIDE_SHARE * body.radius_m
     clear = min(
         (
-            min(_print_gap(found, sets[best], config), float(values[best] - value))
+            min(_print_gap(found, sets[best]), float(values[best] - value))
             for T, found, value in zip(Ts, sets, values, strict=True)
             if mssd_symmetric(Ts[best], T, body.model) > beside
         ),
-        default=config.print_gap,
+        default=PRINT_GAP,
     )
     if best == 0:
-        return Duel(contrast=CONTRAST_DECIDED * clear / config.print_gap, T_rival=rivals[0])
-    return Duel(contrast=-CONTRAST_DECIDED * clear / config.print_gap, T_rival=rivals[best - 1])
+        return Duel(contrast=CONTRAST_DECIDED * clear / PRINT_GAP, T_rival=rivals[0])
+    return Duel(contrast=-CONTRAST_DECIDED * clear / PRINT_GAP, T_rival=rivals[best - 1])
 
 
 def _print_gap(
-    worse: Sequence[tuple[float, Array]], better: Sequence[tuple[float, Array]], config: RivalConfig
+    worse: Sequence[tuple[float, Array]], better: Sequence[tuple[float, Array]]
 ) -> float:
     """Return how clearly one print fits better, block by block; `print_gap` = clearly."""
     gaps = np.concatenate([(w - b).ravel() for (_, w), (_, b) in zip(worse, better, strict=True)])
     gaps = gaps[np.isfinite(gaps)]
-    if len(gaps) < config.least_cells:
+    if len(gaps) < LEAST_CELLS:
         return 0.0
     t = gaps.mean() / max(float(np.std(gaps, ddof=1)) / np.sqrt(len(gaps)), 1e-9)
-    return float(max(t, 0.0)) / config.t * config.print_gap
+    return float(max(t, 0.0)) / STANDARD_ERRORS * PRINT_GAP
 
 
-def _squares(body: Body, T: Array, cloud: Cloud, misfit_m: float, config: RivalConfig) -> Array:
+def _squares(body: Body, T: Array, cloud: Cloud, misfit_m: float) -> Array:
     """Return (N,) squares of the residuals, in units of what they should be."""
-    d = np.minimum(np.abs(body.field.distance(cloud.points, se3.invert(T))), config.cap_m)
-    return np.square(d) / (np.square(cloud.sigmas) + max(misfit_m, config.floor_m) ** 2)
+    d = np.minimum(np.abs(body.field.distance(cloud.points, se3.invert(T))), CAP_M)
+    return np.square(d) / (np.square(cloud.sigmas) + max(misfit_m, FLOOR_M) ** 2)

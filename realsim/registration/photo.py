@@ -29,40 +29,36 @@ WINDOW_PX = 16
 """Around a model in a picture so much is looked at [px]: more than all filters reach."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PhotoConfig:
-    """How outlines are held against a photograph."""
-
-    outline_px: float = 1.5
-    """Smoothing of the model's mask, whose half is the outline, to fractions of a pixel."""
-    reach_px: float = 7.0
-    """Edges are sought so far on both sides."""
-    step_px: float = 0.5
-    """Steps of the search; a parabola through the crest finds the rest."""
-    noise: float = 1.2
-    """Least change at an edge, in units of the photograph's median change."""
-    least_change: float = 0.7
-    """Least change at an edge in absolute terms [of 255, per px]."""
-    front_m: float = 0.015
-    """What was measured by more than this in front of a model hides its outline [m]."""
-    behind_m: float = 0.004
-    """What is seen beyond an outline lies behind by at least this [m]; else it is none."""
-    block_px: int = 16
-    """Blocks of a checkerboard: a correction is fitted on every other one."""
-    together: float = 8.0
-    """Neighbouring outline points that count as one, because they see the same edge."""
-    common_px: float = 3.0
-    """1-sigma of the common shift [px]: published depth lies up to 5 px off its photograph."""
-    own_px: float = 1.0
-    """1-sigma of an object's own shift and of its roll at its reach [px]."""
-    rim_px: float = 2.0
-    """1-sigma of the rim [px]."""
-    least_px: float = 0.4
-    """Residuals are taken for at least so large [px]."""
-    least_points: int = 25
-    """Fewer outline points with an edge move nothing."""
-    rounds: int = 3
-    """Times the outlines are drawn again."""
+OUTLINE_PX = 1.5
+"""Smoothing of the model's mask, whose half is the outline, to fractions of a pixel."""
+REACH_PX = 7.0
+"""Edges are sought so far on both sides."""
+STEP_PX = 0.5
+"""Steps of the search; a parabola through the crest finds the rest."""
+GRAY_NOISE = 1.2
+"""Least change at an edge, in units of the photograph's median change."""
+LEAST_CHANGE = 0.7
+"""Least change at an edge in absolute terms [of 255, per px]."""
+FRONT_M = 0.015
+"""What was measured by more than this in front of a model hides its outline [m]."""
+BEHIND_M = 0.004
+"""What is seen beyond an outline lies behind by at least this [m]; else it is none."""
+SQUARE_PX = 16
+"""Blocks of a checkerboard: a correction is fitted on every other one."""
+TOGETHER = 8.0
+"""Neighbouring outline points that count as one, because they see the same edge."""
+COMMON_PX = 3.0
+"""1-sigma of the common shift [px]: published depth lies up to 5 px off its photograph."""
+OWN_PX = 1.0
+"""1-sigma of an object's own shift and of its roll at its reach [px]."""
+OUTLINE_RIM_PX = 2.0
+"""1-sigma of the rim [px]."""
+LEAST_PX = 0.4
+"""Residuals are taken for at least so large [px]."""
+EDGE_POINTS = 25
+"""Fewer outline points with an edge move nothing."""
+EDGE_ROUNDS = 3
+"""Times the outlines are drawn again."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -132,28 +128,26 @@ class Outline:
         return np.floor((np.arctan2(y, x) / (2 * np.pi) % 1.0) * count).astype(np.int64) % count
 
 
-def hidden_by_measured(measured: Array32, own: Array32, config: PhotoConfig) -> Mask:
+def hidden_by_measured(measured: Array32, own: Array32) -> Mask:
     """Return (H, W) where something was measured in front of a mesh or of its next pixel.
 
     Args:
         measured: (H, W) depth; 0 = none [m].
         own: (H, W) the mesh's depth, inf beside it [m].
-        config: settings.
     """
     # Beside the mesh the nearest depth of its rim.
     rim = np.where(np.isfinite(own), own, cv2.erode(np.minimum(own, 99.0), np.ones((5, 5))))
-    front = (measured > 0) & (rim < 99) & (measured < rim - config.front_m)
+    front = (measured > 0) & (rim < 99) & (measured < rim - FRONT_M)
     return cv2.dilate(front.astype(np.uint8), np.ones((5, 5))) > 0
 
 
-def outline_of(picture: Picture, own: Array32, others: Array32, config: PhotoConfig) -> Outline:
+def outline_of(picture: Picture, own: Array32, others: Array32) -> Outline:
     """Return the outline of a mesh and the photograph's edges beside it.
 
     Args:
         picture: the photograph.
         own: (H, W) the mesh's depth, inf beside it [m].
         others: (H, W) that of all other things.
-        config: settings.
     """
     size = own.shape[::-1]
     inside = np.isfinite(own) & (own <= others)
@@ -165,49 +159,47 @@ def outline_of(picture: Picture, own: Array32, others: Array32, config: PhotoCon
     window = tuple(slice(f, int(s[-1]) + WINDOW_PX) for f, s in zip(first, spans, strict=True))
     own, others, inside = own[window], others[window], inside[window]
     measured = picture.depth_m[window]
-    smooth = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), config.outline_px)
+    smooth = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), OUTLINE_PX)
     du, dv = (cv2.Sobel(smooth, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1)))
     slope = np.hypot(du, dv)
     border = inside & (cv2.erode(inside.astype(np.uint8), np.ones((3, 3))) == 0)
     # Beyond the border something must lie behind: where it lies in front, its own outline is seen.
     nearest = cv2.erode(np.where(inside, 99.0, np.minimum(others, 99.0)), np.ones((3, 3)))
-    seen = border & (nearest > own + config.behind_m) & (slope > 0.02)
-    i, j = np.nonzero(seen & ~hidden_by_measured(measured, own, config))
+    seen = border & (nearest > own + BEHIND_M) & (slope > 0.02)
+    i, j = np.nonzero(seen & ~hidden_by_measured(measured, own))
     normals = -np.stack([du[i, j], dv[i, j]], axis=1) / slope[i, j][:, None]
     # Across a straight outline the smoothed mask falls by `slope` per pixel where it is a half.
     away = np.clip((smooth[i, j] - 0.5) / slope[i, j], -1.0, 1.5)
     pixels = np.stack([j + first[1], i + first[0]], axis=1) + away[:, None] * normals
     within = np.all((pixels > 2) & (pixels < np.array(size) - 3), axis=1)
     pixels, normals = pixels[within], normals[within].astype(np.float64)
-    return Outline(pixels=pixels, normals=normals, offsets=_edges(picture, pixels, normals, config))
+    return Outline(pixels=pixels, normals=normals, offsets=_edges(picture, pixels, normals))
 
 
-def _edges(picture: Picture, pixels: Array, normals: Array, config: PhotoConfig) -> Array:
+def _edges(picture: Picture, pixels: Array, normals: Array) -> Array:
     """Return the signed distance (N,) to the edge that stands out most near every point [px]."""
     if len(pixels) == 0:
         return np.zeros(0)
-    n = round(config.reach_px / config.step_px) + 1
-    s = np.arange(-n, n + 1) * config.step_px
+    n = round(REACH_PX / STEP_PX) + 1
+    s = np.arange(-n, n + 1) * STEP_PX
     at = (pixels[:, None] + s[None, :, None] * normals[:, None]).astype(np.float32)
     along_u, along_v = (
         cv2.remap(c, at[..., 0], at[..., 1], cv2.INTER_LINEAR) for c in picture.changes
     )
     across = along_u * normals[:, :1, None] + along_v * normals[:, 1:, None]
     change = np.linalg.norm(across, axis=2)
-    inner, least = change[:, 1:-1], max(config.least_change, config.noise * picture.noise)
+    inner, least = change[:, 1:-1], max(LEAST_CHANGE, GRAY_NOISE * picture.noise)
     crest = (inner >= change[:, :-2]) & (inner > change[:, 2:]) & (inner > least)
     # A nearer edge is preferred to a stronger one, which is likely another's.
-    worth = np.where(crest, inner * np.exp(-2.0 * np.square(s[1:-1] / config.reach_px)), 0.0)
+    worth = np.where(crest, inner * np.exp(-2.0 * np.square(s[1:-1] / REACH_PX)), 0.0)
     best = np.argmax(worth, axis=1) + 1
     row = np.arange(len(pixels))
     a, b, c = change[row, best - 1], change[row, best], change[row, best + 1]
-    d = s[best] + config.step_px * np.clip(0.5 * (a - c) / np.minimum(a - 2 * b + c, -1e-6), -1, 1)
+    d = s[best] + STEP_PX * np.clip(0.5 * (a - c) / np.minimum(a - 2 * b + c, -1e-6), -1, 1)
     return np.where(worth.max(axis=1) > 0, d, np.nan)
 
 
-def shifted(
-    picture: Picture, meshes: Sequence[Mesh], poses: Sequence[Array], config: PhotoConfig
-) -> list[Array]:
+def shifted(picture: Picture, meshes: Sequence[Mesh], poses: Sequence[Array]) -> list[Array]:
     """Return poses T_world_obj moved in the picture onto its edges.
 
     The even squares of a checkerboard are used; the odd ones are left to judge by.
@@ -216,16 +208,15 @@ def shifted(
         picture: the photograph.
         meshes: of the objects.
         poses: (4, 4) each, as depth has them.
-        config: settings.
     """
     now = list(poses)
-    for _ in range(config.rounds):
+    for _ in range(EDGE_ROUNDS):
         depths = [picture.depth_of(m, T) for m, T in zip(meshes, now, strict=True)]
         outlines: list[Outline] = []
         for k, own in enumerate(depths):
             others = np.min([*depths[:k], *depths[k + 1 :], np.full_like(own, np.inf)], axis=0)
-            found = outline_of(picture, own, others, config)
-            use = found.squares(config.block_px, odd=False) & np.isfinite(found.offsets)
+            found = outline_of(picture, own, others)
+            use = found.squares(SQUARE_PX, odd=False) & np.isfinite(found.offsets)
             outlines.append(found.part(use))
         Ts_cam_obj = [se3.invert(picture.T_world_cam) @ T for T in now]
         middles = [se3.transform(T, m.bounds.mean(0)[None])[0] for T, m in zip(Ts_cam_obj, meshes,
@@ -233,7 +224,7 @@ def shifted(
         centers = camera.project(picture.intrinsics, np.stack(middles))
         reaches = [max(float(np.abs(o.pixels - c).max(initial=1.0)), 1.0)
                    for o, c in zip(outlines, centers, strict=True)]  # fmt: skip
-        x = _solved(outlines, centers, reaches, config)
+        x = _solved(outlines, centers, reaches)
         for k, (T, middle) in enumerate(zip(Ts_cam_obj, middles, strict=True)):
             own_part = x[2 + 4 * k : 6 + 4 * k]
             f = np.array([picture.intrinsics.fx, picture.intrinsics.fy])
@@ -245,16 +236,14 @@ def shifted(
     return now
 
 
-def _solved(
-    outlines: Sequence[Outline], centers: Array, reaches: Sequence[float], config: PhotoConfig
-) -> Array:
+def _solved(outlines: Sequence[Outline], centers: Array, reaches: Sequence[float]) -> Array:
     """Return the common shift (2) and of every object its shift (2), roll and rim [px]."""
     size = 2 + 4 * len(outlines)
-    own = [config.own_px, config.own_px, config.own_px, config.rim_px]
-    prior = 1.0 / np.square([config.common_px] * 2 + own * len(outlines))
+    own = [OWN_PX, OWN_PX, OWN_PX, OUTLINE_RIM_PX]
+    prior = 1.0 / np.square([COMMON_PX] * 2 + own * len(outlines))
     rows: list[tuple[Array, Array]] = []
     for k, o in enumerate(outlines):
-        if len(o.offsets) < config.least_points:
+        if len(o.offsets) < EDGE_POINTS:
             continue
         J, n, p = np.zeros((len(o.offsets), size)), o.normals, o.pixels - centers[k]
         J[:, :2] = J[:, 2 + 4 * k : 4 + 4 * k] = n
@@ -266,9 +255,9 @@ def _solved(
         A, b = np.diag(prior), np.zeros(size)
         for J, d in rows:
             r = d - J @ x
-            sigma = max(1.48 * float(np.median(np.abs(r))), config.least_px)
+            sigma = max(1.48 * float(np.median(np.abs(r))), LEAST_PX)
             w = 1.0 / np.square(1.0 + np.square(r / (1.5 * sigma)))
-            w /= sigma**2 * config.together
+            w /= sigma**2 * TOGETHER
             A += J.T @ (w[:, None] * J)
             b += J.T @ (w * d)
         x = np.asarray(np.linalg.solve(A, b), dtype=np.float64)
@@ -313,8 +302,7 @@ def paint_of(mesh: Mesh, count: int = 6000) -> Paint | None:
 
 def print_errors(
     picture: Picture, paint: Paint, T_world_obj: Array, own: Array32, others: Array32,
-    config: PhotoConfig,
-) -> tuple[float, Array]:  # fmt: skip
+    ) -> tuple[float, Array]:  # fmt: skip
     """Return how well a surface's print is found in the photograph.
 
     The photograph is fitted by gain times print plus an offset, colour by colour: light is unknown.
@@ -325,13 +313,12 @@ def print_errors(
         T_world_obj: (4, 4).
         own: (H, W) the object's depth, inf beside it [m].
         others: (H, W) that of all other things.
-        config: settings.
 
     Returns:
         The correlation of all colours (0 where they go against each other); and the mean square
         rest (H / block, W / block), NaN where nothing of the object is in sight.
     """
-    blocks = tuple(-(-n // config.block_px) for n in own.shape)
+    blocks = tuple(-(-n // SQUARE_PX) for n in own.shape)
     nothing = float("nan"), np.full(blocks, np.nan)
     points = se3.transform(se3.invert(picture.T_world_cam) @ T_world_obj, paint.points)
     seen = points[:, 2] > 0.02
@@ -341,17 +328,17 @@ def print_errors(
     height, width = own.shape
     seen &= (at >= 0).all(1) & (at[:, 0] < width) & (at[:, 1] < height)
     j, i = at[seen].T
-    free = (np.abs(own[i, j] - points[seen, 2]) < config.behind_m) & (own[i, j] <= others[i, j])
-    free &= ~hidden_by_measured(picture.depth_m, own, config)[i, j]
+    free = (np.abs(own[i, j] - points[seen, 2]) < BEHIND_M) & (own[i, j] <= others[i, j])
+    free &= ~hidden_by_measured(picture.depth_m, own)[i, j]
     i, j, C = i[free], j[free], paint.colors[seen][free]
-    if len(i) < 10 * config.least_points:
+    if len(i) < 10 * EDGE_POINTS:
         return nothing
-    P = cv2.GaussianBlur(picture.rgb, (0, 0), config.outline_px)[i, j].astype(np.float64)
+    P = cv2.GaussianBlur(picture.rgb, (0, 0), OUTLINE_PX)[i, j].astype(np.float64)
     p, c = P - P.mean(0), C - C.mean(0)
     gain = np.maximum(np.sum(p * c, axis=0) / np.maximum(np.sum(c * c, axis=0), 1.0), 0.0)
     rest = np.sum(np.square(p - gain * c), axis=1)
     explained = 1.0 - float(rest.sum()) / max(float(np.sum(p * p)), 1.0)
-    cells = (i // config.block_px) * blocks[1] + j // config.block_px
+    cells = (i // SQUARE_PX) * blocks[1] + j // SQUARE_PX
     count = np.bincount(cells, minlength=blocks[0] * blocks[1])
     total = np.bincount(cells, weights=rest, minlength=len(count))
     means = np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -15,7 +15,7 @@ is taken only if the outlines fit clearly better and the depth, its offset taken
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,7 +25,15 @@ from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics
 from realsim.registration.body import Body, footprint, moved_about_center
 from realsim.registration.evidence import DepthNoise
-from realsim.registration.photo import Outline, PhotoConfig, Picture, outline_of
+from realsim.registration.photo import (
+    COMMON_PX,
+    EDGE_POINTS,
+    LEAST_PX,
+    TOGETHER,
+    Outline,
+    Picture,
+    outline_of,
+)
 from realsim.registration.solver import PoseFit
 
 LEAST_OFFSET_PER_M = 1e-4
@@ -34,41 +42,35 @@ AMENDED, REWEIGHTED = 2, 4
 """Times an outline is drawn again while a pose is amended, and times its edges are weighed."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PhotoFitConfig:
-    """What depth and photograph may be off by."""
-
-    offset_noises: float = 1.0
-    """1-sigma of the offset of a view's inverse depth, in units of its noise k: what stereo is off
-    by is some hundredths of a pixel, as its noise is."""
-    rim_px: float = 0.3
-    """1-sigma of an object's rim [px]: a mesh that is 0.5 % too large."""
-    depth_m: float = 0.0006
-    """Common shift of an object's points, 1-sigma [m]."""
-    depth_deg: float = 0.4
-    """Common turn of an object's points, 1-sigma [deg]."""
-    blind_m: float = 0.01
-    """1-sigma of motions that points do not determine, of the surface [m]."""
-    most_m: float = 0.012
-    """A pose that the photograph would move further is not moved [m]."""
-    better: float = 0.9
-    """The mean distance of the edges must shrink to this share, else nothing is moved."""
-    cap_px: float = 3.0
-    """An edge further away, or none, counts as this in that mean [px]."""
-    cap_sigmas: float = 3.0
-    """An edge further off than so many sigmas, or none, counts as that."""
-    rounds: int = 10
-    """Times the outlines are drawn again, at most: edges are sought some pixels away only."""
-    still_m: float = 0.0001
-    """Fewer, where no object moves further than this in one of them [m]."""
-    unlike: tuple[float, float, float] = (0.006, 0.7, 0.7)
-    """An object that the photograph moved so far [m], whose edges then lie so far from its outline
-    in the median [px], or whose rim is off by so much [px], is as likely another's: depth and
-    photograph do not tell of the same thing. Set on the second lab's seeds 1 to 3999."""
-    sharp: float = 12.0
-    """Power of the share of these limits in 1 / (1 + share^sharp), which is what is left."""
-    photo: PhotoConfig = field(default_factory=PhotoConfig)
-    """How outlines are held against the photograph."""
+OFFSET_NOISES = 1.0
+"""1-sigma of the offset of a view's inverse depth, in units of its noise k: what stereo is off
+by is some hundredths of a pixel, as its noise is."""
+EDGE_RIM_PX = 0.3
+"""1-sigma of an object's rim [px]: a mesh that is 0.5 % too large."""
+DEPTH_M = 0.0006
+"""Common shift of an object's points, 1-sigma [m]."""
+DEPTH_DEG = 0.4
+"""Common turn of an object's points, 1-sigma [deg]."""
+BLIND_M = 0.01
+"""1-sigma of motions that points do not determine, of the surface [m]."""
+MOST_M = 0.012
+"""A pose that the photograph would move further is not moved [m]."""
+BETTER_SHARE = 0.9
+"""The mean distance of the edges must shrink to this share, else nothing is moved."""
+CAP_PX = 3.0
+"""An edge further away, or none, counts as this in that mean [px]."""
+CAP_SIGMAS = 3.0
+"""An edge further off than so many sigmas, or none, counts as that."""
+FIT_ROUNDS = 10
+"""Times the outlines are drawn again, at most: edges are sought some pixels away only."""
+STILL_M = 0.0001
+"""Fewer, where no object moves further than this in one of them [m]."""
+UNLIKE = (0.006, 0.7, 0.7)
+"""An object that the photograph moved so far [m], whose edges then lie so far from its outline
+in the median [px], or whose rim is off by so much [px], is as likely another's: depth and
+photograph do not tell of the same thing. Set on the second lab's seeds 1 to 3999."""
+SHARP = 12.0
+"""Power of the share of these limits in 1 / (1 + share^sharp), which is what is left."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -90,7 +92,6 @@ class Edges:
     information: Array
     """(6, 6) of the object's points: twist about the box's centre in its axes, rotation first,
     turns times the radius [1/m^2]."""
-    config: PhotoFitConfig
 
     def amended(self, T_world_obj: Array, held: Array) -> tuple[Array, float]:
         """Return a pose (4, 4) amended to lie on the edges, and what they hold against it.
@@ -99,7 +100,7 @@ class Edges:
         allow it. What is held against it is half the sum of squared residuals, each capped.
         """
         free = np.linalg.svd(held)[0][:, held.shape[1] :]
-        H, together = free.T @ self.information @ free, self.config.photo.together
+        H, together = free.T @ self.information @ free, TOGETHER
         y, T = np.zeros(free.shape[1]), T_world_obj
         for _ in range(AMENDED):
             A, d = self._rows(T)
@@ -111,7 +112,7 @@ class Edges:
                 y = np.asarray(np.linalg.solve(left, A[seen].T @ (w * r0)), dtype=np.float64)
             T = moved_about_center(self.body, T_world_obj, free @ y)
         _, d = self._rows(T)
-        cap = self.config.cap_sigmas
+        cap = CAP_SIGMAS
         r = np.minimum(np.abs(np.nan_to_num(d / self.sigma_px, nan=cap)), cap)
         mean = float(np.mean(np.square(r))) if len(r) else cap**2
         return T, 0.5 * mean * self.count / together
@@ -120,7 +121,7 @@ class Edges:
         """Return (N, 6) how the outline's points move along their normals, and the edges (N,)."""
         T = se3.invert(self.picture.T_world_cam) @ T_world_obj
         depth = _depth_of(self.body, self.picture.intrinsics, T)
-        seen = _outline(self.picture, self.body, T, depth, self.others, self.config.photo)
+        seen = _outline(self.picture, self.body, T, depth, self.others)
         B = np.kron(np.eye(2), T[:3, :3]) / np.repeat([self.body.radius_m, 1.0], 3)
         o = seen.outline
         return seen.J @ B, o.offsets - o.normals @ self.beside_px - self.rim_px
@@ -164,7 +165,7 @@ class _Seen:
 
 def photo_fit(
     picture: Picture, bodies: Sequence[Body], fits: Sequence[PoseFit], together: float,
-    noise: DepthNoise, config: PhotoFitConfig,
+    noise: DepthNoise,
 ) -> PhotoFit:  # fmt: skip
     """Return poses that fit depth and photograph.
 
@@ -174,28 +175,27 @@ def photo_fit(
         fits: of their points.
         together: so many points of the fits share one error.
         noise: of the depth.
-        config: settings.
     """
-    offset = max(config.offset_noises * noise.per_m, LEAST_OFFSET_PER_M)
+    offset = max(OFFSET_NOISES * noise.per_m, LEAST_OFFSET_PER_M)
     T_cam_world = se3.invert(picture.T_world_cam)
     begin = [T_cam_world @ f.T_world_obj for f in fits]
-    H = [_information(b, f, T[:3, :3], together, config)
+    H = [_information(b, f, T[:3, :3], together)
          for b, f, T in zip(bodies, fits, begin, strict=True)]  # fmt: skip
     now, x = list(begin), np.zeros(3 + 7 * len(bodies))
-    seen = _outlines(picture, bodies, now, config.photo)
-    before = _mean_px(seen, np.zeros(2), config)
+    seen = _outlines(picture, bodies, now)
+    before = _mean_px(seen, np.zeros(2))
     sigmas, C = np.ones(len(bodies)), np.eye(len(x))
-    for _ in range(config.rounds):
+    for _ in range(FIT_ROUNDS):
         last = x
-        x, C, sigmas = _solved(seen, bodies, begin, H, x, offset, config)
+        x, C, sigmas = _solved(seen, bodies, begin, H, x, offset)
         now = [_stepped(b, T, x[3 + 7 * k : 9 + 7 * k])
                for k, (b, T) in enumerate(zip(bodies, begin, strict=True))]  # fmt: skip
-        seen = _outlines(picture, bodies, now, config.photo)
-        if np.abs(_places(x) - _places(last)).max() < config.still_m:
+        seen = _outlines(picture, bodies, now)
+        if np.abs(_places(x) - _places(last)).max() < STILL_M:
             break
-    after = _mean_px(seen, x[1:3], config)
-    taken = len(before) > 0 and after.mean() < config.better * before.mean()
-    if not taken or np.linalg.norm(_places(x), axis=1).max() > config.most_m:
+    after = _mean_px(seen, x[1:3])
+    taken = len(before) > 0 and after.mean() < BETTER_SHARE * before.mean()
+    if not taken or np.linalg.norm(_places(x), axis=1).max() > MOST_M:
         return _untouched(fits, before, offset)
     edges: list[Edges] = []
     covariances: list[Array] = []
@@ -204,7 +204,7 @@ def photo_fit(
         edges.append(
             Edges(picture=picture, body=body, others=s.others, beside_px=x[1:3],
                   rim_px=float(x[9 + 7 * k]), sigma_px=float(sigmas[k]),
-                  count=len(s.outline.offsets), information=B.T @ H[k] @ B, config=config)
+                  count=len(s.outline.offsets), information=B.T @ H[k] @ B)
         )  # fmt: skip
         at = np.arange(3 + 7 * k, 9 + 7 * k)
         to_obj = se3.adjoint(se3.from_translation(body.center_obj)) @ np.kron(
@@ -215,7 +215,7 @@ def photo_fit(
         poses=[picture.T_world_cam @ T for T in now], offset_per_m=float(x[0]),
         offset_sigma_per_m=float(np.sqrt(C[0, 0])), beside_px=x[1:3], edges=edges,
         covariances=covariances,
-        agreements=_agreements(seen, _own_moves(bodies, begin, x), x, config),
+        agreements=_agreements(seen, _own_moves(bodies, begin, x), x),
         edge_px=(float(before.mean()), float(after.mean())), taken=True,
     )  # fmt: skip
 
@@ -231,16 +231,14 @@ def _own_moves(bodies: Sequence[Body], begin: Sequence[Array], x: Array) -> Arra
     return np.linalg.norm(_places(x) - common, axis=1)
 
 
-def _agreements(
-    seen: Sequence[_Seen], moved_m: Array, x: Array, config: PhotoFitConfig
-) -> list[tuple[float, str]]:
+def _agreements(seen: Sequence[_Seen], moved_m: Array, x: Array) -> list[tuple[float, str]]:
     """Return how well depth and photograph agree on every object, and in words why they do not."""
     found: list[tuple[float, str]] = []
     rims, aways = x[9::7], np.zeros(len(seen))
     for k, s in enumerate(seen):
         d = np.abs(s.outline.offsets - s.outline.normals @ x[1:3] - rims[k])
         aways[k] = float(np.nanmedian(d)) if np.isfinite(d).any() else 0.0
-    most_m, most_px, most_rim_px = config.unlike
+    most_m, most_px, most_rim_px = UNLIKE
     # Real pictures are worse than made ones, for all objects alike: what stands out is odd.
     limits = (most_m, max(most_px, 2.0 * float(np.median(aways))), most_rim_px)
     beside = np.abs(rims - np.median(rims))
@@ -252,7 +250,7 @@ def _agreements(
             f"the photograph's edges lie {told[1]:.1f} px from its outline",
             f"the photograph shows its rim {told[2]:.1f} px from where the others' are",
         )
-        left = float(np.prod(1.0 / (1.0 + shares**config.sharp)))
+        left = float(np.prod(1.0 / (1.0 + shares**SHARP)))
         found.append((left, words[int(np.argmax(shares))]))
     return found
 
@@ -267,38 +265,33 @@ def _untouched(fits: Sequence[PoseFit], before: Array, offset_sigma: float) -> P
     )  # fmt: skip
 
 
-def _information(
-    body: Body, fit: PoseFit, R_cam_obj: Array, together: float, config: PhotoFitConfig
-) -> Array:
+def _information(body: Body, fit: PoseFit, R_cam_obj: Array, together: float) -> Array:
     """Return what an object's points say of its twist (6, 6), camera axes, about its centre."""
     scale = np.repeat([body.radius_m, 1.0], 3)
     inflation = together * max(1.0, fit.variance if fit.points else 1.0)
     own = fit.information / np.outer(scale, scale) / inflation
-    own = own + np.eye(6) / config.blind_m**2
-    common = np.repeat([np.radians(config.depth_deg) * body.radius_m, config.depth_m], 3)
+    own = own + np.eye(6) / BLIND_M**2
+    common = np.repeat([np.radians(DEPTH_DEG) * body.radius_m, DEPTH_M], 3)
     H = np.linalg.inv(np.linalg.inv(own) + np.diag(np.square(common))) * np.outer(scale, scale)
     B = np.kron(np.eye(2), R_cam_obj)
     return B @ H @ B.T
 
 
-def _outlines(
-    picture: Picture, bodies: Sequence[Body], Ts_cam_obj: Sequence[Array], config: PhotoConfig
-) -> list[_Seen]:
+def _outlines(picture: Picture, bodies: Sequence[Body], Ts_cam_obj: Sequence[Array]) -> list[_Seen]:
     """Return the outlines of all objects, each hidden by the others."""
     depths = [_depth_of(b, picture.intrinsics, T) for b, T in zip(bodies, Ts_cam_obj, strict=True)]
     out: list[_Seen] = []
     for k, (body, T) in enumerate(zip(bodies, Ts_cam_obj, strict=True)):
         others = np.min([*depths[:k], *depths[k + 1 :], np.full_like(depths[k], np.inf)], axis=0)
-        out.append(_outline(picture, body, T, depths[k], others, config))
+        out.append(_outline(picture, body, T, depths[k], others))
     return out
 
 
 def _outline(
-    picture: Picture, body: Body, T_cam_obj: Array, depth: Array32, others: Array32,
-    config: PhotoConfig,
-) -> _Seen:  # fmt: skip
+    picture: Picture, body: Body, T_cam_obj: Array, depth: Array32, others: Array32
+) -> _Seen:
     """Return the outline of one object."""
-    o = outline_of(picture, depth, others, config)
+    o = outline_of(picture, depth, others)
     at = np.round(o.pixels - o.normals).astype(np.int64)
     z = depth[at[:, 1], at[:, 0]].astype(np.float64)
     o, at, z = o.part(np.isfinite(z)), at[np.isfinite(z)], z[np.isfinite(z)]
@@ -330,7 +323,7 @@ def _follows(center: Array) -> Array:
 
 def _solved(
     seen: Sequence[_Seen], bodies: Sequence[Body], begin: Sequence[Array], H: Sequence[Array],
-    x: Array, offset: float, config: PhotoFitConfig,
+    x: Array, offset: float,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Return unknowns, their covariance, and every outline's 1-sigma [px].
 
@@ -338,8 +331,8 @@ def _solved(
     """
     size, before = len(x), x
     prior = np.zeros(size)
-    prior[0], prior[1:3] = offset**-2, config.photo.common_px**-2
-    prior[9::7] = config.rim_px**-2
+    prior[0], prior[1:3] = offset**-2, COMMON_PX**-2
+    prior[9::7] = EDGE_RIM_PX**-2
     base: Array = np.diag(prior)
     rows: list[tuple[Array, Array]] = []
     for k, (body, s) in enumerate(zip(bodies, seen, strict=True)):
@@ -354,16 +347,16 @@ def _solved(
         moved = np.zeros(size)
         moved[at] = before[at]
         rows.append((J, s.outline.offsets[found] + J @ moved))
-    sigmas: Array = np.full(len(bodies), config.photo.least_px)
+    sigmas: Array = np.full(len(bodies), LEAST_PX)
     A: Array = base
     for _ in range(8):
         A, b = base.copy(), np.zeros(size)
         for k, (J, d) in enumerate(rows):
-            if len(d) < config.photo.least_points:
+            if len(d) < EDGE_POINTS:
                 continue
             r = d - J @ x
-            sigmas[k] = max(1.48 * float(np.median(np.abs(r))), config.photo.least_px)
-            w = _weights(r, float(sigmas[k])) / config.photo.together
+            sigmas[k] = max(1.48 * float(np.median(np.abs(r))), LEAST_PX)
+            w = _weights(r, float(sigmas[k])) / TOGETHER
             A += J.T @ (w[:, None] * J)
             b += J.T @ (w * d)
         x = np.asarray(np.linalg.solve(A, b), dtype=np.float64)
@@ -381,8 +374,7 @@ def _stepped(body: Body, T_cam_obj: Array, x: Array) -> Array:
     return c @ se3.exp(x) @ se3.invert(c) @ T_cam_obj
 
 
-def _mean_px(seen: Sequence[_Seen], beside_px: Array, config: PhotoFitConfig) -> Array:
+def _mean_px(seen: Sequence[_Seen], beside_px: Array) -> Array:
     """Return the distances (N,) of all edges, what lies beside taken out [px]."""
     found = [np.abs(s.outline.offsets - s.outline.normals @ beside_px) for s in seen]
-    return np.minimum(np.nan_to_num(np.concatenate([*found, np.zeros(0)]), nan=config.cap_px),
-                      config.cap_px)  # fmt: skip
+    return np.minimum(np.nan_to_num(np.concatenate([*found, np.zeros(0)]), nan=CAP_PX), CAP_PX)

@@ -43,7 +43,7 @@ from realsim.registration.intake import check_odometry, take_in, without_fixed
 from realsim.registration.judge import Defect, Poses, judge_objects
 from realsim.registration.judging.verdict import CONTRAST_DECIDED
 from realsim.registration.many_views import ManyViews, comparer_on, register_many
-from realsim.registration.near_rivals import Duel, duel, duels_by_print
+from realsim.registration.near_rivals import PRINT_VIEWS, Duel, duel, duels_by_print
 from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.registration.registered import (
     Registration,
@@ -192,17 +192,14 @@ def _fit_many(
     """
     intake, config = task.intake, task.config
     many = register_many(intake, found.bodies, _starts(found), intake.plane, config, task.tick.each)
-    rules = config.second_look
     looked = intake
     # Of what nobody named, a model may have been laid into one place many times.
     found_models = {b.model.obj_id: b.model for b in found.bodies}
     wanted = [task.models[w.obj_id] for w in asked] or list(found_models.values())
-    if many.plane is not None and not is_beside_objects(
-        many, found.bodies, many.plane, wanted, rules
-    ):
+    if many.plane is not None and not is_beside_objects(many, found.bodies, many.plane, wanted):
         looked = replace(looked, plane=None, no_plane=NO_TABLE)
     moves = camera_moves(many, found.bodies)
-    if odd := odd_views(looked, moves, config.refine_from, rules):
+    if odd := odd_views(looked, moves, config.refine_from):
         looked = without_views(looked, odd)
     if looked is not intake:
         intake, task = looked, replace(task, intake=looked)
@@ -278,7 +275,7 @@ def _duels(found: FoundObjects, many: ManyViews, config: RegistrationConfig) -> 
     poses, misfits = many.refined.poses, many.refined.misfit_m[:-1]
     rivals = _moved_rivals(found, poses)
     return [
-        None if R is None else duel(b, T, R, cloud, float(m), config.rivals)
+        None if R is None else duel(b, T, R, cloud, float(m))
         for b, T, R, cloud, m in zip(found.bodies, poses, rivals, many.clouds, misfits, strict=True)
     ]
 
@@ -301,7 +298,7 @@ def _print_duels(
     bodies = [moved_body(b, T) for b, T in zip(found.bodies, many.poses, strict=True)]
     rivals = _moved_rivals(found, many.poses)
     middle = np.mean([b.center(b.T_start) for b in bodies], axis=0)
-    some = tuple(spread_frames(many.frames, middle, task.config.rivals.print_views))
+    some = tuple(spread_frames(many.frames, middle, PRINT_VIEWS))
     intake = replace(task.intake, frames=some, plane=many.plane)
     return duels_by_print(bodies, rivals, contrasts, intake, task.config)
 
@@ -400,7 +397,7 @@ def _registration(
         "stride_px": round(float(np.sqrt(intake.views[0].area_px))),
         "noise_per_m": intake.noise.per_m,
         "plane": plane_report(given.plane, intake.no_plane),
-        **common_report(given, objects, config),
+        **common_report(given, objects),
         "search": found.report,
         "single_view": single_report,
         "not_placed": missing_report(missing),

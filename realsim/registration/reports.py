@@ -9,7 +9,6 @@ from realsim.geometry import se3
 from realsim.records import ObjectPose, SupportPlane
 from realsim.registration.blind import Kept, Uncertainty
 from realsim.registration.body import Body
-from realsim.registration.config import RegistrationConfig
 from realsim.registration.judge import Poses
 from realsim.registration.many_views import ManyViews
 from realsim.registration.photo_fit import PhotoFit
@@ -26,16 +25,14 @@ def plane_report(plane: SupportPlane | None, reason: str) -> dict[str, Any]:
     return {"found": True, "rms_mm": 1e3 * plane.rms_m, "inliers": plane.inliers}
 
 
-def common_report(
-    given: Poses, objects: Sequence[ObjectPose], config: RegistrationConfig
-) -> dict[str, Any]:
+def common_report(given: Poses, objects: Sequence[ObjectPose]) -> dict[str, Any]:
     """Return what holds for all objects together."""
     poses = [o.T_world_obj for o in objects]
     good = [o.verdict != "rejected" for o in objects]
-    sinking = common_sinking(given.bodies, poses, good, given.plane, config.sinking)
+    sinking = common_sinking(given.bodies, poses, good, given.plane)
     report: dict[str, Any] = {"common_sinking": sinking}
     if given.with_starts:
-        report["common_offset_mm"] = common_offset(given.bodies, poses, good, config.offset)
+        report["common_offset_mm"] = common_offset(given.bodies, poses, good)
     return report
 
 

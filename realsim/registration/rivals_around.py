@@ -40,42 +40,38 @@ NODES = 9
 """Nodes of the quadrature over the offset of the depth."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class AroundConfig:
-    """How the poses around a fit of few views are weighed."""
-
-    bound_m: float = 0.003
-    """A pose is right within this MSSD [m]."""
-    offsets_m: tuple[float, ...] = (-0.014, -0.009, -0.005, -0.002, 0.0, 0.002, 0.005, 0.009, 0.014)
-    """Offsets along either direction, as motion of the surface [m]: as far as starts are off."""
-    rays: int = 1500
-    """Rays aimed at the object in each frame; sets the stride."""
-    cap: float = 4.0
-    """A pixel that is further off counts as so many sigmas: something else is there."""
-    floor_m: float = 0.0006
-    """Least 1-sigma of a pixel [m]: mesh and neighbours are off by as much."""
-    temperature: float = 3.0
-    """Costs are divided by this: residuals of neighbouring pixels share what is wrong with mesh,
-    lens and edges, and are not independent."""
-    unknown: float = 2.0
-    """A pixel of which nothing is predicted (no table behind it) counts as so many sigmas."""
-    declared_share: float = 0.3
-    """A direction that moves the surface, modulo symmetry, by less than this share of its length is
-    a declared symmetry."""
-    prior_m: float = 0.015
-    """1-sigma of how far the surface is from a claimed start [m]."""
-    better: float = 4.0
-    """Temperatures by which another pose must cost less to be taken instead of the fit."""
-    likely: float = 40.0
-    """Poses that depth holds more than this against, over the best, are not shown to the
-    photograph."""
-    offset_noises: float = 0.5
-    """1-sigma of the offset of a view's inverse depth that no photograph tells, in units of its
-    noise k: what a calibrated stereo camera wanders by, less than what it may be off by."""
-    flat_m: float = 0.008
-    """An object that rises less over the table lies on it, whatever its own points say [m]."""
-    least_open: float = 0.002
-    """A direction whose 1-sigma is greater is named as one that is not seen [m]."""
+BOUND_M = 0.003
+"""A pose is right within this MSSD [m]."""
+OFFSETS_M = (-0.014, -0.009, -0.005, -0.002, 0.0, 0.002, 0.005, 0.009, 0.014)
+"""Offsets along either direction, as motion of the surface [m]: as far as starts are off."""
+AROUND_RAYS = 1500
+"""Rays aimed at the object in each frame; sets the stride."""
+CAP = 4.0
+"""A pixel that is further off counts as so many sigmas: something else is there."""
+FLOOR_M = 0.0006
+"""Least 1-sigma of a pixel [m]: mesh and neighbours are off by as much."""
+TEMPERATURE = 3.0
+"""Costs are divided by this: residuals of neighbouring pixels share what is wrong with mesh,
+lens and edges, and are not independent."""
+UNKNOWN = 2.0
+"""A pixel of which nothing is predicted (no table behind it) counts as so many sigmas."""
+DECLARED_SHARE = 0.3
+"""A direction that moves the surface, modulo symmetry, by less than this share of its length is
+a declared symmetry."""
+PRIOR_M = 0.015
+"""1-sigma of how far the surface is from a claimed start [m]."""
+BETTER = 4.0
+"""Temperatures by which another pose must cost less to be taken instead of the fit."""
+LIKELY = 40.0
+"""Poses that depth holds more than this against, over the best, are not shown to the
+photograph."""
+OFFSET_NOISES = 0.5
+"""1-sigma of the offset of a view's inverse depth that no photograph tells, in units of its
+noise k: what a calibrated stereo camera wanders by, less than what it may be off by."""
+FLAT_M = 0.008
+"""An object that rises less over the table lies on it, whatever its own points say [m]."""
+LEAST_OPEN = 0.002
+"""A direction whose 1-sigma is greater is named as one that is not seen [m]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -119,7 +115,7 @@ def around(
     claimed: Array | None,
     edges: Edges | None,
     images: Images,
-    configs: tuple[AroundConfig, SolverConfig],
+    solver: SolverConfig,
 ) -> Around:
     """Return the best pose near a fit, and how likely it is right.
 
@@ -131,11 +127,10 @@ def around(
         claimed: (4, 4) the start, if somebody claimed it; None = a search found it.
         edges: what the photograph shows of it; None = nothing.
         images: what the poses are compared with.
-        configs: see `AroundConfig`; of the fits.
+        solver: settings of the fits.
     """
-    config, solver = configs
-    weak = _weak_directions(body, fit, config)
-    offsets, steps = np.array(config.offsets_m), np.gradient(config.offsets_m)
+    weak = _weak_directions(body, fit)
+    offsets, steps = np.array(OFFSETS_M), np.gradient(OFFSETS_M)
     moves = [weak @ np.array([a, b]) for a in offsets for b in offsets]
     starts = [moved_about_center(body, fit.T_world_obj, x) for x in moves]
     fits = [solve_pose(body, cloud, T, solver.fine, solver, held=weak) for T in starts]
@@ -143,33 +138,33 @@ def around(
     # What else decided the fit (neighbours, the photograph) moves all poses as it moved the fit.
     Ts = np.stack([_moved_alike(body, fits[middle], fit, f.T_world_obj) for f in fits])
     fits[middle] = fit
-    Ts = _laid_down(body, Ts, images, config)
-    costs = _costs(body, Ts, others, images, config)
+    Ts = _laid_down(body, Ts, images)
+    costs = _costs(body, Ts, others, images)
     if edges is not None:
-        is_likely = costs < costs.min() + config.likely
+        is_likely = costs < costs.min() + LIKELY
         is_likely[middle] = True
         amended = [edges.amended(T, weak) for T in Ts[is_likely]]
-        Ts[is_likely] = _laid_down(body, np.stack([T for T, _ in amended]), images, config)
+        Ts[is_likely] = _laid_down(body, np.stack([T for T, _ in amended]), images)
         seen = np.array([cost for _, cost in amended])
-        costs[is_likely] = _costs(body, Ts[is_likely], others, images, config) + seen
+        costs[is_likely] = _costs(body, Ts[is_likely], others, images) + seen
         costs[~is_likely] = np.inf
     if claimed is not None:
         away = np.array([mssd_symmetric(claimed, T, body.model) for T in Ts])
-        costs = costs + 0.5 * config.temperature * np.square(away / config.prior_m)
+        costs = costs + 0.5 * TEMPERATURE * np.square(away / PRIOR_M)
     best = int(np.argmin(costs))
-    if costs[best] > costs[middle] - config.better * config.temperature:
+    if costs[best] > costs[middle] - BETTER * TEMPERATURE:
         best = middle
     volumes = np.outer(steps, steps).ravel()
-    weights = np.exp(-(costs - costs.min()) / config.temperature) * volumes
+    weights = np.exp(-(costs - costs.min()) / TEMPERATURE) * volumes
     weights /= weights.sum()
     # A pose of the grid stands for all that lie within half a step of it.
     half = 0.5 * np.sqrt(volumes)
-    probability, follows = _within(body, (Ts, best), weights, half, images, config)
+    probability, follows = _within(body, (Ts, best), weights, half, images)
     rival = int(np.argmin(costs))
     if rival != middle:
         # Where the choice changes, the probability does not jump: it is that of both.
-        gap = (costs[middle] - costs[rival]) / config.temperature - config.better
-        both = [_within(body, (Ts, n), weights, half, images, config)[0] for n in (middle, rival)]
+        gap = (costs[middle] - costs[rival]) / TEMPERATURE - BETTER
+        both = [_within(body, (Ts, n), weights, half, images)[0] for n in (middle, rival)]
         probability = float(np.array(both) @ expit(CHOICE * gap * np.array([-1.0, 1.0])))
     xi = np.array([
         _twist(body, Ts[best], T) if w > UNLIKELY else np.zeros(6)
@@ -179,17 +174,12 @@ def around(
     spread[3:, 3:] += np.outer(follows, follows)
     return Around(
         fit=fits[best].at(Ts[best]), probability=probability, spread=spread, weak=weak,
-        step_m=float(steps.min()), unseen=_unseen(spread, config),
+        step_m=float(steps.min()), unseen=_unseen(spread),
     )  # fmt: skip
 
 
 def _within(
-    body: Body,
-    poses: tuple[Array, int],
-    weights: Array,
-    half: Array,
-    images: Images,
-    config: AroundConfig,
+    body: Body, poses: tuple[Array, int], weights: Array, half: Array, images: Images
 ) -> tuple[float, Array]:
     """Return the probability that the best of weighted poses is right within the bound.
 
@@ -202,7 +192,7 @@ def _within(
     follows = follows * images.offset_per_m / np.sqrt(len(frames))
     nodes, shares = np.polynomial.hermite_e.hermegauss(NODES)
     t = np.hypot(off[:, None], np.linalg.norm(follows) * nodes)
-    within = ndtr((config.bound_m - t) / half[:, None]) @ (shares / shares.sum())
+    within = ndtr((BOUND_M - t) / half[:, None]) @ (shares / shares.sum())
     return float(weights @ within), follows
 
 
@@ -228,20 +218,20 @@ def integrated(body: Body, covariance: Array, found: Around) -> Array:
     return 0.5 * (C + C.T)
 
 
-def _weak_directions(body: Body, fit: PoseFit, config: AroundConfig) -> Array:
+def _weak_directions(body: Body, fit: PoseFit) -> Array:
     """Return the two least determined motions (6, 2) of the surface that are no declared symmetry.
 
     Motions are orthonormal, about the centre of the box, rotation first, turns times the radius.
     """
     _, vectors, _ = principal_axes(body, fit)
     chosen: list[Array] = []
-    length = config.offsets_m[-1]
+    length = OFFSETS_M[-1]
     for v in vectors.T:
         T = moved_about_center(body, np.eye(4), length * v)
         low, high = body.bounds_obj
         moved = float(np.linalg.norm(se3.transform(T, np.stack([low, high])) - [low, high],
                                      axis=1).max())  # fmt: skip
-        if mssd_symmetric(np.eye(4), T, body.model) > config.declared_share * moved:
+        if mssd_symmetric(np.eye(4), T, body.model) > DECLARED_SHARE * moved:
             chosen.append(v)
         if len(chosen) == 2:
             break
@@ -256,13 +246,13 @@ def _moved_alike(body: Body, before: PoseFit, after: PoseFit, T_world_obj: Array
     return se3.from_rt(R, center + shift - R @ center) @ T_world_obj
 
 
-def _laid_down(body: Body, Ts: Array, images: Images, config: AroundConfig) -> Array:
+def _laid_down(body: Body, Ts: Array, images: Images) -> Array:
     """Return poses T_world_obj (N, 4, 4), laid down on the table if the object is flat."""
     plane = images.comparer.plane
     if plane is None:
         return Ts
     T = plane.T_world_table
-    return T @ laid_down(body, se3.invert(T) @ Ts, config.flat_m)
+    return T @ laid_down(body, se3.invert(T) @ Ts, FLAT_M)
 
 
 def _motion(body: Body, T_from: Array, T_to: Array) -> Array:
@@ -283,13 +273,7 @@ def _twist(body: Body, T_best: Array, T: Array) -> Array:
     return _motion(body, T_best, aligned_pose(T_best, T, body.model))
 
 
-def _costs(
-    body: Body,
-    Ts: Array,
-    others: Sequence[tuple[Body, Array]],
-    images: Images,
-    config: AroundConfig,
-) -> Array:
+def _costs(body: Body, Ts: Array, others: Sequence[tuple[Body, Array]], images: Images) -> Array:
     """Return what the depth of all frames holds against each of the poses (N, 4, 4)."""
     comparer = images.comparer
     costs = np.zeros(len(Ts))
@@ -311,21 +295,21 @@ def _costs(
             behind[k] = np.minimum(behind[k], p.z)
         known = np.minimum(behind[cells], comparer.table(frame, rows, columns))
         seen = measured > 0
-        sigma = np.hypot(comparer.noise.sigma(measured), config.floor_m)
+        sigma = np.hypot(comparer.noise.sigma(measured), FLOOR_M)
         index = np.full(shape[0] * shape[1], -1)
         index[cells] = np.arange(len(cells))
         for n, (p, k) in enumerate(zip(prints, at, strict=True)):
             z = known.copy()
             z[index[k]] = np.minimum(z[index[k]], p.z)
-            r = np.where(np.isfinite(z), (measured - z) / sigma, config.unknown)
-            costs[n] += 0.5 * share * float(np.sum(np.minimum(r * r, config.cap**2)[seen]))
+            r = np.where(np.isfinite(z), (measured - z) / sigma, UNKNOWN)
+            costs[n] += 0.5 * share * float(np.sum(np.minimum(r * r, CAP**2)[seen]))
     return costs
 
 
-def _unseen(spread: Array, config: AroundConfig) -> tuple[str, ...]:
+def _unseen(spread: Array) -> tuple[str, ...]:
     """Return the directions of a spread (6, 6) that are wider than `least_open`, in words."""
     values, vectors = np.linalg.eigh(spread)
     return tuple(
         f"{axis_name(vectors[:, i])} by {1e3 * np.sqrt(values[i]):.1f} mm"
-        for i in np.argsort(-values) if values[i] > config.least_open**2
+        for i in np.argsort(-values) if values[i] > LEAST_OPEN**2
     )  # fmt: skip

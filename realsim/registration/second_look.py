@@ -14,7 +14,7 @@ from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose, SupportPlane
 from realsim.registration.body import Body
-from realsim.registration.config import RegistrationConfig, SecondLookConfig
+from realsim.registration.config import RegistrationConfig
 from realsim.registration.intake import Intake
 from realsim.registration.judge import Defect
 from realsim.registration.many_views import ManyViews
@@ -25,14 +25,36 @@ NO_TABLE = "what looked like a table is seen on the objects only"
 """Why there is no plane."""
 POINTS = 20_000
 """Points of all views that are asked where the plane is seen."""
+ON_TABLE_M = 0.003
+"""A point so near to the plane is on it [m]."""
+BESIDE_M = 0.012
+"""A point so far from all objects is beside them [m]."""
+CELL_M = 0.01
+"""Cells by which areas on the plane are measured [m]."""
+LEAST_BESIDE = 1.0
+"""Least area of a table that is seen beside the placed objects, as a share of what all wanted
+ones cover: an invented one lies on the objects, or on some that were not placed."""
+ODD_M = 0.0015
+"""A view is odd whose camera was moved by so much, seen at the objects [m]."""
+ODD_FACTOR = 3.5
+"""It was moved by so many times the median of all views, too. One view whose depth lay 9 px
+beside its image moved 4.2 times as far, because it pulls the others along. Of 144 sound views
+none moved more than 3.0 times as far, nor by more than 0.9 mm."""
+MOST_ODD = 0.25
+"""Share of the views that may be odd: of more, the others are no measure."""
+MOVED_M = 0.0015
+"""If all cameras were moved by so much in the median, that is told [m]: an arm is not so
+coarse."""
+UNSURE_M = 0.003
+"""If by more, which is what a right pose may be off, no pose is accepted [m]: cameras follow a
+model of another size, and then everything fits it."""
+EXPLAINED_SIGMAS = 5.0
+"""So many sigmas per axis of what the arm, or a hand that holds the camera, is said to be off
+by are no reason to doubt."""
 
 
 def is_beside_objects(
-    many: ManyViews,
-    bodies: Sequence[Body],
-    plane: SupportPlane,
-    wanted: Sequence[ObjectModel],
-    config: SecondLookConfig,
+    many: ManyViews, bodies: Sequence[Body], plane: SupportPlane, wanted: Sequence[ObjectModel]
 ) -> bool:
     """Return whether the plane is seen beside the objects, as a table is.
 
@@ -41,23 +63,22 @@ def is_beside_objects(
         bodies: the objects that were placed.
         plane: what may be a table.
         wanted: the models of all objects that should be there.
-        config: settings.
     """
     every = max(1, sum(len(v.points) for v in many.views) // POINTS)
     points = np.concatenate([
         se3.transform(v.T_world_cam, v.points[::every].astype(np.float64)) for v in many.views
     ])  # fmt: skip
     there = se3.transform(se3.invert(plane.T_world_table), points)
-    is_on = np.abs(there[:, 2]) < config.on_table_m
+    is_on = np.abs(there[:, 2]) < ON_TABLE_M
     on = points[is_on]
     beside = np.ones(len(on), dtype=np.bool_)
     for body, T in zip(bodies, many.poses, strict=True):
-        near = np.linalg.norm(on - body.center(T), axis=1) < body.radius_m + config.beside_m
+        near = np.linalg.norm(on - body.center(T), axis=1) < body.radius_m + BESIDE_M
         d = body.field.distance(on[near], se3.invert(T))
-        beside[near] &= d > config.beside_m
-    cells = np.unique(np.floor(there[is_on][beside][:, :2] / config.cell_m), axis=0)
+        beside[near] &= d > BESIDE_M
+    cells = np.unique(np.floor(there[is_on][beside][:, :2] / CELL_M), axis=0)
     covered = sum(float(np.prod(np.sort(m.mesh.extent)[1:])) for m in wanted)
-    return len(cells) * config.cell_m**2 >= config.least_beside * covered
+    return len(cells) * CELL_M**2 >= LEAST_BESIDE * covered
 
 
 def camera_moves(many: ManyViews, bodies: Sequence[Body]) -> Array:
@@ -69,14 +90,12 @@ def camera_moves(many: ManyViews, bodies: Sequence[Body]) -> Array:
     return np.linalg.norm(x[:, 3:] + np.cross(x[:, :3], at), axis=1)
 
 
-def odd_views(
-    intake: Intake, moves: Array, least_views: int, config: SecondLookConfig
-) -> list[ViewFinding]:
+def odd_views(intake: Intake, moves: Array, least_views: int) -> list[ViewFinding]:
     """Return the views whose cameras had to be moved much further than the others'."""
     usual = float(np.median(moves))
-    odd = moves > max(config.odd_m, config.odd_factor * usual)
+    odd = moves > max(ODD_M, ODD_FACTOR * usual)
     count = int(np.count_nonzero(odd))
-    if count > config.most_odd * len(moves) or len(moves) - count < least_views:
+    if count > MOST_ODD * len(moves) or len(moves) - count < least_views:
         return []
     return [
         ViewFinding(
@@ -113,8 +132,8 @@ def views_off(
 
 def far_moved(moves: Array, config: RegistrationConfig) -> list[ViewFinding]:
     """Return that all cameras were moved far, if they were: 'cameras_far' if no arm explains it."""
-    usual, rules = float(np.median(moves)), config.second_look
-    if usual < rules.moved_m:
+    usual = float(np.median(moves))
+    if usual < MOVED_M:
         return []
     words = (
         f"each camera had to be moved by {1e3 * usual:.1f} mm on its own (median) for the depth of "
@@ -123,8 +142,8 @@ def far_moved(moves: Array, config: RegistrationConfig) -> list[ViewFinding]:
         "than its object (`--no-cameras` registers without moving them and names its size). Poses "
         "fit the depth; look at the outlines on the photographs before you use them."
     )
-    explained_m = rules.explained_sigmas * (config.arm_sigma_mm or 0.0) / 1e3
-    kind = "cameras_far" if usual > max(rules.unsure_m, explained_m) else "cameras_moved"
+    explained_m = EXPLAINED_SIGMAS * (config.arm_sigma_mm or 0.0) / 1e3
+    kind = "cameras_far" if usual > max(UNSURE_M, explained_m) else "cameras_moved"
     return [ViewFinding(index=None, kind=kind, words=words, exclude=False)]
 
 

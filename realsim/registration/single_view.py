@@ -7,7 +7,6 @@ digits from run to run.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,25 +22,21 @@ from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.body import Body, footprint
 from realsim.registration.evidence import DepthFrame
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SingleViewConfig:
-    """The constants of the baseline (facts of real single frames: the best variant tried)."""
-
-    reach_m: tuple[float, ...] = (0.020, 0.010, 0.005)
-    """Greatest distance of a correspondence in each round, coarse to fine."""
-    tukey_m: tuple[float, ...] = (0.008, 0.004, 0.0025)
-    """Cut-off of Tukey's kernel in each round."""
-    steps: int = 40
-    """Greatest number of iterations in each round."""
-    converged: float = 1e-7
-    """A round ends when the share of partners, and their RMS distance [m], change by less."""
-    source_points: int = 4000
-    """Visible model points used."""
-    crop_m: float = 0.020
-    """The cloud is cropped to the start's bounding sphere plus this."""
-    target_points: int = 15_000
-    """About so many measured points of the crop are used."""
+REACH_M = (0.020, 0.010, 0.005)
+"""Greatest distance of a correspondence in each round, coarse to fine: of the variants tried on
+real single frames the best."""
+TUKEY_M = (0.008, 0.004, 0.0025)
+"""Cut-off of Tukey's kernel in each round."""
+STEPS = 40
+"""Greatest number of iterations in each round."""
+CONVERGED = 1e-7
+"""A round ends when the share of partners, and their RMS distance [m], change by less."""
+SOURCE_POINTS = 4000
+"""Visible model points used."""
+CROP_M = 0.020
+"""The cloud is cropped to the start's bounding sphere plus this."""
+TARGET_POINTS = 15_000
+"""About so many measured points of the crop are used."""
 
 
 def reference_frame(
@@ -56,9 +51,7 @@ def reference_frame(
     return frames[int(np.argmax(offsets @ up / np.linalg.norm(offsets, axis=1)))]
 
 
-def fit_single_view(
-    body: Body, intrinsics: CameraIntrinsics, frame: DepthFrame, config: SingleViewConfig
-) -> Array:
+def fit_single_view(body: Body, intrinsics: CameraIntrinsics, frame: DepthFrame) -> Array:
     """Return T_world_obj (4, 4) by robust point-to-plane ICP in one frame.
 
     Raises:
@@ -68,8 +61,8 @@ def fit_single_view(
 
     o3d = import_open3d()
     T_cam_obj = se3.invert(frame.T_world_cam) @ body.T_start
-    source = _visible_points(body, intrinsics, T_cam_obj, config)
-    target_points = _cropped(body, intrinsics, frame, T_cam_obj, config)
+    source = _visible_points(body, intrinsics, T_cam_obj)
+    target_points = _cropped(body, intrinsics, frame, T_cam_obj)
     if len(source) < 50 or len(target_points) < 50:
         raise DegenerateError(
             f"view {frame.index} sees {len(source)} model points of object "
@@ -81,17 +74,13 @@ def fit_single_view(
     target.orient_normals_towards_camera_location(np.zeros(3))
     normals = np.asarray(target.normals)
     T, tree = T_cam_obj, KDTree(target_points)
-    for reach, tukey in zip(config.reach_m, config.tukey_m, strict=True):
-        T = _point_to_plane(source, (target_points, normals, tree), T, (reach, tukey), config)
+    for reach, tukey in zip(REACH_M, TUKEY_M, strict=True):
+        T = _point_to_plane(source, (target_points, normals, tree), T, (reach, tukey))
     return frame.T_world_cam @ se3.check_rigid(T, "the pose found by ICP")
 
 
 def _point_to_plane(
-    source: Array,
-    target: tuple[Array, Array, Any],
-    T: Array,
-    round_m: tuple[float, float],
-    config: SingleViewConfig,
+    source: Array, target: tuple[Array, Array, Any], T: Array, round_m: tuple[float, float]
 ) -> Array:
     """Return the pose after one round of ICP: correspondence within reach, one Gauss-Newton step.
 
@@ -102,12 +91,11 @@ def _point_to_plane(
         target: (M, 3) measured points [m], (M, 3) their normals, a tree of the points.
         T: (4, 4) the pose before.
         round_m: reach of a correspondence, and Tukey's cut-off [m].
-        config: steps and when to stop.
     """
     reach, cut = round_m
     points, normals, tree = target
     before = (np.inf, np.inf)
-    for _ in range(config.steps):
+    for _ in range(STEPS):
         moved = se3.transform(T, source)
         found: tuple[Any, Any] = tree.query(moved, distance_upper_bound=reach)  # pyright: ignore[reportAssignmentType]
         gap, partner = found
@@ -115,7 +103,7 @@ def _point_to_plane(
         if not has.any():
             return T
         now = (float(np.mean(has)), float(np.sqrt(np.mean(np.square(gap[has])))))
-        if max(abs(now[0] - before[0]), abs(now[1] - before[1])) < config.converged:
+        if max(abs(now[0] - before[0]), abs(now[1] - before[1])) < CONVERGED:
             return T
         before = now
         p, q, n = moved[has], points[partner[has]], normals[partner[has]]
@@ -129,28 +117,22 @@ def _point_to_plane(
     return T
 
 
-def _visible_points(
-    body: Body, intrinsics: CameraIntrinsics, T_cam_obj: Array, config: SingleViewConfig
-) -> Array:
+def _visible_points(body: Body, intrinsics: CameraIntrinsics, T_cam_obj: Array) -> Array:
     """Return the points (N, 3) of the model that the camera sees, in the object's frame."""
     seen = footprint(body, intrinsics, T_cam_obj, 1)
-    every = max(1, int(np.ceil(len(seen.z) / config.source_points)))
+    every = max(1, int(np.ceil(len(seen.z) / SOURCE_POINTS)))
     rays = ray_table(intrinsics)[seen.rows[::every], seen.columns[::every]]
     return se3.transform(se3.invert(T_cam_obj), rays * seen.z[::every, None])
 
 
 def _cropped(
-    body: Body,
-    intrinsics: CameraIntrinsics,
-    frame: DepthFrame,
-    T_cam_obj: Array,
-    config: SingleViewConfig,
+    body: Body, intrinsics: CameraIntrinsics, frame: DepthFrame, T_cam_obj: Array
 ) -> Array:
     """Return the measured points (N, 3) within the start's bounding sphere, in the camera."""
     points, _ = points_from_depth(frame.depth_m, intrinsics, 1)
-    near = np.linalg.norm(points - body.center(T_cam_obj), axis=1) < body.radius_m + config.crop_m
+    near = np.linalg.norm(points - body.center(T_cam_obj), axis=1) < body.radius_m + CROP_M
     points = points[near]
-    return points[:: max(1, len(points) // config.target_points)]
+    return points[:: max(1, len(points) // TARGET_POINTS)]
 
 
 def _point_cloud(o3d: Any, points: Array) -> Any:

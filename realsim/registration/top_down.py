@@ -42,7 +42,7 @@ def top_down_poses(
     missing: list[str] = []
     for i, body in enumerate(given.bodies):
         try:
-            T = fit_single_view(body, intake.intrinsics, frame, config.single_view)
+            T = fit_single_view(body, intake.intrinsics, frame)
         except DegenerateError as error:
             missing.append(f"instance {body.start.instance}: {error}")
             continue

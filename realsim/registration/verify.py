@@ -287,23 +287,19 @@ def _verdict_on(
     return Checked(checks=checks, verdict=verdict, reasons=tuple(reasons))
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class OffsetConfig:
-    """When the objects' moves from their starts are one common move."""
-
-    least_objects: int = 3
-    """Two objects may agree by chance."""
-    least_mm: float = 5.0
-    """A smaller offset is within what annotations are off by."""
-    spread_share: float = 0.5
-    """The median deviation from the common offset must stay below this share of its length."""
-    standard_errors: float = 4.0
-    """The offset must be so many times its standard error: the starts of a few objects, each off by
-    10 mm on its own, may point the same way by chance."""
+OFFSET_OBJECTS = 3
+"""Two objects may agree by chance."""
+LEAST_OFFSET_MM = 5.0
+"""A smaller offset is within what annotations are off by."""
+SPREAD_SHARE = 0.5
+"""The median deviation from the common offset must stay below this share of its length."""
+STANDARD_ERRORS = 4.0
+"""The offset must be so many times its standard error: the starts of a few objects, each off by
+10 mm on its own, may point the same way by chance."""
 
 
 def common_offset(
-    bodies: Sequence[Body], poses: Sequence[Array], use: Sequence[bool], config: OffsetConfig
+    bodies: Sequence[Body], poses: Sequence[Array], use: Sequence[bool]
 ) -> dict[str, object]:
     """Return whether all objects moved alike from their starts: the starts belong elsewhere.
 
@@ -314,7 +310,6 @@ def common_offset(
         bodies: the objects at their starts.
         poses: where they were found.
         use: which of them were found well enough to count.
-        config: settings.
     """
     moves = np.array(
         [
@@ -329,10 +324,10 @@ def common_offset(
     spread = float(np.median(np.linalg.norm(moves - middle, axis=1)))
     length = float(np.linalg.norm(middle))
     consistent = (
-        len(moves) >= config.least_objects
-        and length >= config.least_mm
-        and spread <= config.spread_share * length
-        and length >= config.standard_errors * spread / np.sqrt(len(moves))
+        len(moves) >= OFFSET_OBJECTS
+        and length >= LEAST_OFFSET_MM
+        and spread <= SPREAD_SHARE * length
+        and length >= STANDARD_ERRORS * spread / np.sqrt(len(moves))
     )
     return {
         "offset_mm": [float(v) for v in middle],
@@ -342,24 +337,16 @@ def common_offset(
     }
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SinkingConfig:
-    """When objects that sink into the table speak of a wrong scale, not of wrong poses."""
-
-    least_objects: int = 3
-    """Two objects may agree by chance."""
-    least_share: float = 0.02
-    """A smaller share of the height is within what meshes and planes are off by (3 mm of 15 cm)."""
-    rest_share: float = 0.5
-    """What the common share leaves of the gaps (RMS) must stay below this part of them."""
+SINKING_OBJECTS = 3
+"""Two objects may agree by chance."""
+LEAST_SINKING = 0.02
+"""A smaller share of the height is within what meshes and planes are off by (3 mm of 15 cm)."""
+SINKING_REST = 0.5
+"""What the common share leaves of the gaps (RMS) must stay below this part of them."""
 
 
 def common_sinking(
-    bodies: Sequence[Body],
-    poses: Sequence[Array],
-    use: Sequence[bool],
-    plane: SupportPlane | None,
-    config: SinkingConfig,
+    bodies: Sequence[Body], poses: Sequence[Array], use: Sequence[bool], plane: SupportPlane | None
 ) -> dict[str, object]:
     """Return whether all objects sink into (or float over) the plane by one share of their height.
 
@@ -372,7 +359,6 @@ def common_sinking(
         poses: where they were found.
         use: which of them were found well enough to count.
         plane: what they stand on; None = nothing to compare with.
-        config: settings.
     """
     if plane is None or not any(use):
         return {"share_of_height": None, "rest_mm": None, "objects": 0, "consistent": False}
@@ -386,9 +372,9 @@ def common_sinking(
     share = float(heights @ gaps / (heights @ heights))
     rest = float(np.sqrt(np.mean(np.square(gaps - share * heights))))
     consistent = (
-        len(rows) >= config.least_objects
-        and abs(share) >= config.least_share
-        and rest <= config.rest_share * float(np.sqrt(np.mean(np.square(gaps))))
+        len(rows) >= SINKING_OBJECTS
+        and abs(share) >= LEAST_SINKING
+        and rest <= SINKING_REST * float(np.sqrt(np.mean(np.square(gaps))))
     )
     return {
         "share_of_height": share,

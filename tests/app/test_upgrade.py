@@ -26,8 +26,8 @@ from realsim.geometry.parts import part
 from realsim.records import GraspSet, Mesh, ObjectPose, SupportPlane
 from realsim.registration.body import make_body
 from realsim.registration.judging.verdict import CONTRAST_DECIDED
-from realsim.registration.near_rivals import RivalConfig, print_duel
-from realsim.registration.photo import PhotoConfig, Picture, shifted
+from realsim.registration.near_rivals import print_duel
+from realsim.registration.photo import Picture, shifted
 from realsim.rendering.casting.pixel_caster import PixelCaster
 from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore, load_grasps
@@ -271,7 +271,7 @@ def test_poses_follow_a_photograph_that_lies_beside_its_depth() -> None:
         rgb=np.roll(PAINTS[labels.ids], off_px, axis=1),
     )  # fmt: skip
     poses = [p.T_world_obj for p in placed]
-    moved = shifted(picture, [p.mesh for p in placed], poses, PhotoConfig())
+    moved = shifted(picture, [p.mesh for p in placed], poses)
     for before, after in zip(poses, moved, strict=True):
         a, b = (se3.invert(T) @ X for X in (before, after))
         px = CAMERA.fx * (b[:3, 3] - a[:3, 3]) / a[2, 3]
@@ -302,8 +302,8 @@ def test_the_print_tells_which_way_round_a_box_stands() -> None:
     for paint, expected in ((mesh, True), (bare, False)):
         model = replace(part("box"), mesh=paint)
         body = make_body(ObjectPose(obj_id=1, instance=0, T_world_obj=T), model, 32, 100)
-        right = print_duel([body], [T], 0, [half], [picture], RivalConfig())
-        wrong = print_duel([body], [half], 0, [T], [picture], RivalConfig())
+        right = print_duel([body], [T], 0, [half], [picture])
+        wrong = print_duel([body], [half], 0, [T], [picture])
         if not expected:
             assert right is None and wrong is None
             continue

@@ -11,16 +11,11 @@ from realsim.records import ObjectPose, SupportPlane
 from realsim.registration.body import make_body
 from realsim.registration.compare import CompareConfig, make_comparer
 from realsim.registration.evidence import DepthNoise, average_cloud
-from realsim.registration.judging.held_out import (
-    HeldOutConfig,
-    box_shift_m,
-    half_fit,
-    held_out,
-    owned_points,
-)
-from realsim.registration.judging.scene_checks import SceneCheckConfig, scene_findings
+from realsim.registration.judging.held_out import box_shift_m, half_fit, held_out, owned_points
+from realsim.registration.judging.scene_checks import scene_findings
 from realsim.registration.judging.surface_residuals import (
-    ResidualConfig,
+    LEVEL_M,
+    WRONG_M,
     error_level_m,
     residual_checks,
     surface_residuals,
@@ -31,7 +26,6 @@ from realsim.registration.table_planes import support_checks
 from realsim.registration.views import SampleConfig, sample_views, world_cloud
 from table_scenes import named_scene
 
-CONFIG = ResidualConfig()
 PLANE = SupportPlane(T_world_table=np.eye(4))
 NOISE = DepthNoise(per_m=0.0069, floor_m=0.0002)
 NAMES = ("gear", "box", "mug", "t_profile")
@@ -45,7 +39,7 @@ def watched():
     views = sample_views(scene.intrinsics, scene.frames, NOISE, SampleConfig(stride=1))
 
     def residuals(poses, Ts=scene.Ts_world_cam, plane=PLANE):
-        return surface_residuals(bodies, poses, scene.intrinsics, views, Ts, NOISE, plane, CONFIG)
+        return surface_residuals(bodies, poses, scene.intrinsics, views, Ts, NOISE, plane)
 
     return scene, bodies, [p.T_world_obj for p in scene.truth], residuals
 
@@ -57,8 +51,8 @@ def turned(body, T, angle, axis=(0.0, 0.0, 1.0)):
 
 
 def checks_of(results):
-    level = error_level_m(results, CONFIG)
-    return [residual_checks(r, level, CONFIG) for r in results]
+    level = error_level_m(results)
+    return [residual_checks(r, level) for r in results]
 
 
 def test_true_poses_leave_no_wrong_surface(watched):
@@ -111,23 +105,21 @@ def test_free_space_is_looked_through_where_nothing_stands(watched):
 
 def test_errors_that_all_objects_share_raise_the_bound_but_not_without_end(watched):
     scene, _, poses, residuals = watched
-    exact = error_level_m(residuals(poses), CONFIG)
+    exact = error_level_m(residuals(poses))
     # Cameras 1.2 mm too near along their axes: depth bias of a cheap camera.
     biased = scene.Ts_world_cam @ se3.from_translation([0, 0, 0.0012])
     results = residuals(poses, biased)
-    level = error_level_m(results, CONFIG)
-    assert exact < 0.0004 < level <= CONFIG.level_m[1]
-    assert wrong_bound_m(exact, CONFIG) == CONFIG.wrong_m
+    level = error_level_m(results)
+    assert exact < 0.0004 < level <= LEVEL_M[1]
+    assert wrong_bound_m(exact) == WRONG_M
     shares = [c["wrong_surface"] for c in checks_of(results)]
-    without = [residual_checks(r, exact, CONFIG)["wrong_surface"] for r in results]
+    without = [residual_checks(r, exact)["wrong_surface"] for r in results]
     assert max(shares) < 0.1 < min(without)
     # A single object cannot excuse itself.
-    assert error_level_m(results[:1], CONFIG) < level
+    assert error_level_m(results[:1]) < level
 
 
 # --- Held-out views: halves of the views find a right pose again and pull a wrong one apart.
-
-HALVES = HeldOutConfig()
 
 
 @pytest.fixture(scope="module")
@@ -139,8 +131,8 @@ def halved():
 
     def judge(poses):
         seen = (scene.intrinsics, views, scene.Ts_world_cam)
-        owned = owned_points(bodies, poses, *seen, NOISE, PLANE, HALVES)
-        return held_out(bodies, owned, len(views), half_fit(bodies, poses, owned, HALVES), HALVES)
+        owned = owned_points(bodies, poses, *seen, NOISE, PLANE)
+        return held_out(bodies, owned, len(views), half_fit(bodies, poses, owned))
 
     return bodies, [p.T_world_obj for p in scene.truth], judge
 
@@ -162,7 +154,6 @@ def test_a_wrong_place_shows_on_unused_views(halved):
 
 
 # --- What is wrong with a whole scene: shifted, sunk, swapped, absent, in other units.
-CHECKS = SceneCheckConfig()
 STANDING = ("box", "wedge", "mug", "u_channel")
 
 
@@ -182,7 +173,7 @@ def table():
 
 def findings(table, bodies, poses, probabilities, with_starts=True):
     _, _, comparer, cloud = table
-    return scene_findings(bodies, poses, probabilities, cloud, comparer, CHECKS, with_starts)
+    return scene_findings(bodies, poses, probabilities, cloud, comparer, with_starts)
 
 
 def test_a_right_scene_has_no_findings(table):

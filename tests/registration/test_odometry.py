@@ -11,7 +11,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.registration.evidence import DepthNoise
-from realsim.registration.odometry.cross_check import CheckConfig, check_kinematics
+from realsim.registration.odometry.cross_check import check_kinematics
 from realsim.registration.odometry.kiss import FitConfig, LocalMap, thin_points
 from realsim.registration.views import SampleConfig, ViewPoints, sample_views
 from table_scenes import small_scene
@@ -67,7 +67,7 @@ def test_known_motion_is_found():
 
 
 def test_a_clean_capture_raises_no_alarm():
-    check = check_kinematics(views_of(1), PLANE, CheckConfig())
+    check = check_kinematics(views_of(1), PLANE)
     assert check.good, check.words()
     assert check.noise_mm < 1.6 and check.noise_deg < 0.25
     assert [v.index for v in check.views] == list(range(VIEWS))
@@ -78,7 +78,7 @@ def test_one_wrong_view_is_named():
     views = views_of(1)
     Ts = poses_of(views)
     Ts[17] = Ts[17] @ off(6, 1.2)
-    check = check_kinematics(posed(views, Ts), PLANE, CheckConfig())
+    check = check_kinematics(posed(views, Ts), PLANE)
     assert [(f.kind, f.view) for f in check.faults] == [("view", 17)]
     assert check.faults[0].mm == pytest.approx(6, abs=2)
     assert check.faults[0].deg == pytest.approx(1.2, abs=0.4)
@@ -89,7 +89,7 @@ def test_a_slipped_mount_is_named():
     views = views_of(1)
     Ts = poses_of(views)
     Ts[18:] = Ts[18:] @ off(5, 1.0, 3)
-    check = check_kinematics(posed(views, Ts), PLANE, CheckConfig())
+    check = check_kinematics(posed(views, Ts), PLANE)
     assert [(f.kind, f.view) for f in check.faults] == [("mount", 18)]
     assert check.faults[0].mm == pytest.approx(5, abs=2)
 
@@ -99,9 +99,7 @@ def test_swapped_images_are_named():
     views = views_of(1)
     order = np.arange(VIEWS)
     order[[9, 20]] = order[[20, 9]]
-    check = check_kinematics(
-        posed([views[k] for k in order], poses_of(views)), PLANE, CheckConfig()
-    )
+    check = check_kinematics(posed([views[k] for k in order], poses_of(views)), PLANE)
     assert [(f.kind, f.view, f.other) for f in check.faults] == [("swapped", 9, 20)]
 
 
@@ -109,7 +107,7 @@ def test_swapped_images_are_named():
 def test_a_skipped_image_is_named():
     views = views_of(1)
     kept = np.delete(np.arange(VIEWS), 11)
-    check = check_kinematics(posed([views[k] for k in kept], poses_of(views)), PLANE, CheckConfig())
+    check = check_kinematics(posed([views[k] for k in kept], poses_of(views)), PLANE)
     assert [(f.kind, f.view, f.other) for f in check.faults] == [("shifted", 11, 1)]
     assert "from view 11 on" in check.words()[1]
 
@@ -117,4 +115,4 @@ def test_a_skipped_image_is_named():
 def test_an_empty_table_is_an_error():
     views = [replace(v, points=v.points[:0], pixels=v.pixels[:0]) for v in views_of(1)[:3]]
     with pytest.raises(InputError, match="0 of 3 views"):
-        check_kinematics(views, PLANE, CheckConfig())
+        check_kinematics(views, PLANE)

@@ -18,7 +18,7 @@ from realsim.registration.intake import take_in
 from realsim.registration.judging.verdict import EXPLAINED
 from realsim.registration.refinement.flat import LEAN_DEG, laid_down
 from realsim.registration.register import register_scene
-from realsim.registration.rivals_around import _moved_alike
+from realsim.registration.rivals_around import FLAT_M, _moved_alike
 from realsim.registration.search.flat_search import explained_at, table_map
 from realsim.registration.solver import SolverConfig, solve_pose
 from table_scenes import QUICK
@@ -29,7 +29,6 @@ TRUE_CAMERAS = {"hand_eye_mm": 0.0, "hand_eye_deg": 0.0, "arm_mm": 0.0, "arm_deg
 IDS = {name: i for i, (name, *_) in enumerate(shapes.SHAPES.items(), start=1)}
 OFFSET_PX = 0.1
 """By which the disparity of the one view is too large: 1.5 to 2.5 mm."""
-FLAT_M = QUICK.around.flat_m
 
 
 def off_by(pose: ObjectPose, mm: float, deg: float, rng: np.random.Generator) -> ObjectPose:
@@ -283,15 +282,13 @@ def test_a_slid_plate_does_not_explain_the_heights_around_it():
     intake = take_in(scene.intrinsics, scene.frames, QUICK)
     plane = SupportPlane(T_world_table=np.eye(4))
     assert intake.plane is not None
-    map_ = table_map(intake.views, intake.plane, intake.noise, np.zeros(3), 12.5, QUICK.find.flat)
+    map_ = table_map(intake.views, intake.plane, intake.noise, np.zeros(3), 12.5)
     up = intake.plane.T_world_table @ se3.invert(plane.T_world_table)
     for true in scene.truth:
         name = scene.models[true.obj_id].name
         body = body_of(name, true.T_world_obj)
         there = laid_down(body, (se3.invert(up) @ true.T_world_obj)[None], FLAT_M)[0]
-        right = explained_at(map_, body, up @ there, 0.0, QUICK.find.flat)
-        slid = explained_at(
-            map_, body, up @ se3.from_translation([0.012, 0.0, 0.0]) @ there, 0.0, QUICK.find.flat
-        )
+        right = explained_at(map_, body, up @ there, 0.0)
+        slid = explained_at(map_, body, up @ se3.from_translation([0.012, 0.0, 0.0]) @ there, 0.0)
         assert right is not None and slid is not None
         assert right > EXPLAINED > slid, name

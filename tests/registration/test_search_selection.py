@@ -24,7 +24,7 @@ from realsim.registration.search.scoring import (
     score,
 )
 from realsim.registration.search.selection import (
-    SelectionConfig,
+    LEAST_PER_CELL_UNKNOWN,
     Slot,
     select,
     select_any,
@@ -100,7 +100,6 @@ def test_the_truth_gains_more_than_anything_beside_it(n: int):
 # --- The joint choice: known answers on a real scene's images, with right and wrong poses mixed.
 
 CHOSEN = ("mug", "wedge", "gear", "wedge")
-CHOICE = SelectionConfig()
 
 
 @lru_cache(maxsize=1)
@@ -138,7 +137,7 @@ def slots() -> list[Slot]:
 
 def test_the_right_poses_are_chosen():
     canvas, pool, _ = material()
-    got = select(canvas, pool, slots(), CHOICE)
+    got = select(canvas, pool, slots())
     assert {c for c in got.chosen} == {0, 1, 2, 3}
     assert got.chosen[0] == 0
     assert got.chosen[2] == 2
@@ -150,22 +149,22 @@ def test_the_right_poses_are_chosen():
 def test_two_of_one_model_never_share_a_pose():
     canvas, pool, _ = material()
     only = [frozenset([1]), frozenset([1])]
-    got = select(canvas, pool, only, CHOICE)
+    got = select(canvas, pool, only)
     assert sorted(map(str, got.chosen)) == ["1", "None"]
 
 
 def test_a_bad_first_choice_is_mended():
     canvas, pool, ids = material()
     bad = [n for n in range(len(pool)) if n >= 4 and ids[n] == pool[0].obj_id][1]
-    got = select(canvas, pool, slots(), CHOICE, [bad, None, None, None])
+    got = select(canvas, pool, slots(), [bad, None, None, None])
     assert got.chosen[0] == 0
 
 
 def test_wrong_poses_alone_are_refused():
     canvas, pool, _ = material()
-    got = select_any(canvas, pool[4:], CHOICE)
-    assert all(s is not None and s.per_cell >= CHOICE.least_per_cell_unknown for s in got.scores)
-    empty = select(canvas, pool, [frozenset()], CHOICE)
+    got = select_any(canvas, pool[4:])
+    assert all(s is not None and s.per_cell >= LEAST_PER_CELL_UNKNOWN for s in got.scores)
+    empty = select(canvas, pool, [frozenset()])
     assert empty.chosen == (None,)
     assert empty.scores == (None,)
 
@@ -177,12 +176,12 @@ def test_two_that_stand_in_each_others_places_change_them():
     there = [n for n in range(4, len(pool)) if ids[n] == pool[gear].obj_id][mug]
     others = compose(canvas.table, [pool[1].rendered, pool[3].rendered])
     pair = (slots()[mug], slots()[gear])
-    assert select_pair(canvas, pool, pair, (here, there), others, CHOICE) == (mug, gear)
-    assert select_pair(canvas, pool, pair, (here, None), others, CHOICE) == (mug, gear)
-    assert select_pair(canvas, pool, pair, (mug, gear), others, CHOICE) is None
+    assert select_pair(canvas, pool, pair, (here, there), others) == (mug, gear)
+    assert select_pair(canvas, pool, pair, (here, None), others) == (mug, gear)
+    assert select_pair(canvas, pool, pair, (mug, gear), others) is None
     # One of which there is no acceptable pose cannot have the other's place.
     alone = (frozenset([here]), slots()[gear])
-    assert select_pair(canvas, pool, alone, (None, gear), others, CHOICE) is None
+    assert select_pair(canvas, pool, alone, (None, gear), others) is None
 
 
 # --- Distance of poses modulo symmetry: zero for symmetric poses, the plain distance without.

@@ -28,8 +28,8 @@ from realsim.records import ObjectModel, ObjectPose, SupportPlane
 from realsim.registration.compare import CompareConfig, Comparer, make_comparer
 from realsim.registration.evidence import DepthFrame, EvidenceConfig, measure_noise
 from realsim.registration.photo import (
+    SQUARE_PX,
     Outline,
-    PhotoConfig,
     Picture,
     hidden_by_measured,
     outline_of,
@@ -72,8 +72,6 @@ LEAST_PIECES = 8
 """Fewer pieces decide nothing."""
 VIEWS = 6
 """Views that are looked at, at most."""
-PHOTO = PhotoConfig()
-"""How outlines are laid onto photographs."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -213,11 +211,11 @@ class Referee:
         rest = [self._depth_of(v, i, X) for i, X in others.items() if i != instance]
         behind = np.min([np.full_like(own, np.inf), *rest], axis=0)
         scene = np.minimum(np.minimum(own, behind), self._tables[v])
-        hidden = hidden_by_measured(picture.depth_m, own, PHOTO)
+        hidden = hidden_by_measured(picture.depth_m, own)
         sight = np.isfinite(own) & (own <= behind) & ~hidden
         return _Claim(
             own, scene, sight, float(sight.sum() / max(np.isfinite(own).sum(), 1)),
-            outline_of(picture, own, behind, PHOTO),
+            outline_of(picture, own, behind),
         )  # fmt: skip
 
     def _likelihood(self, v: int, scene: Array, where: Mask) -> Array:
@@ -259,7 +257,7 @@ class Referee:
         for claim in (a, b):
             o = claim.outline
             if held_out:
-                o = o.part(o.squares(PHOTO.block_px, odd=True))
+                o = o.part(o.squares(SQUARE_PX, odd=True))
             d = np.minimum(np.nan_to_num(np.abs(o.offsets), nan=CAP_PX), CAP_PX)
             at, n = o.sectors(center, SECTORS), SECTORS
             sums.append(np.bincount(at, weights=d, minlength=n).astype(np.float64))
@@ -300,7 +298,6 @@ def decide(
         # Several views were brought together by their depth; one can be laid onto its photograph.
         moved = shifted(
             pictures[0], [of[i].mesh for i in new], [r.T_world_obj for r in new.values()],
-            PHOTO,
         )  # fmt: skip
         proposals = {
             i: [_Proposal(T, on_photo=True), *proposals[i]] for i, T in zip(new, moved, strict=True)

@@ -5,7 +5,7 @@ pose that is held by a few views, or by points that belong to a neighbour, moves
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,22 +25,18 @@ HalfFit = Callable[[Int64], Sequence[Array]]
 """From the numbers (N,) of the views that may be used to the poses (4, 4) of all objects."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class HeldOutConfig:
-    """How the halves are fitted and compared."""
-
-    reach_m: float = 0.012
-    """Points further from every surface are not used [m]: a solver step's widest kernel."""
-    points: int = 6_000
-    """About so many points of an object and half are fitted: 60 ns each and step."""
-    least_points: int = 50
-    """An object with fewer in a half cannot be fitted there."""
-    agree_m: float = 0.003
-    """A point of an unused view agrees within this of the surface [m]; plus 1.5 sigma_z."""
-    agree_sigmas: float = 1.5
-    """See `agree_m`."""
-    solver: SolverConfig = field(default_factory=SolverConfig)
-    """Its `fine` stages are run from the final pose."""
+REACH_M = 0.012
+"""Points further from every surface are not used [m]: a solver step's widest kernel."""
+POINTS = 6_000
+"""About so many points of an object and half are fitted: 60 ns each and step."""
+LEAST_POINTS = 50
+"""An object with fewer in a half cannot be fitted there."""
+AGREE_M = 0.003
+"""A point of an unused view agrees within this of the surface [m]; plus 1.5 sigma_z."""
+AGREE_SIGMAS = 1.5
+"""See `agree_m`."""
+SOLVER = SolverConfig()
+"""Its `fine` stages are run from the final pose."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -96,11 +92,10 @@ def owned_points(
     Ts_world_cam: Array,
     noise: DepthNoise,
     plane: SupportPlane | None,
-    config: HeldOutConfig,
 ) -> list[OwnedPoints]:
     """Return per object the points nearest to it, thinned out to what two halves need."""
-    step = thinning(bodies, poses, (intrinsics, views, Ts_world_cam), 2 * config.points)
-    claims = make_claims(bodies, poses, plane, config.reach_m)
+    step = thinning(bodies, poses, (intrinsics, views, Ts_world_cam), 2 * POINTS)
+    claims = make_claims(bodies, poses, plane, REACH_M)
     parts: list[list[tuple[Array, Array, Array, Int64]]] = [[] for _ in bodies]
     for v, (view, T) in enumerate(zip(views, Ts_world_cam, strict=True)):
         seen = view.points[v % step :: step].astype(np.float64)
@@ -114,17 +109,14 @@ def owned_points(
     result: list[OwnedPoints] = []
     for part in parts:
         points, towards, sigmas, of = (np.concatenate(c) for c in zip(*part, strict=True))
-        every = max(1, len(points) // (2 * config.points))
+        every = max(1, len(points) // (2 * POINTS))
         cloud = Cloud(points=points[::every], towards=towards[::every], sigmas=sigmas[::every])
         result.append(OwnedPoints(cloud=cloud, views=of[::every]))
     return result
 
 
 def half_fit(
-    bodies: Sequence[Body],
-    poses: Sequence[Array],
-    owned: Sequence[OwnedPoints],
-    config: HeldOutConfig,
+    bodies: Sequence[Body], poses: Sequence[Array], owned: Sequence[OwnedPoints]
 ) -> HalfFit:
     """Return a fit of every object alone, from its final pose, on the points of some views."""
 
@@ -132,10 +124,10 @@ def half_fit(
         found: list[Array] = []
         for body, T, mine in zip(bodies, poses, owned, strict=True):
             cloud = mine.cloud.select(np.isin(mine.views, used))
-            if len(cloud.points) < config.least_points:
+            if len(cloud.points) < LEAST_POINTS:
                 found.append(np.full((4, 4), np.nan))
                 continue
-            fitted = solve_pose(body, cloud, T, config.solver.fine, config.solver)
+            fitted = solve_pose(body, cloud, T, SOLVER.fine, SOLVER)
             found.append(fitted.T_world_obj)
         return found
 
@@ -143,11 +135,7 @@ def half_fit(
 
 
 def held_out(
-    bodies: Sequence[Body],
-    owned: Sequence[OwnedPoints],
-    views: int,
-    fit: HalfFit,
-    config: HeldOutConfig,
+    bodies: Sequence[Body], owned: Sequence[OwnedPoints], views: int, fit: HalfFit
 ) -> list[HeldOut]:
     """Return what each object's two halves say of each other.
 
@@ -157,7 +145,6 @@ def held_out(
         views: how many views there are.
         fit: from view numbers to the poses of all objects; a pose that is not finite says that it
             could not be fitted.
-        config: settings.
 
     Raises:
         InputError: there are not two views.
@@ -170,28 +157,25 @@ def held_out(
         results.append(
             HeldOut(
                 shift_mm=1e3 * box_shift_m(body, T_a, T_b) if both else float("nan"),
-                agree=_unused_agree(body, mine, ((T_a, second), (T_b, first)), config),
+                agree=_unused_agree(body, mine, ((T_a, second), (T_b, first))),
                 Ts_world_obj=np.stack([T_a, T_b]),
             )
         )
     return results
 
 
-def _unused_agree(
-    body: Body, owned: OwnedPoints, tests: Sequence[tuple[Array, Int64]], config: HeldOutConfig
-) -> float:
+def _unused_agree(body: Body, owned: OwnedPoints, tests: Sequence[tuple[Array, Int64]]) -> float:
     """Return the share of points that agree, each tested with the pose its view was not used for.
 
     Args:
         body: the object.
         owned: its points.
         tests: pairs of a pose (4, 4) and the views (N,) to test it on.
-        config: settings.
     """
     agree: list[Mask] = []
     for T, unused in tests:
         cloud = owned.cloud.select(np.isin(owned.views, unused))
         if np.all(np.isfinite(T)) and len(cloud.points):
             d = np.abs(body.field.distance(cloud.points, se3.invert(T)))
-            agree.append(d <= config.agree_m + config.agree_sigmas * cloud.sigmas)
+            agree.append(d <= AGREE_M + AGREE_SIGMAS * cloud.sigmas)
     return float(np.mean(np.concatenate(agree))) if agree else float("nan")

@@ -18,7 +18,7 @@ from realsim.registration.compare import Comparer
 from realsim.registration.evidence import Cloud
 from realsim.registration.search.records import Placed, SearchResult, Wanted
 from realsim.registration.solver import SolverConfig, solve_pose
-from realsim.registration.verify import OffsetConfig, SinkingConfig, common_offset, common_sinking
+from realsim.registration.verify import common_offset, common_sinking
 
 FindingKind = Literal["common shift", "common sinking", "swapped ids", "not in the scene", "unit"]
 
@@ -36,43 +36,30 @@ class SceneFinding:
     """Plain JSON values."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SwapConfig:
-    """When two objects may have been taken for each other."""
-
-    similar: float = 1.35
-    """Greatest ratio of the sorted sides of the two boxes: nobody mistakes a cup for a nut."""
-    gain: float = 0.5
-    """Objects that gain this much per pixel at their own place are not suspected: right ones gain
-    0.6 or more over the bare table."""
-    better: float = 0.1
-    """Share of its gain that the other model must gain more at either place."""
-    margin_m: float = 0.01
-    """Points this far beyond a model's bounding sphere are fitted too [m]."""
-    turns: int = 4
-    """Quarter turns about the vertical that are tried, for each of the six sides up."""
-    finalists: int = 4
-    """Fitted turns that are rendered."""
-    points: int = 1500
-    """Points that fit a turn."""
-    solver: SolverConfig = field(default_factory=SolverConfig)
-    """The Gauss-Newton fit."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SceneCheckConfig:
-    """Constants of the findings."""
-
-    offset: OffsetConfig = field(default_factory=OffsetConfig)
-    sinking: SinkingConfig = field(default_factory=SinkingConfig)
-    swap: SwapConfig = field(default_factory=SwapConfig)
-    absent_gain: float = 0.15
-    """A model whose best pose explains its pixels by less than this each better than the bare table
-    is not in the scene."""
-    absent_probability: float = 0.1
-    """Probability below which the pose of such a model counts as absent."""
-    good: float = 0.5
-    """Objects of this probability or more count for what all have in common."""
+SIMILAR_SIDES = 1.35
+"""Greatest ratio of the sorted sides of the two boxes: nobody mistakes a cup for a nut."""
+OWN_GAIN = 0.5
+"""Objects that gain this much per pixel at their own place are not suspected: right ones gain
+0.6 or more over the bare table."""
+BETTER_GAIN = 0.1
+"""Share of its gain that the other model must gain more at either place."""
+MARGIN_M = 0.01
+"""Points this far beyond a model's bounding sphere are fitted too [m]."""
+QUARTER_TURNS = 4
+"""Quarter turns about the vertical that are tried, for each of the six sides up."""
+FINALISTS = 4
+"""Fitted turns that are rendered."""
+FIT_POINTS = 1500
+"""Points that fit a turn."""
+SOLVER = SolverConfig()
+"""The Gauss-Newton fit."""
+ABSENT_GAIN = 0.15
+"""A model whose best pose explains its pixels by less than this each better than the bare table
+is not in the scene."""
+ABSENT_PROBABILITY = 0.1
+"""Probability below which the pose of such a model counts as absent."""
+GOOD_PROBABILITY = 0.5
+"""Objects of this probability or more count for what all have in common."""
 
 
 def scene_findings(
@@ -81,7 +68,6 @@ def scene_findings(
     probabilities: Sequence[float],
     cloud: Cloud,
     comparer: Comparer,
-    config: SceneCheckConfig,
     with_starts: bool = True,
     usable: Sequence[bool] | None = None,
 ) -> list[SceneFinding]:
@@ -93,22 +79,21 @@ def scene_findings(
         probabilities: that each is right.
         cloud: the scene's measured points, averaged on voxels of 2 or 3 mm, the table's left out.
         comparer: frames, noise and table.
-        config: settings.
         with_starts: whether the starts were given by someone; else no common shift is looked for.
-        usable: which objects count for what all have in common; None = those of `config.good`.
+        usable: which objects count for what all have in common; None = the likely.
     """
-    use = [p >= config.good for p in probabilities] if usable is None else list(usable)
+    use = [p >= GOOD_PROBABILITY for p in probabilities] if usable is None else list(usable)
     findings: list[SceneFinding] = []
     if with_starts:
-        findings += shift_findings(bodies, poses, use, config.offset)
-    findings += sinking_findings(bodies, poses, use, comparer.plane, config.sinking)
+        findings += shift_findings(bodies, poses, use)
+    findings += sinking_findings(bodies, poses, use, comparer.plane)
     gains = [comparer.gain(b, T, comparer.stride_of(b, T))
              for b, T in zip(bodies, poses, strict=True)]  # fmt: skip
-    swaps = swap_findings(bodies, poses, gains, cloud, comparer, config.swap)
+    swaps = swap_findings(bodies, poses, gains, cloud, comparer)
     swapped = {i for f in swaps for i in f.instances}
     findings += swaps
     for body, (_, gain), p in zip(bodies, gains, probabilities, strict=True):
-        absent = gain < config.absent_gain and p < config.absent_probability
+        absent = gain < ABSENT_GAIN and p < ABSENT_PROBABILITY
         if absent and body.start.instance not in swapped:
             findings.append(
                 SceneFinding(
@@ -125,10 +110,10 @@ def scene_findings(
 
 
 def shift_findings(
-    bodies: Sequence[Body], poses: Sequence[Array], use: Sequence[bool], config: OffsetConfig
+    bodies: Sequence[Body], poses: Sequence[Array], use: Sequence[bool]
 ) -> list[SceneFinding]:
     """Return the finding that all objects stand off their starts by one vector, if they do."""
-    found = common_offset(bodies, poses, use, config)
+    found = common_offset(bodies, poses, use)
     if not found["consistent"]:
         return []
     offset = np.array(found["offset_mm"], dtype=np.float64)
@@ -143,14 +128,10 @@ def shift_findings(
 
 
 def sinking_findings(
-    bodies: Sequence[Body],
-    poses: Sequence[Array],
-    use: Sequence[bool],
-    plane: SupportPlane | None,
-    config: SinkingConfig,
+    bodies: Sequence[Body], poses: Sequence[Array], use: Sequence[bool], plane: SupportPlane | None
 ) -> list[SceneFinding]:
     """Return the finding that all objects sink or float by one share of their height, if so."""
-    found = common_sinking(bodies, poses, use, plane, config)
+    found = common_sinking(bodies, poses, use, plane)
     if not found["consistent"]:
         return []
     share = float(np.array(found["share_of_height"]))
@@ -172,7 +153,6 @@ def swap_findings(
     gains: Sequence[tuple[float, float]],
     cloud: Cloud,
     comparer: Comparer,
-    config: SwapConfig,
 ) -> list[SceneFinding]:
     """Return the pairs of objects that explain each other's place better than their own.
 
@@ -182,23 +162,22 @@ def swap_findings(
         gains: of each there, over the bare table: in all and per pixel.
         cloud: the scene's measured points, the table's left out.
         comparer: frames, noise and table.
-        config: settings.
     """
     pairs: list[tuple[float, int, int, float, float]] = []
     for i, a in enumerate(bodies):
         for j in range(i + 1, len(bodies)):
             b = bodies[j]
             suspected = (
-                a.start.obj_id != b.start.obj_id and min(gains[i][1], gains[j][1]) <= config.gain
+                a.start.obj_id != b.start.obj_id and min(gains[i][1], gains[j][1]) <= OWN_GAIN
             )
-            if not (suspected and _similar(a, b, config.similar)):
+            if not (suspected and _similar(a, b)):
                 continue
-            there = _gain_at(a, b.center(poses[j]), cloud, comparer, config)
-            here = _gain_at(b, a.center(poses[i]), cloud, comparer, config)
+            there = _gain_at(a, b.center(poses[j]), cloud, comparer)
+            here = _gain_at(b, a.center(poses[i]), cloud, comparer)
             # Both places must be explained better, by all pixels together: per pixel a small model
             # within a large object is as good. One wrong object makes no swap.
             more = min(there - gains[j][0], here - gains[i][0])
-            if more >= config.better * max(there, here, 1.0):
+            if more >= BETTER_GAIN * max(there, here, 1.0):
                 pairs.append((more, i, j, here, there))
     findings: list[SceneFinding] = []
     taken: set[int] = set()
@@ -228,28 +207,26 @@ def _name_of(body: Body) -> str:
     return f"{body.model.name} (id {body.start.obj_id}, instance {body.start.instance})"
 
 
-def _similar(a: Body, b: Body, ratio: float) -> bool:
+def _similar(a: Body, b: Body) -> bool:
     """Return whether two boxes have about the same sides."""
     sides = np.sort(a.model.mesh.extent) / np.sort(b.model.mesh.extent)
-    return bool(np.all((sides < ratio) & (sides > 1 / ratio)))
+    return bool(np.all((sides < SIMILAR_SIDES) & (sides > 1 / SIMILAR_SIDES)))
 
 
-def _gain_at(
-    body: Body, center_world: Array, cloud: Cloud, comparer: Comparer, config: SwapConfig
-) -> float:
+def _gain_at(body: Body, center_world: Array, cloud: Cloud, comparer: Comparer) -> float:
     """Return the best gain of a body at a place, in pixels, over its turns, each fitted."""
     away = np.linalg.norm(cloud.points - center_world, axis=1)
-    near = cloud.select(away < body.radius_m + config.margin_m)
-    every = max(1, len(near.points) // config.points)
+    near = cloud.select(away < body.radius_m + MARGIN_M)
+    every = max(1, len(near.points) // FIT_POINTS)
     few = near.select(np.arange(len(near.points)) % every == 0)
     found: list[tuple[float, Array]] = []
-    for R in _turns(config.turns):
+    for R in _turns(QUARTER_TURNS):
         T = se3.from_rt(R, center_world - R @ body.center_obj)
-        fit = solve_pose(body, few, T, config.solver.coarse, config.solver)
+        fit = solve_pose(body, few, T, SOLVER.coarse, SOLVER)
         # The mean residual alone would reward models that lie on few points.
         found.append((fit.points / max(fit.offered, 1) / max(fit.variance, 1.0), fit.T_world_obj))
     found.sort(key=lambda f: -f[0])
-    best = found[: config.finalists]
+    best = found[:FINALISTS]
     return max(comparer.gain(body, T, comparer.stride_of(body, T))[0] for _, T in best)
 
 

@@ -39,49 +39,45 @@ LEVEL_HALVINGS = 40
 """Halvings of the interval in which the level is sought: it ends at 1e-12 of it."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ResidualConfig:
-    """How the surface is cut and when a patch is wrong."""
-
-    patch_m: float = 0.004
-    """Edge of a patch [m]: the teeth of a fine gear are as wide."""
-    samples_per_patch: float = 8.0
-    """Surface samples per patch by which areas are measured."""
-    reach_m: float = 0.008
-    """Points further from every surface belong to none of the objects [m]."""
-    points_per_object: int = 30_000
-    """About so many points are used of each object: 30 or more of a patch."""
-    least_points: int = 4
-    """A patch with fewer is not measured."""
-    variance_factor: float = 2.0
-    """k: neighbouring pixels are not independent, and the noise model is good to a third."""
-    floor_m: float = 0.0001
-    """Part of se that does not average out: the field's grid and the cameras' poses [m]."""
-    wrong_m: float = 0.001
-    """Least mean residual of a wrong patch [m]."""
-    wrong_sigmas: float = 3.0
-    """Least mean residual of a wrong patch, in standard errors."""
-    level_factor: float = 2.5
-    """Least mean residual of a wrong patch, in units of the session's level of error."""
-    level_m: tuple[float, float] = (0.0002, 0.002)
-    """Least and greatest level [m]: beyond, poses are wrong, not meshes and cameras."""
-    level_per_m: float = 0.003
-    """The level where it cannot be measured: this times z^2 [1/m], 0.3 mm at 30 cm, 3 mm at 1 m."""
-    level_prior: float = 2.0
-    """That expectation counts as so many objects: with fewer, one wrong pose would excuse
-    itself."""
-    level_patches: float = 10.0
-    """An object with so many measured patches counts half."""
-    looks: int = 48
-    """Views, evenly picked, in which patches are looked at for free space."""
-    look_cos: float = 0.35
-    """Least cosine at which a patch is looked at: flatter, the next pixel is millimetres off."""
-    through_m: float = 0.0035
-    """Distance behind a patch from which a measurement has gone through it [m]."""
-    through_sigmas: float = 2.0
-    """Plus so many sigma_z, plus `level_per_m` z^2: a camera at 1 m is 3 mm off."""
-    through_looks: int = 2
-    """Fewer looks through do not count where there are more views than two."""
+PATCH_M = 0.004
+"""Edge of a patch [m]: the teeth of a fine gear are as wide."""
+SAMPLES_PER_PATCH = 8.0
+"""Surface samples per patch by which areas are measured."""
+REACH_M = 0.008
+"""Points further from every surface belong to none of the objects [m]."""
+POINTS_PER_OBJECT = 30_000
+"""About so many points are used of each object: 30 or more of a patch."""
+LEAST_POINTS = 4
+"""A patch with fewer is not measured."""
+VARIANCE_FACTOR = 2.0
+"""k: neighbouring pixels are not independent, and the noise model is good to a third."""
+FLOOR_M = 0.0001
+"""Part of se that does not average out: the field's grid and the cameras' poses [m]."""
+WRONG_M = 0.001
+"""Least mean residual of a wrong patch [m]."""
+WRONG_SIGMAS = 3.0
+"""Least mean residual of a wrong patch, in standard errors."""
+LEVEL_FACTOR = 2.5
+"""Least mean residual of a wrong patch, in units of the session's level of error."""
+LEVEL_M = (0.0002, 0.002)
+"""Least and greatest level [m]: beyond, poses are wrong, not meshes and cameras."""
+LEVEL_PER_M = 0.003
+"""The level where it cannot be measured: this times z^2 [1/m], 0.3 mm at 30 cm, 3 mm at 1 m."""
+LEVEL_PRIOR = 2.0
+"""That expectation counts as so many objects: with fewer, one wrong pose would excuse
+itself."""
+LEVEL_PATCHES = 10.0
+"""An object with so many measured patches counts half."""
+LOOKS = 48
+"""Views, evenly picked, in which patches are looked at for free space."""
+LOOK_COS = 0.35
+"""Least cosine at which a patch is looked at: flatter, the next pixel is millimetres off."""
+THROUGH_M = 0.0035
+"""Distance behind a patch from which a measurement has gone through it [m]."""
+THROUGH_SIGMAS = 2.0
+"""Plus so many sigma_z, plus `level_per_m` z^2: a camera at 1 m is 3 mm off."""
+THROUGH_LOOKS = 2
+"""Fewer looks through do not count where there are more views than two."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -116,7 +112,6 @@ def surface_residuals(
     Ts_world_cam: Array,
     noise: DepthNoise,
     plane: SupportPlane | None,
-    config: ResidualConfig,
 ) -> list[SurfaceResiduals]:
     """Return the mean residual of every patch of every object, all views together.
 
@@ -130,7 +125,6 @@ def surface_residuals(
         Ts_world_cam: (V, 4, 4) the corrected cameras.
         noise: of the depth of the camera in the hand.
         plane: the table; its points belong to no object.
-        config: settings.
 
     Raises:
         InputError: there are not as many cameras as views.
@@ -138,23 +132,23 @@ def surface_residuals(
     Ts = np.asarray(Ts_world_cam, dtype=np.float64)
     if Ts.shape != (len(views), 4, 4):
         raise InputError(f"cameras of shape {Ts.shape} for {len(views)} views; give (V, 4, 4).")
-    pieces = [make_patches(b, config.patch_m, config.samples_per_patch) for b in bodies]
+    pieces = [make_patches(b, PATCH_M, SAMPLES_PER_PATCH) for b in bodies]
     sums = [np.zeros((len(p.centers), 4)) for p in pieces]
     looks = [np.zeros((len(p.centers), 3), dtype=np.int32) for p in pieces]
     depths = [
         np.sum((b.center(T) - Ts[:, :3, 3]) * Ts[:, :3, 2], axis=1)
         for b, T in zip(bodies, poses, strict=True)
     ]
-    claims = make_claims(bodies, poses, plane, config.reach_m)
-    step = thinning(bodies, poses, (intrinsics, views, Ts), config.points_per_object)
-    every = max(1, len(views) // config.looks)
+    claims = make_claims(bodies, poses, plane, REACH_M)
+    step = thinning(bodies, poses, (intrinsics, views, Ts), POINTS_PER_OBJECT)
+    every = max(1, len(views) // LOOKS)
     for v, (view, T) in enumerate(zip(views, Ts, strict=True)):
         own = view.noise(noise)
         _add_view(claims, pieces, (view, T, v % step, step), own, sums)
         if v % every == 0 or view.fixed is not None:
-            _look(poses, pieces, view.intrinsics(intrinsics), view, T, own, looks, config)
+            _look(poses, pieces, view.intrinsics(intrinsics), view, T, own, looks)
     return [
-        _means_of(p, s, seen, depth, len(views), config)
+        _means_of(p, s, seen, depth, len(views))
         for p, s, seen, depth in zip(pieces, sums, looks, depths, strict=True)
     ]
 
@@ -225,7 +219,6 @@ def _look(
     T_world_cam: Array,
     noise: DepthNoise,
     looks: Sequence[Int32],
-    config: ResidualConfig,
 ) -> None:
     """Count which patches one view saw, looked through, or was hidden from."""
     stride = max(1, round(float(np.sqrt(view.area_px))))
@@ -234,7 +227,7 @@ def _look(
     depth[view.pixels[:, 1] // stride, view.pixels[:, 0] // stride] = view.points[:, 2]
     own = (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy)
     camera = np.concatenate([own, intrinsics.distortion])
-    limits = (config.look_cos, config.through_m, config.through_sigmas, config.level_per_m)
+    limits = (LOOK_COS, THROUGH_M, THROUGH_SIGMAS, LEVEL_PER_M)
     for k, patches in enumerate(pieces):
         look_at_patches(
             (patches.centers, patches.normals),
@@ -247,14 +240,14 @@ def _look(
 
 
 def _means_of(
-    patches: Patches, sums: Array, looks: Int32, depths: Array, views: int, config: ResidualConfig
+    patches: Patches, sums: Array, looks: Int32, depths: Array, views: int
 ) -> SurfaceResiduals:
     """Return the means of the sums."""
     count, weight, first, _ = sums.T
-    enough = count >= config.least_points
+    enough = count >= LEAST_POINTS
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = np.where(enough, first / weight, np.nan)
-        variance = config.variance_factor / weight + config.floor_m**2
+        variance = VARIANCE_FACTOR / weight + FLOOR_M**2
         sigma = np.where(enough, np.sqrt(variance), np.nan)
     return SurfaceResiduals(
         patches=patches,
@@ -267,7 +260,7 @@ def _means_of(
     )
 
 
-def error_level_m(residuals: Sequence[SurfaceResiduals], config: ResidualConfig) -> float:
+def error_level_m(residuals: Sequence[SurfaceResiduals]) -> float:
     """Return the level of error L that the objects of a session share [m].
 
     It lies between what depth of that distance must be expected to be off by, L0, and the objects'
@@ -277,7 +270,7 @@ def error_level_m(residuals: Sequence[SurfaceResiduals], config: ResidualConfig)
     one wrong pose does not excuse itself; and no pose, moved a little, makes the level jump, as a
     median of a few objects does.
     """
-    least, most = config.level_m
+    least, most = LEVEL_M
     own: list[float] = []
     weights: list[float] = []
     for r in residuals:
@@ -286,12 +279,12 @@ def error_level_m(residuals: Sequence[SurfaceResiduals], config: ResidualConfig)
             noise = float(np.median(r.sigma_m[r.measured]))
             own.append(max(least**2, spread**2 - noise**2))
             count = float(np.count_nonzero(r.measured))
-            weights.append(count / (count + config.level_patches))
+            weights.append(count / (count + LEVEL_PATCHES))
     depths = [r.depth_m for r in residuals if np.isfinite(r.depth_m)]
     if not depths:
         return least
-    squares = np.append(own, max(least, config.level_per_m * float(np.median(depths)) ** 2) ** 2)
-    pulls = np.append(weights, config.level_prior)
+    squares = np.append(own, max(least, LEVEL_PER_M * float(np.median(depths)) ** 2) ** 2)
+    pulls = np.append(weights, LEVEL_PRIOR)
     low, high = np.log(squares.min()), np.log(squares.max())
     for _ in range(LEVEL_HALVINGS):
         middle = 0.5 * (low + high)
@@ -300,14 +293,12 @@ def error_level_m(residuals: Sequence[SurfaceResiduals], config: ResidualConfig)
     return float(np.clip(np.exp(0.25 * (low + high)), least, most))
 
 
-def wrong_bound_m(level_m: float, config: ResidualConfig) -> float:
+def wrong_bound_m(level_m: float) -> float:
     """Return the mean residual beyond which a patch is wrong [m]."""
-    return max(config.wrong_m, config.level_factor * level_m)
+    return max(WRONG_M, LEVEL_FACTOR * level_m)
 
 
-def residual_checks(
-    residuals: SurfaceResiduals, level_m: float, config: ResidualConfig
-) -> dict[str, float]:
+def residual_checks(residuals: SurfaceResiduals, level_m: float) -> dict[str, float]:
     """Return the robust figures of one object's patches.
 
     Returns:
@@ -322,8 +313,8 @@ def residual_checks(
         NaN where nothing was measured or looked at.
     """
     r, areas = residuals, residuals.patches.areas_mm2
-    measured, bound = r.measured, wrong_bound_m(level_m, config)
-    through = _looked_through(r, config)
+    measured, bound = r.measured, wrong_bound_m(level_m)
+    through = _looked_through(r)
     watched = r.looks[:, :2].sum(axis=1) > 0
     checks = {
         "wrong_surface": float("nan"),
@@ -338,7 +329,7 @@ def residual_checks(
         return checks
     size = np.abs(np.where(measured, r.mean_m, 0.0))
     wrong = measured & (size > bound)
-    wrong[measured] &= size[measured] > config.wrong_sigmas * r.sigma_m[measured]
+    wrong[measured] &= size[measured] > WRONG_SIGMAS * r.sigma_m[measured]
     beyond = np.square(r.mean_m[measured]) - np.square(r.sigma_m[measured])
     rms = float(np.sqrt(max(0.0, np.average(beyond, weights=areas[measured]))))
     return checks | {
@@ -379,9 +370,9 @@ def _share(areas: Array, part: Mask, whole: Mask) -> float:
     return float(areas[part & whole].sum()) / total if total > 0 else float("nan")
 
 
-def _looked_through(r: SurfaceResiduals, config: ResidualConfig) -> Mask:
+def _looked_through(r: SurfaceResiduals) -> Mask:
     """Return the patches (P,) through which more views saw than ended on them."""
-    least = config.through_looks if r.views > config.through_looks else 1
+    least = THROUGH_LOOKS if r.views > THROUGH_LOOKS else 1
     return (r.looks[:, 1] >= least) & (r.looks[:, 1] > r.looks[:, 0])
 
 

@@ -8,7 +8,7 @@ and 0.1 degrees, which is what a hand-eye calibration leaves.
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from realsim.registration.odometry.faults import (
 )
 from realsim.registration.odometry.mismatch import Mismatch, find_mismatches, has_failed
 from realsim.registration.odometry.pairs import (
-    AboveTableConfig,
+    LEAST_POINTS,
     Edge,
     PairConfig,
     PairMeter,
@@ -94,19 +94,16 @@ def unmatched_words(view: int) -> str:
     )
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CheckConfig:
-    """How the robot's poses are checked."""
-
-    clouds: AboveTableConfig = field(default_factory=AboveTableConfig)
-    pairs: PairConfig = field(default_factory=PairConfig)
-    faults: FaultConfig = field(default_factory=FaultConfig)
-    further: int = 2
-    """More pairs for a view that a pair makes suspect."""
-    further_share: float = 0.35
-    """Unless more than this share of the views is suspect: then there are pairs enough."""
-    seed: int = 0
-    """Seed of the random search for a table that is not where it should be."""
+PAIRS = PairConfig()
+"""Which views are aligned, and how."""
+FAULTS = FaultConfig()
+"""Which faults are named."""
+FURTHER = 2
+"""More pairs for a view that a pair makes suspect."""
+FURTHER_SHARE = 0.35
+"""Unless more than this share of the views is suspect: then there are pairs enough."""
+SEED = 0
+"""Seed of the random search for a table that is not where it should be."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -192,32 +189,29 @@ class KinematicsCheck:
         }
 
 
-def check_kinematics(
-    views: Sequence[ViewPoints], plane: SupportPlane | None, config: CheckConfig
-) -> KinematicsCheck:
+def check_kinematics(views: Sequence[ViewPoints], plane: SupportPlane | None) -> KinematicsCheck:
     """Return how far the depth images are from the robot's poses, and what is grossly wrong.
 
     Args:
         views: in the order in which they were captured, at the poses that forward kinematics claim.
         plane: the table in world; None = the largest plane of each view.
-        config: settings.
 
     Raises:
         InputError: fewer than two views hold anything above the table.
     """
     began = time.process_time()
-    rng = np.random.default_rng(config.seed)
-    clouds = [view_cloud(v, plane, config.clouds, rng) for v in views]
-    use = [k for k, c in enumerate(clouds) if len(c.source) >= config.clouds.least_points]
+    rng = np.random.default_rng(SEED)
+    clouds = [view_cloud(v, plane, rng) for v in views]
+    use = [k for k, c in enumerate(clouds) if len(c.source) >= LEAST_POINTS]
     if len(use) < 2:
         raise InputError(
-            f"{len(use)} of {len(views)} views hold at least {config.clouds.least_points} averaged "
+            f"{len(use)} of {len(views)} views hold at least {LEAST_POINTS} averaged "
             "points above the table; the robot's poses can be checked from two on. Is anything on "
             "the table, and is the table's height right?"
         )
     empty = set(range(len(views))) - set(use)
     claimed = np.stack([views[k].T_world_cam for k in use])
-    found = _examine([clouds[k] for k in use], claimed, config)
+    found = _examine([clouds[k] for k in use], claimed)
     numbers = [views[k].index for k in use]
     faults = [
         Fault(kind=m.kind, view=numbers[m.place],
@@ -267,22 +261,22 @@ class _Found:
     pairs: int
 
 
-def _examine(clouds: Sequence[ViewCloud], claimed: Array, config: CheckConfig) -> _Found:
+def _examine(clouds: Sequence[ViewCloud], claimed: Array) -> _Found:
     """Return mismatches first, then the faults of the poses that the images do belong to."""
-    meter = PairMeter(clouds, config.pairs)
+    meter = PairMeter(clouds, PAIRS)
     aim = _middle(clouds, claimed)
-    angles = view_angles(claimed, aim, config.pairs.zoom_deg)
+    angles = view_angles(claimed, aim, PAIRS.zoom_deg)
     everyone = list(range(len(claimed)))
-    edges = _measure_pairs(meter, claimed, angles, everyone, config)
+    edges = _measure_pairs(meter, claimed, angles, everyone)
     mismatches, poses = find_mismatches(meter, claimed, edges, angles)
     Ts = claimed[np.maximum(poses, 0)]
     kept = [k for k in everyone if poses[k] >= 0]
     if mismatches:
-        angles = view_angles(Ts, aim, config.pairs.zoom_deg)
-        edges = _measure_pairs(meter, Ts, angles, kept, config)
+        angles = view_angles(Ts, aim, PAIRS.zoom_deg)
+        edges = _measure_pairs(meter, Ts, angles, kept)
     trusted = [e for e in edges if not has_failed(e)]
-    faults, mended = find_faults(Ts, trusted, aim, config.faults)
-    noise = noise_of(differences(mended, trusted), config.faults)
+    faults, mended = find_faults(Ts, trusted, aim, FAULTS)
+    noise = noise_of(differences(mended, trusted), FAULTS)
     paired = {k for e in trusted for k in (e.first, e.second)}
     unmatched = [k for k in kept if k not in paired]
     # Where a pose was skipped, the image before the shift has none; it is not a fault of its own.
@@ -304,24 +298,22 @@ def _examine(clouds: Sequence[ViewCloud], claimed: Array, config: CheckConfig) -
     )
 
 
-def _measure_pairs(
-    meter: PairMeter, Ts: Array, angles: Array, kept: Sequence[int], config: CheckConfig
-) -> list[Edge]:
+def _measure_pairs(meter: PairMeter, Ts: Array, angles: Array, kept: Sequence[int]) -> list[Edge]:
     """Return the pairs of neighbours, and more of those that a pair makes suspect."""
     inner = angles[np.ix_(kept, kept)]
-    pairs = [(kept[i], kept[j]) for i, j in neighbour_pairs(inner, config.pairs)]
+    pairs = [(kept[i], kept[j]) for i, j in neighbour_pairs(inner, PAIRS)]
     edges = [meter.measure(i, j, relative(Ts, i, j)) for i, j in pairs]
     r = differences(Ts, edges)
-    large = (1e3 * np.linalg.norm(r[:, 3:], axis=1) > config.faults.least_mm) | (
-        np.degrees(np.linalg.norm(r[:, :3], axis=1)) > config.faults.least_deg
+    large = (1e3 * np.linalg.norm(r[:, 3:], axis=1) > FAULTS.least_mm) | (
+        np.degrees(np.linalg.norm(r[:, :3], axis=1)) > FAULTS.least_deg
     )
     odd = [e for e, big in zip(edges, large, strict=True) if big or has_failed(e)]
     doubted = sorted({k for e in odd for k in (e.first, e.second)})
-    if len(doubted) > config.further_share * len(kept):
+    if len(doubted) > FURTHER_SHARE * len(kept):
         return edges
     outside = np.full(angles.shape, np.inf)
     outside[np.ix_(kept, kept)] = inner
-    more = further_pairs(outside, pairs, doubted, config.further, config.pairs)
+    more = further_pairs(outside, pairs, doubted, FURTHER, PAIRS)
     return edges + [meter.measure(i, j, relative(Ts, i, j)) for i, j in more]
 
 

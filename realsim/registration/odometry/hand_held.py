@@ -21,7 +21,8 @@ from realsim.records import CameraIntrinsics
 from realsim.registration.evidence import DepthFrame, EvidenceConfig, check_frames, measure_noise
 from realsim.registration.odometry.kiss import FitConfig
 from realsim.registration.odometry.pairs import (
-    AboveTableConfig,
+    LEAST_POINTS,
+    LEAST_SHARE,
     Edge,
     PairConfig,
     PairMeter,
@@ -51,7 +52,6 @@ CAUCHY = 2.0
 """Whitened length from which a pair counts less: a wrong loop must not bend the path."""
 INFLATION = 2.0
 """Sigmas are enlarged by this: pairs of one view share its depth errors."""
-CLOUDS = AboveTableConfig()
 PAIRS = PairConfig(fit=FitConfig(convergence=1e-5, max_iterations=300))
 """Aligned to the end: what is left undone points back to the guess, and adds up on the way."""
 KEY_DEG = 16.0
@@ -222,17 +222,17 @@ def _clouds(
     clouds: list[ViewCloud] = []
     for frame in frames:
         points = sample_view(intrinsics, frame, noise, sample)
-        cloud = view_cloud(points, None, CLOUDS, rng)
+        cloud = view_cloud(points, None, rng)
         if frame.index == 0 and cloud.normal is None:
             raise DegenerateError(
                 "view 0 sees no table: no plane carries at least "
-                f"{100 * CLOUDS.least_share:.0f} % of its points. The first view of a "
+                f"{100 * LEAST_SHARE:.0f} % of its points. The first view of a "
                 "hand-held capture has to show the table; look down on it from 30 to 50 cm."
             )
-        if cloud.normal is not None and len(cloud.source) < CLOUDS.least_points:
+        if cloud.normal is not None and len(cloud.source) < LEAST_POINTS:
             raise InputError(
                 f"view {frame.index} holds only {len(cloud.source)} averaged points above the "
-                f"table; at least {CLOUDS.least_points} are needed. Leave the view out, or "
+                f"table; at least {LEAST_POINTS} are needed. Leave the view out, or "
                 "keep the things on the table in the picture."
             )
         clouds.append(cloud)

@@ -13,35 +13,30 @@ from realsim.records import SupportPlane
 from realsim.registration.odometry.kiss import FitConfig, LocalMap, thin_points
 from realsim.registration.views import ViewPoints
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class AboveTableConfig:
-    """How a view is split into table and things."""
-
-    height_m: float = 0.005
-    """Points less than this above the table are the table's [m]: three sigma at 40 cm."""
-    top_m: float = 0.40
-    """Points higher than this belong to the room [m]."""
-    max_range_m: float = 1.0
-    """Points farther from the camera are not used [m]."""
-    widths_m: tuple[float, ...] = (0.016, 0.004)
-    """Half-widths of the layers in which the plane is refined one after the other [m]: the first
-    catches a camera that is 3 cm off, the last is the table's flatness and the noise."""
-    plane_stride: int = 4
-    """Every which point the plane is refined with; 10 000 are plenty."""
-    ransac_points: int = 3_000
-    """Points of a random search for the plane."""
-    ransac_triples: int = 200
-    """Triples of it: finds a plane of 30 % of the points with p = 0.995."""
-    least_share: float = 0.15
-    """A plane with a smaller share of a view's points is not taken for the table."""
-    map_spacing_m: float = 0.004
-    """Edge of the voxels in which points are averaged that others are aligned to [m]."""
-    source_spacing_m: float = 0.008
-    """Edge of the voxels of the points that are aligned [m]; half as many points cost 1.5 times the
-    accuracy."""
-    least_points: int = 60
-    """A view with fewer averaged points above the table cannot be aligned."""
+HEIGHT_M = 0.005
+"""Points less than this above the table are the table's [m]: three sigma at 40 cm."""
+TOP_M = 0.40
+"""Points higher than this belong to the room [m]."""
+MAX_RANGE_M = 1.0
+"""Points farther from the camera are not used [m]."""
+WIDTHS_M = (0.016, 0.004)
+"""Half-widths of the layers in which the plane is refined one after the other [m]: the first
+catches a camera that is 3 cm off, the last is the table's flatness and the noise."""
+PLANE_STRIDE = 4
+"""Every which point the plane is refined with; 10 000 are plenty."""
+RANSAC_POINTS = 3_000
+"""Points of a random search for the plane."""
+RANSAC_TRIPLES = 200
+"""Triples of it: finds a plane of 30 % of the points with p = 0.995."""
+LEAST_SHARE = 0.15
+"""A plane with a smaller share of a view's points is not taken for the table."""
+MAP_SPACING_M = 0.004
+"""Edge of the voxels in which points are averaged that others are aligned to [m]."""
+SOURCE_SPACING_M = 0.008
+"""Edge of the voxels of the points that are aligned [m]; half as many points cost 1.5 times the
+accuracy."""
+LEAST_POINTS = 60
+"""A view with fewer averaged points above the table cannot be aligned."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -60,42 +55,39 @@ class ViewCloud:
     """(S, 3) coarser ones, to be aligned [m]."""
 
 
-def view_cloud(
-    view: ViewPoints, plane: SupportPlane | None, config: AboveTableConfig, rng: np.random.Generator
-) -> ViewCloud:
+def view_cloud(view: ViewPoints, plane: SupportPlane | None, rng: np.random.Generator) -> ViewCloud:
     """Return the table and the things of one view.
 
     Args:
         view: its trusted points and where the camera is said to be.
         plane: the table in world, where the view's own is looked for first; None = the largest
             plane of the view.
-        config: settings.
         rng: of the random search.
     """
     p = view.points.astype(np.float64)
-    p = p[p[:, 2] < config.max_range_m]
+    p = p[p[:, 2] < MAX_RANGE_M]
     found = T_table_cam = None
     if plane is not None:
         T_table_cam = se3.invert(plane.T_world_table) @ view.T_world_cam
-        found = _refine_table(p, T_table_cam[2, :3], -float(T_table_cam[2, 3]), config)
+        found = _refine_table(p, T_table_cam[2, :3], -float(T_table_cam[2, 3]))
     if found is None:
-        found = _largest(p, config, rng)
+        found = _largest(p, rng)
     if found is None:
         things = np.zeros((0, 3))
         if T_table_cam is not None:
-            things = p[p @ T_table_cam[2, :3] + T_table_cam[2, 3] > config.height_m]
+            things = p[p @ T_table_cam[2, :3] + T_table_cam[2, 3] > HEIGHT_M]
         normal, offset = None, 0.0
     else:
         normal, offset = found
         height = p @ normal - offset
-        things = p[(height > config.height_m) & (height < config.top_m)]
-    target = thin_points(things, config.map_spacing_m)
+        things = p[(height > HEIGHT_M) & (height < TOP_M)]
+    target = thin_points(things, MAP_SPACING_M)
     return ViewCloud(
         index=view.index,
         normal=normal,
         offset=offset,
         target=target,
-        source=thin_points(target, config.source_spacing_m),
+        source=thin_points(target, SOURCE_SPACING_M),
     )
 
 
@@ -132,36 +124,30 @@ def on_plane(
     return se3.from_rt(R, center - R @ about)
 
 
-def _refine_table(
-    p: Array, normal: Array, offset: float, config: AboveTableConfig
-) -> tuple[Array, float] | None:
+def _refine_table(p: Array, normal: Array, offset: float) -> tuple[Array, float] | None:
     """Return the plane (normal, offset) near a given one, or None if the view has none there."""
-    few = p[:: config.plane_stride]
-    if len(few) < config.least_points:
+    few = p[::PLANE_STRIDE]
+    if len(few) < LEAST_POINTS:
         return None
     n, d = np.asarray(normal, dtype=np.float64), offset
     inliers = np.zeros(len(few), dtype=bool)
-    for width in config.widths_m:
+    for width in WIDTHS_M:
         n, d, inliers = refine_plane(few, n, d, width)
-    if np.mean(inliers) < config.least_share or d > 0:
+    if np.mean(inliers) < LEAST_SHARE or d > 0:
         return None
     return n, float(d)
 
 
-def _largest(
-    p: Array, config: AboveTableConfig, rng: np.random.Generator
-) -> tuple[Array, float] | None:
+def _largest(p: Array, rng: np.random.Generator) -> tuple[Array, float] | None:
     """Return the view's largest plane (normal towards the camera, offset), or None."""
-    few = p[:: max(1, len(p) // config.ransac_points)]
+    few = p[:: max(1, len(p) // RANSAC_POINTS)]
     try:
-        n, d, inliers = fit_plane_ransac(few, rng, config.widths_m[-1], config.ransac_triples)
+        n, d, inliers = fit_plane_ransac(few, rng, WIDTHS_M[-1], RANSAC_TRIPLES)
     except DegenerateError:
         return None
-    if np.mean(inliers) < config.least_share:
+    if np.mean(inliers) < LEAST_SHARE:
         return None
-    return (
-        _refine_table(p, n, float(d), config) if d < 0 else _refine_table(p, -n, -float(d), config)
-    )
+    return _refine_table(p, n, float(d)) if d < 0 else _refine_table(p, -n, -float(d))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

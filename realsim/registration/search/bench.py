@@ -23,16 +23,14 @@ from realsim.registration.search.candidates import (
     candidates,
     fuse,
 )
-from realsim.registration.search.flat_search import FlatConfig
 from realsim.registration.search.height_grid import GridConfig, HeightGrid, height_grid
 from realsim.registration.search.matching import MatchConfig, match_templates
 from realsim.registration.search.near_symmetry import NearSymmetryConfig, near_symmetries
-from realsim.registration.search.peel import ExchangeConfig, PeelConfig
+from realsim.registration.search.peel import PeelConfig
 from realsim.registration.search.polish import ContrastConfig
 from realsim.registration.search.records import Region, Wanted
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import Canvas, ScoreConfig, make_canvas, without_far
-from realsim.registration.search.selection import SelectionConfig
 from realsim.registration.search.templates import ModelTemplates, TemplateConfig, model_templates
 from realsim.registration.views import ViewPoints, world_cloud
 
@@ -67,8 +65,6 @@ class FindConfig:
     """Heights over the table."""
     templates: TemplateConfig = field(default_factory=TemplateConfig)
     """How models look from above."""
-    flat: FlatConfig = field(default_factory=FlatConfig)
-    """How plates and cards are found, which no single image shows."""
     match: MatchConfig = field(default_factory=MatchConfig)
     """Templates over heights."""
     near: NearSymmetryConfig = field(default_factory=NearSymmetryConfig)
@@ -79,12 +75,8 @@ class FindConfig:
     """Fits to the points."""
     score: ScoreConfig = field(default_factory=ScoreConfig)
     """Render and compare."""
-    selection: SelectionConfig = field(default_factory=SelectionConfig)
-    """The joint choice."""
     peel: PeelConfig = field(default_factory=PeelConfig)
     """What is unsure is sought again."""
-    exchange: ExchangeConfig = field(default_factory=ExchangeConfig)
-    """Objects in each other's places."""
     contrast: ContrastConfig = field(default_factory=ContrastConfig)
     """Near-symmetric poses against each other."""
 

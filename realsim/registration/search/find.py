@@ -29,7 +29,7 @@ from realsim.registration.search.candidates import Candidate, candidate
 from realsim.registration.search.polish import Decision, decide_rivals, polish_poses
 from realsim.registration.search.records import NotPlaced, Placed, SearchResult, Wanted
 from realsim.registration.search.scoring import compose, render, score
-from realsim.registration.search.selection import Selection
+from realsim.registration.search.selection import LEAST_PER_CELL, Selection
 from realsim.registration.search.state import Search, exchange_places, seek_unsure
 from realsim.registration.views import ViewPoints
 
@@ -216,7 +216,6 @@ def _not_placed(search: Search, final: Sequence[Candidate | None], n: int) -> No
     """Return why a wanted object has no pose."""
     assert search.wanted is not None
     wanted, canvas = search.wanted[n], search.bench.canvas
-    least = search.bench.config.selection.least_per_cell
     where = "on the table" if wanted.region is None else "in its region"
     buffer = compose(canvas.table, [k.rendered for k in final if k is not None])
     rest = [search.pool[k] for k in search.choices[n]]
@@ -227,6 +226,6 @@ def _not_placed(search: Search, final: Sequence[Candidate | None], n: int) -> No
         if not rest
         else f"nothing that was measured {where} looks like it, beside what the other objects and "
         f"the table explain (best of {len(rest)} poses: {max(scores):.2f} likelier per pixel, "
-        f"{least:.2f} is needed): it is not there, or the depth does not show it{strange}"
+        f"{LEAST_PER_CELL:.2f} is needed): it is not there, or the depth does not show it{strange}"
     )
     return NotPlaced(obj_id=wanted.obj_id, instance=wanted.instance, reason=reason)

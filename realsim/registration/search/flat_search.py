@@ -32,36 +32,32 @@ DECIDED_T, DECIDED_RATIO = 4.0, 0.25
 """Standard errors, and share of the mean square, by which a rival is worse that is decided."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class FlatConfig:
-    """How flat objects are sought."""
-
-    most_m: float = 0.008
-    """An object that rises less than this over the table is flat [m]."""
-    cell_m: float = 0.002
-    """Cells of the map [m]."""
-    low_m: float = 0.012
-    """Cells with points higher than this belong to something else [m]."""
-    reach_m: float = 0.3
-    """How far from the middle of the objects it is looked [m]."""
-    ring_m: float = 0.006
-    """Width of the ring around the footprint that must be empty table [m]."""
-    yaw_deg: float = 4.0
-    """Steps of the turn [deg]."""
-    likely: float = 0.03
-    """Least probability of a resting face."""
-    measured: float = 0.6
-    """Least share of the footprint and its ring that is measured."""
-    explained: float = 0.5
-    """Least share of the heights that a pose must explain."""
-    polished: int = 6
-    """Number of best poses that are fitted to the map."""
-    steps: int = 8
-    """Steps of that fit."""
-    floor_m: float = 2e-4
-    """Least 1-sigma of a cell's height [m]: tables are no flatter."""
-    same_m: float = 0.006
-    """Poses nearer than this are one [m]."""
+FLAT_HEIGHT_M = 0.008
+"""An object that rises less than this over the table is flat [m]."""
+CELL_M = 0.002
+"""Cells of the map [m]."""
+LOW_M = 0.012
+"""Cells with points higher than this belong to something else [m]."""
+REACH_M = 0.3
+"""How far from the middle of the objects it is looked [m]."""
+RING_M = 0.006
+"""Width of the ring around the footprint that must be empty table [m]."""
+YAW_DEG = 4.0
+"""Steps of the turn [deg]."""
+LIKELY = 0.03
+"""Least probability of a resting face."""
+MEASURED = 0.6
+"""Least share of the footprint and its ring that is measured."""
+EXPLAINED = 0.5
+"""Least share of the heights that a pose must explain."""
+POLISHED = 6
+"""Number of best poses that are fitted to the map."""
+POLISH_STEPS = 8
+"""Steps of that fit."""
+FLOOR_M = 2e-4
+"""Least 1-sigma of a cell's height [m]: tables are no flatter."""
+SAME_PLACE_M = 0.006
+"""Poses nearer than this are one [m]."""
 
 
 class FlatPose(NamedTuple):
@@ -91,7 +87,7 @@ class TableMap:
 
 def table_map(
     views: Sequence[ViewPoints], plane: SupportPlane, noise: DepthNoise, middle: Array,
-    area_px: float, config: FlatConfig,
+    area_px: float,
 ) -> TableMap:  # fmt: skip
     """Return the mean heights of the views' points.
 
@@ -101,20 +97,19 @@ def table_map(
         noise: of the depth.
         middle: (3,) in world, around which is looked [m].
         area_px: pixels of one independent measurement.
-        config: settings.
     """
     T = se3.invert(plane.T_world_table)
-    low = se3.transform(T, middle[None])[0, :2] - config.reach_m
-    size = int(2 * config.reach_m / config.cell_m)
+    low = se3.transform(T, middle[None])[0, :2] - REACH_M
+    size = int(2 * REACH_M / CELL_M)
     total, precision, tall, count = (np.zeros(size * size) for _ in range(4))
     for view in views:
         p = se3.transform(T @ view.T_world_cam, view.points.astype(np.float64))
-        cell = np.round((p[:, :2] - low) / config.cell_m).astype(np.int64)
-        here = np.all((cell >= 0) & (cell < size), axis=1) & (p[:, 2] > -config.low_m)
+        cell = np.round((p[:, :2] - low) / CELL_M).astype(np.int64)
+        here = np.all((cell >= 0) & (cell < size), axis=1) & (p[:, 2] > -LOW_M)
         at, z = cell[here, 0] * size + cell[here, 1], p[here, 2]
         w = 1.0 / np.square(np.maximum(noise.sigma(view.points[here, 2]), 1e-4))
         w /= max(1.0, area_px / view.area_px)
-        high = z > config.low_m
+        high = z > LOW_M
         precision += np.bincount(at, np.where(high, 0.0, w), size * size)
         total += np.bincount(at, np.where(high, 0.0, w * z), size * size)
         tall += np.bincount(at, high, size * size)
@@ -125,15 +120,15 @@ def table_map(
     return TableMap(plane.T_world_table, low, np.where(weights > 0, heights, 0.0), weights)
 
 
-def cover(map_: TableMap, body: Body, T_world_obj: Array, config: FlatConfig) -> TableMap:
+def cover(map_: TableMap, body: Body, T_world_obj: Array) -> TableMap:
     """Return the map without the cells on which an object lies."""
     weights = map_.weights.copy()
-    weights[_footprint(map_, body, T_world_obj, config)] = 0.0
+    weights[_footprint(map_, body, T_world_obj)] = 0.0
     return TableMap(map_.T_world_table, map_.low, map_.heights, weights)
 
 
 def explained_at(
-    map_: TableMap, body: Body, T_world_obj: Array, table_off_m: float, config: FlatConfig
+    map_: TableMap, body: Body, T_world_obj: Array, table_off_m: float
 ) -> float | None:
     """Return what share of the heights on and around a flat object its pose explains, noise aside.
 
@@ -142,88 +137,84 @@ def explained_at(
     little of the footprint and the ring around it is measured.
     """
     T = se3.invert(map_.T_world_table) @ T_world_obj
-    heights, low = height_map(body, T, config.cell_m / 4)
+    heights, low = height_map(body, T, CELL_M / 4)
     m = gaussian_filter(heights, 2.0)
-    steps = round(config.ring_m / config.cell_m * 4)
+    steps = round(RING_M / CELL_M * 4)
     ring: Mask = np.asarray(binary_dilation(heights > 0, iterations=steps), dtype=np.bool_)
     at = np.argwhere(map_.weights > 0)
-    places = map_.low + config.cell_m * at
-    cells = np.round((places - low) / (config.cell_m / 4)).astype(np.int64)
+    places = map_.low + CELL_M * at
+    cells = np.round((places - low) / (CELL_M / 4)).astype(np.int64)
     inside = np.all((cells >= 0) & (cells < m.shape), axis=1)
     at, cells = at[inside], cells[inside]
     near = ring[tuple(cells.T)]
     at, cells = at[near], cells[near]
-    if len(at) * 16 < config.measured * ring.sum():
+    if len(at) * 16 < MEASURED * ring.sum():
         return None
     h = map_.heights[tuple(at.T)]
-    w = 1.0 / (1.0 / map_.weights[tuple(at.T)] + max(config.floor_m, table_off_m) ** 2)
+    w = 1.0 / (1.0 / map_.weights[tuple(at.T)] + max(FLOOR_M, table_off_m) ** 2)
     left = max(float(w @ np.square(h - m[tuple(cells.T)])) - len(w), 0.0)
     return 1.0 - left / max(float(w @ np.square(h)), 1e-12)
 
 
-def is_free(map_: TableMap, body: Body, T_world_obj: Array, config: FlatConfig) -> bool:
+def is_free(map_: TableMap, body: Body, T_world_obj: Array) -> bool:
     """Return whether enough of the map is left where an object would lie."""
-    left = map_.weights[_footprint(map_, body, T_world_obj, config)] > 0
-    return bool(len(left)) and float(np.mean(left)) >= config.measured
+    left = map_.weights[_footprint(map_, body, T_world_obj)] > 0
+    return bool(len(left)) and float(np.mean(left)) >= MEASURED
 
 
-def _footprint(
-    map_: TableMap, body: Body, T_world_obj: Array, config: FlatConfig
-) -> tuple[Int64, ...]:
+def _footprint(map_: TableMap, body: Body, T_world_obj: Array) -> tuple[Int64, ...]:
     """Return the rows and columns of the map on which an object lies."""
-    heights, low = height_map(body, se3.invert(map_.T_world_table) @ T_world_obj, config.cell_m)
-    at = np.argwhere(heights > 0) + np.round((low - map_.low) / config.cell_m).astype(np.int64)
+    heights, low = height_map(body, se3.invert(map_.T_world_table) @ T_world_obj, CELL_M)
+    at = np.argwhere(heights > 0) + np.round((low - map_.low) / CELL_M).astype(np.int64)
     return tuple(at[np.all((at >= 0) & (at < map_.weights.shape), axis=1)].T)
 
 
-def seek_flat(body: Body, map_: TableMap, config: FlatConfig) -> FlatPose | None:
+def seek_flat(body: Body, map_: TableMap) -> FlatPose | None:
     """Return where a flat object lies; None = it has no flat side, or lies nowhere."""
     w, h = map_.weights, map_.heights
     spectra = [np.fft.rfft2(image) for image in (w * h * h, w, w * h, (w > 0).astype(np.float64))]
     found: list[tuple[float, Array]] = []
     for resting in resting_orientations(body.model.mesh):
-        if resting.height > config.most_m or resting.probability < config.likely:
+        if resting.height > FLAT_HEIGHT_M or resting.probability < LIKELY:
             continue
-        for yaw in np.radians(np.arange(0.0, 360.0, config.yaw_deg)):
+        for yaw in np.radians(np.arange(0.0, 360.0, YAW_DEG)):
             R = se3.exp_so3(np.array([0.0, 0.0, yaw])) @ resting.R
             up = -float((body.model.mesh.vertices @ R[2]).min())
             T = se3.from_rt(R, np.array([0.0, 0.0, up]))
-            found.append(_best_place(body, map_, T, spectra, config))
-    found = sorted((f for f in found if f[0] >= config.explained), key=lambda f: -f[0])
+            found.append(_best_place(body, map_, T, spectra))
+    found = sorted((f for f in found if f[0] >= EXPLAINED), key=lambda f: -f[0])
     if not found:
         return None
     distinct: list[Array] = []
     for _, T in found:
-        if len(distinct) < config.polished and all(
-            mssd_symmetric(T, other, body.model) > config.same_m for other in distinct
+        if len(distinct) < POLISHED and all(
+            mssd_symmetric(T, other, body.model) > SAME_PLACE_M for other in distinct
         ):
             distinct.append(T)
-    polished = [_polished(body, map_, T, config) for T in distinct]
+    polished = [_polished(body, map_, T) for T in distinct]
     polished.sort(key=lambda one: float(one[1].sum()))
     (T, squares), *others = polished
-    rivals = (one for one in others if mssd_symmetric(T, one[0], body.model) > config.same_m)
+    rivals = (one for one in others if mssd_symmetric(T, one[0], body.model) > SAME_PLACE_M)
     contrast = None
     if (rival := next(rivals, None)) is not None:
         contrast = _contrast(squares, rival[1])
     return FlatPose(map_.T_world_table @ T, found[0][0], contrast)
 
 
-def _polished(
-    body: Body, map_: TableMap, T_table_obj: Array, config: FlatConfig
-) -> tuple[Array, Array]:
+def _polished(body: Body, map_: TableMap, T_table_obj: Array) -> tuple[Array, Array]:
     """Return a pose (4, 4) fitted to the map, and the squares (N,) of all cells' residuals."""
     at = np.argwhere(map_.weights > 0)
-    places = np.column_stack([map_.low + config.cell_m * at, map_.heights[tuple(at.T)]])
-    sigmas = np.sqrt(1.0 / map_.weights[tuple(at.T)] + config.floor_m**2)
+    places = np.column_stack([map_.low + CELL_M * at, map_.heights[tuple(at.T)]])
+    sigmas = np.sqrt(1.0 / map_.weights[tuple(at.T)] + FLOOR_M**2)
     above = places + np.array([0.0, 0.0, 1.0])
     T, c = T_table_obj, se3.from_translation(body.center_obj)
-    for _ in range(config.steps):
-        H, b = step_term(body, T, places, above, sigmas, config.cell_m)
+    for _ in range(POLISH_STEPS):
+        H, b = step_term(body, T, places, above, sigmas, CELL_M)
         xi = np.linalg.lstsq(H, b, rcond=1e-9)[0]
         T = T @ c @ se3.exp(xi) @ se3.invert(c)
-    heights, low = height_map(body, T, config.cell_m / 4)
+    heights, low = height_map(body, T, CELL_M / 4)
     smooth = gaussian_filter(heights, 2.0)
-    cells = ((places[:, :2] - low) / (config.cell_m / 4)).T
+    cells = ((places[:, :2] - low) / (CELL_M / 4)).T
     m = map_coordinates(smooth, cells, order=1, mode="constant")
     return T, np.minimum(np.square((places[:, 2] - m) / sigmas), CAP)
 
@@ -240,15 +231,11 @@ def _contrast(squares: Array, rival: Array) -> float:
 
 
 def _best_place(
-    body: Body,
-    map_: TableMap,
-    T_table_obj: Array,
-    spectra: Sequence[NDArray[np.complex128]],
-    config: FlatConfig,
+    body: Body, map_: TableMap, T_table_obj: Array, spectra: Sequence[NDArray[np.complex128]]
 ) -> tuple[float, Array]:
     """Return what the best shift of a pose explains, and the shifted pose (4, 4)."""
-    m, low = height_map(body, T_table_obj, config.cell_m)
-    ring = binary_dilation(m > 0, iterations=round(config.ring_m / config.cell_m))
+    m, low = height_map(body, T_table_obj, CELL_M)
+    ring = binary_dilation(m > 0, iterations=round(RING_M / CELL_M))
     shape = map_.weights.shape
     right, up = shape[0] - m.shape[0] + 1, shape[1] - m.shape[1] + 1
     if right < 1 or up < 1:
@@ -261,7 +248,7 @@ def _best_place(
 
     there, square, cells = sums(0, ring), sums(1, m * m), sums(3, ring)
     explained = (2.0 * sums(2, m) - square) / np.maximum(there - cells, 0.5 * square + 1e-9)
-    explained[cells < config.measured * ring.sum()] = -1.0
+    explained[cells < MEASURED * ring.sum()] = -1.0
     at = np.unravel_index(int(np.argmax(explained)), explained.shape)
-    shift = map_.low + np.array(at) * config.cell_m - low
+    shift = map_.low + np.array(at) * CELL_M - low
     return float(explained[at]), se3.from_translation(np.array([*shift, 0.0])) @ T_table_obj

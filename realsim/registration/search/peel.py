@@ -56,27 +56,6 @@ class PeelConfig:
     """A cluster larger than this may hold it, but is searched around several of its points."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ExchangeConfig:
-    """Which objects may stand in each other's places."""
-
-    size_ratio: float = 1.7
-    """Objects whose radii differ by more do not explain each other's points."""
-    turns: int = 40
-    """Random turns tried in the other's place, 45 deg apart: a fit converges from 30."""
-    beside_m: float = 0.025
-    """Resting poses are sought so near to the other's middle [m]."""
-    certain_agree: float = 0.995
-    """An object of which a greater share agrees stands in nobody's place, unless the other has none
-    at all."""
-    most_per_object: int = 3
-    """Places tried for one unsure object: 0.2 s each."""
-    most_pairs: int = 8
-    """Pairs tried at most, the least sure ones first."""
-    seed: int = 1
-    """Seed of the random turns."""
-
-
 def taken_cells(grid: HeightGrid, T_table_world: Array, cloud: Cloud, explained: Mask) -> Mask:
     """Return the cells (X, Y) of the grid whose top point is explained by sure objects."""
     p = se3.transform(T_table_world, cloud.points)

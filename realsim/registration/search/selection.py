@@ -23,32 +23,28 @@ Good = Callable[[Score, int, Iterable[int]], bool]
 """Tells of a score and a pose of the pool, with others in place, whether it is accepted."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SelectionConfig:
-    """What is accepted."""
-
-    sweeps: int = 4
-    """Greatest number of sweeps of coordinate ascent; two mostly change nothing any more."""
-    least_per_cell: float = 0.10
-    """Least gain per visible cell of an object that is said to be there: a pose that explains
-    less than this is a guess."""
-    least_per_cell_unknown: float = 0.35
-    """The same where it is not known which objects are there: of 134 wrong poses 14 % gain more
-    than 0.66, so the joint choice has to sort them out; below 0.35 nothing right was seen."""
-    least_cells: int = 12
-    """Visible cells, over all frames, below which nothing is said."""
-    least_visible: float = 0.05
-    """Share of its cells that must not be hidden: a wrong pose inside of something else agrees on
-    the few cells that show."""
-    clash_depth_m: float = 0.004
-    """Surface deeper than this inside of another object [m]."""
-    clash_share: float = 0.05
-    """Two poses are impossible together if more than this share lies so deep."""
-    better: float = 1.0
-    """Cells by which another pose must gain more to replace a chosen one: ends the ascent."""
-    pair_shortlist: int = 6
-    """Where two objects are chosen together, so many best poses of one are tried with all of the
-    other."""
+SWEEPS = 4
+"""Greatest number of sweeps of coordinate ascent; two mostly change nothing any more."""
+LEAST_PER_CELL = 0.10
+"""Least gain per visible cell of an object that is said to be there: a pose that explains
+less than this is a guess."""
+LEAST_PER_CELL_UNKNOWN = 0.35
+"""The same where it is not known which objects are there: of 134 wrong poses 14 % gain more
+than 0.66, so the joint choice has to sort them out; below 0.35 nothing right was seen."""
+LEAST_CELLS = 12
+"""Visible cells, over all frames, below which nothing is said."""
+LEAST_VISIBLE = 0.05
+"""Share of its cells that must not be hidden: a wrong pose inside of something else agrees on
+the few cells that show."""
+CLASH_DEPTH_M = 0.004
+"""Surface deeper than this inside of another object [m]."""
+CLASH_SHARE = 0.05
+"""Two poses are impossible together if more than this share lies so deep."""
+BETTER_PX = 1.0
+"""Cells by which another pose must gain more to replace a chosen one: ends the ascent."""
+PAIR_SHORTLIST = 6
+"""Where two objects are chosen together, so many best poses of one are tried with all of the
+other."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -65,7 +61,6 @@ def select(
     canvas: Canvas,
     pool: Sequence[Candidate],
     slots: Sequence[Slot],
-    config: SelectionConfig,
     first: Sequence[int | None] | None = None,
 ) -> Selection:
     """Return one pose of the pool for every slot that gets one.
@@ -74,45 +69,41 @@ def select(
         canvas: where the poses were rendered.
         pool: poses of all objects.
         slots: what is to be placed.
-        config: settings.
         first: what is chosen already (per slot); the greedy choice fills the rest.
     """
     chosen: list[int | None] = list(first) if first is not None else [None] * len(slots)
 
     def good(s: Score, n: int, _others: Iterable[int]) -> bool:
-        return _accepted(s, pool[n], config.least_per_cell, config)
+        return _accepted(s, pool[n], LEAST_PER_CELL)
 
     _fill(canvas, pool, slots, chosen, good)
-    _ascend(canvas, pool, slots, chosen, good, config)
+    _ascend(canvas, pool, slots, chosen, good)
     return Selection(chosen=tuple(chosen), scores=_scores(canvas, pool, chosen))
 
 
-def select_any(
-    canvas: Canvas, pool: Sequence[Candidate], config: SelectionConfig, clash: Clash | None = None
-) -> Selection:
+def select_any(canvas: Canvas, pool: Sequence[Candidate], clash: Clash | None = None) -> Selection:
     """Return as many poses of the pool as the images support, of whatever objects.
 
     Args:
         canvas: where the poses were rendered.
         pool: poses of all objects that may be there.
-        config: settings.
         clash: tells whether two poses of the pool cannot both be; None = never.
     """
     everything = frozenset(range(len(pool)))
 
     def good(s: Score, n: int, others: Iterable[int]) -> bool:
-        if not _accepted(s, pool[n], config.least_per_cell_unknown, config):
+        if not _accepted(s, pool[n], LEAST_PER_CELL_UNKNOWN):
             return False
         return clash is None or not any(clash(n, k) for k in others)
 
     chosen: list[int | None] = []
-    for _ in range(config.sweeps):
+    for _ in range(SWEEPS):
         before = sorted(c for c in chosen if c is not None)
         while not chosen or chosen[-1] is not None:
             chosen.append(None)
             _fill(canvas, pool, [everything] * len(chosen), chosen, good)
         chosen = [c for c in chosen if c is not None]
-        _ascend(canvas, pool, [everything] * len(chosen), chosen, good, config)
+        _ascend(canvas, pool, [everything] * len(chosen), chosen, good)
         chosen = [c for c in chosen if c is not None]
         if sorted(c for c in chosen if c is not None) == before:
             break
@@ -127,9 +118,9 @@ def buffer_of(
     return compose(canvas.table, others)
 
 
-def _accepted(s: Score, c: Candidate, least_per_cell: float, config: SelectionConfig) -> bool:
+def _accepted(s: Score, c: Candidate, least_per_cell: float) -> bool:
     """Return whether a score is enough to say that the object is there."""
-    visible = s.cells >= max(config.least_cells, config.least_visible * len(c.rendered.cells))
+    visible = s.cells >= max(LEAST_CELLS, LEAST_VISIBLE * len(c.rendered.cells))
     return visible and s.gain > 0 and s.per_cell >= least_per_cell
 
 
@@ -167,10 +158,9 @@ def _ascend(
     slots: Sequence[Slot],
     chosen: list[int | None],
     good: Good,
-    config: SelectionConfig,
 ) -> None:
     """Choose every slot again with the others in place, until nothing changes."""
-    for _ in range(config.sweeps):
+    for _ in range(SWEEPS):
         changed = False
         for n, slot in enumerate(slots):
             buffer = buffer_of(canvas, pool, chosen, but=n)
@@ -178,7 +168,7 @@ def _ascend(
             now = chosen[n]
             best, at = 0.0, None
             if now is not None and good(s := score(canvas, pool[now].rendered, buffer), now, taken):
-                best, at = s.gain + config.better, now
+                best, at = s.gain + BETTER_PX, now
             for k in sorted(slot - taken):
                 s = score(canvas, pool[k].rendered, buffer)
                 if s.gain > best and good(s, k, taken):
@@ -205,7 +195,6 @@ def select_pair(
     slots: tuple[Slot, Slot],
     chosen: tuple[int | None, int | None],
     buffer: Array32,
-    config: SelectionConfig,
 ) -> tuple[int, int] | None:
     """Return poses for two objects that explain more together than those they have, or None.
 
@@ -217,33 +206,28 @@ def select_pair(
         slots: of the two objects.
         chosen: what they have; at most one of them may have none.
         buffer: holds all other objects.
-        config: settings.
     """
-    now, filled = config.better, buffer
+    now, filled = BETTER_PX, buffer
     for c in chosen:
         if c is not None:
             now += score(canvas, pool[c].rendered, filled).gain
             filled = compose(filled, [pool[c].rendered])
     best: tuple[int, int] | None = None
     for first in (0, 1):
-        ranked = _ranked(canvas, pool, slots[first], buffer, config)
-        for gain, n in ranked[: config.pair_shortlist]:
+        ranked = _ranked(canvas, pool, slots[first], buffer)
+        for gain, n in ranked[:PAIR_SHORTLIST]:
             with_it = compose(buffer, [pool[n].rendered])
             others = slots[1 - first] - {n}
-            for more, k in _ranked(canvas, pool, others, with_it, config)[:1]:
+            for more, k in _ranked(canvas, pool, others, with_it)[:1]:
                 if gain + more > now:
                     now, best = gain + more, (n, k) if first == 0 else (k, n)
     return best
 
 
 def _ranked(
-    canvas: Canvas,
-    pool: Sequence[Candidate],
-    choices: Iterable[int],
-    buffer: Array32,
-    config: SelectionConfig,
+    canvas: Canvas, pool: Sequence[Candidate], choices: Iterable[int], buffer: Array32
 ) -> list[tuple[float, int]]:
     """Return the gain and the place in the pool of acceptable poses, the best first."""
     scored = [(score(canvas, pool[n].rendered, buffer), n) for n in sorted(choices)]
-    good = [(s.gain, n) for s, n in scored if _accepted(s, pool[n], config.least_per_cell, config)]
+    good = [(s.gain, n) for s, n in scored if _accepted(s, pool[n], LEAST_PER_CELL)]
     return sorted(good, key=lambda g: (-g[0], g[1]))

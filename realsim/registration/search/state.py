@@ -13,7 +13,30 @@ from realsim.registration.search.candidates import Candidate, Fused, Sought, ins
 from realsim.registration.search.polish import owners
 from realsim.registration.search.records import Region, Wanted
 from realsim.registration.search.scoring import compose
-from realsim.registration.search.selection import Selection, select, select_any, select_pair
+from realsim.registration.search.selection import (
+    CLASH_DEPTH_M,
+    CLASH_SHARE,
+    Selection,
+    select,
+    select_any,
+    select_pair,
+)
+
+SIZE_RATIO = 1.7
+"""Objects whose radii differ by more do not explain each other's points."""
+EXCHANGE_TURNS = 40
+"""Random turns tried in the other's place, 45 deg apart: a fit converges from 30."""
+EXCHANGE_BESIDE_M = 0.025
+"""Resting poses are sought so near to the other's middle [m]."""
+CERTAIN_AGREE = 0.995
+"""An object of which a greater share agrees stands in nobody's place, unless the other has none
+at all."""
+MOST_PER_OBJECT = 3
+"""Places tried for one unsure object: 0.2 s each."""
+MOST_PAIRS = 8
+"""Pairs tried at most, the least sure ones first."""
+EXCHANGE_SEED = 1
+"""Seed of the random turns."""
 
 
 @dataclass(eq=False, kw_only=True)
@@ -39,26 +62,25 @@ class Search:
 
     def choose(self, first: Sequence[int | None] | None = None) -> Selection:
         """Return the joint choice; `first` is what was chosen before, of wanted objects."""
-        canvas, config = self.bench.canvas, self.bench.config.selection
+        canvas = self.bench.canvas
         self.say(f"choosing among {len(self.pool)} poses")
         if self.wanted is None:
             # A new pose of a large object can stand for several small ones: all compete again.
-            chosen = select_any(canvas, self.pool, config, self._clash)
+            chosen = select_any(canvas, self.pool, self._clash)
         else:
             slots = [frozenset(c) for c in self.choices]
-            chosen = select(canvas, self.pool, slots, config, first)
+            chosen = select(canvas, self.pool, slots, first)
         self.bench.watch.lap("select")
         return chosen
 
     def _clash(self, n: int, k: int) -> bool:
         """Return whether two poses of the pool cannot both be."""
-        config = self.bench.config.selection
         a, b = self.pool[n], self.pool[k]
         sought = self.bench.sought
         share = inside_share(
-            sought[a.obj_id], a.T_world_obj, sought[b.obj_id], b.T_world_obj, config.clash_depth_m
+            sought[a.obj_id], a.T_world_obj, sought[b.obj_id], b.T_world_obj, CLASH_DEPTH_M
         )
-        return share > config.clash_share
+        return share > CLASH_SHARE
 
     def add(self, found: Sequence[Candidate], places: Sequence[int]) -> None:
         """Put poses into the pool, for wanted objects at these places; known ones are left out.
@@ -190,9 +212,8 @@ def exchange_places(search: Search, selection: Selection) -> Selection:
     """
     if search.wanted is None:
         return selection
-    config = search.bench.config.exchange
-    rng = np.random.default_rng(config.seed)
-    pairs = _pairs(search, selection)[: config.most_pairs]
+    rng = np.random.default_rng(EXCHANGE_SEED)
+    pairs = _pairs(search, selection)[:MOST_PAIRS]
     for u, v in pairs:
         if selection.chosen[v] is None or peel.is_sure(selection.scores[u], _peel(search)):
             continue
@@ -202,9 +223,7 @@ def exchange_places(search: Search, selection: Selection) -> Selection:
         taken = set(rest)
         slots = (frozenset(search.choices[u] - taken), frozenset(search.choices[v] - taken))
         now = (selection.chosen[u], selection.chosen[v])
-        better = select_pair(
-            search.bench.canvas, search.pool, slots, now, buffer, search.bench.config.selection
-        )
+        better = select_pair(search.bench.canvas, search.pool, slots, now, buffer)
         search.bench.watch.lap("exchange")
         if better is None:
             continue
@@ -225,7 +244,7 @@ def _pairs(search: Search, selection: Selection) -> list[tuple[int, int]]:
     Those come first of which both agree least with the images.
     """
     assert search.wanted is not None
-    bench, wanted, config = search.bench, search.wanted, search.bench.config.exchange
+    bench, wanted = search.bench, search.wanted
     radius = [bench.sought[w.obj_id].body.radius_m for w in wanted]
     agree = [-1.0 if s is None else s.agree for s in selection.scores]
     least = bench.config.peel.sure_agree
@@ -238,10 +257,10 @@ def _pairs(search: Search, selection: Selection) -> list[tuple[int, int]]:
             if c is None or v == u or twice or wanted[u].obj_id == wanted[v].obj_id:
                 continue
             ratio = abs(float(np.log(radius[u] / radius[v])))
-            certain = agree[v] > config.certain_agree and not lost
-            if ratio <= np.log(config.size_ratio) and not certain:
+            certain = agree[v] > CERTAIN_AGREE and not lost
+            if ratio <= np.log(SIZE_RATIO) and not certain:
                 mine.append((agree[u] + agree[v] + ratio, u, v))
-        found += sorted(mine)[: config.most_per_object]
+        found += sorted(mine)[:MOST_PER_OBJECT]
     return [(u, v) for _, u, v in sorted(found)]
 
 
@@ -279,16 +298,16 @@ def _starts(
     search: Search, obj_id: int, there: int, left: Fused, rng: np.random.Generator
 ) -> Sequence[tuple[Array, str]]:
     """Return poses (4, 4) of a model in the place of another object, and their names."""
-    bench, config = search.bench, search.bench.config.exchange
+    bench = search.bench
     other = search.pool[there]
     sought = bench.sought[other.obj_id]
     T = other.T_world_obj
     own = owners(left.coarse, [sought], [T], bench.config.peel.explained_m) == 0
     middle = sought.body.center(T)
-    beside = Region(center_world=middle, radius_m=config.beside_m)
+    beside = Region(center_world=middle, radius_m=EXCHANGE_BESIDE_M)
     starts = [(S, f"exchange, {name}") for S, name in resting_starts(bench, obj_id, beside)]
     if np.count_nonzero(own) >= bench.config.peel.least_points:
-        turns = replace(bench.config.peel, rotations=config.turns, most_starts=config.turns)
+        turns = replace(bench.config.peel, rotations=EXCHANGE_TURNS, most_starts=EXCHANGE_TURNS)
         up = bench.plane.T_world_table[:3, 2]
         groups = [left.coarse.points[own]]
         random = peel.residual_starts(bench.sought[obj_id], groups, up, rng, turns)

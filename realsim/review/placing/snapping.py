@@ -285,10 +285,9 @@ def _snapped(task: _Task, tick: Callable[[], None]) -> Snapped:
     tick()
     mine = task.own(fine, T)
     still = solve_pose(body, mine, T, config.solver.fine[-1:], config.solver).at(T)
-    constants = (config.blind, config.covariance, config.solver)
-    kept = keep_start(body, still, (mine, few, space), constants)
+    kept = keep_start(body, still, (mine, few, space), config.covariance, config.solver)
     if kept.report.get("start_kept"):
-        T = nearest_to_start(T, T_start, body.center_obj, list(kept.axes), config.blind)
+        T = nearest_to_start(T, T_start, body.center_obj, list(kept.axes))
     sure = uncertainty(body, still.at(T), task.views.stride_px, config.covariance)
     tick()
     stride = few.stride_of(body, T_start)
