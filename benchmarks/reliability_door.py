@@ -21,7 +21,7 @@ FRAMES, QUICK_FRAMES, BATCH = 5_000, 100, 20
 """Frames in all, and those between two looks at whether the server still answers."""
 ANSWER_S = 30.0
 """A server that answers no ping for so long hangs."""
-SOAK_S, QUICK_SOAK_S = 900.0, 5.0
+SOAK_S, QUICK_SOAK_S = 3600.0, 5.0
 LEAST_VISITS, LOOPS = 12, 3
 """Reviewers, and whole loops after the one that warms up."""
 HOSTILE = (
