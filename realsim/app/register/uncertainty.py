@@ -48,15 +48,19 @@ def held(covariance: ArrayLike, directions: Sequence[ArrayLike]) -> Array:
 
 
 def sigmas(covariance: Any, model: ObjectModel | None) -> tuple[float, float]:
+    """Return what `largest` does, a model's axes of revolution set aside."""
+    return largest(covariance, [] if model is None else [axis for axis, _ in model.symmetry_axes])
+
+
+def largest(covariance: Any, axes: Sequence[ArrayLike]) -> tuple[float, float]:
     """Return the largest 1 sigma along and about any axis [mm, deg]; NaN = not known.
 
     Args:
         covariance: (6, 6) of the right perturbation, rotation first [rad, m]; None = not known.
-        model: whose axes of revolution are set aside.
+        axes: (3,) of revolution, which are set aside.
     """
     if covariance is None or not np.all(np.isfinite(covariance)):
         return float("nan"), float("nan")
-    axes = [] if model is None else [axis for axis, _ in model.symmetry_axes]
     C = held(covariance, axes)
     shift, turn = (float(np.linalg.eigvalsh(c)[-1]) for c in (C[3:, 3:], C[:3, :3]))
     return 1e3 * float(np.sqrt(max(shift, 0.0))), float(np.degrees(np.sqrt(max(turn, 0.0))))

@@ -1,13 +1,14 @@
 """What one session holds: frames, objects with verdict, uncertainty, visibility, and grasps."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from realsim.app.register.uncertainty import largest
 from realsim.app.stages import judged_scene, open_session
 from realsim.arrays import Array
 from realsim.errors import InputError
@@ -21,10 +22,6 @@ from realsim.store.session_store import rgb_path
 Kind = Literal["real", "simulated"]
 SIMULATED = "synthetic"
 """Key of a session's `extra` that only rendered ones have; the simulated lab's camera says it."""
-FREE_TURN_DEG = 10.0
-"""Within which a principal axis of the rotation's covariance is the axis of revolution [deg]: the
-turn about it is free, so its variance is far the greatest, and a registration that is sure to a
-degree tells its axis to that. Beyond, what is least certain is another thing."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -80,19 +77,19 @@ def session_facts(folder: Path) -> SessionFacts:
     if store.has("registration/scene.json"):
         scene_objects = judged_scene(store).objects
     known = _infos(store)
-    objects = tuple(
-        ObjectFacts(
-            instance=o.instance,
-            obj_id=o.obj_id,
-            name=str(known.get(o.obj_id, {}).get("name", f"object {o.obj_id}")),
-            identity=_identity(store, o.obj_id),
-            verdict=o.verdict,
-            sigma_mm=_sigma_mm(o),
-            sigma_deg=_sigma_deg(o, known.get(o.obj_id, {})),
-            visibility=_visibility(infos, instances.get(o.instance)),
-        )
-        for o in scene_objects
-    )
+    objects: list[ObjectFacts] = []
+    for o in scene_objects:
+        info = known.get(o.obj_id, {})
+        axes = [s["axis"] for s in info.get("symmetries_continuous", ())]
+        mm, deg = largest(o.covariance, axes)
+        objects.append(
+            ObjectFacts(
+                instance=o.instance, obj_id=o.obj_id,
+                name=str(info.get("name", f"object {o.obj_id}")),
+                identity=_identity(store, o.obj_id), verdict=o.verdict, sigma_mm=mm, sigma_deg=deg,
+                visibility=_visibility(infos, instances.get(o.instance)),
+            )
+        )  # fmt: skip
     return SessionFacts(
         name=folder.resolve().name,
         folder=folder,
@@ -102,7 +99,7 @@ def session_facts(folder: Path) -> SessionFacts:
         frames=len(session.views),
         frames_annotated=len(infos),
         content=_content(store),
-        objects=objects,
+        objects=tuple(objects),
         sets=tuple(_without_poses(s) for s in load_grasps(store)),
         has=_present(store),
     )
@@ -124,42 +121,6 @@ def _content(store: SessionStore) -> str:
     digest = hashlib.sha256(photograph.read_bytes())
     digest.update(scene.read_bytes() if scene.is_file() else b"")
     return digest.hexdigest()
-
-
-def _sigma_mm(pose: ObjectPose) -> float:
-    if pose.covariance is None:
-        return float("nan")
-    return 1e3 * float(np.sqrt(max(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1], 0.0)))
-
-
-def _sigma_deg(pose: ObjectPose, info: Mapping[str, Any]) -> float:
-    """Return the sigma of the rotation; turns about an axis of revolution change nothing."""
-    if pose.covariance is None:
-        return float("nan")
-    axes = [np.asarray(s["axis"], np.float64) for s in info.get("symmetries_continuous", ())]
-    axes = [axis / np.linalg.norm(axis) for axis in axes]
-    variance = _free_of_turns(pose.covariance[:3, :3], axes)
-    return float(np.degrees(np.sqrt(max(variance, 0.0))))
-
-
-def _free_of_turns(covariance: Array, axes: Sequence[Array]) -> float:
-    """Return the greatest variance of a rotation [rad^2] beside turns about axes of revolution.
-
-    The free turn's variance is thousands of times the others': projected along the declared axis,
-    a thousandth of it would be left where the covariance's own axis is a degree or two off. So its
-    principal axis is left out instead.
-    """
-    if not axes:
-        return float(np.linalg.eigvalsh(covariance)[-1])
-    if any(np.linalg.norm(np.cross(axes[0], axis)) > 1e-3 for axis in axes[1:]):
-        return 0.0  # a ball: turns about two axes make every turn
-    variances, principal = np.linalg.eigh(covariance)
-    along = np.abs(axes[0] @ principal)
-    nearest = int(along.argmax())
-    if along[nearest] >= np.cos(np.radians(FREE_TURN_DEG)):
-        return float(np.delete(variances, nearest).max())
-    across = np.eye(3) - np.outer(axes[0], axes[0])
-    return float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
 
 
 def _infos(store: SessionStore) -> dict[int, Mapping[str, Any]]:
