@@ -14,7 +14,7 @@ from realsim.records.grasps import MEASURES
 from realsim.store import atomic
 from realsim.store.session_store import SessionStore
 from realsim.untrusted.arrays import read_npz
-from realsim.untrusted.own_json import read_own, to_json
+from realsim.untrusted.own_json import REMEDY, read_own, to_json
 
 HAND_EYE_FILE = "calibration/hand_eye.json"
 BOARD_FILE = "calibration/board.json"
@@ -51,8 +51,16 @@ def hand_eye_to_json(result: HandEye) -> dict[str, Any]:
 
 
 def load_hand_eye(store: SessionStore, name: str = HAND_EYE_FILE) -> HandEye:
-    """Return the calibration of the session."""
-    return read_own(store.path(name), HandEye)
+    """Return the calibration of the session.
+
+    Raises:
+        InputError: the file is damaged, or how sure it is has NaN.
+    """
+    found = read_own(store.path(name), HandEye)
+    for what in ("covariance", "intrinsics_sd"):
+        if not np.isfinite(getattr(found, what)).all():
+            raise InputError(f"{store.path(name)}: {what} has NaN or infinite numbers. {REMEDY}")
+    return found
 
 
 def save_board(store: SessionStore, board: TagBoard, name: str = BOARD_FILE) -> None:

@@ -238,7 +238,7 @@ def _failures_named(path: Path) -> Generator[None]:
         raise InputError(f"{path}: {error}") from error
     except (
         tarfile.TarError, zipfile.BadZipFile, zlib.error, EOFError, ValueError, OSError,
-        RuntimeError, NotImplementedError, LookupError, MemoryError,
+        RuntimeError, NotImplementedError, LookupError, MemoryError, OverflowError,
     ) as error:  # fmt: skip
         raise InputError(
             f"{path} is damaged or cannot be unpacked ({type(error).__name__}: {str(error)[:200]})."

@@ -170,6 +170,13 @@ def test_a_header_that_claims_gigabytes_is_refused(tmp_path: Path, kind: bytes) 
     refused("claims 8589934592 bytes", members, path)
 
 
+def test_a_header_with_a_length_that_no_machine_has_is_refused(tmp_path: Path) -> None:
+    body = b"99999999999999999999 a=b\n".ljust(512, b"\0")
+    data = _info("x", 25, tarfile.XHDTYPE).tobuf(tarfile.GNU_FORMAT) + body
+    (tmp_path / "a.tar").write_bytes(data + _info("y", 0).tobuf(tarfile.GNU_FORMAT) + bytes(1024))
+    refused("damaged or cannot be unpacked", members, tmp_path / "a.tar")
+
+
 def test_a_zip_whose_sizes_lie_is_refused(tmp_path: Path) -> None:
     data = os.urandom(1000)
     path = _zip(tmp_path / "a.zip", {"x": data})

@@ -233,3 +233,5 @@ def test_results_live_in_the_session(tmp_path):
     assert store.verify() == []
     with pytest.raises(InputError, match="has the step that writes it been run"):
         stores.load_scene(store, "registration/other.json")
+    stores.save_hand_eye(store, replace(h, intrinsics_sd=np.full(12, np.nan)))
+    refused("sd has NaN", stores.load_hand_eye, store)
