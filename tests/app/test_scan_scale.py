@@ -321,7 +321,7 @@ def test_an_accepted_scale_goes_into_the_library(tmp_path):
     assert not run_scale(replace(request, accept_doubtful=True), CONSOLE)
     kept = ModelLibrary.open(tmp_path / "models").load("box")
     assert kept.scale is not None and kept.scale.verdict == "doubtful"
-    assert kept.scale.scale == fit.scale and kept.scale.session == "mugs"
+    assert kept.scale.scale == fit.scale and kept.scale.session == session.session.name
     np.testing.assert_allclose(kept.model.mesh.extent, UNIT_M * known.scan.extent, rtol=1e-3)
     with pytest.raises(InputError, match=r"neither a file nor a model.*box"):
         read_mesh(ScaleRequest(mesh="boxx", library=tmp_path / "models"))

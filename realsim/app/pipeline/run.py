@@ -15,7 +15,7 @@ from typing import Any
 from realsim.app.console import Console
 from realsim.app.pipeline import chain
 from realsim.app.pipeline.campaign import Campaign, Step
-from realsim.app.pipeline.chain import Command, Ended
+from realsim.app.pipeline.chain import Command, Ended, run_command
 from realsim.errors import InputError, RealsimError
 from realsim.formats.export_folder import FINISHED
 from realsim.many import Outcome, PoolConfig, Task, Worked, open_pool, run_many
@@ -350,7 +350,7 @@ def _words_of_all(
 def _run(campaign: Campaign, step: Step, words: Sequence[str], workers: int) -> Ended:
     command = _command(step, words, workers)
     folder = _folder(campaign)
-    return chain.run_command(command, folder, folder, _log(campaign, step.stage))
+    return run_command(command, folder, folder, _log(campaign, step.stage))
 
 
 def _known(campaign: Campaign, name: str, place: Path) -> SceneState:
