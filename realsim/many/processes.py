@@ -13,7 +13,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
-from multiprocessing import get_context, parent_process
+from multiprocessing import current_process, get_context, parent_process
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -38,7 +38,7 @@ def local_pool(count: int | None = None) -> Generator[Pool]:
     """Yield that many fresh processes (None = one a core), or this process where it is one."""
     count = cores() if count is None else count
     with TemporaryDirectory(prefix="realsim_many_") as kept:
-        if count <= 1:
+        if count <= 1 or current_process().daemon:  # a worker of the user's own may have none
             yield _ThisProcess(Path(kept))
             return
         processes = _Processes(count, Path(kept))

@@ -27,6 +27,10 @@ def only_run_in(folder: Path) -> Generator[None]:
                 f"another run is working in '{folder}'. Wait until it ends, stop it, or choose "
                 "another folder; two at once would mix their results."
             ) from None
-        yield
+        try:
+            yield
+        finally:
+            # By itself it would go on in processes that were forked meanwhile.
+            fcntl.flock(handle, fcntl.LOCK_UN)
     finally:
         os.close(handle)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from realsim.app import stages
-from realsim.app.register.from_review import review_starts, stayed
+from realsim.app.register.from_review import moved_since_accepted, review_starts, stayed
 from realsim.app.register.results import load_registered, with_objects
 from realsim.geometry import se3
 from realsim.records import ObjectPose
@@ -69,6 +69,13 @@ def test_moved_rejected_and_excluded_are_what_comes_out(session: SessionStore) -
     finished("register", session.folder, "--from-review", "--quiet")
     assert session.path("registration/scene.json").read_bytes() == scene
     assert len(list(session.path("registration/earlier").iterdir())) == 1
+    # What is taken back afterwards is told, and no longer told as done.
+    state = journal.replay(journal.read(session.path(journal.JOURNAL_FILE)).entries)
+    assert state.entries[1] == reject
+    say(session, "undo", second, undoes=reject.id)
+    again = finished("register", session.folder, "--from-review", "--json", "--quiet").stdout
+    assert f"the reject of instance {second.instance} by ada was taken back" in again
+    assert "It is left out" not in again
     assert stages.registered_views(session) == [0, 1, 3, 4, 5, 6, 7]
 
 
@@ -119,7 +126,7 @@ def test_an_accepted_object_seen_by_other_cameras_is_where_it_is_found(
 
 
 @pytest.mark.slow
-def test_an_acceptance_outlives_a_registration_to_the_same_place_and_no_other(
+def test_an_acceptance_outlives_a_registration_also_that_of_a_moved_object(
     session: SessionStore,
 ) -> None:
     first, second = load_scene(session).objects[:2]
@@ -136,15 +143,18 @@ def test_an_acceptance_outlives_a_registration_to_the_same_place_and_no_other(
         file.write(b'{"torn\n')
     result = invoked("register", session.folder, "--from-review", "--json", "--quiet")
     words = [f["words"] for f in json.loads(result.stdout[result.stdout.index("{") :])["findings"]]
-    told = [w for w in words if f"instance {second.instance} was accepted by ada" in w]
-    assert len(told) == 1 and "look at it again" in told[0]
+    said = f"instance {second.instance} stays where ada accepted it; the fit would put it"
+    assert any(said in w for w in words)
     # Lines about what is not there and damaged ones are told.
     for part in ("no view 99", "no model 9999", "no instance 77", "line 7 of", "not whole"):
         assert part in " ".join(words), part
     state = journal.replay(journal.read(session.path(journal.JOURNAL_FILE)).entries)
-    now = load_scene(session)
-    assert decision_on(now.object(first.instance), state) is not None
-    assert decision_on(now.object(second.instance), state) is None
+    now = load_scene(session).objects
+    assert all(decision_on(o, state) is not None for o in now)
+    assert moved_since_accepted(now, state) == []
+    beside = se3.from_translation([0.003, 0.0, 0.0])
+    elsewhere = [replace(o, T_world_obj=beside @ o.T_world_obj) for o in now]
+    assert [found[1].action for found in moved_since_accepted(elsewhere, state)] == ["accept"] * 2
 
 
 def test_a_swap_to_an_object_without_a_model_is_refused_before_anything_is_written(

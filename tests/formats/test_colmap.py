@@ -248,6 +248,7 @@ def text_model(folder: Path, **changed: str) -> Path:
         ("images", "3 0.5 0.5 -0.5 0.5 0.1 -0.2 0.7 7 a b.png\n\n", "space"),
         ("images", f"3 0.5 0.5 -0.5 0.5 0 0 0 7 {'9' * 300}\n\n", "no file has such a name"),
         ("images", f"3 0.5 0.5 -0.5 0.5 0 0 0 7 {'9/' * 3000}\n\n", "no file has such a name"),
+        ("images", "".join(f"{k} 1 0 0 0 0 0 {k} 7 a.png\n\n" for k in (3, 4)), "2 images named"),
         ("images", "3 0.5 0.5 -0.5 0.5 0 0 0 7 ../a.png\n\n", "leads out of the data set"),
         ("cameras", "7 PINHOLE 40 30 0.9 0.9 0.5 0.5\n", "focal length fx is 0.9"),
         ("cameras", "7 OPENCV_FISHEYE 40 30 35 36 20.5 15 0 0 0 0\n", "OPENCV_FISHEYE"),

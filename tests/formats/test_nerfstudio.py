@@ -226,6 +226,14 @@ def test_a_name_that_no_file_has_is_refused(tmp_path, images):
     refused("no file has such a name", open_nerfstudio, folder, images_folder=images)
 
 
+def test_images_found_by_their_base_names_belong_to_one_pose_each(tmp_path):
+    folder = ngp(
+        tmp_path / "x", lambda rows: [r | {"file_path": f"cam{k}/r_1"} for k, r in enumerate(rows)],
+        fl_x=40,
+    )  # fmt: skip
+    refused("two frames of the image .*r_1", open_nerfstudio, folder, images_folder=folder)
+
+
 def test_an_image_that_is_not_there_is_named(tmp_path):
     folder = ngp(tmp_path / "x", fl_x=40)
     (folder / "r_1.png").unlink()

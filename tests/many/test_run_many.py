@@ -94,6 +94,24 @@ def test_a_script_without_a_guard_is_run_once(tmp_path):
     assert (ran.stdout, ran.stderr) == ("begun\n2.0\n", "")
 
 
+def test_in_a_worker_of_the_users_own_that_may_have_none_the_job_is_done_there(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import math, multiprocessing\n"
+        "from realsim.many import PoolConfig, Task, open_pool, run_many\n"
+        "def work(x):\n"
+        "    found = []\n"
+        "    with open_pool(PoolConfig(workers=2)) as pool:\n"
+        "        run_many([Task(name='root', fn=math.sqrt, args=(x,))], pool, found.append)\n"
+        "    return found[0].found()\n"
+        "if __name__ == '__main__':\n"
+        "    with multiprocessing.get_context('spawn').Pool(1) as own:\n"
+        "        print(own.map(work, [4.0]))\n"
+    )
+    ran = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60)
+    assert (ran.stdout, ran.stderr) == ("[2.0]\n", "")
+
+
 def test_results_come_in_order_where_that_is_asked_for(two):
     pauses = [0.3, 0.0, 0.0, 0.2, 0.0, 0.0]
     tasks = tasks_of(waits_then, *((s, k) for k, s in enumerate(pauses)))

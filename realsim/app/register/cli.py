@@ -46,6 +46,7 @@ def register_command(
 
     Exit codes: 0 done, 1 nothing was placed or everything is rejected, 2 bad input.
     """  # noqa: D301 - click's own mark for lines that stay as they are
+    from realsim.app.annotate.current import is_annotated, what_is_stale
     from realsim.app.many_sessions import one_session
     from realsim.app.register.config import RegisterRequest
     from realsim.app.register.run import run_register
@@ -63,4 +64,6 @@ def register_command(
     console.result(as_json(result, models))
     if not console.as_json:
         show_registered(session, result, models, console)
+        if is_annotated(store) and (why := what_is_stale(store)):
+            console.say(f"labels    are of the scene before ({why}): realsim annotate {session}")
     return result.is_usable

@@ -6,7 +6,7 @@ replaced stay in `registration/earlier/`.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from realsim.app.register.results import (
 from realsim.app.reviewed import damage_words, review_of
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.records import ObjectModel, ObjectPose
+from realsim.records import ObjectModel, ObjectPose, Scene
 from realsim.registration.search.records import Region, Wanted
 from realsim.review.corrections import (
     DECIDED,
@@ -99,17 +99,24 @@ def review_starts(store: SessionStore, models: Mapping[int, ObjectModel] | None)
         raise InputError(f"nothing of the review can be read: {damage_words(store)}")
     if not state.standing:
         raise InputError(
-            f"nobody has reviewed session '{store.folder}': its journal is empty. Run "
-            f"`realsim review {store.folder}` first, or leave --from-review away."
+            f"no decision of a review stands in session '{store.folder}': its journal is empty, or "
+            f"all was taken back. Run `realsim review {store.folder}`, or leave --from-review away."
         )
     lines = pending(scene, state)
     kept = store.read_json(REVIEW_FILE) if store.has(REVIEW_FILE) else None
-    if kept is not None and {e.id for e in lines} <= set(kept["applied"]):
+    before = () if kept is None else tuple(kept["applied"])
+    standing = {e.id for e in state.standing}
+    if kept is not None and {e.id for e in lines} <= set(before) <= standing:
         return ReviewStarts(
             rows=kept["starts"], applied=tuple(kept["applied"]), words=tuple(kept["words"])
         )
     rows: list[Row] = []
-    words: list[str] = []
+    words = [
+        f"the {e.action} of instance {e.instance} by {e.reviewer} was taken back after this scene "
+        "was made with it: register without --from-review to begin without it."
+        for e in state.entries
+        if e.id in before and e.id not in standing and e.action in ("reject", "move", "swap")
+    ]
     for placed in corrected_scene(scene, state).objects:
         decision = decision_on(placed, state)
         name = f"instance {placed.instance} (object {placed.obj_id})"
@@ -132,8 +139,7 @@ def review_starts(store: SessionStore, models: Mapping[int, ObjectModel] | None)
             f"the reviewers rejected every object of session '{store.folder}'; there is nothing to "
             "register. Move one to where it is, or say what is there with --object."
         )
-    before = () if kept is None else tuple(kept["applied"])
-    applied = (*before, *(e.id for e in lines if e.id not in before))
+    applied = (*(i for i in before if i in standing), *(e.id for e in lines if e.id not in before))
     return ReviewStarts(rows=rows, applied=applied, words=tuple(words))
 
 
@@ -167,23 +173,26 @@ def stayed(
     """Return the registration with those objects where they stood that stay, and words on them.
 
     What a person accepted stays, and in an upgraded scene all that nobody moved: annotations that
-    no fit bettered are among it. Seen by other cameras than before, an object is where it is found.
+    no fit bettered are among it. The table stays with them. Seen by other cameras than before, an
+    object is where it is found.
     """
     before, record, state = load_scene(store), load_cameras(store), review_of(store)
     cameras = cameras_now(store) if record is None else record.session
+    corrected = corrected_scene(before, state)
     fitted = {o.instance: o for o in result.scene.objects}
     words: list[str] = []
+    stay = False
     for row in starts.rows:
-        placed = before.object(row["instance"])
+        placed = corrected.object(row["instance"])
         decision = decision_on(placed, state)
-        stays = store.has(UPGRADE_FILE) or (decision is not None and decision.action == "accept")
-        if row["radius_m"] != HELD_RADIUS_M or not stays:
+        is_accepted = decision is not None and decision.action == "accept"
+        if not is_accepted and not (store.has(UPGRADE_FILE) and _is_as_before(placed, before)):
             continue
         at, now = placed.T_world_obj[:, 3], result.cameras.refined
         steps = [(se3.invert(cameras[k]) - se3.invert(now[k])) @ at for k in now if k in cameras]
         if not steps or np.median(np.linalg.norm(steps, axis=1)) > SAME_CAMERAS_M:
             continue
-        found = fitted.get(placed.instance)
+        found, stay = fitted.get(placed.instance), True
         if found is None or not is_same_place(found.T_world_obj, placed.T_world_obj):
             fit = "finds it nowhere"
             if found is not None:
@@ -192,7 +201,24 @@ def stayed(
             who = "where it stood" if decision is None else f"where {decision.reviewer} accepted it"
             words.append(f"instance {placed.instance} stays {who}; the fit {fit}.")
         fitted[placed.instance] = placed
-    return with_objects(result, [fitted[k] for k in sorted(fitted)]), words
+    result = with_objects(result, [fitted[k] for k in sorted(fitted)])
+    if stay and before.plane is not None:  # grasps were tried at places on this table
+        result = replace(result, scene=replace(result.scene, plane=before.plane))
+    return result, words
+
+
+def _is_as_before(placed: ObjectPose, scene: Scene) -> bool:
+    """Return whether an object is the one of a scene, and at its place there."""
+    old = scene.object(placed.instance)
+    return old.obj_id == placed.obj_id and is_same_place(old.T_world_obj, placed.T_world_obj)
+
+
+def accepted_in(store: SessionStore) -> list[int]:
+    """Return the instances that a person accepted where they stand."""
+    state = review_of(store)
+    decided = [(o.instance, decision_on(o, state))
+               for o in corrected_scene(load_scene(store), state).objects]  # fmt: skip
+    return [k for k, e in decided if e is not None and e.action == "accept"]
 
 
 def is_precious(store: SessionStore) -> bool:

@@ -11,7 +11,7 @@ from realsim import __version__
 from realsim.app.register.config import RegisterRequest, config_of
 from realsim.app.register.files import write_claims
 from realsim.app.register.fixed import FixedInput, read_fixed
-from realsim.app.register.from_review import review_starts
+from realsim.app.register.from_review import accepted_in, review_starts
 from realsim.app.register.results import claimed_cameras, load_cameras
 from realsim.app.reviewed import exclusion_words, review_of
 from realsim.app.stages import content_key, evenly, session_models, take_models
@@ -214,7 +214,8 @@ def _said(store: SessionStore, request: RegisterRequest) -> list[Any]:
     Not the regions that were made of it: they move a little when cameras are refined.
     """
     if request.from_review:
-        return ["review", review_starts(store, None).rows]
+        starts = review_starts(store, None)
+        return ["review", starts.rows, starts.words, accepted_in(store)]
     if request.objects or request.find_all:
         return [list(request.objects), request.find_all]
     files = [store.path(STARTS_FILE), *sorted(store.path(MASKS).glob("*"))]

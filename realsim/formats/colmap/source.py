@@ -1,5 +1,6 @@
 """Images that a COLMAP model places, with depth beside them: joined by name."""
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -178,10 +179,13 @@ def _images_there(
     """Return the images whose files are there, in natural order; those absent go to the notes.
 
     Raises:
-        InputError: they are of another size than the model's camera.
+        InputError: they are of another size than the model's camera, or one has several poses.
     """
     there = [(i, place / i.name) for i in chosen if (place / i.name).is_file()]
     absent = [i.name for i in chosen if not (place / i.name).is_file()]
+    for name, count in Counter(i.name for i, _ in there).items():
+        if count > 1:
+            raise InputError(f"the model has {count} images named {name}: which pose is its own?")
     if absent:
         notes.append(f"{len(absent)} images are not in {place} and were left out: {shown(absent)}.")
     size = require_one_size([image_header(p) for _, p in there], f"images of {place}")

@@ -284,20 +284,20 @@ def read_transforms(path: Path | str, *, images_folder: Path | None = None) -> T
     T_original_file, factor, notes = undone(top, str(path))
     frames: list[PosedImage] = []
     absent: list[str] = []
-    seen: set[str] = set()
+    seen: set[Path] = set()
     for k, row in enumerate(rows):
         where = f"frame {k + 1} of {path}"
         entry = values.mapping(row, where)
         name = values.text(entry.get("file_path"), f"'file_path' of {where}")
-        if name in seen:
-            raise InputError(f"{path} has two frames of the image {name}: which pose is its own?")
-        seen.add(name)
         T = T_world_cam_of(entry.get("transform_matrix"), f"'transform_matrix' of {where}")
         T[:3, 3] *= factor
         colour = _image_file(path.parent, name, images_folder, where)
         if colour is None:
             absent.append(name)
             continue
+        if colour in seen:
+            raise InputError(f"{path} has two frames of the image {colour}: which pose is its own?")
+        seen.add(colour)
         frames.append(
             PosedImage(
                 name=name, colour=colour, depth=_depth_file(path.parent, entry, where),
