@@ -77,6 +77,17 @@ def test_a_session_has_plan_devices_log_and_sheet(plans: Path) -> None:
     assert np.corrcoef(photo[inner].ravel(), cell[inner].ravel())[0, 1] > 0.8
 
 
+def test_a_sheet_that_a_killed_run_did_not_come_to_is_made_by_the_next(
+    plans: Path, tmp_path: Path
+) -> None:
+    sheet = shutil.copytree(scene_session(plans), tmp_path / "s") / "reports/contact_sheet.png"
+    before = sheet.read_bytes()
+    sheet.unlink()
+    words = ("--plan", plans / "plan.json", "--simulated", "--only-views", "0")
+    assert realsim("capture", tmp_path / "s", *words).returncode == 0
+    assert len(sheet.read_bytes()) > 0.9 * len(before)
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [

@@ -28,7 +28,12 @@ from realsim_capture_plans.capturing.capture import (
     check_views,
     dry_run,
 )
-from realsim_capture_plans.capturing.contact_sheet import Thumbnails, cell_size, write_contact_sheet
+from realsim_capture_plans.capturing.contact_sheet import (
+    SHEET_FILE,
+    Thumbnails,
+    cell_size,
+    write_contact_sheet,
+)
 from realsim_capture_plans.capturing.operator import LineOperator, Operator
 from realsim_capture_plans.devices.interfaces import Arm, DepthCamera, DeviceError
 from realsim_capture_plans.planning.record import CapturePlan
@@ -146,7 +151,7 @@ def _carry_out(
     config, store, target, lab, fixed = work
     intrinsics = camera.intrinsics
     size = (intrinsics.width, intrinsics.height)
-    taken = Thumbnails(cell_size(len(plan), size)[1:])
+    taken, is_due = Thumbnails(cell_size(len(plan), size)[1:]), False
     try:
         with _operator(request, f"{request.out}   {arm.name}, {camera.name}", console) as operator:
             job = CaptureJob(
@@ -154,12 +159,13 @@ def _carry_out(
                 on_view=taken.add, board_check=_board_check(target), fixed=fixed,
             )  # fmt: skip
             summary = capture(plan, arm, camera, store, config=config, job=job)
+        is_due = not store.has(SHEET_FILE)  # an earlier run was killed before it wrote it
         if lab is not None and target is None:
             _give_models(lab, store)
         show_summary(summary, console)
         console.result(_document(store.folder, summary, len(store.completed), len(plan)))
     finally:
-        if taken.images:  # a run that was refused changes nothing
+        if taken.images or is_due:  # a run that was refused changes nothing
             title = f"{request.out.resolve().name}, {arm.name}, {camera.name}"
             sheet = write_contact_sheet(store, len(plan), title, taken)
             console.say(f"contact sheet  {store.folder / sheet}")
