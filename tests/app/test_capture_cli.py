@@ -1,5 +1,6 @@
 """`realsim capture`: sessions begun and gone on with, board views in place, clear refusals."""
 
+import json
 import shutil
 from functools import lru_cache
 from pathlib import Path
@@ -77,15 +78,19 @@ def test_a_session_has_plan_devices_log_and_sheet(plans: Path) -> None:
     assert np.corrcoef(photo[inner].ravel(), cell[inner].ravel())[0, 1] > 0.8
 
 
-def test_a_sheet_that_a_killed_run_did_not_come_to_is_made_by_the_next(
+def test_what_a_killed_run_did_not_come_to_after_its_last_view_is_done_by_the_next(
     plans: Path, tmp_path: Path
 ) -> None:
     sheet = shutil.copytree(scene_session(plans), tmp_path / "s") / "reports/contact_sheet.png"
-    before = sheet.read_bytes()
+    before, log = sheet.read_bytes(), tmp_path / "s/capture_log.jsonl"
     sheet.unlink()
+    *views, end = log.read_text().splitlines(keepends=True)
+    log.write_text("".join(views))
     words = ("--plan", plans / "plan.json", "--simulated", "--only-views", "0")
     assert realsim("capture", tmp_path / "s", *words).returncode == 0
     assert len(sheet.read_bytes()) > 0.9 * len(before)
+    last = json.loads(log.read_text().splitlines()[-1])
+    assert last["event"] == json.loads(end)["event"] == "ended" and last["complete"]
 
 
 @pytest.mark.parametrize(

@@ -82,21 +82,28 @@ def test_a_task_that_kills_three_workers_is_named_and_the_rest_go_on(two, tmp_pa
     assert summary.done == 2 and len(list(tmp_path.iterdir())) == 3
 
 
+def said_by_script(folder, text):
+    """Return what a program prints that is a file of its own."""
+    (folder / "script.py").write_text(text)
+    command = [sys.executable, folder / "script.py"]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    return ran.stdout + ran.stderr
+
+
 def test_a_script_without_a_guard_is_run_once(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(
+    said = said_by_script(
+        tmp_path,
         "import math\nfrom realsim.many import PoolConfig, Task, open_pool, run_many\n"
         "print('begun')\nwith open_pool(PoolConfig(workers=2)) as pool:\n"
         "    done = lambda o: print(o.found())\n"
-        "    run_many([Task(name='root', fn=math.sqrt, args=(4.0,))], pool, done)\n"
+        "    run_many([Task(name='root', fn=math.sqrt, args=(4.0,))], pool, done)\n",
     )
-    ran = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60)
-    assert (ran.stdout, ran.stderr) == ("begun\n2.0\n", "")
+    assert said == "begun\n2.0\n"
 
 
 def test_in_a_worker_of_the_users_own_that_may_have_none_the_job_is_done_there(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(
+    said = said_by_script(
+        tmp_path,
         "import math, multiprocessing\n"
         "from realsim.many import PoolConfig, Task, open_pool, run_many\n"
         "def work(x):\n"
@@ -106,10 +113,9 @@ def test_in_a_worker_of_the_users_own_that_may_have_none_the_job_is_done_there(t
         "    return found[0].found()\n"
         "if __name__ == '__main__':\n"
         "    with multiprocessing.get_context('spawn').Pool(1) as own:\n"
-        "        print(own.map(work, [4.0]))\n"
+        "        print(own.map(work, [4.0]))\n",
     )
-    ran = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60)
-    assert (ran.stdout, ran.stderr) == ("[2.0]\n", "")
+    assert said == "[2.0]\n"
 
 
 def test_results_come_in_order_where_that_is_asked_for(two):

@@ -203,7 +203,8 @@ class Run:
             warnings=tuple(self._looker.warnings),
             complete=self._wanted <= self._done,
         )
-        if todo:
+        # Also of a run that was killed after its last view.
+        if todo or any(e.get("event") != "ended" for e in self._log.entries[-1:]):
             self._log.add(
                 "ended", at=_now(), captured=summary.captured, left_out=list(left),
                 complete=summary.complete, seconds=round(summary.seconds, 1),

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from realsim import __version__
+from realsim.app.register.from_review import UPGRADE_FILE
 from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig
 from realsim.errors import InputError
 from realsim.store import SessionStore, atomic
@@ -22,7 +23,7 @@ from realsim.untrusted.own_json import read_object
 RECORD = 2
 """Number of the records' layout: those of another are made again."""
 IMPORTED = "imported"
-NOTE = "stages/upgrade.json"
+NOTE = UPGRADE_FILE
 IMAGE_FOLDERS = ("mask", "mask_visib", "label", "rect", "meta")
 """Folders of a scene: not read, and no reason to upgrade it again."""
 DOCUMENTS = {

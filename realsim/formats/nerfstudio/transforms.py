@@ -292,12 +292,12 @@ def read_transforms(path: Path | str, *, images_folder: Path | None = None) -> T
         T = T_world_cam_of(entry.get("transform_matrix"), f"'transform_matrix' of {where}")
         T[:3, 3] *= factor
         colour = _image_file(path.parent, name, images_folder, where)
+        if (image := colour or Path(name)) in seen:
+            raise InputError(f"{path} has two frames of the image {image}: which pose is its own?")
+        seen.add(image)
         if colour is None:
             absent.append(name)
             continue
-        if colour in seen:
-            raise InputError(f"{path} has two frames of the image {colour}: which pose is its own?")
-        seen.add(colour)
         frames.append(
             PosedImage(
                 name=name, colour=colour, depth=_depth_file(path.parent, entry, where),
