@@ -13,6 +13,7 @@ from click.testing import Result
 from realsim.app.console import Console
 from realsim.app.upgrade.analytic import FOLDER, agreement_of
 from realsim.app.upgrade.dataset import scenes_of
+from realsim.app.upgrade.files import NOTE
 from realsim.app.upgrade.outcome import Outcome, decide
 from realsim.app.upgrade.run import UpgradeConfig, run_upgrade
 from realsim.app.upgrade.source import told_apart, world_starts
@@ -148,6 +149,42 @@ def test_other_images_are_not_mixed_into_an_upgrade(upgraded, tmp_path) -> None:
     other = dataset / "test/000002/rgb/000003.png"
     (copy / "test/000001/rgb/000003.png").write_bytes(other.read_bytes())
     assert "upgrade of other images" in failed_with(copy, again, "--only-scenes", "1")
+
+
+@pytest.mark.slow
+def test_another_data_set_is_not_mixed_into_an_upgrade(upgraded, tmp_path) -> None:
+    dataset, out, _ = upgraded
+    before = content_and_times(out)
+    shutil.copytree(dataset, moved := tmp_path / "moved")
+    gt = moved / "test/000001/scene_gt.json"
+    told = json.loads(gt.read_text())
+    told["3"][0]["cam_t_m2c"][0] += 15.0
+    gt.write_text(json.dumps(told))
+    assert "upgrade of another data set: test/000001" in failed_with(moved, out)
+    shutil.move(moved / "test/000001", moved / "test/000077")
+    shutil.rmtree(moved / "test/000002")
+    assert "upgrade of another data set" in failed_with(moved, out)
+    assert content_and_times(out) == before
+
+
+@pytest.mark.slow
+def test_what_is_done_anew_is_told_where_it_was_reviewed_and_where_its_models_changed(
+    upgraded, tmp_path
+) -> None:
+    dataset, out, _ = upgraded
+    shutil.copytree(out, again := tmp_path / "out")
+    (again / "test/000001/review").mkdir()
+    (again / "test/000001/review/journal.jsonl").write_text("")
+    shutil.copytree(again / "test/000001", again / "test/000003")
+    note = again / "test/000003" / NOTE
+    note.write_text(note.read_text().replace("test/000001", "test/000003"))
+    info = again / "test/000003/models/models_info.json"
+    models = json.loads(info.read_text())
+    models["1"]["diameter"] += 1.0
+    info.write_text(json.dumps(models))
+    told = upgrade(dataset, again, "--only-scenes", "1", "--views", "1").output
+    assert "test/000001 was reviewed" in told
+    assert "object 1 of test/000003 is another model" in told
 
 
 @pytest.mark.slow

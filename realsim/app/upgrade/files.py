@@ -113,7 +113,7 @@ def keep_imported(
         if not store.has(relative) or store.path(relative).read_bytes() != data:
             store.write_bytes(relative, data)
     record = {
-        "kind": ref.kind, "dataset": str(ref.root), "scene": str(ref.folder),
+        "kind": ref.kind, "dataset": str(ref.root.resolve()), "scene": str(ref.folder.resolve()),
         "grasp_labels": list(labels),
         "images": said,
     }  # fmt: skip
@@ -121,9 +121,42 @@ def keep_imported(
         store.write_json(source, record)
 
 
-def gather_models(out: Path, places: Sequence[str]) -> None:
-    """Copy the models of all scenes into one models folder, as BOP has it."""
+def require_one_data_set(out: Path, refs: Sequence[SceneRef]) -> None:
+    """Refuse a folder that another data set has been upgraded into.
+
+    A data set elsewhere is the same one, moved, if what it says of a scene is what was imported.
+
+    Raises:
+        InputError: the folder holds scenes of another one.
+    """
+    there = {str(p.parents[1].relative_to(out)): p for p in out.glob(f"*/*/{IMPORTED}/source.json")}
+    roots = {place: str(read_object(path)["dataset"]) for place, path in sorted(there.items())}
+    root = refs[0].root.resolve()
+    others = {place: told for place, told in roots.items() if Path(told).resolve() != root}
+    here = [ref for ref in refs if ref.place in others]
+    if others and not (here and all(_is_imported(ref, there[ref.place].parent) for ref in here)):
+        place, told = next(iter(others.items()))
+        raise InputError(
+            f"'{out}' holds an upgrade of another data set: {place} is of {told}. Its labels, "
+            f"models and review would be mixed up with those of {root}. Give another --out."
+        )
+
+
+def _is_imported(ref: SceneRef, imported: Path) -> bool:
+    """Return whether a scene's annotations are those that were imported, byte by byte."""
+    files = [p for pattern in DOCUMENTS[ref.kind] for p in ref.folder.glob(pattern)]
+    copies = [(p, imported / p.relative_to(ref.folder)) for p in files]
+    return all(c.is_file() and c.read_bytes() == p.read_bytes() for p, c in copies)
+
+
+def gather_models(out: Path, places: Sequence[str]) -> list[str]:
+    """Copy the models of all scenes into one models folder, as BOP has it.
+
+    Returns:
+        Which models of a scene are not those of an earlier one, in words.
+    """
     info: dict[str, Any] = {}
+    words: list[str] = []
     home = out / "models"
     for place in places:
         models = out / place / "models"
@@ -131,6 +164,10 @@ def gather_models(out: Path, places: Sequence[str]) -> None:
             continue
         for obj_id, entry in read_object(models / "models_info.json").items():
             if obj_id in info:
+                if entry != info[obj_id]:
+                    words.append(f"object {obj_id} of {place} is another model than that of an "
+                                 "earlier scene, which stays in OUT/models: upgrade all scenes "
+                                 "again, or each data set into a folder of its own.")  # fmt: skip
                 continue
             info[obj_id] = entry
             for path in sorted(models.glob(f"obj_{int(obj_id):06d}.*")):
@@ -139,6 +176,7 @@ def gather_models(out: Path, places: Sequence[str]) -> None:
                     atomic.write_bytes(home / path.name, data)
     ordered = {k: info[k] for k in sorted(info, key=int)}
     atomic.write_json(home / "models_info.json", ordered)
+    return words
 
 
 def write_root_files(out: Path, places: Sequence[str]) -> None:

@@ -21,6 +21,7 @@ from realsim.app.upgrade.scene import Record, read_source, upgrade_scene
 from realsim.app.upgrade.tables import show_upgrade, write_tables
 from realsim.errors import InputError
 from realsim.many import Workers
+from realsim.review.journal import JOURNAL_FILE
 from realsim.store.lock import only_run_in
 
 __all__ = ["UpgradeConfig", "UpgradeResult", "run_upgrade", "show_upgrade"]
@@ -51,6 +52,7 @@ def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Consol
     refs = scenes_of(dataset, config)
     require_outside(out, sorted({r.root.resolve() for r in refs}))
     _refuse_what_cannot_be_written(out)
+    files.require_one_data_set(out, refs)
     done: dict[str, Record] = {}
     todo: list[SceneRef] = []
     for ref in refs:
@@ -69,6 +71,10 @@ def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Consol
         console.say(f"{skipped} of {len(refs)} scenes are upgraded already, with the same inputs")
     if again := sum((out / ref.place / files.NOTE).is_file() for ref in todo):
         console.warn(f"options or inputs have changed: {again} of {len(refs)} scenes are done anew")
+    if reviewed := [ref.place for ref in todo if (out / ref.place / JOURNAL_FILE).is_file()]:
+        shown = ", ".join(reviewed[:4]) + (" ..." if len(reviewed) > 4 else "")
+        console.warn(f"{shown} was reviewed: a decision counts on only where its object comes out "
+                     "at the same place. Look at it again with `realsim review`.")  # fmt: skip
     failed: dict[str, str] = {}
     with contextlib.ExitStack() as lock:
         if len(refs) == 1 and todo:
@@ -119,7 +125,7 @@ def _write_together(out: Path, failed: dict[str, str], console: Console) -> Reco
     records = files.all_records(out)
     places = [str(r["place"]) for r in records]
     with console.stage("together", f"{len(records)} scenes"):
-        files.gather_models(out, places)
+        console.warn(*files.gather_models(out, places))
         files.write_root_files(out, places)
         analytic = agreement_of(all_sets(out, places))
         write_tables(out, records, failed, analytic)
