@@ -18,8 +18,8 @@ from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim_calibration.detect.find import find_target
-from realsim_calibration.detect.markers import FAMILY_DICTIONARY, predefined_dictionary
 from realsim_calibration.sheets import target_image
+from realsim_calibration.targets.marker_sets import load_dictionary, tag_dictionary
 
 SUPER = 8
 """Rays per pixel and axis."""
@@ -179,7 +179,7 @@ def opencv(image: Image, target: Target) -> tuple[Int64, Array]:
     if isinstance(target, TagBoard):
         parameters = aruco.DetectorParameters()
         parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
-        dictionary = predefined_dictionary(FAMILY_DICTIONARY[target.family])
+        dictionary = load_dictionary(tag_dictionary(target.family))
         corners, found, _ = aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
         if found is not None:
             row = {int(tag): k for k, tag in enumerate(target.ids)}
@@ -195,7 +195,7 @@ def opencv(image: Image, target: Target) -> tuple[Int64, Array]:
             (target.columns, target.rows),
             target.square_m,
             target.marker_m,
-            predefined_dictionary(target.dictionary),
+            load_dictionary(target.dictionary),
         )
         board.setLegacyPattern(target.legacy)
         corners, found, _, _ = aruco.CharucoDetector(board).detectBoard(image)

@@ -8,10 +8,10 @@ from realsim.arrays import Array, Int64, Mask, UInt8
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import CharucoBoard
 from realsim_calibration.detect.homography import (
+    agreeing,
     apply_homography,
     fit_homography,
-    fit_trimmed,
-    seen_from_front,
+    fit_layout,
 )
 from realsim_calibration.detect.images import gray_image, no_points, size_of
 from realsim_calibration.detect.markers import TWO_BOARDS, decode_markers, several_boards
@@ -24,8 +24,6 @@ LAYOUT_SHARE = 0.5
 """Furthest that a marker's corner may lie from where the others put it, in marker sides."""
 MIN_MARKERS = 2
 """Least number of markers that agree: one alone may be chance."""
-AGREEING_SHARE = 0.7
-"""Least share of the markers that must agree: of a wrong layout a skewed map explains half."""
 NEAR_MARKERS = 6
 """A corner is expected where the map of so many nearest markers puts it: few, so that the
 lens does not bend the map."""
@@ -127,47 +125,28 @@ def markers_on_board(
         if usable.any():
             rejected.append(f"{int(usable.sum())} marker alone may be chance")
         return np.zeros(len(ids), dtype=bool), quads, rejected
-    side = np.linalg.norm(quads - np.roll(quads, -1, axis=1), axis=-1)
-    limit = LAYOUT_SHARE * float(np.median(side[usable]))
-    least = max(MIN_MARKERS, int(np.ceil(AGREEING_SHARE * usable.sum())))
-    # Some generators print the codes turned on the page; the grid says by how much.
-    for roll in (0, 2, 1, 3):
-        turned = np.roll(quads, roll, axis=1)
-        good = _agreeing(ids, turned, known, usable, limit)
-        if good.sum() < least:
-            continue
-        # A wrong pattern may explain most markers, moved by a square: a better one counts more.
-        better = ""
-        if good.sum() < usable.sum():
-            better = _remedy(ids, quads, board, usable, limit, int(good.sum()) + 1)
-        if not better.startswith(";"):
-            rejected += [
-                f"marker {i}: does not lie where the rest of the board puts it"
-                for i in ids[usable & ~good]
-            ]
-            return good, turned, rejected
-    rejected.append(
-        f"{int(usable.sum())} markers were read, but they do not lie as the board file says"
-        + _remedy(ids, quads, board, usable, limit, least)
-    )
-    return np.zeros(len(ids), dtype=bool), quads, rejected
-
-
-def _agreeing(ids: Int64, quads: Array, known: Array, usable: Mask, limit: float) -> Mask:
-    """Return which markers (n,) one map of the plane explains, seen from the printed side."""
+    known = known[ids[usable]]
+    fits, roll, better = fit_layout(
+        known, quads[usable], LAYOUT_SHARE,
+        lambda limit, least: _remedy(ids[usable], quads[usable], board, limit, least),
+    )  # fmt: skip
     good = np.zeros(len(ids), dtype=bool)
-    board = known[ids[usable]].reshape(-1, 2)
-    H, inside = fit_trimmed(board, quads[usable].reshape(-1, 2), limit)
-    fits = inside.reshape(-1, 4).all(-1)
-    if fits.any() and seen_from_front(H, board[np.repeat(fits, 4)]):
-        good[usable] = fits
-    return good
+    good[usable] = fits
+    if good.any():
+        rejected += [
+            f"marker {i}: does not lie where the rest of the board puts it"
+            for i in ids[usable & ~good]
+        ]
+    else:
+        better = better or ". Are rows, columns, square and marker size right?"
+        rejected.append(
+            f"{len(known)} markers were read, but they do not lie as the board file says{better}"
+        )
+    return good, np.roll(quads, roll, axis=1), rejected
 
 
-def _remedy(
-    ids: Int64, quads: Array, board: CharucoBoard, usable: Mask, limit: float, least: int
-) -> str:
-    """Return how they do lie, where a usual mistake explains it."""
+def _remedy(ids: Int64, quads: Array, board: CharucoBoard, limit: float, least: int) -> str:
+    """Return how markers do lie, where a usual mistake explains so many; empty where none does."""
     turned = replace(board, rows=board.columns, columns=board.rows)
     candidates = (
         (replace(board, legacy=not board.legacy), f"with legacy={not board.legacy}"),
@@ -176,11 +155,9 @@ def _remedy(
          f"with {turned.rows} rows, {turned.columns} columns and legacy={not board.legacy}"),
     )  # fmt: skip
     for candidate, how in candidates:
-        known = charuco_markers(candidate)
-        ours = usable & (ids < len(known))
-        if ours.sum() >= least and _agreeing(ids, quads, known, ours, limit).sum() >= least:
+        if agreeing(charuco_markers(candidate)[ids], quads, limit).sum() >= least:
             return f"; {how} they would"
-    return ". Are rows, columns, square and marker size right?"
+    return ""
 
 
 def _expected(ids: Int64, quads: Array, board: CharucoBoard) -> tuple[Int64, Array, Array]:

@@ -183,12 +183,12 @@ def refine_dots(gray: UInt8, middles: Array, axes: Array, gap: Array) -> Dots:
     if small.any():
         k = np.flatnonzero(small)
         margin = np.clip(0.5 * gap[k], MIN_HALF_WINDOW_PX, HALF_WINDOW_PX)
-        fit = fit_small_dots(image, uv[k], A[k], blur[k], margin)
-        apart = np.linalg.norm(fit.uv - uv[k], axis=-1)
+        middle, outline, spread = fit_small_dots(image, uv[k], A[k], blur[k], margin)
+        apart = np.linalg.norm(middle - uv[k], axis=-1)
         for i in np.flatnonzero(~(apart <= MAX_APART_PX)):
             faults[k[i]] = f"outline and inside disagree by {apart[i]:.1f} px: covered?"
         kept = apart <= MAX_APART_PX
-        uv[k[kept]], A[k[kept]], sd[k[kept]] = fit.uv[kept], fit.axes[kept], fit.sd_px[kept]
+        uv[k[kept]], A[k[kept]], sd[k[kept]] = middle[kept], outline[kept], spread[kept]
     return Dots(uv=uv, axes=A, sd_px=sd, faults=tuple(faults))
 
 
@@ -281,22 +281,10 @@ def _conic_middles(points: Array) -> Array:
 # in one fit the middle is twice as sharp. Integer pixels are pixel centres.
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class SmallDots:
-    """Middles of dots."""
-
-    uv: Array
-    """(n, 2) [px]."""
-    axes: Array
-    """(n, 2, 2) A of the outline c + A (cos, sin) [px]."""
-    sd_px: Array
-    """(n,) predicted 1-sigma of a coordinate [px]."""
-
-
 def fit_small_dots(
     image: Array, middles: Array, axes: Array, blur: Array, margin: Array
-) -> SmallDots:
-    """Return the ellipses of least squares.
+) -> tuple[Array, Array, Array]:
+    """Return middles, axes A and predicted sigmas [px] of the ellipses of least squares.
 
     The model is I = p + q x + r y - D Phi(-s / blur) with s the distance from the outline, to
     first order s = (|Bd| - 1) |Bd| / |B B d|, B = A^-1, d = pixel - middle.
@@ -343,14 +331,13 @@ def fit_small_dots(
         change = (inverse @ g[..., None])[..., 0]
         change[:, :6] = np.clip(change[:, :6], -MAX_STEP_PX, MAX_STEP_PX)
         uv = uv + change[:, :2]
-        c = change[:, 2:5]
-        A = A + np.stack([np.stack([c[:, 0], c[:, 1]], -1), np.stack([c[:, 1], c[:, 2]], -1)], 1)
+        A = A + _symmetric(change[:, 2:5])
         sigma = np.clip(sigma + change[:, 5], 0.3, 4.0)
         dark = dark + change[:, 6]
         plane = plane + change[:, 7:]
         scatter = (r**2).sum(-1) / np.maximum(weight.sum(-1) - 10, 1.0)
         covariance = scatter[:, None] * np.einsum("nii->ni", inverse)[:, :2]
-    return SmallDots(uv=uv, axes=A, sd_px=np.sqrt(covariance.mean(-1)))
+    return uv, A, np.sqrt(covariance.mean(-1))
 
 
 def _linearised(

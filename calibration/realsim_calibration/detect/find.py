@@ -83,7 +83,6 @@ def tag_points(
             f"{board.ids.max()}."
         )
     rows = np.array([row_of[int(i)] for i in detections.ids], dtype=np.int64)
-    assert detections.corner_sd_px is not None
     return TargetDetection(
         point_ids=(4 * rows[:, None] + np.arange(4)).ravel(),
         uv=detections.corners_px.reshape(-1, 2),

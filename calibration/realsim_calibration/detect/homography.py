@@ -1,8 +1,13 @@
 """The map from a flat board to its image: fit, apply, and which side of the board is seen."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from realsim.arrays import Array, Mask
+
+AGREEING_SHARE = 0.7
+"""Least share of the markers that must agree: of a wrong layout a skewed map explains half."""
 
 
 def fit_homography(board: Array, uv: Array) -> Array:
@@ -66,3 +71,38 @@ def fit_trimmed(board: Array, uv: Array, limit_px: float) -> tuple[Array, Mask]:
         H = fit_homography(board[inside], uv[inside])
         inside = np.linalg.norm(apply_homography(H, board) - uv, axis=-1) <= limit_px
     return H, inside
+
+
+def agreeing(known: Array, quads: Array, limit_px: float) -> Mask:
+    """Return which quads (n, 4, 2) one map of the plane explains, seen from the printed side.
+
+    `known` (n, 4, 2) is where they are on the board.
+    """
+    H, inside = fit_trimmed(known.reshape(-1, 2), quads.reshape(-1, 2), limit_px)
+    fits: Mask = np.all(inside.reshape(-1, 4), axis=1)
+    if not fits.any() or seen_from_front(H, known[fits].reshape(-1, 2)):
+        return fits
+    return np.zeros(len(known), dtype=bool)
+
+
+def fit_layout(
+    known: Array, quads: Array, share: float, remedy: Callable[[float, int], str]
+) -> tuple[Mask, int, str]:
+    """Return which quads (n, 4, 2) lie as on the board, the codes' quarter turns, and a remedy.
+
+    Args:
+        known: (n, 4, 2) where they are on the board.
+        quads: where they are seen [px].
+        share: furthest that a corner may lie from where the others put it, in sides.
+        remedy: of a limit [px] and a number of quads: the layout that explains so many, in words;
+            empty where none does.
+    """
+    limit = share * float(np.median(np.linalg.norm(quads - np.roll(quads, -1, axis=1), axis=-1)))
+    least = max(2, int(np.ceil(AGREEING_SHARE * len(quads))))
+    # Some generators print the codes turned on the page; the grid says by how much.
+    for roll in (0, 2, 1, 3):
+        good = agreeing(known, np.roll(quads, roll, axis=1), limit)
+        # A wrong pattern may explain most markers, moved by a square: a better one counts more.
+        if good.sum() >= least and (good.all() or not remedy(limit, int(good.sum()) + 1)):
+            return good, roll, ""
+    return np.zeros(len(quads), dtype=bool), 0, remedy(limit, least)

@@ -6,15 +6,8 @@ from typing import Any
 import numpy as np
 
 from realsim.arrays import Array, Int64, Mask, UInt8
-from realsim.errors import InputError
+from realsim_calibration.targets.marker_sets import load_dictionary
 
-FAMILY_DICTIONARY = {
-    "tag16h5": "DICT_APRILTAG_16h5",
-    "tag25h9": "DICT_APRILTAG_25h9",
-    "tag36h10": "DICT_APRILTAG_36h10",
-    "tag36h11": "DICT_APRILTAG_36h11",
-}
-"""OpenCV's name of each tag family."""
 WEAK_DICTIONARIES = ("DICT_APRILTAG_16h5", "DICT_4X4_", "DICT_ARUCO_ORIGINAL")
 """Few bits or codes that differ in few: no bit is corrected, else clutter decodes."""
 TOUCHING_KERNELS = (3, 5)
@@ -32,49 +25,17 @@ def several_boards(ids: Int64) -> bool:
     return twice >= 2 and twice >= TWICE_SHARE * len(values)
 
 
-def dictionary_names() -> tuple[str, ...]:
-    """Return the names of OpenCV's predefined dictionaries."""
-    from cv2 import aruco
-
-    return tuple(sorted(n for n in dir(aruco) if n.startswith("DICT_") and not _doubled(n, aruco)))
-
-
-def _doubled(name: str, module: Any) -> bool:
-    """Return whether the name is the upper-case twin of another."""
-    return name.upper() == name and any(
-        other != name and other.upper() == name for other in dir(module)
-    )
-
-
-def predefined_dictionary(name: str) -> Any:
-    """Return one of OpenCV's predefined dictionaries.
-
-    Raises:
-        InputError: there is none of this name.
-    """
-    from cv2 import aruco
-
-    known = dictionary_names()
-    match = [n for n in known if n.upper() == name.upper()]
-    if not match:
-        raise InputError(
-            f"the marker dictionary '{name}' is not known; OpenCV has {', '.join(known)}."
-        )
-    return aruco.getPredefinedDictionary(getattr(aruco, match[0]))
-
-
 @lru_cache(maxsize=16)
 def _detector(name: str, border: int) -> Any:
     """Return the quad finder and decoder; its own corner refinement stays off."""
     from cv2 import aruco
 
-    dictionary = predefined_dictionary(name)
     parameters = aruco.DetectorParameters()
     parameters.cornerRefinementMethod = aruco.CORNER_REFINE_NONE
     parameters.markerBorderBits = border
     if name.startswith(WEAK_DICTIONARIES):
         parameters.errorCorrectionRate = 0.0
-    return aruco.ArucoDetector(dictionary, parameters)
+    return aruco.ArucoDetector(load_dictionary(name), parameters)
 
 
 def decode_markers(

@@ -1,6 +1,6 @@
 """Tags against the board: which of them lie where it has them, and what it says of missed ones."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -9,16 +9,13 @@ from realsim.arrays import Array, Int64, Mask, UInt8
 from realsim.records import TagBoard
 from realsim_calibration.detect.edges import bilinear
 from realsim_calibration.detect.homography import (
+    agreeing,
     apply_homography,
     fit_homography,
-    fit_trimmed,
-    seen_from_front,
+    fit_layout,
 )
-from realsim_calibration.detect.markers import FAMILY_DICTIONARY, predefined_dictionary
+from realsim_calibration.targets.marker_sets import load_dictionary, tag_dictionary
 
-MIN_SHARE = 0.7
-"""Least share of the tags that must agree: fewer, and the board file does not fit the picture. With
-rows counted from the wrong end a skewed map can explain half of them."""
 NEAR_TAGS = 4
 """Known tags that tell where a neighbour is; few, so that the lens does not bend the map."""
 WRONG_SHARE = 0.1
@@ -29,53 +26,13 @@ MIN_STEP = 20.0
 """Least difference between the white and the black cells [gray levels of 255]."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class TagLayout:
-    """Which tags lie where the board has them."""
+def check_layout(
+    ids: Int64, corners: Array, board: TagBoard, share: float
+) -> tuple[Mask, int, str]:
+    """Return which of two or more tags (n, 4, 2) agree with the board to within `share` sides.
 
-    good: Mask
-    """(n,)."""
-    roll: int
-    """Quarter turns of the codes on the page."""
-    reason: str
-    """What is wrong with the others."""
-
-
-def check_layout(ids: Int64, corners: Array, board: TagBoard, share: float) -> TagLayout:
-    """Return which of two or more tags (n, 4, 2) agree with the board to within `share` sides."""
-    side = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=-1)
-    limit = share * float(np.median(side))
-    least = max(2, int(np.ceil(MIN_SHARE * len(ids))))
-    for roll in (0, 2, 1, 3):
-        good = _agreeing(ids, np.roll(corners, roll, axis=1), board, limit)
-        if good.sum() < least:
-            continue
-        better = ""
-        if not good.all():
-            better = _remedy(ids, corners, board, limit, int(good.sum()) + 1)
-        if not better.startswith(";"):
-            reason = "does not lie where the rest of the board puts it"
-            return TagLayout(good=good, roll=roll, reason=reason)
-    reason = "the tags do not lie as the board file says" + _remedy(
-        ids, corners, board, limit, least
-    )
-    return TagLayout(good=np.zeros(len(ids), dtype=bool), roll=0, reason=reason)
-
-
-def _agreeing(ids: Int64, corners: Array, board: TagBoard, limit: float) -> Mask:
-    """Return the tags (n,) that one map of the plane explains, seen from the printed side."""
-    at = {int(tag): k for k, tag in enumerate(board.ids)}
-    rows = np.array([at.get(int(i), -1) for i in ids])
-    known = board.corners_board[rows][..., :2].reshape(-1, 2)
-    H, inside = fit_trimmed(known, corners.reshape(-1, 2), limit)
-    good = inside.reshape(-1, 4).all(-1) & (rows >= 0)
-    if good.any() and not seen_from_front(H, known.reshape(-1, 4, 2)[good].reshape(-1, 2)):
-        good[:] = False
-    return good
-
-
-def _remedy(ids: Int64, corners: Array, board: TagBoard, limit: float, least: int) -> str:
-    """Return how they do lie, where a usual mistake explains it."""
+    Also the quarter turns of the codes on the page, and what is wrong with the other tags.
+    """
     other = "top" if board.ids_from == "bottom" else "bottom"
     turned = replace(board, rows=board.columns, columns=board.rows)
     candidates = (
@@ -84,12 +41,26 @@ def _remedy(ids: Int64, corners: Array, board: TagBoard, limit: float, least: in
         (replace(turned, ids_from=other), f"with {turned.rows} rows, {turned.columns} columns and "
          f"ids_from='{other}'"),
     )  # fmt: skip
-    for candidate, how in candidates:
-        for roll in (0, 2, 1, 3):
-            good = _agreeing(ids, np.roll(corners, roll, axis=1), candidate, limit)
-            if good.sum() >= least:
-                return f"; {how} they would"
-    return ". Are rows, columns, first id, tag size and gap right?"
+
+    def remedy(limit: float, least: int) -> str:
+        for candidate, how in candidates:
+            known = _corners_of(ids, candidate)
+            for roll in (0, 2, 1, 3):
+                if agreeing(known, np.roll(corners, roll, axis=1), limit).sum() >= least:
+                    return f"; {how} they would"
+        return ""
+
+    good, roll, better = fit_layout(_corners_of(ids, board), corners, share, remedy)
+    if good.any():
+        return good, roll, "does not lie where the rest of the board puts it"
+    better = better or ". Are rows, columns, first id, tag size and gap right?"
+    return good, roll, f"the tags do not lie as the board file says{better}"
+
+
+def _corners_of(ids: Int64, board: TagBoard) -> Array:
+    """Return where tags are on a board (n, 4, 2) [m]."""
+    at = {int(tag): k for k, tag in enumerate(board.ids)}
+    return board.corners_board[[at[int(i)] for i in ids]][..., :2]
 
 
 # --- tags that the general search missed ---------------------------------------------------------
@@ -111,14 +82,12 @@ def read_missing_tags(
         code: width of the black border in modules, and quarter turns of the codes on the page.
     """
     (ids, corners), (border, roll) = seen, code
-    row_of = {int(tag): row for row, tag in enumerate(board.ids)}
-    known = board.corners_board[[row_of[int(i)] for i in ids]][..., :2]
+    known = _corners_of(ids, board)
     limit = np.array([gray.shape[1] - 1, gray.shape[0] - 1])
     image = gray.astype(np.float64)
     new_ids: list[int] = []
     new: list[Array] = []
-    for tag in missing:
-        square = board.corners_board[row_of[int(tag)]][:, :2]
+    for tag, square in zip(missing, _corners_of(missing, board), strict=True):
         apart = np.linalg.norm(known.mean(1) - square.mean(0), axis=-1)
         near = np.argsort(apart)[:NEAR_TAGS]
         H = fit_homography(known[near].reshape(-1, 2), corners[near].reshape(-1, 2))
@@ -137,7 +106,7 @@ def _code(family: str, tag: int, border: int) -> Mask:
     """Return the white cells (cells, cells) of a tag, its black border included."""
     from cv2 import aruco
 
-    dictionary = predefined_dictionary(FAMILY_DICTIONARY[family])
+    dictionary = load_dictionary(tag_dictionary(family))
     cells = int(dictionary.markerSize) + 2 * border
     drawn = aruco.generateImageMarker(dictionary, tag, cells, borderBits=border)
     return np.asarray(drawn) > 127

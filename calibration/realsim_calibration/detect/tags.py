@@ -9,7 +9,6 @@ pixel off that in both axes).
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from realsim.arrays import Array, Int64, UInt8
 from realsim.errors import InputError
@@ -17,13 +16,9 @@ from realsim.records import CameraIntrinsics, TagBoard
 from realsim.records.targets import TAG_CELLS
 from realsim_calibration.detect.edges import CORNER_CUT_PX, RefinedQuads, refine_quads
 from realsim_calibration.detect.images import gray_image
-from realsim_calibration.detect.markers import (
-    FAMILY_DICTIONARY,
-    TWO_BOARDS,
-    decode_markers,
-    several_boards,
-)
+from realsim_calibration.detect.markers import TWO_BOARDS, decode_markers, several_boards
 from realsim_calibration.detect.tag_layout import check_layout, read_missing_tags
+from realsim_calibration.targets.marker_sets import tag_dictionary
 
 WEAK_FAMILIES = ("tag16h5",)
 """Families whose codes turn up by chance in any picture: one tag of a board proves nothing."""
@@ -55,15 +50,6 @@ MAX_MOVE_PX = 3.0
 """Furthest that refinement may move a corner [px]; more means it found another edge."""
 
 
-def _per_tag(value: ArrayLike | None, n: int, name: str) -> Array:
-    """Return (n,) read-only numbers, NaN where nothing was measured."""
-    array = np.full(n, np.nan) if value is None else np.array(value, dtype=np.float64)
-    if array.shape != (n,):
-        raise InputError(f"tag detections: {name} has shape {array.shape} for {n} tags.")
-    array.setflags(write=False)
-    return array
-
-
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class TagDetections:
     """The tags seen in one image, sorted by id."""
@@ -72,13 +58,7 @@ class TagDetections:
     """(n,) tag ids, ascending."""
     corners_px: Array
     """(n, 4, 2) corners, clockwise from the top left as printed [px]."""
-    sharpness_px: Array | None = None
-    """(n,) sigma of the blurred edge [px]; small is sharp. NaN = not measured."""
-    contrast: Array | None = None
-    """(n,) step across the edges [gray levels of 255]."""
-    residual_px: Array | None = None
-    """(n,) RMS distance of the edge points to their lines [px]."""
-    corner_sd_px: Array | None = None
+    corner_sd_px: Array
     """(n,) predicted 1-sigma of a corner [px]."""
     rejected: tuple[tuple[int, str], ...] = ()
     """(tag id, reason) of every decoded tag that was not used."""
@@ -93,15 +73,14 @@ class TagDetections:
             raise InputError("tag detections: a tag id occurs twice in one image.")
         if not np.all(np.isfinite(corners)):
             raise InputError("tag detections: a corner is not a finite number.")
+        sd = np.array(self.corner_sd_px, dtype=np.float64)
+        if sd.shape != ids.shape:
+            raise InputError(f"tag detections: {sd.shape} sigmas for {len(ids)} tags.")
         order = np.argsort(ids)
-        ids, corners = ids[order], corners[order]
-        ids.setflags(write=False)
-        corners.setflags(write=False)
-        object.__setattr__(self, "ids", ids)
-        object.__setattr__(self, "corners_px", corners)
-        for name in ("sharpness_px", "contrast", "residual_px", "corner_sd_px"):
-            value = _per_tag(getattr(self, name), len(ids), name)[order]
-            object.__setattr__(self, name, _per_tag(value, len(ids), name))
+        for name, value in (("ids", ids), ("corners_px", corners), ("corner_sd_px", sd)):
+            ordered = value[order]
+            ordered.setflags(write=False)
+            object.__setattr__(self, name, ordered)
 
     def __len__(self) -> int:
         """Return the number of tags."""
@@ -154,8 +133,9 @@ def detect_tags(
 
 def _no_tags(rejected: list[tuple[int, str]]) -> TagDetections:
     return TagDetections(
-        ids=np.zeros(0, np.int64), corners_px=np.zeros((0, 4, 2)), rejected=tuple(sorted(rejected))
-    )
+        ids=np.zeros(0, np.int64), corners_px=np.zeros((0, 4, 2)), corner_sd_px=np.zeros(0),
+        rejected=tuple(sorted(rejected)),
+    )  # fmt: skip
 
 
 def _measured(
@@ -168,7 +148,7 @@ def _measured(
     """Return those of the tags (n,) with rough corners (n, 4, 2) that can be measured well."""
     board, intrinsics = how
     if not len(ids):
-        return TagDetections(ids=ids, corners_px=corners)
+        return _no_tags([])
     clear = (border / (TAG_CELLS[board.family] + 2 * (border - 1)), board.gap_m / board.tag_size_m)
     cut_px, most_px = CORNER_CUT_PX, MAX_MOVE_PX
     if board.corner_squares:
@@ -181,9 +161,6 @@ def _measured(
     return TagDetections(
         ids=ids[good],
         corners_px=refined.corners_px[good],
-        sharpness_px=refined.sharpness_px[good],
-        contrast=refined.contrast[good],
-        residual_px=refined.residual_px[good],
         corner_sd_px=refined.corner_sd_px[good],
         rejected=tuple((int(i), r) for i, r in zip(ids, reasons, strict=True) if r),
     )
@@ -191,24 +168,17 @@ def _measured(
 
 def _both(a: TagDetections, b: TagDetections) -> TagDetections:
     """Return the tags of both."""
-
-    def joined(name: str) -> Array:
-        return np.concatenate([getattr(a, name), getattr(b, name)])
-
     return TagDetections(
         ids=np.concatenate([a.ids, b.ids]),
-        corners_px=joined("corners_px"),
-        sharpness_px=joined("sharpness_px"),
-        contrast=joined("contrast"),
-        residual_px=joined("residual_px"),
-        corner_sd_px=joined("corner_sd_px"),
+        corners_px=np.concatenate([a.corners_px, b.corners_px]),
+        corner_sd_px=np.concatenate([a.corner_sd_px, b.corner_sd_px]),
         rejected=a.rejected + b.rejected,
     )
 
 
 def _decode(gray: UInt8, board: TagBoard) -> tuple[Int64, Array, int]:
     """Return ids, quads (n, 4, 2) and the width of the black border in modules."""
-    name = FAMILY_DICTIONARY[board.family]
+    name = tag_dictionary(board.family)
     ids, corners = decode_markers(gray, name, touching=board.corner_squares)
     seen = int(np.isin(ids, board.ids).sum())
     if board.corner_squares and 2 * seen < len(board.ids):
@@ -227,11 +197,9 @@ def _on_board(
         return ids[:0], corners[:0], [(int(ids[0]), f"one {board.family} alone may be chance")], 0
     if len(ids) < 2:
         return ids, corners, [], 0
-    layout = check_layout(ids, corners, board, LAYOUT_SHARE)
-    bad = [(int(i), layout.reason) for i in ids[~layout.good]]
-    # Some generators print the codes turned on the page; the grid says by how much.
-    corners = np.roll(corners[layout.good], layout.roll, axis=1)
-    return ids[layout.good], corners, bad, layout.roll
+    good, roll, reason = check_layout(ids, corners, board, LAYOUT_SHARE)
+    bad = [(int(i), reason) for i in ids[~good]]
+    return ids[good], np.roll(corners[good], roll, axis=1), bad, roll
 
 
 def _fault(

@@ -6,17 +6,15 @@ import numpy as np
 
 from realsim.arrays import Array, Int64, UInt8
 from realsim.records import CharucoBoard
-from realsim_calibration.detect.charuco import AGREEING_SHARE, markers_on_board
+from realsim_calibration.detect.charuco import markers_on_board
 from realsim_calibration.detect.chessboard import largest_chessboard
 from realsim_calibration.detect.ellipses import find_blobs
+from realsim_calibration.detect.homography import AGREEING_SHARE
 from realsim_calibration.detect.images import gray_image
 from realsim_calibration.detect.lattice import grow_lattices, unimodular
-from realsim_calibration.detect.markers import (
-    decode_markers,
-    dictionary_names,
-    predefined_dictionary,
-)
+from realsim_calibration.detect.markers import decode_markers
 from realsim_calibration.detect.saddles import grid_arms, refine_saddles
+from realsim_calibration.targets.marker_sets import dictionary_names, dictionary_size
 
 SEARCH_PX = 1600
 """Larger pictures are halved until they fit: a diagnosis need not see the smallest marker."""
@@ -155,11 +153,7 @@ def _smallest(name: str, most: int) -> str:
     if not name.endswith("_250"):
         return name
     stem = name[: -len("250")]
-    sizes = sorted(
-        (len(predefined_dictionary(n).bytesList), n)
-        for n in dictionary_names()
-        if n.startswith(stem)
-    )
+    sizes = sorted((dictionary_size(n), n) for n in dictionary_names() if n.startswith(stem))
     return next(n for size, n in sizes if most < size) + " (or larger)"
 
 

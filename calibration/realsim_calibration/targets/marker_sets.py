@@ -36,7 +36,8 @@ def dictionary_name(text: str) -> str:
     for name in dictionary_names():
         if name.upper() == f"DICT_{wanted}":
             return name
-    known = ", ".join(name.removeprefix("DICT_") for name in dictionary_names())
+    prefix = "DICT_" * text.upper().startswith("DICT_")
+    known = ", ".join(prefix + name.removeprefix("DICT_") for name in dictionary_names())
     raise InputError(f"the marker dictionary '{text}' is not known; accepted: {known}.")
 
 
