@@ -1,6 +1,6 @@
 """What a person should know of a hand-eye calibration: verdicts, each with a sentence of advice."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -57,13 +57,6 @@ def _verdict(value: float, limits: tuple[float, float], *, high_is_bad: bool = T
 def _worst(*verdicts: Verdict) -> Verdict:
     """Return the worst of some verdicts."""
     return max(verdicts, key=["good", "unknown", "warn", "bad"].index)
-
-
-def roll_range_deg(Ts_cam_board: Sequence[Array]) -> float:
-    """Return the range of camera roll about the optical axis [deg]: 360 less the largest gap."""
-    angles = np.sort(np.degrees([np.arctan2(T[1, 0], T[0, 0]) for T in Ts_cam_board]) % 360.0)
-    gaps = np.diff(np.append(angles, angles[0] + 360.0))
-    return float(360.0 - gaps.max())
 
 
 def hand_eye_checks(report: HandEyeReport) -> tuple[Check, ...]:

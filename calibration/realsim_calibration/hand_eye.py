@@ -1,7 +1,7 @@
 """Hand-eye calibration from views of a target: screening, joint fit, report."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -9,10 +9,10 @@ from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, HandEye, Target
 from realsim_calibration.checks import given_camera_check, hand_eye_checks
 from realsim_calibration.fit.joint_solve import Setup, ViewCorners
-from realsim_calibration.fit.robust_fit import Solution, solve
+from realsim_calibration.fit.robust_fit import Solution, SolvedView, solve
 from realsim_calibration.fit.view_system import SHARED, camera_record
 from realsim_calibration.plain import choose_plain
-from realsim_calibration.results import BoardShape, HandEyeReport, Stretch, ViewReport
+from realsim_calibration.results import BoardShape, HandEyeReport, ViewReport
 from realsim_calibration.screening import Candidate, HandEyeConfig, Screened, joints_of, screen
 from realsim_calibration.views import BoardView
 
@@ -118,7 +118,7 @@ def _report(
         intrinsics_alone=plain.intrinsics,
         plain_name=plain.name,
         plain_scores=plain.scores,
-        stretch=_stretch(screened, solution),
+        stretch=solution.stretch,
         intrinsics=camera_record(state.camera, size),
         intrinsics_covariance=lens,
         board=shape,
@@ -147,15 +147,6 @@ def _report(
     return replace(report, checks=checks)
 
 
-def _stretch(screened: Screened, solution: Solution) -> Stretch | None:
-    """Return how the map does beyond its poses, views by index."""
-    s = solution.stretch
-    if s is None:
-        return None
-    views = tuple(screened.candidates[k].view.index for k in s.views)
-    return Stretch(views=views, map_px=s.map_px, plain_px=s.plain_px)
-
-
 def _rms(values: Sequence[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
@@ -166,21 +157,14 @@ def _view_reports(
     """Yield every given view's part, by index."""
     used = {c.view.index: v for c, v in zip(screened.candidates, solution.views, strict=True)}
     for view in sorted(views, key=lambda v: v.index):
-        part = used.get(view.index)
-        nan = float("nan")
         yield ViewReport(
             index=view.index,
             label=view.label,
-            used=part is not None,
+            used=view.index in used,
             reason=screened.rejected.get(view.index, ""),
             T_base_ee=view.T_base_ee,
             joints=view.joints,
             point_ids=view.detection.point_ids,
             uv=view.detection.uv,
-            residuals=np.zeros((0, 2)) if part is None else part.residuals,
-            seen_px=nan if part is None else part.seen_px,
-            unseen_px=nan if part is None else part.unseen_px,
-            unseen_mm=nan if part is None else part.unseen_mm,
-            unseen_deg=nan if part is None else part.unseen_deg,
-            robot_error=np.zeros(6) if part is None else part.robot_error,
+            **asdict(used.get(view.index, SolvedView())),
         )

@@ -11,7 +11,6 @@ from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Check, Target
-from realsim_calibration.checks import roll_range_deg
 from realsim_calibration.faults.consequences import (
     SINGLE_VIEWS,
     check_of,
@@ -28,6 +27,7 @@ from realsim_calibration.faults.gates import (
     rotation_mismatch_deg,
     screw_ratio,
 )
+from realsim_calibration.faults.motion_check import roll_range_deg
 from realsim_calibration.fit.board_pose import BoardPose, estimate_board_pose
 from realsim_calibration.fit.closed_forms import CLOSED_FORMS, MIN_VIEWS, check_observable
 from realsim_calibration.fit.joint_solve import JointConfig
@@ -128,7 +128,7 @@ def screen(
         starts=starts,
         mismatch_deg=mismatch,
         screw_ratio=ratio,
-        roll_range_deg=roll_range_deg(list(used)),
+        roll_range_deg=roll_range_deg(used),
         checks=(
             *(c for c in (conventions, turned, motion) if c is not None),
             *drawings_check([(v.index, v.detection) for v in views]),

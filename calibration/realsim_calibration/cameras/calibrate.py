@@ -1,7 +1,7 @@
 """Several cameras calibrated together: lenses, start, joint fit, and what it says."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -37,13 +37,9 @@ from realsim_calibration.cameras.solve import (
     without_arm,
 )
 from realsim_calibration.cameras.start import Start, board_poses, find_start
-from realsim_calibration.checks import (
-    FOCAL_SHARE,
-    given_camera_check,
-    hand_eye_checks,
-    roll_range_deg,
-)
+from realsim_calibration.checks import FOCAL_SHARE, given_camera_check, hand_eye_checks
 from realsim_calibration.faults.consequences import drawings_check
+from realsim_calibration.faults.motion_check import roll_range_deg
 from realsim_calibration.fit.joint_solve import JointConfig
 from realsim_calibration.fit.view_system import camera_record
 from realsim_calibration.lens.intrinsics import calibrate_intrinsics
@@ -236,12 +232,7 @@ def _sighting(
         instant=given.instant, used=part is not None, reason=reason,
         name=given.name or f"{rig.cameras[given.camera].name}/{rig.instants[given.instant].name}",
         detection=s.detection,
-        residuals=np.zeros((0, 2)) if part is None else part.residuals,
-        seen_px=NAN if part is None else part.seen_px,
-        unseen_px=NAN if part is None else part.unseen_px,
-        unseen_mm=NAN if part is None else part.unseen_mm,
-        unseen_deg=NAN if part is None else part.unseen_deg,
-        T_cam_board=np.full((4, 4), NAN) if part is None else part.T_cam_board,
+        **asdict(part or UnseenView()),
     )  # fmt: skip
 
 
@@ -323,7 +314,7 @@ def _camera(
         starts=(),
         mismatch_deg=NAN,
         screw_ratio=NAN,
-        roll_range_deg=roll_range_deg([v.T_cam_board for v in used]),
+        roll_range_deg=roll_range_deg(np.array([v.T_cam_board for v in used])),
         checks=(),
         information=inverse(known),
     )  # fmt: skip

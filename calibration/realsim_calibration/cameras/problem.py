@@ -198,12 +198,6 @@ class RigProblem:
         chosen = range(len(self.views)) if views is None else views
         return np.stack([camera_from_board(*self._arguments(state, k)[:5]) for k in chosen])
 
-    def shaped_points(self, shape: Array, board: int, xy: Array) -> Array:
-        """Return points (n, 3) [m] of places (n, 2) from the middle on a board of a shape (5,)."""
-        x, y = xy.T
-        lift = (shape[2] * x * x + shape[3] * x * y + shape[4] * y * y) / self.halves[board]
-        return self.middles[board] + shape[0] * np.stack([x, (1 + shape[1]) * y, lift], -1)
-
     def residuals(self, state: RigState, views: Sequence[int] | None = None) -> list[Array]:
         """Return predicted minus measured (n, 2) [px] of views, by default of all."""
         found: list[Array] = []

@@ -8,7 +8,7 @@
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from realsim_calibration.fit.joint_solve import (
     JointState,
     Setup,
     ViewCorners,
+    shaped_points,
     smooth_errors,
 )
 from realsim_calibration.fit.linear_model import LinearFit
@@ -348,14 +349,14 @@ def without_arm(state: RigState, instants: Sequence[int]) -> RigState:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class UnseenView:
-    """One view's part; the fields are those of `results.SightingReport`."""
+    """One view's part, by default that of one not used; fields of `results.SightingReport`."""
 
-    residuals: Array
-    seen_px: float
-    unseen_px: float
-    unseen_mm: float
-    unseen_deg: float
-    T_cam_board: Array
+    residuals: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    seen_px: float = float("nan")
+    unseen_px: float = float("nan")
+    unseen_mm: float = float("nan")
+    unseen_deg: float = float("nan")
+    T_cam_board: Array = field(default_factory=lambda: np.full((4, 4), np.nan))
 
 
 def unseen_views(solution: RigSolution) -> list[UnseenView]:
@@ -376,7 +377,10 @@ def unseen_views(solution: RigSolution) -> list[UnseenView]:
         unseen = problem.residuals(moved, views)
         for k, r, expected in zip(views, unseen, problem.poses(moved, views), strict=True):
             view = problem.views[k]
-            points = problem.shaped_points(moved.shape[view.board], view.board, view.xy)
+            points = shaped_points(
+                moved.shape[view.board], view.xy, problem.middles[view.board],
+                problem.halves[view.board],
+            )  # fmt: skip
             alone, _ = refine_board_pose(expected, points, view.uv, moved.lens[view.camera])
             middle = problem.middles[view.board][None]
             apart = se3.transform(alone, middle) - se3.transform(expected, middle)

@@ -97,7 +97,7 @@ def check_motion(
     turns, axes = np.degrees(rms), axes.T
     fit = fit_frames(hand_side(T, eye_in_hand), C, m)
     sd_mm = _best_sd(hand_side(T, eye_in_hand), C, m, fit)
-    roll = _range_deg(np.arctan2(C[:, 1, 0], C[:, 0, 0]))
+    roll = roll_range_deg(C)
     identical = _identical(T)
     found = [
         *_turn_sentences(turns, axes, roll, sd_mm),
@@ -129,9 +129,14 @@ def _best_sd(A: Array, C: Array, m: Array, fit: FrameFit) -> Array:
     return 1e3 * (np.sqrt(np.diag(Rx.T @ covariance[6:9, 6:9] @ Rx)) / s)
 
 
-def _range_deg(angles: Array) -> float:
+def roll_range_deg(Ts_cam_board: Array) -> float:
+    """Return the range of camera roll about the optical axis [deg] over board poses (n, 4, 4)."""
+    return range_deg(np.degrees(np.arctan2(Ts_cam_board[:, 1, 0], Ts_cam_board[:, 0, 0])))
+
+
+def range_deg(angles_deg: ArrayLike) -> float:
     """Return the range of angles round the circle [deg]: 360 less the largest gap."""
-    turned = np.sort(np.degrees(angles) % 360.0)
+    turned = np.sort(np.asarray(angles_deg) % 360.0)
     return float(360.0 - np.diff(np.append(turned, turned[0] + 360.0)).max())
 
 

@@ -23,6 +23,7 @@ from realsim_calibration.fit.joint_solve import JointState
 from realsim_calibration.fit.linear_model import LinearFit, LinearModel
 from realsim_calibration.fit.robot_error import ErrorBasis
 from realsim_calibration.fit.view_system import SHARED
+from realsim_calibration.results import Stretch
 
 PLACES = 12
 """X and Z."""
@@ -84,18 +85,6 @@ def _folded(P: Array, steps: Array) -> Array:
     return np.concatenate([steps @ P.T, steps[..., PLACES:SHARED]], -1)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Stretch:
-    """How a map does beyond the poses it was fitted on: the outermost views held out together."""
-
-    views: tuple[int, ...]
-    """Which (by position in the fit)."""
-    map_px: float
-    """RMS with the map [px]."""
-    plain_px: float
-    """RMS without a map [px]."""
-
-
 def stretch(
     model: LinearModel, mapped: LinearFit, basis: ErrorBasis, none: LinearFit, features: Array
 ) -> Stretch | None:
@@ -120,4 +109,5 @@ def stretch(
             return None
         seen = model.predicted(errors, np.broadcast_to(step, fit.away.shape))[outer]
         px.append(float(np.sqrt(np.mean(seen**2))))
-    return Stretch(views=tuple(int(k) for k in outer), map_px=px[0], plain_px=px[1])
+    views = tuple(model.problem.setup.views[k].index for k in outer)
+    return Stretch(views=views, map_px=px[0], plain_px=px[1])

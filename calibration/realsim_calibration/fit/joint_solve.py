@@ -232,13 +232,6 @@ class JointProblem:
         """Return predicted minus measured (points, 2) [px] of all views, as `rows`."""
         return self.rows(state, errors)[:, -1].reshape(-1, 2)
 
-    def shaped_points(self, board: Array, xy: Array) -> Array:
-        """Return points (n, 3) [m] of places (n, 2) from the middle on a board of a shape (5,)."""
-        x, y = xy.T
-        s, a = board[:2]
-        lift = (board[2] * x * x + board[3] * x * y + board[4] * y * y) / self.setup.half_extent
-        return self.setup.middle + s * np.stack([x, (1 + a) * y, lift], -1)
-
     def equations(self, state: JointState, roots: Array) -> Array:
         """Return every view's compressed equations (views, 24, 36) at a state [px]."""
         arguments: list[Any] = [*self._arguments(state, state.errors), roots]
@@ -340,3 +333,10 @@ class _Normal:
 def smooth_errors(basis: ErrorBasis | None, weights: Array, views: int) -> Array:
     """Return B_i w (views, 6)."""
     return np.zeros((views, 6)) if basis is None else basis.columns @ weights
+
+
+def shaped_points(board: Array, xy: Array, middle: Array, half_extent: float) -> Array:
+    """Return points (n, 3) [m] of places (n, 2) from the middle on a board of a shape (5,)."""
+    x, y = xy.T
+    lift = (board[2] * x * x + board[3] * x * y + board[4] * y * y) / half_extent
+    return middle + board[0] * np.stack([x, (1 + board[1]) * y, lift], -1)

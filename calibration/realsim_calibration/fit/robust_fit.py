@@ -9,7 +9,7 @@ numbers; each judged by predicting every view without it
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,8 +19,14 @@ from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim.records import ArmErrorMap, RobotErrorMap
 from realsim_calibration.fit.board_pose import refine_board_pose
-from realsim_calibration.fit.effective import PlainFit, Stretch, plain_fits, projection, stretch
-from realsim_calibration.fit.joint_solve import JointProblem, JointState, Setup, smooth_errors
+from realsim_calibration.fit.effective import PlainFit, plain_fits, projection, stretch
+from realsim_calibration.fit.joint_solve import (
+    JointProblem,
+    JointState,
+    Setup,
+    shaped_points,
+    smooth_errors,
+)
 from realsim_calibration.fit.linear_model import LinearFit, LinearModel
 from realsim_calibration.fit.noise_scale import (
     Whiteness,
@@ -39,6 +45,7 @@ from realsim_calibration.fit.robot_error import (
     pose_features,
 )
 from realsim_calibration.fit.view_system import SHARED
+from realsim_calibration.results import Stretch
 
 if TYPE_CHECKING:
     from realsim_calibration.screening import HandEyeConfig
@@ -62,14 +69,14 @@ freely."""
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class SolvedView:
-    """One used view's part; the fields are those of ViewReport."""
+    """One view's part, by default that of one not used; the fields are those of ViewReport."""
 
-    residuals: Array
-    seen_px: float
-    unseen_px: float
-    unseen_mm: float
-    unseen_deg: float
-    robot_error: Array
+    residuals: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    seen_px: float = float("nan")
+    unseen_px: float = float("nan")
+    unseen_mm: float = float("nan")
+    unseen_deg: float = float("nan")
+    robot_error: Array = field(default_factory=lambda: np.zeros(6))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -161,12 +168,12 @@ def solve(
     beyond = None
     if best.basis is not None and best.basis.kind != "arm":
         beyond = stretch(model, best.fit, best.basis, none.fit, pose_features(Ts)[0])
-    alone_here = here_covariance(model, none, independent=white.excess <= 0)
+    independent = white.excess <= 0
+    alone_here = here_covariance(model, none, independent=independent)
     state, sigma, roots = _final_fit(problem, state, best, roots)
     model = LinearModel(problem, state, roots)
     final = model.fit(best.basis, best.ratio, sigma)
     columns = hidden_errors(model, none, known, Ts, sigma)
-    independent = white.excess <= 0
     best = replace(best, fit=final)
     here = here_covariance(model, best, independent=independent)
     covariance = at_least(_covariance(model, final, best, columns, known, independent), here)
@@ -177,7 +184,7 @@ def solve(
         state=state,
         sigma_px=sigma,
         ratio=best.ratio,
-        covariance=shared(covariance),
+        covariance=covariance[:SHARED, :SHARED],
         information=final.information[:SHARED, :SHARED],
         here=state.X @ se3.exp(moved),
         here_covariance=here,
@@ -185,7 +192,7 @@ def solve(
         alone_here_covariance=alone_here,
         plain=tuple(plain),
         stretch=beyond,
-        alone_covariance=shared(at_least(alone_covariance, alone_here)),
+        alone_covariance=at_least(alone_covariance, alone_here)[:SHARED, :SHARED],
         robot_map=None if best.basis is None else map_record(best.basis, state.weights, Ts, arm),
         map_name=best.name,
         scores=tuple((c.name, c.fit.score) for c in choices),
@@ -306,7 +313,7 @@ def _covariance(
     known: ErrorBasis | None, independent: bool,
 ) -> Array:  # fmt: skip
     """Return the covariance of all parameters of a fit."""
-    covariance = noise_covariance(fit, independent=independent)
+    covariance = _noise(fit, np.eye(len(fit.step)), independent)
     if known is not None and choice.basis is known:
         return covariance  # the arm's errors are parameters of the fit
     return with_arm(covariance, model.influence(fit, choice.ratio, columns))
@@ -342,7 +349,9 @@ def _views(
     expected = problem.poses(without, smooth)
     seen = np.empty_like(expected)
     for n, view in enumerate(views):
-        points = problem.shaped_points(without.board[n], view.xy)
+        points = shaped_points(
+            without.board[n], view.xy, problem.setup.middle, problem.setup.half_extent
+        )
         seen[n] = refine_board_pose(expected[n], points, view.uv, without.camera[n])[0]
     middle = problem.setup.middle[None]
     apart = (se3.transform(seen, middle) - se3.transform(expected, middle))[:, 0]
@@ -376,11 +385,6 @@ def _views(
 # poses looks exactly like another place of the camera. They are considered (Schmidt): errors
 # e_i = B_i w, w ~ N(0, I), move the estimate by M w, M = d theta / d w, and add M M^T. B is the
 # arm's own basis where joints are known, its scales estimated from the views; else a generic one.
-
-
-def noise_covariance(fit: LinearFit, *, independent: bool) -> Array:
-    """Return the covariance (29 + p, ...) from noise, jackknifed unless corners are independent."""
-    return _noise(fit, np.eye(len(fit.step)), independent)
 
 
 def here_covariance(model: LinearModel, choice: Choice, *, independent: bool) -> Array:
@@ -424,8 +428,3 @@ def with_arm(covariance: Array, influence: Array) -> Array:
         influence: (29 + p, q) d theta / d w of errors with unit variance.
     """
     return covariance + influence @ influence.T
-
-
-def shared(covariance: Array) -> Array:
-    """Return the block (29, 29) of the shared parameters."""
-    return covariance[:SHARED, :SHARED]

@@ -2,9 +2,9 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +14,7 @@ from realsim.errors import DegenerateError, InputError, RealsimError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Target
 from realsim_calibration.fit.board_pose import planar_poses
+from realsim_calibration.hand_eye import calibrate_hand_eye_report
 from realsim_calibration.planning.next_view import NextView, predicted_boards, rank_next_views
 from realsim_calibration.planning.view_proposals import (
     Need,
@@ -29,23 +30,8 @@ from realsim_calibration.views import BoardView
 State = Literal["collecting", "improving", "done", "bad"]
 
 
-class Solve(Protocol):
-    """A hand-eye calibration."""
-
-    def __call__(
-        self, views: Sequence[BoardView], target: Target, intrinsics0: CameraIntrinsics, config: Any
-    ) -> HandEyeReport:
-        """Return the calibration of the views."""
-        ...
-
-
-def _default_solve(
-    views: Sequence[BoardView], target: Target, intrinsics0: CameraIntrinsics, config: Any
-) -> HandEyeReport:
-    from realsim_calibration import hand_eye
-
-    solve: Any = hand_eye.calibrate_hand_eye_report
-    return solve(views, target, intrinsics0, config)
+Solve = Callable[[Sequence[BoardView], Target, CameraIntrinsics, Any], HandEyeReport]
+"""A hand-eye calibration."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -138,7 +124,7 @@ class LiveCalibration:
         self.config = config or LiveConfig()
         self._plan = None if plan is None else se3.check_rigid(plan, "planned T_base_ee")
         self._calibration = calibration
-        self._solve: Solve = solve or _default_solve
+        self._solve: Solve = solve or calibrate_hand_eye_report
         self._views: list[BoardView] = []
         self._seen: list[SeenBoard] = []
         self._held_out: list[float] = []
@@ -352,8 +338,6 @@ def watch_folder(
     Raises:
         InputError: the folder does not exist.
     """
-    from dataclasses import replace
-
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; make it, or check the path.")

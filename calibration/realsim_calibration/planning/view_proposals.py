@@ -10,6 +10,7 @@ from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Target
+from realsim_calibration.faults.motion_check import range_deg
 from realsim_calibration.planning.next_view import BoardGeometry, board_geometry, target_middle
 from realsim_calibration.results import HandEyeReport
 from realsim_calibration.views import BoardView
@@ -200,15 +201,6 @@ class SeenBoard:
     """(4, 4) [m]."""
 
 
-def roll_range_deg(rolls_deg: Sequence[float]) -> float:
-    """Return the shortest arc that holds all rolls [deg]: a full turn less the largest gap."""
-    if len(rolls_deg) < 2:
-        return 0.0
-    ordered = np.sort(np.mod(rolls_deg, 360.0))
-    gaps = np.diff(np.append(ordered, ordered[0] + 360.0))
-    return float(360.0 - gaps.max())
-
-
 def second_turn_deg(Ts_base_ee: Array) -> float:
     """Return the RMS turn of the hand about the second axis of all its relative turns [deg].
 
@@ -231,7 +223,7 @@ def missing(
         return (Need(about="target", sentence="show the target to the camera"),)
     places = [board_geometry(s.T_cam_board, target) for s in seen]
     needs: list[Need] = []
-    roll = roll_range_deg([p.roll_deg for p in places])
+    roll = range_deg([p.roll_deg for p in places])
     if roll < ROLL_DEG:
         told = f"{ROLL_DEG:.0f} deg about the optical axis (so far {roll:.0f})"
         needs.append(Need(about="roll", sentence=f"roll the hand by {told}"))
