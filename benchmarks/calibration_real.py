@@ -30,12 +30,9 @@ from realsim_calibration import (
     calibrate_from_poses,
     find_target,
 )
-from realsim_calibration.inputs import (
-    load_image,
-    read_board_poses,
-    read_image_folder,
-    reading_from_text,
-)
+from realsim_calibration.inputs.folder import read_board_poses, read_image_folder
+from realsim_calibration.inputs.image_files import load_image
+from realsim_calibration.inputs.readings import reading_from_text
 from realsim_calibration.results import BoardShape
 from realsim_calibration.targets.target_text import parse_target
 

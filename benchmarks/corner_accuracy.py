@@ -18,7 +18,7 @@ from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim_calibration.detect.find import find_target
-from realsim_calibration.sheets import target_image
+from realsim_calibration.sheets.artwork import target_image
 from realsim_calibration.targets.marker_sets import load_dictionary, tag_dictionary
 
 SUPER = 8

@@ -191,7 +191,7 @@ def read_camera_files(folder: Path) -> Any:
     """Read all of them; a file that is refused does not keep the next one from being read."""
     from realsim.app.importing.folder import camera_of_file
     from realsim.errors import InputError
-    from realsim_calibration.inputs import read_pose_file
+    from realsim_calibration.inputs.pose_file import read_pose_file
 
     found: list[Any] = []
     refused: list[InputError] = []

@@ -23,7 +23,7 @@ from realsim.store.atomic import write_json
 from realsim.store.cameras import camera_folder
 from realsim_calibration.cameras.files import read_cameras
 from realsim_calibration.exports.calibration_file import read_calibration
-from realsim_calibration.inputs import load_image
+from realsim_calibration.inputs.image_files import load_image
 from realsim_calibration.targets.target_file import target_to_json
 from typed_commands import invoked, refused
 
@@ -237,7 +237,7 @@ def test_a_board_that_is_said_to_be_elsewhere_is_named(
 
 def test_images_without_partners_are_left_out(photos: Path, tmp_path: Path) -> None:
     from realsim.app.calibrate.camera_frames import cameras_of, frames_of
-    from realsim_calibration.inputs import read_pose_file
+    from realsim_calibration.inputs.pose_file import read_pose_file
 
     folder = shutil.copytree(photos, tmp_path / "lab")
     (folder / "left/004.png").unlink()

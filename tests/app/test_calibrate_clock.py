@@ -15,8 +15,8 @@ from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics, Chessboard
 from realsim_calibration import BoardView, detection_of, solve_pose_pairs
-from realsim_calibration.exports import read_calibration
-from realsim_calibration.inputs import read_pose_file
+from realsim_calibration.exports.calibration_file import read_calibration
+from realsim_calibration.inputs.pose_file import read_pose_file
 from realsim_calibration.results import Clock
 from typed_commands import invoked
 

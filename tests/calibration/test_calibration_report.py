@@ -21,15 +21,18 @@ from realsim.geometry import camera, se3
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check, HandEye
 from realsim.records.depth_bias import DepthBias
 from realsim_calibration.lens.intrinsics import calibrate_intrinsics
-from realsim_calibration.report import check_rows, style, summary_rows, verdict
+from realsim_calibration.report import style
 from realsim_calibration.report.model_plots import lens_field
 from realsim_calibration.report.page import PAGE_NAME, write_calibration_report
 from realsim_calibration.report.scene_3d import frustum
 from realsim_calibration.report.summary import (
     camera_in_board,
+    check_rows,
     corrected,
     pose_rows,
     rest_of_map,
+    summary_rows,
+    verdict,
     viewpoint,
 )
 from realsim_calibration.report.view_plots import plot_views

@@ -24,16 +24,10 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
-from realsim_calibration.exports import (
-    FrameNames,
-    calibration_text,
-    note_lines,
-    opencv_text,
-    published_transform,
-    read_calibration,
-    ros,
-    write_exports,
-)
+from realsim_calibration.exports import ros
+from realsim_calibration.exports.calibration_file import calibration_text, read_calibration
+from realsim_calibration.exports.frames import FrameNames, note_lines, published_transform
+from realsim_calibration.exports.write import opencv_text, write_exports
 from realsim_calibration.results import HandEyeReport, Mode
 from refusals import refused
 

@@ -23,14 +23,13 @@ from realsim_calibration import (
     calibrate_hand_eye_report,
 )
 from realsim_calibration.checks import hand_eye_checks
-from realsim_calibration.exports import (
-    FrameNames,
+from realsim_calibration.exports.calibration_file import (
     calibration_text,
-    note_lines,
     read_calibration,
     write_calibration,
-    write_exports,
 )
+from realsim_calibration.exports.frames import FrameNames, note_lines
+from realsim_calibration.exports.write import write_exports
 from realsim_calibration.fit.closed_forms import CLOSED_FORMS
 from realsim_calibration.fit.effective import places_of
 from realsim_calibration.fit.linear_model import LinearModel

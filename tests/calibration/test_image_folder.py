@@ -11,14 +11,10 @@ from PIL import Image
 from pose_layouts import LAYOUTS, PAIRS, folder_a_pose, layouts_read, save_images, tiny
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_calibration.inputs import (
-    list_images,
-    load_image,
-    pair,
-    read_board_poses,
-    read_image_folder,
-    reading_from_text,
-)
+from realsim_calibration.inputs.folder import read_board_poses, read_image_folder
+from realsim_calibration.inputs.image_files import list_images, load_image
+from realsim_calibration.inputs.pairing import pair
+from realsim_calibration.inputs.readings import reading_from_text
 from refusals import refused
 
 READING = reading_from_text("quat_xyzw,m")

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from pose_rows import all_readings, folder, random_poses
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_calibration.inputs import ROTATIONS, read_pose_file, reading_from_text
+from realsim_calibration.inputs.pose_file import read_pose_file
+from realsim_calibration.inputs.readings import ROTATIONS, reading_from_text
 from refusals import refused
 
 READINGS = list(all_readings())

@@ -4,7 +4,7 @@ from scipy.spatial.transform import Rotation
 
 from pose_rows import all_readings, random_poses
 from realsim.errors import InputError, NotRigidError, UnitError
-from realsim_calibration.inputs import EULER_ORDERS, PoseReading, reading_from_text
+from realsim_calibration.inputs.readings import EULER_ORDERS, PoseReading, reading_from_text
 from refusals import refused
 
 # --- readings -----------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.records import CharucoBoard
-from realsim_calibration.sheets import largest_fit, make_board, paper_size, write_sheet
+from realsim_calibration.sheets.write import largest_fit, make_board, paper_size, write_sheet
 from realsim_calibration.targets.target_text import parse_target
 from refusals import refused
 

@@ -9,14 +9,8 @@ from cv2 import aruco
 
 from realsim.arrays import Array, UInt8
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
-from realsim_calibration.sheets import (
-    PAPERS_MM,
-    SheetReport,
-    artwork_of,
-    dot_diameters_m,
-    target_image,
-    write_sheet,
-)
+from realsim_calibration.sheets.artwork import artwork_of, dot_diameters_m, target_image
+from realsim_calibration.sheets.write import PAPERS_MM, SheetReport, write_sheet
 from realsim_calibration.targets.target_file import read_target, target_to_json
 from realsim_calibration.targets.target_text import parse_target
 

@@ -7,7 +7,7 @@ import numpy as np
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid, TagBoard
-from realsim_calibration.sheets import target_image
+from realsim_calibration.sheets.artwork import target_image
 
 CAMERA = CameraIntrinsics(width=640, height=480, fx=600.0, fy=600.0, cx=319.5, cy=239.5)
 PER_M, MARGIN, SUPER = 8000.0, 240, 6  # page pixels per metre and about the target, rays a pixel

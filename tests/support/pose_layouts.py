@@ -14,7 +14,7 @@ from PIL import Image
 
 from realsim.arrays import Array, UInt8
 from realsim.geometry import se3
-from realsim_calibration.inputs import reading_from_text
+from realsim_calibration.inputs.readings import reading_from_text
 
 Written = tuple[Path, Path, str]
 QUATERNION = reading_from_text("quat_xyzw,m")
@@ -294,7 +294,7 @@ PAIRS: dict[str, Callable[[Path, Array, Array], tuple[Path | None, Path]]] = {
 def layouts_read(place: Path, n: int = 7, seed: int = 3) -> dict[str, str]:
     """Write every layout and read it back; return what is wrong with each, "" where nothing is."""
     from realsim.errors import RealsimError
-    from realsim_calibration.inputs import read_board_poses, read_image_folder
+    from realsim_calibration.inputs.folder import read_board_poses, read_image_folder
 
     rng = np.random.default_rng(seed)
     Ts, Cs = (se3.random_transform(rng, n, spread=0.5) for _ in range(2))

@@ -11,7 +11,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.geometry import se3
-from realsim_calibration.inputs import ROTATIONS, PoseReading
+from realsim_calibration.inputs.readings import ROTATIONS, PoseReading
 
 
 @contextmanager

@@ -32,7 +32,7 @@ def board_command(console: Console, what: str, out: Path, paper: str, **options:
       circles:9x9,pitch=18mm,large-origin
       tag:7,size=80mm                           one AprilTag
     """  # noqa: D301 - click's own mark for lines that stay as they are
-    from realsim_calibration.sheets import make_board
+    from realsim_calibration.sheets.write import make_board
 
     files = make_board(what, out, paper, **options)
     console.say(*map(str, files))

@@ -151,7 +151,8 @@ def write_results(
     report: HandEyeReport, seen: Sequence[BoardView], store: SessionFiles, views_store: SessionStore
 ) -> None:
     """Write report, pictures, depth bias and the files for other tools into the session."""
-    from realsim_calibration.exports import FrameNames, write_exports
+    from realsim_calibration.exports.frames import FrameNames
+    from realsim_calibration.exports.write import write_exports
     from realsim_calibration.report.page import PAGE_NAME, write_calibration_report
 
     folder = store.folder / RESULTS

@@ -9,8 +9,9 @@ from realsim.app.calibrate.folder import target_of
 from realsim.errors import InputError
 from realsim_calibration.cameras.faults import require_distinct
 from realsim_calibration.cameras.rig import Mount, Place, RigBoard, RigCamera
-from realsim_calibration.inputs import RawPoses, list_images
+from realsim_calibration.inputs.image_files import list_images
 from realsim_calibration.inputs.pairing import pair, running_numbers
+from realsim_calibration.inputs.raw_poses import RawPoses
 
 POSE_SUFFIXES = {".csv", ".txt", ".json", ".yaml", ".yml", ".npy", ".npz", ".tum"}
 USAGE = (

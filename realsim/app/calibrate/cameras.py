@@ -45,13 +45,10 @@ from realsim_calibration.cameras.files import document, write_cameras
 from realsim_calibration.cameras.results import CamerasReport
 from realsim_calibration.cameras.rig import Instant, Rig, RigBoard, RigCamera, Sighting
 from realsim_calibration.faults.diagnosis import ReadingProof
-from realsim_calibration.inputs import (
-    PoseReading,
-    RawPoses,
-    list_images,
-    read_pose_file,
-    reading_from_text,
-)
+from realsim_calibration.inputs.image_files import list_images
+from realsim_calibration.inputs.pose_file import read_pose_file
+from realsim_calibration.inputs.raw_poses import RawPoses
+from realsim_calibration.inputs.readings import PoseReading, reading_from_text
 
 CAMERAS_FILE = "cameras.json"
 PROOF_VIEWS = 40
@@ -300,7 +297,8 @@ def _calibrated(rig: Rig, arm: str, console: Console) -> CamerasReport:
 
 def write_files(report: CamerasReport, out: Path) -> list[Path]:
     """Write all files, and last the page, which tells that all are there; return it first."""
-    from realsim_calibration.exports import FrameNames, write_exports
+    from realsim_calibration.exports.frames import FrameNames
+    from realsim_calibration.exports.write import write_exports
 
     (out / page.PAGE).unlink(missing_ok=True)
     files = [out / page.PAGE, write_cameras(report, out / CAMERAS_FILE)]

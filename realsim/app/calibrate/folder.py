@@ -47,7 +47,9 @@ from realsim_calibration.inputs.layouts import MADE_OF
 from realsim_calibration.results import Clock
 
 if TYPE_CHECKING:
-    from realsim_calibration.inputs import FolderInput, PoseReading, RawPoses
+    from realsim_calibration.inputs.folder import FolderInput
+    from realsim_calibration.inputs.raw_poses import RawPoses
+    from realsim_calibration.inputs.readings import PoseReading
 
 MIN_POSE_POINTS = 6
 """Fewest points of a board pose that may speak for a reading."""
@@ -148,7 +150,8 @@ def read_views(request: FolderRequest, console: Console) -> FolderViews:
     Raises:
         InputError: something cannot be read, paired or proven; says what to give.
     """
-    from realsim_calibration.inputs import read_image_folder, reading_from_text
+    from realsim_calibration.inputs.folder import read_image_folder
+    from realsim_calibration.inputs.readings import reading_from_text
 
     target = target_of(request.board)
     reading = reading_from_text(request.reading) if request.reading else None
@@ -243,7 +246,7 @@ def _proven(
     Raises:
         InputError: none fits, or several do.
     """
-    from realsim_calibration.inputs import reading_from_text
+    from realsim_calibration.inputs.readings import reading_from_text
 
     if not len(boards):
         raise InputError(
@@ -309,7 +312,8 @@ def _from_pose_files(
     request: FolderRequest, config: CalibrationConfig, console: Console
 ) -> tuple[Calibration, list[Path]]:
     """Return the calibration of robot poses and board poses without images."""
-    from realsim_calibration.inputs import read_board_poses, reading_from_text
+    from realsim_calibration.inputs.folder import read_board_poses
+    from realsim_calibration.inputs.readings import reading_from_text
 
     assert request.board_poses is not None
     stamped = _from_logs(request, console)
@@ -338,7 +342,8 @@ def _from_logs(
 ) -> tuple[Array, Array, Array | None, list[str], Clock | None] | None:
     """Return the pairs of two logs with time stamps, None where they are paired otherwise."""
     from realsim.app.calibrate.clock import pair_pose_logs
-    from realsim_calibration.inputs import read_pose_file, reading_from_text
+    from realsim_calibration.inputs.pose_file import read_pose_file
+    from realsim_calibration.inputs.readings import reading_from_text
 
     assert request.board_poses is not None
     if request.clock == "off" or request.poses is None:
@@ -379,8 +384,9 @@ def write_calibration(
     result: Calibration, request: FolderRequest, images: Sequence[Path], console: Console
 ) -> list[Path]:
     """Write all files, and last the page, which tells that all are there; return it first."""
-    from realsim_calibration.exports import FrameNames, write_exports
-    from realsim_calibration.inputs import load_image
+    from realsim_calibration.exports.frames import FrameNames
+    from realsim_calibration.exports.write import write_exports
+    from realsim_calibration.inputs.image_files import load_image
     from realsim_calibration.report.page import PAGE_NAME, write_calibration_report
 
     out = request.out

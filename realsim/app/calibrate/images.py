@@ -19,7 +19,7 @@ from realsim.untrusted.own_json import read_own, to_json
 from realsim_calibration import TargetDetection, find_target
 
 if TYPE_CHECKING:
-    from realsim_calibration.inputs import FolderInput
+    from realsim_calibration.inputs.folder import FolderInput
 
 SEARCH = "4"
 """Goes up when a search finds or says something else: notes of an earlier search are void."""
@@ -62,7 +62,7 @@ def _found_once(
     path: Path, target: Target, what: bytes, out: Path
 ) -> tuple[Path, TargetDetection, bool]:
     """Return the points in one image, from its note or by a search; the note, whether it is new."""
-    from realsim_calibration.inputs import load_image
+    from realsim_calibration.inputs.image_files import load_image
 
     note = out / "detections" / f"{hashlib.sha256(path.read_bytes() + what).hexdigest()[:24]}.json"
     seen = _noted(note)
@@ -78,7 +78,7 @@ def warn_of_pictures(
     from realsim_calibration.detect.blur import BLURRED
     from realsim_calibration.detect.drawings import COVERED, DRAWN
     from realsim_calibration.detect.visible import what_is_visible
-    from realsim_calibration.inputs import load_image
+    from realsim_calibration.inputs.image_files import load_image
 
     drawn = [
         k
@@ -176,7 +176,7 @@ def why_not_found(path: Path, name: str) -> str:
     from realsim_calibration.detect.drawings import drawing_reason
     from realsim_calibration.detect.images import gray_image
     from realsim_calibration.detect.visible import dark_reason, what_is_visible
-    from realsim_calibration.inputs import load_image
+    from realsim_calibration.inputs.image_files import load_image
 
     image = load_image(path)
     spoiled = dark_reason(image) or drawing_reason(image, np.zeros((0, 2)))

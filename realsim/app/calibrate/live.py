@@ -25,7 +25,9 @@ def run_live(request: FolderRequest, console: Console) -> bool:
     """
     from dataclasses import replace
 
-    from realsim_calibration.inputs import load_image, read_pose_file, reading_from_text
+    from realsim_calibration.inputs.image_files import load_image
+    from realsim_calibration.inputs.pose_file import read_pose_file
+    from realsim_calibration.inputs.readings import reading_from_text
     from realsim_calibration.lens.camera_files import read_camera
     from realsim_calibration.planning.live_calibration import watch_folder
 

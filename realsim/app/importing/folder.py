@@ -258,7 +258,9 @@ def _poses(
     Raises:
         InputError: they were given and cannot be read, or how to read them is not clear.
     """
-    from realsim_calibration.inputs import listed_readings, read_pose_file, reading_from_text
+    from realsim_calibration.inputs.pose_file import read_pose_file
+    from realsim_calibration.inputs.raw_poses import listed_readings
+    from realsim_calibration.inputs.readings import reading_from_text
 
     if request.poses is None and (request.no_poses or has_states):
         return [], []
