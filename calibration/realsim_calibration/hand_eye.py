@@ -89,15 +89,7 @@ def _report(
 ) -> HandEyeReport:  # fmt: skip
     """Return everything that is known of the calibration."""
     state, problem = solution.state, solution.problem
-    sides = np.ptp(target.points_board, axis=0) / 2
-    shape = BoardShape(
-        scale=float(state.board[0]),
-        aspect=float(state.board[1]),
-        warp=state.board[2:],
-        sd=np.where(problem.free[12:], np.sqrt(np.diag(solution.covariance)[24:SHARED]), 0.0),
-        half_extent_m=problem.setup.half_extent,
-        half_sides_m=(float(sides[0]), float(sides[1])),
-    )
+    shape_sd = np.where(problem.free[12:], np.sqrt(np.diag(solution.covariance)[24:SHARED]), 0.0)
     lens = solution.covariance[12:24, 12:24].copy()
     held = ~problem.free[:12]
     lens[held], lens[:, held] = 0.0, 0.0
@@ -121,7 +113,7 @@ def _report(
         stretch=solution.stretch,
         intrinsics=camera_record(state.camera, size),
         intrinsics_covariance=lens,
-        board=shape,
+        board=BoardShape.fitted(target, state.board, shape_sd),
         robot_map=solution.robot_map,
         map_name=solution.map_name,
         map_scores=solution.scores,

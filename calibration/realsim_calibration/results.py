@@ -45,6 +45,15 @@ class BoardShape:
     half_sides_m: tuple[float, float] | None = None
     """Half the extent of the points along x and y; the larger one is L. None: both are L."""
 
+    @classmethod
+    def fitted(cls, target: Target, terms: Array, sd: Array) -> "BoardShape":
+        """Return the shape of a print by fitted terms (5,), scale, aspect and warps, and sigmas."""
+        x, y, _ = (float(side) / 2 for side in np.ptp(target.points_board, axis=0))
+        return cls(
+            scale=float(terms[0]), aspect=float(terms[1]), warp=terms[2:], sd=sd,
+            half_extent_m=max(x, y), half_sides_m=(x, y),
+        )  # fmt: skip
+
     @property
     def warp_mm(self) -> float:
         """Largest lift of the target's points from their flat drawing [mm]."""

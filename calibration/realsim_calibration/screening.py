@@ -33,7 +33,7 @@ from realsim_calibration.fit.closed_forms import CLOSED_FORMS, MIN_VIEWS, check_
 from realsim_calibration.fit.joint_solve import JointConfig
 from realsim_calibration.fit.noise_scale import NoiseConfig
 from realsim_calibration.results import Mode
-from realsim_calibration.views import BoardView
+from realsim_calibration.views import BoardView, TargetDetection
 
 TWIN_FLOOR_PX = 0.1
 """Poses that fit the corners to a tenth of a pixel are equally good."""
@@ -207,7 +207,6 @@ def _candidates(
     candidates: list[Candidate] = []
     rejected: dict[int, str] = {}
     size = (intrinsics.width, intrinsics.height)
-    least = min(config.min_points, len(target.points_board))
     for view in ordered:
         found = view.detection
         if len(found) and tuple(found.image_size) != size:
@@ -216,15 +215,11 @@ def _candidates(
                 f"{found.image_size[1]} px, the camera's are {size[0]}x{size[1]}. Images of one "
                 "size are needed: leave this view out, and do not rescale images."
             )
-        if len(found) < least:
-            why = f"shows {len(found)} points of the target; at least {least} are needed"
-            rejected[view.index] = "; ".join([why, *found.rejected[:2]]) + "."
+        pose = board_pose(found, target, intrinsics, config)
+        if isinstance(pose, str):
+            rejected[view.index] = pose
             continue
         points = found.points(target)
-        pose = estimate_board_pose(points, found.uv, intrinsics)
-        if pose is None:
-            rejected[view.index] = "no pose in front of the camera fits its points."
-            continue
         A = view.T_base_ee if config.mode == "eye_in_hand" else se3.invert(view.T_base_ee)
         candidates.append(Candidate(view=view, points=points, uv=found.uv, pose=pose, A=A))
     if len(candidates) < MIN_VIEWS:
@@ -234,6 +229,18 @@ def _candidates(
             + " ".join(f"View {i} {why}" for i, why in list(rejected.items())[:3])
         )
     return candidates, rejected
+
+
+def board_pose(
+    found: TargetDetection, target: Target, intrinsics: CameraIntrinsics, config: HandEyeConfig
+) -> BoardPose | str:
+    """Return the board's pose in a view, or why it has none."""
+    least = min(config.min_points, len(target.points_board))
+    if len(found) < least:
+        why = f"shows {len(found)} points of the target; at least {least} are needed"
+        return "; ".join([why, *found.rejected[:2]]) + "."
+    pose = estimate_board_pose(found.points(target), found.uv, intrinsics)
+    return pose or "no pose in front of the camera fits its points."
 
 
 def stacks(candidates: list[Candidate]) -> tuple[Array, Array]:

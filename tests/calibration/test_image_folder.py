@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from pose_layouts import LAYOUTS, PAIRS, folder_a_pose, layouts_read, save_images, tiny
+from pose_rows import rows_of
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_calibration.inputs.folder import read_board_poses, read_image_folder
@@ -37,7 +38,7 @@ def make_images(folder, names):
 
 
 def rows(n, seed=0):
-    return READING.numbers(se3.random_transform(np.random.default_rng(seed), n, spread=0.5))
+    return rows_of(READING, se3.random_transform(np.random.default_rng(seed), n, spread=0.5))
 
 
 def write_rows(path, raw, names=None):

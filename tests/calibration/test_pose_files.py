@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pose_rows import all_readings, folder, random_poses
+from pose_rows import all_readings, folder, random_poses, rows_of
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_calibration.inputs.pose_file import read_pose_file
@@ -124,7 +124,7 @@ def same_matrix(p, reading):
 )
 def test_every_reading_survives_every_layout(layout, seed, n, reading, wide):
     T = random_poses(seed, n)
-    raw = reading.numbers(T, width=reading.widths[0 if wide else -1])
+    raw = rows_of(reading, T, width=reading.widths[0 if wide else -1])
     names = [f"img_{k}.png" for k in range(n)]
     with folder() as place:
         found = read_pose_file(LAYOUTS[layout](place, raw, names))
@@ -152,7 +152,7 @@ def test_every_reading_survives_every_layout(layout, seed, n, reading, wide):
 def test_header_names_say_what_columns_are(header, text):
     reading = reading_from_text(f"{text},mm")
     T = random_poses(5, 9)
-    raw = reading.numbers(T, width=12 if text == "matrix" else None)
+    raw = rows_of(reading, T, width=12 if text == "matrix" else 16)
     separator = next(s for s in ";, " if s in header)
     with folder() as place:
         for k, start in enumerate(("", "# ")):
@@ -169,7 +169,7 @@ def test_units_in_names_extra_columns_and_joints():
     T = random_poses(6, 8)
     reading = reading_from_text("euler_xyz,deg,mm")
     joints = np.random.default_rng(0).uniform(-170, 170, (8, 6))
-    table = np.hstack([joints, reading.numbers(T), np.full((8, 1), 7.0)])
+    table = np.hstack([joints, rows_of(reading, T), np.full((8, 1), 7.0)])
     head = ",".join(["image", *(f"q{k} [deg]" for k in range(6))])
     head += ",x (mm),y (mm),z (mm),roll_deg,pitch_deg,yaw_deg,force"
     names = [f"{k}.png" for k in range(8)]
@@ -191,7 +191,7 @@ def test_units_in_names_extra_columns_and_joints():
 
 def test_degrees_under_names_that_state_radians_are_noted():
     T = random_poses(6, 8)
-    numbers = reading_from_text("rotvec,deg,m").numbers(T)
+    numbers = rows_of(reading_from_text("rotvec,deg,m"), T)
     with folder() as place:
         head = "x_m,y_m,z_m,rx_rad,ry_rad,rz_rad"
         found = read_pose_file(write_lines(place / "a.csv", numbers, ",", head=head))
@@ -203,10 +203,10 @@ def test_time_and_index_columns_are_told_from_the_pose():
     reading = reading_from_text("quat_xyzw,m")
     times = 1305031102.17 + np.cumsum(np.full(6, 0.03))
     with folder() as place:
-        tum = write_lines(place / "a.txt", np.column_stack([times, reading.numbers(T)]), " ")
+        tum = write_lines(place / "a.txt", np.column_stack([times, rows_of(reading, T)]), " ")
         check(read_pose_file(tum), reading, T)
         vector = reading_from_text("rotvec,m")
-        rows = np.column_stack([np.arange(3, 9), vector.numbers(T)])
+        rows = np.column_stack([np.arange(3, 9), rows_of(vector, T)])
         counted = read_pose_file(write_lines(place / "b.txt", rows, " "))
     check(counted, vector, T)
     assert counted.stems == tuple("345678")
@@ -228,7 +228,7 @@ def test_time_stamps_from_1970_and_from_the_machines_start(start, stops, unit):
 
 
 def test_text_of_spreadsheets_and_windows():
-    raw = reading_from_text("rotvec,m").numbers(random_poses(12, 4))
+    raw = rows_of(reading_from_text("rotvec,m"), random_poses(12, 4))
     text = "\r\n".join(" ".join(map(number, r)) for r in raw)
     with folder() as place:
         for k, data in enumerate(
@@ -240,7 +240,7 @@ def test_text_of_spreadsheets_and_windows():
 
 def test_ros_poses_and_parts():
     T = random_poses(8, 5)
-    q = reading_from_text("quat_xyzw,m").numbers(T)
+    q = rows_of(reading_from_text("quat_xyzw,m"), T)
 
     def ros(row):
         position = dict(zip("xyz", row[:3].tolist(), strict=True))
@@ -262,7 +262,7 @@ def test_ros_poses_and_parts():
         check(found, found.stated, T)
         tree = [
             {"rvec": r[3:].tolist(), "tvec_mm": r[:3].tolist()}
-            for r in reading_from_text("rotvec,mm").numbers(T)
+            for r in rows_of(reading_from_text("rotvec,mm"), T)
         ]
         found = read_pose_file(as_json(place / "c.json", tree))
         assert str(found.stated) == "rotvec,rad,mm"
@@ -292,7 +292,7 @@ def test_numbers_leave_open_what_they_do_not_say():
     T = random_poses(10, 12)
     with folder() as place:
         six = read_pose_file(
-            write_lines(place / "a.txt", reading_from_text("euler_ZYX,deg,mm").numbers(T), " ")
+            write_lines(place / "a.txt", rows_of(reading_from_text("euler_ZYX,deg,mm"), T), " ")
         )
         assert {p.angle_unit for p in six.possible if p.position_first} == {"deg"}
         assert {p.length_unit for p in six.possible if p.position_first} == {"mm"}
@@ -303,7 +303,7 @@ def test_numbers_leave_open_what_they_do_not_say():
         near = T.copy()
         near[:, :3, 3] = 10.0 / 1000 * se3.random_rotation(np.random.default_rng(0), 12)[:, 0]
         open_unit = read_pose_file(
-            write_lines(place / "b.txt", reading_from_text("quat_wxyz,mm").numbers(near), " ")
+            write_lines(place / "b.txt", rows_of(reading_from_text("quat_wxyz,mm"), near), " ")
         )
         assert {p.length_unit for p in open_unit.possible} == {"m", "mm"}
         assert {p.rotation for p in open_unit.possible if p.position_first} == {

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from pose_rows import rows_of
 from realsim.arrays import Array, UInt8
 from realsim.geometry import se3
 from realsim_calibration.inputs.readings import reading_from_text
@@ -38,13 +39,13 @@ def save_images(folder: Path, shots: list[UInt8], pattern: str = "{:02d}.png") -
 
 def quaternion(T: Array) -> dict[str, float]:
     """Return one pose by names."""
-    row = QUATERNION.numbers(T[None])[0].tolist()
+    row = rows_of(QUATERNION, T[None])[0].tolist()
     return dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), row, strict=True))
 
 
 def ros(T: Array) -> dict[str, dict[str, float]]:
     """Return one pose as a geometry_msgs/Pose."""
-    row = QUATERNION.numbers(T[None])[0].tolist()
+    row = rows_of(QUATERNION, T[None])[0].tolist()
     return {
         "position": dict(zip("xyz", row[:3], strict=True)),
         "orientation": dict(zip("xyzw", row[3:], strict=True)),
@@ -68,19 +69,19 @@ def _lines(path: Path, rows: Array, head: str = "", names: list[str] | None = No
 def text_by_number(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
     """Line i of a txt belongs to image i."""
     save_images(d, shots, "0-{}.jpg")
-    return d, _lines(d / "poses.txt", ROTVEC.numbers(Ts)), "rotvec,m"
+    return d, _lines(d / "poses.txt", rows_of(ROTVEC, Ts)), "rotvec,m"
 
 
 def text_by_name(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
     """Every line begins with the image's name."""
     names = save_images(d, shots)
-    return d, _lines(d / "poses.txt", ROTVEC.numbers(Ts), names=names), "rotvec,m"
+    return d, _lines(d / "poses.txt", rows_of(ROTVEC, Ts), names=names), "rotvec,m"
 
 
 def csv_with_names(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
     """A csv with a header, units in it, millimetres and degrees."""
     names = save_images(d, shots)
-    rows = reading_from_text("euler_xyz,deg,mm").numbers(Ts)
+    rows = rows_of(reading_from_text("euler_xyz,deg,mm"), Ts)
     text = ["image,x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg"]
     text += [",".join([n, *map(repr, r.tolist())]) for n, r in zip(names, rows, strict=True)]
     (d / "poses.csv").write_text("\n".join(text))
@@ -121,7 +122,7 @@ def json_frames(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
 def json_beside(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
     """A json beside every image, with joints, as ur_rtde scripts write it."""
     save_images(d, shots, "{}.jpg")
-    for k, row in enumerate(ROTVEC.numbers(Ts)):
+    for k, row in enumerate(rows_of(ROTVEC, Ts)):
         joints = np.linspace(-1, 1, 6).tolist()
         (d / f"{k}.json").write_text(json.dumps({"joints": joints, "pose_flange": row.tolist()}))
     return d, d, "rotvec,m"
@@ -130,7 +131,7 @@ def json_beside(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
 def text_beside(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
     """A txt beside every image."""
     save_images(d, shots)
-    for k, row in enumerate(ROTVEC.numbers(Ts)):
+    for k, row in enumerate(rows_of(ROTVEC, Ts)):
         _lines(d / f"{k:02d}.txt", row[None])
     return d, d, "rotvec,m"
 
@@ -163,7 +164,7 @@ def opencv_storage(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
 
     save_images(d, shots)
     store = cv2.FileStorage(str(d / "poses.yml"), cv2.FileStorage_WRITE)
-    store.write("poses", np.ascontiguousarray(QUATERNION.numbers(Ts)))
+    store.write("poses", np.ascontiguousarray(rows_of(QUATERNION, Ts)))
     store.release()
     return d, d, "quat_xyzw,m"
 
@@ -171,7 +172,7 @@ def opencv_storage(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
 def visp_beside(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
     """pose_fPe_1.yaml beside image-1.png, the board's pose_cPo_1.yaml and camera.xml there, too."""
     save_images(d, shots, "image-{}.png")
-    for k, row in enumerate(ROTVEC.numbers(Ts)):
+    for k, row in enumerate(rows_of(ROTVEC, Ts)):
         (d / f"pose_fPe_{k}.yaml").write_text(visp(row.tolist()))
         (d / f"pose_cPo_{k}.yaml").write_text(visp([0.1, 0.0, 0.5, 0.0, 0.1, 0.0]))
     return d, d, ""
@@ -264,7 +265,7 @@ def pairs_csv(d: Path, Ts: Array, Cs: Array) -> tuple[Path | None, Path]:
     """A csv with the columns robot_x ... board_qw."""
     names = ["x", "y", "z", "qx", "qy", "qz", "qw"]
     head = ",".join([f"robot_{n}" for n in names] + [f"board_{n}" for n in names])
-    rows = np.hstack([QUATERNION.numbers(Ts), QUATERNION.numbers(Cs)])
+    rows = np.hstack([rows_of(QUATERNION, Ts), rows_of(QUATERNION, Cs)])
     lines = [",".join(map(repr, r.tolist())) for r in rows]
     (d / "pairs.csv").write_text("\n".join([head, *lines]))
     return None, d / "pairs.csv"
@@ -279,7 +280,7 @@ def two_files(d: Path, Ts: Array, Cs: Array) -> tuple[Path | None, Path]:
 
 def visp_pairs(d: Path, Ts: Array, Cs: Array) -> tuple[Path | None, Path]:
     """ViSP's pose_fPe_1.yaml and pose_cPo_1.yaml in one folder."""
-    for k, (a, b) in enumerate(zip(ROTVEC.numbers(Ts), ROTVEC.numbers(Cs), strict=True)):
+    for k, (a, b) in enumerate(zip(rows_of(ROTVEC, Ts), rows_of(ROTVEC, Cs), strict=True)):
         (d / f"pose_fPe_{k}.yaml").write_text(visp(a.tolist()))
         (d / f"pose_cPo_{k}.yaml").write_text(visp(b.tolist()))
     return d, d

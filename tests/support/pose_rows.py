@@ -8,6 +8,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from realsim.arrays import Array
 from realsim.geometry import se3
@@ -37,3 +38,23 @@ def all_readings() -> Iterator[PoseReading]:
 def random_poses(seed: int, n: int) -> Array:
     """Return poses (n, 4, 4) [m]."""
     return se3.random_transform(np.random.default_rng(seed), n, spread=0.5)
+
+
+def rows_of(reading: PoseReading, Ts: Array, width: int = 16) -> Array:
+    """Return the rows (n, k) that a reading turns into poses (n, 4, 4) [m]; `width` of matrices."""
+    T = se3.invert(Ts) if reading.inverted else Ts.copy()
+    T[:, :3, 3] *= 1000.0 if reading.length_unit == "mm" else 1.0
+    R, t, kind = T[:, :3, :3], T[:, :3, 3], reading.rotation
+    if kind.startswith("matrix"):
+        columns = kind == "matrix_column_major"
+        if width == 16:
+            return (np.swapaxes(T, 1, 2) if columns else T).reshape(-1, 16)
+        rotation = (np.swapaxes(R, 1, 2) if columns else R).reshape(-1, 9)
+    elif kind.startswith("quaternion"):
+        q = se3.quaternion_wxyz(R)
+        rotation = q if kind.endswith("wxyz") else np.roll(q, -1, axis=-1)
+    else:
+        turn, order = Rotation.from_matrix(R), kind.removeprefix("euler_")
+        rotation = turn.as_rotvec() if kind == "rotation_vector" else turn.as_euler(order)
+        rotation = np.degrees(rotation) if reading.angle_unit == "deg" else rotation
+    return np.concatenate([t, rotation] if reading.position_first else [rotation, t], -1)

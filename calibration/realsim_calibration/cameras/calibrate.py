@@ -262,7 +262,6 @@ def _camera(
     held = ~problem.free[at[6:]]
     lens = solution.covariance[np.ix_(at[6:], at[6:])].copy()
     lens[held], lens[:, held] = 0.0, 0.0
-    sides = np.ptp(board.target.points_board, axis=0) / 2
     sd = np.sqrt(np.diag(solution.covariance)[on[6:]])
     columns = np.concatenate([at[:6], on[:6], at[6:], on[6:]])
     known = inverse(solution.information)[np.ix_(columns, columns)]
@@ -285,10 +284,8 @@ def _camera(
         intrinsics_alone=camera_record(solution.alone.lens[c], image),
         intrinsics=camera_record(state.lens[c], image),
         intrinsics_covariance=lens,
-        board=BoardShape(
-            scale=float(state.shape[b, 0]), aspect=float(state.shape[b, 1]),
-            warp=state.shape[b, 2:], sd=np.where(problem.free[on[6:]], sd, 0.0),
-            half_extent_m=problem.halves[b], half_sides_m=(float(sides[0]), float(sides[1])),
+        board=BoardShape.fitted(
+            board.target, state.shape[b], np.where(problem.free[on[6:]], sd, 0.0)
         ),
         robot_map=solution.robot_map,
         map_name="none" if solution.basis is None else solution.basis.name,

@@ -22,8 +22,7 @@ from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Check
 from realsim_calibration.cameras.rig import MOUNTS, PLACES, Rig, Sighting
 from realsim_calibration.faults.gates import PX_FLOOR, PX_RATIO
-from realsim_calibration.fit.board_pose import estimate_board_pose
-from realsim_calibration.screening import HandEyeConfig, screen
+from realsim_calibration.screening import HandEyeConfig, board_pose, screen
 from realsim_calibration.views import BoardView
 
 MOST_OFF = 0.1
@@ -80,15 +79,9 @@ def board_poses(
     found: dict[int, Array] = {}
     rejected: dict[int, str] = {}
     for k, s in enumerate(rig.sightings):
-        target = rig.boards[s.board].target
-        least = min(config.min_points, len(target.points_board))
-        if len(s.detection) < least:
-            why = f"shows {len(s.detection)} points of the target; at least {least} are needed"
-            rejected[k] = "; ".join([why, *s.detection.rejected[:2]]) + "."
-            continue
-        pose = estimate_board_pose(s.detection.points(target), s.detection.uv, lenses[s.camera])
-        if pose is None:
-            rejected[k] = "no pose in front of the camera fits its points."
+        pose = board_pose(s.detection, rig.boards[s.board].target, lenses[s.camera], config)
+        if isinstance(pose, str):
+            rejected[k] = pose
         else:
             found[k] = pose.T_cam_board
     return found, rejected

@@ -55,6 +55,16 @@ CONVENTIONS = {
     "numbers": "written so that they read back bit for bit; null = not a number",
 }
 
+ACCURACY = (
+    "seen_px", "held_out_px", "held_out_mm", "held_out_deg", "floor_px", "sigma_px", "robot_ratio",
+    "mismatch_deg", "screw_ratio", "roll_range_deg",
+)  # fmt: skip
+CHECKED = ("checks", "clock", "nominal_lens", "T_points_board")
+FITTED = (
+    "map_name", "map_scores", "joint_offsets", "starts", "plain_scores", "stretch", "views",
+    "information",
+)  # fmt: skip
+
 
 def write_calibration(report: HandEyeReport, path: Path | str, *, frames: FrameNames) -> Path:
     """Write a calibration as `calibration.json`, whole or not at all."""
@@ -110,12 +120,7 @@ def _document(report: HandEyeReport, frames: FrameNames) -> dict[str, Any]:
         "conventions": CONVENTIONS,
         "mode": report.mode,
         "warnings": list(report.warnings),
-        "frames": {
-            "robot_base": frames.robot_base,
-            "hand": frames.hand,
-            "camera_optical": cam,
-            "target": frames.target,
-        },
+        "frames": frames.frames,
         "X": _transform(report.X, parent, cam, with_map, report.X_covariance),
         "X_here": None
         if report.X_here is None
@@ -127,22 +132,8 @@ def _document(report: HandEyeReport, frames: FrameNames) -> dict[str, Any]:
         },
         "Z": _transform(report.Z, other, frames.target, "together with X", None),
         "Z_alone": _transform(report.Z_alone, other, frames.target, "together with X_alone", None),
-        "accuracy": {
-            "seen_px": report.seen_px,
-            "held_out_px": report.held_out_px,
-            "held_out_mm": report.held_out_mm,
-            "held_out_deg": report.held_out_deg,
-            "floor_px": report.floor_px,
-            "sigma_px": report.sigma_px,
-            "robot_ratio": report.robot_ratio,
-            "mismatch_deg": report.mismatch_deg,
-            "screw_ratio": report.screw_ratio,
-            "roll_range_deg": report.roll_range_deg,
-        },
-        "checks": [to_json(c) for c in report.checks],
-        "clock": None if report.clock is None else to_json(report.clock),
-        "nominal_lens": report.nominal_lens,
-        "T_points_board": report.T_points_board,
+        "accuracy": _entries(report, ACCURACY),
+        **_entries(report, CHECKED),
         "intrinsics": {
             "use": NOMINAL if report.nominal_lens else "together with X",
             **to_json(report.intrinsics),
@@ -155,15 +146,13 @@ def _document(report: HandEyeReport, frames: FrameNames) -> dict[str, Any]:
         "target": {"type": type(report.target).__name__, **to_json(report.target)},
         "board": {**to_json(report.board), "warp_mm": report.board.warp_mm},
         "robot_map": _map_entries(report.robot_map),
-        "map_name": report.map_name,
-        "map_scores": [list(pair) for pair in report.map_scores],
-        "joint_offsets": report.joint_offsets,
-        "starts": [list(pair) for pair in report.starts],
-        "plain_scores": [list(pair) for pair in report.plain_scores],
-        "stretch": None if report.stretch is None else to_json(report.stretch),
-        "views": [to_json(v) for v in report.views],
-        "information": report.information,
+        **_entries(report, FITTED),
     }
+
+
+def _entries(record: Any, names: tuple[str, ...]) -> dict[str, Any]:
+    """Return some fields of a record, which the file and the report have alike."""
+    return {name: getattr(record, name) for name in names}
 
 
 def _map_entries(robot_map: RobotErrorMap | ArmErrorMap | None) -> dict[str, Any] | None:
@@ -298,7 +287,7 @@ def _report(d: _File, path: str) -> HandEyeReport:
     ):
         if entry not in known:
             raise InputError(f"{path}: {name} is {entry!r}; {', '.join(known)} are known.")
-    figures = {name: value for name, value in d.accuracy.items() if name != "floor_px"}
+    figures: dict[str, Any] = {k: v for k, v in d.accuracy.items() if k != "floor_px"}
     robot_map = None
     if d.robot_map is not None:
         robot_map = _record(
@@ -322,23 +311,12 @@ def _report(d: _File, path: str) -> HandEyeReport:
         X_alone_covariance=d.X_alone.covariance,
         X_alone_here_covariance=d.X_alone.here_covariance,
         plain_name=d.X_alone.origin,
-        plain_scores=d.plain_scores,
-        stretch=d.stretch,
         Z_alone=_matrix(d.Z_alone, f"{path}: Z_alone"),
         intrinsics_alone=alone,
         intrinsics=camera,
         intrinsics_covariance=np.array(d.intrinsics["covariance"], dtype=np.float64),
         board=_record(d.board, BoardShape, f"{path}: board", "warp_mm"),
         robot_map=robot_map,
-        map_name=d.map_name,
-        map_scores=d.map_scores,
-        joint_offsets=d.joint_offsets,
-        views=d.views,
-        starts=d.starts,
-        checks=d.checks,
-        information=d.information,
-        clock=d.clock,
-        nominal_lens=d.nominal_lens,
-        T_points_board=d.T_points_board,
+        **_entries(d, CHECKED + FITTED),
         **figures,
     )

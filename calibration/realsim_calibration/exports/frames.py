@@ -58,12 +58,7 @@ class FrameNames:
 
     def __post_init__(self) -> None:
         """Check that the names can be used."""
-        names = {
-            "robot_base": self.robot_base,
-            "hand": self.hand,
-            "camera_optical": self.camera_optical,
-            "target": self.target,
-        }
+        names = self.frames
         if self.camera_link:
             names["camera_link"] = self.camera_link
         for what, name in names.items():
@@ -82,6 +77,12 @@ class FrameNames:
                 "_ - . are accepted."
             )
         object.__setattr__(self, "T_link_optical", rigid(self.T_link_optical, "T_link_optical"))
+
+    @property
+    def frames(self) -> dict[str, str]:
+        """The names of the four frames by what they are."""
+        kinds = ("robot_base", "hand", "camera_optical", "target")
+        return {kind: getattr(self, kind) for kind in kinds}
 
 
 def parent_frame(report: HandEyeReport, frames: FrameNames) -> str:

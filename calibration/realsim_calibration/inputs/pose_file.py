@@ -267,14 +267,13 @@ def read_single_files(
         table.stems = [file.stem]
         tables.append(table)
     return raw_from_table(
-        PoseTable(
+        replace(
+            tables[0],
             path=path,
-            names=tables[0].names,
             values=np.concatenate([t.values for t in tables]),
             labels=[t.labels[0] for t in tables],
             stems=[t.stems[0] for t in tables],
             where=[t.where[0] for t in tables],
-            notes=list(tables[0].notes),
         )
     )
 

@@ -1,6 +1,7 @@
 """Files that hold pairs: the robot's pose beside the board's pose in the camera, without images."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -85,13 +86,10 @@ def _part(table: PoseTable, whose: list[str], which: str) -> RawPoses:
     while all(len(w) > common + 1 for w in words) and len({w[common] for w in words}) == 1:
         common += 1
     return raw_from_table(
-        PoseTable(
-            path=table.path,
+        replace(
+            table,
             names=tuple("_".join(w[common:]) for w in words),
             values=table.values[:, columns],
-            labels=list(table.labels),
-            stems=list(table.stems),
-            where=list(table.where),
             notes=list(table.notes),
         )
     )

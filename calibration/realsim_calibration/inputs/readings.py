@@ -5,7 +5,7 @@ transforms. A `PoseReading` says it in full, so that nothing is left to be guess
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 from typing import Any, Literal
@@ -164,38 +164,6 @@ class PoseReading:
         error = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
         return good & (error <= MATRIX_TOLERANCE) & (np.linalg.det(R) > 0)
 
-    def numbers(self, Ts: ArrayLike, *, width: int | None = None) -> Array:
-        """Return the rows (n, k) that `apply` turns into the poses (n, 4, 4) [m].
-
-        Args:
-            Ts: T_base_ee.
-            width: count of numbers where there is a choice: 16 (default) or 12 for matrices.
-
-        Raises:
-            InputError: the reading has no rows of that width.
-        """
-        T = np.asarray(Ts, dtype=np.float64).reshape(-1, 4, 4)
-        T = se3.invert(T) if self.inverted else T.copy()
-        width = self.widths[0] if width is None else width
-        if width not in self.widths:
-            raise InputError(f"'{self}' writes rows of {self.widths} numbers, not {width}.")
-        if self.length_unit == "mm":
-            T[:, :3, 3] *= 1000.0
-        columns = self.rotation == "matrix_column_major"
-        if width == 16:
-            return (np.swapaxes(T, 1, 2) if columns else T).reshape(-1, 16)
-        R, t = T[:, :3, :3], T[:, :3, 3]
-        if self.has_angles:
-            order = self.rotation.removeprefix("euler_")
-            rotation = se3.log_so3(R) if self.rotation == "rotation_vector" else _angles(R, order)
-            rotation = np.degrees(rotation) if self.angle_unit == "deg" else rotation
-        elif self.rotation.startswith("quaternion"):
-            q = se3.quaternion_wxyz(R)
-            rotation = q if self.rotation.endswith("wxyz") else np.roll(q, -1, axis=-1)
-        else:
-            rotation = (np.swapaxes(R, 1, 2) if columns else R).reshape(-1, 9)
-        return np.concatenate([t, rotation] if self.position_first else [rotation, t], -1)
-
     def _checked(self, raw: ArrayLike, rows: Sequence[str] | None) -> tuple[Array, Sequence[str]]:
         """Return finite numbers (n, k) of an accepted width, and the names of the rows."""
         values = np.asarray(raw, dtype=np.float64)
@@ -348,30 +316,3 @@ def _from_angles(angles: Array, order: str) -> Array:
     """Return rotations (n, 3, 3) of Euler angles (n, 3) [rad] in an order of EULER_ORDERS."""
     a, b, c = (_about("xyz".index(s), angles[:, k]) for k, s in enumerate(order.lower()))
     return a @ b @ c if order.isupper() else c @ b @ a
-
-
-def _angles(R: Array, order: str) -> Array:
-    """Return the Euler angles (n, 3) [rad] of rotations (n, 3, 3).
-
-    Each angle is taken from what the ones before have left over, so that the angles give R back to
-    rounding even where the first and the last turn about the same axis.
-    """
-    turned = order if order.isupper() else order[::-1]
-    i, j, last = ("xyz".index(s) for s in turned.lower())
-    k = 3 - i - j
-    s = 1.0 if (j - i) % 3 == 1 else -1.0
-    arctan: Callable[[Array, Array], Array] = np.arctan2
-    if last == i:
-        a = arctan(R[:, j, i], -s * R[:, k, i])
-        rest = _about(i, -a) @ R
-        b = arctan(-s * rest[:, k, i], rest[:, i, i])
-        rest = _about(j, -b) @ rest
-        c = arctan(s * rest[:, k, j], rest[:, j, j])
-    else:
-        a = arctan(-s * R[:, j, k], R[:, k, k])
-        rest = _about(i, -a) @ R
-        b = arctan(s * rest[:, i, k], rest[:, k, k])
-        rest = _about(j, -b) @ rest
-        c = arctan(s * rest[:, j, i], rest[:, i, i])
-    found = np.stack([a, b, c], -1)
-    return found if order.isupper() else found[:, ::-1]

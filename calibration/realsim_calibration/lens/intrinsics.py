@@ -244,7 +244,6 @@ def _report(
                 rms_px=rms, T_cam_board=T, outliers=corners.outliers.get(i, ()),
             )
         )  # fmt: skip
-    shape_sd = np.concatenate([[0.0], cov.sd[CAMERA_TERMS:]])
     return IntrinsicsReport(
         target=target,
         intrinsics=camera_record(fit.state.camera, obs.image_size),
@@ -259,13 +258,10 @@ def _report(
         rms_px=float(np.sqrt(np.mean(np.sum(fit.residuals**2, -1)))),
         views=tuple(views),
         coverage=measure_coverage(obs.uv, obs.image_size, fit.state.poses),
-        board=BoardShape(
-            scale=1.0,
-            aspect=float(fit.state.board[0]),
-            warp=fit.state.board[1:].copy(),
-            sd=shape_sd,
-            half_extent_m=obs.half_extent_m,
-            half_sides_m=corners.half_sides_m,
+        board=BoardShape.fitted(
+            target,
+            np.concatenate([[1.0], fit.state.board]),
+            np.concatenate([[0.0], cov.sd[CAMERA_TERMS:]]),
         ),
         start="",
         checks=(),

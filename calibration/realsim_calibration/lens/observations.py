@@ -47,8 +47,6 @@ class Corners:
     """(N,) points of the target."""
     middle: Array
     """(2,) the board's middle on the drawing [m]."""
-    half_sides_m: tuple[float, float]
-    """Half the extent of the target's points along x and y [m]."""
     names: tuple[str, ...]
     """Names of all views given."""
     reasons: tuple[str, ...]
@@ -100,7 +98,6 @@ def gather(
     size = _image_size(detections, labels, start)
     drawing = target.points_board[:, :2]
     middle = (drawing.min(0) + drawing.max(0)) / 2
-    half_x, half_y = (float(v) / 2 for v in np.ptp(drawing, axis=0))
     reasons: list[str] = []
     used: list[int] = []
     for i, (d, label) in enumerate(zip(detections, labels, strict=True)):
@@ -120,12 +117,12 @@ def gather(
         uv=np.concatenate([np.zeros((0, 2)), *(d.uv for d in parts)]),
         weight=_weights(parts, WEIGHT_RATIO),
         offsets=np.cumsum([0, *(len(d) for d in parts)]).astype(np.int64),
-        half_extent_m=max(half_x, half_y),
+        half_extent_m=float(np.ptp(drawing, axis=0).max()) / 2,
         image_size=size,
     )
     return Corners(
         obs=obs, indices=np.array(used, dtype=np.int64), ids=ids, middle=middle,
-        half_sides_m=(half_x, half_y), names=labels,
+        names=labels,
         reasons=tuple(reasons), outliers={},
     )  # fmt: skip
 

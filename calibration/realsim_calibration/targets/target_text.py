@@ -15,11 +15,10 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import cast
+from typing import Any, cast
 
 from realsim.errors import InputError, UnitError
 from realsim.records import TAG_CELLS, CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
-from realsim.records.targets import TagFamily
 from realsim_calibration.targets.marker_sets import check_markers, dictionary_name
 
 UNITS_M: dict[str, Decimal] = {
@@ -36,57 +35,6 @@ FILE_ENDINGS = (".json", ".yaml", ".yml")
 _LENGTH = re.compile(r"([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([a-zA-Zµ\"]*)")
 _COUNTS = re.compile(r"([0-9]{1,4})\s*[xX×]\s*([0-9]{1,4})")
 _NUMBER = re.compile(r"[0-9]{1,6}")
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Form:
-    """One kind of target: which words its line may have, and how they make the target."""
-
-    usage: str
-    """A line that is accepted, for messages."""
-    counted: str
-    """What the counts count, for messages; empty where a single id stands in their place."""
-    needed: tuple[str, ...]
-    """Keys that must be given."""
-    optional: tuple[str, ...] = ()
-    """Keys that may be given."""
-    flags: tuple[str, ...] = ()
-    """Words without a value."""
-    build: Callable[["_Words"], Target]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Words:
-    """The words of a line, sorted into counts, keys and flags."""
-
-    first: tuple[int, int]
-    """Columns and rows, or an id twice."""
-    values: dict[str, str]
-    flags: frozenset[str]
-    usage: str
-
-    def length(self, key: str) -> float:
-        """Return a length [m]."""
-        return parse_length(self.values[key], key)
-
-    def number(self, key: str, default: int) -> int:
-        """Return a whole number."""
-        text = self.values.get(key)
-        if text is None:
-            return default
-        if not _NUMBER.fullmatch(text):
-            raise InputError(f"'{key}={text}' is not a whole number; write for example {key}=0.")
-        return int(text)
-
-    def family(self) -> TagFamily:
-        """Return the AprilTag family."""
-        text = self.values.get("family", "tag36h11").lower()
-        text = text if text.startswith("tag") else f"tag{text}"
-        if text not in TAG_CELLS:
-            raise InputError(
-                f"'family={self.values['family']}' is not known; accepted: {', '.join(TAG_CELLS)}."
-            )
-        return cast(TagFamily, text)
 
 
 def parse_length(text: str, what: str) -> float:
@@ -121,43 +69,19 @@ def format_length(value_m: float) -> str:
     return f"{text}mm"
 
 
-def _charuco(words: _Words) -> Target:
-    return CharucoBoard(
-        columns=words.first[0],
-        rows=words.first[1],
-        square_m=words.length("square"),
-        marker_m=words.length("marker"),
-        dictionary=dictionary_name(words.values["dict"]),
-        legacy="legacy" in words.flags,
-    )
+def _number(text: str, key: str) -> int:
+    """Return a whole number."""
+    if not _NUMBER.fullmatch(text):
+        raise InputError(f"'{key}={text}' is not a whole number; write for example {key}=0.")
+    return int(text)
 
 
-def _chessboard(words: _Words) -> Target:
-    columns, rows = words.first
-    return Chessboard(columns=columns, rows=rows, square_m=words.length("square"))
-
-
-def _circles(words: _Words) -> Target:
-    return CircleGrid(
-        columns=words.first[0],
-        rows=words.first[1],
-        pitch_m=words.length("pitch"),
-        asymmetric="asymmetric" in words.flags,
-        large_origin="large-origin" in words.flags,
-    )
-
-
-def _aprilgrid(words: _Words) -> Target:
-    return TagBoard(
-        columns=words.first[0],
-        rows=words.first[1],
-        tag_size_m=words.length("tag"),
-        gap_m=words.length("gap"),
-        family=words.family(),
-        first_id=words.number("first", 0),
-        ids_from="bottom" if "from-bottom" in words.flags else "top",
-        corner_squares="corner-squares" in words.flags,
-    )
+def _family(text: str, key: str) -> str:
+    """Return the AprilTag family."""
+    family = text.lower() if text.lower().startswith("tag") else f"tag{text.lower()}"
+    if family not in TAG_CELLS:
+        raise InputError(f"'{key}={text}' is not known; accepted: {', '.join(TAG_CELLS)}.")
+    return family
 
 
 def single_tag_gap(tag_size_m: float, family: str) -> float:
@@ -165,50 +89,79 @@ def single_tag_gap(tag_size_m: float, family: str) -> float:
     return tag_size_m / TAG_CELLS[family]
 
 
-def _tag(words: _Words) -> Target:
-    size, family = words.length("size"), words.family()
-    gap = words.length("gap") if "gap" in words.values else single_tag_gap(size, family)
-    return TagBoard(
-        rows=1, columns=1, tag_size_m=size, gap_m=gap, family=family, first_id=words.first[0]
-    )
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Form:
+    """One kind of target: which words its line may have."""
+
+    usage: str
+    """A line that is accepted, for messages."""
+    record: type[Any]
+    counted: str
+    """What the counts count, for messages; empty where a single id stands in their place."""
+    needed: tuple[str, ...]
+    """Keys that must be given."""
+    optional: tuple[str, ...] = ()
+    """Keys that may be given."""
+    flags: tuple[str, ...] = ()
+    """Words without a value."""
 
 
+KEYS: dict[str, tuple[str, Callable[[str, str], Any]]] = {
+    "square": ("square_m", parse_length),
+    "marker": ("marker_m", parse_length),
+    "pitch": ("pitch_m", parse_length),
+    "tag": ("tag_size_m", parse_length),
+    "size": ("tag_size_m", parse_length),
+    "gap": ("gap_m", parse_length),
+    "dict": ("dictionary", lambda text, _: dictionary_name(text)),
+    "family": ("family", _family),
+    "first": ("first_id", _number),
+}
+"""The record's field that each key is, and how its text is read."""
+FLAGS: dict[str, tuple[str, Any]] = {
+    "legacy": ("legacy", True),
+    "asymmetric": ("asymmetric", True),
+    "large-origin": ("large_origin", True),
+    "from-bottom": ("ids_from", "bottom"),
+    "corner-squares": ("corner_squares", True),
+}
+"""The record's field that each word without a value sets."""
 FORMS: dict[str, _Form] = {
     "charuco": _Form(
+        record=CharucoBoard,
         usage="charuco:5x7,square=33mm,marker=20mm,dict=6X6_100[,legacy]",
         counted="COLUMNSxROWS of squares",
         needed=("square", "marker", "dict"),
         flags=("legacy",),
-        build=_charuco,
     ),
     "chessboard": _Form(
+        record=Chessboard,
         usage="chessboard:8x6,square=21.9mm",
         counted="COLUMNSxROWS of INNER CORNERS",
         needed=("square",),
-        build=_chessboard,
     ),
     "circles": _Form(
+        record=CircleGrid,
         usage="circles:10x10,pitch=25.4mm[,asymmetric][,large-origin]",
         counted="COLUMNSxROWS of dots",
         needed=("pitch",),
         flags=("asymmetric", "large-origin"),
-        build=_circles,
     ),
     "aprilgrid": _Form(
+        record=TagBoard,
         usage="aprilgrid:6x4,tag=40mm,gap=10mm[,family=tag36h11][,first=0][,from-bottom]"
         "[,corner-squares]",
         counted="COLUMNSxROWS of tags",
         needed=("tag", "gap"),
         optional=("family", "first"),
         flags=("from-bottom", "corner-squares"),
-        build=_aprilgrid,
     ),
     "tag": _Form(
+        record=TagBoard,
         usage="tag:7,size=80mm[,gap=10mm][,family=tag36h11]",
         counted="",
         needed=("size",),
         optional=("gap", "family"),
-        build=_tag,
     ),
 }
 """The kinds of target that a line may name."""
@@ -245,14 +198,13 @@ def parse_target(text: str) -> Target:
             f"'{kind}' in '{text}' is no kind of target. Accepted are lines like:\n"
             + target_usage()
         )
-    words = _sort_words(text, rest, form)
-    target = form.build(words)
+    target = cast(Target, form.record(**_fields(text, rest, form)))
     check_markers(target)
     return target
 
 
-def _sort_words(text: str, rest: str, form: _Form) -> _Words:
-    """Return the words behind the kind, each checked to be one that the kind has."""
+def _fields(text: str, rest: str, form: _Form) -> dict[str, Any]:
+    """Return the record's fields by the words behind the kind, each one that the kind has."""
     first, *others = [word.strip() for word in rest.split(",")]
     values: dict[str, str] = {}
     flags: set[str] = set()
@@ -273,9 +225,18 @@ def _sort_words(text: str, rest: str, form: _Form) -> _Words:
         raise InputError(
             f"'{text}' lacks {', '.join(f'{key}=' for key in missing)}. Accepted: {form.usage}"
         )
-    return _Words(
-        first=_leading(text, first, form), values=values, flags=frozenset(flags), usage=form.usage
-    )
+    count = _leading(text, first, form)
+    columns, rows = count if form.counted else (1, 1)
+    fields: dict[str, Any] = {"columns": columns, "rows": rows}
+    for key in (*form.needed, *form.optional):
+        if key in values:
+            name, read = KEYS[key]
+            fields[name] = read(values[key], key)
+    if not form.counted:
+        fields["first_id"] = count[0]
+        usual = single_tag_gap(fields["tag_size_m"], fields.get("family", "tag36h11"))
+        fields.setdefault("gap_m", usual)
+    return fields | dict(FLAGS[flag] for flag in flags)
 
 
 def _not_accepted(text: str, word: str, form: _Form) -> str:
