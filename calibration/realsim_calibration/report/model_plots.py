@@ -39,14 +39,11 @@ def plot_uncertainty(report: HandEyeReport) -> Any:
         limit = 2.35 * float(np.sqrt(np.diag(cov).max())) or 1.0
         for ax, (i, j) in zip(row, PAIRS, strict=True):
             _ellipses(ax, cov[np.ix_((i, j), (i, j))], color)
-            ax.set_xlim(-limit, limit)
-            ax.set_ylim(-limit, limit)
-            ax.set_aspect("equal")
-            ax.set_xlabel(f"{what} {CAMERA_AXES[i]} [{unit}]")
-            ax.set_ylabel(f"{what} {CAMERA_AXES[j]} [{unit}]")
+            ax.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
+            x, y = (f"{what} {CAMERA_AXES[k]} [{unit}]" for k in (i, j))
+            ax.set(xlabel=x, ylabel=y)
             ax.locator_params(nbins=5)
-            ax.grid()
-            ax.set_axisbelow(True)
+            style.grid(ax)
         sd = np.sqrt(np.diag(cov))
         row[0].set_title(
             f"1 sigma x, y, z: {sd[0]:.3g}, {sd[1]:.3g}, {sd[2]:.3g} {unit}", fontsize=9
@@ -89,10 +86,8 @@ def plot_board(report: HandEyeReport) -> Any:
     left.set_title(f"Bend: up to {board.warp_mm:.2f} mm" if bent else "Bend: taken for flat")
     _outline(right, report, 2 * np.array(sides))
     for ax in (left, right):
-        ax.set_aspect("equal")
+        ax.set(aspect="equal", xlabel="x [mm]", ylabel="y, down the page [mm]")
         ax.invert_yaxis()
-        ax.set_xlabel("x [mm]")
-        ax.set_ylabel("y, down the page [mm]")
     return figure
 
 
@@ -153,13 +148,11 @@ def plot_robot(report: HandEyeReport) -> Any:
             ax.bar(known, rest, width=0.4, color=style.BLUE,
                    label=f"left by the map{some}, RMS {_rms_text(rest, unit)}")  # fmt: skip
         ax.set_title(name, pad=20)
-        ax.set_ylabel(f"[{unit}]")
-        ax.set_xlabel("view")
+        ax.set(xlabel="view", ylabel=f"[{unit}]")
         step = max(1, int(np.ceil(len(used) / 24)))
         ax.set_xticks(k[::step], [str(v.index) for v in used[::step]], rotation=90, fontsize=6.5)
         ax.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.2)
-        ax.grid(axis="y")
-        ax.set_axisbelow(True)
+        style.grid(ax, "y")
     return figure
 
 
@@ -196,10 +189,8 @@ def plot_choices(report: HandEyeReport) -> Any:
             ax.text((value if np.isfinite(value) else 0.0) + most * 0.01, k, words, va="center",
                     fontsize=7.5, color=style.INK)  # fmt: skip
         ax.set_yticks(range(len(pairs)), [style.short_label(n) for n, _ in pairs])
-        ax.set_ylim(len(pairs) - 0.4, -0.6)
-        ax.set_xlim(0, most * 1.12)
-        ax.set_title(title)
-        ax.set_xlabel("reprojection RMS [px]")
+        ax.set(ylim=(len(pairs) - 0.4, -0.6), xlim=(0, most * 1.12))
+        ax.set(title=title, xlabel="reprojection RMS [px]")
     return figure
 
 
@@ -324,8 +315,7 @@ def plot_depth_bias(report: DepthBiasReport) -> Any:
                   color=style.BAD, label="dropped")  # fmt: skip
     left.axhline(0, color=style.MUTED, lw=0.7)
     left.set_title("Measured minus true depth", pad=20)
-    left.set_xlabel("distance [mm]")
-    left.set_ylabel("[mm]")
+    left.set(xlabel="distance [mm]", ylabel="[mm]")
     left.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=4, borderaxespad=0.2,
                 columnspacing=1.0)  # fmt: skip
     right.plot(1e3 * z, 1e3 * np.array([v.unseen_m for v in used]), "o", ms=4, color=style.BLUE)
@@ -334,9 +324,7 @@ def plot_depth_bias(report: DepthBiasReport) -> Any:
         f"Unseen views: {amount(1e3 * report.held_out_m, 2, 'mm')} RMS, "
         f"{amount(1e3 * report.uncorrected_m, 2, 'mm')} uncorrected", pad=20,
     )  # fmt: skip
-    right.set_xlabel("distance [mm]")
-    right.set_ylabel("error after correction [mm]")
-    for ax in (left, right):
-        ax.grid()
-        ax.set_axisbelow(True)
+    right.set(xlabel="distance [mm]", ylabel="error after correction [mm]")
+    style.grid(left)
+    style.grid(right)
     return figure

@@ -13,7 +13,7 @@ from realsim.records import ArmErrorMap, CameraIntrinsics, Check
 from realsim.store import atomic
 from realsim_calibration.depth.bias import DepthBiasReport
 from realsim_calibration.lens.models import TERM_NAMES
-from realsim_calibration.lens.report import IntrinsicsReport, LensView
+from realsim_calibration.lens.report import IntrinsicsReport
 from realsim_calibration.report import model_plots, scene_3d, style, view_plots
 from realsim_calibration.report.summary import (
     NOT_KNOWN,
@@ -29,7 +29,7 @@ from realsim_calibration.report.summary import (
     worst_first,
 )
 from realsim_calibration.report.view_plots import Images
-from realsim_calibration.results import HandEyeReport, ViewReport
+from realsim_calibration.results import HandEyeReport
 
 PAGE_NAME = "calibration_report.html"
 VERDICT_KIND = {"good": "good", "warn": "warn", "bad": "bad", "unknown": "off"}
@@ -248,7 +248,7 @@ def _lens_section(
     page.plot(
         "lens.png",
         lambda: model_plots.plot_lens(
-            report.intrinsics, report.intrinsics_covariance, _points(report.used)
+            report.intrinsics, report.intrinsics_covariance, style.joined(v.uv for v in report.used)
         ),
         f"As calibrated together with the hand-eye. {caption}",
     )
@@ -260,7 +260,9 @@ def _lens_section(
         columns.append(_lens_column(r.intrinsics, r.covariance))
         page.plot(
             "lens_alone.png",
-            lambda: model_plots.plot_lens(r.intrinsics, r.open_covariance, _points(r.used)),
+            lambda: model_plots.plot_lens(
+                r.intrinsics, r.open_covariance, style.joined(v.uv for v in r.used)
+            ),
             f"The lens alone, {r.model}. {caption}",
         )
     header.append("exported, with X_alone")
@@ -275,11 +277,6 @@ def _lens_section(
                 for m in intrinsics_report.held_out
             ],
         )
-
-
-def _points(views: Sequence[ViewReport] | Sequence[LensView]) -> Array:
-    """Return the points (n, 2) of some views [px]."""
-    return np.concatenate([v.uv for v in views] or [np.zeros((0, 2))])
 
 
 def _lens_column(i: CameraIntrinsics, covariance: Array) -> list[str]:

@@ -134,9 +134,8 @@ def _equal_box(ax: Any, points: Array, zoom: float) -> None:
     low, high = points.min(0), points.max(0)
     half = 0.52 * np.maximum(high - low, 0.25 * float((high - low).max()))
     middle = (low + high) / 2
-    ax.set_xlim(middle[0] - half[0], middle[0] + half[0])
-    ax.set_ylim(middle[1] - half[1], middle[1] + half[1])
-    ax.set_zlim(middle[2] - half[2], middle[2] + half[2])
+    x, y, z = np.stack([middle - half, middle + half], -1)
+    ax.set(xlim=x, ylim=y, zlim=z)
     ax.set_box_aspect(half, zoom=zoom)
     ax.set_proj_type("ortho")
 
@@ -180,20 +179,15 @@ def _side_view(ax: Any, side: _Side, across: int) -> None:
     _dimensions(ax, camera, low, high, span, down)
     ax.plot(*camera, "o", ms=3.5, color=style.INK)
     middle = (low[0] + high[0]) / 2 + 0.14 * span
-    ax.set_xlim(middle - 0.78 * span, middle + 0.78 * span)
-    z0, z1 = (low[1] - 0.34 * span, high[1] + 0.08 * span)
-    if not down:
-        z0, z1 = low[1] - 0.08 * span, high[1] + 0.34 * span
-    ax.set_ylim((z1, z0) if down else (z0, z1))
-    ax.set_aspect("equal")
+    z = (low[1] - 0.08 * span, high[1] + 0.34 * span)
+    if down:
+        z = (high[1] + 0.08 * span, low[1] - 0.34 * span)
+    ax.set(xlim=(middle - 0.78 * span, middle + 0.78 * span), ylim=z, aspect="equal")
     name, what = "xy"[across], carrier(report)
     seen = {(0, True): "+y", (1, True): "-x", (0, False): "-y", (1, False): "+x"}[across, down]
-    ax.set_title(f"Seen from {seen}")
     ax.locator_params(nbins=6)
-    ax.set_xlabel(f"{what} {name} [mm]")
-    ax.set_ylabel(f"{what} z [mm]")
-    ax.grid()
-    ax.set_axisbelow(True)
+    ax.set(title=f"Seen from {seen}", xlabel=f"{what} {name} [mm]", ylabel=f"{what} z [mm]")
+    style.grid(ax)
 
 
 def _convex(points: Array) -> Array:
@@ -330,11 +324,7 @@ def _above_looks(ax: Any, points: Array, length: float) -> None:
     margin = 0.06 * float((high - low).max())
     ax.text(-0.4 * margin, -0.7 * margin, "base", ha="right", va="top", fontsize=8,
             fontweight="bold", color=style.INK)  # fmt: skip
-    ax.set_xlim(low[0] - 3 * margin, high[0] + margin)
-    ax.set_ylim(low[1] - 2 * margin, high[1] + margin)
-    ax.set_aspect("equal")
-    ax.set_title("From above")
-    ax.set_xlabel("base x [m]")
-    ax.set_ylabel("base y [m]")
-    ax.grid()
-    ax.set_axisbelow(True)
+    x, y = (low[0] - 3 * margin, high[0] + margin), (low[1] - 2 * margin, high[1] + margin)
+    ax.set(xlim=x, ylim=y, aspect="equal")
+    ax.set(title="From above", xlabel="base x [m]", ylabel="base y [m]")
+    style.grid(ax)

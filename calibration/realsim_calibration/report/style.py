@@ -138,12 +138,15 @@ def round_number(value: float) -> float:
 
 def image_axes(ax: Any, width: int, height: int) -> None:
     """Make axes an image plane: pixels, y down, the image's border drawn."""
-    ax.set_xlim(-0.5, width - 0.5)
-    ax.set_ylim(height - 0.5, -0.5)
-    ax.set_aspect("equal")
+    ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+    ax.set(xlabel="u [px]", ylabel="v [px]")
     ax.spines[["top", "right"]].set_visible(True)
-    ax.set_xlabel("u [px]")
-    ax.set_ylabel("v [px]")
+
+
+def grid(ax: Any, axis: str = "both") -> None:
+    """Draw the lines of a grid behind what is plotted."""
+    ax.grid(axis=axis)
+    ax.set_axisbelow(True)
 
 
 def draw_arrows(
@@ -185,6 +188,11 @@ def empty_axes(ax: Any, text: str) -> None:
     """Say in the place of a plot why there is none."""
     ax.set_axis_off()
     ax.text(0.5, 0.5, text, ha="center", va="center", color=MUTED, transform=ax.transAxes)
+
+
+def joined(arrays: Iterable[Array]) -> Array:
+    """Return pairs of numbers (n, 2) of some views, one after the other."""
+    return np.concatenate([np.zeros((0, 2)), *arrays])
 
 
 def finite(values: Sequence[float] | Array) -> Array:

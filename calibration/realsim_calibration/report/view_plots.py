@@ -38,8 +38,8 @@ def plot_residuals(report: HandEyeReport) -> Any:
     height_in, room = 0.75 + 0.43 * style.PAGE_WIDTH_IN * h / w, (0.65, 0.1, 0.5, 0.3, 1.35, 0)
     figure = style.new_figure(height_in, grid=(1, 2), room=room)
     axes = figure.subplots(1, 2)
-    uv = np.concatenate([v.uv for v in report.used] or [np.zeros((0, 2))])
-    r = np.concatenate([v.residuals for v in report.used] or [np.zeros((0, 2))])
+    uv = style.joined(v.uv for v in report.used)
+    r = style.joined(v.residuals for v in report.used)
     for ax in axes:
         style.image_axes(ax, w, h)
     if len(r) == 0:
@@ -97,10 +97,8 @@ def plot_worst_views(
         style.image_axes(ax, i.width, i.height)
         low, width_px = _window(view.uv, i.width, i.height)
         height_px = width_px * i.height / i.width
-        ax.set_xlim(low[0], low[0] + width_px)
-        ax.set_ylim(low[1] + height_px, low[1])
-        ax.set_xticks([])
-        ax.set_yticks([])
+        ax.set(xlim=(low[0], low[0] + width_px), ylim=(low[1] + height_px, low[1]))
+        ax.set(xticks=[], yticks=[], ylabel="")
         _, factor = style.draw_arrows(
             ax, view.uv, view.residuals, width_px, color=style.BAD, width=0.005
         )
@@ -109,7 +107,6 @@ def plot_worst_views(
         ax.set_xlabel(
             f"unseen {amount(view.unseen_px, 2, 'px')}; arrows {factor:g} times{note}", fontsize=8
         )
-        ax.set_ylabel("")
     return figure
 
 
@@ -167,8 +164,7 @@ def plot_views(report: HandEyeReport) -> Any:
     ax.set_yticks(range(len(shown)), names)
     for tick, v in zip(ax.get_yticklabels(), shown, strict=True):
         tick.set_color(style.INK if v.used else style.BAD)
-    ax.set_ylim(len(shown) - 0.4, -0.6)
-    ax.set_xlim(0, largest * 1.06)
+    ax.set(ylim=(len(shown) - 0.4, -0.6), xlim=(0, largest * 1.06))
     line = ax.axvline(report.held_out_px, color=style.INK, lw=1, ls=(0, (4, 3)))
     handles = {
         "predicted without this view": Patch(color=style.PALE),
@@ -181,8 +177,7 @@ def plot_views(report: HandEyeReport) -> Any:
     ax.set_xlabel("RMS through the robot's pose [px]")
     ax.legend(handles.values(), handles.keys(), loc="lower left", bbox_to_anchor=(0, 1.0), ncols=3,
               borderaxespad=0.2)  # fmt: skip
-    ax.grid(axis="x")
-    ax.set_axisbelow(True)
+    style.grid(ax, "x")
     return figure
 
 
@@ -207,7 +202,7 @@ def _image_coverage(figure: Any, ax: Any, report: HandEyeReport) -> None:
         return
     w, h = report.intrinsics.width, report.intrinsics.height
     style.image_axes(ax, w, h)
-    uv = np.concatenate([v.uv for v in report.used] or [np.zeros((0, 2))])
+    uv = style.joined(v.uv for v in report.used)
     rows = max(1, round(CELLS_ACROSS * h / w))
     counts, x, y = np.histogram2d(
         uv[:, 0], uv[:, 1], bins=(CELLS_ACROSS, rows), range=((-0.5, w - 0.5), (-0.5, h - 0.5))
