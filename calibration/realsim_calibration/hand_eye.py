@@ -14,7 +14,7 @@ from realsim_calibration.fit.view_system import SHARED, camera_record
 from realsim_calibration.plain import choose_plain
 from realsim_calibration.results import BoardShape, HandEyeReport, ViewReport
 from realsim_calibration.screening import Candidate, HandEyeConfig, Screened, joints_of, screen
-from realsim_calibration.views import BoardView
+from realsim_calibration.views import BoardView, target_middle
 
 
 def calibrate_hand_eye(
@@ -65,7 +65,7 @@ def setup_of(
 ) -> Setup:
     """Return the joint fit's input."""
     points = target.points_board
-    middle = (points.max(0) + points.min(0)) / 2
+    middle = target_middle(target)
     return Setup(
         views=tuple(
             ViewCorners(

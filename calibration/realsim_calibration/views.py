@@ -92,6 +92,12 @@ class BoardView:
         return self.name or str(self.index)
 
 
+def target_middle(target: Target) -> Array:
+    """Return the middle (3,) of a target's points [m]."""
+    points = target.points_board
+    return (points.min(0) + points.max(0)) / 2
+
+
 def measured_poses(Ts: ArrayLike, names: Sequence[str]) -> Array:
     """Return poses (n, 4, 4) as controllers and detectors print them, made exactly rigid.
 

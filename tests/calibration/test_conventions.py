@@ -339,8 +339,7 @@ def test_missing_motion_is_said():
     assert any("small" in t for t in small.sentences) and small.sd_mm.max() > full.sd_mm.max()
     twice = camera_session(0.5 * free, shift)
     twice[0][3] = twice[0][9]
-    repeated = check_motion(*twice, MIDDLE)
-    assert repeated.identical == ((3, 9),) and "rows 3, 9" in repeated.sentences[-1]
+    assert "rows 3, 9" in check_motion(*twice, MIDDLE).sentences[-1]
 
 
 @pytest.mark.slow

@@ -40,7 +40,7 @@ def test_auto_takes_the_smallest_paper_and_makes_larger_ones_to_measure(tmp_path
         target = parse_target(f"aprilgrid:6x6,tag={tag},gap=8mm")
         report = write_sheet(target, tmp_path / f"{tag}.pdf", paper="auto")
         raster_mm = np.array(pdfium.PdfDocument(report.pdf)[0].get_size()) * 25.4 / 72
-        assert raster_mm == pytest.approx(report.page_mm, abs=1e-3)
+        assert raster_mm == pytest.approx(report.layout.page_mm, abs=1e-3)
         papers.append(report.paper)
     assert papers[0] == "A3" and papers[1] not in ("A4", "A3")
     with pytest.raises(InputError, match="--paper A3"):

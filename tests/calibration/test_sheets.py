@@ -128,7 +128,7 @@ def up_to_turns(target: Target, found: Array, expected: Array):
 @pytest.mark.parametrize("line", SHEETS)
 def test_every_point_is_printed_at_its_place(line: str, printed) -> None:
     target, report, raster = printed(line)
-    expected = np.array(report.origin_mm) + 1000 * target.points_board[:, :2]
+    expected = np.array(report.layout.origin_mm) + 1000 * target.points_board[:, :2]
     found = up_to_turns(target, raster.to_mm(found_points(target, raster.gray)), expected)
     error = np.linalg.norm(found - expected, axis=-1)
     assert not np.isnan(error).any(), f"{np.isnan(error).sum()} points were not found"
@@ -138,9 +138,9 @@ def test_every_point_is_printed_at_its_place(line: str, printed) -> None:
 @pytest.mark.parametrize("line", SHEETS)
 def test_rulers_and_page_have_their_length(line: str, printed) -> None:
     _, report, raster = printed(line)
-    assert raster.size_mm == pytest.approx(report.page_mm, abs=1e-3)
-    assert sorted(report.page_mm) == pytest.approx(sorted(PAPERS_MM[SHEETS[line]]))
-    for ruler in report.rulers:
+    assert raster.size_mm == pytest.approx(report.layout.page_mm, abs=1e-3)
+    assert sorted(report.layout.page_mm) == pytest.approx(sorted(PAPERS_MM[SHEETS[line]]))
+    for ruler in report.layout.rulers:
         assert ruler.length_mm >= 100
         ticks = ruler_ticks_mm(ruler, raster)
         assert len(ticks) == round(ruler.length_mm) + 1
@@ -173,7 +173,7 @@ def test_the_sheet_says_its_own_name(line: str, printed) -> None:
     assert report.name in raster.text
     assert target_to_json(parse_target(report.name)) == target_to_json(target)
     assert "Print at 100 %" in raster.text
-    assert f"{report.rulers[0].length_mm:g} mm along the" in raster.text
+    assert f"{report.layout.rulers[0].length_mm:g} mm along the" in raster.text
     assert b"/PrintScaling /None" in raster.preferences
     assert target_to_json(read_target(report.target_file)) == target_to_json(target)
 
@@ -182,8 +182,8 @@ def test_the_sheet_says_its_own_name(line: str, printed) -> None:
 def test_nothing_is_printed_in_the_quiet_zone(line: str, printed) -> None:
     target, report, raster = printed(line)
     x0, y0, x1, y1 = (v * 1000 for v in artwork_of(target).bounds_m)
-    inner = np.array([x0, y0, x1, y1]) + np.tile(report.origin_mm, 2)
-    quiet = np.array(report.quiet_mm)
+    inner = np.array([x0, y0, x1, y1]) + np.tile(report.layout.origin_mm, 2)
+    quiet = np.array(report.layout.quiet_mm)
     assert np.all((inner - quiet) * [1, 1, -1, -1] >= 5.0 - 1e-6)
     scale = np.tile(raster.mm_per_px, 2)
     a, b = np.round(quiet / scale).astype(int), np.round(inner / scale).astype(int)
@@ -196,7 +196,7 @@ def test_nothing_is_printed_in_the_quiet_zone(line: str, printed) -> None:
 def test_page_and_picture_show_the_same_without_seams(line: str, printed) -> None:
     target, report, raster = printed(line)
     picture, origin = target_image(target, 1000 / float(raster.mm_per_px.mean()), 0.001)
-    u, v = origin - (np.array(report.origin_mm) / raster.mm_per_px - 0.5)
+    u, v = origin - (np.array(report.layout.origin_mm) / raster.mm_per_px - 0.5)
     move = np.array([[1, 0, u], [0, 1, v]])
     seen = cv2.warpAffine(raster.gray, move, picture.shape[::-1], borderValue=255)
     # Inside of what is black nothing is lighter: neighbouring modules are one area.

@@ -100,8 +100,8 @@ def calibrate_cameras(
 def _only_instants(rig: Rig, rows: Sequence[int]) -> Rig:
     """Return the rig without the instants at which nothing was seen."""
     place = {i: n for n, i in enumerate(rows)}
-    return Rig(
-        cameras=rig.cameras, boards=rig.boards, instants=tuple(rig.instants[i] for i in rows),
+    return replace(
+        rig, instants=tuple(rig.instants[i] for i in rows),
         sightings=tuple(replace(s, instant=place[s.instant]) for s in rig.sightings),
     )  # fmt: skip
 

@@ -10,7 +10,7 @@ controller's pose at an instant and D_i its error, which all cameras of the inst
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -116,10 +116,7 @@ class Rig:
 
     def only(self, sightings: Sequence[Sighting]) -> "Rig":
         """Return the rig with these sightings."""
-        return Rig(
-            cameras=self.cameras, boards=self.boards, instants=self.instants,
-            sightings=tuple(sightings),
-        )  # fmt: skip
+        return replace(self, sightings=tuple(sightings))
 
     def of_camera(self, camera: int) -> list[Sighting]:
         """Return what a camera saw."""

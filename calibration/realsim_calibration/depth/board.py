@@ -12,7 +12,7 @@ from realsim.geometry.camera import project, projection_jacobian
 from realsim.records import CameraIntrinsics, Target
 from realsim_calibration.fit.board_pose import planar_poses
 from realsim_calibration.results import BoardShape
-from realsim_calibration.views import TargetDetection
+from realsim_calibration.views import TargetDetection, target_middle
 
 NEWTON_STEPS = 4
 """A lift of millimetres over a decimetre converges in two."""
@@ -80,8 +80,7 @@ class DepthSetup:
     @property
     def middle(self) -> Array:
         """(3,) middle of the target [m]."""
-        points = self.target.points_board
-        return (points.min(0) + points.max(0)) / 2
+        return target_middle(self.target)
 
     def lift(self, xy: Array) -> tuple[Array, Array]:
         """Return height (...) [m] along the board's z at true places (..., 2), and its slope."""

@@ -111,10 +111,7 @@ def diagnose(
     rows, copied = _without_copies(p, copies)
     if copied is not None and copied.fault == "unknown":
         return _diagnosis(p, copied, ())
-    part = Poses(
-        T=T[rows], C=C[rows], eye_in_hand=p.eye_in_hand, middle=middle,
-        labels=tuple(names[k] for k in rows), target=target,
-    )  # fmt: skip
+    part = replace(p, T=T[rows], C=C[rows], labels=tuple(names[k] for k in rows))
     known = None if nominal is None else np.asarray(nominal, dtype=np.float64)[rows]
     found, tried = _search(part, known)
     views = tuple(int(rows[k]) for k in found.views)

@@ -148,11 +148,7 @@ def mismatch(fit: FrameFit, A: ArrayLike, C: ArrayLike) -> Array:
     where = np.einsum("kij,lj->kli", left[:, :3, :3], seen) + left[:, None, :3, 3]
     z = fit.Z[:3, :3] @ fit.middle * fit.length_ratio + fit.Z[:3, 3]
     slip = np.linalg.norm(where - z, axis=-1) / fit.length_ratio
-    return _units(angle, slip, fit.distance)
-
-
-def _units(angles: Array, slips: Array, distance: float) -> Array:
-    return np.hypot(angles / np.radians(UNIT_DEG), slips / (distance * UNIT_PART))
+    return np.hypot(angle / np.radians(UNIT_DEG), slip / (fit.distance * UNIT_PART))
 
 
 def chord_angle(R: Array, S: Array) -> Array:

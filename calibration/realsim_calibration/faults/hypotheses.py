@@ -180,9 +180,8 @@ def inverted(p: Poses) -> Hypothesis:
     if (x > z) == p.eye_in_hand:
         likely, other_way = other_way, likely
         remedy, other_remedy = other_remedy, remedy
-    return Hypothesis(
-        fault="robot_inverted", name=h.name, fit=h.fit, score=h.score, T=h.T, C=h.C, rows=h.rows,
-        sentence="The hand poses are inverted: hand and camera agree when every hand pose is "
+    return replace(
+        h, sentence="The hand poses are inverted: hand and camera agree when every hand pose is "
         f"inverted. Either {likely}, or {other_way}: poses alone cannot tell the two apart. "
         f"With them inverted {places}, which speaks for the first.",
         advice=f"Say which it is. For the first: {remedy}. For the second: {other_remedy}.",
@@ -197,7 +196,7 @@ def _mm(length: float, h: Hypothesis) -> str:
 
 def flipped_boards(p: Poses) -> Hypothesis | None:
     """Return the hypothesis that some boards were read turned by 180 deg."""
-    if p.target is None or not _can_turn(p.target):
+    if not isinstance(p.target, (Chessboard, CircleGrid)):
         return None
     turns = synchronise_half_turns(p.T, p.C, p.middle)
     if not turns.flips.any():
@@ -213,10 +212,6 @@ def flipped_boards(p: Poses) -> Hypothesis | None:
         "tag board, or a chessboard whose inner corners are even one way and odd the other.",
         views=views, note="the boards were turned back about their middle.",
     )  # fmt: skip
-
-
-def _can_turn(target: Target) -> bool:
-    return isinstance(target, (Chessboard, CircleGrid))
 
 
 def reread_rotations(p: Poses, *, thorough: bool) -> list[Hypothesis]:

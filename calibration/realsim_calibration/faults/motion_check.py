@@ -58,12 +58,8 @@ class MotionCheck:
 
     turns_deg: Array
     """(3,) RMS turn of the pairs of views about the principal axes, descending [deg]."""
-    roll_deg: float
-    """Range of the camera's roll about its optical axis [deg]."""
     sd_mm: Array
     """(3,) best possible 1-sigma of the camera's place along the camera's x, y, z [mm]."""
-    identical: tuple[tuple[int, int], ...]
-    """Pairs of views with the same hand pose."""
     sentences: tuple[str, ...]
     """What is missing, with its consequence and what to do; empty where nothing is."""
 
@@ -98,15 +94,12 @@ def check_motion(
     fit = fit_frames(hand_side(T, eye_in_hand), C, m)
     sd_mm = _best_sd(hand_side(T, eye_in_hand), C, m, fit)
     roll = roll_range_deg(C)
-    identical = _identical(T)
     found = [
         *_turn_sentences(turns, axes, roll, sd_mm),
         *_place_sentences(C, m),
-        *_identical_sentences(identical, len(T)),
+        *_identical_sentences(_identical(T), len(T)),
     ]
-    return MotionCheck(
-        turns_deg=turns, roll_deg=roll, sd_mm=sd_mm, identical=identical, sentences=tuple(found)
-    )
+    return MotionCheck(turns_deg=turns, sd_mm=sd_mm, sentences=tuple(found))
 
 
 def _best_sd(A: Array, C: Array, m: Array, fit: FrameFit) -> Array:

@@ -68,8 +68,7 @@ def tool_offset(Ts_base_ee: ArrayLike, nominal: ArrayLike) -> ToolOffset:
             f"tool offset: {len(A)} hand poses and {len(N)} nominal ones; three or more with one "
             "of each are needed."
         )
-    chosen = _simplest(A, N)
-    L, offsets, groups, error = chosen
+    L, offsets, groups, error = _simplest(A, N)
     mm, deg = _rms(error)
     known = mm <= MAX_ERROR_MM
     active = known and any(_differs(E) for E in offsets)
@@ -86,8 +85,6 @@ def _simplest(A: Array, N: Array) -> tuple[Array, tuple[Array, ...], Int64, Arra
     one = np.zeros(len(A), dtype=np.int64)
     I4 = np.eye(4)
     fit = fit_frames(A, se3.invert(N))
-    L = se3.from_rt(fit.Z[:3, :3], fit.Z[:3, 3])
-    E = se3.invert(fit.X)
     turn = se3.from_rt(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     # Typical cases first, each with an exact base: a tool, the base turned by 180 deg, then any.
     models: list[tuple[Array, tuple[Array, ...], Int64]] = [
@@ -95,7 +92,7 @@ def _simplest(A: Array, N: Array) -> tuple[Array, tuple[Array, ...], Int64, Arra
         (I4, (mean_transform(se3.invert(N) @ A),), one),
         (turn, (mean_transform(se3.invert(turn @ N) @ A),), one),
         (mean_transform(A @ se3.invert(N)), (I4,), one),
-        (L, (E,), one),
+        (fit.Z, (se3.invert(fit.X),), one),
     ]
     for base in (I4, turn):
         offsets, groups = _groups(se3.invert(base @ N) @ A)

@@ -116,13 +116,13 @@ class JointState:
     """(views, 6) robot errors log D_i, smooth part included, rotation first [rad, m]."""
 
     def moved(self, step: Array) -> "JointState":
-        """Return the state after a step (29 + p,); robot errors stay."""
+        """Return the state after a step (29 + p,), or after several; robot errors stay."""
         return JointState(
-            X=self.X @ se3.exp(step[:6]),
-            Z=self.Z @ se3.exp(step[6:12]),
-            camera=self.camera + step[12:24],
-            board=self.board + step[24:29],
-            weights=self.weights + step[29:],
+            X=self.X @ se3.exp(step[..., :6]),
+            Z=self.Z @ se3.exp(step[..., 6:12]),
+            camera=self.camera + step[..., 12:24],
+            board=self.board + step[..., 24:29],
+            weights=self.weights + step[..., 29:],
             errors=self.errors,
         )
 

@@ -339,11 +339,7 @@ def _views(
     views, away = problem.setup.views, fit.away
     smooth = smooth_errors(basis, state.weights, len(views))
     residuals = np.split(problem.residuals(state, smooth), problem.starts[1:-1])
-    without = JointState(
-        X=state.X @ se3.exp(away[:, :6]), Z=state.Z @ se3.exp(away[:, 6:12]),
-        camera=state.camera + away[:, 12:24], board=state.board + away[:, 24:SHARED],
-        weights=state.weights, errors=state.errors,
-    )  # fmt: skip
+    without = state.moved(away)
     if basis is not None:
         smooth = smooth + (basis.columns @ away[:, SHARED:, None])[..., 0]
     expected = problem.poses(without, smooth)

@@ -199,11 +199,7 @@ def _listings_in(place: Path, folder: Path) -> list[tuple[Path, list[tuple[str, 
 
 def _pose_files(folder: Path, *, board: bool = False) -> tuple[list[Path], str]:
     """Return a folder's pose files in natural order, and what was left out."""
-    files = [
-        p
-        for p in folder.iterdir()
-        if p.suffix.lower() in ENDINGS and p.is_file() and not p.name.startswith(".")
-    ]
+    files = _candidates(folder)
     if len(files) > MAX_FOLDER_FILES:
         raise InputError(f"{folder} holds {len(files)} files; at most {MAX_FOLDER_FILES} are read.")
     cameras = [p for p in files if _is_camera(p)]
@@ -232,9 +228,14 @@ def _pose_files(folder: Path, *, board: bool = False) -> tuple[list[Path], str]:
 
 def pose_files_in(folder: Path) -> list[Path]:
     """Return the files of a folder that may hold poses, in natural order; cameras do not."""
-    files = [p for p in folder.iterdir() if p.suffix.lower() in ENDINGS and p.is_file()]
-    files = [p for p in files if not p.name.startswith(".") and not _is_camera(p)]
+    files = [p for p in _candidates(folder) if not _is_camera(p)]
     return sorted(files, key=lambda p: natural_key(p.name))
+
+
+def _candidates(folder: Path) -> list[Path]:
+    """Return the files of a folder that have the ending of pose files."""
+    files = (p for p in folder.glob("[!.]*") if p.suffix.lower() in ENDINGS)
+    return [p for p in files if p.is_file()]
 
 
 def _is_camera(path: Path) -> bool:

@@ -143,7 +143,9 @@ def _from_list(path: Path, node: list[Any], key: str | None) -> list[Entry]:
 def _from_dict(path: Path, node: dict[str, Any], key: str | None) -> list[Entry]:
     """Return the poses of a dict: one pose, image to pose, or a list with companions."""
     if key is None and len(node) >= 2 and all(_is_pose(v) for v in node.values()):
-        if not any(_JOINTS.match(k.lower()) for k in node) and not _POSITION & _lower(node):
+        if not any(_JOINTS.match(k.lower()) for k in node) and not _POSITION & {
+            _stem(k)[0] for k in node
+        }:
             return _by_name(path, node)
     if _is_pose(node) or (key is not None and key in node and _is_pose(node[key])):
         return [_entry(path, node, key, "its pose")]
@@ -245,10 +247,6 @@ def _stem(key: str) -> tuple[str, str]:
     """Return a key in lower case without its unit, and the unit."""
     match = re.fullmatch(r"(.+?)_(mm|m|deg|rad)", key.lower())
     return (match[1], match[2]) if match else (key.lower(), "")
-
-
-def _lower(node: dict[str, Any]) -> set[str]:
-    return {_stem(k)[0] for k in node}
 
 
 def _direct(node: dict[str, Any]) -> Entry:

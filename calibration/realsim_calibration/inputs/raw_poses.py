@@ -17,7 +17,6 @@ from realsim_calibration.inputs.readings import (
     AngleUnit,
     LengthUnit,
     PoseReading,
-    both_directions,
 )
 
 ANGLE_ROTATIONS: tuple[str, ...] = ("rotation_vector", *(f"euler_{o}" for o in EULER_ORDERS))
@@ -198,7 +197,9 @@ def possible_readings(
     found: list[PoseReading] = []
     reasons: list[str] = []
     refused: list[str] = []
-    for first, kind in product((True, False), _kinds(values.shape[1], said)):
+    by_width = {6: ANGLE_ROTATIONS, 7: QUATERNIONS, 12: MATRICES, 16: MATRICES}
+    kinds = by_width[values.shape[1]] if said.rotations is None else said.rotations
+    for first, kind in product((True, False), kinds):
         if (said.position_first is not None and first != said.position_first) or (
             not first and values.shape[1] == 16
         ):
@@ -224,15 +225,7 @@ def possible_readings(
             f"{name}: no pose format fits its {values.shape[1]} numbers a pose. {tried} Are other "
             "numbers among them? Name the columns in a first line, or delete the others."
         )
-    both = [both_directions(r) for r in found]
-    ordered = tuple(p for p, _ in both) + tuple(i for _, i in both)
-    return ordered, tuple(reasons)
-
-
-def _kinds(width: int, said: Said) -> tuple[str, ...]:
-    """Return the rotation formats that a width and the names leave open."""
-    by_width = {6: ANGLE_ROTATIONS, 7: QUATERNIONS, 12: MATRICES, 16: MATRICES}[width]
-    return by_width if said.rotations is None else said.rotations
+    return (*found, *(replace(r, inverted=True) for r in found)), tuple(reasons)
 
 
 def _rotation_problem(reading: PoseReading, values: Array, names: Sequence[str]) -> str:

@@ -255,11 +255,6 @@ def reading_from_text(text: str) -> PoseReading:
     return PoseReading(**given)
 
 
-def both_directions(reading: PoseReading) -> tuple[PoseReading, PoseReading]:
-    """Return the reading as it is not inverted and as it is."""
-    return replace(reading, inverted=False), replace(reading, inverted=True)
-
-
 def _listed(names: Sequence[str], bad: Mask, most: int = 8) -> str:
     """Return the names of the bad rows for a message, at most so many."""
     chosen = [names[int(k)] for k in np.flatnonzero(bad)]

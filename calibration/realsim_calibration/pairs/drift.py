@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.records.calibration import worst_sigmas
 from realsim_calibration.pairs.noise import Noise, RobotParts, estimate_noise, linearise, solve
 from realsim_calibration.pairs.solve import jackknifed
 
@@ -60,9 +61,8 @@ class Drift:
     @property
     def sigmas(self) -> tuple[float, float]:
         """Largest 1-sigma along any axis: rotation [deg], translation [mm]."""
-        parts = self.covariance[:3, :3], self.covariance[3:, 3:]
-        turn, shift = (float(np.sqrt(np.linalg.eigvalsh(p)[-1])) for p in parts)
-        return float(np.degrees(turn)), 1e3 * shift
+        mm, deg = worst_sigmas(self.covariance)
+        return deg, mm
 
 
 def estimate_drift(

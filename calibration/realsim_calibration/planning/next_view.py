@@ -32,7 +32,9 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import projection_jacobian, undistort
 from realsim.records import Chessboard, CircleGrid, RobotErrorMap, Target
+from realsim.records.calibration import worst_sigmas
 from realsim_calibration.results import HandEyeReport
+from realsim_calibration.views import target_middle
 
 SHARED = 29
 """X 6, Z 6, camera 12, board 5."""
@@ -98,12 +100,6 @@ class BoardGeometry:
     """Side of the board on which the camera stands, in the board's axes [deg]."""
     roll_deg: float
     """Turn of the board about the optical axis [deg] (twist part of its rotation)."""
-
-
-def target_middle(target: Target) -> Array:
-    """Return the middle (3,) of the target [m]."""
-    points = target.points_board
-    return (points.min(0) + points.max(0)) / 2
 
 
 def board_geometry(T_cam_board: Array, target: Target) -> BoardGeometry:
@@ -367,13 +363,12 @@ class _Planned:
         rms = state.rms(covariances)
         _, logdet = np.linalg.slogdet(covariances)
         for k, C, after, volume in zip(where, covariances[1:], rms[1:], logdet[1:], strict=True):
-            g, reason = self.geometry[k], self.reasons[k]
+            g, reason, (mm, deg) = self.geometry[k], self.reasons[k], worst_sigmas(C)
             yield NextView(
                 plan_index=int(k), T_base_ee=self.Ts[k], visible=not reason, reason=reason,
                 visible_share=float(self.inside[k].mean()), distance_m=g.distance_m,
                 tilt_deg=g.tilt_deg, roll_deg=g.roll_deg,
-                sigma_mm=float(1e3 * np.sqrt(np.linalg.eigvalsh(C[3:, 3:])[-1])),
-                sigma_deg=float(np.degrees(np.sqrt(np.linalg.eigvalsh(C[:3, :3])[-1]))),
+                sigma_mm=mm, sigma_deg=deg,
                 rms_mm=float(1e3 * after), gain=float(1 - after / rms[0]),
                 gain_nats=float(logdet[0] - volume) / 2,
             )  # fmt: skip

@@ -11,9 +11,9 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Target
 from realsim_calibration.faults.motion_check import range_deg
-from realsim_calibration.planning.next_view import BoardGeometry, board_geometry, target_middle
+from realsim_calibration.planning.next_view import BoardGeometry, board_geometry
 from realsim_calibration.results import HandEyeReport
-from realsim_calibration.views import BoardView
+from realsim_calibration.views import BoardView, target_middle
 
 SMALL_MOVE_DEG = 10.0
 """Angles that are not worth a word to the operator [deg]."""

@@ -12,6 +12,7 @@ from realsim.records import ArmErrorMap, Check, RobotErrorMap
 from realsim.records.calibration import worst_sigmas
 from realsim_calibration.exports.frames import quaternion_xyzw, roll_pitch_yaw
 from realsim_calibration.results import Clock, HandEyeReport, ViewReport
+from realsim_calibration.views import target_middle
 
 Verdict = Literal["good", "warn", "bad", "unknown"]
 NOT_KNOWN = "not known"
@@ -278,12 +279,6 @@ def rest_of_map(report: HandEyeReport, view: ViewReport) -> Array | None:
     return se3.log(se3.invert(mapped) @ view.T_base_ee @ se3.exp(view.robot_error))
 
 
-def board_middle(report: HandEyeReport) -> Array:
-    """Return the middle (3,) of the target's points in the board frame [m]."""
-    points = report.target.points_board
-    return (points.min(0) + points.max(0)) / 2
-
-
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Viewpoint:
     """From where a view sees the target."""
@@ -300,7 +295,7 @@ class Viewpoint:
 def viewpoint(report: HandEyeReport, view: ViewReport) -> Viewpoint:
     """Return from where a view sees the target."""
     T = camera_in_board(report, view)
-    away = T[:3, 3] - board_middle(report)
+    away = T[:3, 3] - target_middle(report.target)
     distance = float(np.linalg.norm(away))
     # The board's z points into the paper, away from the camera.
     tilt = np.degrees(np.arccos(np.clip(-away[2] / max(distance, 1e-12), -1.0, 1.0)))

@@ -17,7 +17,6 @@ from realsim_calibration.sheets.layout import (
     PREVIEW_PX,
     Layout,
     Place,
-    Ruler,
     lay_out,
     needed_page,
     page_of,
@@ -64,14 +63,7 @@ class SheetReport:
     name: str
     """The line that is printed on the sheet and that `parse_target` reads."""
     paper: str
-    page_mm: tuple[float, float]
-    """Width and height of the page as oriented."""
-    origin_mm: tuple[float, float]
-    """Origin of the target's board frame."""
-    quiet_mm: tuple[float, float, float, float]
-    """Left, top, right and bottom of the target with the white that must stay around it."""
-    rulers: tuple[Ruler, Ruler]
-    """Along the bottom and along the left edge."""
+    layout: Layout
 
     @property
     def paths(self) -> list[Path]:
@@ -163,10 +155,7 @@ def write_sheet(
         preview=picture_path if preview else None,
         name=line,
         paper=name,
-        page_mm=layout.page_mm,
-        origin_mm=layout.origin_mm,
-        quiet_mm=layout.quiet_mm,
-        rulers=layout.rulers,
+        layout=layout,
     )
 
 

@@ -59,16 +59,13 @@ def dictionary_size(name: str) -> int:
     return len(load_dictionary(name).bytesList)
 
 
-def marker_cells(name: str) -> int:
-    """Return the modules along a marker's edge, its black border of one module included."""
-    return int(load_dictionary(name).markerSize) + 2
-
-
 def marker_modules(name: str, marker_id: int) -> Mask:
     """Return (cells, cells) modules of a marker, True = black, first row at the top."""
     from cv2 import aruco
 
-    gray = aruco.generateImageMarker(load_dictionary(name), marker_id, marker_cells(name))
+    dictionary = load_dictionary(name)
+    cells = int(dictionary.markerSize) + 2  # its black border of one module included
+    gray = aruco.generateImageMarker(dictionary, marker_id, cells)
     return np.asarray(gray, dtype=np.uint8) == 0
 
 
