@@ -119,7 +119,8 @@ def test_a_folder_is_its_own_from_the_first_note_on(lab, found_before):
 
 def test_results_that_are_half_replaced_have_no_page(tmp_path):
     _, hands = pictures()
-    write_matrices(tmp_path / "hand.json", hands)
+    lost = np.arange(len(hands)) == 4
+    write_matrices(tmp_path / "hand.json", np.where(lost[:, None, None], np.nan, hands))
     write_matrices(tmp_path / "board.json", se3.invert(hands @ X) @ Z)
     out = tmp_path / "out"
     out.mkdir()
@@ -129,6 +130,7 @@ def test_results_that_are_half_replaced_have_no_page(tmp_path):
     poses = ("--poses", "hand.json", "--board-poses", tmp_path / "board.json")
     done = invoked("calibrate", tmp_path, *poses, "--out", out)
     assert isinstance(done.exception, OSError), done.output
+    assert "entry 4 was left out: NaN" in " ".join(done.output.split())
     assert not (out / "calibration_report.html").exists()
 
 

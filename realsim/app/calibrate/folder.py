@@ -321,6 +321,8 @@ def _from_pose_files(
         return _of_pairs(request, config, console, stamped)
     given = read_board_poses(request.poses, request.board_poses, robot_key=request.key or None)
     console.say(f"{len(given.robot)} pose pairs: {given.pairing}")
+    for name, reason in given.unpaired_robot:
+        console.warn(f"{name} was left out: {reason}")
     board_reading = given.board.stated
     if board_reading is None:
         raise InputError(
