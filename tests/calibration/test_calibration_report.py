@@ -16,7 +16,6 @@ from matplotlib.text import Text
 
 import board_depth
 from page_tags import Tags
-from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check, HandEye
 from realsim.records.depth_bias import DepthBias
@@ -38,6 +37,7 @@ from realsim_calibration.report.summary import (
 from realsim_calibration.report.view_plots import plot_views
 from realsim_calibration.results import HandEyeReport, Mode
 from realsim_calibration.views import detection_of
+from refusals import refused
 
 Maker = Callable[..., HandEyeReport]
 HOSTILE = "<script>alert('$x^2$ & _y_')</script>.png"
@@ -267,8 +267,7 @@ def test_camera_poses_of_an_arm_s_calibration_need_joints(calibrated_arm: Maker)
     hand_eye = plain_report.hand_eye
     assert isinstance(hand_eye, HandEye)
     view = plain_report.used[0]
-    with pytest.raises(InputError, match="joint angles are needed"):
-        hand_eye.camera_poses(view.T_base_ee)
+    refused("joint angles are needed", hand_eye.camera_poses, view.T_base_ee)
     T = hand_eye.camera_poses(view.T_base_ee, view.joints)
     moved = se3.log(se3.invert(view.T_base_ee @ hand_eye.T_ee_cam) @ T)
     assert 0 < np.linalg.norm(moved[3:]) < 5e-3

@@ -185,8 +185,7 @@ def test_units_in_names_extra_columns_and_joints():
         found.poses(reading_from_text("euler_xyz,deg,m"))
     moved = found.poses(reading_from_text("euler_xyz,rad,mm"), despite_names=True)
     assert np.allclose(moved[:, :3, 3], T[:, :3, 3])
-    with pytest.raises(InputError, match="not rotation_vector"):
-        found.poses(reading_from_text("rotvec,deg,mm"))
+    refused("not rotation_vector", found.poses, reading_from_text("rotvec,deg,mm"))
 
 
 def test_degrees_under_names_that_state_radians_are_noted():

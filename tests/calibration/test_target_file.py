@@ -245,8 +245,7 @@ def test_wrong_files_are_named(
 def test_yaml_runs_no_code_and_aliases_do_not_grow(tmp_path: Path) -> None:
     marker = tmp_path / "ran"
     code = f"kind: !!python/object/apply:os.system ['touch {marker}']\n"
-    with pytest.raises(InputError, match="has the tag"):
-        read_target(write(tmp_path, "code.yaml", code))
+    refused("has the tag", read_target, write(tmp_path, "code.yaml", code))
     assert not marker.exists()
     nested = "a0: &a0 [x, x]\n" + "".join(
         f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}, *a{k - 1}, *a{k - 1}]\n" for k in range(1, 40)
