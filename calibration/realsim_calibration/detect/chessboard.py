@@ -271,10 +271,6 @@ def _first_is_dark(gray: UInt8, grid: Array) -> bool:
     r, c = np.indices(level.shape)
     even = (r + c) % 2 == 0
     # Neighbours are compared, because light may fall off across the board.
-    step = np.concatenate(
-        [
-            (np.diff(level, axis=0) * np.where(even[:-1], 1, -1)).ravel(),
-            (np.diff(level, axis=1) * np.where(even[:, :-1], 1, -1)).ravel(),
-        ]
-    )
-    return bool(step.mean() > 0)
+    down = np.diff(level, axis=0) * np.where(even[:-1], 1, -1)
+    right = np.diff(level, axis=1) * np.where(even[:, :-1], 1, -1)
+    return bool(np.concatenate([down.ravel(), right.ravel()]).mean() > 0)

@@ -183,11 +183,10 @@ def camera_info_text(report: HandEyeReport, frames: FrameNames) -> str:
 
     It is intrinsics_alone: the published transform is X_alone, and the two were fitted together.
     """
-    return comments(
-        (
-            f"Camera of a hand-eye calibration by realsim {__version__}. Pixels; integer "
-            "pixels are pixel centres.",
-            f"The image's frame is {frames.camera_optical}.",
-            fit_line(report),
-        )
-    ) + ros_yaml(report.intrinsics_alone, frames.name)
+    notes = (
+        f"Camera of a hand-eye calibration by realsim {__version__}. Pixels; integer pixels are "
+        "pixel centres.",
+        f"The image's frame is {frames.camera_optical}.",
+        fit_line(report),
+    )
+    return comments(notes) + ros_yaml(report.intrinsics_alone, frames.name)

@@ -1,28 +1,26 @@
 """Views that repeat another: the same view twice, one pose for several images, one image twice."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from realsim.arrays import Array, Mask
-from realsim_calibration.faults.diagnosis import OTHER_VIEW, SAME_POSE_DEG, SAME_POSE_MM, SAME_VIEW
+from realsim_calibration.faults.diagnosis import (
+    OTHER_VIEW,
+    SAME_POSE_DEG,
+    SAME_POSE_MM,
+    SAME_VIEW,
+    Fault,
+)
 from realsim_calibration.faults.frame_fit import UNIT_DEG, UNIT_PART, chord_angle
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Copies:
-    """Groups of rows that repeat each other, by kind."""
-
-    duplicates: tuple[tuple[int, ...], ...]
-    """The same pose and the same image."""
-    frozen: tuple[tuple[int, ...], ...]
-    """The same pose, different images."""
-    repeated: tuple[tuple[int, ...], ...]
-    """The same image, different poses."""
+Groups = tuple[tuple[int, ...], ...]
 
 
-def find_copies(T: Array, C: Array, middle: Array) -> Copies:
-    """Return the groups of (n, 4, 4) hand and board poses that repeat each other."""
+def find_copies(T: Array, C: Array, middle: Array) -> dict[Fault, Groups]:
+    """Return the groups of (n, 4, 4) hand and board poses that repeat each other, worst first.
+
+    A frozen pose has different images, a repeated image different poses; of a duplicate both are
+    the same.
+    """
     unit = _length_unit(T)
     same_hand = _near(T, 1e-3 * SAME_POSE_MM * unit, np.radians(SAME_POSE_DEG))
     q = C[:, :3, :3] @ middle + C[:, :3, 3]
@@ -32,11 +30,11 @@ def find_copies(T: Array, C: Array, middle: Array) -> Copies:
     seen = np.hypot(turn / np.radians(UNIT_DEG), slip / UNIT_PART)
     # The same image gives the same numbers; a second photograph of the same view does not.
     same_image = seen < 1e-6 * SAME_VIEW
-    return Copies(
-        duplicates=_groups(same_hand & (seen < SAME_VIEW)),
-        frozen=_groups(same_hand & (seen > OTHER_VIEW)),
-        repeated=_groups(same_image & ~same_hand),
-    )
+    return {
+        "frozen_pose": _groups(same_hand & (seen > OTHER_VIEW)),
+        "repeated_image": _groups(same_image & ~same_hand),
+        "duplicated_views": _groups(same_hand & (seen < SAME_VIEW)),
+    }
 
 
 def _length_unit(T: Array) -> float:
@@ -50,7 +48,7 @@ def _near(T: Array, length: float, angle: float) -> Mask:
     return (far < length) & (turn < angle)
 
 
-def _groups(linked: Mask) -> tuple[tuple[int, ...], ...]:
+def _groups(linked: Mask) -> Groups:
     """Return the rows that are linked with each other, groups of two and more."""
     n = len(linked)
     free, groups = set(range(n)), list[tuple[int, ...]]()

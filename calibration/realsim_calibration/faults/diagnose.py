@@ -18,7 +18,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Target
 from realsim_calibration.faults import pairing
-from realsim_calibration.faults.copied_views import Copies, find_copies
+from realsim_calibration.faults.copied_views import Groups, find_copies
 from realsim_calibration.faults.diagnosis import (
     ACCEPT_SCORE,
     DECISIVE,
@@ -107,8 +107,7 @@ def diagnose(
     middle = np.zeros(3) if target is None else target.points_board.mean(0)
     p = Poses(T=T, C=C, eye_in_hand=mode == "eye_in_hand", middle=middle, labels=names,
               target=target)  # fmt: skip
-    copies = find_copies(T, C, middle)
-    rows, copied = _without_copies(p, copies)
+    rows, copied = _without_copies(p, find_copies(T, C, middle))
     if copied is not None and copied.fault == "unknown":
         return _diagnosis(p, copied, ())
     part = replace(p, T=T[rows], C=C[rows], labels=tuple(names[k] for k in rows))
@@ -139,32 +138,26 @@ def _diagnosis(p: Poses, h: Hypothesis, tried: Sequence[Hypothesis]) -> Diagnosi
     )  # fmt: skip
 
 
-def _without_copies(p: Poses, copies: Copies) -> tuple[Int64, Hypothesis | None]:
+def _without_copies(p: Poses, groups: dict[Fault, Groups]) -> tuple[Int64, Hypothesis | None]:
     """Return the rows that repeat nothing, and what the others are."""
-    groups = {"duplicated_views": copies.duplicates, "frozen_pose": copies.frozen,
-              "repeated_image": copies.repeated}  # fmt: skip
     n = len(p.T)
     every = np.arange(n)
     if not any(groups.values()):
         return every, None
-    doubtful = {
-        row for kind in ("frozen_pose", "repeated_image") for g in groups[kind] for row in g
-    }
-    spare = {row for g in copies.duplicates for row in g[1:]}
+    unsure = (*groups["frozen_pose"], *groups["repeated_image"])
+    doubtful = {row for group in unsure for row in group}
+    spare = {row for g in groups["duplicated_views"] for row in g[1:]}
     sure = np.array([k for k in range(n) if k not in doubtful | spare], dtype=np.int64)
     kept = list(sure)
     if doubtful and len(sure) > MIN_VIEWS:
         fit = p.fit(p.T[sure], p.C[sure])
         errors = np.diag(mismatch(fit, hand_side(p.T, p.eye_in_hand), p.C))
         gate = max(pairing.RATIO * fit.usual, pairing.SWAP_FLOOR)
-        for kind in ("frozen_pose", "repeated_image"):
-            for group in groups[kind]:
-                best = min(group, key=lambda k: errors[k])
-                kept += [best] if errors[best] <= gate else []
+        for group in unsure:
+            best = min(group, key=lambda k: errors[k])
+            kept += [best] if errors[best] <= gate else []
     rows = np.array(sorted(set(kept) - spare), dtype=np.int64)
-    fault: Fault = next(
-        kind for kind in ("frozen_pose", "repeated_image", "duplicated_views") if groups[kind]
-    )  # pyright: ignore[reportAssignmentType]
+    fault: Fault = next(kind for kind, found in groups.items() if found)
     text = {
         "frozen_pose": ("share one hand pose to the last digit although their images differ: the "
                         "controller delivered an old pose", "Read the pose after the arm has "

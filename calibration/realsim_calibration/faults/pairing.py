@@ -94,10 +94,9 @@ class Moved:
 
 def find_pairing(A: Array, C: Array, middle: Array) -> Pairing | None:
     """Return the pairing that fits best, None where no stretch of the lists is consistent."""
-    best = _best_stretch(A, C, middle)
-    if best is None:
+    fit = _best_stretch(A, C, middle)
+    if fit is None:
         return None
-    fit = best
     result: Pairing | None = None
     # Twice: the first frames come from a part of the views, the second from all that were paired.
     for _ in range(2):
@@ -290,13 +289,9 @@ def _carried(
     for _ in range(MOVE_ROUNDS):
         seen = C.copy()
         seen[:, :3, 3] *= fit.length_ratio
-        if frame == "X":
-            places = se3.invert(A) @ fit.Z @ se3.invert(seen)
-            step = mean_transform(places[:start]) @ se3.invert(mean_transform(places[start:]))
-            hands = np.concatenate([A[:start], A[start:] @ se3.invert(step)])
-        else:
-            places = A @ fit.X @ seen
-            step = mean_transform(places[:start]) @ se3.invert(mean_transform(places[start:]))
-            hands = np.concatenate([A[:start], step @ A[start:]])
-        fit = fit_frames(hands, C, middle)
+        hand = frame == "X"
+        places = se3.invert(A) @ fit.Z @ se3.invert(seen) if hand else A @ fit.X @ seen
+        step = mean_transform(places[:start]) @ se3.invert(mean_transform(places[start:]))
+        later = A[start:] @ se3.invert(step) if hand else step @ A[start:]
+        fit = fit_frames(np.concatenate([A[:start], later]), C, middle)
     return step, fit

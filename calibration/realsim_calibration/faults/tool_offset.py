@@ -40,10 +40,6 @@ class ToolOffset:
     """Whether the nominal poses fit at all; else nothing is claimed."""
     offsets: tuple[Array, ...]
     """(4, 4) T_flange_ee of every stretch of views; one where it is constant [m]."""
-    groups: Int64
-    """(n,) which of the offsets a view has."""
-    rms_mm: float
-    """What remains [mm]."""
     active: bool
     """Whether some offset is more than the nominal kinematics' own error."""
     base_turned: bool
@@ -75,8 +71,8 @@ def tool_offset(Ts_base_ee: ArrayLike, nominal: ArrayLike) -> ToolOffset:
     turned = known and _differs(L)
     sentence, advice = _sentence(L, offsets, groups, (mm, deg), known)
     return ToolOffset(
-        known=known, offsets=offsets, groups=groups, rms_mm=mm, active=active,
-        base_turned=turned, sentence=sentence, advice=advice,
+        known=known, offsets=offsets, active=active, base_turned=turned, sentence=sentence,
+        advice=advice,
     )  # fmt: skip
 
 

@@ -36,10 +36,6 @@ class FolderInput:
     """(file name, reason)."""
     unpaired_poses: tuple[tuple[str, str], ...]
     """(where it stands, reason)."""
-    duplicate_images: tuple[tuple[str, ...], ...]
-    """Names of images whose files are equal byte by byte."""
-    duplicate_poses: tuple[tuple[str, ...], ...]
-    """Where poses with the very same numbers stand."""
     warnings: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -148,8 +144,6 @@ def read_image_folder(
             *((raw.where[r], why) for r, why in found.unpaired_poses),
             *((raw.where[r], "NaN or infinite numbers") for _, r in lost),
         ),
-        duplicate_images=same_images,
-        duplicate_poses=same_poses,
         warnings=(
             *([f"{against} It is taken as you say."] if against else []),
             *found.warnings,

@@ -270,13 +270,11 @@ def _lens_section(
     columns.append([f"{v:.6g}" for v in (i.fx, i.fy, i.cx, i.cy, *i.distortion)])
     page.table(header, [[name, *[c[k] for c in columns]] for k, name in enumerate(TERM_NAMES)])
     if intrinsics_report is not None:
-        page.table(
-            ["lens model", "unseen [px]", "seen [px]", ""],
-            [
-                [m.model, amount(m.held_out_px, 3), amount(m.seen_px, 3), "chosen" * m.chosen]
-                for m in intrinsics_report.held_out
-            ],
-        )
+        models = [
+            [m.model, amount(m.held_out_px, 3), amount(m.seen_px, 3), "chosen" * m.chosen]
+            for m in intrinsics_report.held_out
+        ]
+        page.table(["lens model", "unseen [px]", "seen [px]", ""], models)
 
 
 def _lens_column(i: CameraIntrinsics, covariance: Array) -> list[str]:

@@ -123,25 +123,15 @@ def pose_rows(report: HandEyeReport) -> list[list[str]]:
         ["quaternion x, y, z, w", q],
         ["looks along", looks_along(report)],
     ]
-    moved = float(metrics.translation_error_mm(report.X, report.X_alone))
-    turned = float(metrics.rotation_error_deg(report.X, report.X_alone))
-    if report.robot_map is None:
-        rows.append(["robot error map", "none: the controller's poses are taken as they are"])
-    else:
-        rows.append(
-            [
-                "robot error map",
-                f"in use; X_alone, which needs none, is {moved:.2f} mm and {turned:.3f} deg from X",
-            ]
-        )
-    if report.stretch is not None:
-        s = report.stretch
-        rows.append(
-            [
-                f"the {len(s.views)} outermost views, held out together",
-                f"{amount(s.map_px, 3, 'px')} with the map, {amount(s.plain_px, 3, 'px')} without",
-            ]
-        )
+    used = "none: the controller's poses are taken as they are"
+    if report.robot_map is not None:
+        moved = float(metrics.translation_error_mm(report.X, report.X_alone))
+        turned = float(metrics.rotation_error_deg(report.X, report.X_alone))
+        used = f"in use; X_alone, which needs none, is {moved:.2f} mm and {turned:.3f} deg from X"
+    rows.append(["robot error map", used])
+    if (s := report.stretch) is not None:
+        held = f"{amount(s.map_px, 3, 'px')} with the map, {amount(s.plain_px, 3, 'px')} without"
+        rows.append([f"the {len(s.views)} outermost views, held out together", held])
     if report.plain_scores:
         held = ", ".join(
             f"{name} {amount(px, 2)}{' (taken)' * (name == report.plain_name)}"
@@ -199,23 +189,19 @@ def accuracy_rows(report: HandEyeReport) -> list[list[str]]:
     """Return the rows that say how good the calibration is."""
     ratio = report.held_out_px / report.seen_px if report.seen_px > 0 else float("nan")
     compared = f"; unseen / seen = {ratio:.2f}" if np.isfinite(ratio) else ""
-    return [
-        [
-            "unseen views (each predicted without it)",
-            f"{amount(report.held_out_px, 3, 'px')}, {amount(report.held_out_mm, 3, 'mm')}, "
-            f"{amount(report.held_out_deg, 4, 'deg')} RMS",
-        ],
+    unseen = f"{amount(report.held_out_px, 3, 'px')}, {amount(report.held_out_mm, 3, 'mm')}"
+    unseen += f", {amount(report.held_out_deg, 4, 'deg')} RMS"
+    rows = [
+        ["unseen views (each predicted without it)", unseen],
         ["seen views (in-sample)", f"{amount(report.seen_px, 3, 'px')} RMS{compared}"],
         ["what a perfect calibration of this kind leaves", amount(report.floor_px, 3, "px")],
         ["corner noise", amount(report.sigma_px, 3, "px")],
         ["views used, dropped", f"{len(report.used)}, {len(report.rejected)}"],
         ["roll about the optical axis", amount(report.roll_range_deg, 0, "deg")],
-        *(
-            []
-            if report.clock is None
-            else [["clock offset arm to camera", clock_in_words(report.clock)]]
-        ),
     ]
+    if report.clock is not None:
+        rows.append(["clock offset arm to camera", clock_in_words(report.clock)])
+    return rows
 
 
 def clock_in_words(clock: Clock) -> str:

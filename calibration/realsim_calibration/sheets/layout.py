@@ -82,8 +82,8 @@ class Layout:
     place: Place
 
 
-def sheet_text(target: Target, rulers: tuple[Ruler, Ruler]) -> list[tuple[str, bool]]:
-    """Return the paragraphs of the sheet, and whether each is the line that names the target."""
+def sheet_text(target: Target, rulers: tuple[Ruler, Ruler]) -> list[str]:
+    """Return the paragraphs of the sheet; the second one is the line that names the target."""
     x, y = target.size_m
     origin = {
         TagBoard: "the top left corner of the top left tag",
@@ -105,19 +105,13 @@ def sheet_text(target: Target, rulers: tuple[Ruler, Ruler]) -> list[tuple[str, b
         facts += f", the first {1000 * first:.4g} mm." if target.large_origin else "."
     bottom, left = (f"{ruler.length_mm:g} mm" for ruler in rulers)
     return [
-        (describe(target), False),
-        (format_target(target), True),
-        (
-            f"Print at 100 %, never fitted to the page. Measure the rulers: {bottom} along the "
-            f"bottom, {left} up the left edge. If a print is off, multiply the target's lengths by "
-            "measured / nominal, or print again.",
-            False,
-        ),
-        (
-            f"{facts} Frame: origin at {origin} (at the marks 0), x along the columns, y along "
-            "the rows, z into the paper. Glue the sheet to a flat, stiff plate.",
-            False,
-        ),
+        describe(target),
+        format_target(target),
+        f"Print at 100 %, never fitted to the page. Measure the rulers: {bottom} along the "
+        f"bottom, {left} up the left edge. If a print is off, multiply the target's lengths by "
+        "measured / nominal, or print again.",
+        f"{facts} Frame: origin at {origin} (at the marks 0), x along the columns, y along "
+        "the rows, z into the paper. Glue the sheet to a flat, stiff plate.",
     ]
 
 
@@ -181,10 +175,10 @@ def _set_text(
     """Return the lines of text, broken to a width [mm]."""
     lines: list[tuple[str, Font, float]] = []
     font: Font
-    for k, (paragraph, is_name) in enumerate(sheet_text(target, rulers)):
-        font = "Courier-Bold" if is_name else ("Helvetica-Bold" if k == 0 else "Helvetica")
+    for k, paragraph in enumerate(sheet_text(target, rulers)):
+        font = ("Helvetica-Bold", "Courier-Bold", "Helvetica")[min(k, 2)]
         size = TITLE_PT if k == 0 else TEXT_PT
-        if is_name:
+        if k == 1:
             # The name must stay on one line to be copied; the smallest print is still legible.
             size = max(4.5, min(size, size * measure / text_width_mm(paragraph, font, size)))
         for line in wrap(paragraph, font, size, measure):
