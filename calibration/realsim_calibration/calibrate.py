@@ -60,9 +60,9 @@ RADIAL_POWERS = {"k1": 3, "k2": 5, "k3": 7}
 
 
 def determined_priors(
-    sd: tuple[float, ...], lens: IntrinsicsReport, border_px: float
-) -> tuple[float, ...]:
-    """Return the priors of the distortion, tight for terms that the views do not determine.
+    joint: JointConfig, lens: IntrinsicsReport, config: CalibrationConfig
+) -> JointConfig:
+    """Return the priors around an own lens, tight for distortion that the views do not determine.
 
     Freed entirely, such terms bend the lens outside of the corners until it folds inside the image;
     held, they leave what they could explain to the robot.
@@ -70,12 +70,12 @@ def determined_priors(
     camera = lens.intrinsics
     radius = 0.5 * float(np.hypot(camera.width / camera.fx, camera.height / camera.fy))
     priors: list[float] = []
-    for name, prior in zip(DISTORTION, sd, strict=True):
+    for name, prior in zip(DISTORTION, joint.distortion_sd, strict=True):
         limit = np.inf
         if name not in lens.terms and name in RADIAL_POWERS:
-            limit = border_px / (camera.fx * radius ** RADIAL_POWERS[name])
+            limit = config.border_px / (camera.fx * radius ** RADIAL_POWERS[name])
         priors.append(float(min(prior, limit)))
-    return tuple(priors)
+    return replace(joint, focal_sd=config.own_focal_sd, distortion_sd=tuple(priors))
 
 
 def calibrate(
@@ -105,27 +105,17 @@ def calibrate(
     lens: IntrinsicsReport | None = None
     hand_eye = config.hand_eye
     camera = intrinsics0
+    ordered = sorted(views, key=lambda v: v.index)
+    detections, names = [v.detection for v in ordered], [v.label for v in ordered]
     if camera is None:
-        ordered = sorted(views, key=lambda v: v.index)
-        detections = [v.detection for v in ordered]
-        lens = calibrate_intrinsics(
-            detections, target, names=[v.label for v in ordered], config=config.intrinsics
-        )
+        lens = calibrate_intrinsics(detections, target, names=names, config=config.intrinsics)
         camera = lens.intrinsics
-        joint = replace(
-            hand_eye.joint,
-            focal_sd=config.own_focal_sd,
-            distortion_sd=determined_priors(hand_eye.joint.distortion_sd, lens, config.border_px),
-        )
-        hand_eye = replace(hand_eye, joint=joint)
+        hand_eye = replace(hand_eye, joint=determined_priors(hand_eye.joint, lens, config))
     try:
         report = calibrate_hand_eye_report(views, target, camera, hand_eye, arm)
     except (InputError, UnitError):
         if intrinsics0 is not None:
-            seen = sorted(views, key=lambda v: v.index)
-            require_given_camera(
-                intrinsics0, [v.detection for v in seen], target, [v.label for v in seen], config
-            )
+            require_given_camera(intrinsics0, detections, target, names, config)
         raise
     if lens is not None:  # no camera was given, so nothing is said of one
         both = (lens.covariance + report.intrinsics_covariance)[2:4, 2:4]

@@ -121,10 +121,10 @@ def _report(
         sigma_px=solution.sigma_px,
         robot_ratio=float(np.sqrt(np.prod(solution.ratio))),
         views=tuple(_view_reports(views, screened, solution)),
-        seen_px=_rms([v.seen_px for v in used]),
-        held_out_px=_rms([v.unseen_px for v in used]),
-        held_out_mm=_rms([v.unseen_mm for v in used]),
-        held_out_deg=_rms([v.unseen_deg for v in used]),
+        seen_px=rms([v.seen_px for v in used]),
+        held_out_px=rms([v.unseen_px for v in used]),
+        held_out_mm=rms([v.unseen_mm for v in used]),
+        held_out_deg=rms([v.unseen_deg for v in used]),
         starts=screened.starts,
         mismatch_deg=screened.mismatch_deg,
         screw_ratio=screened.screw_ratio,
@@ -139,7 +139,8 @@ def _report(
     return replace(report, checks=checks)
 
 
-def _rms(values: Sequence[float]) -> float:
+def rms(values: Sequence[float]) -> float:
+    """Return the root of the mean square of some numbers, NaN where there are none."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 

@@ -42,6 +42,7 @@ from realsim_calibration.faults.consequences import drawings_check
 from realsim_calibration.faults.motion_check import roll_range_deg
 from realsim_calibration.fit.joint_solve import JointConfig
 from realsim_calibration.fit.view_system import camera_record
+from realsim_calibration.hand_eye import rms
 from realsim_calibration.lens.intrinsics import calibrate_intrinsics
 from realsim_calibration.lens.report import IntrinsicsReport
 from realsim_calibration.results import BoardShape, HandEyeReport, ViewReport
@@ -144,8 +145,7 @@ def _lenses(
         joint = config.hand_eye.joint
         if given is None:
             assert report is not None
-            terms = determined_priors(joint.distortion_sd, report, config.border_px)
-            joint = replace(joint, focal_sd=config.own_focal_sd, distortion_sd=terms)
+            joint = determined_priors(joint, report, config)
             given = report.intrinsics
         lenses.append(given)
         joints.append(joint)
@@ -304,10 +304,10 @@ def _camera(
             )
             for v in mine
         ),
-        seen_px=_rms([v.seen_px for v in used]),
-        held_out_px=_rms([v.unseen_px for v in used]),
-        held_out_mm=_rms([v.unseen_mm for v in used]),
-        held_out_deg=_rms([v.unseen_deg for v in used]),
+        seen_px=rms([v.seen_px for v in used]),
+        held_out_px=rms([v.unseen_px for v in used]),
+        held_out_mm=rms([v.unseen_mm for v in used]),
+        held_out_deg=rms([v.unseen_deg for v in used]),
         starts=(),
         mismatch_deg=NAN,
         screw_ratio=NAN,
@@ -329,7 +329,3 @@ def _camera(
         )
         checks.append(given_camera_check(given, fitted))
     return replace(report, checks=tuple(checks))
-
-
-def _rms(values: Sequence[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else NAN

@@ -7,6 +7,7 @@ import numpy as np
 
 from realsim.records import Check
 from realsim_calibration.cameras.results import ROBOT_BASE, CamerasReport
+from realsim_calibration.lens.observations import named
 from realsim_calibration.results import HandEyeReport
 
 TOGETHER_MM = (2.0, 6.0)
@@ -75,11 +76,10 @@ def _pairs(r: CamerasReport) -> Iterator[Check]:
 def _arm(r: CamerasReport) -> Iterator[Check]:
     if not r.bad_arm:
         return
-    names = ", ".join(r.bad_arm[:NAMED])
-    more = f" and {len(r.bad_arm) - NAMED} more" if len(r.bad_arm) > NAMED else ""
+    names = named(r.bad_arm, NAMED)
     yield Check(
         name="arm poses", verdict="warn", value=len(r.bad_arm),
-        sentence=f"all cameras contradict the arm's pose at {names}{more}; there the cameras "
+        sentence=f"all cameras contradict the arm's pose at {names}; there the cameras "
         "alone were used.",
         advice="Was the arm still moving, or is it another instant's pose?",
     )  # fmt: skip
@@ -89,11 +89,10 @@ def _odd(r: CamerasReport) -> Iterator[Check]:
     odd = r.disagreeing()
     if not odd:
         return
-    names = ", ".join(f"{v.name} ({v.unseen_px:.2f} px)" for v in odd[:NAMED])
-    more = f" and {len(odd) - NAMED} more" if len(odd) > NAMED else ""
+    names = named([f"{v.name} ({v.unseen_px:.2f} px)" for v in odd], NAMED)
     yield Check(
         name="views that disagree", verdict="warn", value=len(odd),
-        sentence=f"predicted three times worse than their camera's other views: {names}{more}.",
+        sentence=f"predicted three times worse than their camera's other views: {names}.",
         advice="Check these images: is one blurred, did the board move, was the arm at rest?",
         views=tuple(v.instant for v in odd),
     )  # fmt: skip

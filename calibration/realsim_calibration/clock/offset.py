@@ -117,12 +117,11 @@ class ClockOffset:
                 f"the camera's clock is {self.offset_s:+.6f} s off the robot's (+-"
                 f"{1e3 * self.sigma_s:.2f} ms): the clocks start at different times."
             )
-        told = (
-            "it matters" if self.matters else "too small to matter"
-        ) + f": it moves the board by {self.moved_mm:.2f} mm, the pairs scatter by "
+        told = "it matters" if self.matters else "too small to matter"
         return (
             f"the camera's clock is {1e3 * self.offset_s:+.2f} +-{1e3 * self.sigma_s:.2f} ms off "
-            f"the robot's ({told}{self.scatter_mm:.2f} mm)."
+            f"the robot's ({told}: it moves the board by {self.moved_mm:.2f} mm, the pairs scatter "
+            f"by {self.scatter_mm:.2f} mm)."
         )
 
 

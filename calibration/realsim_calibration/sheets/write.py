@@ -4,6 +4,7 @@ import math
 import re
 from dataclasses import dataclass, fields, replace
 from decimal import Decimal
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -190,12 +191,8 @@ def _fit(
     upright, sideways = (min(size), max(size)), (max(size), min(size))
     pages = (sideways, upright) if x1 - x0 > y1 - y0 else (upright, sideways)
     places: tuple[Place, ...] = ("bottom", "side")
-    for place in places:
-        for page in pages:
-            layout = lay_out(target, artwork, page, place, cut_marks)
-            if layout is not None:
-                return layout
-    return None
+    tried = (lay_out(target, artwork, p, place, cut_marks) for place, p in product(places, pages))
+    return next((layout for layout in tried if layout is not None), None)
 
 
 def _choose(target: Target, artwork: Artwork, paper: Paper, cut_marks: bool) -> tuple[str, Layout]:
