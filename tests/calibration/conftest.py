@@ -15,6 +15,12 @@ from realsim_calibration.hand_eye import HandEyeConfig, calibrate_hand_eye_repor
 from realsim_calibration.results import BoardShape, HandEyeReport, Mode, ViewReport
 from realsim_calibration.views import BoardView, TargetDetection
 
+FACTORY = CameraIntrinsics(width=1280, height=720, fx=640.0, fy=640.0, cx=639.5, cy=359.5)
+TRUE_LENS = CameraIntrinsics(
+    width=1280, height=720, fx=644.0, fy=643.0, cx=643.0, cy=356.0,
+    distortion=np.array([-0.05, 0.04, 6e-4, -4e-4, 0, 0, 0, 0]),
+)  # fmt: skip
+
 
 def camera_at(
     rng: np.random.Generator, board: TagBoard, distance: float, max_tilt_deg: float
@@ -43,13 +49,7 @@ class Simulation:
     ) -> None:
         rng = np.random.default_rng(seed)
         self.board = TagBoard(rows=4, columns=6, tag_size_m=0.03, gap_m=0.01)
-        self.intrinsics0 = CameraIntrinsics(
-            width=1280, height=720, fx=640.0, fy=640.0, cx=639.5, cy=359.5
-        )
-        self.intrinsics = CameraIntrinsics(
-            width=1280, height=720, fx=644.0, fy=643.0, cx=643.0, cy=356.0,
-            distortion=np.array([-0.05, 0.04, 0.0006, -0.0004, 0, 0, 0, 0]),
-        )  # fmt: skip
+        self.intrinsics0, self.intrinsics = FACTORY, TRUE_LENS
         self.T_ee_cam = se3.from_rt(
             se3.exp_so3([0.1, -0.05, 1.5]) @ se3.exp_so3(rng.normal(scale=0.1, size=3)),
             np.array([0.03, -0.06, 0.05]),
@@ -202,11 +202,6 @@ ARM = DhArm(
     alpha=np.array([np.pi / 2, 0, 0, np.pi / 2, -np.pi / 2, 0]),
 )  # fmt: skip
 ARM_START = np.array([0.0, -1.4, 1.9, -2.0, -1.57, 0.0])
-FACTORY = CameraIntrinsics(width=1280, height=720, fx=640.0, fy=640.0, cx=639.5, cy=359.5)
-TRUE_LENS = CameraIntrinsics(
-    width=1280, height=720, fx=644.0, fy=643.0, cx=643.0, cy=356.0,
-    distortion=np.array([-0.05, 0.04, 6e-4, -4e-4, 0, 0, 0, 0]),
-)  # fmt: skip
 PRINT_SCALE = 0.9958
 HOSTILE_NAME = "<script>alert('$x^2$ & _y_')</script>.png"
 

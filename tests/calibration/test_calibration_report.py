@@ -17,7 +17,7 @@ from matplotlib.text import Text
 import board_depth
 from page_tags import Tags
 from realsim.geometry import camera, se3
-from realsim.records import ArmErrorMap, CameraIntrinsics, Check, HandEye
+from realsim.records import ArmErrorMap, Check, HandEye
 from realsim.records.depth_bias import DepthBias
 from realsim_calibration.lens.intrinsics import calibrate_intrinsics
 from realsim_calibration.report import style
@@ -38,6 +38,7 @@ from realsim_calibration.report.view_plots import plot_views
 from realsim_calibration.results import HandEyeReport, Mode
 from realsim_calibration.views import detection_of
 from refusals import refused
+from tests.calibration.conftest import TRUE_LENS
 
 Maker = Callable[..., HandEyeReport]
 HOSTILE = "<script>alert('$x^2$ & _y_')</script>.png"
@@ -207,10 +208,6 @@ def test_a_camera_beside_the_robot_with_lens_and_depth(
 
 
 # --- The pictures of a calibration's page: what they are drawn from, and what stands in them.
-LENS = CameraIntrinsics(
-    width=1280, height=720, fx=644.0, fy=643.0, cx=643.0, cy=356.0,
-    distortion=np.array([-0.05, 0.04, 6e-4, -4e-4, 0, 0, 0, 0]),
-)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -303,15 +300,15 @@ def test_sigma_is_given_along_the_axes_of_the_carrier(plain_report: HandEyeRepor
 
 
 def test_frustum_meets_the_corners_of_the_image() -> None:
-    ideal = dataclasses.replace(LENS, distortion=np.zeros(8))
+    ideal = dataclasses.replace(TRUE_LENS, distortion=np.zeros(8))
     uv = camera.project(ideal, frustum(ideal, 0.3)[1:])
     np.testing.assert_allclose(uv, [[-0.5, -0.5], [1279.5, -0.5], [1279.5, 719.5], [-0.5, 719.5]])
 
 
 def test_lens_field_undoes_the_lens() -> None:
-    uv, shift = lens_field(LENS)
-    ideal = (uv - shift - [LENS.cx, LENS.cy]) / [LENS.fx, LENS.fy]
+    uv, shift = lens_field(TRUE_LENS)
+    ideal = (uv - shift - [TRUE_LENS.cx, TRUE_LENS.cy]) / [TRUE_LENS.fx, TRUE_LENS.fy]
     rays = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], -1)
-    np.testing.assert_allclose(camera.project(LENS, rays), uv, atol=1e-6)
-    _, none = lens_field(dataclasses.replace(LENS, distortion=np.zeros(8)))
+    np.testing.assert_allclose(camera.project(TRUE_LENS, rays), uv, atol=1e-6)
+    _, none = lens_field(dataclasses.replace(TRUE_LENS, distortion=np.zeros(8)))
     assert np.abs(none).max() < 1e-9

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -252,11 +253,9 @@ def test_a_wrong_arm_pose_is_named_and_an_instant_without_one_counts_as_well() -
         assert place_mm(report, name) < 1.0
 
 
-def test_the_file_reads_back(tmp_path: object) -> None:
-    from pathlib import Path
-
+def test_the_file_reads_back(tmp_path: Path) -> None:
     report = calibrated()
-    path = write_cameras(report, Path(str(tmp_path)) / "cameras.json")
+    path = write_cameras(report, tmp_path / "cameras.json")
     found = read_cameras(path)
     assert np.array_equal(found.camera("left").T, report.camera("left").X)
     assert np.array_equal(found.covariance, report.covariance)
@@ -286,16 +285,12 @@ def one_mounted_otherwise(rig: Rig) -> Rig:
     return replace(rig, cameras=tuple(cameras))
 
 
-def board_elsewhere(rig: Rig) -> Rig:
-    places: tuple[Place, Place] = ("hand", "hand")
-    boards = tuple(replace(b, place=p) for b, p in zip(rig.boards, places, strict=True))
-    return replace(rig, boards=boards)
+def boards_at(*places: Place) -> Callable[[Rig], Rig]:
+    def fault(rig: Rig) -> Rig:
+        boards = tuple(replace(b, place=p) for b, p in zip(rig.boards, places, strict=True))
+        return replace(rig, boards=boards)
 
-
-def mixed_boards(rig: Rig) -> Rig:
-    places: tuple[Place, Place] = ("hand", "table")
-    boards = tuple(replace(b, place=p) for b, p in zip(rig.boards, places, strict=True))
-    return replace(rig, boards=boards)
+    return fault
 
 
 def same_boards(rig: Rig) -> Rig:
@@ -323,8 +318,8 @@ def other_size(rig: Rig) -> Rig:
         (blind, ("camera 'right' never sees a board", "--cameras")),
         (swapped_cameras, ("cameras 'wrist' and 'left' are exchanged", "exchange their folders")),
         (one_mounted_otherwise, ("camera 'left' is standing still", "left=fixed")),
-        (board_elsewhere, ("board 'table' is on the table", "--board")),
-        (mixed_boards, ("boards 'table' and 'held' are exchanged",)),
+        (boards_at("hand", "hand"), ("board 'table' is on the table", "--board")),
+        (boards_at("hand", "table"), ("boards 'table' and 'held' are exchanged",)),
         (same_boards, ("carry the same markers", "another first id")),
         (lone_camera, ("camera 'right' sees a board in 1 of 1 images", "right.yaml")),
         (other_size, ("camera 'right'", "640x480", "1280x960", "--intrinsics")),

@@ -1,7 +1,6 @@
 """What a calibration leaves behind: every format reads back as the same transform."""
 
 import ast
-import dataclasses
 import json
 import math
 import shlex
@@ -19,6 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
+from scipy.spatial.transform import Rotation
 
 from realsim.arrays import Array
 from realsim.errors import InputError
@@ -30,6 +30,7 @@ from realsim_calibration.exports.frames import FrameNames, note_lines, published
 from realsim_calibration.exports.write import opencv_text, write_exports
 from realsim_calibration.results import HandEyeReport, Mode
 from refusals import refused
+from tried_grasps import assert_same
 
 EXACT = 1e-9
 Maker = Callable[..., HandEyeReport]
@@ -54,15 +55,10 @@ def transforms(draw: st.DrawFn) -> Array:
 
 
 def rigid_of(xyz: Any, xyzw: Any) -> Array:
-    """Return T of a translation and a quaternion x y z w, by a formula of its own."""
-    x, y, z, w = (float(v) for v in xyzw)
-    assert abs(x * x + y * y + z * z + w * w - 1) < 1e-12
-    R = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return se3.from_rt(R, [float(v) for v in xyz])
+    """Return T of a translation and a quaternion x y z w, by scipy's formula."""
+    q = np.array([float(v) for v in xyzw])
+    assert abs(q @ q - 1) < 1e-12
+    return se3.from_rt(Rotation.from_quat(q).as_matrix(), [float(v) for v in xyz])
 
 
 def yaml11(text: str) -> Any:
@@ -296,26 +292,7 @@ def test_json_round_trip_is_exact(
     again = read_calibration(path)
     assert type(again.target) is type(report.target)
     assert calibration_text(again, FRAMES) == path.read_text(encoding="utf-8")
-    assert_same_record(report, again)
-
-
-def assert_same_record(a: Any, b: Any) -> None:
-    """Compare dataclasses field by field; a rotation may be made orthonormal within 1e-12."""
-    assert type(a) is type(b)
-    for field in dataclasses.fields(a):
-        x, y = getattr(a, field.name), getattr(b, field.name)
-        if dataclasses.is_dataclass(x):
-            assert_same_record(x, y)
-        elif isinstance(x, np.ndarray):
-            np.testing.assert_allclose(y, x, rtol=0, atol=1e-12, err_msg=field.name)
-            assert y.shape == x.shape
-        elif isinstance(x, tuple) and x and dataclasses.is_dataclass(x[0]):
-            for u, v in zip(x, y, strict=True):
-                assert_same_record(u, v)
-        elif isinstance(x, float) and math.isnan(x):
-            assert math.isnan(y)
-        else:
-            assert x == y, field.name
+    assert_same(report, again, 1e-12)  # a rotation may be made orthonormal
 
 
 DROPPED = object()

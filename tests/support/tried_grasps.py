@@ -94,27 +94,28 @@ def tried_scene(seed, *, with_poses=True, with_attempts=True):
     )
 
 
-def assert_same(a, b):
-    """Every field is equal, arrays bit for bit."""
+def assert_same(a, b, atol=0.0):
+    """Every field is equal, arrays bit for bit or, where `atol` is given, to within it."""
     assert type(a) is type(b)
     for name in a.__dataclass_fields__:
-        same_value(getattr(a, name), getattr(b, name), name)
+        same_value(getattr(a, name), getattr(b, name), name, atol)
 
 
-def same_value(x, y, name):
-    """Two values are equal, arrays bit for bit."""
+def same_value(x, y, name, atol):
+    """Two values are equal, arrays bit for bit or to within `atol`."""
     if hasattr(x, "__dataclass_fields__"):
-        assert_same(x, y)
+        assert_same(x, y, atol)
     elif isinstance(x, np.ndarray):
         assert isinstance(y, np.ndarray) and x.dtype == y.dtype and x.shape == y.shape, name
-        assert x.tobytes() == y.tobytes(), name
+        close = atol and np.allclose(x, y, rtol=0, atol=atol, equal_nan=True)
+        assert close or x.tobytes() == y.tobytes(), name
     elif isinstance(x, dict):
         assert isinstance(y, dict) and sorted(x) == sorted(y), name
         for key in x:
-            same_value(x[key], y[key], f"{name}[{key}]")
+            same_value(x[key], y[key], f"{name}[{key}]", atol)
     elif isinstance(x, tuple):
         assert isinstance(y, tuple) and len(x) == len(y), name
         for k, (p, q) in enumerate(zip(x, y, strict=True)):
-            same_value(p, q, f"{name}[{k}]")
+            same_value(p, q, f"{name}[{k}]", atol)
     else:
         assert repr(x) == repr(y), name  # NaN is not equal to itself
