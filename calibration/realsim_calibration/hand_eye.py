@@ -72,7 +72,7 @@ def setup_of(
                 index=c.view.index,
                 T_base_ee=np.ascontiguousarray(c.view.T_base_ee),
                 xy=np.ascontiguousarray((c.points - middle)[:, :2]),
-                uv=np.ascontiguousarray(c.uv),
+                uv=np.ascontiguousarray(c.view.detection.uv),
             )
             for c in candidates
         ),

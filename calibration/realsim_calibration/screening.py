@@ -61,7 +61,6 @@ class Candidate:
 
     view: BoardView
     points: Array
-    uv: Array
     pose: BoardPose
     A: Array
     """(4, 4) the hand in the base, or the base in the hand where the camera stands still [m]."""
@@ -174,9 +173,7 @@ def _counted_from_one_end(
         points = view.detection.points(target)
         pose = estimate_board_pose(points, view.detection.uv, intrinsics)
         if pose is not None:
-            mended.append(
-                Candidate(view=view, points=points, uv=view.detection.uv, pose=pose, A=c.A)
-            )
+            mended.append(replace(c, view=view, points=points, pose=pose))
     names = [c.view.label for c, flip in zip(candidates, turns.flips, strict=True) if flip]
     check = Check(
         name="half turns",
@@ -221,7 +218,7 @@ def _candidates(
             continue
         points = found.points(target)
         A = view.T_base_ee if config.mode == "eye_in_hand" else se3.invert(view.T_base_ee)
-        candidates.append(Candidate(view=view, points=points, uv=found.uv, pose=pose, A=A))
+        candidates.append(Candidate(view=view, points=points, pose=pose, A=A))
     if len(candidates) < MIN_VIEWS:
         raise DegenerateError(
             f"hand-eye: {len(candidates)} of {len(ordered)} views show the target; at least "
@@ -296,8 +293,9 @@ def view_px(candidates: list[Candidate], X: Array, Z: Array, camera: CameraIntri
     """Return each view's RMS through the robot pose [px], infinite behind the camera."""
     Ts = se3.invert(stacks(candidates)[0] @ X) @ Z
     seen = [se3.transform(T, c.points) for T, c in zip(Ts, candidates, strict=True)]
-    error = project(camera, np.concatenate(seen)) - np.concatenate([c.uv for c in candidates])
-    counts = np.array([len(c.uv) for c in candidates])
+    measured = np.concatenate([c.view.detection.uv for c in candidates])
+    error = project(camera, np.concatenate(seen)) - measured
+    counts = np.array([len(c.points) for c in candidates])
     first = np.cumsum(counts) - counts
     px = np.sqrt(np.add.reduceat(np.sum(error**2, -1), first) / counts)
     return np.where(np.isfinite(px), px, np.inf)
