@@ -30,7 +30,7 @@ from realsim.geometry.mesh import symmetry_transforms
 from realsim.geometry.metrics import mssd
 from realsim.records import ObjectModel, ObjectPose, SupportPlane
 from realsim.registration.body import Body, make_body
-from realsim.registration.compare import CompareConfig, make_comparer, spread_frames
+from realsim.registration.compare import make_comparer, spread_frames
 from realsim.registration.evidence import (
     Cloud,
     DepthFrame,
@@ -49,9 +49,9 @@ from realsim.registration.judging.surface_residuals import (
 )
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.simulated import TableLabConfig, TableScene, scatter_objects, table_scene
-from realsim.registration.solver import SolverConfig, Stage, solve_pose
+from realsim.registration.solver import COARSE, FINE, Stage, solve_pose
 from realsim.registration.table_planes import support_checks
-from realsim.registration.verify import VerifyConfig, verify_objects
+from realsim.registration.verify import FRAMES, verify_objects
 from realsim.registration.views import SampleConfig, ViewPoints, sample_views, world_cloud
 from realsim.scanning.simulated import distorted
 
@@ -65,7 +65,6 @@ RIGHT_M = 0.003
 CAMERA_M, CAMERA_DEG = 1e-4, 0.02
 HOWS = ("slid", "turned", "near", "near", "place", "best", "model", "scale")
 WRONG_PER_ROUND = 5
-SOLVER = SolverConfig()
 
 
 @dataclass
@@ -128,7 +127,7 @@ def fit(r: Round, body: Body, T: Array, cloud: Cloud, stages: Sequence[Stage]) -
     if len(few.points) < 30:
         return T
     few = few.select(np.arange(len(few.points)) % max(1, len(few.points) // 3000) == 0)
-    return solve_pose(body, few, T, tuple(stages), SOLVER).T_world_obj
+    return solve_pose(body, few, T, tuple(stages)).T_world_obj
 
 
 def error_m(model: ObjectModel, true: Array, found: Array) -> float:
@@ -185,10 +184,10 @@ def wrong(
     claims = make_claims([r.bodies[j] for j in others], [r.bodies[j].T_start for j in others],
                          None, 0.004)  # fmt: skip
     cloud = r.cloud if how == "place" else r.cloud.select(owners(claims, r.cloud.points) < 0)
-    stages = (*SOLVER.coarse[1:], *SOLVER.fine)
+    stages = (*COARSE[1:], *FINE)
     if how == "scale":
         big = resized(body, float(rng.choice([0.95, 1.05])))
-        T = fit(r, big, true, cloud, SOLVER.fine)
+        T = fit(r, big, true, cloud, FINE)
         apart = se3.transform(T, big.model.mesh.vertices)
         apart -= se3.transform(true, body.model.mesh.vertices)
         return big, T, float(np.linalg.norm(apart, axis=1).max())
@@ -202,7 +201,7 @@ def wrong(
             body = replace(rivals[alike[int(rng.integers(2))]], start=body.start)
         found: list[tuple[float, Array]] = []
         frames = spread_frames(r.frames, body.center(true), 5)
-        comparer = make_comparer(r.scene.intrinsics, frames, r.noise, r.plane, CompareConfig())
+        comparer = make_comparer(r.scene.intrinsics, frames, r.noise, r.plane)
         for _ in range(10):
             T = wrong_start(r, k, "start", rng)
             shift = r.bodies[k].center(true) - body.center(T)
@@ -213,17 +212,17 @@ def wrong(
         return body, T, np.inf if how == "model" else error_m(model, true, T)
     T = wrong_start(r, k, how, rng)
     if rng.random() < 0.7:
-        T = fit(r, body, T, cloud, stages if how == "place" else SOLVER.fine)
+        T = fit(r, body, T, cloud, stages if how == "place" else FINE)
     return body, T, error_m(model, true, T)
 
 
 def judged(r: Round, bodies: list[Body], poses: list[Array]) -> list[dict[str, float]]:
     """Return all checks of all objects."""
     middle = np.mean([b.center(T) for b, T in zip(bodies, poses, strict=True)], axis=0)
-    frames = spread_frames(r.frames, middle, VerifyConfig().frames)
-    comparer = make_comparer(r.scene.intrinsics, frames, r.noise, r.plane, CompareConfig())
+    frames = spread_frames(r.frames, middle, FRAMES)
+    comparer = make_comparer(r.scene.intrinsics, frames, r.noise, r.plane)
     owned = owned_points(bodies, poses, r.scene.intrinsics, r.views, r.Ts, r.noise, r.plane)
-    checked = verify_objects(bodies, poses, [o.cloud for o in owned], comparer, VerifyConfig())
+    checked = verify_objects(bodies, poses, [o.cloud for o in owned], comparer)
     held = support_checks(bodies, poses, r.plane)
     features = [c.checks | s for c, s in zip(checked, held, strict=True)]
     if len(r.views) == 1:
@@ -250,7 +249,7 @@ def collect(
     for n in range(rounds):
         rng = np.random.default_rng([seed, n, 5])
         r = round_of(scene, bodies, SUBSETS[n % len(SUBSETS)], n % 5 == 4, rng)
-        poses = [fit(r, b, b.T_start, r.cloud, SOLVER.fine) for b in bodies]
+        poses = [fit(r, b, b.T_start, r.cloud, FINE) for b in bodies]
         errors = [error_m(scene.models[b.model.obj_id], b.T_start, T)
                   for b, T in zip(bodies, poses, strict=True)]  # fmt: skip
         hows = ["right"] * len(bodies)

@@ -11,7 +11,7 @@ import numpy as np
 
 from realsim.arrays import Array, Mask
 from realsim.registration.judging import verdict
-from realsim.registration.judging.verdict import NAMES, Coefficients, Kind, VerdictConfig, terms_of
+from realsim.registration.judging.verdict import ACCEPT, NAMES, Coefficients, Kind, terms_of
 
 RIDGE = 0.003
 """Weight of the squared coefficients against the mean log-loss: tables are few, and what separates
@@ -100,7 +100,7 @@ def told(sets: Mapping[Kind, Coefficients], samples: Sequence[Any], drop: str) -
 
 def figures(name: str, p: Array, right: Mask) -> str:
     """Return the figures of one group of samples as a line."""
-    accept, wrong = VerdictConfig().accept, ~right
+    accept, wrong = ACCEPT, ~right
     order = np.argsort(np.argsort(p, kind="stable"))
     n = int(right.sum()) * int(wrong.sum())
     auc = (order[right].sum() - right.sum() * (right.sum() - 1) / 2) / max(n, 1)
@@ -145,10 +145,10 @@ def tested(
             print(figures(f"each by the others, {name}", p[mine], right[mine]))
     for how in sorted({s["how"] for s in flat}):
         mine = several & np.array([s["how"] == how for s in flat]) & (~right | (how == "right"))
-        held = p[mine] >= VerdictConfig().accept
+        held = p[mine] >= ACCEPT
         middle = np.median(p[mine]) if np.any(mine) else np.nan
         print(f"  {how:8s} {mine.sum():5d}, accepted {held.sum()}, median P {middle:.4f}")
-    for k in np.flatnonzero(several & ~right & (p >= VerdictConfig().accept)):
+    for k in np.flatnonzero(several & ~right & (p >= ACCEPT)):
         s = flat[k]
         print(f"  accepted though wrong: {s['how']} {s['object']} table {s['seed']} {s['views']} "
               f"views, {s['error_mm']:.1f} mm off, P {p[k]:.3f}")  # fmt: skip
@@ -215,7 +215,7 @@ def _picture(p: Array, right: Mask, several: Mask, out: Path) -> None:
     groups = [p[right & several], p[~right & several]]
     below.hist(groups, np.linspace(0, 1, 21), color=["C2", "C3"], label=["right", "wrong"])
     below.set_yscale("log")
-    below.axvline(VerdictConfig().accept, color="0.3", linestyle="--", label="accepted from here")
+    below.axvline(ACCEPT, color="0.3", linestyle="--", label="accepted from here")
     below.set(xlabel="told probability", ylabel="poses", title="Several views")
     below.legend(loc="upper center")
     figure.savefig(out / "registration_calibration.png", dpi=110)

@@ -132,7 +132,7 @@ def _judged(g: Given, claims: Sequence[Array]) -> list[ObjectPose]:
         for true, T in zip(g.scene.truth, claims, strict=True)
     ]  # fmt: skip
     many = register_many(intake, bodies, [None] * len(bodies), intake.plane, c)
-    comparer = comparer_on(intake, many.frames, many.plane, bodies, many.poses, c)
+    comparer = comparer_on(intake, many.frames, many.plane, bodies, many.poses)
     given = Poses(
         bodies=bodies, poses=many.poses, clouds=many.clouds, covariances=list(many.covariances),
         blind=[0] * len(bodies), contrasts=[None] * len(bodies), cameras=many.refined.cameras,

@@ -164,7 +164,7 @@ def jump_of_many(
     intake = take_in(scene.intrinsics, scene.frames, config)
     bodies = [_body(scene, true, config) for true in scene.truth]
     many = register_many(intake, bodies, [None] * len(bodies), intake.plane, config)
-    comparer = comparer_on(intake, many.frames, many.plane, bodies, many.poses, config)
+    comparer = comparer_on(intake, many.frames, many.plane, bodies, many.poses)
 
     def told(poses: list[Array]) -> Array:
         given = Poses(

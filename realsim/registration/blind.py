@@ -24,7 +24,7 @@ from realsim.records import ObjectModel
 from realsim.registration.body import Body
 from realsim.registration.compare import Comparer
 from realsim.registration.evidence import Cloud
-from realsim.registration.solver import FreeSpace, PoseFit, SolverConfig, solve_pose
+from realsim.registration.solver import FINE, FreeSpace, PoseFit, solve_pose
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -238,7 +238,6 @@ def keep_start(
     fit: PoseFit,
     data: tuple[Cloud, Comparer, FreeSpace | None],
     covariance: CovarianceConfig,
-    solver: SolverConfig,
 ) -> Kept:
     """Return the fit with its blind directions as they were at the start.
 
@@ -247,7 +246,6 @@ def keep_start(
         fit: of the points that do not see those directions.
         data: the object's points, the frames to render in, and the images of free space.
         covariance: what says what is blind.
-        solver: settings of the fits.
     """
     cloud, comparer, free_space = data
     motions = blind_motions(body, fit, covariance)
@@ -257,7 +255,7 @@ def keep_start(
     T, new = fit.T_world_obj, fit
     for _ in range(START_ROUNDS):
         T = nearest_to_start(T, body.T_start, body.center_obj, axes)
-        new = solve_pose(body, cloud, T, solver.fine[-1:], solver, free_space)
+        new = solve_pose(body, cloud, T, FINE[-1:], free_space)
         T = new.T_world_obj
     T = nearest_to_start(T, body.T_start, body.center_obj, axes)
     stride = comparer.stride_of(body, fit.T_world_obj)

@@ -15,24 +15,19 @@ from realsim.registration.body import Body, footprint, pixel_box
 from realsim.registration.evidence import DepthFrame, DepthNoise
 from realsim.registration.table_planes import table_depth
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CompareConfig:
-    """When a rendered and a measured depth agree."""
-
-    tau_m: float = 0.003
-    """Depth difference that agrees whatever the noise: pose, mesh and bias errors [m]."""
-    tau_sigmas: float = 1.5
-    """Plus so many sigma_z: a camera a metre away is noisier than one at 30 cm."""
-    tau_bias_per_m: float = 0.003
-    """Plus this times z^2 [1/m]: a disparity bias grows so. 0.3 mm at 30 cm, 3 mm at 1 m, which is
-    what rendered annotations differ by from real structured-light depth (1 to 3 mm)."""
-    front_penalty: float = 0.3
-    """Cost of a pixel where something measured stands in front: an occluder or a wrong pose."""
-    rays: int = 1500
-    """Rays per object and frame aimed at; sets the stride."""
-    frames: int = 6
-    """Frames in which a hypothesis is rendered, spread in direction."""
+TAU_M = 0.003
+"""Depth difference that agrees whatever the noise: pose, mesh and bias errors [m]."""
+TAU_SIGMAS = 1.5
+"""Plus so many sigma_z: a camera a metre away is noisier than one at 30 cm."""
+TAU_BIAS_PER_M = 0.003
+"""Plus this times z^2 [1/m]: a disparity bias grows so. 0.3 mm at 30 cm, 3 mm at 1 m, which is
+what rendered annotations differ by from real structured-light depth (1 to 3 mm)."""
+FRONT_PENALTY = 0.3
+"""Cost of a pixel where something measured stands in front: an occluder or a wrong pose."""
+RAYS = 1500
+"""Rays per object and frame aimed at; sets the stride."""
+FRAMES = 6
+"""Frames in which a hypothesis is rendered, spread in direction."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -45,15 +40,16 @@ class Comparer:
     """Per frame (H, W): pixels at depth jumps, which are not compared."""
     noise: DepthNoise
     plane: SupportPlane | None
-    config: CompareConfig
+    rays: int
+    """Rays per object and frame aimed at."""
 
     def tau(self, z: NDArray[np.floating]) -> Array:
         """Return the depth difference that agrees at depth z [m]."""
-        return self.config.tau_m + self.config.tau_sigmas * self.noise.sigma(z) + self.bias(z)
+        return TAU_M + TAU_SIGMAS * self.noise.sigma(z) + self.bias(z)
 
     def bias(self, z: NDArray[np.floating]) -> Array:
         """Return the depth bias that must be expected at depth z [m]."""
-        return self.config.tau_bias_per_m * np.square(np.asarray(z, dtype=np.float64))
+        return TAU_BIAS_PER_M * np.square(np.asarray(z, dtype=np.float64))
 
     def likelihood(self, measured: Array, rendered: Array) -> Array:
         """Return per pixel 1 (agrees) down to -1 (the camera saw through the rendered surface).
@@ -62,7 +58,7 @@ class Comparer:
         """
         d = measured - rendered
         value = 1.0 - 2.0 * np.square(d / self.tau(measured))
-        return np.maximum(value, np.where(d < 0, -self.config.front_penalty, -1.0))
+        return np.maximum(value, np.where(d < 0, -FRONT_PENALTY, -1.0))
 
     def table(self, frame: DepthFrame, rows: Int64, columns: Int64) -> Array:
         """Return the table's depth (N,) at pixels [m]; inf without a table."""
@@ -97,7 +93,7 @@ class Comparer:
             T_cam_obj = se3.invert(frame.T_world_cam) @ T_world_obj
             left, top, right, bottom = pixel_box(body, self.intrinsics, T_cam_obj)
             areas.append((right - left) * (bottom - top))
-        return max(1, int(np.sqrt(np.mean(areas) / self.config.rays)))
+        return max(1, int(np.sqrt(np.mean(areas) / self.rays)))
 
 
 def make_comparer(
@@ -105,14 +101,14 @@ def make_comparer(
     frames: Sequence[DepthFrame],
     noise: DepthNoise,
     plane: SupportPlane | None,
-    config: CompareConfig,
+    rays: int = RAYS,
 ) -> Comparer:
     """Return a comparer for these frames."""
     edges: list[Mask] = []
     for frame in frames:
         z = frame.depth_m
         # Within 3 px a surface seen at 70 degrees spans about 6 pixel pitches.
-        jump = config.tau_m + 6.0 * z / intrinsics.fx + 6.0 * noise.sigma(z)
+        jump = TAU_M + 6.0 * z / intrinsics.fx + 6.0 * noise.sigma(z)
         edges.append(edge_mask(z, jump))
     return Comparer(
         intrinsics=intrinsics,
@@ -120,7 +116,7 @@ def make_comparer(
         edges=tuple(edges),
         noise=noise,
         plane=plane,
-        config=config,
+        rays=rays,
     )
 
 

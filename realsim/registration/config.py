@@ -6,29 +6,14 @@ from typing import Literal
 
 from realsim.records.depth_bias import DepthBias
 from realsim.registration.blind import CovarianceConfig
-from realsim.registration.compare import CompareConfig
 from realsim.registration.evidence import EvidenceConfig
-from realsim.registration.find_table import TableSearchConfig
-from realsim.registration.judging.verdict import VerdictConfig
-from realsim.registration.near_start import JointConfig, SearchConfig
 from realsim.registration.refinement.config import RefineConfig
 from realsim.registration.search.find import FindConfig
-from realsim.registration.solver import SolverConfig
 from realsim.registration.table_planes import PlaneConfig
-from realsim.registration.verify import VerifyConfig
-from realsim.registration.view_agreement import ViewCheckConfig
 from realsim.registration.views import SampleConfig
 
 Method = Literal["joint", "top-down"]
 METHODS: tuple[Method, ...] = ("joint", "top-down")
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class JudgingConfig:
-    """How poses are judged without ground truth."""
-
-    verdict: VerdictConfig = field(default_factory=VerdictConfig)
-    views: ViewCheckConfig = field(default_factory=ViewCheckConfig)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -72,9 +57,7 @@ class RegistrationConfig:
     """Bias of the depth camera, from its calibration; the images are given as measured."""
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
     sample: SampleConfig = field(default_factory=SampleConfig)
-    table: TableSearchConfig = field(default_factory=TableSearchConfig)
     plane: PlaneConfig = field(default_factory=PlaneConfig)
-    compare: CompareConfig = field(default_factory=CompareConfig)
     odometry: bool = False
     """Whether the claimed camera poses are checked by odometry from depth (KISS-ICP): 0.03 CPU-s a
     view, and it names a mount that slipped or images that belong to other poses."""
@@ -82,10 +65,5 @@ class RegistrationConfig:
     """Only where views lie this near to their neighbours [deg]: 24 views all around, 20 degrees
     apart, raised false alarms."""
     find: FindConfig = field(default_factory=FindConfig)
-    search: SearchConfig = field(default_factory=SearchConfig)
-    solver: SolverConfig = field(default_factory=SolverConfig)
-    joint: JointConfig = field(default_factory=JointConfig)
     refine: RefineConfig = field(default_factory=RefineConfig)
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
-    verify: VerifyConfig = field(default_factory=VerifyConfig)
-    judging: JudgingConfig = field(default_factory=JudgingConfig)

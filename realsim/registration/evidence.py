@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.arrays import Array, Array32, Mask, UInt8
+from realsim.arrays import Array, Array32, Int64, Mask, UInt8
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.clouds import voxel_mean
@@ -128,8 +128,8 @@ class Cloud:
     sigmas: Array
     """(N,) 1-sigma [m]."""
 
-    def select(self, keep: Mask) -> "Cloud":
-        """Return the points where `keep` (N,)."""
+    def select(self, keep: Mask | Int64 | slice) -> "Cloud":
+        """Return the points where `keep` (N,), or of these numbers."""
         return Cloud(points=self.points[keep], towards=self.towards[keep], sigmas=self.sigmas[keep])
 
 

@@ -17,7 +17,7 @@ from realsim.records import SupportPlane
 from realsim.records.depth_bias import DepthBias
 from realsim.registration.blind import Kept, keep_start
 from realsim.registration.body import Body, moved_body
-from realsim.registration.compare import Comparer, make_comparer, spread_frames
+from realsim.registration.compare import FRAMES, Comparer, make_comparer, spread_frames
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import (
     Cloud,
@@ -30,7 +30,14 @@ from realsim.registration.evidence import (
     without_table,
 )
 from realsim.registration.intake import Intake
-from realsim.registration.near_start import BestStart, joint_fit, search
+from realsim.registration.near_start import (
+    BestStart,
+    coarse_voxel,
+    drop_height,
+    fine_voxel,
+    joint_fit,
+    search,
+)
 from realsim.registration.photo import Picture
 from realsim.registration.photo_fit import PhotoFit, photo_fit
 from realsim.registration.rivals_around import AROUND_RAYS, OFFSET_NOISES, Around, Images, around
@@ -51,13 +58,10 @@ class NearTask:
     evidence: Evidence
     config: RegistrationConfig
 
-    def comparer(self, center: Array, n: int, rays: int) -> Comparer:
-        """Return a comparer on n frames spread around `center`."""
-        chosen = [read_frame(f) for f in spread_frames(self.intake.frames, center, n)]
-        config = replace(self.config.compare, rays=rays)
-        return make_comparer(
-            self.intake.intrinsics, chosen, self.evidence.noise, self.plane, config
-        )
+    def comparer(self, center: Array) -> Comparer:
+        """Return a comparer on some frames spread around `center`."""
+        chosen = [read_frame(f) for f in spread_frames(self.intake.frames, center, FRAMES)]
+        return make_comparer(self.intake.intrinsics, chosen, self.evidence.noise, self.plane)
 
     def free_space(self, frames: Sequence[DepthFrame]) -> FreeSpace | None:
         """Return the images that models may not stand in front of."""
@@ -218,7 +222,7 @@ def few_around(
     comparer = make_comparer(
         intake.intrinsics, [read_frame(f) for f in intake.frames], intake.noise,
         few.plane if few.plane is not None else intake.plane,
-        replace(config.compare, rays=AROUND_RAYS),
+        AROUND_RAYS,
     )  # fmt: skip
     offset = OFFSET_NOISES * intake.noise.per_m
     images = Images(
@@ -229,7 +233,7 @@ def few_around(
     agreements = [(1.0, "")] * len(bodies) if taken is None else taken.agreements
     at = [(b, k.fit.T_world_obj) for b, k in zip(bodies, few.kept, strict=True)]
     tried = [
-        around(b, k.fit, cloud, [*at[:n], *at[n + 1 :]], start, edge, images, config.solver)
+        around(b, k.fit, cloud, [*at[:n], *at[n + 1 :]], start, edge, images)
         for n, (b, k, cloud, start, edge) in enumerate(
             zip(bodies, few.kept, few.clouds, claimed, edges, strict=True)
         )
@@ -242,14 +246,13 @@ def few_around(
 
 def _search_one(work: NearTask, body: Body, near: Cloud, tick: Callable[[], None]) -> BestStart:
     """Return the best hypothesis of one object, its neighbours not yet considered."""
-    config = work.config
     center = body.center(body.T_start)
-    comparer = work.comparer(center, config.compare.frames, config.compare.rays)
+    comparer = work.comparer(center)
     free_space = work.free_space(comparer.frames)
-    above = without_table(near, work.plane, config.joint.drop_height(body, work.plane))
-    coarse = average_cloud(above, body.T_start, config.joint.coarse_voxel(body))
-    fine = average_cloud(above, body.T_start, config.joint.fine_voxel(body))
-    found = search(body, coarse, fine, comparer, free_space, (config.search, config.solver))
+    above = without_table(near, work.plane, drop_height(body, work.plane))
+    coarse = average_cloud(above, body.T_start, coarse_voxel(body))
+    fine = average_cloud(above, body.T_start, fine_voxel(body))
+    found = search(body, coarse, fine, comparer, free_space)
     tick()
     return found
 
@@ -273,22 +276,17 @@ def _joint(
         near = gather(work.intake.intrinsics, work.intake.frames, there, config.evidence).near
     clouds = [
         average_cloud(
-            without_table(cloud, work.plane, config.joint.drop_height(body, work.plane)),
+            without_table(cloud, work.plane, drop_height(body, work.plane)),
             body.T_start,
-            config.joint.fine_voxel(body),
+            fine_voxel(body),
         )
         for body, cloud in zip(bodies, near, strict=True)
     ]
-    comparers = [
-        work.comparer(b.center(T), config.compare.frames, config.compare.rays)
-        for b, T in zip(bodies, poses, strict=True)
-    ]
+    comparers = [work.comparer(b.center(T)) for b, T in zip(bodies, poses, strict=True)]
     spaces = [work.free_space(c.frames) for c in comparers]
-    fits, own, history = joint_fit(
-        bodies, poses, clouds, (comparers, spaces), (config.joint, config.solver)
-    )
+    fits, own, history = joint_fit(bodies, poses, clouds, (comparers, spaces))
     kept = [
-        keep_start(body, fit, data, config.covariance, config.solver)
+        keep_start(body, fit, data, config.covariance)
         for body, fit, data in zip(
             bodies, fits, zip(own, comparers, spaces, strict=True), strict=True
         )

@@ -17,13 +17,34 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.registration.evidence import DepthNoise
-from realsim.registration.table_planes import TableSearchConfig, best_plane, table_frame
+from realsim.registration.table_planes import LEAST_POINTS, SEED, best_plane, table_frame
 from realsim.registration.views import ViewPoints
 
-__all__ = [
-    "TableFound", "TableSearchConfig", "ViewTable", "find_table", "looked_at",
-    "region_of_interest", "view_table",
-]  # fmt: skip
+TOLERANCE_M = 0.004
+"""Points within this (plus the depth noise) belong to a plane: tables are flat to 2 mm, and
+cameras of a 0.4 deg hand-eye disagree by 3 mm at 0.4 m."""
+NOISE_SIGMAS = 2.0
+"""Plus so many sigma_z of the typical point."""
+SEARCH_POINTS = 12_000
+"""Points of all views that the planes are fitted to."""
+VIEW_POINTS = 600
+"""Points of each view by which its own table is measured."""
+COMMON_DEG = 3.0
+"""Where views see their planes tilted by more than this against the common one, in the median,
+it is no table [deg]: a hand-eye is off by a degree at most."""
+REACH = 0.6
+"""Region of interest: so many median camera distances around the point looked at. A lens of
+60 deg sees 0.58 of its distance to either side."""
+LEAST_REACH_M = 0.15
+"""The region of interest is never smaller [m]: one large object."""
+VIEW_SLOPE = 0.36
+"""Steepest tilt of one view's own table against the common one (tan of 20 deg)."""
+VIEW_HEIGHT_M = 0.15
+"""Largest height of one view's own table over the common one [m]."""
+VIEW_TRIPLES = 96
+"""Random triples per view; finds a table of a third of the points with p = 0.97."""
+VIEW_SHARE = 0.10
+"""A view whose best plane holds a smaller share of its points does not see the table."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -86,7 +107,7 @@ def looked_at(views: Sequence[ViewPoints]) -> Array:
 
 
 def region_of_interest(
-    views: Sequence[ViewPoints], plane: SupportPlane | None, config: TableSearchConfig
+    views: Sequence[ViewPoints], plane: SupportPlane | None
 ) -> tuple[Array, float]:
     """Return the middle (3,) of what the views look at, on the table, and its radius [m].
 
@@ -94,19 +115,15 @@ def region_of_interest(
     """
     aim = looked_at(views)
     eyes = np.stack([v.T_world_cam[:3, 3] for v in views if len(v.points)])
-    radius = config.reach * float(np.median(np.linalg.norm(eyes - aim, axis=1)))
+    radius = REACH * float(np.median(np.linalg.norm(eyes - aim, axis=1)))
     if plane is not None:
         z = plane.T_world_table[:3, 2]
         aim = aim - z * float(z @ (aim - plane.T_world_table[:3, 3]))
-    return aim, max(config.least_reach_m, radius)
+    return aim, max(LEAST_REACH_M, radius)
 
 
 def find_table(
-    views: Sequence[ViewPoints],
-    noise: DepthNoise,
-    config: TableSearchConfig,
-    *,
-    gravity_up_world: ArrayLike | None = None,
+    views: Sequence[ViewPoints], noise: DepthNoise, *, gravity_up_world: ArrayLike | None = None
 ) -> TableFound:
     """Return the plane that the scene stands on, and how every view sees it.
 
@@ -116,22 +133,21 @@ def find_table(
     Args:
         views: the trusted points of the views, where their cameras are said to be.
         noise: of the depth.
-        config: settings.
         gravity_up_world: (3,) direction up, or None.
     """
     full = [v for v in views if len(v.points)]
     total = sum(len(v.points) for v in full)
-    if total < config.least_points:
+    if total < LEAST_POINTS:
         return TableFound(
             plane=None,
             reason=f"the {len(views)} views hold {total} trusted points; at least "
-            f"{config.least_points} are needed. Is the unit of the depth right, and its range?",
+            f"{LEAST_POINTS} are needed. Is the unit of the depth right, and its range?",
         )
-    rng = np.random.default_rng(config.seed)
-    aim, radius = region_of_interest(full, None, config)
-    points, eyes, sigma = _search_points(full, aim, radius, noise, config, rng)
-    tolerance = config.tolerance_m + config.noise_sigmas * sigma
-    best, reason = best_plane(points, eyes, (aim, radius), tolerance, config, gravity_up_world)
+    rng = np.random.default_rng(SEED)
+    aim, radius = region_of_interest(full, None)
+    points, eyes, sigma = _search_points(full, aim, radius, noise, rng)
+    tolerance = TOLERANCE_M + NOISE_SIGMAS * sigma
+    best, reason = best_plane(points, eyes, (aim, radius), tolerance, gravity_up_world)
     if best is None:
         return TableFound(plane=None, reason=reason)
     on = np.abs(points @ best.normal - best.offset) < tolerance
@@ -141,27 +157,25 @@ def find_table(
         rms_m=rms,
         inliers=int(np.count_nonzero(on)),
     )
-    tables = tuple(view_table(v, plane, noise, config) for v in views)
+    tables = tuple(view_table(v, plane, noise) for v in views)
     tilts = [t.tilt_deg for t in tables if t.own_share > 0]
-    if tilts and float(np.median(tilts)) > config.common_deg:
+    if tilts and float(np.median(tilts)) > COMMON_DEG:
         # Without a table, objects' faces make one up; every view sees another.
         return TableFound(
             plane=None,
             reason=f"the views see planes that are tilted by {np.median(tilts):.1f} degrees "
-            f"against the best common one; {config.common_deg:g} is the most of a table",
+            f"against the best common one; {COMMON_DEG:g} is the most of a table",
         )
     return TableFound(plane=plane, reason="", views=tables, share=best.count / len(points))
 
 
-def view_table(
-    view: ViewPoints, plane: SupportPlane, noise: DepthNoise, config: TableSearchConfig
-) -> ViewTable:
+def view_table(view: ViewPoints, plane: SupportPlane, noise: DepthNoise) -> ViewTable:
     """Return the table as one view alone sees it, near the common one.
 
     Random triples propose z = a x + b y + c in the table's frame; the one with most points is
     fitted again by least squares to its points.
     """
-    few = view.points[:: max(1, len(view.points) // config.view_points)].astype(np.float64)
+    few = view.points[:: max(1, len(view.points) // VIEW_POINTS)].astype(np.float64)
     nan = float("nan")
     none = ViewTable(
         index=view.index, share=0.0, own_share=0.0, height_m=nan, tilt_deg=nan, rms_m=nan
@@ -169,14 +183,14 @@ def view_table(
     if len(few) < 3:
         return none
     p = se3.transform(se3.invert(plane.T_world_table) @ view.T_world_cam, few)
-    tolerance = config.tolerance_m + config.noise_sigmas * noise.sigma(few[:, 2])
+    tolerance = TOLERANCE_M + NOISE_SIGMAS * noise.sigma(few[:, 2])
     share = float(np.mean(np.abs(p[:, 2]) < tolerance))
-    rng = np.random.default_rng((config.seed, view.index))
-    fit = _best_sheet(p, tolerance, config, rng)
+    rng = np.random.default_rng((SEED, view.index))
+    fit = _best_sheet(p, tolerance, rng)
     if fit is None:
         return none
     abc, on = fit
-    if np.mean(on) < config.view_share:
+    if np.mean(on) < VIEW_SHARE:
         return replace(none, share=share)
     middle = p[on].mean(0)
     rest = p[on, 2] - _heights(p[on], abc)
@@ -190,11 +204,9 @@ def view_table(
     )
 
 
-def _best_sheet(
-    p: Array, tolerance: Array, config: TableSearchConfig, rng: np.random.Generator
-) -> tuple[Array, Mask] | None:
+def _best_sheet(p: Array, tolerance: Array, rng: np.random.Generator) -> tuple[Array, Mask] | None:
     """Return (a, b, c) of z = a x + b y + c with most points (N, 3), and which they are."""
-    triples = p[rng.integers(0, len(p), size=(config.view_triples, 3))]
+    triples = p[rng.integers(0, len(p), size=(VIEW_TRIPLES, 3))]
     A = np.concatenate([triples[..., :2], np.ones((*triples.shape[:2], 1))], axis=-1)
     usable = np.abs(np.linalg.det(A)) > 1e-6  # twice a triangle's area [m^2]: 1 mm x 1 mm at least
     if not usable.any():
@@ -202,9 +214,9 @@ def _best_sheet(
     sheets = np.linalg.solve(A[usable], triples[usable, :, 2:])[..., 0]
     # The common plane itself is tried, too.
     sheets = np.concatenate([np.zeros((1, 3)), sheets])
-    near = np.hypot(sheets[:, 0], sheets[:, 1]) < config.view_slope
+    near = np.hypot(sheets[:, 0], sheets[:, 1]) < VIEW_SLOPE
     middle = np.median(p[:, :2], axis=0)
-    near &= np.abs(sheets[:, :2] @ middle + sheets[:, 2]) < config.view_height_m
+    near &= np.abs(sheets[:, :2] @ middle + sheets[:, 2]) < VIEW_HEIGHT_M
     sheets = sheets[near]
     flat = np.concatenate([p[:, :2], np.ones((len(p), 1))], axis=1)
     gaps = np.abs(p[:, 2] - sheets @ flat.T)
@@ -228,14 +240,13 @@ def _search_points(
     aim: Array,
     radius: float,
     noise: DepthNoise,
-    config: TableSearchConfig,
     rng: np.random.Generator,
 ) -> tuple[Array, Array, float]:
     """Return points (N, 3) of all views around the aim, the eyes (N, 3) that saw them, sigma_z.
 
     Every view gives equally many, chosen at random: a regular step would pick the same columns.
     """
-    each = max(40, 2 * config.search_points // len(views))
+    each = max(40, 2 * SEARCH_POINTS // len(views))
     points: list[Array] = []
     eyes: list[Array] = []
     z: list[Array] = []
@@ -249,6 +260,6 @@ def _search_points(
     p, e, depth = np.concatenate(points), np.concatenate(eyes), np.concatenate(z)
     sigma = float(np.median(noise.sigma(depth))) if len(depth) else 0.0
     keep = slice(None)
-    if len(p) > config.search_points:
-        keep = np.sort(rng.permutation(len(p))[: config.search_points])
+    if len(p) > SEARCH_POINTS:
+        keep = np.sort(rng.permutation(len(p))[:SEARCH_POINTS])
     return p[keep], e[keep], sigma

@@ -13,7 +13,6 @@ from realsim.registration.find_table import region_of_interest
 from realsim.registration.view_agreement import (
     NO_COUNTS,
     Counts,
-    ViewCheckConfig,
     ViewFinding,
     ViewMaps,
     compare,
@@ -26,6 +25,31 @@ T_CAM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL's camera (y up, z backward) in OpenCV's."""
 OVERDRAWN = 20
 """Factor of points drawn before those above the table, which may be few, are picked."""
+
+
+ABOVE_M = 0.008
+"""Points higher than this over the table are of what stands there [m]."""
+MARGIN_M = 0.008
+"""Depths that differ by less agree [m]: twice what a 0.4 deg hand-eye does at 0.5 m."""
+SIGMAS = 3.0
+"""Plus so many sigma_z."""
+POINTS = 300
+"""Points of a view that others are asked about, of each kind."""
+NEAR = 3
+"""Partners of a view: the nearest."""
+SPREAD = 5
+"""Further partners of a view, spread over the session."""
+LEAST_DECIDED = 60
+"""With fewer points that partners decide upon, nothing is said."""
+SCENE_SUPPORT = 0.2
+"""Points that agree less those looked through; below it the views are not of one scene. Clean
+scenes: 0.55 to 0.7."""
+TRIAL_GAIN = 0.2
+"""A mistake of all poses is named if undoing it raises the support by this."""
+TRIAL_VIEWS = 24
+"""Views by which mistakes of all poses are tried."""
+SEED = 0
+"""Seed of the choice of points."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -43,43 +67,36 @@ class HeldViews:
 
 
 def hold_views(
-    views: Sequence[ViewPoints],
-    plane: SupportPlane | None,
-    noise: DepthNoise,
-    config: ViewCheckConfig,
+    views: Sequence[ViewPoints], plane: SupportPlane | None, noise: DepthNoise
 ) -> HeldViews:
     """Return the views with their maps, partners and points."""
-    aim, radius = region_of_interest(views, plane, config.table)
+    aim, radius = region_of_interest(views, plane)
     above: list[Array] = []
     everywhere: list[Array] = []
     for v in views:
-        rng = np.random.default_rng((config.seed, v.index))
-        mine = v.points[rng.integers(0, len(v.points), OVERDRAWN * config.points)]
+        rng = np.random.default_rng((SEED, v.index))
+        mine = v.points[rng.integers(0, len(v.points), OVERDRAWN * POINTS)]
         mine = mine.astype(np.float64)
-        everywhere.append(mine[: config.points])
+        everywhere.append(mine[:POINTS])
         if plane is not None:
             T = se3.invert(plane.T_world_table) @ v.T_world_cam
             height = se3.transform(T, mine)[:, 2]
             near = np.linalg.norm(se3.transform(v.T_world_cam, mine) - aim, axis=1) < radius
-            least = config.above_m + config.sigmas * noise.sigma(mine[:, 2])
+            least = ABOVE_M + SIGMAS * noise.sigma(mine[:, 2])
             mine = mine[near & (height > least)]
-        above.append(mine[: config.points])
+        above.append(mine[:POINTS])
     maps = make_maps(views, noise)
     return HeldViews(
         views=tuple(views),
         maps=maps,
-        partners=partners(maps.Ts_world_cam, config.near, config.spread),
+        partners=partners(maps.Ts_world_cam, NEAR, SPREAD),
         above=tuple(above),
         everywhere=tuple(everywhere),
     )
 
 
 def contradiction(
-    held: HeldViews,
-    k: int,
-    others: Sequence[int] | Int64,
-    config: ViewCheckConfig,
-    T_world_cam: Array | None = None,
+    held: HeldViews, k: int, others: Sequence[int] | Int64, T_world_cam: Array | None = None
 ) -> float:
     """Return the median share by which others contradict view k, above the table; 0 = none can.
 
@@ -87,7 +104,6 @@ def contradiction(
         held: the views.
         k: which is asked about.
         others: the views that it is held against.
-        config: settings.
         T_world_cam: (4, 4) where it is supposed to be; None = where it is said to be.
     """
     maps = held.maps if T_world_cam is None else _move_camera(held.maps, k, T_world_cam)
@@ -96,58 +112,50 @@ def contradiction(
     counts: list[Counts] = []
     for j in (int(j) for j in others):
         theirs = se3.transform(Ts[j], held.above[j])
-        ours = compare(maps, j, mine, config.margin_m, config.sigmas)
-        counts.append(ours.plus(compare(maps, k, theirs, config.margin_m, config.sigmas)))
-    told = [c for c in counts if c.decided >= config.least_decided // 3]
-    if sum(c.decided for c in counts) < config.least_decided or not told:
+        ours = compare(maps, j, mine, MARGIN_M, SIGMAS)
+        counts.append(ours.plus(compare(maps, k, theirs, MARGIN_M, SIGMAS)))
+    told = [c for c in counts if c.decided >= LEAST_DECIDED // 3]
+    if sum(c.decided for c in counts) < LEAST_DECIDED or not told:
         return 0.0
     return float(np.median([c.contradicted for c in told]))
 
 
-def support(
-    held: HeldViews,
-    k: int,
-    others: Sequence[int] | Int64,
-    config: ViewCheckConfig,
-    T_world_cam: Array,
-) -> float:
+def support(held: HeldViews, k: int, others: Sequence[int] | Int64, T_world_cam: Array) -> float:
     """Return which share of all points of view k, supposed at T_world_cam, others confirm."""
     p = se3.transform(T_world_cam, held.everywhere[k])
     total = NO_COUNTS
     for j in others:
-        total = total.plus(compare(held.maps, int(j), p, config.margin_m, config.sigmas))
+        total = total.plus(compare(held.maps, int(j), p, MARGIN_M, SIGMAS))
     return total.support
 
 
-def sheet_contradiction(held: HeldViews, k: int, margin_m: float, config: ViewCheckConfig) -> float:
+def sheet_contradiction(held: HeldViews, k: int, margin_m: float) -> float:
     """Return the share of all points by which view k and its partners contradict each other."""
     Ts = held.maps.Ts_world_cam
     total = NO_COUNTS
     mine = se3.transform(Ts[k], held.everywhere[k])
     for j in (int(j) for j in held.partners[k]):
         theirs = se3.transform(Ts[j], held.everywhere[j])
-        total = total.plus(compare(held.maps, j, mine, margin_m, config.sigmas))
-        total = total.plus(compare(held.maps, k, theirs, margin_m, config.sigmas))
+        total = total.plus(compare(held.maps, j, mine, margin_m, SIGMAS))
+        total = total.plus(compare(held.maps, k, theirs, margin_m, SIGMAS))
     return total.contradicted
 
 
-def check_all_poses(
-    held: HeldViews, plane: SupportPlane | None, config: ViewCheckConfig
-) -> list[ViewFinding]:
+def check_all_poses(held: HeldViews, plane: SupportPlane | None) -> list[ViewFinding]:
     """Return what is wrong with all poses or units alike, if the views are not of one scene."""
     n = len(held.views)
-    now = _scene_support(held, held.maps.Ts_world_cam, 1.0, config)
-    if now > config.scene_support:
+    now = _scene_support(held, held.maps.Ts_world_cam, 1.0)
+    if now > SCENE_SUPPORT:
         return []
     trials = _trials(held.maps.Ts_world_cam)
-    then = [_scene_support(held, Ts, scale, config) for _, Ts, scale in trials]
+    then = [_scene_support(held, Ts, scale) for _, Ts, scale in trials]
     best = int(np.argmax(then))
     words = (
         f"the {n} views do not show one scene: where they are said to be, others confirm "
         f"{100 * now:.0f} % more of what a view measures than they look through (of a sound "
-        f"session over {100 * config.scene_support:.0f} %)"
+        f"session over {100 * SCENE_SUPPORT:.0f} %)"
     )
-    if then[best] > max(config.scene_support, now + config.trial_gain):
+    if then[best] > max(SCENE_SUPPORT, now + TRIAL_GAIN):
         words += f"; {trials[best][0]}. Then it is {100 * then[best]:.0f} %."
     elif plane is None:
         words += (
@@ -182,22 +190,22 @@ def _trials(Ts: Array) -> list[tuple[str, Array, float]]:
     ]
 
 
-def _scene_support(held: HeldViews, Ts: Array, scale: float, config: ViewCheckConfig) -> float:
+def _scene_support(held: HeldViews, Ts: Array, scale: float) -> float:
     """Return which share of some views' points others confirm, less those looked through."""
     n = len(held.views)
-    pick = np.unique(np.linspace(0, n - 1, min(n, config.trial_views)).round().astype(int))
+    pick = np.unique(np.linspace(0, n - 1, min(n, TRIAL_VIEWS)).round().astype(int))
     maps = replace(held.maps, Ts_world_cam=Ts)
     if scale != 1.0:
         factor = np.float32(scale)
         # sigma_z = k z^2 of the depth as it was: scale k (z / scale)^2.
         noise = DepthNoise(per_m=maps.noise.per_m / scale, floor_m=maps.noise.floor_m * scale)
         maps = replace(maps, low=maps.low * factor, high=maps.high * factor, noise=noise)
-    near = partners(Ts, config.near, config.spread)
+    near = partners(Ts, NEAR, SPREAD)
     total = NO_COUNTS
     for k in pick:
         p = se3.transform(Ts[k], scale * held.everywhere[k])
         for j in near[k]:
-            total = total.plus(compare(maps, int(j), p, config.margin_m, config.sigmas))
+            total = total.plus(compare(maps, int(j), p, MARGIN_M, SIGMAS))
     return total.support
 
 

@@ -34,7 +34,7 @@ from realsim.geometry import se3
 from realsim.images import read_image
 from realsim.records import CameraIntrinsics, ObjectModel, SupportPlane
 from realsim.registration.evidence import DepthFrame, EvidenceConfig, measure_noise
-from realsim.registration.find_table import TableSearchConfig, find_table
+from realsim.registration.find_table import find_table
 from realsim.registration.hint_regions import (
     Box,
     Click,
@@ -317,4 +317,4 @@ def _table(camera: CameraIntrinsics, frames: Sequence[DepthFrame], up: Any) -> S
     except InputError:
         return None  # hardly any depth: then there is no table either
     views = sample_views(camera, frames, noise, SampleConfig(stride=TABLE_STRIDE))
-    return find_table(views, noise, TableSearchConfig(), gravity_up_world=up).plane
+    return find_table(views, noise, gravity_up_world=up).plane

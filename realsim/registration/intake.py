@@ -112,8 +112,8 @@ def take_in(
         views.append(sample_view(intrinsics, image, noise, sample))
         if progress is not None:
             progress()
-    first = find_table(views, noise, config.table, gravity_up_world=gravity_up_world)
-    findings = check_views(views, first.plane, noise, config.judging.views)
+    first = find_table(views, noise, gravity_up_world=gravity_up_world)
+    findings = check_views(views, first.plane, noise)
     for f in findings:
         if f.kind == "all_disagree" and len(views) >= config.refine_from:
             raise InputError(f"{f.words} Nothing was registered.")
@@ -125,7 +125,7 @@ def take_in(
     table = first
     if bad and first.plane is not None:
         kept = [views[k] for k in keep]
-        table = find_table(kept, noise, config.table, gravity_up_world=gravity_up_world)
+        table = find_table(kept, noise, gravity_up_world=gravity_up_world)
     return Intake(
         intrinsics=intrinsics, frames=tuple(ordered[k] for k in keep),
         views=tuple(views[k] for k in keep), noise=noise, plane=table.plane,

@@ -22,7 +22,7 @@ from realsim.registration.judging.surface_residuals import (
     size_error,
     surface_residuals,
 )
-from realsim.registration.judging.verdict import probability_right, verdict_of
+from realsim.registration.judging.verdict import REJECT, probability_right, verdict_of
 from realsim.registration.refinement.flat import is_flat
 from realsim.registration.rivals_around import Around
 from realsim.registration.search.flat_search import FLAT_HEIGHT_M, cover, explained_at, table_map
@@ -90,13 +90,13 @@ def judge_objects(
     intake: Intake, given: Poses, comparer: Comparer, config: RegistrationConfig
 ) -> Judgement:
     """Return the objects with checks, probability, verdict and reasons."""
-    checked = verify_objects(given.bodies, given.poses, given.clouds, comparer, config.verify)
+    checked = verify_objects(given.bodies, given.poses, given.clouds, comparer)
     features = _features(intake, given, checked, config)
     probabilities = [probability_right(f) for f in features]
     if given.around:
         # Of few views half of the right poses look improbable to checks that were set on many;
         # they warn below `reject`, and what the views leave open decides.
-        least = config.judging.verdict.reject
+        least = REJECT
         probabilities = [
             a.probability * min(1.0, p / least)
             for a, p in zip(given.around, probabilities, strict=True)
@@ -110,7 +110,7 @@ def judge_objects(
     )  # fmt: skip
     findings = [*given.known, *findings]
     objects = [
-        _object(given, k, checked[k], features[k], probabilities[k], findings, config)
+        _object(given, k, checked[k], features[k], probabilities[k], findings)
         for k in range(len(given.bodies))
     ]
     return Judgement(objects=objects, findings=findings)
@@ -189,11 +189,10 @@ def _object(
     features: Mapping[str, float | None],
     probability: float,
     findings: Sequence[SceneFinding],
-    config: RegistrationConfig,
 ) -> ObjectPose:
     """Return one object with its verdict: the worse of the bounds' and the probability's."""
     body = given.bodies[k]
-    verdict, reasons = verdict_of(probability, features, config.judging.verdict)
+    verdict, reasons = verdict_of(probability, features)
     if given.around and verdict != "accepted":
         # Not knowing is no reason to reject: the bounds do that.
         verdict = "doubtful"

@@ -25,11 +25,12 @@ from realsim.registration.evidence import (
     without_table,
 )
 from realsim.registration.intake import Intake
-from realsim.registration.near_start import assign_points
+from realsim.registration.near_start import ASSIGN_M, assign_points, drop_height, fine_voxel
 from realsim.registration.refinement.config import RefineConfig
 from realsim.registration.refinement.refine import Refined, refine
 from realsim.registration.refinement.uncertainty import SeenPose, object_covariance, seen_poses
-from realsim.registration.solver import PoseFit, solve_pose
+from realsim.registration.solver import FINE, PoseFit, solve_pose
+from realsim.registration.verify import FRAMES, RAYS
 from realsim.registration.views import ViewPoints
 
 CLOUD_POINTS = 400_000
@@ -189,8 +190,8 @@ def _refine_once(
         replace(v, T_world_cam=T, points=refined.state.corrected(v.points, k).astype(np.float32))
         for k, (v, T) in enumerate(zip(intake.all_views, refined.cameras, strict=True))
     )
-    clouds = _clouds(intake, views, bodies, refined, config)
-    comparer = comparer_on(intake, frames, refined.plane, bodies, refined.poses, config)
+    clouds = _clouds(intake, views, bodies, refined)
+    comparer = comparer_on(intake, frames, refined.plane, bodies, refined.poses)
     kept = [
         _keep_blind(body, start, T, (cloud, comparer), config)
         for body, start, T, cloud in zip(bodies, claimed, refined.poses, clouds, strict=True)
@@ -207,10 +208,10 @@ def _keep_blind(
 ) -> Kept:
     """Return the refined pose with its blind turns as they were claimed."""
     cloud, comparer = data
-    still = solve_pose(body, cloud, T, config.solver.fine[-1:], config.solver).at(T)
+    still = solve_pose(body, cloud, T, FINE[-1:]).at(T)
     if claimed is None:
         return Kept(fit=still, axes=(), report={})
-    kept = keep_start(claimed, still, (cloud, comparer, None), config.covariance, config.solver)
+    kept = keep_start(claimed, still, (cloud, comparer, None), config.covariance)
     if kept.report.get("start_kept"):
         axes = list(kept.axes)
         T = nearest_to_start(T, claimed.T_start, body.center_obj, axes)
@@ -234,16 +235,14 @@ def comparer_on(
     plane: SupportPlane | None,
     bodies: Sequence[Body],
     poses: Sequence[Array] | Array,
-    config: RegistrationConfig,
 ) -> Comparer:
     """Return a comparer on the frames that look at the objects from directions far apart."""
     if len(bodies):
         center = np.mean([b.center(T) for b, T in zip(bodies, poses, strict=True)], axis=0)
     else:
         center = np.zeros(3) if plane is None else plane.T_world_table[:3, 3]
-    chosen = [read_frame(f) for f in spread_frames(frames, center, config.verify.frames)]
-    compare = replace(config.compare, rays=config.verify.rays)
-    return make_comparer(intake.intrinsics, chosen, intake.noise, plane, compare)
+    chosen = [read_frame(f) for f in spread_frames(frames, center, FRAMES)]
+    return make_comparer(intake.intrinsics, chosen, intake.noise, plane, RAYS)
 
 
 def _misfit_covariance(body: Body, misfit_m: float) -> Array:
@@ -269,41 +268,29 @@ def _blind_covariance(body: Body, fit: PoseFit, config: RegistrationConfig) -> A
 
 
 def _clouds(
-    intake: Intake,
-    views: Sequence[ViewPoints],
-    bodies: Sequence[Body],
-    refined: Refined,
-    config: RegistrationConfig,
+    intake: Intake, views: Sequence[ViewPoints], bodies: Sequence[Body], refined: Refined
 ) -> list[Cloud]:
     """Return each object's averaged points, cameras and depth as refined."""
     total = sum(len(v.points) for v in views)
     every = max(1, -(-total // CLOUD_POINTS))
-    parts = [
-        _points_near(v, (bodies, refined.poses), every, v.noise(intake.noise), config)
-        for v in views
-    ]
+    parts = [_points_near(v, (bodies, refined.poses), every, v.noise(intake.noise)) for v in views]
     near: list[Cloud] = []
     for k, (body, T) in enumerate(zip(bodies, refined.poses, strict=True)):
         cloud = join_clouds([p[k] for p in parts])
-        above = without_table(cloud, refined.plane, config.joint.drop_height(body, refined.plane))
-        near.append(average_cloud(above, T, config.joint.fine_voxel(body)))
-    return assign_points(bodies, list(refined.poses), near, config.joint)
+        above = without_table(cloud, refined.plane, drop_height(body, refined.plane))
+        near.append(average_cloud(above, T, fine_voxel(body)))
+    return assign_points(bodies, list(refined.poses), near)
 
 
 def _points_near(
-    view: ViewPoints,
-    objects: tuple[Sequence[Body], Array],
-    every: int,
-    noise: DepthNoise,
-    config: RegistrationConfig,
+    view: ViewPoints, objects: tuple[Sequence[Body], Array], every: int, noise: DepthNoise
 ) -> list[Cloud]:
     """Return of one view, per object, the points near it in world."""
     p = view.points[::every].astype(np.float64)
     world = se3.transform(view.T_world_cam, p)
-    reach = config.joint.assign_m
     out: list[Cloud] = []
     for body, T in zip(*objects, strict=True):
-        close = np.linalg.norm(world - body.center(T), axis=1) < body.radius_m + reach
+        close = np.linalg.norm(world - body.center(T), axis=1) < body.radius_m + ASSIGN_M
         sigmas = noise.sigma(p[close, 2])
         out.append(seen_cloud(world[close], view.T_world_cam[:3, 3], sigmas))
     return out

@@ -24,7 +24,7 @@ from realsim.registration.evidence import Cloud, read_frame
 from realsim.registration.judging.verdict import CONTRAST_DECIDED
 from realsim.registration.photo import Picture, paint_of, print_errors
 from realsim.registration.search.near_symmetry import near_symmetries
-from realsim.registration.solver import SolverConfig, solve_pose
+from realsim.registration.solver import FINE, solve_pose
 
 if TYPE_CHECKING:
     from realsim.registration.config import RegistrationConfig
@@ -62,8 +62,6 @@ PRINT_LOSS = 0.5
 """How the photograph is read."""
 PRINT_FROM = 4.0 * CONTRAST_DECIDED
 """Depth that decides by more than this contrast is not asked again by the print."""
-SOLVER = SolverConfig()
-"""The fits."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -87,7 +85,7 @@ def duel(body: Body, T: Array, T_rival: Array, cloud: Cloud, misfit_m: float) ->
         cloud: the object's averaged points, cameras refined.
         misfit_m: by how much the object's mesh is off everywhere [m].
     """
-    fitted = [solve_pose(body, cloud, X, SOLVER.fine, SOLVER).T_world_obj for X in (T, T_rival)]
+    fitted = [solve_pose(body, cloud, X, FINE).T_world_obj for X in (T, T_rival)]
     if mssd_symmetric(fitted[0], fitted[1], body.model) < SAME_M:
         # On better points the two are one: the rival was no more than an unfinished fit.
         return Duel(contrast=None, T_rival=fitted[1])
@@ -139,7 +137,6 @@ def duels_by_print(
         return out, fought
     comparer = make_comparer(
         intake.intrinsics, [read_frame(f) for f in intake.frames], intake.noise, intake.plane,
-        config.compare,
     )  # fmt: skip
     for n in asked:
         near = near_symmetries(bodies[n].model, config.find.near, config.field_folder)

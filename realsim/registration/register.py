@@ -152,7 +152,7 @@ def _sought(
         task, found, fit = _fit_many(task, seek_objects(task, asked), asked or ())
     missing = (*refused, *found.not_placed)
     result = _registration(task, found, missing, fit)
-    bad = {o.instance for o in result.scene.objects if is_wrong(o, task.config)}
+    bad = {o.instance for o in result.scene.objects if is_wrong(o)}
     if not bad or len(bad) == len(found.bodies):
         return result
     # What is not there must not pull the cameras.
@@ -208,11 +208,11 @@ def _fit_many(
         found = more
         many = register_many(intake, found.bodies, _starts(found), intake.plane, config)
     claimed, starts = claimed_bodies(found), _starts(found)
-    fought = _duels(found, many, config)
+    fought = _duels(found, many)
     if any(_is_lost(d) for d in fought):
         found = _with_rivals(found, fought)
         many = register_many(intake, found.bodies, starts, intake.plane, config)
-        fought = _duels(found, many, config)
+        fought = _duels(found, many)
     contrasts, printed = _print_duels(task, found, many, fought)
     if any(_is_lost(d) for d in printed):
         found = _with_rivals(found, printed)
@@ -240,7 +240,7 @@ def _fit_many(
             }
             for v, number in enumerate(numbers)
         },
-        findings=[*moved, *views_off(intake, many, claimed, config)],
+        findings=[*moved, *views_off(intake, many, claimed)],
         report={"refinement": camera_report(many, claimed, numbers)},
     )  # fmt: skip
 
@@ -270,7 +270,7 @@ def _is_lost(fought: Duel | None) -> bool:
     return contrast is not None and contrast < -CONTRAST_DECIDED
 
 
-def _duels(found: FoundObjects, many: ManyViews, config: RegistrationConfig) -> list[Duel | None]:
+def _duels(found: FoundObjects, many: ManyViews) -> list[Duel | None]:
     """Return how every pose compares with its near-symmetric rival, cameras refined."""
     poses, misfits = many.refined.poses, many.refined.misfit_m[:-1]
     rivals = _moved_rivals(found, poses)
@@ -370,7 +370,7 @@ def _registration(
 ) -> Registration:
     """Return the objects judged, with the paper's way beside them."""
     given, intake, config = fit.poses, task.intake, task.config
-    comparer = comparer_on(intake, fit.frames, given.plane, given.bodies, given.poses, config)
+    comparer = comparer_on(intake, fit.frames, given.plane, given.bodies, given.poses)
     judgement = judge_objects(
         replace(intake, views=fit.views, fixed=fit.fixed), given, comparer, config
     )

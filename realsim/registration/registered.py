@@ -8,9 +8,9 @@ from typing import Any
 
 from realsim.arrays import Array
 from realsim.records import ObjectPose, Scene
-from realsim.registration.config import RegistrationConfig
 from realsim.registration.finding import NO_INSTANCE
 from realsim.registration.judge import COMMON, Defect
+from realsim.registration.judging.verdict import ACCEPT
 from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.registration.search.records import NotPlaced
 
@@ -39,13 +39,13 @@ class Registration:
     """Plain JSON values: per object the search, the residuals, what was rejected; the cameras."""
 
 
-def is_wrong(o: ObjectPose, config: RegistrationConfig) -> bool:
+def is_wrong(o: ObjectPose) -> bool:
     """Return whether an object is rejected by its own evidence.
 
     One that fits well and overlaps another may be right and the other wrong: it is judged again
     without those that are wrong by themselves.
     """
-    fits = o.checks.get("probability", 0.0) >= config.judging.verdict.accept
+    fits = o.checks.get("probability", 0.0) >= ACCEPT
     return o.verdict == "rejected" and not (fits and o.checks.get("penetration_mm", 0.0) > 0.0)
 
 

@@ -30,7 +30,7 @@ from realsim.registration.compare import Comparer
 from realsim.registration.evidence import Cloud
 from realsim.registration.photo_fit import Edges
 from realsim.registration.refinement.flat import laid_down
-from realsim.registration.solver import PoseFit, SolverConfig, solve_pose
+from realsim.registration.solver import FINE, PoseFit, solve_pose
 
 CHOICE = 2.0
 """How fast the probability goes over from the fit's to the rival's [1 / temperature]."""
@@ -115,7 +115,6 @@ def around(
     claimed: Array | None,
     edges: Edges | None,
     images: Images,
-    solver: SolverConfig,
 ) -> Around:
     """Return the best pose near a fit, and how likely it is right.
 
@@ -127,13 +126,12 @@ def around(
         claimed: (4, 4) the start, if somebody claimed it; None = a search found it.
         edges: what the photograph shows of it; None = nothing.
         images: what the poses are compared with.
-        solver: settings of the fits.
     """
     weak = _weak_directions(body, fit)
     offsets, steps = np.array(OFFSETS_M), np.gradient(OFFSETS_M)
     moves = [weak @ np.array([a, b]) for a in offsets for b in offsets]
     starts = [moved_about_center(body, fit.T_world_obj, x) for x in moves]
-    fits = [solve_pose(body, cloud, T, solver.fine, solver, held=weak) for T in starts]
+    fits = [solve_pose(body, cloud, T, FINE, held=weak) for T in starts]
     middle = len(fits) // 2
     # What else decided the fit (neighbours, the photograph) moves all poses as it moved the fit.
     Ts = np.stack([_moved_alike(body, fits[middle], fit, f.T_world_obj) for f in fits])

@@ -118,12 +118,10 @@ def without_views(intake: Intake, odd: Sequence[ViewFinding]) -> Intake:
     )  # fmt: skip
 
 
-def views_off(
-    intake: Intake, many: ManyViews, bodies: Sequence[Body], config: RegistrationConfig
-) -> list[ViewFinding]:
+def views_off(intake: Intake, many: ManyViews, bodies: Sequence[Body]) -> list[ViewFinding]:
     """Return the views that do not fit the registered objects, their cameras refined."""
     found = check_views(
-        many.hand_views, many.plane, intake.noise, config.judging.views, bodies=bodies,
+        many.hand_views, many.plane, intake.noise, bodies=bodies,
         Ts_world_obj=many.poses,
     )  # fmt: skip
     known = {f.index for f in intake.findings}

@@ -43,31 +43,27 @@ class Stage:
     costs a little and matters once the pose is right to about a wall."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SolverConfig:
-    """The solver's constants."""
-
-    sigma_floor_m: float = 0.0006
-    """Least 1-sigma of a point: camera poses, mesh and grid are off by as much."""
-    coarse: tuple[Stage, ...] = (
-        Stage(kernel=25.0, cap_m=0.030, steps=8, gated=False),
-        Stage(kernel=12.0, cap_m=0.015, steps=8, gated=True),
-        Stage(kernel=6.0, cap_m=0.010, steps=8, gated=True),
-    )
-    """From a rough start: 15, 7 and 3.6 mm for a quiet camera (facts of simulated benches)."""
-    fine: tuple[Stage, ...] = (
-        Stage(kernel=12.0, cap_m=0.012, steps=6, gated=True),
-        Stage(kernel=6.0, cap_m=0.008, steps=12, gated=True),
-    )
-    """From a pose that is right to some millimetres."""
-    damping: float = 0.04
-    """Levenberg: sensitivities (root mean square cosine) below this are not moved along."""
-    free_space_weight: float = 0.3
-    """Weight of one violating model sample relative to one measured point."""
-    free_space_tolerance_m: float = 0.003
-    """A sample must lie this (and 1.5 sigma_z) in front of the measurement to violate it."""
-    converged_m: float = 2e-6
-    """A step that moves no point of the object further ends a stage."""
+SIGMA_FLOOR_M = 0.0006
+"""Least 1-sigma of a point: camera poses, mesh and grid are off by as much."""
+COARSE = (
+    Stage(kernel=25.0, cap_m=0.030, steps=8, gated=False),
+    Stage(kernel=12.0, cap_m=0.015, steps=8, gated=True),
+    Stage(kernel=6.0, cap_m=0.010, steps=8, gated=True),
+)
+"""From a rough start: 15, 7 and 3.6 mm for a quiet camera (facts of simulated benches)."""
+FINE = (
+    Stage(kernel=12.0, cap_m=0.012, steps=6, gated=True),
+    Stage(kernel=6.0, cap_m=0.008, steps=12, gated=True),
+)
+"""From a pose that is right to some millimetres."""
+DAMPING = 0.04
+"""Levenberg: sensitivities (root mean square cosine) below this are not moved along."""
+FREE_SPACE_WEIGHT = 0.3
+"""Weight of one violating model sample relative to one measured point."""
+FREE_SPACE_TOLERANCE_M = 0.003
+"""A sample must lie this (and 1.5 sigma_z) in front of the measurement to violate it."""
+CONVERGED_M = 2e-6
+"""A step that moves no point of the object further ends a stage."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -244,7 +240,6 @@ def solve_pose(
     cloud: Cloud,
     T_world_obj: Array,
     stages: tuple[Stage, ...],
-    config: SolverConfig,
     free_space: FreeSpace | None = None,
     held: Array | None = None,
 ) -> PoseFit:
@@ -255,13 +250,12 @@ def solve_pose(
         cloud: measured points near it; others are tolerated up to the kernel's width.
         T_world_obj: (4, 4) where to start.
         stages: the annealing.
-        config: settings.
         free_space: images that the model may not stand in front of; None = not checked.
         held: (6, K) orthonormal motions that are left as they are, about the box's centre, rotation
             first, turns times the radius; None = none.
     """
     T = np.array(T_world_obj, dtype=np.float64)
-    sigmas = np.sqrt(np.square(cloud.sigmas) + config.sigma_floor_m**2)
+    sigmas = np.sqrt(np.square(cloud.sigmas) + SIGMA_FLOOR_M**2)
     typical = float(np.median(1.0 / np.square(sigmas))) if len(sigmas) else 1.0
     data = (np.ascontiguousarray(cloud.points), np.ascontiguousarray(cloud.towards), sigmas)
     radius = body.radius_m
@@ -275,7 +269,7 @@ def solve_pose(
             if sums.used < LEAST_POINTS:
                 break
             if free_space is not None:
-                limits = (config.free_space_weight * typical, config.free_space_tolerance_m)
+                limits = (FREE_SPACE_WEIGHT * typical, FREE_SPACE_TOLERANCE_M)
                 _accumulate_free_space(
                     (body.samples, body.normals),
                     T,
@@ -284,9 +278,9 @@ def solve_pose(
                     body.center_obj,
                     (H, b),
                 )
-            damping = config.damping**2 * sums.weight
+            damping = DAMPING**2 * sums.weight
             T, moved = _step(T, (H, b), free, damping, radius, body.center_obj)
-            if moved < config.converged_m:
+            if moved < CONVERGED_M:
                 break
         rms = np.sqrt(sums.square / sums.weight) if sums.weight > 0 else np.nan
         history.append(float(1e3 * rms))

@@ -12,70 +12,40 @@ from realsim.geometry.clouds import fit_plane_ransac, plane_frame, refine_plane
 from realsim.records import SupportPlane
 from realsim.registration.body import Body
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class TableSearchConfig:
-    """How the table is searched without any object's pose."""
-
-    tolerance_m: float = 0.004
-    """Points within this (plus the depth noise) belong to a plane: tables are flat to 2 mm, and
-    cameras of a 0.4 deg hand-eye disagree by 3 mm at 0.4 m."""
-    noise_sigmas: float = 2.0
-    """Plus so many sigma_z of the typical point."""
-    search_points: int = 12_000
-    """Points of all views that the planes are fitted to."""
-    view_points: int = 600
-    """Points of each view by which its own table is measured."""
-    iterations: int = 300
-    """Random triples; finds a plane of 25 % of the points with p = 0.99."""
-    common_deg: float = 3.0
-    """Where views see their planes tilted by more than this against the common one, in the median,
-    it is no table [deg]: a hand-eye is off by a degree at most."""
-    searches: int = 2
-    """Random searches per plane, each over other points."""
-    triple_points: int = 4_000
-    """Points that a random search counts."""
-    widenings: tuple[float, ...] = (4.0, 1.0)
-    """Tolerances of the refinement, in turn, in units of the tolerance; the last must be 1."""
-    candidates: int = 5
-    """Planes looked at, largest first: table, floor, two walls and the lid of a box."""
-    reach: float = 0.6
-    """Region of interest: so many median camera distances around the point looked at. A lens of
-    60 deg sees 0.58 of its distance to either side."""
-    least_reach_m: float = 0.15
-    """The region of interest is never smaller [m]: one large object."""
-    least_share: float = 0.08
-    """A plane with a smaller share of the points looked at is no table; below a pile that covers
-    half of it there is still a fifth."""
-    least_points: int = 200
-    """Fewer points tell nothing about a scene."""
-    gravity_cos: float = 0.9
-    """Least cosine between the normal and the given up direction (26 deg)."""
-    facing_cos: float = 0.08
-    """Least mean cosine between the normal and the way to the cameras: walls seen edge-on."""
-    pierced_m: float = 0.02
-    """A point further behind the plane than this [m] was seen through it; 3 times the noise of a
-    depth camera at 1 m."""
-    pierced_share: float = 0.25
-    """A plane through whose points more than this share of the rays pass is no surface."""
-    cell_m: float = 0.02
-    """Cells of a plane's footprint [m]: where points lie on it."""
-    lid_share: float = 0.3
-    """A lower parallel plane with at least this share of the largest one's points is the table."""
-    lid_gap_m: float = 0.25
-    """At most so far below [m]: a floor lies deeper, an object is not taller."""
-    lid_cos: float = 0.985
-    """Planes nearer to parallel than this (10 deg) are lid and table."""
-    view_slope: float = 0.36
-    """Steepest tilt of one view's own table against the common one (tan of 20 deg)."""
-    view_height_m: float = 0.15
-    """Largest height of one view's own table over the common one [m]."""
-    view_triples: int = 96
-    """Random triples per view; finds a table of a third of the points with p = 0.97."""
-    view_share: float = 0.10
-    """A view whose best plane holds a smaller share of its points does not see the table."""
-    seed: int = 0
-    """Seed of the random search."""
+ITERATIONS = 300
+"""Random triples; finds a plane of 25 % of the points with p = 0.99."""
+SEARCHES = 2
+"""Random searches per plane, each over other points."""
+TRIPLE_POINTS = 4_000
+"""Points that a random search counts."""
+WIDENINGS = (4.0, 1.0)
+"""Tolerances of the refinement, in turn, in units of the tolerance; the last must be 1."""
+CANDIDATES = 5
+"""Planes looked at, largest first: table, floor, two walls and the lid of a box."""
+LEAST_SHARE = 0.08
+"""A plane with a smaller share of the points looked at is no table; below a pile that covers
+half of it there is still a fifth."""
+LEAST_POINTS = 200
+"""Fewer points tell nothing about a scene."""
+GRAVITY_COS = 0.9
+"""Least cosine between the normal and the given up direction (26 deg)."""
+FACING_COS = 0.08
+"""Least mean cosine between the normal and the way to the cameras: walls seen edge-on."""
+PIERCED_M = 0.02
+"""A point further behind the plane than this [m] was seen through it; 3 times the noise of a
+depth camera at 1 m."""
+PIERCED_SHARE = 0.25
+"""A plane through whose points more than this share of the rays pass is no surface."""
+CELL_M = 0.02
+"""Cells of a plane's footprint [m]: where points lie on it."""
+LID_SHARE = 0.3
+"""A lower parallel plane with at least this share of the largest one's points is the table."""
+LID_GAP_M = 0.25
+"""At most so far below [m]: a floor lies deeper, an object is not taller."""
+LID_COS = 0.985
+"""Planes nearer to parallel than this (10 deg) are lid and table."""
+SEED = 0
+"""Seed of the random search."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -89,47 +59,42 @@ class TablePlane:
 
 
 def best_plane(
-    points: Array,
-    eyes: Array,
-    region: tuple[Array, float],
-    tolerance: float,
-    config: TableSearchConfig,
-    up: ArrayLike | None,
+    points: Array, eyes: Array, region: tuple[Array, float], tolerance: float, up: ArrayLike | None
 ) -> tuple[TablePlane | None, str]:
     """Return the table among the largest planes, or why there is none."""
-    if len(points) < config.least_points:
+    if len(points) < LEAST_POINTS:
         return None, (
             f"only {len(points)} points lie within {region[1]:.2f} m of where the cameras look "
-            f"({', '.join(f'{x:.2f}' for x in region[0])} m); at least {config.least_points} are "
+            f"({', '.join(f'{x:.2f}' for x in region[0])} m); at least {LEAST_POINTS} are "
             "needed. Are the camera poses camera-to-world, and in metres?"
         )
-    rng = np.random.default_rng(config.seed)
+    rng = np.random.default_rng(SEED)
     left, largest = points, 0.0
     found: list[TablePlane] = []
-    for _ in range(config.candidates):
-        if len(left) < max(50, config.least_share * len(points)):
+    for _ in range(CANDIDATES):
+        if len(left) < max(50, LEAST_SHARE * len(points)):
             break
-        normal, offset, inliers = _largest_plane(left, tolerance, config, rng)
+        normal, offset, inliers = _largest_plane(left, tolerance, rng)
         count = int(np.count_nonzero(inliers))
         largest = max(largest, count / len(points))
-        candidate = _judged(normal, offset, points, eyes, tolerance, config, up)
+        candidate = _judged(normal, offset, points, eyes, tolerance, up)
         if candidate is not None:
             found.append(candidate)
         left = left[~inliers]
     if not found:
         return None, (
             f"the largest plane holds {100 * largest:.0f} % of the points that the cameras look "
-            f"at; at least {100 * config.least_share:.0f} % are needed, on a plane that no camera "
+            f"at; at least {100 * LEAST_SHARE:.0f} % are needed, on a plane that no camera "
             "looks through"
             + ("" if up is None else " and that lies across the given up direction")
             + ". A flat table is expected; check the camera poses."
         )
     best = max(found, key=lambda c: c.score)
-    return _lowest_parallel(best, found, region[0], config), ""
+    return _lowest_parallel(best, found, region[0]), ""
 
 
 def _largest_plane(
-    points: Array, tolerance: float, config: TableSearchConfig, rng: np.random.Generator
+    points: Array, tolerance: float, rng: np.random.Generator
 ) -> tuple[Array, float, Mask]:
     """Return normal, offset and inliers of the plane with most points, out of several searches.
 
@@ -138,12 +103,12 @@ def _largest_plane(
     objects, so another keeps to the tolerance.
     """
     found: list[tuple[int, Array, float, Mask]] = []
-    for _ in range(config.searches):
-        few = points[rng.integers(0, len(points), size=min(len(points), config.triple_points))]
-        normal, offset, _ = fit_plane_ransac(few, rng, tolerance, config.iterations)
+    for _ in range(SEARCHES):
+        few = points[rng.integers(0, len(points), size=min(len(points), TRIPLE_POINTS))]
+        normal, offset, _ = fit_plane_ransac(few, rng, tolerance, ITERATIONS)
         narrow = refine_plane(points, normal, offset, tolerance)
         found.append((int(np.count_nonzero(narrow[2])), *narrow))
-        for widening in config.widenings:
+        for widening in WIDENINGS:
             normal, offset, on = refine_plane(points, normal, offset, widening * tolerance)
             found.append((int(np.count_nonzero(on)) if widening == 1 else 0, normal, offset, on))
     _, normal, offset, on = max(found, key=lambda f: f[0])
@@ -151,32 +116,26 @@ def _largest_plane(
 
 
 def _judged(
-    normal: Array,
-    offset: float,
-    points: Array,
-    eyes: Array,
-    tolerance: float,
-    config: TableSearchConfig,
-    up: ArrayLike | None,
+    normal: Array, offset: float, points: Array, eyes: Array, tolerance: float, up: ArrayLike | None
 ) -> TablePlane | None:
     """Return the plane, turned to the cameras, with its score; None = it cannot be the table."""
     if np.mean(eyes @ normal - offset) < 0:
         normal, offset = -normal, -offset
     if up is not None:
         u = np.asarray(up, dtype=np.float64)
-        if normal @ u / np.linalg.norm(u) < config.gravity_cos:
+        if normal @ u / np.linalg.norm(u) < GRAVITY_COS:
             return None
     height = points @ normal - offset
     on = np.abs(height) < tolerance
     count = int(np.count_nonzero(on))
-    if count < config.least_share * len(points):
+    if count < LEAST_SHARE * len(points):
         return None
     towards = eyes[on] - points[on]
     facing = float(np.mean(towards @ normal / np.linalg.norm(towards, axis=1)))
-    if facing < config.facing_cos:
+    if facing < FACING_COS:
         return None
-    pierced = _pierced(normal, offset, points, eyes, height, on, config)
-    if pierced > config.pierced_share * count:
+    pierced = _pierced(normal, offset, points, eyes, height, on)
+    if pierced > PIERCED_SHARE * count:
         return None
     # What stands on a table lies above it; behind a wall of a shelf nothing is seen, but before it
     # is everything: the plane that faces the cameras more is what they were moved around.
@@ -186,39 +145,37 @@ def _judged(
 
 def _pierced(
     normal: Array, offset: float, points: Array, eyes: Array, height: Array,
-    on: Mask, config: TableSearchConfig,
+    on: Mask,
 ) -> int:  # fmt: skip
     """Return how many rays pass through cells of the plane where other points lie on it."""
     T = se3.invert(table_frame(normal, offset, points[on].mean(0)))
     flat = se3.transform(T, points[on])[:, :2]
     low = flat.min(0)
-    size = np.floor((flat.max(0) - low) / config.cell_m).astype(np.int64) + 1
+    size = np.floor((flat.max(0) - low) / CELL_M).astype(np.int64) + 1
     covered = np.zeros((int(size[0]), int(size[1])), dtype=bool)
-    index = np.floor((flat - low) / config.cell_m).astype(np.int64)
+    index = np.floor((flat - low) / CELL_M).astype(np.int64)
     covered[index[:, 0], index[:, 1]] = True
     eye_height = eyes @ normal - offset
-    through = (height < -config.pierced_m) & (eye_height > 0)
+    through = (height < -PIERCED_M) & (eye_height > 0)
     if not through.any():
         return 0
     share = eye_height[through] / (eye_height[through] - height[through])
     hit = eyes[through] + share[:, None] * (points[through] - eyes[through])
-    index = np.floor((se3.transform(T, hit)[:, :2] - low) / config.cell_m).astype(np.int64)
+    index = np.floor((se3.transform(T, hit)[:, :2] - low) / CELL_M).astype(np.int64)
     inside = np.all((index >= 0) & (index < size), axis=1)
     return int(np.count_nonzero(covered[index[inside, 0], index[inside, 1]]))
 
 
-def _lowest_parallel(
-    best: TablePlane, found: Sequence[TablePlane], aim: Array, config: TableSearchConfig
-) -> TablePlane:
+def _lowest_parallel(best: TablePlane, found: Sequence[TablePlane], aim: Array) -> TablePlane:
     """Return the lowest plane that is parallel to the best and not much smaller: not a lid."""
     # Height of the plane over the aim, along the best one's normal.
     heights = {id(c): float(c.offset - c.normal @ aim) for c in (best, *found)}
     below = [
         c
         for c in found
-        if c.normal @ best.normal > config.lid_cos
-        and c.count >= config.lid_share * best.count
-        and 0 < heights[id(best)] - heights[id(c)] < config.lid_gap_m
+        if c.normal @ best.normal > LID_COS
+        and c.count >= LID_SHARE * best.count
+        and 0 < heights[id(best)] - heights[id(c)] < LID_GAP_M
     ]
     return min(below, key=lambda c: heights[id(c)], default=best)
 

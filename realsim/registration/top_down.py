@@ -50,7 +50,6 @@ def top_down_poses(
         poses.append(T)
     checked = verify_objects(
         [given.bodies[i] for i in kept], poses, [given.clouds[i] for i in kept], comparer,
-        config.verify,
     )  # fmt: skip
     objects = [
         ObjectPose(

@@ -10,7 +10,7 @@ from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import SupportPlane, Verdict
 from realsim.registration.body import Body, footprint
-from realsim.registration.compare import Comparer
+from realsim.registration.compare import TAU_SIGMAS, Comparer
 from realsim.registration.evidence import Cloud, DepthFrame
 from realsim.registration.table_planes import lowest_height, support_checks
 
@@ -18,42 +18,34 @@ FAR_M = 1e3
 """Depth of what is nowhere [m]."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class VerifyConfig:
-    """Where a check turns from good to doubtful and from doubtful to bad.
-
-    Each pair is (doubtful beyond, rejected beyond). Real single frames (depth bias 1 to 3 mm,
-    meshes good to 1 mm) reach agree 0.9 to 1 at annotated poses; clean multi-view data 0.97.
-    """
-
-    frames: int = 12
-    """Frames rendered, spread in direction."""
-    rays: int = 4000
-    """Rays per object and frame aimed at; sets the stride."""
-    agree: tuple[float, float] = (0.90, 0.70)
-    """Share of visible pixels whose depth agrees within tau = 3 mm + 1.5 sigma_z; at least."""
-    gain: tuple[float, float] = (0.50, 0.15)
-    """Mean likelihood (1 .. -1) of visible pixels; at least. Graded where `agree` is not."""
-    cover: tuple[float, float] = (0.80, 0.50)
-    """Share of visible surface with a measured point within `cover_m` plus 1.5 sigma_z."""
-    cover_m: float = 0.002
-    """See `cover`."""
-    violation: tuple[float, float] = (0.06, 0.25)
-    """Share of visible pixels where the camera looked through the model; at most."""
-    plane_gap_mm: tuple[float, float] = (4.0, 20.0)
-    """How far the lowest point may float over or sink into the table, beyond twice the slack."""
-    penetration_mm: tuple[float, float] = (4.0, 12.0)
-    """Greatest depth of one object inside another."""
-    residual_mm: tuple[float, float] = (1.5, 4.0)
-    """Median distance of the object's points from its surface, beyond the slack: half a sigma_z
-    plus the depth bias at the object's distance (0.5 mm at 30 cm, 3 mm at 1 m)."""
-    occluder_m: float = 0.025
-    """A measurement this far in front belongs to something unmodelled that hides the object;
-    nearer in front it speaks against the pose."""
-    least_pixels: int = 60
-    """Fewer visible pixels (at the stride used) do not prove anything."""
-    hidden: float = 0.7
-    """Share of the object hidden by something unmodelled beyond which the pose is doubtful."""
+FRAMES = 12
+"""Frames rendered, spread in direction."""
+RAYS = 4000
+"""Rays per object and frame aimed at; sets the stride."""
+AGREE = (0.90, 0.70)
+"""Share of visible pixels whose depth agrees within tau = 3 mm + 1.5 sigma_z; at least."""
+GAIN = (0.50, 0.15)
+"""Mean likelihood (1 .. -1) of visible pixels; at least. Graded where `agree` is not."""
+COVER = (0.80, 0.50)
+"""Share of visible surface with a measured point within `cover_m` plus 1.5 sigma_z."""
+COVER_M = 0.002
+"""See `cover`."""
+VIOLATION = (0.06, 0.25)
+"""Share of visible pixels where the camera looked through the model; at most."""
+PLANE_GAP_MM = (4.0, 20.0)
+"""How far the lowest point may float over or sink into the table, beyond twice the slack."""
+PENETRATION_MM = (4.0, 12.0)
+"""Greatest depth of one object inside another."""
+RESIDUAL_MM = (1.5, 4.0)
+"""Median distance of the object's points from its surface, beyond the slack: half a sigma_z
+plus the depth bias at the object's distance (0.5 mm at 30 cm, 3 mm at 1 m)."""
+OCCLUDER_M = 0.025
+"""A measurement this far in front belongs to something unmodelled that hides the object;
+nearer in front it speaks against the pose."""
+LEAST_PIXELS = 60
+"""Fewer visible pixels (at the stride used) do not prove anything."""
+HIDDEN = 0.7
+"""Share of the object hidden by something unmodelled beyond which the pose is doubtful."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -77,11 +69,7 @@ class _Seen:
 
 
 def verify_objects(
-    bodies: Sequence[Body],
-    poses: Sequence[Array],
-    clouds: Sequence[Cloud],
-    comparer: Comparer,
-    config: VerifyConfig,
+    bodies: Sequence[Body], poses: Sequence[Array], clouds: Sequence[Cloud], comparer: Comparer
 ) -> list[Checked]:
     """Return the checks of every object at its pose, all objects rendered together.
 
@@ -90,7 +78,6 @@ def verify_objects(
         poses: their T_world_obj (4, 4).
         clouds: their measured points (those assigned to each).
         comparer: frames, noise and table.
-        config: settings.
     """
     stride = max(
         1, min((comparer.stride_of(b, T) for b, T in zip(bodies, poses, strict=True)), default=1)
@@ -104,7 +91,7 @@ def verify_objects(
     supports = support_checks(bodies, poses, comparer.plane)
     results: list[Checked] = []
     for i, body in enumerate(bodies):
-        checks = _image_checks(seen[i], clouds[i], comparer, config)
+        checks = _image_checks(seen[i], clouds[i], comparer)
         checks["n_pixels"] *= stride**2
         z = np.concatenate([s.measured for s in seen[i]])
         typical = np.array([np.median(z)]) if len(z) else np.zeros(1)
@@ -117,7 +104,7 @@ def verify_objects(
             floats = supports[i].get("floating_mm", 0.0)
             checks["plane_gap_mm"] = floats if height > 0 else 1e3 * height
         checks["penetration_mm"] = _penetration_mm(i, bodies, poses)
-        results.append(_verdict_on(checks, stride, slack, config))
+        results.append(_verdict_on(checks, stride, slack))
     return _without_doubles(results, bodies, poses)
 
 
@@ -183,9 +170,7 @@ def _seen_in(
     return seen
 
 
-def _image_checks(
-    seen: Sequence[_Seen], cloud: Cloud, comparer: Comparer, config: VerifyConfig
-) -> dict[str, float]:
+def _image_checks(seen: Sequence[_Seen], cloud: Cloud, comparer: Comparer) -> dict[str, float]:
     """Return the shares that come from comparing rendered with measured depth."""
     measured = np.concatenate([s.measured for s in seen])
     rendered = np.concatenate([s.rendered for s in seen])
@@ -193,7 +178,7 @@ def _image_checks(
     points = np.concatenate([s.points_world for s in seen])
     tau = comparer.tau(measured)
     d = measured - rendered
-    hidden = d < -np.maximum(tau, config.occluder_m)
+    hidden = d < -np.maximum(tau, OCCLUDER_M)
     n = int(np.count_nonzero(~hidden))
     checks = {"n_pixels": float(n), "hidden": float(np.mean(hidden)) if len(d) else 1.0}
     if n == 0:
@@ -207,20 +192,18 @@ def _image_checks(
     instead = comparer.likelihood(measured[~hidden], np.minimum(behind[~hidden], FAR_M))
     checks["margin"] = float(np.mean(likelihood - instead))
     checks["free_space_violation"] = float(np.mean(d > tau))
-    checks["cover"] = _cover(points[~hidden], measured[~hidden], cloud, comparer, config)
+    checks["cover"] = _cover(points[~hidden], measured[~hidden], cloud, comparer)
     return checks
 
 
-def _cover(
-    points: Array, depths: Array, cloud: Cloud, comparer: Comparer, config: VerifyConfig
-) -> float:
+def _cover(points: Array, depths: Array, cloud: Cloud, comparer: Comparer) -> float:
     """Return the share of visible surface points (N, 3) with a measured point close by."""
     from scipy.spatial import KDTree
 
     if len(cloud.points) == 0:
         return 0.0
     every = max(1, len(points) // 3000)
-    reach = config.cover_m + comparer.config.tau_sigmas * comparer.noise.sigma(depths[::every])
+    reach = COVER_M + TAU_SIGMAS * comparer.noise.sigma(depths[::every])
     distance, _ = KDTree(cloud.points).query(points[::every], distance_upper_bound=reach.max())
     return float(np.mean(distance <= reach))
 
@@ -239,9 +222,7 @@ def _penetration_mm(i: int, bodies: Sequence[Body], poses: Sequence[Array]) -> f
     return 1e3 * deepest
 
 
-def _verdict_on(
-    checks: dict[str, float], stride: int, slack_mm: float, config: VerifyConfig
-) -> Checked:
+def _verdict_on(checks: dict[str, float], stride: int, slack_mm: float) -> Checked:
     """Return the checks with a verdict and the reasons for it.
 
     Args:
@@ -249,25 +230,24 @@ def _verdict_on(
         stride: every how many pixels one was rendered.
         slack_mm: half a sigma_z plus the depth bias at the object's distance: what lengths may be
             off by for the camera's sake; the plane and the object each once.
-        config: the bounds.
     """
     tests: list[tuple[str, float, tuple[float, float], bool]] = [
-        ("of the visible pixels agree with the depth", checks["agree"], config.agree, True),
-        ("mean likelihood of the visible pixels", checks["gain"], config.gain, True),
-        ("of the visible surface has a measured point", checks["cover"], config.cover, True),
+        ("of the visible pixels agree with the depth", checks["agree"], AGREE, True),
+        ("mean likelihood of the visible pixels", checks["gain"], GAIN, True),
+        ("of the visible surface has a measured point", checks["cover"], COVER, True),
         (
             "of the visible pixels were looked through",
             checks["free_space_violation"],
-            config.violation,
+            VIOLATION,
             False,
         ),
-        ("mm inside another object", checks["penetration_mm"], config.penetration_mm, False),
-        ("mm median residual", checks["residual_median_mm"] - slack_mm, config.residual_mm, False),
+        ("mm inside another object", checks["penetration_mm"], PENETRATION_MM, False),
+        ("mm median residual", checks["residual_median_mm"] - slack_mm, RESIDUAL_MM, False),
     ]
     if "plane_gap_mm" in checks:
         gap = checks["plane_gap_mm"]
         words = "mm over the table" if gap > 0 else "mm sunk into the table"
-        tests.append((words, abs(gap) - 2 * slack_mm, config.plane_gap_mm, False))
+        tests.append((words, abs(gap) - 2 * slack_mm, PLANE_GAP_MM, False))
     reasons: list[str] = []
     worst = 0
     for words, value, (doubtful, bad), at_least in tests:
@@ -277,10 +257,10 @@ def _verdict_on(
             bound = "at least" if at_least else "at most"
             reasons.append(f"{value:.2f} {words} ({bound} {doubtful:g} is good)")
         worst = max(worst, level if np.isfinite(value) else 1)
-    if checks["n_pixels"] < config.least_pixels * stride**2:
+    if checks["n_pixels"] < LEAST_PIXELS * stride**2:
         reasons.append(f"only {checks['n_pixels']:.0f} pixels of it are seen")
         worst = max(worst, 1)
-    if checks["hidden"] > config.hidden:
+    if checks["hidden"] > HIDDEN:
         reasons.append(f"{checks['hidden']:.2f} of it is hidden by something that is no model")
         worst = max(worst, 1)
     verdict: Verdict = ("accepted", "doubtful", "rejected")[worst]

@@ -20,6 +20,13 @@ from realsim.registration.body import Body
 from realsim.registration.evidence import DepthNoise
 from realsim.registration.find_table import ViewTable, view_table
 from realsim.registration.held_views import (
+    ABOVE_M,
+    LEAST_DECIDED,
+    NEAR,
+    POINTS,
+    SCENE_SUPPORT,
+    SEED,
+    SIGMAS,
     HeldViews,
     check_all_poses,
     contradiction,
@@ -27,15 +34,46 @@ from realsim.registration.held_views import (
     sheet_contradiction,
     support,
 )
-from realsim.registration.view_agreement import Kind, ViewCheckConfig, ViewFinding
+from realsim.registration.view_agreement import Kind, ViewFinding
 from realsim.registration.views import ViewPoints
-
-__all__ = ["ViewCheckConfig", "ViewFinding", "check_views"]
 
 LEVER_M = 0.1
 """A tilt moves the table by its tangent times this: half the width of what stands there [m]."""
 LISTED = 12
 """At most so many views are listed in a sentence."""
+
+
+LEAST_VIEW_POINTS = 50
+"""Views with fewer trusted points are left out."""
+LITTLE_SHARE = 0.25
+"""A view with less than this share of the others' median depth pixels is named."""
+TABLE_HEIGHT_M = 0.008
+"""The table may be this far from where the others see it [m]: a hand-eye off by 1.5 mm and
+0.4 deg moves it by 2 mm, forward kinematics by 1 mm."""
+TABLE_TILT_DEG = 2.0
+"""Greatest tilt of the table against what the others see [deg]: the same hand-eye tilts it by
+0.6 deg."""
+TABLE_SPREADS = 6.0
+"""The same limits in median absolute deviations of the views, if that is more."""
+TABLE_KEPT = 0.8
+"""The common table holds less than this share of the points on the view's own: it is off."""
+WORST_SHARE = 0.6
+"""At first only views with this share of the worst one's contradictions are set aside."""
+ROUNDS = 6
+"""Views are held against sound ones only; which these are settles in 2 or 3 rounds."""
+FOREIGN_SHARE = 0.30
+"""More than this share of a view's points looked through by most others: another scene's, or
+another pose's. Clean views: up to 0.015 (0.4 deg hand-eye); foreign ones: 0.5 to 1."""
+PARTLY_SHARE = 0.10
+"""More than this: something was moved, or the pose is off by a centimetre."""
+SPREADS = 8.0
+"""The same limit as median absolute deviations above the views' median, if that is more."""
+SOLVED_SHARE = 0.3
+"""Another pose explains a view if it leaves less than this share of its contradictions."""
+OBJECT_REACH_M = 0.01
+"""After registration: a point this far from every object is not explained [m]."""
+OBJECT_SHARE = 0.35
+"""A view with so much more of them than the median view does not fit the objects."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -54,7 +92,6 @@ def check_views(
     views: Sequence[ViewPoints],
     plane: SupportPlane | None,
     noise: DepthNoise,
-    config: ViewCheckConfig,
     *,
     bodies: Sequence[Body] = (),
     Ts_world_obj: Sequence[Array] = (),
@@ -65,7 +102,6 @@ def check_views(
         views: the trusted points of the views, where their cameras are said to be.
         plane: the table that they share, or None if none was found.
         noise: of the depth.
-        config: settings.
         bodies: the registered objects; only after registration.
         Ts_world_obj: per body (4, 4) its pose.
 
@@ -76,38 +112,36 @@ def check_views(
         raise InputError("no views were given; at least one is needed.")
     if len(bodies) != len(Ts_world_obj):
         raise InputError(f"{len(bodies)} objects have {len(Ts_world_obj)} poses; one each.")
-    found = _check_amounts(views, config)
+    found = _check_amounts(views)
     gone = {f.index for f in found if f.exclude}
     left = [v for v in views if v.index not in gone]
     if len(left) > 1:
-        held = hold_views(left, plane, noise, config)
-        wrong = check_all_poses(held, plane, config)
+        held = hold_views(left, plane, noise)
+        wrong = check_all_poses(held, plane)
         if not wrong and plane is not None:
-            wrong = _check_each(held, plane, noise, config)
+            wrong = _check_each(held, plane, noise)
         found += wrong
     if bodies and plane is not None:
         named = {f.index for f in found}
         rest = [v for v in left if v.index not in named]
-        found += _check_objects(
-            rest, plane, noise, config, list(zip(bodies, Ts_world_obj, strict=True))
-        )
+        found += _check_objects(rest, plane, noise, list(zip(bodies, Ts_world_obj, strict=True)))
     return tuple(sorted(found, key=lambda f: -1 if f.index is None else f.index))
 
 
-def _check_amounts(views: Sequence[ViewPoints], config: ViewCheckConfig) -> list[ViewFinding]:
+def _check_amounts(views: Sequence[ViewPoints]) -> list[ViewFinding]:
     """Return views whose depth images are empty, or hold much less than the others'."""
     found: list[ViewFinding] = []
     usual = float(np.median([v.measured_share for v in views]))
     for v in views:
         n, share = len(v.points), v.measured_share
-        few = n < config.least_view_points
+        few = n < LEAST_VIEW_POINTS
         if share == 0:
             words = (
                 f"view {v.index}: its depth image is empty; it is left out. Capture it again, and "
                 "check that the depth stream was running."
             )
             found.append(ViewFinding(index=v.index, kind="no_depth", words=words, exclude=True))
-        elif few or share < config.little_share * usual:
+        elif few or share < LITTLE_SHARE * usual:
             words = (
                 f"view {v.index}: only {100 * share:.1f} % of its pixels hold depth ({n} trusted "
                 f"points), of the median view's {100 * usual:.0f} %. Usual causes: too near or too "
@@ -118,14 +152,12 @@ def _check_amounts(views: Sequence[ViewPoints], config: ViewCheckConfig) -> list
     return found
 
 
-def _check_each(
-    held: HeldViews, plane: SupportPlane, noise: DepthNoise, config: ViewCheckConfig
-) -> list[ViewFinding]:
+def _check_each(held: HeldViews, plane: SupportPlane, noise: DepthNoise) -> list[ViewFinding]:
     """Return the views that are not where the others are, or show another scene."""
     n = len(held.views)
-    tables = [view_table(v, plane, noise, config.table) for v in held.views]
-    offs = _tables_off(held, tables, config)
-    odd = _odd_views(held, offs, config)
+    tables = [view_table(v, plane, noise) for v in held.views]
+    offs = _tables_off(held, tables)
+    odd = _odd_views(held, offs)
     if not odd:
         return []
     if 2 * len(odd) > n:
@@ -136,11 +168,11 @@ def _check_each(
             "images of one session, and was nothing moved meanwhile?"
         )
         return [ViewFinding(index=None, kind="all_disagree", words=words, exclude=False)]
-    found = [_finding(held, o, odd, (plane, noise), config) for o in odd]
+    found = [_finding(held, o, odd, (plane, noise)) for o in odd]
     return _with_slip(held, found, odd)
 
 
-def _odd_views(held: HeldViews, offs: dict[int, str], config: ViewCheckConfig) -> list[_Odd]:
+def _odd_views(held: HeldViews, offs: dict[int, str]) -> list[_Odd]:
     """Return the views that disagree with the sound ones.
 
     A few wrong views spoil the partners of sound ones: the odd views of one round are nobody's
@@ -149,18 +181,18 @@ def _odd_views(held: HeldViews, offs: dict[int, str], config: ViewCheckConfig) -
     n = len(held.views)
     bad = set(offs)
     shares = np.zeros(n)
-    for round_ in range(config.rounds):
+    for round_ in range(ROUNDS):
         shares = np.array([
-            contradiction(held, k, _sound_partners(held, k, bad), config) for k in range(n)
+            contradiction(held, k, _sound_partners(held, k, bad)) for k in range(n)
         ])  # fmt: skip
         usual, spread = _middle(shares.tolist())
-        limit = max(config.partly_share, usual + config.spreads * spread)
-        limit = min(limit, config.foreign_share)
+        limit = max(PARTLY_SHARE, usual + SPREADS * spread)
+        limit = min(limit, FOREIGN_SHARE)
         # The worst first: with many wrong partners sound views look bad as well.
-        if round_ < config.rounds - 1:
-            limit = max(limit, config.worst_share * float(shares.max()))
+        if round_ < ROUNDS - 1:
+            limit = max(limit, WORST_SHARE * float(shares.max()))
         worse = {k for k in range(n) if shares[k] > limit} | set(offs)
-        if worse == bad and limit <= config.foreign_share:
+        if worse == bad and limit <= FOREIGN_SHARE:
             break
         bad = worse
     return [_Odd(k=k, share=float(shares[k]), off=offs.get(k, "")) for k in sorted(bad)]
@@ -178,9 +210,7 @@ def _sound_partners(held: HeldViews, k: int, bad: set[int]) -> Sequence[int]:
     return sound + more[: len(mine) - len(sound)]
 
 
-def _tables_off(
-    held: HeldViews, tables: Sequence[ViewTable], config: ViewCheckConfig
-) -> dict[int, str]:
+def _tables_off(held: HeldViews, tables: Sequence[ViewTable]) -> dict[int, str]:
     """Return in words, per view, how its table lies against the others', if it lies wrong.
 
     A lid of a large box is higher than the table, too; but nobody looks through it.
@@ -190,17 +220,17 @@ def _tables_off(
         return {}
     height, height_spread = _middle([t.height_m for t in seen])
     tilt, tilt_spread = _middle([t.tilt_deg for t in seen])
-    most_height = max(config.table_height_m, config.table_spreads * height_spread)
-    most_tilt = max(config.table_tilt_deg, tilt + config.table_spreads * tilt_spread)
+    most_height = max(TABLE_HEIGHT_M, TABLE_SPREADS * height_spread)
+    most_tilt = max(TABLE_TILT_DEG, tilt + TABLE_SPREADS * tilt_spread)
     off: dict[int, str] = {}
     for k, t in enumerate(tables):
-        if not t.own_share > 0 or t.share > config.table_kept * t.own_share:
+        if not t.own_share > 0 or t.share > TABLE_KEPT * t.own_share:
             continue
         up = t.height_m - height
         if abs(up) <= most_height and t.tilt_deg <= most_tilt:
             continue
         shift = max(abs(up), LEVER_M * float(np.tan(np.radians(t.tilt_deg))))
-        if sheet_contradiction(held, k, 0.5 * shift, config) > config.partly_share:
+        if sheet_contradiction(held, k, 0.5 * shift) > PARTLY_SHARE:
             off[k] = (
                 f"it sees the table {1e3 * abs(up):.0f} mm {'above' if up > 0 else 'below'} and "
                 f"{t.tilt_deg:.1f} deg tilted against where the others see it"
@@ -209,15 +239,11 @@ def _tables_off(
 
 
 def _finding(
-    held: HeldViews,
-    odd: _Odd,
-    all_odd: Sequence[_Odd],
-    table: tuple[SupportPlane, DepthNoise],
-    config: ViewCheckConfig,
+    held: HeldViews, odd: _Odd, all_odd: Sequence[_Odd], table: tuple[SupportPlane, DepthNoise]
 ) -> ViewFinding:
     """Return what is wrong with a view that is not where the others are."""
     index = held.views[odd.k].index
-    other = _pose_of(held, odd, all_odd, table, config)
+    other = _pose_of(held, odd, all_odd, table)
     kind: Kind = "pose_of_another"
     if other is not None:
         words = (
@@ -230,7 +256,7 @@ def _finding(
             f"view {index}: {odd.off}: its camera pose is not that of its image. Was the arm "
             "still moving, or did the mount slip?"
         )
-    elif odd.share > config.foreign_share:
+    elif odd.share > FOREIGN_SHARE:
         kind = "foreign"
         words = (
             f"view {index}: it shows another scene: {100 * odd.share:.0f} % of what it and the "
@@ -252,33 +278,27 @@ def _finding(
 
 
 def _pose_of(
-    held: HeldViews,
-    odd: _Odd,
-    all_odd: Sequence[_Odd],
-    table: tuple[SupportPlane, DepthNoise],
-    config: ViewCheckConfig,
+    held: HeldViews, odd: _Odd, all_odd: Sequence[_Odd], table: tuple[SupportPlane, DepthNoise]
 ) -> int | None:
     """Return the view whose camera pose fits this view's image, if one does."""
     bad = {o.k for o in all_odd}
     sound = [k for k in range(len(held.views)) if k not in bad]
     Ts = held.maps.Ts_world_cam
     eyes = Ts[sound, :3, 3]
-    best, best_support = None, config.scene_support
+    best, best_support = None, SCENE_SUPPORT
     for u in range(len(held.views)):
         if u == odd.k:
             continue
         order = np.argsort(np.linalg.norm(eyes - Ts[u, :3, 3], axis=1), kind="stable")
-        near = [sound[int(i)] for i in order if sound[int(i)] != u][: config.near + 1]
-        gain = support(held, odd.k, near, config, Ts[u])
+        near = [sound[int(i)] for i in order if sound[int(i)] != u][: NEAR + 1]
+        gain = support(held, odd.k, near, Ts[u])
         if gain <= best_support:
             continue
-        rest = contradiction(held, odd.k, near, config, Ts[u])
-        moved = view_table(
-            replace(held.views[odd.k], T_world_cam=Ts[u]), table[0], table[1], config.table
-        )
-        flat = moved.share > config.table_kept * moved.own_share
-        before = max(odd.share, config.partly_share)
-        if flat and rest < min(config.partly_share, config.solved_share * before):
+        rest = contradiction(held, odd.k, near, Ts[u])
+        moved = view_table(replace(held.views[odd.k], T_world_cam=Ts[u]), table[0], table[1])
+        flat = moved.share > TABLE_KEPT * moved.own_share
+        before = max(odd.share, PARTLY_SHARE)
+        if flat and rest < min(PARTLY_SHARE, SOLVED_SHARE * before):
             best, best_support = u, gain
     return best
 
@@ -310,14 +330,13 @@ def _check_objects(
     views: Sequence[ViewPoints],
     plane: SupportPlane,
     noise: DepthNoise,
-    config: ViewCheckConfig,
     placed: Sequence[tuple[Body, Array]],
 ) -> list[ViewFinding]:
     """Return the views whose points on the table are on none of the registered objects."""
     shares: list[float] = []
     told: list[ViewPoints] = []
     for v in views:
-        share = _unexplained(v, plane, noise, config, placed)
+        share = _unexplained(v, plane, noise, placed)
         if share is not None:
             shares.append(share)
             told.append(v)
@@ -334,36 +353,32 @@ def _check_objects(
             exclude=True,
         )
         for v, share in zip(told, shares, strict=True)
-        if share > usual + config.object_share
+        if share > usual + OBJECT_SHARE
     ]
 
 
 def _unexplained(
-    view: ViewPoints,
-    plane: SupportPlane,
-    noise: DepthNoise,
-    config: ViewCheckConfig,
-    placed: Sequence[tuple[Body, Array]],
+    view: ViewPoints, plane: SupportPlane, noise: DepthNoise, placed: Sequence[tuple[Body, Array]]
 ) -> float | None:
     """Return the share of a view's points around the objects that lie on none; None = too few."""
-    rng = np.random.default_rng((config.seed, view.index))
-    few = view.points[rng.integers(0, len(view.points), 4 * config.points)].astype(np.float64)
+    rng = np.random.default_rng((SEED, view.index))
+    few = view.points[rng.integers(0, len(view.points), 4 * POINTS)].astype(np.float64)
     p = se3.transform(view.T_world_cam, few)
     height = se3.transform(se3.invert(plane.T_world_table), p)[:, 2]
     sigma = noise.sigma(few[:, 2])
-    above = height > config.above_m + config.sigmas * sigma
+    above = height > ABOVE_M + SIGMAS * sigma
     nearest = np.full(len(p), np.inf)
     around = np.zeros(len(p), dtype=bool)
     for body, T in placed:
-        close = np.linalg.norm(p - body.center(T), axis=1) < body.radius_m + config.object_reach_m
+        close = np.linalg.norm(p - body.center(T), axis=1) < body.radius_m + OBJECT_REACH_M
         around |= close
         some = np.flatnonzero(close & above)
         gap = np.abs(body.field.distance(p[some], se3.invert(T)))
         nearest[some] = np.minimum(nearest[some], gap)
     mine = around & above
-    if np.count_nonzero(mine) < config.least_decided:
+    if np.count_nonzero(mine) < LEAST_DECIDED:
         return None
-    return float(np.mean(nearest[mine] > config.object_reach_m + config.sigmas * sigma[mine]))
+    return float(np.mean(nearest[mine] > OBJECT_REACH_M + SIGMAS * sigma[mine]))
 
 
 def _middle(values: Sequence[float]) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from realsim.errors import UnitError
 from realsim.geometry import se3
 from realsim.records import ObjectPose, SupportPlane
 from realsim.registration.body import make_body
-from realsim.registration.compare import CompareConfig, make_comparer
+from realsim.registration.compare import make_comparer
 from realsim.registration.evidence import DepthNoise, average_cloud
 from realsim.registration.judging.held_out import box_shift_m, half_fit, held_out, owned_points
 from realsim.registration.judging.scene_checks import scene_findings
@@ -165,7 +165,7 @@ def table():
         replace(f, T_world_cam=T) for f, T in zip(scene.frames, scene.Ts_world_cam, strict=True)
     ]
     bodies = [make_body(p, scene.models[p.obj_id], 48, 300) for p in scene.truth]
-    comparer = make_comparer(scene.intrinsics, frames, NOISE, PLANE, CompareConfig())
+    comparer = make_comparer(scene.intrinsics, frames, NOISE, PLANE)
     views = sample_views(scene.intrinsics, frames, NOISE, SampleConfig(stride=2))
     cloud = average_cloud(world_cloud(views, NOISE), np.eye(4), 0.003)
     return scene, bodies, comparer, cloud.select(cloud.points[:, 2] > 0.003)

@@ -8,7 +8,6 @@ from realsim.registration.judging.verdict import (
     CONTRAST_DECIDED,
     HELD_OUT,
     SURFACE,
-    VerdictConfig,
     probability_right,
     verdict_of,
 )
@@ -87,25 +86,25 @@ def test_an_undecided_rival_makes_it_doubtful():
     decided = probability_right({**GOOD, "contrast": 2 * CONTRAST_DECIDED})
     assert decided == probability_right({**GOOD, "contrast": None}) == probability_right(GOOD)
     assert probability_right({**GOOD, "contrast": 0.0}) < decided
-    verdict, reasons = verdict_of(0.99, {**GOOD, "contrast": 0.02}, VerdictConfig())
+    verdict, reasons = verdict_of(0.99, {**GOOD, "contrast": 0.02})
     assert verdict == "doubtful"
     assert any("0.02" in r and "symmetric" in r for r in reasons)
 
 
 def test_verdicts_have_reasons_with_numbers_in_words():
-    assert verdict_of(0.99, GOOD, VerdictConfig()) == ("accepted", ())
+    assert verdict_of(0.99, GOOD) == ("accepted", ())
     features = {**GOOD, "wrong_surface": 0.12}
-    verdict, reasons = verdict_of(0.5, features, VerdictConfig())
+    verdict, reasons = verdict_of(0.5, features)
     assert verdict == "doubtful"
     assert "0.12 of its seen surface is more than 1.0 mm off" in reasons
-    verdict, reasons = verdict_of(0.001, {**GOOD, **BAD}, VerdictConfig())
+    verdict, reasons = verdict_of(0.001, {**GOOD, **BAD})
     assert verdict == "rejected"
     assert len(reasons) > 8
     assert all(any(ch.isdigit() for ch in r) for r in reasons)
 
 
 def test_what_is_deep_inside_another_object_is_never_accepted():
-    verdict, reasons = verdict_of(0.99, {**GOOD, "penetration_mm": 29.5}, VerdictConfig())
+    verdict, reasons = verdict_of(0.99, {**GOOD, "penetration_mm": 29.5})
     assert verdict == "doubtful"
     assert "29.50 mm inside another object" in reasons
-    assert verdict_of(0.99, {**GOOD, "penetration_mm": 3.0}, VerdictConfig())[0] == "accepted"
+    assert verdict_of(0.99, {**GOOD, "penetration_mm": 3.0})[0] == "accepted"

@@ -20,7 +20,7 @@ from realsim.registration.refinement.flat import LEAN_DEG, laid_down
 from realsim.registration.register import register_scene
 from realsim.registration.rivals_around import FLAT_M, _moved_alike
 from realsim.registration.search.flat_search import explained_at, table_map
-from realsim.registration.solver import SolverConfig, solve_pose
+from realsim.registration.solver import FINE, solve_pose
 from table_scenes import QUICK
 
 shapes = load_benchmark("outside_shapes")
@@ -49,7 +49,7 @@ def dummy_fit(body, T: np.ndarray):
     """Return a fit at T of no points but one on the body."""
     point = se3.transform(T, body.center_obj[None])
     cloud = Cloud(points=point, towards=np.array([[0.0, 0, 1]]), sigmas=np.ones(1))
-    return solve_pose(body, cloud, T, SolverConfig().fine, SolverConfig()).at(T)
+    return solve_pose(body, cloud, T, FINE).at(T)
 
 
 # --- laws -----------------------------------------------------------------------------------------
@@ -74,7 +74,7 @@ def test_held_directions_are_left_as_they_are():
         held = np.linalg.qr(rng.normal(size=(6, 2)))[0]
         x = rng.normal(size=6) * 2e-3
         start = moved_about_center(body, np.eye(4), x)
-        fit = solve_pose(body, cloud, start, SolverConfig().fine, SolverConfig(), held=held)
+        fit = solve_pose(body, cloud, start, FINE, held=held)
         step = se3.log(se3.invert(start) @ fit.T_world_obj) * np.repeat([body.radius_m, 1.0], 3)
         free = step - held @ (held.T @ step)
         assert np.linalg.norm(held.T @ step) < 0.05 * np.linalg.norm(step)

@@ -13,12 +13,12 @@ from realsim.geometry.parts import part
 from realsim.records import ObjectPose
 from realsim.registration.blind import CovarianceConfig, twist_rad
 from realsim.registration.body import make_body
-from realsim.registration.compare import CompareConfig, make_comparer
+from realsim.registration.compare import make_comparer
 from realsim.registration.evidence import EvidenceConfig, average_cloud, gather, without_table
 from realsim.registration.register import DepthFrame, register_scene
-from realsim.registration.solver import SolverConfig, solve_pose
+from realsim.registration.solver import COARSE, FINE, solve_pose
 from realsim.registration.table_planes import PlaneConfig, find_support_plane
-from realsim.registration.verify import VerifyConfig, verify_objects
+from realsim.registration.verify import verify_objects
 from table_scenes import QUICK
 
 CONFIG = replace(QUICK, covariance=CovarianceConfig(correlation_area_px=1.0))
@@ -111,15 +111,13 @@ def checker(clutter):
     centers = np.stack([b.center(b.T_start) for b in bodies])
     cameras = np.stack([f.T_world_cam[:3, 3] for f in clutter.frames])
     plane, _ = find_support_plane(evidence.support, centers, cameras, PlaneConfig(), 0.001)
-    comparer = make_comparer(
-        clutter.intrinsics, clutter.frames, evidence.noise, plane, CompareConfig()
-    )
+    comparer = make_comparer(clutter.intrinsics, clutter.frames, evidence.noise, plane)
     clouds = [
         average_cloud(without_table(c, plane, 0.003), np.eye(4), 0.003) for c in evidence.near
     ]
 
     def check(poses):
-        return verify_objects(bodies, poses, clouds, comparer, VerifyConfig())
+        return verify_objects(bodies, poses, clouds, comparer)
 
     return bodies, check
 
@@ -156,9 +154,8 @@ def test_solver_stays_at_the_truth_without_noise(make_scene):
     body = make_body(truth, scene.models[truth.obj_id], 96, 300)
     evidence = gather(scene.intrinsics, scene.frames, [body], EvidenceConfig(noise_per_m=0.001))
     cloud = evidence.near[0].select(evidence.near[0].points[:, 2] > 0.002)
-    config = SolverConfig()
     rough = truth.T_world_obj @ se3.exp([0.05, -0.04, 0.06, 0.003, -0.002, 0.002])
-    fit = solve_pose(body, cloud, rough, config.coarse + config.fine, config)
+    fit = solve_pose(body, cloud, rough, COARSE + FINE)
     error = se3.log(se3.invert(truth.T_world_obj) @ fit.T_world_obj)
     assert np.linalg.norm(error[3:]) < 5e-5
     assert np.linalg.norm(error[:3]) < 1e-3

@@ -214,7 +214,7 @@ def test_what_fits_and_is_overlapped_is_judged_again_without_what_does_not_fit()
     overlapped = replace(o, checks={**o.checks, "probability": 0.97, "penetration_mm": 14.2})
     invented = replace(o, checks={**o.checks, "probability": 0.01, "penetration_mm": 14.2})
     sunk = replace(o, checks={**o.checks, "probability": 0.97, "penetration_mm": 0.0})
-    assert [is_wrong(x, QUICK) for x in (overlapped, invented, sunk)] == [False, True, True]
+    assert [is_wrong(x) for x in (overlapped, invented, sunk)] == [False, True, True]
 
 
 @cache

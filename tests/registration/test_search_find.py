@@ -14,11 +14,11 @@ from realsim.geometry.parts import part
 from realsim.records import Mesh, ObjectModel, ObjectPose, SupportPlane
 from realsim.registration.body import make_body
 from realsim.registration.evidence import Cloud, DepthNoise
-from realsim.registration.find_table import TableSearchConfig, find_table
-from realsim.registration.search.candidates import Candidate, CandidateConfig, Sought, fuse
+from realsim.registration.find_table import find_table
+from realsim.registration.search.candidates import Candidate, Sought, fuse
 from realsim.registration.search.find import FindConfig, find_objects
-from realsim.registration.search.peel import PeelConfig, clusters, explained_points, suspects
-from realsim.registration.search.polish import ContrastConfig, Decision, decide_rivals
+from realsim.registration.search.peel import clusters, explained_points, suspects
+from realsim.registration.search.polish import SAME_SHARE, Decision, decide_rivals
 from realsim.registration.search.records import SearchResult, Wanted
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import Render, Score, ScoreConfig, make_canvas
@@ -31,10 +31,7 @@ from table_scenes import SMALL_LAB, named_scene
 NAMES = ("l_bracket", "wedge", "stepped_shaft", "wedge")
 NOISE = DepthNoise(per_m=0.08 / (648 * 0.018), floor_m=2e-4)
 CONFIG = FindConfig(
-    field_cells=48,
-    templates=TemplateConfig(rays=1500),
-    score=ScoreConfig(columns=80, frames=8),
-    refine=CandidateConfig(refined=3),
+    field_cells=48, templates=TemplateConfig(rays=1500), score=ScoreConfig(columns=80, frames=8)
 )
 
 
@@ -48,7 +45,7 @@ def views() -> tuple[ViewPoints, ...]:
 
 
 def find(wanted: list[Wanted] | None, folder: Path, told: list[str] | None = None) -> SearchResult:
-    plane = find_table(views(), NOISE, TableSearchConfig()).plane
+    plane = find_table(views(), NOISE).plane
     assert plane is not None
     return find_objects(
         scene().intrinsics, scene().frames, views(), plane, NOISE, scene().models, wanted, CONFIG,
@@ -112,7 +109,7 @@ def test_one_too_many_is_not_placed_and_says_why(folder: Path):
 
 
 def test_bad_questions_are_refused():
-    plane = find_table(views(), NOISE, TableSearchConfig()).plane
+    plane = find_table(views(), NOISE).plane
     assert plane is not None
     twice = [Wanted(obj_id=1, instance=0), Wanted(obj_id=1, instance=0)]
     rest = (scene().intrinsics, scene().frames, views(), plane, NOISE)
@@ -124,7 +121,7 @@ def test_bad_questions_are_refused():
 
 # --- Near-symmetric poses told apart: a shape with one small feature, turned the wrong way.
 PLANE = SupportPlane(T_world_table=np.eye(4), rms_m=1e-3, inliers=1000)
-RIVALS = ContrastConfig(lattice=ScoreConfig(columns=160, frames=10))
+LATTICE = ScoreConfig(columns=160, frames=10)
 HALF_TURN = se3.from_rt(se3.exp_so3([0.0, 0.0, np.pi]), np.zeros(3))
 QUARTER = se3.from_rt(se3.exp_so3([0.0, 0.0, np.pi / 2]), np.zeros(3))
 
@@ -155,10 +152,10 @@ def marked_scene(knob_m: float) -> tuple[TableScene, Sought]:
 def decide(knob_m: float, start: np.ndarray, near: np.ndarray) -> Decision:
     made, sought = marked_scene(knob_m)
     views = sample_views(made.intrinsics, made.frames, NOISE, SampleConfig(stride=1))
-    cloud = fuse(views, NOISE, PLANE, CandidateConfig()).fine
-    canvas = make_canvas(made.intrinsics, made.frames, NOISE, PLANE, RIVALS.lattice)
+    cloud = fuse(views, NOISE, PLANE).fine
+    canvas = make_canvas(made.intrinsics, made.frames, NOISE, PLANE, LATTICE)
     T = made.truth[0].T_world_obj @ start
-    return decide_rivals(sought, T, canvas.table, (canvas, cloud, near), RIVALS, CandidateConfig())
+    return decide_rivals(sought, T, canvas.table, (canvas, cloud, near))
 
 
 def test_a_single_rival_that_is_right_replaces_a_wrong_pose():
@@ -194,13 +191,11 @@ def test_a_fit_of_the_same_pose_that_ended_a_little_apart_is_no_rival():
     _, sought = marked_scene(0.012)
     turn = se3.from_rt(se3.exp_so3([0.0, 0.0, np.radians(1.5)]), np.zeros(3))
     size = 2.0 * sought.body.radius_m
-    assert sought.sameness.distance(np.eye(4), turn) < RIVALS.same_share * size
+    assert sought.sameness.distance(np.eye(4), turn) < SAME_SHARE * size
     assert decide(0.012, np.eye(4), turn[None]).contrast is None
 
 
 # --- What is left over: clusters of it, starts in it, and objects it makes suspect.
-
-PEEL = PeelConfig()
 
 
 def sought(name: str) -> Sought:
@@ -245,8 +240,8 @@ def test_an_object_in_the_wrong_turn_is_suspect_and_its_neighbour_is_not():
 
     def worst(T: np.ndarray) -> list[int]:
         placed = [at(shaft, T), at(mug, T_mug)]
-        rest = cloud.points[~explained_points(cloud, placed, PEEL)]
-        return suspects(cloud, clusters(rest, np.eye(4), PEEL), placed, PEEL)
+        rest = cloud.points[~explained_points(cloud, placed)]
+        return suspects(cloud, clusters(rest, np.eye(4)), placed)
 
     assert worst(T_shaft) == []
     assert worst(wrong) == [0]

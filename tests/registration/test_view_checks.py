@@ -8,15 +8,15 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.registration import view_checks
 from realsim.registration.body import make_body
 from realsim.registration.evidence import DepthNoise
-from realsim.registration.find_table import TableSearchConfig, find_table
+from realsim.registration.find_table import find_table
 from realsim.registration.simulated import table_scene
-from realsim.registration.view_checks import ViewCheckConfig, check_views
+from realsim.registration.view_checks import check_views
 from realsim.registration.views import SampleConfig, ViewPoints, sample_views
 from table_scenes import SMALL_LAB, part_models, small_scene
 
-CONFIG = ViewCheckConfig()
 NOISE = DepthNoise(per_m=0.008, floor_m=2e-4)
 VIEWS = 16
 
@@ -30,8 +30,8 @@ def views_of(seed: int):
 
 
 def findings(views, noise=NOISE, **more):
-    plane = find_table(views, noise, TableSearchConfig()).plane
-    return check_views(views, plane, noise, CONFIG, **more)
+    plane = find_table(views, noise).plane
+    return check_views(views, plane, noise, **more)
 
 
 def with_pose(view, T):
@@ -145,30 +145,30 @@ def test_a_wrong_depth_unit_is_named():
     assert kinds(found) == {None: "all_disagree"} and "ten times too large" in found[0].words
 
 
-def test_after_registration_views_that_fit_no_object_are_named():
+def test_after_registration_views_that_fit_no_object_are_named(monkeypatch):
     scene = small_scene(1, 6, VIEWS)
     bodies = [make_body(p, scene.models[p.obj_id], 48, 200) for p in scene.truth]
     Ts = [p.T_world_obj for p in scene.truth]
-    plane = find_table(views_of(1), NOISE, TableSearchConfig()).plane
-    sound = check_views(views_of(1), plane, NOISE, CONFIG, bodies=bodies, Ts_world_obj=Ts)
+    plane = find_table(views_of(1), NOISE).plane
+    sound = check_views(views_of(1), plane, NOISE, bodies=bodies, Ts_world_obj=Ts)
     assert sound == ()
     # With the check against other views switched off, the objects alone tell.
-    deaf = replace(CONFIG, partly_share=2.0, foreign_share=2.0)
+    monkeypatch.setattr(view_checks, "PARTLY_SHARE", 2.0)
+    monkeypatch.setattr(view_checks, "FOREIGN_SHARE", 2.0)
     views = [*views_of(1)[:3], replace(views_of(2)[6], index=9)]
-    found = check_views(views, plane, NOISE, deaf, bodies=bodies, Ts_world_obj=Ts)
+    found = check_views(views, plane, NOISE, bodies=bodies, Ts_world_obj=Ts)
     assert kinds(found) == {9: "objects_off"} and found[0].exclude
 
 
 def test_senseless_calls_are_errors():
     with pytest.raises(InputError, match="no views"):
-        check_views([], None, NOISE, CONFIG)
+        check_views([], None, NOISE)
     with pytest.raises(InputError, match="0 objects have 1 poses"):
-        check_views(views_of(1), None, NOISE, CONFIG, Ts_world_obj=[np.eye(4)])
+        check_views(views_of(1), None, NOISE, Ts_world_obj=[np.eye(4)])
 
 
 # --- The table is found without any object's pose, and moves with the world.
 
-SEARCH = TableSearchConfig()
 TABLE_NOISE = DepthNoise(per_m=0.008, floor_m=2e-4)
 
 
@@ -200,7 +200,7 @@ def view_of_points(index: int, eye, points_world) -> ViewPoints:
 
 
 def test_the_true_table_is_found():
-    found = find_table(table_views(1), TABLE_NOISE, SEARCH)
+    found = find_table(table_views(1), TABLE_NOISE)
     assert found.plane is not None and found.reason == ""
     T = found.plane.T_world_table
     # The hand-eye is off by 0.5 mm and 0.1 deg, the arm by a little more.
@@ -217,7 +217,7 @@ def test_the_table_moves_with_the_world():
     views = table_views(1)
     rng = np.random.default_rng(3)
     T = se3.from_rt(se3.exp_so3([0.3, -0.4, 1.1]), rng.normal(size=3))
-    a, b = (find_table(v, TABLE_NOISE, SEARCH).plane for v in (views, moved(views, T)))
+    a, b = (find_table(v, TABLE_NOISE).plane for v in (views, moved(views, T)))
     assert a is not None and b is not None
     normal = T[:3, :3] @ a.T_world_table[:3, 2]
     assert np.degrees(np.arccos(np.clip(normal @ b.T_world_table[:3, 2], -1, 1))) < 0.05
@@ -235,7 +235,7 @@ def test_the_lid_of_a_large_box_is_not_the_table():
         view_of_points(k, (0.3 * np.cos(a), 0.3 * np.sin(a), 0.6), points)
         for k, a in enumerate(np.arange(6.0))
     ]
-    plane = find_table(views, TABLE_NOISE, SEARCH).plane
+    plane = find_table(views, TABLE_NOISE).plane
     assert plane is not None and abs(plane.T_world_table[2, 3]) < 0.002
 
 
@@ -245,8 +245,8 @@ def test_gravity_chooses_the_floor_of_a_shelf():
     wall = np.stack([np.full(len(wall), -0.2), wall[:, 0], wall[:, 1] + 0.2], axis=1)
     points = np.concatenate([floor, wall]) + rng.normal(0, 3e-4, (5500, 3))
     views = [view_of_points(k, (0.6, y, 0.25), points) for k, y in enumerate((-0.2, 0, 0.2))]
-    blind = find_table(views, TABLE_NOISE, SEARCH).plane
-    told = find_table(views, TABLE_NOISE, SEARCH, gravity_up_world=[0, 0, 1]).plane
+    blind = find_table(views, TABLE_NOISE).plane
+    told = find_table(views, TABLE_NOISE, gravity_up_world=[0, 0, 1]).plane
     assert blind is not None and abs(blind.T_world_table[0, 2]) > 0.99  # the wall is larger
     assert told is not None and told.T_world_table[2, 2] > 0.999
 
@@ -254,10 +254,10 @@ def test_gravity_chooses_the_floor_of_a_shelf():
 def test_reasons_are_given_where_there_is_no_table():
     rng = np.random.default_rng(0)
     cloud = rng.uniform(-0.15, 0.15, (4000, 3))
-    found = find_table([view_of_points(0, (0.0, 0.1, 0.6), cloud)], TABLE_NOISE, SEARCH)
+    found = find_table([view_of_points(0, (0.0, 0.1, 0.6), cloud)], TABLE_NOISE)
     assert found.plane is None and "largest plane" in found.reason
     empty = replace(
         table_views(1)[0], points=np.zeros((0, 3), np.float32), pixels=np.zeros((0, 2), np.int32)
     )
-    found = find_table([empty], TABLE_NOISE, SEARCH)
+    found = find_table([empty], TABLE_NOISE)
     assert found.plane is None and "0 trusted points" in found.reason

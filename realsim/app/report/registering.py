@@ -15,7 +15,7 @@ from realsim.app.report.figures import Figure, count
 from realsim.app.report.section import Section, counted, drawn
 from realsim.pages import VERDICT_KIND, Cell
 from realsim.records import ObjectModel, ObjectPose
-from realsim.registration.judging.verdict import VerdictConfig
+from realsim.registration.judging.verdict import ACCEPT
 from realsim.review.corrections import decision_on
 from realsim.review.journal import ReviewState
 from realsim.store import SessionStore
@@ -241,7 +241,7 @@ def _plots(section: Section, result: Registered) -> None:
     verdicts = [r["verdict"] for r in rows]
     if any(r["probability"] is not None for r in rows):
         values = [r["probability"] or 0.0 for r in rows]
-        picture = drawing.probabilities(names, values, verdicts, VerdictConfig().accept)
+        picture = drawing.probabilities(names, values, verdicts, ACCEPT)
         plots.append((picture, "Bars in the colour of the verdict."))
     if any(r["sigma_mm"] is not None for r in rows):
         mm = [r["sigma_mm"] if r["sigma_mm"] is not None else float("nan") for r in rows]

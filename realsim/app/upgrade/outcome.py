@@ -25,7 +25,7 @@ from realsim.arrays import Array, Array32, Mask
 from realsim.geometry import camera, se3
 from realsim.geometry.metrics import aligned_pose, mssd_symmetric
 from realsim.records import ObjectModel, ObjectPose, SupportPlane
-from realsim.registration.compare import CompareConfig, Comparer, make_comparer
+from realsim.registration.compare import Comparer, make_comparer
 from realsim.registration.evidence import DepthFrame, EvidenceConfig, measure_noise
 from realsim.registration.photo import (
     SQUARE_PX,
@@ -166,7 +166,7 @@ class Referee:
         ]
         noise = measure_noise(frames, EvidenceConfig())
         intrinsics = pictures[0].intrinsics
-        self._comparer: Comparer = make_comparer(intrinsics, frames, noise, plane, CompareConfig())
+        self._comparer: Comparer = make_comparer(intrinsics, frames, noise, plane)
         rows, columns = np.mgrid[: intrinsics.height, : intrinsics.width]
         shape, flat = rows.shape, (rows.ravel(), columns.ravel())
         self._tables = [self._comparer.table(f, *flat).reshape(shape) for f in frames]

@@ -18,7 +18,7 @@ from realsim.registration.body import Body
 from realsim.registration.evidence import Cloud, DepthNoise
 from realsim.registration.judging.ownership import make_claims, owners
 from realsim.registration.judging.surface_residuals import thinning
-from realsim.registration.solver import SolverConfig, solve_pose
+from realsim.registration.solver import FINE, solve_pose
 from realsim.registration.views import ViewPoints
 
 HalfFit = Callable[[Int64], Sequence[Array]]
@@ -35,8 +35,6 @@ AGREE_M = 0.003
 """A point of an unused view agrees within this of the surface [m]; plus 1.5 sigma_z."""
 AGREE_SIGMAS = 1.5
 """See `agree_m`."""
-SOLVER = SolverConfig()
-"""Its `fine` stages are run from the final pose."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -127,7 +125,7 @@ def half_fit(
             if len(cloud.points) < LEAST_POINTS:
                 found.append(np.full((4, 4), np.nan))
                 continue
-            fitted = solve_pose(body, cloud, T, SOLVER.fine, SOLVER)
+            fitted = solve_pose(body, cloud, T, FINE)
             found.append(fitted.T_world_obj)
         return found
 

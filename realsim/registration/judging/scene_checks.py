@@ -17,7 +17,7 @@ from realsim.registration.body import Body
 from realsim.registration.compare import Comparer
 from realsim.registration.evidence import Cloud
 from realsim.registration.search.records import Placed, SearchResult, Wanted
-from realsim.registration.solver import SolverConfig, solve_pose
+from realsim.registration.solver import COARSE, solve_pose
 from realsim.registration.verify import common_offset, common_sinking
 
 FindingKind = Literal["common shift", "common sinking", "swapped ids", "not in the scene", "unit"]
@@ -51,8 +51,6 @@ FINALISTS = 4
 """Fitted turns that are rendered."""
 FIT_POINTS = 1500
 """Points that fit a turn."""
-SOLVER = SolverConfig()
-"""The Gauss-Newton fit."""
 ABSENT_GAIN = 0.15
 """A model whose best pose explains its pixels by less than this each better than the bare table
 is not in the scene."""
@@ -222,7 +220,7 @@ def _gain_at(body: Body, center_world: Array, cloud: Cloud, comparer: Comparer) 
     found: list[tuple[float, Array]] = []
     for R in _turns(QUARTER_TURNS):
         T = se3.from_rt(R, center_world - R @ body.center_obj)
-        fit = solve_pose(body, few, T, SOLVER.coarse, SOLVER)
+        fit = solve_pose(body, few, T, COARSE)
         # The mean residual alone would reward models that lie on few points.
         found.append((fit.points / max(fit.offered, 1) / max(fit.variance, 1.0), fit.T_world_obj))
     found.sort(key=lambda f: -f[0])

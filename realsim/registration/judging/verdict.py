@@ -224,43 +224,37 @@ def probability_right(features: Mapping[str, float | None]) -> float:
     return float(np.clip(p, LOWEST, HIGHEST))
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class VerdictConfig:
-    """From where on a pose is accepted, and which checks are worth a word."""
-
-    accept: float = 0.9
-    """Least probability of an accepted pose: one in ten of the least sure ones may be wrong."""
-    accept_few: float = 0.92
-    """The same for one to three views, in which wrong poses are as sure as right ones that are half
-    hidden; set on the second lab's seeds 6000 to 6007."""
-    reject: float = 0.1
-    """Below this the pose is not to be used."""
-    contrast: float = CONTRAST_DECIDED
-    """Least contrast of an accepted pose that has a near-symmetric rival."""
-    inside_mm: float = 12.0
-    """An object further inside another is not accepted, however well it explains the images: a
-    small one hidden in a large one does. The large one is doubtful too until that is settled."""
-    agree: float = 0.95
-    """Less than this share of agreeing pixels is mentioned."""
-    gain: float = 0.65
-    """A lower mean likelihood is mentioned."""
-    cover: float = 0.90
-    """Less cover is mentioned."""
-    violation: float = 0.03
-    """A greater share of pixels that the camera saw through is mentioned."""
-    wrong_surface: float = 0.03
-    """A greater share of wrong surface is mentioned."""
-    looked_through: float = 0.05
-    """A greater share of surface that views saw through is mentioned."""
-    length_mm: float = 2.0
-    """Greater lengths (sunk, floating, inside another, moved by the held-out fit) are mentioned."""
-    pixels: float = 1500.0
-    """Fewer visible pixels over all frames are mentioned."""
-    hidden: float = 0.7
-    """A greater hidden share is mentioned."""
+ACCEPT = 0.9
+"""Least probability of an accepted pose: one in ten of the least sure ones may be wrong."""
+ACCEPT_FEW = 0.92
+"""The same for one to three views, in which wrong poses are as sure as right ones that are half
+hidden; set on the second lab's seeds 6000 to 6007."""
+REJECT = 0.1
+"""Below this the pose is not to be used."""
+INSIDE_MM = 12.0
+"""An object further inside another is not accepted, however well it explains the images: a
+small one hidden in a large one does. The large one is doubtful too until that is settled."""
+AGREE = 0.95
+"""Less than this share of agreeing pixels is mentioned."""
+GAIN = 0.65
+"""A lower mean likelihood is mentioned."""
+COVER = 0.90
+"""Less cover is mentioned."""
+VIOLATION = 0.03
+"""A greater share of pixels that the camera saw through is mentioned."""
+WRONG_SURFACE = 0.03
+"""A greater share of wrong surface is mentioned."""
+LOOKED_THROUGH = 0.05
+"""A greater share of surface that views saw through is mentioned."""
+LENGTH_MM = 2.0
+"""Greater lengths (sunk, floating, inside another, moved by the held-out fit) are mentioned."""
+PIXELS = 1500.0
+"""Fewer visible pixels over all frames are mentioned."""
+HIDDEN = 0.7
+"""A greater hidden share is mentioned."""
 
 
-def reasons_of(features: Mapping[str, float | None], config: VerdictConfig) -> tuple[str, ...]:
+def reasons_of(features: Mapping[str, float | None]) -> tuple[str, ...]:
     """Return what speaks against a pose, each in words with its number."""
 
     def value(name: str) -> float:
@@ -269,12 +263,11 @@ def reasons_of(features: Mapping[str, float | None], config: VerdictConfig) -> t
 
     bound = value("residual_bound_mm")
     contrast = value("contrast")
-    c = config
     low = (
-        ("agree", c.agree, "of its visible pixels agree with the depth"),
-        ("gain", c.gain, "is the mean likelihood of its visible pixels (1 is the most)"),
-        ("cover", c.cover, "of its visible surface has a measured point"),
-        ("held_out_agree", c.agree, "of the points of views that were not used agree"),
+        ("agree", AGREE, "of its visible pixels agree with the depth"),
+        ("gain", GAIN, "is the mean likelihood of its visible pixels (1 is the most)"),
+        ("cover", COVER, "of its visible surface has a measured point"),
+        ("held_out_agree", AGREE, "of the points of views that were not used agree"),
         (
             "margin",
             MARGIN,
@@ -283,46 +276,43 @@ def reasons_of(features: Mapping[str, float | None], config: VerdictConfig) -> t
         ("explained", EXPLAINED, "of the heights over the table around it are its own"),
     )
     high = (
-        ("free_space_violation", c.violation, "of its visible pixels were looked through"),
-        ("wrong_surface", c.wrong_surface, f"of its seen surface is more than {bound:.1f} mm off"),
-        ("looked_through", c.looked_through, "of its surface was looked through by the views"),
-        ("sunk_mm", c.length_mm, "mm sunk into the table"),
-        ("floating_mm", c.length_mm, "mm over the table and everything else"),
-        ("penetration_mm", c.length_mm, "mm inside another object"),
-        ("held_out_shift_mm", c.length_mm, "mm between what two halves of the views find"),
-        ("hidden", c.hidden, "of it is hidden by something that is no model"),
+        ("free_space_violation", VIOLATION, "of its visible pixels were looked through"),
+        ("wrong_surface", WRONG_SURFACE, f"of its seen surface is more than {bound:.1f} mm off"),
+        ("looked_through", LOOKED_THROUGH, "of its surface was looked through by the views"),
+        ("sunk_mm", LENGTH_MM, "mm sunk into the table"),
+        ("floating_mm", LENGTH_MM, "mm over the table and everything else"),
+        ("penetration_mm", LENGTH_MM, "mm inside another object"),
+        ("held_out_shift_mm", LENGTH_MM, "mm between what two halves of the views find"),
+        ("hidden", HIDDEN, "of it is hidden by something that is no model"),
     )
     reasons = [f"{value(n):.2f} {words}" for n, limit, words in low if value(n) < limit]
     reasons += [f"{value(n):.2f} {words}" for n, limit, words in high if value(n) > limit]
-    if value("n_pixels") < c.pixels:
+    if value("n_pixels") < PIXELS:
         reasons.append(f"only {value('n_pixels'):.0f} pixels of it are seen")
-    if contrast < c.contrast:
+    if contrast < CONTRAST_DECIDED:
         reasons.append(
             f"a nearly symmetric pose explains the images as well (contrast {contrast:.2f}, "
-            f"{c.contrast:g} decides): declare the symmetry if both are the same to you, else look "
-            "at the photograph"
+            f"{CONTRAST_DECIDED:g} decides): declare the symmetry if both are the same to you, "
+            "else look at the photograph"
         )
     return tuple(reasons)
 
 
 def verdict_of(
-    probability: float, features: Mapping[str, float | None], config: VerdictConfig
+    probability: float, features: Mapping[str, float | None]
 ) -> tuple[Verdict, tuple[str, ...]]:
     """Return the verdict, and the reasons for it unless it is accepted.
 
     Args:
         probability: that the pose is right, of `probability_right`.
         features: the checks it was told from.
-        config: settings.
     """
-    reasons = reasons_of(features, config)
-    contrast = features.get("contrast")
-    undecided = contrast is not None and contrast < config.contrast
-    inside = features.get("penetration_mm")
-    undecided |= inside is not None and inside > config.inside_mm
+    reasons = reasons_of(features)
     known = {k: float(v) for k, v in features.items() if v is not None}
-    least = config.accept_few if kind_of(known) == "single_view" else config.accept
+    undecided = known.get("contrast", np.inf) < CONTRAST_DECIDED
+    undecided |= known.get("penetration_mm", 0.0) > INSIDE_MM
+    least = ACCEPT_FEW if kind_of(known) == "single_view" else ACCEPT
     if np.isfinite(probability) and probability >= least and not undecided:
         return "accepted", ()
     said = (f"the probability that it is right within 3 mm is {probability:.3f}", *reasons)
-    return ("rejected" if probability < config.reject else "doubtful"), said
+    return ("rejected" if probability < REJECT else "doubtful"), said

@@ -19,7 +19,8 @@ from realsim.geometry import se3
 from realsim.json_values import json_value
 from realsim.records import SupportPlane
 from realsim.registration.odometry.faults import (
-    FaultConfig,
+    LEAST_DEG,
+    LEAST_MM,
     PoseFault,
     differences,
     find_faults,
@@ -96,8 +97,6 @@ def unmatched_words(view: int) -> str:
 
 PAIRS = PairConfig()
 """Which views are aligned, and how."""
-FAULTS = FaultConfig()
-"""Which faults are named."""
 FURTHER = 2
 """More pairs for a view that a pair makes suspect."""
 FURTHER_SHARE = 0.35
@@ -275,8 +274,8 @@ def _examine(clouds: Sequence[ViewCloud], claimed: Array) -> _Found:
         angles = view_angles(Ts, aim, PAIRS.zoom_deg)
         edges = _measure_pairs(meter, Ts, angles, kept)
     trusted = [e for e in edges if not has_failed(e)]
-    faults, mended = find_faults(Ts, trusted, aim, FAULTS)
-    noise = noise_of(differences(mended, trusted), FAULTS)
+    faults, mended = find_faults(Ts, trusted, aim)
+    noise = noise_of(differences(mended, trusted))
     paired = {k for e in trusted for k in (e.first, e.second)}
     unmatched = [k for k in kept if k not in paired]
     # Where a pose was skipped, the image before the shift has none; it is not a fault of its own.
@@ -304,8 +303,8 @@ def _measure_pairs(meter: PairMeter, Ts: Array, angles: Array, kept: Sequence[in
     pairs = [(kept[i], kept[j]) for i, j in neighbour_pairs(inner, PAIRS)]
     edges = [meter.measure(i, j, relative(Ts, i, j)) for i, j in pairs]
     r = differences(Ts, edges)
-    large = (1e3 * np.linalg.norm(r[:, 3:], axis=1) > FAULTS.least_mm) | (
-        np.degrees(np.linalg.norm(r[:, :3], axis=1)) > FAULTS.least_deg
+    large = (1e3 * np.linalg.norm(r[:, 3:], axis=1) > LEAST_MM) | (
+        np.degrees(np.linalg.norm(r[:, :3], axis=1)) > LEAST_DEG
     )
     odd = [e for e, big in zip(edges, large, strict=True) if big or has_failed(e)]
     doubted = sorted({k for e in odd for k in (e.first, e.second)})

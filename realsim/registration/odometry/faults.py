@@ -29,41 +29,37 @@ ROBUST_STEPS = 6
 """Re-weighted least squares settles within as many steps on six unknowns."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class FaultConfig:
-    """From when a difference is a fault."""
-
-    least_mm: float = 2.0
-    """Smaller shifts of the camera are not named [mm]: depth alone measures a pair to 0.5 mm."""
-    least_deg: float = 0.4
-    """Smaller turns are not named [deg]: depth alone measures a pair to 0.1."""
-    noise_factor: float = 3.0
-    """A fault is at least as many times the noise, which is measured from the pairs themselves."""
-    most_noise_mm: float = 1.2
-    """Noise is not believed to be above this [mm], or a scene full of faults would hide them."""
-    most_noise_deg: float = 0.25
-    """Greatest noise of a turn that is believed [deg]."""
-    screen_mm: float = 0.35
-    """Sigma of a component at most while the gravest fault is sought [mm]; a mount that slipped
-    early spoils most pairs, and noise measured from those would hide it."""
-    screen_deg: float = 0.07
-    """Greatest sigma of a component of a turn while the gravest fault is sought [deg]."""
-    floor_mm: float = 0.15
-    """Least sigma of a component of a pair's difference [mm]."""
-    floor_deg: float = 0.03
-    """Least sigma of a component of a pair's turn [deg]."""
-    cauchy: float = 12.0
-    """Squared whitened residual from which a pair counts less; a good one has 6 on average."""
-    least_gain: float = 8.0
-    """A fault lowers the robust cost by this much per pair of it."""
-    explained: float = 0.35
-    """A pair is explained if its squared residual falls below this part of what it was."""
-    explained_share: float = 0.6
-    """A fault explains at least this share of its pairs: a single wrong alignment does not."""
-    nuisance: float = 0.6
-    """Differences of this part of a nameable fault are taken out unnamed."""
-    most_faults: int = 24
-    """Faults looked for at most."""
+LEAST_MM = 2.0
+"""Smaller shifts of the camera are not named [mm]: depth alone measures a pair to 0.5 mm."""
+LEAST_DEG = 0.4
+"""Smaller turns are not named [deg]: depth alone measures a pair to 0.1."""
+NOISE_FACTOR = 3.0
+"""A fault is at least as many times the noise, which is measured from the pairs themselves."""
+MOST_NOISE_MM = 1.2
+"""Noise is not believed to be above this [mm], or a scene full of faults would hide them."""
+MOST_NOISE_DEG = 0.25
+"""Greatest noise of a turn that is believed [deg]."""
+SCREEN_MM = 0.35
+"""Sigma of a component at most while the gravest fault is sought [mm]; a mount that slipped
+early spoils most pairs, and noise measured from those would hide it."""
+SCREEN_DEG = 0.07
+"""Greatest sigma of a component of a turn while the gravest fault is sought [deg]."""
+FLOOR_MM = 0.15
+"""Least sigma of a component of a pair's difference [mm]."""
+FLOOR_DEG = 0.03
+"""Least sigma of a component of a pair's turn [deg]."""
+CAUCHY = 12.0
+"""Squared whitened residual from which a pair counts less; a good one has 6 on average."""
+LEAST_GAIN = 8.0
+"""A fault lowers the robust cost by this much per pair of it."""
+EXPLAINED = 0.35
+"""A pair is explained if its squared residual falls below this part of what it was."""
+EXPLAINED_SHARE = 0.6
+"""A fault explains at least this share of its pairs: a single wrong alignment does not."""
+NUISANCE = 0.6
+"""Differences of this part of a nameable fault are taken out unnamed."""
+MOST_FAULTS = 24
+"""Faults looked for at most."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -104,14 +100,14 @@ def differences(Ts_world_cam: Array, edges: Sequence[Edge]) -> Array:
     return se3.log(se3.invert(F) @ Z)
 
 
-def noise_of(r: Array, config: FaultConfig) -> Noise:
+def noise_of(r: Array) -> Noise:
     """Return the noise of pair differences (E, 6) from the smaller ones, which faults spare.
 
     A quantile of the lengths, divided by what it is of a normal distribution with sigma 1: of one
     component (for `sigmas`), and of a vector of three over the median of such (for mm, deg).
     """
-    low = np.repeat([np.radians(config.floor_deg), 1e-3 * config.floor_mm], 3)
-    high = np.repeat([np.radians(config.most_noise_deg), 1e-3 * config.most_noise_mm], 3)
+    low = np.repeat([np.radians(FLOOR_DEG), 1e-3 * FLOOR_MM], 3)
+    high = np.repeat([np.radians(MOST_NOISE_DEG), 1e-3 * MOST_NOISE_MM], 3)
     if len(r) == 0:
         return Noise(mm=0.0, deg=0.0, sigmas=low)
     sigmas = np.quantile(np.abs(r), NOISE_QUANTILE, axis=0) / QUANTILE_OF_ONE
@@ -123,7 +119,7 @@ def noise_of(r: Array, config: FaultConfig) -> Noise:
 
 
 def find_faults(
-    Ts_world_cam: Array, edges: Sequence[Edge], aim: Array, config: FaultConfig
+    Ts_world_cam: Array, edges: Sequence[Edge], aim: Array
 ) -> tuple[tuple[PoseFault, ...], Array]:
     """Return the faults, gravest first, and the poses (F, 4, 4) without them.
 
@@ -133,23 +129,22 @@ def find_faults(
         Ts_world_cam: (F, 4, 4) claimed.
         edges: the pairs whose alignment can be trusted.
         aim: (3,) what the views look at, world [m]: a moved table is measured there.
-        config: settings.
     """
     Ts = Ts_world_cam.copy()
     faults: list[PoseFault] = []
     refuted: set[tuple[str, int]] = set()
-    for _ in range(config.most_faults if edges else 0):
-        before = noise_of(differences(Ts, edges), config)
-        fault = _gravest(Ts, edges, aim, _screening(before, config), refuted, config)
+    for _ in range(MOST_FAULTS if edges else 0):
+        before = noise_of(differences(Ts, edges))
+        fault = _gravest(Ts, edges, aim, _screening(before), refuted)
         if fault is None:
             break
         mended = _correct_poses(Ts, fault)
         # What is left without the fault says what the noise is.
-        noise = noise_of(differences(mended, edges), config)
-        if not _explains(fault, Ts, mended, edges, noise, config):
+        noise = noise_of(differences(mended, edges))
+        if not _explains(fault, Ts, mended, edges, noise):
             refuted.add((_group(fault.kind), fault.place))
             continue
-        if _size(fault, noise, config) > 1.0:
+        if _size(fault, noise) > 1.0:
             faults.append(fault)
         Ts = mended
     return tuple(faults), Ts
@@ -160,15 +155,14 @@ def _group(kind: str) -> str:
     return "view" if kind == "view" else "change"
 
 
-def _screening(noise: Noise, config: FaultConfig) -> Noise:
+def _screening(noise: Noise) -> Noise:
     """Return the noise with which the gravest fault is sought."""
-    most = np.repeat([np.radians(config.screen_deg), 1e-3 * config.screen_mm], 3)
+    most = np.repeat([np.radians(SCREEN_DEG), 1e-3 * SCREEN_MM], 3)
     return Noise(mm=noise.mm, deg=noise.deg, sigmas=np.minimum(noise.sigmas, most))
 
 
 def _explains(
     fault: PoseFault, Ts: Array, mended: Array, edges: Sequence[Edge], noise: Noise,
-    config: FaultConfig,
 ) -> bool:  # fmt: skip
     """Return whether a fault is still needed, given the noise that is left without it."""
     touched = np.array([
@@ -176,18 +170,18 @@ def _explains(
         else e.first < fault.place <= e.second
         for e in edges
     ])  # fmt: skip
-    c = config.cauchy
+    c = CAUCHY
     before, after = (
         np.sum(np.square(differences(x, edges)[touched] / noise.sigmas), axis=1)
         for x in (Ts, mended)
     )
     gain = np.sum(c * np.log1p(before / c) - c * np.log1p(after / c))
-    return bool(gain > config.least_gain * np.count_nonzero(touched))
+    return bool(gain > LEAST_GAIN * np.count_nonzero(touched))
 
 
 def _gravest(
     Ts: Array, edges: Sequence[Edge], aim: Array, noise: Noise,
-    refuted: set[tuple[str, int]], config: FaultConfig,
+    refuted: set[tuple[str, int]],
 ) -> PoseFault | None:  # fmt: skip
     """Return the fault that lowers the cost of all pairs most, or None if none is one."""
     r = differences(Ts, edges)
@@ -198,31 +192,33 @@ def _gravest(
     for k in range(len(Ts)):
         incident = np.flatnonzero((first == k) | (second == k))
         crossing = np.flatnonzero((first < k) & (second >= k))
-        for kind, which in (("view", incident), ("mount", crossing), ("world", crossing)):
+        kinds: tuple[tuple[Kind, NDArray[np.intp]], ...] = (
+            ("view", incident), ("mount", crossing), ("world", crossing)
+        )  # fmt: skip
+        for kind, which in kinds:
             # A view alone at one end is a change from there on as well: the former says less.
             if len(which) == 0 or (kind != "view" and k in (0, len(Ts) - 1)):
                 continue
-            if np.median(cost[which]) < config.cauchy or (_group(kind), k) in refuted:
+            if np.median(cost[which]) < CAUCHY or (_group(kind), k) in refuted:
                 continue
-            found = _fit_fault(kind, k, Ts, edges, r, which, noise, config)
-            if found is None:
+            gain, explained, twist = _fit_fault(kind, k, Ts, edges, r, which, noise)
+            if gain < LEAST_GAIN * len(which) or explained < EXPLAINED_SHARE:
                 continue
-            gain, twist = found
             fault = _size_of(kind, k, twist, aim)
-            if (best is None or gain > best[0]) and _size(fault, noise, config) > config.nuisance:
+            if (best is None or gain > best[0]) and _size(fault, noise) > NUISANCE:
                 best = gain, fault
     if best is None:
         return None
     return best[1] if best[1].kind == "view" else _mount_or_world(
-        best[1], Ts, edges, r, aim, noise, config
+        best[1], Ts, edges, r, aim, noise
     )  # fmt: skip
 
 
 def _fit_fault(
-    kind: str, k: int, Ts: Array, edges: Sequence[Edge], r: Array,
-    which: NDArray[np.intp], noise: Noise, config: FaultConfig,
-) -> tuple[float, Array] | None:  # fmt: skip
-    """Return the gain in robust cost and the twist (6,) of a fault, or None if it is not one.
+    kind: Kind, k: int, Ts: Array, edges: Sequence[Edge], r: Array,
+    which: NDArray[np.intp], noise: Noise,
+) -> tuple[float, float, Array]:  # fmt: skip
+    """Return the gain in robust cost, the share of explained pairs, and the twist (6,) of a fault.
 
     Cauchy's cost c log(1 + q / c) of the squared whitened residuals q, by re-weighting.
     """
@@ -239,17 +235,14 @@ def _fit_fault(
         g = np.einsum("e,eab,ea->b", weight, A, b)
         s = np.linalg.lstsq(H, g, rcond=None)[0]
         q = np.sum(np.square(b - A @ s), axis=1)
-        weight = 1.0 / (1.0 + q / config.cauchy)
-    c = config.cauchy
+        weight = 1.0 / (1.0 + q / CAUCHY)
+    c = CAUCHY
     gain = float(np.sum(c * np.log1p(before / c) - c * np.log1p(q / c)))
-    explained = np.mean(q < np.maximum(config.explained * before, c))
-    if gain < config.least_gain * len(which) or explained < config.explained_share:
-        return None
-    return gain, s
+    return gain, float(np.mean(q < np.maximum(EXPLAINED * before, c))), s
 
 
 def _jacobian(
-    kind: str, k: int, Ts: Array, edges: Sequence[Edge], which: NDArray[np.intp]
+    kind: Kind, k: int, Ts: Array, edges: Sequence[Edge], which: NDArray[np.intp]
 ) -> Array:
     """Return d(pair difference)/d(twist) (E, 6, 6) of a fault for some of the pairs."""
     out = np.zeros((len(which), 6, 6))
@@ -267,49 +260,37 @@ def _jacobian(
 
 def _mount_or_world(
     fault: PoseFault, Ts: Array, edges: Sequence[Edge], r: Array, aim: Array, noise: Noise,
-    config: FaultConfig,
 ) -> PoseFault:  # fmt: skip
     """Return the change as that of the mount or of the world, whichever fits all pairs better.
 
     Pairs after the change tell: they do not feel a moved world, but a mount that slipped.
     """
     later = np.flatnonzero([e.second >= fault.place for e in edges])
-    # Pairs that feel nothing of the fault may take part.
-    lenient = replace(config, least_gain=-np.inf, explained_share=0.0)
-    costs: dict[str, tuple[float, PoseFault]] = {}
     kinds: tuple[Kind, ...] = ("mount", "world")
+    found: list[tuple[float, PoseFault]] = []
     for kind in kinds:
-        found = _fit_fault(kind, fault.place, Ts, edges, r, later, noise, lenient)
-        if found is not None:
-            gain, twist = found
-            costs[kind] = (gain, _size_of(kind, fault.place, twist, aim))
-    if not costs:
-        return fault
-    ordered = sorted(costs.values(), key=lambda c: -c[0])
-    alike = len(ordered) > 1 and ordered[0][0] - ordered[1][0] < config.cauchy
-    chosen = ordered[0][1]
-    return PoseFault(
-        kind=chosen.kind, place=chosen.place, twist=chosen.twist, mm=chosen.mm, deg=chosen.deg,
-        alternative=alike,
-    )  # fmt: skip
+        # Pairs that feel nothing of the fault take part: it need not explain most of them.
+        gain, _, twist = _fit_fault(kind, fault.place, Ts, edges, r, later, noise)
+        found.append((gain, _size_of(kind, fault.place, twist, aim)))
+    (best, chosen), (other, _) = sorted(found, key=lambda f: -f[0])
+    return replace(chosen, alternative=best - other < CAUCHY)
 
 
-def _size_of(kind: Kind | str, k: int, twist: Array, aim: Array) -> PoseFault:
+def _size_of(kind: Kind, k: int, twist: Array, aim: Array) -> PoseFault:
     """Return a fault with its size [mm, deg]."""
     T = se3.exp(twist)
     deg = float(np.degrees(se3.angle(T)))
     shift = T[:3, 3]
     if kind == "world":
         shift = se3.transform(T, aim[None])[0] - aim
-    named: Kind = "view" if kind == "view" else "mount" if kind == "mount" else "world"
     mm = float(1e3 * np.linalg.norm(shift))
-    return PoseFault(kind=named, place=k, twist=twist, mm=mm, deg=deg, alternative=False)
+    return PoseFault(kind=kind, place=k, twist=twist, mm=mm, deg=deg, alternative=False)
 
 
-def _size(fault: PoseFault, noise: Noise, config: FaultConfig) -> float:
+def _size(fault: PoseFault, noise: Noise) -> float:
     """Return the size of a fault over the size from which it is named."""
-    mm = max(config.least_mm, config.noise_factor * min(noise.mm, config.most_noise_mm))
-    deg = max(config.least_deg, config.noise_factor * min(noise.deg, config.most_noise_deg))
+    mm = max(LEAST_MM, NOISE_FACTOR * min(noise.mm, MOST_NOISE_MM))
+    deg = max(LEAST_DEG, NOISE_FACTOR * min(noise.deg, MOST_NOISE_DEG))
     return max(fault.mm / mm, fault.deg / deg)
 
 

@@ -26,8 +26,6 @@ class PointConfig:
     """An object with fewer points is left where it is."""
     table_points_per_view: int = 1200
     """At most so many of the table in one view."""
-    least_view_points: int = 100
-    """A view with fewer points keeps the robot's word for its camera."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

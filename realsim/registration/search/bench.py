@@ -13,21 +13,13 @@ from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, SupportPlane
 from realsim.registration.body import make_body
 from realsim.registration.evidence import DepthFrame, DepthNoise
-from realsim.registration.find_table import TableSearchConfig, region_of_interest
-from realsim.registration.near_start import SearchConfig, perturbed_starts
-from realsim.registration.search.candidates import (
-    Candidate,
-    CandidateConfig,
-    Fused,
-    Sought,
-    candidates,
-    fuse,
-)
-from realsim.registration.search.height_grid import GridConfig, HeightGrid, height_grid
-from realsim.registration.search.matching import MatchConfig, match_templates
+from realsim.registration.find_table import region_of_interest
+from realsim.registration.near_start import perturbed_starts
+from realsim.registration.search.candidates import Candidate, Fused, Sought, candidates, fuse
+from realsim.registration.search.height_grid import HeightGrid, height_grid
+from realsim.registration.search.matching import match_templates
 from realsim.registration.search.near_symmetry import NearSymmetryConfig, near_symmetries
-from realsim.registration.search.peel import PeelConfig
-from realsim.registration.search.polish import ContrastConfig
+from realsim.registration.search.polish import LATTICE
 from realsim.registration.search.records import Region, Wanted
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import Canvas, ScoreConfig, make_canvas, without_far
@@ -46,8 +38,6 @@ class FindConfig:
     it, and flat things are found in them."""
     far_ratio: float = 2.5
     """It is looked at where the typical depth's sigma is only so many times smaller."""
-    table: TableSearchConfig = field(default_factory=TableSearchConfig)
-    """Tells what the views look at: 0.6 of their distance around the point they aim at."""
     area: float = 1.4
     """Points further than so many times that from there are not looked at: there the table is seen
     at grazing angles only and rises by centimetres with the tilt of the cameras."""
@@ -61,24 +51,12 @@ class FindConfig:
     """The same for its turn [deg]."""
     seed: int = 0
     """Seed of the random turns at clusters."""
-    grid: GridConfig = field(default_factory=GridConfig)
-    """Heights over the table."""
     templates: TemplateConfig = field(default_factory=TemplateConfig)
     """How models look from above."""
-    match: MatchConfig = field(default_factory=MatchConfig)
-    """Templates over heights."""
     near: NearSymmetryConfig = field(default_factory=NearSymmetryConfig)
     """Turns after which a model looks nearly the same."""
-    start: SearchConfig = field(default_factory=SearchConfig)
-    """Neighbours of a claimed pose."""
-    refine: CandidateConfig = field(default_factory=CandidateConfig)
-    """Fits to the points."""
     score: ScoreConfig = field(default_factory=ScoreConfig)
     """Render and compare."""
-    peel: PeelConfig = field(default_factory=PeelConfig)
-    """What is unsure is sought again."""
-    contrast: ContrastConfig = field(default_factory=ContrastConfig)
-    """Near-symmetric poses against each other."""
 
 
 class Stopwatch:
@@ -186,15 +164,15 @@ def make_bench(
     watch.lap("models")
     used = [views[int(n)] for n in np.linspace(0, len(views) - 1, min(config.views, len(views)))]
     far = _far(used, noise, config)
-    middle, radius = region_of_interest(views, plane, config.table)
+    middle, radius = region_of_interest(views, plane)
     used = [_within(v, far, middle, config.area * radius) for v in used]
-    fused = fuse(used, noise, plane, config.refine)
+    fused = fuse(used, noise, plane)
     watch.lap("fuse")
-    grid = height_grid(world_cloud(used, noise), plane, config.grid)
+    grid = height_grid(world_cloud(used, noise), plane)
     watch.lap("heights")
     center = fused.coarse.points.mean(0) if len(fused.coarse.points) else plane.T_world_table[:3, 3]
     shown = _shown(frames, views, center, config)
-    close = without_far(make_canvas(intrinsics, shown, noise, plane, config.contrast.lattice), far)
+    close = without_far(make_canvas(intrinsics, shown, noise, plane, LATTICE), far)
     shown = shown[: config.score.frames]
     canvas = without_far(make_canvas(intrinsics, shown, noise, plane, config.score), far)
     watch.lap("canvas")
@@ -226,7 +204,7 @@ def _shown(
     frames: Sequence[DepthFrame], views: Sequence[ViewPoints], center: Array, config: FindConfig
 ) -> list[DepthFrame]:
     """Return the frames to render into; those of a lazy sequence that are not used stay unread."""
-    count = max(config.score.frames, config.contrast.lattice.frames)
+    count = max(config.score.frames, LATTICE.frames)
     if len(frames) == len(views):
         Ts = np.stack([v.T_world_cam for v in views])
         shown = [frames[n] for n in spread(Ts, center, count)]
@@ -241,7 +219,7 @@ def resting_starts(
 ) -> list[tuple[Array, str]]:
     """Return where a model may rest on the table: poses (4, 4) and their names."""
     found = match_templates(
-        bench.grid, bench.templates[obj_id], bench.config.match,
+        bench.grid, bench.templates[obj_id],
         region=region, plane=bench.plane, taken=taken,
     )  # fmt: skip
     bench.watch.lap("match")
@@ -256,7 +234,7 @@ def claimed_starts(bench: Bench, wanted: Wanted) -> list[tuple[Array, str]]:
     if wanted.region is not None:
         return [(pose.T_world_obj, "start")]
     body = replace(bench.sought[wanted.obj_id].body, start=pose)
-    near = perturbed_starts(body, bench.plane.T_world_table[:3, 2], bench.config.start)
+    near = perturbed_starts(body, bench.plane.T_world_table[:3, 2])
     return [(T, "start" if n == 0 else f"start, neighbour {n}") for n, T in enumerate(near)]
 
 
@@ -279,7 +257,7 @@ def fitted_candidates(
     """
     sought = bench.sought[obj_id]
     fused, buffer = left or (bench.fused, bench.canvas.table)
-    found = candidates(sought, fused, bench.canvas, starts, bench.config.refine, buffer)
+    found = candidates(sought, fused, bench.canvas, starts, buffer)
     bench.watch.lap("fit and render")
     where = bench.looked_at if region is None else region
     return [c for c in found if within(bench, sought, c.T_world_obj, where)]

@@ -5,7 +5,7 @@ ends sooner. A step turns about the box centre and shifts it: T <- T C exp(omega
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -17,21 +17,26 @@ from realsim.geometry.distance_field import sample
 from realsim.geometry.point_loops import move_back
 from realsim.records import SupportPlane
 from realsim.registration.body import Body
-from realsim.registration.evidence import Cloud, DepthNoise, average_cloud, without_table
+from realsim.registration.evidence import (
+    Cloud,
+    DepthNoise,
+    average_cloud,
+    join_clouds,
+    without_table,
+)
 from realsim.registration.search.sameness import Sameness, distinct
 from realsim.registration.search.scoring import Canvas, Render, Score, render, score
-from realsim.registration.solver import LEAST_POINTS, SolverConfig, Stage, accumulate_points
+from realsim.registration.solver import (
+    DAMPING,
+    LEAST_POINTS,
+    SIGMA_FLOOR_M,
+    Stage,
+    accumulate_points,
+)
 from realsim.registration.views import ViewPoints, world_cloud
 
 
-def quick_fit(
-    body: Body,
-    cloud: Cloud,
-    T_world_obj: Array,
-    stages: tuple[Stage, ...],
-    config: SolverConfig,
-    converged_m: float,
-) -> Array:
+def quick_fit(body: Body, cloud: Cloud, T_world_obj: Array, stages: tuple[Stage, ...]) -> Array:
     """Return the pose (4, 4) at which the measured points lie on the model's surface.
 
     Args:
@@ -39,19 +44,18 @@ def quick_fit(
         cloud: measured points near it.
         T_world_obj: (4, 4) where to start.
         stages: the annealing.
-        config: of the solver.
-        converged_m: a step that moves no point of the object further ends a stage [m].
     """
     rules = np.array([[s.kernel, s.cap_m, s.gated, s.steps] for s in stages], np.float64)
-    sigmas = np.sqrt(np.square(cloud.sigmas) + config.sigma_floor_m**2)
-    return _fit(
+    sigmas = np.sqrt(np.square(cloud.sigmas) + SIGMA_FLOOR_M**2)
+    T = _fit(
         body.field.lattice,
         np.array(T_world_obj, dtype=np.float64),
         (cloud.points, cloud.towards, sigmas),
         rules,
         (body.center_obj, body.radius_m),
-        (config.damping, converged_m),
+        (DAMPING, CONVERGED_M),
     )
+    return se3.check_rigid(T, "the fitted pose")
 
 
 @njit
@@ -140,54 +144,39 @@ def _moved(T: Array, center: Array, x: Array) -> None:
         T[i, 3] = middle[i] - (T[i, 0] * center[0] + T[i, 1] * center[1] + T[i, 2] * center[2])
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CandidateConfig:
-    """How hypotheses are fitted."""
-
-    coarse_voxel_m: float = 0.003
-    """Edge of the voxels on which all hypotheses are fitted [m]."""
-    fine_voxel_m: float = 0.002
-    """Edge of the voxels on which the best are refined [m]."""
-    above_table_m: float = 0.002
-    """Points lower than this over the table are the table's [m]."""
-    coarse_margin_m: float = 0.010
-    """Points within this of the hypothesis are fitted [m]: matching is right to a cell or two."""
-    fine_margin_m: float = 0.006
-    """The same for the refinement [m]."""
-    coarse_points: int = 700
-    """At most so many points fit a hypothesis: the cost is 60 ns each and step, and
-    1500 find nothing more."""
-    fine_points: int = 6000
-    """At most so many points refine one."""
-    same_m: float = 0.002
-    """Poses nearer than this, modulo symmetry, are one hypothesis [m]."""
-    refined: int = 5
-    """Number of an object's best hypotheses that are refined on the fine points."""
-    solver: SolverConfig = field(default_factory=SolverConfig)
-    """The Gauss-Newton fit."""
-    coarse: tuple[Stage, ...] = (
-        Stage(kernel=25.0, cap_m=0.015, steps=8, gated=False),
-        Stage(kernel=12.0, cap_m=0.0072, steps=8, gated=True),
-        Stage(kernel=6.0, cap_m=0.0036, steps=8, gated=True),
-    )
-    """From a hypothesis."""
-    fine: tuple[Stage, ...] = (
-        Stage(kernel=6.0, cap_m=0.005, steps=8, gated=True),
-        Stage(kernel=4.0, cap_m=0.003, steps=8, gated=True),
-    )
-    """From a fitted pose."""
-    converged_m: float = 1e-5
-    """A step that moves no point of the object further ends a stage of a fit [m]: the joint
-    refinement comes later."""
-
-    def fit(
-        self, sought: "Sought", cloud: Cloud, T_world_obj: Array, stages: tuple[Stage, ...]
-    ) -> Array:
-        """Return the pose (4, 4) of a model fitted to points from a start (4, 4)."""
-        return se3.check_rigid(
-            quick_fit(sought.body, cloud, T_world_obj, stages, self.solver, self.converged_m),
-            "the fitted pose",
-        )
+COARSE_VOXEL_M = 0.003
+"""Edge of the voxels on which all hypotheses are fitted [m]."""
+FINE_VOXEL_M = 0.002
+"""Edge of the voxels on which the best are refined [m]."""
+ABOVE_TABLE_M = 0.002
+"""Points lower than this over the table are the table's [m]."""
+COARSE_MARGIN_M = 0.010
+"""Points within this of the hypothesis are fitted [m]: matching is right to a cell or two."""
+FINE_MARGIN_M = 0.006
+"""The same for the refinement [m]."""
+COARSE_POINTS = 700
+"""At most so many points fit a hypothesis: the cost is 60 ns each and step, and
+1500 find nothing more."""
+FINE_POINTS = 6000
+"""At most so many points refine one."""
+SAME_M = 0.002
+"""Poses nearer than this, modulo symmetry, are one hypothesis [m]."""
+REFINED = 5
+"""Number of an object's best hypotheses that are refined on the fine points."""
+COARSE = (
+    Stage(kernel=25.0, cap_m=0.015, steps=8, gated=False),
+    Stage(kernel=12.0, cap_m=0.0072, steps=8, gated=True),
+    Stage(kernel=6.0, cap_m=0.0036, steps=8, gated=True),
+)
+"""From a hypothesis."""
+FINE = (
+    Stage(kernel=6.0, cap_m=0.005, steps=8, gated=True),
+    Stage(kernel=4.0, cap_m=0.003, steps=8, gated=True),
+)
+"""From a fitted pose."""
+CONVERGED_M = 1e-5
+"""A step that moves no point of the object further ends a stage of a fit [m]: the joint
+refinement comes later."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -232,19 +221,12 @@ class Candidate:
     """Whether it was refined on the fine points."""
 
 
-def fuse(
-    views: Sequence[ViewPoints], noise: DepthNoise, plane: SupportPlane, config: CandidateConfig
-) -> Fused:
+def fuse(views: Sequence[ViewPoints], noise: DepthNoise, plane: SupportPlane) -> Fused:
     """Return the views' points above the table, averaged on voxels of the table's frame."""
-    above = [without_table(world_cloud([v], noise), plane, config.above_table_m) for v in views]
-    cloud = Cloud(
-        points=np.concatenate([c.points for c in above]),
-        towards=np.concatenate([c.towards for c in above]),
-        sigmas=np.concatenate([c.sigmas for c in above]),
-    )
+    above = [without_table(world_cloud([v], noise), plane, ABOVE_TABLE_M) for v in views]
     T = plane.T_world_table
-    fine = average_cloud(cloud, T, config.fine_voxel_m)
-    return Fused(coarse=average_cloud(fine, T, config.coarse_voxel_m), fine=fine)
+    fine = average_cloud(join_clouds(above), T, FINE_VOXEL_M)
+    return Fused(coarse=average_cloud(fine, T, COARSE_VOXEL_M), fine=fine)
 
 
 def nearby(cloud: Cloud, sought: Sought, T_world_obj: Array, margin_m: float, most: int) -> Cloud:
@@ -255,9 +237,7 @@ def nearby(cloud: Cloud, sought: Sought, T_world_obj: Array, margin_m: float, mo
     where = _near(cloud.points, T_world_obj, body.center(T_world_obj), limit, lattice)
     if len(where) > most:
         where = where[np.linspace(0, len(where) - 1, most).astype(np.int64)]
-    return Cloud(
-        points=cloud.points[where], towards=cloud.towards[where], sigmas=cloud.sigmas[where]
-    )
+    return cloud.select(where)
 
 
 @njit
@@ -284,15 +264,13 @@ def _near(
     return out[:n].copy()
 
 
-def fit_start(
-    sought: Sought, cloud: Cloud, T_world_obj: Array, fine: bool, config: CandidateConfig
-) -> Array:
+def fit_start(sought: Sought, cloud: Cloud, T_world_obj: Array, fine: bool) -> Array:
     """Return the pose (4, 4) after a coarse or a fine fit to the points near it."""
-    margin = config.fine_margin_m if fine else config.coarse_margin_m
-    most = config.fine_points if fine else config.coarse_points
+    margin = FINE_MARGIN_M if fine else COARSE_MARGIN_M
+    most = FINE_POINTS if fine else COARSE_POINTS
     points = nearby(cloud, sought, T_world_obj, margin, most)
-    stages = config.fine if fine else config.coarse
-    return config.fit(sought, points, T_world_obj, stages)
+    stages = FINE if fine else COARSE
+    return quick_fit(sought.body, points, T_world_obj, stages)
 
 
 def candidate(
@@ -320,7 +298,6 @@ def candidates(
     fused: Fused,
     canvas: Canvas,
     starts: Sequence[tuple[Array, str]],
-    config: CandidateConfig,
     buffer: Array32 | None = None,
 ) -> list[Candidate]:
     """Return the distinct poses that the starts lead to, the best first.
@@ -330,33 +307,25 @@ def candidates(
         fused: the measured points.
         canvas: where poses are rendered.
         starts: poses (4, 4) and where they come from.
-        config: settings.
         buffer: what is there already; None = the bare table.
     """
-    Ts = [fit_start(sought, fused.coarse, T, False, config) for T, _ in starts]
+    Ts = [fit_start(sought, fused.coarse, T, False) for T, _ in starts]
     made = [
         candidate(sought, canvas, Ts[n], starts[n][1], False, buffer)
-        for n in distinct(sought.sameness, Ts, config.same_m)
+        for n in distinct(sought.sameness, Ts, SAME_M)
     ]
     made.sort(key=lambda c: -c.alone.gain)
-    best = [
-        refine_candidate(sought, fused, canvas, c, config, buffer) for c in made[: config.refined]
-    ]
-    made = sorted([*best, *made[config.refined :]], key=lambda c: -c.alone.gain)
-    kept = distinct(sought.sameness, [c.T_world_obj for c in made], config.same_m)
+    best = [refine_candidate(sought, fused, canvas, c, buffer) for c in made[:REFINED]]
+    made = sorted([*best, *made[REFINED:]], key=lambda c: -c.alone.gain)
+    kept = distinct(sought.sameness, [c.T_world_obj for c in made], SAME_M)
     return [made[n] for n in kept]
 
 
 def refine_candidate(
-    sought: Sought,
-    fused: Fused,
-    canvas: Canvas,
-    start: Candidate,
-    config: CandidateConfig,
-    buffer: Array32 | None = None,
+    sought: Sought, fused: Fused, canvas: Canvas, start: Candidate, buffer: Array32 | None = None
 ) -> Candidate:
     """Return a candidate refined on the fine points, or as it was if that explains less."""
-    T = fit_start(sought, fused.fine, start.T_world_obj, True, config)
+    T = fit_start(sought, fused.fine, start.T_world_obj, True)
     finer = candidate(sought, canvas, T, start.source, True, buffer)
     return finer if finer.alone.gain >= start.alone.gain else start
 

@@ -134,11 +134,10 @@ def _finish(
     at = [n for n, c in enumerate(selection.chosen) if c is not None]
     chosen = [search.pool[c] for c in selection.chosen if c is not None]
     soughts = [bench.sought[c.obj_id] for c in chosen]
-    refine = bench.config.refine
 
     def polish() -> list[Candidate]:
         pairs = list(zip(soughts, chosen, strict=True))
-        out = polish_poses(bench.canvas, bench.fused.fine, pairs, refine)
+        out = polish_poses(bench.canvas, bench.fused.fine, pairs)
         bench.watch.lap("polish")
         return out
 
@@ -151,9 +150,7 @@ def _finish(
     for n, sought in enumerate(soughts):
         others = compose(bench.close.table, [r for k, r in enumerate(renders) if k != n])
         evidence = (bench.close, bench.fused.fine, _near(search, at[n], chosen[n]))
-        d = decide_rivals(
-            sought, chosen[n].T_world_obj, others, evidence, bench.config.contrast, refine
-        )
+        d = decide_rivals(sought, chosen[n].T_world_obj, others, evidence)
         if d.changed:
             chosen[n] = candidate(sought, bench.canvas, d.T_world_obj, chosen[n].source, True)
             renders[n] = render(bench.close, sought.body, d.T_world_obj)

@@ -6,7 +6,6 @@ seen free, and nothing can stand there. Where nothing was measured the height is
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,39 +17,26 @@ from realsim.geometry.point_loops import move
 from realsim.records import SupportPlane
 from realsim.registration.evidence import Cloud
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class GridConfig:
-    """How a cloud becomes a grid of heights."""
-
-    cell_m: float = 0.003
-    """Edge of a cell [m]: a depth camera resolves 1-2 mm at working distance, and objects of 3 cm
-    still have 100 cells."""
-    low_m: float = -0.02
-    """Points further below the plane are of other furniture or wrong [m]."""
-    high_m: float = 0.5
-    """Points higher above the plane are of other furniture or wrong [m]."""
-    reach_m: float = 0.75
-    """Cells lie at most so far from the middle of the points, along each axis [m]: the arm reaches
-    no further, and far walls must not make the grid large."""
-    border_share: float = 0.0005
-    """Share of the points at either end of an axis that do not widen the grid: stray ones."""
-    percentile: float = 85.0
-    """Percentile of a cell's heights that counts: walls put lower points into it, flying pixels
-    higher ones."""
-    jump_m: float = 0.010
-    """If the top point of a cell is so much above the next one it is left out as flying [m]."""
-    layer_m: float = 0.004
-    """The height is the mean of the points within this of the percentile [m]: of the noisy points
-    of a flat surface the percentile alone is one sigma too high."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if not (0 < self.cell_m <= self.reach_m and self.low_m < self.high_m):
-            raise DegenerateError(
-                f"cell_m {self.cell_m}, reach_m {self.reach_m}, low_m {self.low_m}, high_m "
-                f"{self.high_m}; needed are 0 < cell <= reach and low < high, in metres."
-            )
+CELL_M = 0.003
+"""Edge of a cell [m]: a depth camera resolves 1-2 mm at working distance, and objects of 3 cm
+still have 100 cells."""
+LOW_M = -0.02
+"""Points further below the plane are of other furniture or wrong [m]."""
+HIGH_M = 0.5
+"""Points higher above the plane are of other furniture or wrong [m]."""
+REACH_M = 0.75
+"""Cells lie at most so far from the middle of the points, along each axis [m]: the arm reaches
+no further, and far walls must not make the grid large."""
+BORDER_SHARE = 0.0005
+"""Share of the points at either end of an axis that do not widen the grid: stray ones."""
+PERCENTILE = 85.0
+"""Percentile of a cell's heights that counts: walls put lower points into it, flying pixels
+higher ones."""
+JUMP_M = 0.010
+"""If the top point of a cell is so much above the next one it is left out as flying [m]."""
+LAYER_M = 0.004
+"""The height is the mean of the points within this of the percentile [m]: of the noisy points
+of a flat surface the percentile alone is one sigma too high."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -74,43 +60,42 @@ class HeightGrid:
         return self.origin + (index + 0.5) * self.cell_m
 
 
-def height_grid(cloud: Cloud, plane: SupportPlane, config: GridConfig) -> HeightGrid:
+def height_grid(cloud: Cloud, plane: SupportPlane) -> HeightGrid:
     """Return the heights over the plane of all views' points, the table's among them.
 
     Args:
         cloud: in world; raw points or averaged ones.
         plane: what the objects stand on.
-        config: settings.
 
     Raises:
         DegenerateError: no point lies over the plane.
     """
     T = se3.invert(plane.T_world_table)
-    p = _table_points(np.ascontiguousarray(cloud.points), T, config.low_m, config.high_m)
+    p = _table_points(np.ascontiguousarray(cloud.points), T, LOW_M, HIGH_M)
     if len(p) == 0:
         raise DegenerateError(
-            f"none of {len(cloud.points)} points lies between {config.low_m:g} m and "
-            f"{config.high_m:g} m over the plane. Is its normal up, and is it the objects' table?"
+            f"none of {len(cloud.points)} points lies between {LOW_M:g} m and "
+            f"{HIGH_M:g} m over the plane. Is its normal up, and is it the objects' table?"
         )
-    low, high = _bounds(p, config)
-    shape = np.maximum(np.ceil((high - low) / config.cell_m).astype(np.int64), 1)
+    low, high = _bounds(p)
+    shape = np.maximum(np.ceil((high - low) / CELL_M).astype(np.int64), 1)
     heights = _heights(
-        p, low, (int(shape[0]), int(shape[1])), config.cell_m,
-        (config.percentile / 100, config.jump_m, config.layer_m),
+        p, low, (int(shape[0]), int(shape[1])), CELL_M,
+        (PERCENTILE / 100, JUMP_M, LAYER_M),
     )  # fmt: skip
     heights.setflags(write=False)
-    return HeightGrid(heights=heights, origin=low, cell_m=config.cell_m)
+    return HeightGrid(heights=heights, origin=low, cell_m=CELL_M)
 
 
-def _bounds(p: Array, config: GridConfig) -> tuple[Array, Array]:
+def _bounds(p: Array) -> tuple[Array, Array]:
     """Return the corners (2,), (2,) of the area that points (N, 3) cover, stray ones left out."""
-    rank = int(config.border_share * len(p))
+    rank = int(BORDER_SHARE * len(p))
     low, high, middle = np.empty(2), np.empty(2), np.empty(2)
     for k in range(2):
         part = np.partition(p[:, k], [rank, len(p) // 2, len(p) - 1 - rank])
         low[k], middle[k], high[k] = part[rank], part[len(p) // 2], part[len(p) - 1 - rank]
-    low = np.maximum(low - config.cell_m, middle - config.reach_m)
-    return low, np.minimum(high + config.cell_m, middle + config.reach_m)
+    low = np.maximum(low - CELL_M, middle - REACH_M)
+    return low, np.minimum(high + CELL_M, middle + REACH_M)
 
 
 @njit
@@ -182,8 +167,6 @@ def _top(z: Array32, rule: tuple[float, float, float]) -> float:
     return total / count
 
 
-if TYPE_CHECKING:
-    from realsim.registration.search.matching import MatchConfig
 UNKNOWN_M = 1e3
 """Height that stands for 'never measured' [m]."""
 OCCUPIED_M = 10.0
@@ -208,15 +191,25 @@ class Maps:
     """(X, Y) distance to the nearest cell in which something stands [m]."""
 
 
-def maps_of(grid: HeightGrid, reach: float, taken: Mask | None, config: "MatchConfig") -> Maps:
-    """Return the heights for the kernels."""
+def maps_of(
+    grid: HeightGrid, reach: float, taken: Mask | None, standing_m: float, step_cells: int
+) -> Maps:
+    """Return the heights for the kernels.
+
+    Args:
+        grid: the measured heights.
+        reach: greatest distance of a template's point from its reference point [m].
+        taken: (X, Y) cells that other objects explain.
+        standing_m: from this height on something stands in a cell [m].
+        step_cells: positions are so many cells apart.
+    """
     from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter
 
-    pad = math.ceil(reach / grid.cell_m) + 2 * config.step_cells
+    pad = math.ceil(reach / grid.cell_m) + 2 * step_cells
     heights = np.where(np.isnan(grid.heights), UNKNOWN_M, grid.heights).astype(np.float32)
     if taken is not None:
         heights = np.where(taken, np.float32(OCCUPIED_M), heights)
-    standing = _standing(heights, config)
+    standing = _standing(heights, standing_m)
     low_, high_ = _box(standing, math.ceil(reach / grid.cell_m))
     heights = heights[low_[0] : high_[0], low_[1] : high_[1]]
     standing = standing[low_[0] : high_[0], low_[1] : high_[1]]
@@ -235,11 +228,11 @@ def maps_of(grid: HeightGrid, reach: float, taken: Mask | None, config: "MatchCo
     )
 
 
-def _standing(own: Array32, config: "MatchConfig") -> Mask:
+def _standing(own: Array32, standing_m: float) -> Mask:
     """Return the cells (X, Y) in which something stands and in most cells around, too."""
     from scipy.ndimage import uniform_filter
 
-    above = (own > config.standing_m) & (own < OCCUPIED_M)
+    above = (own > standing_m) & (own < OCCUPIED_M)
     return above & (uniform_filter(above.astype(np.float32), 3) > 0.5)
 
 
@@ -254,11 +247,11 @@ def _box(standing: Mask, margin: int) -> tuple[Int64, Int64]:
     return low, high
 
 
-def near_enough(maps: Maps, points: Array32, config: "MatchConfig") -> Mask:
+def near_enough(maps: Maps, points: Array32, inner_share: float) -> Mask:
     """Return the cells (X, Y) at which a template can have any score at all.
 
     Where the nearest thing is further away than half of the template's points are, half of them
     lie in free space.
     """
-    reach = float(np.quantile(np.hypot(points[:, 0], points[:, 1]), config.inner_share))
+    reach = float(np.quantile(np.hypot(points[:, 0], points[:, 1]), inner_share))
     return maps.free_m <= reach + maps.cell

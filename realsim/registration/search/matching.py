@@ -8,7 +8,7 @@ judged by rendering them.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.registration.search.height_grid import HeightGrid, Maps, maps_of, near_enough
-from realsim.registration.search.matching_kernels import climbed, correlated, maxima, rule_of
+from realsim.registration.search.matching_kernels import Rule, climbed, correlated, maxima
 from realsim.registration.search.records import Hypothesis, Region
 from realsim.registration.search.templates import ModelTemplates, turned
 
@@ -25,85 +25,84 @@ CLIMB_HALVINGS = 3
 """The steps of the climb are halved so often: 3 mm to 0.4 mm, 5 deg to 0.6 deg."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class MatchConfig:
-    """How templates are compared with the measured heights."""
+STEP_CELLS = 2
+"""Positions are so many cells apart (6 mm): a fit converges from twice as far."""
+AGREE_M = 0.004
+"""Heights agree fully up to this [m]: noise, and what a surface rises over half a cell."""
+DIFFER_M = 0.010
+"""From here on they do not agree at all [m]; beyond, a measurement is free space or lies in
+front."""
+FREE_COST = 1.0
+"""Cost of a point in space that was seen free."""
+HIDDEN_COST = 0.3
+"""Cost of a point that something else lies above."""
+TABLE_LOW_M = 0.001
+"""Agreement with a surface up to this height over the plane counts nothing [m]: it is the table
+itself."""
+TABLE_HIGH_M = 0.004
+"""Height over the plane from which on agreement counts fully [m]."""
+STANDING_M = 0.006
+"""Something stands where the surface is so high over the plane [m]: far and slanted views of
+the table are noisy."""
+STANDING_SHARE = 0.6
+"""The same as a share of the height of a lying object, if that is less."""
+STANDING_LOW_M = 0.0015
+"""Least of these heights [m]: the noise of a table that many views see."""
+INNER_SHARE = 0.45
+"""Positions are skipped where the nearest thing is further off than this share of the
+template's points are: (1 - s) - s < `least_score`."""
+OUTSIDE_COST = 0.25
+"""Cost, if the measured surface goes on all around the footprint as high as the object's
+edge: then it is a part of something larger."""
+PATIENCE = 4.0
+"""A comparison ends when the sum over its first k points is so much below `least_score` k: on
+the free table after 4 points. Of places with a mean of 0.5 this loses 1 %."""
+PATIENCE_POINTS = 12.0
+"""It ends, too, when so many more points are not measured than `least_measured` allows."""
+COARSE_SHARE = 0.5
+"""Share of the points that the search over all places uses; the refinement uses all."""
+LEAST_MEASURED = 0.15
+"""Least share of a template's points that must be measured."""
+LEAST_SCORE = 0.15
+"""Candidates below are dropped: they agree with nothing."""
+YAW_SLACK = 0.05
+"""A candidate may score so much less than the same one turned by one step: small features
+decide the yaw of a flange, and only its rendering shows them."""
+REFINED = 160
+"""Number of best candidates that are moved to the best place nearby; each costs 20 us."""
+CLIMB_M = 0.003
+"""First step of the climb [m]: half the step of the search."""
+CLIMB_DEG = 5.0
+"""First step of its yaw [deg]: nearly half a step of the search."""
+CLIMB_REACH_DEG = 7.5
+"""It does not turn further than this [deg], half a step of the search: else the candidates of
+all yaws end at the one that the heights favour."""
+CLIMB_GAIN = 0.005
+"""A turn must improve the score by so much, one point of 200: else the candidates of a disc
+with a few small holes gather at yaws that mean nothing."""
+SAME_M = 0.012
+"""Candidates nearer than this [m]."""
+SAME_DEG = 8.0
+"""Candidates turned by less, modulo symmetry, are then one [deg]: half a step of the search.
+With 13 deg a flange whose yaw only its bores tell had no candidate within 18 deg."""
+MOST_PER_PLACE = 10
+"""Candidates with the same centre at most: else an object that looks nearly the same after
+many turns has no candidate elsewhere."""
+MOST = 24
+"""Hypotheses returned. Simpler scores needed them all; now 99 % are among the first 8."""
+MOST_IN_REGION = 8
+"""The same if a region is given."""
 
-    step_cells: int = 2
-    """Positions are so many cells apart (6 mm): a fit converges from twice as far."""
-    agree_m: float = 0.004
-    """Heights agree fully up to this [m]: noise, and what a surface rises over half a cell."""
-    differ_m: float = 0.010
-    """From here on they do not agree at all [m]; beyond, a measurement is free space or lies in
-    front."""
-    free_cost: float = 1.0
-    """Cost of a point in space that was seen free."""
-    hidden_cost: float = 0.3
-    """Cost of a point that something else lies above."""
-    table_low_m: float = 0.001
-    """Agreement with a surface up to this height over the plane counts nothing [m]: it is the table
-    itself."""
-    table_high_m: float = 0.004
-    """Height over the plane from which on agreement counts fully [m]."""
-    standing_m: float = 0.006
-    """Something stands where the surface is so high over the plane [m]: far and slanted views of
-    the table are noisy."""
-    standing_share: float = 0.6
-    """The same as a share of the height of a lying object, if that is less."""
-    standing_low_m: float = 0.0015
-    """Least of these heights [m]: the noise of a table that many views see."""
-    inner_share: float = 0.45
-    """Positions are skipped where the nearest thing is further off than this share of the
-    template's points are: (1 - s) - s < `least_score`."""
-    outside_cost: float = 0.25
-    """Cost, if the measured surface goes on all around the footprint as high as the object's
-    edge: then it is a part of something larger."""
-    patience: float = 4.0
-    """A comparison ends when the sum over its first k points is so much below `least_score` k: on
-    the free table after 4 points. Of places with a mean of 0.5 this loses 1 %."""
-    patience_points: float = 12.0
-    """It ends, too, when so many more points are not measured than `least_measured` allows."""
-    coarse_share: float = 0.5
-    """Share of the points that the search over all places uses; the refinement uses all."""
-    least_measured: float = 0.15
-    """Least share of a template's points that must be measured."""
-    least_score: float = 0.15
-    """Candidates below are dropped: they agree with nothing."""
-    yaw_slack: float = 0.05
-    """A candidate may score so much less than the same one turned by one step: small features
-    decide the yaw of a flange, and only its rendering shows them."""
-    refined: int = 160
-    """Number of best candidates that are moved to the best place nearby; each costs 20 us."""
-    climb_m: float = 0.003
-    """First step of the climb [m]: half the step of the search."""
-    climb_deg: float = 5.0
-    """First step of its yaw [deg]: nearly half a step of the search."""
-    climb_reach_deg: float = 7.5
-    """It does not turn further than this [deg], half a step of the search: else the candidates of
-    all yaws end at the one that the heights favour."""
-    climb_gain: float = 0.005
-    """A turn must improve the score by so much, one point of 200: else the candidates of a disc
-    with a few small holes gather at yaws that mean nothing."""
-    same_m: float = 0.012
-    """Candidates nearer than this [m]."""
-    same_deg: float = 8.0
-    """Candidates turned by less, modulo symmetry, are then one [deg]: half a step of the search.
-    With 13 deg a flange whose yaw only its bores tell had no candidate within 18 deg."""
-    most_per_place: int = 10
-    """Candidates with the same centre at most: else an object that looks nearly the same after
-    many turns has no candidate elsewhere."""
-    most: int = 24
-    """Hypotheses returned. Simpler scores needed them all; now 99 % are among the first 8."""
-    most_in_region: int = 8
-    """The same if a region is given."""
 
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if not (0 < self.agree_m < self.differ_m and self.step_cells >= 1 and self.most >= 1):
-            raise InputError(
-                f"agree_m {self.agree_m}, differ_m {self.differ_m}, step_cells {self.step_cells}, "
-                f"most {self.most}; needed are 0 < agree < differ and at least 1 of the others."
-            )
+RULE: Rule = tuple(
+    np.float32(f)
+    for f in (
+        AGREE_M, DIFFER_M, 1 / (DIFFER_M - AGREE_M), FREE_COST, HIDDEN_COST,
+        TABLE_LOW_M, 1 / (TABLE_HIGH_M - TABLE_LOW_M), OUTSIDE_COST, LEAST_SCORE,
+        LEAST_MEASURED, PATIENCE, PATIENCE_POINTS,
+    )
+)  # fmt: skip
+"""The figures of the comparison as the loops use them."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -125,7 +124,6 @@ class _Candidates:
 def match_templates(
     grid: HeightGrid,
     templates: ModelTemplates,
-    config: MatchConfig,
     *,
     region: Region | None = None,
     plane: SupportPlane,
@@ -136,7 +134,6 @@ def match_templates(
     Args:
         grid: the measured heights.
         templates: of the object.
-        config: settings.
         region: where the object may be and how it may be turned; None = anywhere.
         plane: the plane of the grid.
         taken: (X, Y) cells that other objects explain; nothing is found there.
@@ -149,17 +146,16 @@ def match_templates(
             f"the mask of taken cells is {taken.shape}, the grid {grid.heights.shape}; they must "
             "have the same shape."
         )
-    standing = replace(config, standing_m=_standing_m(templates, config))
-    maps = maps_of(grid, templates.reach_m, taken, standing)
-    found = _searched(maps, templates, config, region, plane)
-    best = np.argsort(-found.score, kind="stable")[: config.refined]
-    found = _refined(maps, templates, found.select(best), config)
+    maps = maps_of(grid, templates.reach_m, taken, _standing_m(templates), STEP_CELLS)
+    found = _searched(maps, templates, region, plane)
+    best = np.argsort(-found.score, kind="stable")[:REFINED]
+    found = _refined(maps, templates, found.select(best))
     Ts = plane.T_world_table @ _poses(templates, found)
-    allowed = found.score > config.least_score
+    allowed = found.score > LEAST_SCORE
     if region is not None:
         allowed &= _turns(Ts, templates, region) <= math.radians(region.turn_deg)
     order = np.argsort(-found.score, kind="stable")
-    most = config.most if region is None else config.most_in_region
+    most = MOST if region is None else MOST_IN_REGION
     return [
         Hypothesis(
             obj_id=templates.obj_id,
@@ -167,15 +163,15 @@ def match_templates(
             score=float(found.score[k]),
             source=_source(found, k),
         )
-        for k in _distinct(Ts, order[allowed[order]], templates, config, most)
+        for k in _distinct(Ts, order[allowed[order]], templates, most)
     ]
 
 
-def _standing_m(templates: ModelTemplates, config: MatchConfig) -> float:
+def _standing_m(templates: ModelTemplates) -> float:
     """Return from which height on something stands that may be this object [m]."""
     flattest = float(np.median(templates.points[..., 2], axis=1).min())
-    least = max(config.standing_low_m, config.standing_share * flattest)
-    return min(config.standing_m, least)
+    least = max(STANDING_LOW_M, STANDING_SHARE * flattest)
+    return min(STANDING_M, least)
 
 
 def _source(found: _Candidates, k: int) -> str:
@@ -184,16 +180,12 @@ def _source(found: _Candidates, k: int) -> str:
 
 
 def _searched(
-    maps: Maps,
-    templates: ModelTemplates,
-    config: MatchConfig,
-    region: Region | None,
-    plane: SupportPlane,
+    maps: Maps, templates: ModelTemplates, region: Region | None, plane: SupportPlane
 ) -> _Candidates:
     """Return the local maxima of the score over all poses, yaws and positions."""
     inner = [maps.bands.shape[k] - 2 * maps.pad for k in (0, 1)]
     # Half a template may lie outside of what was measured.
-    rows, columns = (maps.pad + np.arange(0, n, config.step_cells) for n in inner)
+    rows, columns = (maps.pad + np.arange(0, n, STEP_CELLS) for n in inner)
     x, y = (maps.origin[k] + (c + 0.5) * maps.cell for k, c in enumerate((rows, columns)))
     poses: list[Int64] = [np.zeros(0, np.int64)]
     places: list[Array] = [np.zeros((0, 3))]
@@ -201,15 +193,15 @@ def _searched(
     for d in range(len(templates.rotations)):
         yaws = np.arange(templates.yaw_counts[d]) * templates.yaw_steps[d]
         wanted = _wanted(templates, d, yaws, (x, y), region, plane)
-        wanted &= near_enough(maps, templates.points[d], config)[np.ix_(rows, columns)]
+        wanted &= near_enough(maps, templates.points[d], INNER_SHARE)[np.ix_(rows, columns)]
         if not wanted.any():
             continue
         volume = correlated(
             maps.bands, rows, columns, wanted,
-            _first(templates.points[d], config), _first(templates.outside[d], config),
-            yaws, (rule_of(config), maps.cell),
+            _first(templates.points[d]), _first(templates.outside[d]),
+            yaws, (RULE, maps.cell),
         )  # fmt: skip
-        peaks = maxima(volume, config.least_score, config.yaw_slack)
+        peaks = maxima(volume, LEAST_SCORE, YAW_SLACK)
         n = len(peaks)
         poses.append(np.full(n, d, np.int64))
         places.append(np.stack([x[peaks[:, 1]], y[peaks[:, 2]], yaws[peaks[:, 0]]], 1))
@@ -219,9 +211,9 @@ def _searched(
     )
 
 
-def _first(points: Array32, config: MatchConfig) -> Array32:
+def _first(points: Array32) -> Array32:
     """Return the points (K, 3) that the search uses: they are in random order."""
-    return points[: math.ceil(config.coarse_share * len(points))]
+    return points[: math.ceil(COARSE_SHARE * len(points))]
 
 
 def _wanted(
@@ -250,19 +242,17 @@ def _wanted(
     return near & near_turn[:, None, None]
 
 
-def _refined(
-    maps: Maps, templates: ModelTemplates, found: _Candidates, config: MatchConfig
-) -> _Candidates:
+def _refined(maps: Maps, templates: ModelTemplates, found: _Candidates) -> _Candidates:
     """Return the candidates at the best place near each."""
     steps = np.array(
         [
-            config.climb_m, math.radians(config.climb_deg), CLIMB_HALVINGS,
-            math.radians(config.climb_reach_deg), config.climb_gain,
+            CLIMB_M, math.radians(CLIMB_DEG), CLIMB_HALVINGS,
+            math.radians(CLIMB_REACH_DEG), CLIMB_GAIN,
         ]
     )  # fmt: skip
     place, score = climbed(
         maps.own, np.array([*maps.origin, maps.cell]), found.pose, found.place,
-        templates.points, templates.outside, rule_of(config), steps,
+        templates.points, templates.outside, RULE, steps,
     )  # fmt: skip
     return _Candidates(pose=found.pose, place=place, score=score)
 
@@ -290,18 +280,16 @@ def _least_angles(Rs: Array, R: Array, symmetries: Array) -> Array:
     return np.arccos(np.clip((traces.max(1) - 1) / 2, -1.0, 1.0))
 
 
-def _distinct(
-    Ts: Array, order: Int64, templates: ModelTemplates, config: MatchConfig, most: int
-) -> list[int]:
+def _distinct(Ts: Array, order: Int64, templates: ModelTemplates, most: int) -> list[int]:
     """Return the numbers of the first poses that differ, modulo symmetry."""
     centers = se3.transform(Ts, templates.center_obj[None])[:, 0]
     kept: list[int] = []
     for k in order:
-        near = [i for i in kept if np.linalg.norm(centers[i] - centers[k]) < config.same_m]
-        if len(near) >= config.most_per_place or (near and templates.is_ball):
+        near = [i for i in kept if np.linalg.norm(centers[i] - centers[k]) < SAME_M]
+        if len(near) >= MOST_PER_PLACE or (near and templates.is_ball):
             continue
         angles = _least_angles(Ts[near, :3, :3], Ts[k, :3, :3], templates.symmetries)
-        if np.all(angles > math.radians(config.same_deg)):
+        if np.all(angles > math.radians(SAME_DEG)):
             kept.append(int(k))
             if len(kept) == most:
                 break

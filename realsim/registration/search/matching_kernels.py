@@ -1,18 +1,13 @@
 """The loops of the template matching: every pose, yaw and position, then the climb.
 
 Maps are (X, Y, 3): least and greatest height around a cell, and the cell's own [m]; 1000 m stands
-for 'never measured', 10 m for 'another object'. A rule is what `rule_of` makes.
+for 'never measured', 10 m for 'another object'. A rule is `RULE` of `matching`.
 """
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from realsim.arrays import Array, Array32, Int64, Mask
 from realsim.compiled import njit
-
-if TYPE_CHECKING:
-    from realsim.registration.search.matching import MatchConfig
 
 Rule = tuple[np.float32, ...]
 ZERO, ONE = np.float32(0), np.float32(1)
@@ -25,17 +20,6 @@ NOTHING = -1.0
 """Score of a place that was not compared to the end."""
 MOST_STEPS = 60
 """Most steps of a climb; it ends by itself after 10 to 20."""
-
-
-def rule_of(config: "MatchConfig") -> Rule:
-    """Return the figures of the comparison (12,) as the loops use them."""
-    c = config
-    figures = (
-        c.agree_m, c.differ_m, 1 / (c.differ_m - c.agree_m), c.free_cost, c.hidden_cost,
-        c.table_low_m, 1 / (c.table_high_m - c.table_low_m), c.outside_cost, c.least_score,
-        c.least_measured, c.patience, c.patience_points,
-    )  # fmt: skip
-    return tuple(np.float32(f) for f in figures)
 
 
 @njit(inline="always", error_model="numpy")

@@ -5,7 +5,6 @@ explained by no object falls into clusters; at each of them an object is tried i
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,42 +17,37 @@ from realsim.registration.search.height_grid import HeightGrid
 from realsim.registration.search.polish import NOBODY, owners
 from realsim.registration.search.scoring import Score
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PeelConfig:
-    """Which objects are unsure, and how they are sought again."""
-
-    sure_agree: float = 0.965
-    """An object with a smaller share of agreeing pixels is sought again: right ones have more, and
-    wrong ones in piles reach 0.96."""
-    beside_share: float = 0.25
-    """In the end an object is suspect, too, if so many points about it are explained by nothing, as
-    a share of its own: of a pipe in the wrong turn inside a pile all agrees that shows, but half of
-    its true place is left over."""
-    most_suspects: int = 3
-    """Greatest number of these, those with the greatest share first."""
-    explained_m: float = 0.006
-    """Points this near to a sure object are explained [m]."""
-    least_height_m: float = 0.007
-    """Unexplained points lower than this over the table are the table's noise [m]."""
-    cell_m: float = 0.006
-    """Points in neighbouring cells of this edge are one cluster [m]."""
-    least_points: int = 40
-    """Smaller clusters are left-overs at the edges of sure objects."""
-    most_clusters: int = 12
-    """Number of clusters that are searched, the largest first."""
-    rounds: int = 3
-    """Times that unsure objects are sought in what is left."""
-    rotations: int = 48
-    """Random turns tried at each place of a cluster for each object."""
-    most_starts: int = 480
-    """Maximum number of starts of one object in a round, spread over all places: 2 ms each."""
-    most_starts_together: int = 1600
-    """Maximum number of starts of all objects in a round: 53 each with 30 models, 3 s."""
-    least_extent: float = 0.25
-    """A cluster smaller than this share of the object's size is not it."""
-    greatest_extent: float = 1.0
-    """A cluster larger than this may hold it, but is searched around several of its points."""
+SURE_AGREE = 0.965
+"""An object with a smaller share of agreeing pixels is sought again: right ones have more, and
+wrong ones in piles reach 0.96."""
+BESIDE_SHARE = 0.25
+"""In the end an object is suspect, too, if so many points about it are explained by nothing, as
+a share of its own: of a pipe in the wrong turn inside a pile all agrees that shows, but half of
+its true place is left over."""
+MOST_SUSPECTS = 3
+"""Greatest number of these, those with the greatest share first."""
+EXPLAINED_M = 0.006
+"""Points this near to a sure object are explained [m]."""
+LEAST_HEIGHT_M = 0.007
+"""Unexplained points lower than this over the table are the table's noise [m]."""
+CELL_M = 0.006
+"""Points in neighbouring cells of this edge are one cluster [m]."""
+LEAST_POINTS = 40
+"""Smaller clusters are left-overs at the edges of sure objects."""
+MOST_CLUSTERS = 12
+"""Number of clusters that are searched, the largest first."""
+ROUNDS = 3
+"""Times that unsure objects are sought in what is left."""
+ROTATIONS = 48
+"""Random turns tried at each place of a cluster for each object."""
+MOST_STARTS = 480
+"""Maximum number of starts of one object in a round, spread over all places: 2 ms each."""
+MOST_STARTS_TOGETHER = 1600
+"""Maximum number of starts of all objects in a round: 53 each with 30 models, 3 s."""
+LEAST_EXTENT = 0.25
+"""A cluster smaller than this share of the object's size is not it."""
+GREATEST_EXTENT = 1.0
+"""A cluster larger than this may hold it, but is searched around several of its points."""
 
 
 def taken_cells(grid: HeightGrid, T_table_world: Array, cloud: Cloud, explained: Mask) -> Mask:
@@ -72,22 +66,19 @@ def taken_cells(grid: HeightGrid, T_table_world: Array, cloud: Cloud, explained:
     return taken & ~free
 
 
-def explained_points(
-    cloud: Cloud, placed: Sequence[tuple[Sought, Candidate]], config: PeelConfig
-) -> Mask:
+def explained_points(cloud: Cloud, placed: Sequence[tuple[Sought, Candidate]]) -> Mask:
     """Return which points (N,) lie on one of these objects."""
     Ts = [c.T_world_obj for _, c in placed]
-    return owners(cloud, [s for s, _ in placed], Ts, config.explained_m) != NOBODY
+    return owners(cloud, [s for s, _ in placed], Ts, EXPLAINED_M) != NOBODY
 
 
-def is_sure(score: Score | None, config: PeelConfig) -> bool:
+def is_sure(score: Score | None) -> bool:
     """Return whether an object need not be sought again."""
-    return score is not None and score.agree >= config.sure_agree
+    return score is not None and score.agree >= SURE_AGREE
 
 
 def suspects(
     cloud: Cloud, left: Sequence[Array], placed: Sequence[tuple[Sought, Candidate]],
-    config: PeelConfig,
 ) -> list[int]:  # fmt: skip
     """Return the places of objects about which much is explained by nothing, the worst first.
 
@@ -95,38 +86,37 @@ def suspects(
         cloud: measured points above the table.
         left: clusters (K, 3) of those that no object explains [m].
         placed: all objects.
-        config: settings.
     """
     if not left:
         return []
     rest = np.concatenate(left)
     Ts = [c.T_world_obj for _, c in placed]
-    owner = owners(cloud, [s for s, _ in placed], Ts, config.explained_m)
+    owner = owners(cloud, [s for s, _ in placed], Ts, EXPLAINED_M)
     found: list[tuple[float, int]] = []
     for n, (sought, c) in enumerate(placed):
         off = np.linalg.norm(rest - sought.body.center(c.T_world_obj), axis=1)
         near = int(np.count_nonzero(off < sought.body.radius_m))
         own = max(1, int(np.count_nonzero(owner == n)))
-        if near >= max(config.least_points, config.beside_share * own):
+        if near >= max(LEAST_POINTS, BESIDE_SHARE * own):
             found.append((-near / own, n))
-    return [n for _, n in sorted(found)[: config.most_suspects]]
+    return [n for _, n in sorted(found)[:MOST_SUSPECTS]]
 
 
-def clusters(points: Array, T_table_world: Array, config: PeelConfig) -> list[Array]:
+def clusters(points: Array, T_table_world: Array) -> list[Array]:
     """Return the connected groups (K, 3) of points (N, 3) above the table, the largest first."""
     from scipy.ndimage import label
 
-    points = points[se3.transform(T_table_world, points)[:, 2] > config.least_height_m]
+    points = points[se3.transform(T_table_world, points)[:, 2] > LEAST_HEIGHT_M]
     if len(points) == 0:
         return []
-    cells = np.floor((points - points.min(0)) / config.cell_m).astype(np.int64)
+    cells = np.floor((points - points.min(0)) / CELL_M).astype(np.int64)
     filled = np.zeros(cells.max(0) + 1, dtype=bool)
     filled[tuple(cells.T)] = True
     numbered: Any = label(filled, structure=np.ones((3, 3, 3)))
     of_point = numbered[0][tuple(cells.T)]
     numbers, counts = np.unique(of_point, return_counts=True)
     order = np.argsort(-counts, kind="stable")
-    keep = [k for k in order if counts[k] >= config.least_points][: config.most_clusters]
+    keep = [k for k in order if counts[k] >= LEAST_POINTS][:MOST_CLUSTERS]
     return [points[of_point == numbers[k]] for k in keep]
 
 
@@ -135,8 +125,8 @@ def residual_starts(
     groups: Sequence[Array],
     up_world: Array,
     rng: np.random.Generator,
-    config: PeelConfig,
-    models: int = 1,
+    turns: int,
+    most: int,
 ) -> list[tuple[Array, str]]:
     """Return poses (4, 4) of an object at clusters of unexplained points, and their names.
 
@@ -148,20 +138,18 @@ def residual_starts(
         groups: clusters of points.
         up_world: (3,) the table's normal.
         rng: of the turns.
-        config: settings.
-        models: so many are sought in the same clusters.
+        turns: so many at each place of a cluster.
+        most: so many starts, spread over all places.
     """
     body = sought.body
-    most = min(config.most_starts, max(1, config.most_starts_together // models))
     half = 0.5 * np.ptp(body.bounds_obj, axis=0)
     starts: list[tuple[Array, str]] = []
     for n, points in enumerate(groups):
         size = float(np.linalg.norm(np.ptp(points, axis=0)))
-        if size < config.least_extent * 2 * body.radius_m:
+        if size < LEAST_EXTENT * 2 * body.radius_m:
             continue
-        for anchor in _anchors(points, size, body.radius_m, rng, config):
-            turns = np.asarray(se3.random_rotation(rng, config.rotations))
-            for k, R in enumerate(turns):
+        for anchor in _anchors(points, size, body.radius_m, rng):
+            for k, R in enumerate(np.asarray(se3.random_rotation(rng, turns))):
                 thickness = float(np.abs(R.T @ up_world) @ half)
                 center = anchor - 0.5 * thickness * up_world
                 T = se3.from_rt(R, center - R @ body.center_obj)
@@ -170,11 +158,9 @@ def residual_starts(
     return [starts[k] for k in sorted(few)]
 
 
-def _anchors(
-    points: Array, size: float, radius: float, rng: np.random.Generator, config: PeelConfig
-) -> Array:
+def _anchors(points: Array, size: float, radius: float, rng: np.random.Generator) -> Array:
     """Return the points (K, 3) about which an object is put: one, or several of a large group."""
-    if size <= config.greatest_extent * radius:
+    if size <= GREATEST_EXTENT * radius:
         return points.mean(0)[None]
     count = int(np.ceil(size / radius))
     seeds = points[rng.integers(0, len(points), count)]

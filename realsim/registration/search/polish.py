@@ -7,7 +7,7 @@ axis without its points noticing.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,11 +17,13 @@ from realsim.geometry.distance_field import sample
 from realsim.geometry.point_loops import move_back
 from realsim.registration.evidence import Cloud
 from realsim.registration.search.candidates import (
+    FINE,
+    FINE_POINTS,
     Candidate,
-    CandidateConfig,
     Sought,
     candidate,
     nearby,
+    quick_fit,
 )
 from realsim.registration.search.sameness import distinct
 from realsim.registration.search.scoring import (
@@ -95,10 +97,7 @@ def _claim(
 
 
 def polish_poses(
-    canvas: Canvas,
-    cloud: Cloud,
-    placed: Sequence[tuple[Sought, Candidate]],
-    refine: CandidateConfig,
+    canvas: Canvas, cloud: Cloud, placed: Sequence[tuple[Sought, Candidate]]
 ) -> list[Candidate]:
     """Return the placed objects fitted to their own points.
 
@@ -106,7 +105,6 @@ def polish_poses(
         canvas: where poses are rendered.
         cloud: fine points above the table.
         placed: models and poses.
-        refine: stages and constants of the fit.
     """
     now = [c for _, c in placed]
     soughts = [s for s, _ in placed]
@@ -116,12 +114,9 @@ def polish_poses(
             own = np.flatnonzero(owner == n)
             if len(own) < LEAST_POINTS:
                 continue
-            if len(own) > refine.fine_points:
-                own = own[np.linspace(0, len(own) - 1, refine.fine_points).astype(np.int64)]
-            mine = Cloud(
-                points=cloud.points[own], towards=cloud.towards[own], sigmas=cloud.sigmas[own]
-            )
-            T = refine.fit(sought, mine, now[n].T_world_obj, refine.fine)
+            if len(own) > FINE_POINTS:
+                own = own[np.linspace(0, len(own) - 1, FINE_POINTS).astype(np.int64)]
+            T = quick_fit(sought.body, cloud.select(own), now[n].T_world_obj, FINE)
             new = candidate(sought, canvas, T, now[n].source, True)
             buffer = compose(canvas.table, [c.rendered for k, c in enumerate(now) if k != n])
             before = score(canvas, now[n].rendered, buffer).gain
@@ -130,34 +125,30 @@ def polish_poses(
     return now
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ContrastConfig:
-    """How rivals are compared."""
-
-    lattice: ScoreConfig = field(default_factory=lambda: ScoreConfig(columns=320, frames=16))
-    """Denser than for the search: what differs may be a hole of 12 mm."""
-    first_frames: int = 6
-    """Frames in which all rivals are compared first."""
-    finalists: int = 4
-    """Rivals that are compared in all frames."""
-    points: int = 800
-    """Points that fit a rival."""
-    margin_m: float = 0.006
-    """Points within this of a rival are fitted [m]."""
-    stages: tuple[Stage, ...] = (
-        Stage(kernel=8.0, cap_m=0.005, steps=6, gated=True),
-        Stage(kernel=4.0, cap_m=0.003, steps=6, gated=True),
-    )
-    """Stages of that fit: the pose is right but for the near-symmetry."""
-    same_m: float = 0.003
-    """Poses nearer than this, modulo symmetry, are no rivals [m]."""
-    same_share: float = 0.04
-    """The same as a share of the object's size: fits of one and the same pose that
-    ended a little apart make a right pose look undecided."""
-    differ_m: float = 0.0005
-    """Rendered depths that differ by more than this belong to differing pixels [m]."""
-    offset: float = 20.0
-    """Pixels added to those that differ."""
+LATTICE = ScoreConfig(columns=320, frames=16)
+"""Denser than for the search: what differs may be a hole of 12 mm."""
+FIRST_FRAMES = 6
+"""Frames in which all rivals are compared first."""
+FINALISTS = 4
+"""Rivals that are compared in all frames."""
+POINTS = 800
+"""Points that fit a rival."""
+MARGIN_M = 0.006
+"""Points within this of a rival are fitted [m]."""
+STAGES = (
+    Stage(kernel=8.0, cap_m=0.005, steps=6, gated=True),
+    Stage(kernel=4.0, cap_m=0.003, steps=6, gated=True),
+)
+"""Stages of that fit: the pose is right but for the near-symmetry."""
+SAME_M = 0.003
+"""Poses nearer than this, modulo symmetry, are no rivals [m]."""
+SAME_SHARE = 0.04
+"""The same as a share of the object's size: fits of one and the same pose that
+ended a little apart make a right pose look undecided."""
+DIFFER_M = 0.0005
+"""Rendered depths that differ by more than this belong to differing pixels [m]."""
+OFFSET = 20.0
+"""Pixels added to those that differ."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -175,12 +166,7 @@ class Decision:
 
 
 def decide_rivals(
-    sought: Sought,
-    T_world_obj: Array,
-    others: Array32,
-    evidence: tuple[Canvas, Cloud, Array],
-    config: ContrastConfig,
-    refine: CandidateConfig,
+    sought: Sought, T_world_obj: Array, others: Array32, evidence: tuple[Canvas, Cloud, Array]
 ) -> Decision:
     """Return the best of a pose and its near-symmetric rivals.
 
@@ -190,26 +176,24 @@ def decide_rivals(
         others: buffer of the canvas with all other objects in place.
         evidence: canvas, measured points (of the object and around it), and the
             near-symmetries (N, 4, 4).
-        config: settings.
-        refine: constants of the fit.
     """
     canvas, cloud, near = evidence
-    Ts = [T_world_obj, *_rivals(sought, T_world_obj, cloud, near, config, refine)]
-    apart = max(config.same_m, config.same_share * 2.0 * sought.body.radius_m)
+    Ts = [T_world_obj, *_rivals(sought, T_world_obj, cloud, near)]
+    apart = max(SAME_M, SAME_SHARE * 2.0 * sought.body.radius_m)
     Ts = [Ts[n] for n in distinct(sought.sameness, Ts, apart)]
     if len(Ts) == 1:
         return Decision(T_world_obj=T_world_obj, contrast=None, T_rival=None, changed=False)
-    few = first_frames(canvas, config.first_frames)
+    few = first_frames(canvas, FIRST_FRAMES)
     gains = [_gain(few, render(few, sought.body, T), others[: len(few.table)]) for T in Ts]
     best = [n for n in np.argsort([-g for g in gains], kind="stable") if n != 0]
-    finalists = [Ts[n] for n in (0, *best[: config.finalists])]
+    finalists = [Ts[n] for n in (0, *best[:FINALISTS])]
     renders = [render(canvas, sought.body, T) for T in finalists]
     final = np.array([_gain(canvas, r, others) for r in renders])
     winner = int(np.argmax(final))
     contrasts = [
         np.inf if n == winner
         else (final[winner] - final[n])
-        / (_differing(canvas, (renders[winner], renders[n]), others, config) + config.offset)
+        / (_differing(canvas, (renders[winner], renders[n]), others) + OFFSET)
         for n in range(len(finalists))
     ]  # fmt: skip
     rival = int(np.argmin(contrasts))
@@ -221,19 +205,12 @@ def decide_rivals(
     )
 
 
-def _rivals(
-    sought: Sought,
-    T: Array,
-    cloud: Cloud,
-    near: Array,
-    config: ContrastConfig,
-    refine: CandidateConfig,
-) -> list[Array]:
+def _rivals(sought: Sought, T: Array, cloud: Cloud, near: Array) -> list[Array]:
     """Return the near-symmetric poses (4, 4), each fitted to the points."""
     rivals: list[Array] = []
     for start in T @ near:
-        points = nearby(cloud, sought, start, config.margin_m, config.points)
-        rivals.append(refine.fit(sought, points, start, config.stages))
+        points = nearby(cloud, sought, start, MARGIN_M, POINTS)
+        rivals.append(quick_fit(sought.body, points, start, STAGES))
     return rivals
 
 
@@ -245,11 +222,9 @@ def _gain(canvas: Canvas, rendered: Render, others: Array32) -> float:
     return float(np.sum(likelihoods(canvas, alone, cells) - likelihoods(canvas, others, cells)))
 
 
-def _differing(
-    canvas: Canvas, pair: Sequence[Render], others: Array32, config: ContrastConfig
-) -> int:
+def _differing(canvas: Canvas, pair: Sequence[Render], others: Array32) -> int:
     """Return in how many compared cells two poses look different."""
     a, b = (compose(others, [r]) for r in pair)
     cells = np.union1d(pair[0].cells, pair[1].cells)
     cells = cells[canvas.measured[cells] > 0]
-    return int(np.count_nonzero(np.abs(a[cells] - b[cells]) > config.differ_m))
+    return int(np.count_nonzero(np.abs(a[cells] - b[cells]) > DIFFER_M))

@@ -9,7 +9,7 @@ it. The buffer holds the table and the other objects, so occlusion is accounted 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from realsim.geometry.camera import project, ray_table
 from realsim.geometry.mesh import box_corners
 from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.body import Body
-from realsim.registration.compare import CompareConfig
+from realsim.registration.compare import FRONT_PENALTY, TAU_BIAS_PER_M, TAU_M, TAU_SIGMAS
 from realsim.registration.evidence import DepthFrame, DepthNoise
 from realsim.registration.table_planes import table_depth
 from realsim.registration.views import SampleConfig, sample_view
@@ -46,8 +46,6 @@ class ScoreConfig:
     """Span of depth around a pixel beyond which it is not compared [m]: flying pixels."""
     edge_slope: float = 8.0
     """Plus so many pixel pitches: what a surface seen at 75 degrees spans."""
-    compare: CompareConfig = field(default_factory=CompareConfig)
-    """When rendered and measured depth agree."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -134,9 +132,8 @@ def make_canvas(
         # The height falls from the camera's to 0 along the ray, in proportion to depth.
         height[n] = np.where(table[n] < FAR, camera * (1.0 - measured[n] / table[n]), 0.0)
     z = measured.ravel().astype(np.float64)
-    c = config.compare
-    tau = c.tau_m + c.tau_sigmas * noise.sigma(z) + c.tau_bias_per_m * np.square(z)
-    floor = np.where(height.ravel() > 0, -c.front_penalty, -1.0)
+    tau = TAU_M + TAU_SIGMAS * noise.sigma(z) + TAU_BIAS_PER_M * np.square(z)
+    floor = np.where(height.ravel() > 0, -FRONT_PENALTY, -1.0)
     of_table = np.maximum(1.0 - 2.0 * np.square(height.ravel() / tau), floor)
     return Canvas(
         intrinsics=intrinsics,
@@ -147,7 +144,7 @@ def make_canvas(
         tau=tau.astype(np.float32),
         table=table.ravel(),
         table_likelihood=np.where(table.ravel() < FAR, of_table, 0.0).astype(np.float32),
-        front_penalty=c.front_penalty,
+        front_penalty=FRONT_PENALTY,
     )
 
 

@@ -1,7 +1,7 @@
 """The state of a search: the poses found so far, and which wanted object may have which."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from realsim.arrays import Array, Array32
 from realsim.geometry import se3
 from realsim.registration.search import peel
 from realsim.registration.search.bench import Bench, fitted_candidates, resting_starts
-from realsim.registration.search.candidates import Candidate, Fused, Sought, inside_share
+from realsim.registration.search.candidates import SAME_M, Candidate, Fused, Sought, inside_share
 from realsim.registration.search.polish import owners
 from realsim.registration.search.records import Region, Wanted
 from realsim.registration.search.scoring import compose
@@ -93,7 +93,7 @@ class Search:
             known = self._known.setdefault(c.obj_id, [])
             Ts = np.array([self.pool[n].T_world_obj for n in known]).reshape(-1, 4, 4)
             apart = same.distances(c.T_world_obj, Ts)
-            if known and apart.min() < 0.5 * self.bench.config.refine.same_m:
+            if known and apart.min() < 0.5 * SAME_M:
                 at = known[int(np.argmin(apart))]
                 if c.alone.gain > self.pool[at].alone.gain:
                     self.pool[at] = c
@@ -121,10 +121,9 @@ class Search:
 
 def seek_unsure(search: Search, selection: Selection) -> Selection:
     """Return the choice after what is unsure was sought again where the sure ones are not."""
-    config = search.bench.config.peel
     rng = np.random.default_rng(search.bench.config.seed)
-    for round_ in range(1 + config.rounds):
-        unsure = [n for n, s in enumerate(selection.scores) if not peel.is_sure(s, config)]
+    for round_ in range(1 + peel.ROUNDS):
+        unsure = [n for n, s in enumerate(selection.scores) if not peel.is_sure(s)]
         if (search.wanted is not None and not unsure) or not _sought(
             search, selection, unsure, None if round_ == 0 else rng
         ):
@@ -151,19 +150,20 @@ def _sought(
         unsure: the places of those that are sought.
         rng: of the turns at clusters; None = at rest on the table.
     """
-    bench, config = search.bench, search.bench.config.peel
+    bench = search.bench
     T_table_world = se3.invert(bench.plane.T_world_table)
     sure = _placed(search, selection, unsure)
-    known = peel.explained_points(bench.fused.coarse, sure, config)
+    known = peel.explained_points(bench.fused.coarse, sure)
     rest = bench.fused.coarse.select(~known)
-    groups = peel.clusters(rest.points, T_table_world, config)
+    groups = peel.clusters(rest.points, T_table_world)
     if not groups:
         return False
-    fine = peel.explained_points(bench.fused.fine, sure, config)
+    fine = peel.explained_points(bench.fused.fine, sure)
     left = Fused(coarse=rest, fine=bench.fused.fine.select(~fine))
     buffer = compose(bench.canvas.table, [c.rendered for _, c in sure])
     taken = peel.taken_cells(bench.grid, T_table_world, bench.fused.coarse, known)
     bench.watch.lap("peel")
+    most = min(peel.MOST_STARTS, max(1, peel.MOST_STARTS_TOGETHER // len(bench.sought)))
     sought = search.groups(unsure)
     for n, (obj_id, region, places) in enumerate(sought):
         search.say(f"searching what is left for model {n + 1} of {len(sought)}", obj_id)
@@ -175,8 +175,8 @@ def _sought(
                 groups,
                 bench.plane.T_world_table[:3, 2],
                 rng,
-                config,
-                len(bench.sought),
+                peel.ROTATIONS,
+                most,
             )
         )
         search.add(fitted_candidates(bench, obj_id, starts, region, (left, buffer)), places)
@@ -194,13 +194,13 @@ def _placed(
 
 def _suspects(search: Search, selection: Selection) -> list[int]:
     """Return the places of the objects about which much is left over."""
-    bench, config = search.bench, search.bench.config.peel
+    bench = search.bench
     at = [n for n, c in enumerate(selection.chosen) if c is not None]
     placed = _placed(search, selection)
     cloud = bench.fused.coarse
-    rest = cloud.points[~peel.explained_points(cloud, placed, config)]
-    left = peel.clusters(rest, se3.invert(bench.plane.T_world_table), config)
-    found = [at[n] for n in peel.suspects(cloud, left, placed, config)]
+    rest = cloud.points[~peel.explained_points(cloud, placed)]
+    left = peel.clusters(rest, se3.invert(bench.plane.T_world_table))
+    found = [at[n] for n in peel.suspects(cloud, left, placed)]
     bench.watch.lap("peel")
     return found
 
@@ -215,7 +215,7 @@ def exchange_places(search: Search, selection: Selection) -> Selection:
     rng = np.random.default_rng(EXCHANGE_SEED)
     pairs = _pairs(search, selection)[:MOST_PAIRS]
     for u, v in pairs:
-        if selection.chosen[v] is None or peel.is_sure(selection.scores[u], _peel(search)):
+        if selection.chosen[v] is None or peel.is_sure(selection.scores[u]):
             continue
         rest = [c for n, c in enumerate(selection.chosen) if c is not None and n not in (u, v)]
         buffer = compose(search.bench.canvas.table, [search.pool[c].rendered for c in rest])
@@ -233,11 +233,6 @@ def exchange_places(search: Search, selection: Selection) -> Selection:
     return selection
 
 
-def _peel(search: Search) -> peel.PeelConfig:
-    """Return when an object is sure."""
-    return search.bench.config.peel
-
-
 def _pairs(search: Search, selection: Selection) -> list[tuple[int, int]]:
     """Return an unsure object and a placed one of similar size, of another model, each.
 
@@ -247,7 +242,7 @@ def _pairs(search: Search, selection: Selection) -> list[tuple[int, int]]:
     bench, wanted = search.bench, search.wanted
     radius = [bench.sought[w.obj_id].body.radius_m for w in wanted]
     agree = [-1.0 if s is None else s.agree for s in selection.scores]
-    least = bench.config.peel.sure_agree
+    least = peel.SURE_AGREE
     found: list[tuple[float, int, int]] = []
     for u in (n for n in range(len(wanted)) if agree[n] < least):
         lost = selection.chosen[u] is None
@@ -275,17 +270,12 @@ def _seek(
     assert search.wanted is not None
     bench, wanted = search.bench, search.wanted
     at = [selection.chosen[n] for n in pair]
-    placed = [
-        (bench.sought[search.pool[c].obj_id], search.pool[c])
-        for n, c in enumerate(selection.chosen) if c is not None and n not in pair
-    ]  # fmt: skip
-    peeling = bench.config.peel
-    left = Fused(
-        coarse=bench.fused.coarse.select(
-            ~peel.explained_points(bench.fused.coarse, placed, peeling)
-        ),
-        fine=bench.fused.fine.select(~peel.explained_points(bench.fused.fine, placed, peeling)),
+    placed = _placed(search, selection, pair)
+    coarse, fine = (
+        cloud.select(~peel.explained_points(cloud, placed))
+        for cloud in (bench.fused.coarse, bench.fused.fine)
     )
+    left = Fused(coarse=coarse, fine=fine)
     for n, there in zip(pair, reversed(at), strict=True):
         if there is None:
             continue
@@ -302,14 +292,15 @@ def _starts(
     other = search.pool[there]
     sought = bench.sought[other.obj_id]
     T = other.T_world_obj
-    own = owners(left.coarse, [sought], [T], bench.config.peel.explained_m) == 0
+    own = owners(left.coarse, [sought], [T], peel.EXPLAINED_M) == 0
     middle = sought.body.center(T)
     beside = Region(center_world=middle, radius_m=EXCHANGE_BESIDE_M)
     starts = [(S, f"exchange, {name}") for S, name in resting_starts(bench, obj_id, beside)]
-    if np.count_nonzero(own) >= bench.config.peel.least_points:
-        turns = replace(bench.config.peel, rotations=EXCHANGE_TURNS, most_starts=EXCHANGE_TURNS)
+    if np.count_nonzero(own) >= peel.LEAST_POINTS:
         up = bench.plane.T_world_table[:3, 2]
         groups = [left.coarse.points[own]]
-        random = peel.residual_starts(bench.sought[obj_id], groups, up, rng, turns)
+        random = peel.residual_starts(
+            bench.sought[obj_id], groups, up, rng, EXCHANGE_TURNS, EXCHANGE_TURNS
+        )
         starts += [(S, name.replace("residual 0", "exchange")) for S, name in random]
     return starts

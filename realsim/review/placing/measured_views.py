@@ -124,7 +124,7 @@ def measured_views(
         tick()
     counts = [len(v.points) for v in views]
     return MeasuredViews(
-        comparer=make_comparer(intrinsics, frames, noise, scene.plane, config.compare),
+        comparer=make_comparer(intrinsics, frames, noise, scene.plane),
         views=tuple(views),
         points=np.concatenate([v.world().astype(np.float32) for v in views]),
         view=np.repeat(np.arange(len(views), dtype=np.int32), counts),

@@ -18,16 +18,22 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.records.depth_bias import DepthBias
+from realsim.registration import verify
 from realsim.registration.blind import keep_start, nearest_to_start, uncertainty
 from realsim.registration.body import Body, make_body
-from realsim.registration.compare import Comparer, spread_frames
+from realsim.registration.compare import FRAMES, Comparer, spread_frames
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import Cloud, average_cloud, without_table
-from realsim.registration.near_start import assign_points, search
+from realsim.registration.near_start import (
+    assign_points,
+    coarse_voxel,
+    drop_height,
+    fine_voxel,
+    search,
+)
 from realsim.registration.refinement.config import CameraPrior, RefineConfig
 from realsim.registration.refinement.refine import refine
-from realsim.registration.solver import FreeSpace, solve_pose
-from realsim.registration.verify import verify_objects
+from realsim.registration.solver import FINE, FreeSpace, solve_pose
 from realsim.review.placing.measured_views import (
     MOST_VIEWS,
     MeasuredViews,
@@ -191,20 +197,19 @@ class _Task:
         bodies = [self.body, *self.close]
         poses = [T_world_obj, *(o.T_start for o in self.close)]
         clouds = [cloud, *(_no_points(cloud) for _ in self.close)]
-        return assign_points(bodies, poses, clouds, self.config.joint)[0]
+        return assign_points(bodies, poses, clouds)[0]
 
     def checks(self, T_world_obj: Array) -> dict[str, float]:
         """Return the registration's checks of the object at a pose, neighbours in place."""
-        config = self.config
-        cloud = average_cloud(self.near, self.body.T_start, config.joint.fine_voxel(self.body))
+        cloud = average_cloud(self.near, self.body.T_start, fine_voxel(self.body))
         own = self.own(cloud, T_world_obj)
-        comparer = self.spread(config.verify.frames)
+        comparer = self.spread(verify.FRAMES)
         bodies = [self.body, *self.hiding]
         poses = [T_world_obj, *(o.T_start for o in self.hiding)]
-        rays = config.verify.rays * _ray_share(comparer, bodies, poses, config.verify.rays)
-        comparer = replace(comparer, config=replace(config.compare, rays=max(1, round(rays))))
+        rays = verify.RAYS * _ray_share(comparer, bodies, poses)
+        comparer = replace(comparer, rays=max(1, round(rays)))
         clouds = [own, *(_no_points(own) for _ in self.hiding)]
-        found = verify_objects(bodies, poses, clouds, comparer, config.verify)[0]
+        found = verify.verify_objects(bodies, poses, clouds, comparer)[0]
         return {name: float(v) for name, v in found.checks.items() if np.isfinite(v)}
 
 
@@ -213,14 +218,12 @@ def _no_points(cloud: Cloud) -> Cloud:
     return cloud.select(np.zeros(len(cloud.points), dtype=bool))
 
 
-def _ray_share(
-    comparer: Comparer, bodies: Sequence[Body], poses: Sequence[Array], rays: int
-) -> float:
+def _ray_share(comparer: Comparer, bodies: Sequence[Body], poses: Sequence[Array]) -> float:
     """Return by how much fewer rays are cast so that the first body gets as many as it should.
 
     All bodies are rendered at the stride of the smallest; a tiny neighbour would make it fine.
     """
-    full = replace(comparer, config=replace(comparer.config, rays=rays))
+    full = replace(comparer, rays=verify.RAYS)
     strides = [full.stride_of(b, T) for b, T in zip(bodies, poses, strict=True)]
     return (min(strides) / strides[0]) ** 2
 
@@ -239,13 +242,13 @@ def _task(
     table_m = config.refine.points.table_margin_m
     index = np.flatnonzero(away2 < (body.radius_m + max(REACH_M, table_m)) ** 2)
     within = index[away2[index] < (body.radius_m + REACH_M) ** 2]
-    near = without_table(views.cloud(within), plane, config.joint.drop_height(body, plane))
+    near = without_table(views.cloud(within), plane, drop_height(body, plane))
     comparer = replace(views.comparer, plane=plane)
     balls = [(o.center(o.T_start), o.radius_m) for o in neighbours]
     ball = (center, body.radius_m)
     apart = [float(np.linalg.norm(c - center)) - r - body.radius_m for c, r in balls]
     close = tuple(o for o, gap in zip(neighbours, apart, strict=True) if gap < REACH_M)
-    chosen = spread_frames(comparer.frames, center, config.verify.frames)
+    chosen = spread_frames(comparer.frames, center, verify.FRAMES)
     eyes = [f.T_world_cam[:3, 3] for f in chosen]
     hiding = tuple(
         o
@@ -272,20 +275,20 @@ def _snapped(task: _Task, tick: Callable[[], None]) -> Snapped:
     """Return the result of all stages."""
     body, config, T_start = task.body, task.config, task.body.T_start
     free = _without_neighbours(task.near, task.close)
-    coarse = average_cloud(free, T_start, config.joint.coarse_voxel(body))
+    coarse = average_cloud(free, T_start, coarse_voxel(body))
     if len(coarse.points) < LEAST_POINTS:
         taken = len(task.near.points) - len(free.points)
         return _nothing(body, task.checks(T_start), len(coarse.points), taken)
-    fine = average_cloud(free, T_start, config.joint.fine_voxel(body))
-    few = task.spread(config.compare.frames)
+    fine = average_cloud(free, T_start, fine_voxel(body))
+    few = task.spread(FRAMES)
     space = _free_space(few) if len(task.views.views) < config.refine_from else None
-    found = search(body, coarse, fine, few, space, (config.search, config.solver))
+    found = search(body, coarse, fine, few, space)
     tick()
     T = _refined(task, found.fit.T_world_obj)
     tick()
     mine = task.own(fine, T)
-    still = solve_pose(body, mine, T, config.solver.fine[-1:], config.solver).at(T)
-    kept = keep_start(body, still, (mine, few, space), config.covariance, config.solver)
+    still = solve_pose(body, mine, T, FINE[-1:]).at(T)
+    kept = keep_start(body, still, (mine, few, space), config.covariance)
     if kept.report.get("start_kept"):
         T = nearest_to_start(T, T_start, body.center_obj, list(kept.axes))
     sure = uncertainty(body, still.at(T), task.views.stride_px, config.covariance)
@@ -293,7 +296,7 @@ def _snapped(task: _Task, tick: Callable[[], None]) -> Snapped:
     stride = few.stride_of(body, T_start)
     before, after = (few.gain(body, pose, stride)[0] for pose in (T_start, T))
     checks = task.checks(T_start), task.checks(T)
-    doubtful = config.verify.agree[0]
+    doubtful = verify.AGREE[0]
     told = _told(body, T, sure.covariance, checks, (before, after), doubtful)
     tick()
     return told

@@ -192,13 +192,13 @@ def _table(
         InputError: they show none.
     """
     from realsim.registration.evidence import DepthFrame, EvidenceConfig, measure_noise
-    from realsim.registration.find_table import TableSearchConfig, find_table
+    from realsim.registration.find_table import find_table
     from realsim.registration.views import SampleConfig, sample_views
 
     frames = [DepthFrame(index=i, depth_m=d, T_world_cam=cameras[i]) for i, d in depths_m.items()]
     noise = measure_noise(frames, EvidenceConfig())
     views = sample_views(intrinsics, frames, noise, SampleConfig(stride=TABLE_STRIDE))
-    found = find_table(views, noise, TableSearchConfig())
+    found = find_table(views, noise)
     if found.plane is None:
         raise InputError(f"no table is seen in the depth of {name}: {found.reason}")
     return found.plane, [
