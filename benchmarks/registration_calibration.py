@@ -40,7 +40,7 @@ from realsim.registration.evidence import (
     measure_noise,
     without_table,
 )
-from realsim.registration.judging.held_out import half_fit, held_out, owned_points
+from realsim.registration.judging.held_out import held_out, owned_points
 from realsim.registration.judging.ownership import make_claims, owners
 from realsim.registration.judging.surface_residuals import (
     error_level_m,
@@ -231,7 +231,7 @@ def judged(r: Round, bodies: list[Body], poses: list[Array]) -> list[dict[str, f
         bodies, poses, r.scene.intrinsics, r.views, r.Ts, r.noise, r.plane
     )
     level = error_level_m(residuals)
-    tested_on = held_out(bodies, owned, len(r.views), half_fit(bodies, poses, owned))
+    tested_on = held_out(bodies, poses, owned, len(r.views))
     return [
         f | residual_checks(s, level) | h.checks()
         for f, s, h in zip(features, residuals, tested_on, strict=True)

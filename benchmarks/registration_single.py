@@ -149,7 +149,7 @@ def jump_of_one(
 
     def told(poses: Sequence[Array]) -> Array:
         kept = [replace(k, fit=k.fit.at(T)) for k, T in zip(few.kept, poses, strict=True)]
-        now = few_around(intake, replace(few, kept=kept), bodies, claimed, photo, config)
+        now = few_around(intake, replace(few, kept=kept), bodies, claimed, photo)
         return np.array([a.probability for a in now])
 
     poses = [k.fit.T_world_obj for k in few.kept]

@@ -120,20 +120,25 @@ def make_comparer(
     )
 
 
-def spread_frames(frames: Sequence[DepthFrame], center: Array, n: int) -> list[DepthFrame]:
-    """Return n frames that look at `center` (3,) from directions far apart.
+def spread(Ts_world_cam: Array, center: Array, count: int) -> list[int]:
+    """Return cameras (F, 4, 4) that look at `center` (3,) from directions far apart.
 
-    The first is the nearest; each next one has the greatest angle to those already taken. Depends
-    on the frames only, not on their order.
+    The first is the nearest, each next one has the greatest angle to those before, so the first
+    few are spread too.
     """
-    if len(frames) <= n:
-        return list(frames)
-    offsets = np.stack([f.T_world_cam[:3, 3] - center for f in frames])
+    offsets = Ts_world_cam[:, :3, 3] - center
     distances = np.linalg.norm(offsets, axis=1)
-    directions = offsets / distances[:, None]
+    directions = offsets / np.maximum(distances, 1e-9)[:, None]
     chosen = [int(np.argmin(distances))]
     nearest = directions @ directions[chosen[0]]
-    while len(chosen) < n:
+    while len(chosen) < min(count, len(offsets)):
+        nearest[chosen] = np.inf
         chosen.append(int(np.argmin(nearest)))
         nearest = np.maximum(nearest, directions @ directions[chosen[-1]])
-    return [frames[i] for i in sorted(chosen)]
+    return chosen
+
+
+def spread_frames(frames: Sequence[DepthFrame], center: Array, n: int) -> list[DepthFrame]:
+    """Return n frames that look at `center` (3,) from directions far apart, in their order."""
+    Ts = np.stack([f.T_world_cam for f in frames])
+    return [frames[i] for i in sorted(spread(Ts, center, n))]

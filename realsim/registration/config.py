@@ -31,20 +31,10 @@ class RegistrationConfig:
     """Cells of a distance field along the object's longest side; 56 doubled the scale error."""
     samples: int = 600
     """Surface samples per object for free space and penetration."""
-    free_space: bool = True
-    """Whether models are kept out of space the cameras looked through (few views)."""
     field_folder: Path | None = None
     """Where what is derived from meshes is kept between runs; None = in memory only."""
     with_single_view: bool = True
     """Whether the single-view baseline is computed as well."""
-    start_radius_m: float = 0.045
-    """How far an object may be from a start pose: 1.5 times what a start may be off by."""
-    start_turn_deg: float = 38.0
-    """How far an object may be turned from a start pose, with the same factor."""
-    regather_m: float = 0.012
-    """If an object moved further than this, its points are collected again around its new pose."""
-    dense_views: int = 48
-    """With more views, every second point is enough: neighbours share their noise."""
     hand_eye_sigma_mm: float | None = None
     """1-sigma of the hand-eye [mm], from its calibration; None = the refinement's own prior."""
     hand_eye_sigma_deg: float | None = None

@@ -67,7 +67,7 @@ GAIN = 1.3
 as they do unmoved."""
 FEW_CONFIDENCE = 3.4
 """Least confidence of the best shift in one or two views, which cannot vote. The values from
-here to `few_resized_gain` were set on five frames of YCB-Video (aligned, shifted, stretched),
+here to `FEW_RESIZED_GAIN` were set on five frames of YCB-Video (aligned, shifted, stretched),
 15 of an F200 and ten resized ones of a UR5e's camera."""
 FEW_STRETCH_CONFIDENCE = 3.9
 """Least confidence of the best stretch: misaligned frames 4.0 to 7.7, an aligned one 3.3."""

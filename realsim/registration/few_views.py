@@ -21,7 +21,6 @@ from realsim.registration.compare import FRAMES, Comparer, make_comparer, spread
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import (
     Cloud,
-    DepthFrame,
     Evidence,
     average_cloud,
     correct_frame,
@@ -35,15 +34,18 @@ from realsim.registration.near_start import (
     coarse_voxel,
     drop_height,
     fine_voxel,
+    free_space_of,
     joint_fit,
     search,
 )
 from realsim.registration.photo import Picture
 from realsim.registration.photo_fit import PhotoFit, photo_fit
+from realsim.registration.refinement.refine import area_at
 from realsim.registration.rivals_around import AROUND_RAYS, OFFSET_NOISES, Around, Images, around
-from realsim.registration.solver import FreeSpace
 from realsim.registration.table_planes import find_support_plane
 
+REGATHER_M = 0.012
+"""If an object moved further than this, its points are collected again around its new pose."""
 ALIKE = 0.9
 """Depth and photograph that agree less on an object are told of."""
 
@@ -62,18 +64,6 @@ class NearTask:
         """Return a comparer on some frames spread around `center`."""
         chosen = [read_frame(f) for f in spread_frames(self.intake.frames, center, FRAMES)]
         return make_comparer(self.intake.intrinsics, chosen, self.evidence.noise, self.plane)
-
-    def free_space(self, frames: Sequence[DepthFrame]) -> FreeSpace | None:
-        """Return the images that models may not stand in front of."""
-        if not self.config.free_space:
-            return None
-        i, noise = self.intake.intrinsics, self.evidence.noise
-        return FreeSpace(
-            depths=np.stack([f.depth_m for f in frames]).astype(np.float32),
-            Ts_cam_world=np.stack([se3.invert(f.T_world_cam) for f in frames]),
-            camera=np.concatenate([[i.fx, i.fy, i.cx, i.cy], i.distortion]),
-            noise=(noise.per_m, noise.floor_m),
-        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -206,7 +196,6 @@ def few_around(
     bodies: Sequence[Body],
     claimed: Sequence[Array | None],
     photo: PhotoFit | None,
-    config: RegistrationConfig,
 ) -> list[Around]:
     """Return what the images say of every pose and those around it, all others where they are.
 
@@ -216,7 +205,6 @@ def few_around(
         bodies: the objects.
         claimed: (4, 4) starts that somebody claimed; None = a search found them.
         photo: what the photograph says; None = there is none.
-        config: settings.
     """
     taken = photo if photo is not None and photo.taken else None
     comparer = make_comparer(
@@ -226,7 +214,7 @@ def few_around(
     )  # fmt: skip
     offset = OFFSET_NOISES * intake.noise.per_m
     images = Images(
-        comparer=comparer, area_px=config.refine.noise.area_at(intake.intrinsics.width),
+        comparer=comparer, area_px=area_at(intake.intrinsics.width),
         offset_per_m=offset if taken is None else taken.offset_sigma_per_m,
     )  # fmt: skip
     edges = [None] * len(bodies) if taken is None else taken.edges
@@ -248,7 +236,7 @@ def _search_one(work: NearTask, body: Body, near: Cloud, tick: Callable[[], None
     """Return the best hypothesis of one object, its neighbours not yet considered."""
     center = body.center(body.T_start)
     comparer = work.comparer(center)
-    free_space = work.free_space(comparer.frames)
+    free_space = free_space_of(comparer)
     above = without_table(near, work.plane, drop_height(body, work.plane))
     coarse = average_cloud(above, body.T_start, coarse_voxel(body))
     fine = average_cloud(above, body.T_start, fine_voxel(body))
@@ -271,7 +259,7 @@ def _joint(
         for b, T in zip(bodies, poses, strict=True)
     ]
     near = work.evidence.near
-    if max(moved) > config.regather_m:
+    if max(moved) > REGATHER_M:
         there = [moved_body(b, T) for b, T in zip(bodies, poses, strict=True)]
         near = gather(work.intake.intrinsics, work.intake.frames, there, config.evidence).near
     clouds = [
@@ -283,7 +271,7 @@ def _joint(
         for body, cloud in zip(bodies, near, strict=True)
     ]
     comparers = [work.comparer(b.center(T)) for b, T in zip(bodies, poses, strict=True)]
-    spaces = [work.free_space(c.frames) for c in comparers]
+    spaces = [free_space_of(c) for c in comparers]
     fits, own, history = joint_fit(bodies, poses, clouds, (comparers, spaces))
     kept = [
         keep_start(body, fit, data, config.covariance)

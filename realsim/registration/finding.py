@@ -16,11 +16,13 @@ from realsim.records import ObjectModel, ObjectPose, names_of
 from realsim.registration.body import Body, make_body, moved_body
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.few_views import begin, search_near
+from realsim.registration.hint_regions import RoughPose, region_about
 from realsim.registration.intake import Intake
 from realsim.registration.judging.scene_checks import SceneFinding, with_swaps
 from realsim.registration.judging.unit_checks import unit_errors
 from realsim.registration.many_views import ManyViews
 from realsim.registration.odometry.cross_check import KinematicsCheck
+from realsim.registration.refinement.refine import area_at
 from realsim.registration.reports import search_report
 from realsim.registration.search.find import find_objects
 from realsim.registration.search.flat_search import (
@@ -32,7 +34,7 @@ from realsim.registration.search.flat_search import (
     seek_flat,
     table_map,
 )
-from realsim.registration.search.records import NotPlaced, Placed, Region, SearchResult, Wanted
+from realsim.registration.search.records import NotPlaced, Placed, SearchResult, Wanted
 
 Progress = Callable[[int, int], None]
 NO_INSTANCE = -1
@@ -109,9 +111,7 @@ class FoundObjects:
 
 
 def wanted_objects(
-    models: Mapping[int, ObjectModel],
-    wanted: Sequence[ObjectPose] | Sequence[Wanted] | None,
-    config: RegistrationConfig,
+    models: Mapping[int, ObjectModel], wanted: Sequence[ObjectPose] | Sequence[Wanted] | None
 ) -> list[Wanted] | None:
     """Return what is wanted, each checked against the models.
 
@@ -136,11 +136,7 @@ def wanted_objects(
             )
         if isinstance(w, ObjectPose):
             T = w.T_world_obj
-            region = Region(
-                center_world=se3.transform(T, model.mesh.bounds.mean(0)[None])[0],
-                radius_m=config.start_radius_m, R_world_obj=T[:3, :3],
-                turn_deg=config.start_turn_deg,
-            )  # fmt: skip
+            region = region_about(RoughPose(T_world_obj=T), model)
             w = Wanted(obj_id=w.obj_id, instance=w.instance, region=region, T_start=T)  # noqa: PLW2901
         asked.append(w)
     return asked
@@ -262,7 +258,7 @@ def with_flat(
     middle = plane.T_world_table[:3, 3]
     if placed:
         middle = np.mean([body.center(T) for body, T in placed.values()], axis=0)
-    area_px = task.config.refine.noise.area_at(task.intake.intrinsics.width)
+    area_px = area_at(task.intake.intrinsics.width)
     map_ = table_map(many.hand_views, plane, task.intake.noise, middle, area_px)
     flat = {b.start.instance for b in sought}
     for instance, (body, T) in placed.items():

@@ -108,13 +108,7 @@ def region_of(hint: Hint, model: ObjectModel, scene: HintScene) -> Region | None
     if where is None:
         return None
     if isinstance(where, RoughPose):
-        T = where.T_world_obj
-        return Region(
-            center_world=T[:3, :3] @ model.mesh.bounds.mean(0) + T[:3, 3],
-            radius_m=START_RADIUS_M if where.radius_m is None else where.radius_m,
-            R_world_obj=T[:3, :3].copy(),
-            turn_deg=START_TURN_DEG if where.turn_deg is None else where.turn_deg,
-        )
+        return region_about(where, model)
     name = f"object {hint.obj_id} (instance {hint.instance})"
     if where.view not in scene.frames:
         known = sorted(scene.frames)
@@ -133,6 +127,17 @@ def region_of(hint: Hint, model: ObjectModel, scene: HintScene) -> Region | None
             "and no table was found to guess it from. Give another view, or a rough pose."
         )
     return _from_table(where.view, middle, model, scene, name)
+
+
+def region_about(start: RoughPose, model: ObjectModel) -> Region:
+    """Return where the middle of an object may be whose pose is known roughly."""
+    T = start.T_world_obj
+    return Region(
+        center_world=T[:3, :3] @ model.mesh.bounds.mean(0) + T[:3, 3],
+        radius_m=START_RADIUS_M if start.radius_m is None else start.radius_m,
+        R_world_obj=T[:3, :3].copy(),
+        turn_deg=START_TURN_DEG if start.turn_deg is None else start.turn_deg,
+    )
 
 
 def _pixels(

@@ -42,6 +42,8 @@ SCENE_VOXEL_M = 0.003
 """Its voxels [m]."""
 ABOVE_M = 0.003
 """Lower points are the table's [m]."""
+DENSE_VIEWS = 48
+"""With more views, every second point is enough: neighbours share their noise."""
 FULL_WIDTH = 1280
 """Image width that the strides are for [px]; narrower images are thinned out less."""
 
@@ -77,7 +79,7 @@ class Intake:
 def sampling(intrinsics: CameraIntrinsics, frames: int, config: RegistrationConfig) -> SampleConfig:
     """Return how images of this size and number are thinned out."""
     share = min(1.0, intrinsics.width / FULL_WIDTH)
-    full = config.sample.stride * (2 if frames > config.dense_views else 1)
+    full = config.sample.stride * (2 if frames > DENSE_VIEWS else 1)
     return replace(
         config.sample,
         stride=max(1, round(full * share)),

@@ -14,7 +14,7 @@ from realsim.registration.compare import Comparer
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import Cloud
 from realsim.registration.intake import Intake, scene_cloud
-from realsim.registration.judging.held_out import half_fit, held_out, owned_points
+from realsim.registration.judging.held_out import held_out, owned_points
 from realsim.registration.judging.scene_checks import SceneFinding, scene_findings
 from realsim.registration.judging.surface_residuals import (
     error_level_m,
@@ -24,6 +24,7 @@ from realsim.registration.judging.surface_residuals import (
 )
 from realsim.registration.judging.verdict import REJECT, probability_right, verdict_of
 from realsim.registration.refinement.flat import is_flat
+from realsim.registration.refinement.refine import area_at
 from realsim.registration.rivals_around import Around
 from realsim.registration.search.flat_search import FLAT_HEIGHT_M, cover, explained_at, table_map
 from realsim.registration.table_planes import support_checks
@@ -132,8 +133,7 @@ def _features(
             given.bodies, given.poses, intake.intrinsics, intake.views,
             given.cameras[: len(intake.views)], intake.noise, given.plane,
         )  # fmt: skip
-        fit = half_fit(given.bodies, given.poses, owned)
-        found = held_out(given.bodies, owned, len(intake.views), fit)
+        found = held_out(given.bodies, given.poses, owned, len(intake.views))
         halves = [h.checks() for h in found]
     flat = flat_checks(intake, given, config)
     surfaces = [
@@ -170,7 +170,7 @@ def flat_checks(intake: Intake, given: Poses, config: RegistrationConfig) -> lis
     if not flat:
         return checks
     middle = np.mean([b.center(T) for b, T in both], axis=0)
-    area_px = config.refine.noise.area_at(intake.intrinsics.width)
+    area_px = area_at(intake.intrinsics.width)
     map_ = table_map(intake.views, plane, intake.noise, middle, area_px)
     for k in flat:
         rest = map_

@@ -3,7 +3,7 @@
 In the search, cameras are off by a millimetre, and a pipe whose ends differ by half a millimetre
 stays undecided. Refined, the averaged points lie within a tenth of a millimetre of the surface; so
 the pose and its rival are fitted to the same points, and the squares of their residuals compared
-cell by cell over the surface (a paired t-test over cells of `cell_m`, each an independent piece).
+cell by cell over the surface (a paired t-test over cells of `CELL_M`, each an independent piece).
 
 A box turned by half is the same to depth; its print is not. Where the mesh has colours, the frames
 photographs, and depth hardly decides, the print does.
@@ -59,7 +59,6 @@ LEAST_PRINT = 0.25
 """A print that correlates by less at both poses is not the object's, or not seen."""
 PRINT_LOSS = 0.5
 """A rival that loses more of the rendered gain, not fitted yet, is none to the print."""
-"""How the photograph is read."""
 PRINT_FROM = 4.0 * CONTRAST_DECIDED
 """Depth that decides by more than this contrast is not asked again by the print."""
 
@@ -212,7 +211,7 @@ def print_duel(
 def _print_gap(
     worse: Sequence[tuple[float, Array]], better: Sequence[tuple[float, Array]]
 ) -> float:
-    """Return how clearly one print fits better, block by block; `print_gap` = clearly."""
+    """Return how clearly one print fits better, block by block; `PRINT_GAP` = clearly."""
     gaps = np.concatenate([(w - b).ravel() for (_, w), (_, b) in zip(worse, better, strict=True)])
     gaps = gaps[np.isfinite(gaps)]
     if len(gaps) < LEAST_CELLS:

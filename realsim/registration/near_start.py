@@ -75,6 +75,17 @@ def perturbed_starts(body: Body, up_world: Array | None) -> Array:
     return T @ C @ moves @ se3.invert(C)
 
 
+def free_space_of(comparer: Comparer) -> FreeSpace:
+    """Return the images that models may not stand in front of: few views leave much unseen."""
+    i, noise = comparer.intrinsics, comparer.noise
+    return FreeSpace(
+        depths=np.stack([f.depth_m for f in comparer.frames]).astype(np.float32),
+        Ts_cam_world=np.stack([se3.invert(f.T_world_cam) for f in comparer.frames]),
+        camera=np.concatenate([[i.fx, i.fy, i.cx, i.cy], i.distortion]),
+        noise=(noise.per_m, noise.floor_m),
+    )
+
+
 def search(
     body: Body, coarse: Cloud, fine: Cloud, comparer: Comparer, free_space: FreeSpace | None
 ) -> BestStart:
@@ -145,11 +156,11 @@ TABLE_M = 0.003
 TABLE_SHARE = 0.2
 """At most this share of the object's height is: a flat object keeps its points."""
 COARSE_SHARE = 1 / 25
-"""Coarse voxel as a share of the bounding box's diagonal, within `coarse_m`."""
+"""Coarse voxel as a share of the bounding box's diagonal, within `COARSE_M`."""
 COARSE_M = (0.002, 0.005)
 """Least and greatest coarse voxel."""
 FINE_SHARE = 1 / 60
-"""Fine voxel as a share of the bounding box's diagonal, within `fine_m`."""
+"""Fine voxel as a share of the bounding box's diagonal, within `FINE_M`."""
 FINE_M = (0.001, 0.0025)
 """Least and greatest fine voxel."""
 ASSIGN_M = 0.010

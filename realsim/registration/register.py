@@ -113,7 +113,7 @@ def register_scene(  # noqa: PLR0913 - the inputs, and two ways to follow them
     config = config or RegistrationConfig()
     if config.method not in METHODS:
         raise InputError(f"the method is '{config.method}'; {' or '.join(METHODS)} is accepted.")
-    asked = wanted_objects(models, wanted, config)
+    asked = wanted_objects(models, wanted)
     sought = len(models if asked is None else asked)
     tick = Ticker(progress, len(frames) + 2 * sought + config.refine.rounds + 3, told)
     up = None if gravity_up_world is None else np.asarray(gravity_up_world, dtype=np.float64)
@@ -323,7 +323,7 @@ def _fit_few(task: SceneTask, found: FoundObjects) -> _Fit:
     intake, few, photo = with_photograph(intake, few, claimed, config)
     kept, tried = few.kept, list[Around]()
     if len(intake.frames) < config.refine_from:
-        tried = few_around(intake, few, claimed, found.claimed, photo, config)
+        tried = few_around(intake, few, claimed, found.claimed, photo)
         kept = [replace(k, fit=a.fit) for k, a in zip(kept, tried, strict=True)]
     uncertain = [
         uncertainty(b, k.fit, few.stride, config.covariance)

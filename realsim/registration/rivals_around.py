@@ -305,7 +305,7 @@ def _costs(body: Body, Ts: Array, others: Sequence[tuple[Body, Array]], images: 
 
 
 def _unseen(spread: Array) -> tuple[str, ...]:
-    """Return the directions of a spread (6, 6) that are wider than `least_open`, in words."""
+    """Return the directions of a spread (6, 6) that are wider than `LEAST_OPEN`, in words."""
     values, vectors = np.linalg.eigh(spread)
     return tuple(
         f"{axis_name(vectors[:, i])} by {1e3 * np.sqrt(values[i]):.1f} mm"

@@ -69,7 +69,8 @@ def fit_single_view(body: Body, intrinsics: CameraIntrinsics, frame: DepthFrame)
             f"{body.model.name} and {len(target_points)} measured points near it; "
             "50 of each are needed."
         )
-    target = _point_cloud(o3d, target_points)
+    vectors = o3d.utility.Vector3dVector(np.ascontiguousarray(target_points))
+    target = o3d.geometry.PointCloud(vectors)
     target.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(knn=20))
     target.orient_normals_towards_camera_location(np.zeros(3))
     normals = np.asarray(target.normals)
@@ -133,8 +134,3 @@ def _cropped(
     near = np.linalg.norm(points - body.center(T_cam_obj), axis=1) < body.radius_m + CROP_M
     points = points[near]
     return points[:: max(1, len(points) // TARGET_POINTS)]
-
-
-def _point_cloud(o3d: Any, points: Array) -> Any:
-    """Return an Open3D cloud of the points."""
-    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.ascontiguousarray(points)))

@@ -9,7 +9,6 @@ through) is drawn back along its normal; without it a model may grow out of what
 """
 
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -260,13 +259,18 @@ def solve_pose(
     data = (np.ascontiguousarray(cloud.points), np.ascontiguousarray(cloud.towards), sigmas)
     radius = body.radius_m
     free = np.eye(6) if held is None else np.eye(6) - held @ held.T
-    sums, taken = _Sums(np.zeros((6, 6)), 0.0, 0.0, 0.0, 0), 0
+    upper, weight, square, kernels, used, taken = np.zeros((6, 6)), 0.0, 0.0, 0.0, 0, 0
     history: list[float] = []
     for stage in stages:
         for _ in range(stage.steps):
             taken += 1
-            sums, H, b = _linearised(body, data, T, stage)
-            if sums.used < LEAST_POINTS:
+            H, b = np.zeros((6, 6)), np.zeros(6)
+            rules = (stage.kernel, stage.cap_m, stage.gated)
+            weight, square, kernels, used = accumulate_points(
+                body.field.lattice, T, data, rules, body.center_obj, (H, b)
+            )
+            upper = H.copy()
+            if used < LEAST_POINTS:
                 break
             if free_space is not None:
                 limits = (FREE_SPACE_WEIGHT * typical, FREE_SPACE_TOLERANCE_M)
@@ -278,45 +282,19 @@ def solve_pose(
                     body.center_obj,
                     (H, b),
                 )
-            damping = DAMPING**2 * sums.weight
+            damping = DAMPING**2 * weight
             T, moved = _step(T, (H, b), free, damping, radius, body.center_obj)
             if moved < CONVERGED_M:
                 break
-        rms = np.sqrt(sums.square / sums.weight) if sums.weight > 0 else np.nan
+        rms = np.sqrt(square / weight) if weight > 0 else np.nan
         history.append(float(1e3 * rms))
     return PoseFit(
         T_world_obj=se3.check_rigid(T, "the fitted pose"),
-        information=sums.upper + np.triu(sums.upper, 1).T,
-        weight=sums.weight,
-        variance=sums.square / sums.kernels if sums.kernels > 0 else float("nan"),
-        points=sums.used,
+        information=upper + np.triu(upper, 1).T,
+        weight=weight,
+        variance=square / kernels if kernels > 0 else float("nan"),
+        points=used,
         offered=len(cloud.points),
         steps=taken,
         history_mm=tuple(history),
     )
-
-
-class _Sums(NamedTuple):
-    """What one pass over the points adds up to."""
-
-    upper: Array
-    weight: float
-    square: float
-    kernels: float
-    used: int
-
-
-def _linearised(
-    body: Body, cloud: tuple[Array, Array, Array], T: Array, stage: Stage
-) -> tuple[_Sums, Array, Array]:
-    """Return the sums at pose T, and the upper normal matrix (6, 6) and right side (6,)."""
-    H, b = np.zeros((6, 6)), np.zeros(6)
-    weight, square, kernels, used = accumulate_points(
-        body.field.lattice,
-        T,
-        cloud,
-        (stage.kernel, stage.cap_m, stage.gated),
-        body.center_obj,
-        (H, b),
-    )
-    return _Sums(H.copy(), weight, square, kernels, used), H, b

@@ -25,11 +25,11 @@ RAYS = 4000
 AGREE = (0.90, 0.70)
 """Share of visible pixels whose depth agrees within tau = 3 mm + 1.5 sigma_z; at least."""
 GAIN = (0.50, 0.15)
-"""Mean likelihood (1 .. -1) of visible pixels; at least. Graded where `agree` is not."""
+"""Mean likelihood (1 .. -1) of visible pixels; at least. Graded where `AGREE` is not."""
 COVER = (0.80, 0.50)
-"""Share of visible surface with a measured point within `cover_m` plus 1.5 sigma_z."""
+"""Share of visible surface with a measured point within `COVER_M` plus 1.5 sigma_z."""
 COVER_M = 0.002
-"""See `cover`."""
+"""See `COVER`."""
 VIOLATION = (0.06, 0.25)
 """Share of visible pixels where the camera looked through the model; at most."""
 PLANE_GAP_MM = (4.0, 20.0)

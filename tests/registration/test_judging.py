@@ -11,7 +11,7 @@ from realsim.records import ObjectPose, SupportPlane
 from realsim.registration.body import make_body
 from realsim.registration.compare import make_comparer
 from realsim.registration.evidence import DepthNoise, average_cloud
-from realsim.registration.judging.held_out import box_shift_m, half_fit, held_out, owned_points
+from realsim.registration.judging.held_out import box_shift_m, held_out, owned_points
 from realsim.registration.judging.scene_checks import scene_findings
 from realsim.registration.judging.surface_residuals import (
     LEVEL_M,
@@ -132,7 +132,7 @@ def halved():
     def judge(poses):
         seen = (scene.intrinsics, views, scene.Ts_world_cam)
         owned = owned_points(bodies, poses, *seen, NOISE, PLANE)
-        return held_out(bodies, owned, len(views), half_fit(bodies, poses, owned))
+        return held_out(bodies, poses, owned, len(views))
 
     return bodies, [p.T_world_obj for p in scene.truth], judge
 

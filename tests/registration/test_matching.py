@@ -21,6 +21,7 @@ from realsim.registration.search.near_symmetry import NearSymmetryConfig, near_s
 from realsim.registration.search.records import Region
 from realsim.registration.search.templates import TemplateConfig, model_templates
 from realsim.registration.views import SampleConfig, sample_views, world_cloud
+from realsim.rendering.rays import PlacedMesh, RayScene
 from table_scenes import named_scene
 
 PLANE = SupportPlane(T_world_table=np.eye(4))
@@ -43,16 +44,19 @@ def measured(seed=3):
 
 def exact_grid(model, T_world_obj, cells=140):
     """The heights of one mesh on an endless table, by ray casting: no noise, nothing missing."""
-    from realsim.rendering.rays import PlacedMesh, RayScene
-
     cell, origin = 0.003, np.full(2, -0.0015 * cells)
     grid = HeightGrid(heights=np.zeros((cells, cells), np.float32), origin=origin, cell_m=cell)
     xy = grid.centers().reshape(-1, 2)
-    scene = RayScene([PlacedMesh(0, model.mesh, T_world_obj)], center=np.zeros(3))
-    down = np.tile(np.float32([0, 0, -1]), (len(xy), 1))
-    t, _ = scene.first_hits(np.c_[xy, np.ones(len(xy))], down)
-    heights = np.where(np.isfinite(t), 1.0 - t, 0.0).reshape(cells, cells).astype(np.float32)
+    z = seen_from_above(model.mesh, T_world_obj, xy)
+    heights = np.where(np.isfinite(z), z, 0.0).reshape(cells, cells).astype(np.float32)
     return HeightGrid(heights=heights, origin=origin, cell_m=cell)
+
+
+def seen_from_above(mesh, T_world_obj, xy):
+    """The height of a placed mesh at places (N, 2); -inf beside it."""
+    scene = RayScene([PlacedMesh(0, mesh, T_world_obj)], center=np.zeros(3))
+    down = np.tile(np.float32([0, 0, -1]), (len(xy), 1))
+    return 1.0 - scene.first_hits(np.c_[xy, np.ones(len(xy))], down)[0]
 
 
 def error(model, T, truth):
@@ -181,14 +185,9 @@ def test_the_table_is_zero_and_the_block_has_its_height(rng):
 
 def rebuilt(mesh, templates, d):
     """The template's points as the mesh, put down by the same pose, shows them from above."""
-    from realsim.rendering.rays import PlacedMesh, RayScene
-
     T = se3.from_rt(templates.rotations[d], templates.offsets[d])
-    scene = RayScene([PlacedMesh(0, mesh, T)], center=np.zeros(3))
     p = templates.points[d].astype(float)
-    start = np.c_[p[:, :2], np.full(len(p), 1.0)]
-    t, _ = scene.first_hits(start, np.tile(np.float32([0, 0, -1]), (len(p), 1)))
-    return p[:, 2], 1.0 - t
+    return p[:, 2], seen_from_above(mesh, T, p[:, :2])
 
 
 @pytest.mark.parametrize("name", ["mug", "wedge"])

@@ -226,12 +226,8 @@ SEEDS = range(3)
 
 @lru_cache(maxsize=8)
 def refined_scene(seed: int) -> tuple[TableScene, list[Body], Refined]:
-    scene = named_scene(seed, ALL_SEEN)
-    intake = take_in(scene.intrinsics, scene.frames, RegistrationConfig())
-    bodies = [make_body(p, scene.models[p.obj_id], 96, 400) for p in scene.truth]
-    poses = [b.T_start for b in bodies]
-    result = refine(scene.intrinsics, intake.views, bodies, poses, intake.plane, intake.noise)
-    return scene, bodies, result
+    case = case_of(named_scene(seed, ALL_SEEN))
+    return case.scene, case.bodies, case.refined()
 
 
 @lru_cache(maxsize=8)

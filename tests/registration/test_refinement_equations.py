@@ -134,45 +134,37 @@ def numeric(point: OnePoint, unknowns: int, apply: Callable[[Array], State]) -> 
     return out
 
 
-def test_derivatives_of_an_object_are_those_of_the_residual(box: Body):
-    point = some_point(np.random.default_rng(0), box)
+def checked_row(point: OnePoint) -> tuple[Array, Array]:
+    """The derivatives by shared and view's unknowns, which are those of the residual."""
     shared, view = point.row()
-    n = OBJECTS + 6
-    no_view, nothing = np.zeros((1, OF_VIEW)), np.zeros(n)
-    expected = numeric(point, n, lambda x: step_state(point.state, point.bodies, x, no_view))
+    nothing, no_view = np.zeros(len(shared)), np.zeros((1, len(view)))
+    state, bodies = point.state, point.bodies
+    expected = numeric(point, len(shared), lambda x: step_state(state, bodies, x, no_view))
     np.testing.assert_allclose(shared, expected, atol=1e-6)
-    assert np.linalg.norm(expected[OBJECTS:]) > 0.5
-    expected = numeric(
-        point, OF_VIEW, lambda x: step_state(point.state, point.bodies, nothing, x[None])
-    )
+    expected = numeric(point, len(view), lambda x: step_state(state, bodies, nothing, x[None]))
     np.testing.assert_allclose(view, expected, atol=1e-6)
+    return shared, view
+
+
+def test_derivatives_of_an_object_are_those_of_the_residual(box: Body):
+    shared, view = checked_row(some_point(np.random.default_rng(0), box))
+    assert (len(shared), len(view)) == (OBJECTS + 6, OF_VIEW)
+    assert np.linalg.norm(shared[OBJECTS:]) > 0.5
 
 
 def test_a_camera_that_stands_still_has_no_part_in_hand_eye_and_bias(box: Body):
     point = some_point(np.random.default_rng(5), box, bias=(1.003, 0.004))
     still = replace(point.state, views=np.zeros((1, OF_FIXED)), common=np.zeros(1))
-    point = replace(point, state=still)
-    shared, view = point.row()
-    n = OBJECTS + 6
-    no_view, nothing = np.zeros((1, OF_FIXED)), np.zeros(n)
-    expected = numeric(point, n, lambda x: step_state(still, point.bodies, x, no_view))
-    np.testing.assert_allclose(shared, expected, atol=1e-6)
-    assert not np.any(expected[: TABLE.start])
-    assert np.linalg.norm(expected[OBJECTS:]) > 0.5
-    expected = numeric(point, OF_FIXED, lambda x: step_state(still, point.bodies, nothing, x[None]))
-    np.testing.assert_allclose(view, expected, atol=1e-6)
-    assert abs(view[7]) > 0.05
+    shared, view = checked_row(replace(point, state=still))
+    assert not np.any(shared[: TABLE.start])
+    assert np.linalg.norm(shared[OBJECTS:]) > 0.5
+    assert len(view) == OF_FIXED and abs(view[7]) > 0.05
 
 
 def test_derivatives_of_the_table_are_those_of_the_residual():
-    point = some_point(np.random.default_rng(100), None)
-    shared, view = point.row()
-    no_view, nothing = np.zeros((1, OF_VIEW)), np.zeros(OBJECTS)
-    expected = numeric(point, OBJECTS, lambda x: step_state(point.state, [], x, no_view))
-    np.testing.assert_allclose(shared, expected, atol=1e-6)
+    shared, view = checked_row(some_point(np.random.default_rng(100), None))
+    assert (len(shared), len(view)) == (OBJECTS, OF_VIEW)
     assert shared[TABLE][2] == pytest.approx(-1.0)
-    expected = numeric(point, OF_VIEW, lambda x: step_state(point.state, [], nothing, x[None]))
-    np.testing.assert_allclose(view, expected, atol=1e-6)
 
 
 def test_noise_of_a_point_is_not_in_its_derivative(box: Body):

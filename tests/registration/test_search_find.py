@@ -13,7 +13,7 @@ from realsim.geometry.mesh import merged, sample_surface, transformed
 from realsim.geometry.parts import part
 from realsim.records import Mesh, ObjectModel, ObjectPose, SupportPlane
 from realsim.registration.body import make_body
-from realsim.registration.evidence import Cloud, DepthNoise
+from realsim.registration.evidence import Cloud, DepthNoise, join_clouds
 from realsim.registration.find_table import find_table
 from realsim.registration.search.candidates import Candidate, Sought, fuse
 from realsim.registration.search.find import FindConfig, find_objects
@@ -221,19 +221,13 @@ def at(s: Sought, T: np.ndarray) -> tuple[Sought, Candidate]:
     )  # fmt: skip
 
 
-def both(a: Cloud, b: Cloud) -> Cloud:
-    parts = [
-        np.concatenate([getattr(c, k) for c in (a, b)]) for k in ("points", "towards", "sigmas")
-    ]
-    return Cloud(points=parts[0], towards=parts[1], sigmas=parts[2])
-
-
 def test_an_object_in_the_wrong_turn_is_suspect_and_its_neighbour_is_not():
     rng = np.random.default_rng(0)
     shaft, mug = sought("stepped_shaft"), sought("mug")
     T_shaft = se3.from_rt(se3.exp_so3([np.pi / 2, 0, 0]), [0.0, 0.0, 0.1])
     T_mug = se3.from_translation([0.25, 0.0, 0.05])
-    cloud = both(surface("stepped_shaft", T_shaft, 900, rng), surface("mug", T_mug, 900, rng))
+    parts = (("stepped_shaft", T_shaft), ("mug", T_mug))
+    cloud = join_clouds([surface(name, T, 900, rng) for name, T in parts])
     center = shaft.body.center(T_shaft)
     R = se3.exp_so3([0, 0, np.pi / 2])
     wrong = se3.from_rt(R, center - R @ center) @ T_shaft

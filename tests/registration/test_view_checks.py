@@ -169,15 +169,6 @@ def test_senseless_calls_are_errors():
 
 # --- The table is found without any object's pose, and moves with the world.
 
-TABLE_NOISE = DepthNoise(per_m=0.008, floor_m=2e-4)
-
-
-def table_views(seed: int, views: int = 12) -> tuple[ViewPoints, ...]:
-    scene = small_scene(seed, views=views)
-    return sample_views(
-        scene.intrinsics, scene.frames, TABLE_NOISE, SampleConfig(stride=2, edge_reach_px=1)
-    )
-
 
 def moved(views, T):
     return [replace(v, T_world_cam=T @ v.T_world_cam) for v in views]
@@ -200,7 +191,7 @@ def view_of_points(index: int, eye, points_world) -> ViewPoints:
 
 
 def test_the_true_table_is_found():
-    found = find_table(table_views(1), TABLE_NOISE)
+    found = find_table(views_of(1), NOISE)
     assert found.plane is not None and found.reason == ""
     T = found.plane.T_world_table
     # The hand-eye is off by 0.5 mm and 0.1 deg, the arm by a little more.
@@ -208,16 +199,16 @@ def test_the_true_table_is_found():
     assert np.degrees(np.arccos(T[2, 2])) < 0.3
     # x along world x; the origin under what the cameras look at.
     assert T[0, 0] > 0.999 and np.linalg.norm(T[:2, 3]) < 0.03
-    assert found.seen_by == tuple(range(12))
+    assert found.seen_by == tuple(range(VIEWS))
     assert max(v.tilt_deg for v in found.views) < 1.0
     assert max(abs(v.height_m) for v in found.views) < 0.003
 
 
 def test_the_table_moves_with_the_world():
-    views = table_views(1)
+    views = views_of(1)
     rng = np.random.default_rng(3)
     T = se3.from_rt(se3.exp_so3([0.3, -0.4, 1.1]), rng.normal(size=3))
-    a, b = (find_table(v, TABLE_NOISE).plane for v in (views, moved(views, T)))
+    a, b = (find_table(v, NOISE).plane for v in (views, moved(views, T)))
     assert a is not None and b is not None
     normal = T[:3, :3] @ a.T_world_table[:3, 2]
     assert np.degrees(np.arccos(np.clip(normal @ b.T_world_table[:3, 2], -1, 1))) < 0.05
@@ -235,7 +226,7 @@ def test_the_lid_of_a_large_box_is_not_the_table():
         view_of_points(k, (0.3 * np.cos(a), 0.3 * np.sin(a), 0.6), points)
         for k, a in enumerate(np.arange(6.0))
     ]
-    plane = find_table(views, TABLE_NOISE).plane
+    plane = find_table(views, NOISE).plane
     assert plane is not None and abs(plane.T_world_table[2, 3]) < 0.002
 
 
@@ -245,8 +236,8 @@ def test_gravity_chooses_the_floor_of_a_shelf():
     wall = np.stack([np.full(len(wall), -0.2), wall[:, 0], wall[:, 1] + 0.2], axis=1)
     points = np.concatenate([floor, wall]) + rng.normal(0, 3e-4, (5500, 3))
     views = [view_of_points(k, (0.6, y, 0.25), points) for k, y in enumerate((-0.2, 0, 0.2))]
-    blind = find_table(views, TABLE_NOISE).plane
-    told = find_table(views, TABLE_NOISE, gravity_up_world=[0, 0, 1]).plane
+    blind = find_table(views, NOISE).plane
+    told = find_table(views, NOISE, gravity_up_world=[0, 0, 1]).plane
     assert blind is not None and abs(blind.T_world_table[0, 2]) > 0.99  # the wall is larger
     assert told is not None and told.T_world_table[2, 2] > 0.999
 
@@ -254,10 +245,10 @@ def test_gravity_chooses_the_floor_of_a_shelf():
 def test_reasons_are_given_where_there_is_no_table():
     rng = np.random.default_rng(0)
     cloud = rng.uniform(-0.15, 0.15, (4000, 3))
-    found = find_table([view_of_points(0, (0.0, 0.1, 0.6), cloud)], TABLE_NOISE)
+    found = find_table([view_of_points(0, (0.0, 0.1, 0.6), cloud)], NOISE)
     assert found.plane is None and "largest plane" in found.reason
     empty = replace(
-        table_views(1)[0], points=np.zeros((0, 3), np.float32), pixels=np.zeros((0, 2), np.int32)
+        views_of(1)[0], points=np.zeros((0, 3), np.float32), pixels=np.zeros((0, 2), np.int32)
     )
-    found = find_table([empty], TABLE_NOISE)
+    found = find_table([empty], NOISE)
     assert found.plane is None and "0 trusted points" in found.reason

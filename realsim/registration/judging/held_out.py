@@ -4,7 +4,7 @@ A right pose is the bottom of a basin that any half of the views finds again wit
 pose that is held by a few views, or by points that belong to a neighbour, moves.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,15 +15,11 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import box_corners
 from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.body import Body
-from realsim.registration.evidence import Cloud, DepthNoise
+from realsim.registration.evidence import Cloud, DepthNoise, join_clouds, seen_cloud
 from realsim.registration.judging.ownership import make_claims, owners
 from realsim.registration.judging.surface_residuals import thinning
 from realsim.registration.solver import FINE, solve_pose
 from realsim.registration.views import ViewPoints
-
-HalfFit = Callable[[Int64], Sequence[Array]]
-"""From the numbers (N,) of the views that may be used to the poses (4, 4) of all objects."""
-
 
 REACH_M = 0.012
 """Points further from every surface are not used [m]: a solver step's widest kernel."""
@@ -34,7 +30,7 @@ LEAST_POINTS = 50
 AGREE_M = 0.003
 """A point of an unused view agrees within this of the surface [m]; plus 1.5 sigma_z."""
 AGREE_SIGMAS = 1.5
-"""See `agree_m`."""
+"""See `AGREE_M`."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -94,63 +90,43 @@ def owned_points(
     """Return per object the points nearest to it, thinned out to what two halves need."""
     step = thinning(bodies, poses, (intrinsics, views, Ts_world_cam), 2 * POINTS)
     claims = make_claims(bodies, poses, plane, REACH_M)
-    parts: list[list[tuple[Array, Array, Array, Int64]]] = [[] for _ in bodies]
+    parts: list[list[tuple[Cloud, Int64]]] = [[] for _ in bodies]
     for v, (view, T) in enumerate(zip(views, Ts_world_cam, strict=True)):
         seen = view.points[v % step :: step].astype(np.float64)
         points, sigmas = se3.transform(T, seen), noise.sigma(seen[:, 2])
         owner = owners(claims, points)
         for k, part in enumerate(parts):
             mine = np.flatnonzero(owner == k)
-            towards = T[:3, 3] - points[mine]
-            towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-            part.append((points[mine], towards, sigmas[mine], np.full(len(mine), v)))
+            cloud = seen_cloud(points[mine], T[:3, 3], sigmas[mine])
+            part.append((cloud, np.full(len(mine), v)))
     result: list[OwnedPoints] = []
     for part in parts:
-        points, towards, sigmas, of = (np.concatenate(c) for c in zip(*part, strict=True))
-        every = max(1, len(points) // (2 * POINTS))
-        cloud = Cloud(points=points[::every], towards=towards[::every], sigmas=sigmas[::every])
-        result.append(OwnedPoints(cloud=cloud, views=of[::every]))
+        cloud, of = join_clouds([c for c, _ in part]), np.concatenate([n for _, n in part])
+        every = slice(None, None, max(1, len(of) // (2 * POINTS)))
+        result.append(OwnedPoints(cloud=cloud.select(every), views=of[every]))
     return result
 
 
-def half_fit(
-    bodies: Sequence[Body], poses: Sequence[Array], owned: Sequence[OwnedPoints]
-) -> HalfFit:
-    """Return a fit of every object alone, from its final pose, on the points of some views."""
-
-    def fit(used: Int64) -> Sequence[Array]:
-        found: list[Array] = []
-        for body, T, mine in zip(bodies, poses, owned, strict=True):
-            cloud = mine.cloud.select(np.isin(mine.views, used))
-            if len(cloud.points) < LEAST_POINTS:
-                found.append(np.full((4, 4), np.nan))
-                continue
-            fitted = solve_pose(body, cloud, T, FINE)
-            found.append(fitted.T_world_obj)
-        return found
-
-    return fit
-
-
 def held_out(
-    bodies: Sequence[Body], owned: Sequence[OwnedPoints], views: int, fit: HalfFit
+    bodies: Sequence[Body], poses: Sequence[Array], owned: Sequence[OwnedPoints], views: int
 ) -> list[HeldOut]:
     """Return what each object's two halves say of each other.
 
+    Every object is fitted alone, from its final pose, on its points of the views of one half.
+
     Args:
         bodies: the objects.
+        poses: their final T_world_obj (4, 4).
         owned: their points, as `owned_points` returns them.
         views: how many views there are.
-        fit: from view numbers to the poses of all objects; a pose that is not finite says that it
-            could not be fitted.
 
     Raises:
         InputError: there are not two views.
     """
     first, second = halves(views)
-    a, b = fit(first), fit(second)
     results: list[HeldOut] = []
-    for body, mine, T_a, T_b in zip(bodies, owned, a, b, strict=True):
+    for body, T, mine in zip(bodies, poses, owned, strict=True):
+        T_a, T_b = _fitted(body, T, mine, first), _fitted(body, T, mine, second)
         both = bool(np.all(np.isfinite(T_a)) and np.all(np.isfinite(T_b)))
         results.append(
             HeldOut(
@@ -160,6 +136,14 @@ def held_out(
             )
         )
     return results
+
+
+def _fitted(body: Body, T_world_obj: Array, owned: OwnedPoints, used: Int64) -> Array:
+    """Return the pose (4, 4) that an object's points of some views say; NaN = too few."""
+    cloud = owned.cloud.select(np.isin(owned.views, used))
+    if len(cloud.points) < LEAST_POINTS:
+        return np.full((4, 4), np.nan)
+    return solve_pose(body, cloud, T_world_obj, FINE).T_world_obj
 
 
 def _unused_agree(body: Body, owned: OwnedPoints, tests: Sequence[tuple[Array, Int64]]) -> float:

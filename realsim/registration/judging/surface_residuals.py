@@ -75,7 +75,7 @@ LOOK_COS = 0.35
 THROUGH_M = 0.0035
 """Distance behind a patch from which a measurement has gone through it [m]."""
 THROUGH_SIGMAS = 2.0
-"""Plus so many sigma_z, plus `level_per_m` z^2: a camera at 1 m is 3 mm off."""
+"""Plus so many sigma_z, plus `LEVEL_PER_M` z^2: a camera at 1 m is 3 mm off."""
 THROUGH_LOOKS = 2
 """Fewer looks through do not count where there are more views than two."""
 
@@ -266,7 +266,7 @@ def error_level_m(residuals: Sequence[SurfaceResiduals]) -> float:
     It lies between what depth of that distance must be expected to be off by, L0, and the objects'
     own levels l_i = 1.48 * median |m| of their patches, freed of their standard error:
         w_0 (L0^2 - L^2) / (L0^2 + L^2) + sum_i w_i (l_i^2 - L^2) / (l_i^2 + L^2) = 0,
-    w_i = n_i / (n_i + `level_patches`) with n_i patches. No object pulls by more than 1, so that
+    w_i = n_i / (n_i + `LEVEL_PATCHES`) with n_i patches. No object pulls by more than 1, so that
     one wrong pose does not excuse itself; and no pose, moved a little, makes the level jump, as a
     median of a few objects does.
     """

@@ -228,12 +228,9 @@ def check_kinematics(views: Sequence[ViewPoints], plane: SupportPlane | None) ->
               words=unmatched_words(numbers[k]))
         for k in found.unmatched
     ]  # fmt: skip
-    by_place = dict(zip(use, found.differences, strict=True))
-    unknown = ViewDifference(index=-1, mm=np.nan, deg=np.nan, pairs=0, overlap=0.0)
+    twists = dict(zip(use, found.twists, strict=True))
     return KinematicsCheck(
-        views=tuple(
-            _number(by_place.get(k, unknown), view.index) for k, view in enumerate(views)
-        ),
+        views=tuple(_difference(v.index, twists.get(k, ())) for k, v in enumerate(views)),
         faults=tuple(faults),
         noise_mm=found.noise_mm,
         noise_deg=found.noise_deg,
@@ -254,7 +251,8 @@ class _Found:
     faults: tuple[PoseFault, ...]
     unmatched: tuple[int, ...]
     poseless: tuple[int, ...]
-    differences: tuple[ViewDifference, ...]
+    twists: list[list[tuple[Array, float]]]
+    """Of every view what its pairs say about its pose (6,), and their overlaps."""
     noise_mm: float
     noise_deg: float
     pairs: int
@@ -290,7 +288,7 @@ def _examine(clouds: Sequence[ViewCloud], claimed: Array) -> _Found:
         faults=faults,
         unmatched=tuple(k for k in unmatched if k not in skipped),
         poseless=tuple(poseless),
-        differences=tuple(_difference(k, Ts, mended, trusted) for k in everyone),
+        twists=[_twists(k, Ts, mended, trusted) for k in everyone],
         noise_mm=noise.mm,
         noise_deg=noise.deg,
         pairs=len(edges),
@@ -322,32 +320,31 @@ def _middle(clouds: Sequence[ViewCloud], Ts: Array) -> Array:
     return np.median(centers, axis=0)
 
 
-def _difference(k: int, Ts: Array, mended: Array, edges: Sequence[Edge]) -> ViewDifference:
-    """Return what view k's pairs say about its pose, its neighbours' faults taken out."""
-    twists: list[Array] = []
-    overlaps: list[float] = []
+def _twists(k: int, Ts: Array, mended: Array, edges: Sequence[Edge]) -> list[tuple[Array, float]]:
+    """Return what view k's pairs say about its pose (6,), its neighbours' faults taken out.
+
+    Each with the pair's overlap.
+    """
+    found: list[tuple[Array, float]] = []
     for e in edges:
         if k not in (e.first, e.second):
             continue
         other, Z = (e.first, e.T_first_second) if e.second == k else (
             e.second, se3.invert(e.T_first_second)
         )  # fmt: skip
-        twists.append(se3.log(se3.invert(Ts[k]) @ mended[other] @ Z))
-        overlaps.append(e.overlap)
+        found.append((se3.log(se3.invert(Ts[k]) @ mended[other] @ Z), e.overlap))
+    return found
+
+
+def _difference(index: int, twists: Sequence[tuple[Array, float]]) -> ViewDifference:
+    """Return how far the depth of view number `index` is from its pose, by its pairs."""
     if not twists:
-        return ViewDifference(index=-1, mm=np.nan, deg=np.nan, pairs=0, overlap=0.0)
-    x = np.median(twists, axis=0)
+        return ViewDifference(index=index, mm=np.nan, deg=np.nan, pairs=0, overlap=0.0)
+    x = np.median([twist for twist, _ in twists], axis=0)
     return ViewDifference(
-        index=-1,
+        index=index,
         mm=float(1e3 * np.linalg.norm(x[3:])),
         deg=float(np.degrees(np.linalg.norm(x[:3]))),
         pairs=len(twists),
-        overlap=float(np.median(overlaps)),
+        overlap=float(np.median([overlap for _, overlap in twists])),
     )
-
-
-def _number(difference: ViewDifference, index: int) -> ViewDifference:
-    """Return the difference with the view's number."""
-    from dataclasses import replace
-
-    return replace(difference, index=index)

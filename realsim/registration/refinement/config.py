@@ -29,34 +29,6 @@ class PointConfig:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class NoiseConfig:
-    """How much a point says."""
-
-    area_px: float = 50.0
-    """Pixels of one independent measurement at 1280 columns: 4 pi s^2 of noise correlated over
-    s = 2 px, the D405's matching window."""
-    area_width_px: int = 1280
-    """The image width at which `area_px` holds; it shrinks with the square of the width."""
-
-    def area_at(self, width_px: int) -> float:
-        """Return the pixels that share one window's noise in an image of this width [px^2]."""
-        return self.area_px * (width_px / self.area_width_px) ** 2
-
-    oblique: float = 0.3
-    """Least cosine by which a ray's noise is projected onto the surface's normal."""
-    floor_m: float = 1e-4
-    """Least 1-sigma of a point along the normal [m]: the steps of the depth images."""
-    table_flat_m: float = 2e-4
-    """1-sigma of the table's flatness [m]."""
-    cut_sigmas: float = 4.0
-    """Tukey's cut-off [sigma of noise and misfit]."""
-    widest_m: float = 0.003
-    """First misfit that is tolerated [m]; it shrinks to what the residuals show."""
-    least_misfit_m: float = 1e-4
-    """Least misfit [m]: no mesh is better."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class CameraPrior:
     """What the cameras' errors may be, 1-sigma per axis."""
 
@@ -120,5 +92,4 @@ class RefineConfig:
     unmeasured_offset_per_m: float = 0.0035
     """1-sigma of the inverse depth's offset if no calibration says it [1/m]: 0.04 px of a D405."""
     points: PointConfig = field(default_factory=PointConfig)
-    noise: NoiseConfig = field(default_factory=NoiseConfig)
     prior: CameraPrior = field(default_factory=CameraPrior)

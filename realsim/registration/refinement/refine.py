@@ -31,7 +31,7 @@ from realsim.geometry.seen_surface import seen_distances
 from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.evidence import DepthNoise
-from realsim.registration.refinement.config import NoiseConfig, RefineConfig
+from realsim.registration.refinement.config import RefineConfig
 from realsim.registration.refinement.equations import (
     BLOCK,
     LEAST_ALONG,
@@ -71,6 +71,30 @@ SMOOTH_WHOLE = 0.7
 """Share of the variance of smooth errors that all views have in common: set in the second lab."""
 GROUPS = 8
 """Groups of views that are left out in turn."""
+
+
+AREA_PX = 50.0
+"""Pixels of one independent measurement at 1280 columns: 4 pi s^2 of noise correlated over
+s = 2 px, the D405's matching window."""
+AREA_WIDTH_PX = 1280
+"""The image width at which `AREA_PX` holds; it shrinks with the square of the width."""
+OBLIQUE = 0.3
+"""Least cosine by which a ray's noise is projected onto the surface's normal."""
+FLOOR_M = 1e-4
+"""Least 1-sigma of a point along the normal [m]: the steps of the depth images."""
+TABLE_FLAT_M = 2e-4
+"""1-sigma of the table's flatness [m]."""
+CUT_SIGMAS = 4.0
+"""Tukey's cut-off [sigma of noise and misfit]."""
+WIDEST_M = 0.003
+"""First misfit that is tolerated [m]; it shrinks to what the residuals show."""
+LEAST_MISFIT_M = 1e-4
+"""Least misfit [m]: no mesh is better."""
+
+
+def area_at(width_px: int) -> float:
+    """Return the pixels that share one window's noise in an image of this width [px^2]."""
+    return AREA_PX * (width_px / AREA_WIDTH_PX) ** 2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -146,7 +170,7 @@ def refine(
     task = _Task(
         list(bodies), np.stack([v.T_world_cam for v in views]), tuple(views),
         join_views(views, noise),
-        np.array([config.noise.area_at(v.intrinsics(intrinsics).width) for v in views]),
+        np.array([area_at(v.intrinsics(intrinsics).width) for v in views]),
         np.array([v.fixed is None for v in views]), config,
         [thin_share(b, config.thin_cells) > config.thin_share for b in bodies],
     )  # fmt: skip
@@ -158,7 +182,7 @@ def refine(
         bias=np.array([config.bias.scale, config.bias.offset_per_m]),
         common=None if np.all(task.hand) else task.hand.astype(np.float64),
     )  # fmt: skip
-    misfits = np.full(len(bodies) + 1, config.noise.widest_m)
+    misfits = np.full(len(bodies) + 1, WIDEST_M)
     sigmas = said_sigmas(config)
     history: list[dict[str, float]] = []
     system, blocks, used = None, list[Blocks](), np.zeros(len(bodies) + 1)
@@ -256,7 +280,7 @@ def _linearise(
         up = np.tile(np.array([0.0, 0.0, 1.0]), (len(p), 1))
         (H, b), seen[-1], used[-1] = _block_sums(
             task, ((places, places[:, 2].copy(), up), table, p), (np.zeros(3), eyes), Ms,
-            (float(misfits[-1]), task.config.noise.table_flat_m), False,
+            (float(misfits[-1]), TABLE_FLAT_M), False,
         )  # fmt: skip
         blocks.append(Blocks(H=H, b=b, Ms=Ms, own=TABLE_AT, rows=TABLE_ROWS, common=state.common))
     return blocks, seen, used
@@ -281,9 +305,8 @@ def _add_step(
     Ms = T @ state.cameras(task.claimed)
     p = state.corrected(near.points, near.views)
     M = Ms[near.views]
-    noise = task.config.noise
     crowding = np.maximum(1.0, task.area_px[near.views] / near.area_px)
-    sigmas = np.maximum(task.points.sigma(p[:, 2], near.views), noise.floor_m) * np.sqrt(crowding)
+    sigmas = np.maximum(task.points.sigma(p[:, 2], near.views), FLOOR_M) * np.sqrt(crowding)
     places = np.einsum("nij,nj->ni", M[:, :3, :3], p) + M[:, :3, 3]
     H, b = step_term(task.bodies[k], T @ state.poses[k], places, M[:, :3, 3], sigmas, blur_m)
     at = object_at(k)
@@ -301,7 +324,6 @@ def _block_sums(
 ) -> tuple[tuple[Array, Array], float, int]:
     """Return the views' blocks H, b of one body, its misfit as seen, and how many points it had."""
     (places, distances, normals), mine, p = data
-    noise = task.config.noise
     n = len(Ms)
     H, b = np.zeros((n, BLOCK, BLOCK)), np.zeros((n, BLOCK))
     if few:
@@ -312,28 +334,28 @@ def _block_sums(
     # Weighed by the depth of the surface: by their own, points too near would count for more.
     steep = cosine > LEAST_ALONG
     surface_z = p[:, 2] * (1.0 - np.where(steep, distances / np.where(steep, along, 1.0), 0.0))
-    sigma = task.points.sigma(surface_z, mine.views) * np.clip(cosine, noise.oblique, None)
-    variance = np.square(np.maximum(sigma, noise.floor_m)) + misfit[1] ** 2
+    sigma = task.points.sigma(surface_z, mine.views) * np.clip(cosine, OBLIQUE, None)
+    variance = np.square(np.maximum(sigma, FLOOR_M)) + misfit[1] ** 2
     crowding = np.maximum(1.0, task.area_px[mine.views] / mine.area_px)
     weight = 1.0 / (variance * crowding + misfit[0] ** 2)
-    reach = noise.cut_sigmas**2 * (variance + misfit[0] ** 2)
+    reach = CUT_SIGMAS**2 * (variance + misfit[0] ** 2)
     kernels = np.empty(len(p))
     axes = np.ascontiguousarray(Ms[:, :3, 2])
     add_blocks(
         (places, distances, normals), mine.views, (*frame, axes), (weight, reach), (H, b), kernels
     )
-    seen = _misfit(distances, variance, noise)
-    return (symmetric(H), b), min(seen, noise.widest_m), int(np.count_nonzero(kernels))
+    seen = _misfit(distances, variance)
+    return (symmetric(H), b), min(seen, WIDEST_M), int(np.count_nonzero(kernels))
 
 
-def _misfit(distances: Array, variance: Array, noise: NoiseConfig) -> float:
+def _misfit(distances: Array, variance: Array) -> float:
     """Return by how much residuals are wider than their noise [m], robustly."""
     known = np.isfinite(distances)
     if np.count_nonzero(known) < 2:
-        return noise.widest_m
+        return WIDEST_M
     spread = mad_sigma(distances[known])
     beyond = spread**2 - float(np.median(variance[known]))
-    return max(noise.least_misfit_m, float(np.sqrt(max(beyond, 0.0))))
+    return max(LEAST_MISFIT_M, float(np.sqrt(max(beyond, 0.0))))
 
 
 def _apart(

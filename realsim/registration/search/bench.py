@@ -12,6 +12,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, SupportPlane
 from realsim.registration.body import make_body
+from realsim.registration.compare import spread
 from realsim.registration.evidence import DepthFrame, DepthNoise
 from realsim.registration.find_table import region_of_interest
 from realsim.registration.near_start import perturbed_starts
@@ -101,24 +102,6 @@ class Bench:
             model = self.sought[obj_id].body.model
             self._near[obj_id] = near_symmetries(model, self.config.near, self.field_folder)
         return self._near[obj_id]
-
-
-def spread(Ts_world_cam: Array, center: Array, count: int) -> list[int]:
-    """Return cameras (F, 4, 4) that look at `center` (3,) from directions far apart.
-
-    The first is the nearest, each next one has the greatest angle to those before, so the first
-    few are spread too.
-    """
-    offsets = Ts_world_cam[:, :3, 3] - center
-    distances = np.linalg.norm(offsets, axis=1)
-    directions = offsets / np.maximum(distances, 1e-9)[:, None]
-    chosen = [int(np.argmin(distances))]
-    nearest = directions @ directions[chosen[0]]
-    while len(chosen) < min(count, len(offsets)):
-        nearest[chosen] = np.inf
-        chosen.append(int(np.argmin(nearest)))
-        nearest = np.maximum(nearest, directions @ directions[chosen[-1]])
-    return chosen
 
 
 def make_bench(

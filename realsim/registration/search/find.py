@@ -99,9 +99,7 @@ def find_objects(  # noqa: PLR0913 - the stage's inputs, all of them needed
         "changed_by_contrast": sum(d is not None and d.changed for d in decisions),
     }
     placed, not_placed = _results(search, final, decisions)
-    return SearchResult(
-        plane=plane, placed=placed, not_placed=(*not_placed, *missing), report=report
-    )
+    return SearchResult(placed=placed, not_placed=(*not_placed, *missing), report=report)
 
 
 def _check_wanted(

@@ -50,15 +50,15 @@ STANDING_LOW_M = 0.0015
 """Least of these heights [m]: the noise of a table that many views see."""
 INNER_SHARE = 0.45
 """Positions are skipped where the nearest thing is further off than this share of the
-template's points are: (1 - s) - s < `least_score`."""
+template's points are: (1 - s) - s < `LEAST_SCORE`."""
 OUTSIDE_COST = 0.25
 """Cost, if the measured surface goes on all around the footprint as high as the object's
 edge: then it is a part of something larger."""
 PATIENCE = 4.0
-"""A comparison ends when the sum over its first k points is so much below `least_score` k: on
+"""A comparison ends when the sum over its first k points is so much below `LEAST_SCORE` k: on
 the free table after 4 points. Of places with a mean of 0.5 this loses 1 %."""
 PATIENCE_POINTS = 12.0
-"""It ends, too, when so many more points are not measured than `least_measured` allows."""
+"""It ends, too, when so many more points are not measured than `LEAST_MEASURED` allows."""
 COARSE_SHARE = 0.5
 """Share of the points that the search over all places uses; the refinement uses all."""
 LEAST_MEASURED = 0.15

@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from realsim.arrays import Array
-from realsim.records import SupportPlane
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -85,7 +84,6 @@ class NotPlaced:
 class SearchResult:
     """What a search found."""
 
-    plane: SupportPlane
     placed: tuple[Placed, ...]
     not_placed: tuple[NotPlaced, ...]
     report: dict[str, Any] = field(default_factory=dict[str, Any])

@@ -29,11 +29,12 @@ from realsim.registration.near_start import (
     coarse_voxel,
     drop_height,
     fine_voxel,
+    free_space_of,
     search,
 )
 from realsim.registration.refinement.config import CameraPrior, RefineConfig
 from realsim.registration.refinement.refine import refine
-from realsim.registration.solver import FINE, FreeSpace, solve_pose
+from realsim.registration.solver import FINE, solve_pose
 from realsim.review.placing.measured_views import (
     MOST_VIEWS,
     MeasuredViews,
@@ -281,7 +282,7 @@ def _snapped(task: _Task, tick: Callable[[], None]) -> Snapped:
         return _nothing(body, task.checks(T_start), len(coarse.points), taken)
     fine = average_cloud(free, T_start, fine_voxel(body))
     few = task.spread(FRAMES)
-    space = _free_space(few) if len(task.views.views) < config.refine_from else None
+    space = free_space_of(few) if len(task.views.views) < config.refine_from else None
     found = search(body, coarse, fine, few, space)
     tick()
     T = _refined(task, found.fit.T_world_obj)
@@ -309,17 +310,6 @@ def _without_neighbours(cloud: Cloud, neighbours: Sequence[Body]) -> Cloud:
         d = other.field.distance(cloud.points, se3.invert(other.T_start))
         free &= np.abs(d) > NEIGHBOUR_M
     return cloud.select(free)
-
-
-def _free_space(comparer: Comparer) -> FreeSpace:
-    """Return the images that the model may not stand in front of: few views leave much unseen."""
-    i, noise = comparer.intrinsics, comparer.noise
-    return FreeSpace(
-        depths=np.stack([f.depth_m for f in comparer.frames]).astype(np.float32),
-        Ts_cam_world=np.stack([se3.invert(f.T_world_cam) for f in comparer.frames]),
-        camera=np.concatenate([[i.fx, i.fy, i.cx, i.cy], i.distortion]),
-        noise=(noise.per_m, noise.floor_m),
-    )
 
 
 def _refined(task: _Task, T_found: Array) -> Array:
