@@ -11,12 +11,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import ObjectPose
-from realsim.review.placing.ellipsoid import (
-    ellipsoid_of,
-    middle_of,
-    rotation_sigmas_deg,
-    unit_sphere,
-)
+from realsim.review.placing.ellipsoid import ellipsoid_of, middle_of, pose_sigmas, unit_sphere
 
 MUG = part("mug")
 TUBE = replace(part("tube"), symmetry_axes=(((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)),))
@@ -80,11 +75,11 @@ def test_a_turn_about_the_own_axis_does_not_blur_the_middle_nor_count_as_a_turn(
     sharp, same = (ellipsoid_of(at(np.eye(4), c), model=model) for c in (C, blurred))
     assert sharp is not None and same is not None
     np.testing.assert_allclose(same.radii_m, sharp.radii_m)
-    turn = rotation_sigmas_deg(at(np.eye(4), blurred), model)
+    turn = pose_sigmas(at(np.eye(4), blurred), model)
     assert turn is not None
     np.testing.assert_allclose(turn.sigmas_deg, np.degrees([0.02, 0.01]))
     assert "own axis" in turn.words and "left out" in turn.words
-    plain = rotation_sigmas_deg(at(np.eye(4), blurred), replace(model, symmetry_axes=()))
+    plain = pose_sigmas(at(np.eye(4), blurred), replace(model, symmetry_axes=()))
     assert plain is not None
     np.testing.assert_allclose(plain.sigmas_deg, np.degrees([1.0, 0.02, 0.01]))
 
@@ -92,7 +87,7 @@ def test_a_turn_about_the_own_axis_does_not_blur_the_middle_nor_count_as_a_turn(
 def test_without_a_covariance_there_is_none() -> None:
     placed = at(np.eye(4), None)
     assert ellipsoid_of(placed) is None
-    assert rotation_sigmas_deg(placed, MUG) is None
+    assert pose_sigmas(placed, MUG) is None
     with pytest.raises(InputError, match="positive"):
         ellipsoid_of(at(np.eye(4), covariance(8)), sigmas=0.0)
 

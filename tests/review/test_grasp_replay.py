@@ -12,13 +12,7 @@ from realsim import InputError, Mesh
 from realsim.geometry import se3
 from realsim.records import STAGES
 from realsim.records.trajectories import PHASES
-from realsim.review.replaying.grasp_replay import (
-    GraspMotion,
-    HandApproach,
-    Motions,
-    ReplayPlayer,
-    hand_approach,
-)
+from realsim.review.replaying.grasp_replay import GraspMotion, Motions, ReplayPlayer, hand_approach
 from realsim.review.replaying.grasp_words import (
     LOST,
     NOT_TRIED,
@@ -28,6 +22,7 @@ from realsim.review.replaying.grasp_words import (
     slip_words,
     why_words,
 )
+from realsim.robots.hand import find_hand
 from reviewed_boxes import grasp_set
 from tried_grasps import tried_set
 
@@ -38,7 +33,7 @@ TRIANGLE = Mesh(vertices=np.eye(3), faces=np.array([[0, 1, 2]], dtype=np.int32))
 def approach(seed: int = 0, width_m: float = WIDTH_M) -> GraspMotion:
     rng = np.random.default_rng(seed)
     T_world_obj, T_obj_grasp = se3.random_transform(rng), se3.random_transform(rng)
-    return hand_approach(4, 2, T_world_obj, T_obj_grasp, width_m, HandApproach())
+    return hand_approach(4, 2, T_world_obj, T_obj_grasp, width_m, find_hand())
 
 
 def carried(seconds: float = 0.4, rate_hz: float = 50.0) -> GraspMotion:
@@ -60,14 +55,14 @@ def carried(seconds: float = 0.4, rate_hz: float = 50.0) -> GraspMotion:
 def test_the_approach_ends_in_the_grasp_with_closed_fingers() -> None:
     rng = np.random.default_rng(3)
     T_world_obj, T_obj_grasp = se3.random_transform(rng), se3.random_transform(rng)
-    motion = hand_approach(0, 0, T_world_obj, T_obj_grasp, WIDTH_M, HandApproach())
+    motion = hand_approach(0, 0, T_world_obj, T_obj_grasp, WIDTH_M, find_hand())
     closing = motion.phase == PHASES.index("close")
     np.testing.assert_allclose(
         motion.Ts_world_hand[closing],
         np.tile(T_world_obj @ T_obj_grasp, (closing.sum(), 1, 1)), atol=1e-12,
     )  # fmt: skip
     assert motion.opening_m[-1] == pytest.approx(WIDTH_M, abs=1e-12)
-    assert motion.opening_m[0] == HandApproach().hand.max_opening_m
+    assert motion.opening_m[0] == find_hand().max_opening_m
 
 
 @pytest.mark.parametrize("width_m", [0.0, 0.11])
@@ -80,8 +75,8 @@ def test_time_increases_and_fingers_only_close(width_m: float) -> None:
 def test_the_approach_moves_with_the_world() -> None:
     rng = np.random.default_rng(5)
     T, T_world_obj, T_obj_grasp = (se3.random_transform(rng) for _ in range(3))
-    a = hand_approach(0, 0, T_world_obj, T_obj_grasp, WIDTH_M, HandApproach())
-    b = hand_approach(0, 0, T @ T_world_obj, T_obj_grasp, WIDTH_M, HandApproach())
+    a = hand_approach(0, 0, T_world_obj, T_obj_grasp, WIDTH_M, find_hand())
+    b = hand_approach(0, 0, T @ T_world_obj, T_obj_grasp, WIDTH_M, find_hand())
     np.testing.assert_allclose(b.Ts_world_hand, T @ a.Ts_world_hand, atol=1e-12)
     np.testing.assert_allclose(b.Ts_world_obj, T @ a.Ts_world_obj, atol=1e-12)
     np.testing.assert_array_equal(a.time_s, b.time_s)

@@ -48,8 +48,8 @@ def server() -> Iterator[viser.ViserServer]:
 def nodes(server: viser.ViserServer, shown: SceneContent) -> SceneNodes:
     built = SceneNodes(server.scene, shown, CONFIG)
     built.build()
-    built.refine_cloud(CONFIG.shown_points)
-    assert built.wait_for_cloud(20)
+    built.cloud.refine(CONFIG.shown_points)
+    assert built.cloud.wait(20)
     return built
 
 
@@ -126,7 +126,7 @@ def test_switches_show_one_look_at_a_time_and_colours_follow_the_verdict(
     nodes.show_objects("appearance")
     assert seen(0) == [True, False]
     for switch, name in (
-        (nodes.show_cloud, "/cloud"), (nodes.show_cameras, "/cameras"), (nodes.show_table, "/table")
+        (nodes.cloud.show, "/cloud"), (nodes.show_cameras, "/cameras"), (nodes.show_table, "/table")
     ):  # fmt: skip
         switch(False)
         assert not states(server)[name][-2]
@@ -145,17 +145,17 @@ def test_colours_of_the_cloud_are_set_in_its_order_and_taken_back(
         names = sorted((n for n in handles if n.startswith("/cloud/")), key=lambda n: int(n[7:]))
         return np.concatenate([cast(Any, handles[n]).colors for n in names])
 
-    nodes.set_cloud_colors(colors)
+    nodes.cloud.color(colors)
     n = len(sent())
     np.testing.assert_array_equal(sent(), colors[:n])
-    nodes.refine_cloud()  # pieces that come later are coloured likewise
-    assert nodes.wait_for_cloud(20)
+    nodes.cloud.refine()  # pieces that come later are coloured likewise
+    assert nodes.cloud.wait(20)
     np.testing.assert_array_equal(sent(), colors)
-    nodes.set_cloud_colors(None)
+    nodes.cloud.color(None)
     np.testing.assert_array_equal(sent(), shown.cloud.colors)
     handle: Any = server.scene.get_handle_by_name("/cloud/1")
     assert np.shares_memory(handle.points, shown.cloud.points)  # and is no window's own
-    refused("colours", nodes.set_cloud_colors, colors[:-1])
+    refused("colours", nodes.cloud.color, colors[:-1])
 
 
 def test_grasps_are_one_node_at_their_poses_and_a_click_tells_the_row(
@@ -163,7 +163,7 @@ def test_grasps_are_one_node_at_their_poses_and_a_click_tells_the_row(
 ) -> None:
     clicked: list[tuple[int, int]] = []
     done = threading.Event()
-    nodes.on_grasp(lambda instance, row: (clicked.append((instance, row)), done.set()))
+    nodes.grasps.on_click(lambda instance, row: (clicked.append((instance, row)), done.set()))
     moved = se3.random_transform(np.random.default_rng(2))
     chosen = GraspFilter(stage=4)
     drawn = nodes.draw_grasps(chosen, {3: moved})
@@ -223,19 +223,19 @@ def test_clear_takes_everything_away_and_stops_the_background(
     empty = set(states(server))
     built = SceneNodes(server.scene, shown, CONFIG)
     built.build()
-    built.refine_cloud()
+    built.cloud.refine()
     built.draw_grasps(GraspFilter())
     built.highlight(0)
     built.ellipsoids({0: ellipsoid_of(SCENE.object(0))})
     built.clear()
-    assert built.wait_for_cloud(20)
+    assert built.cloud.wait(20)
     left = {n for n in states(server) if n not in empty}
     assert left <= {"/objects", "/ellipsoids"}  # empty anchors that viser made itself
     built.clear()
     built.build()
     asked: list[bool] = []
-    built.refine_cloud(CONFIG.shown_points, lambda: asked.append("/cloud/1" in states(server)))
-    assert built.wait_for_cloud(20) and "/cloud/1" in states(server)
+    built.cloud.refine(CONFIG.shown_points, lambda: asked.append("/cloud/1" in states(server)))
+    assert built.cloud.wait(20) and "/cloud/1" in states(server)
     assert asked == [False]  # finer points leave only then
 
 
@@ -248,7 +248,7 @@ def test_each_browser_has_its_own_scene_and_the_coarse_cloud_comes_first(
     def build(client: viser.ClientHandle) -> None:
         nodes = SceneNodes(client.scene, shown, CONFIG)
         nodes.build()
-        nodes.refine_cloud()
+        nodes.cloud.refine()
         made.append(nodes)
         ready.release()
 
@@ -256,7 +256,7 @@ def test_each_browser_has_its_own_scene_and_the_coarse_cloud_comes_first(
     first, second = opened(server), opened(server)
     assert ready.acquire(timeout=20) and ready.acquire(timeout=20)
     end = time.monotonic() + 20
-    while time.monotonic() < end and not all(n.wait_for_cloud(0.1) for n in made):
+    while time.monotonic() < end and not all(n.cloud.wait(0.1) for n in made):
         first.receive(0.05), second.receive(0.05)
     for client in (first, second):
         client.until_quiet(0.5)

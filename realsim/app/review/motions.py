@@ -23,7 +23,7 @@ from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet, Mesh, ObjectModel
 from realsim.records.trajectories import PHASES, GraspTrajectories
-from realsim.review.replaying.grasp_replay import GraspMotion, HandApproach, hand_approach
+from realsim.review.replaying.grasp_replay import RATE_HZ, GraspMotion, hand_approach
 from realsim.robots.hand import FRANKA, find_hand
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.reach_config import base_on_table, grasping_arm
@@ -51,7 +51,6 @@ class SessionMotions:
         models: Mapping[int, ObjectModel],
         *,
         cache: Path | None = None,
-        rate_hz: int = 20,
         with_arm: bool = True,
     ) -> None:
         """Look at what is there; nothing is replayed yet.
@@ -60,10 +59,9 @@ class SessionMotions:
             grasps: sets, trajectories and poses (`app.school.files.stored_grasps`).
             models: the objects by id.
             cache: the school's folder of convex parts (grasps/cache); None = they are computed.
-            rate_hz: samples per second.
             with_arm: whether arm and hand are drawn by their meshes (a plain hand otherwise).
         """
-        self._grasps, self._models, self._rate = grasps, models, rate_hz
+        self._grasps, self._models = grasps, models
         self._sets = {s.instance: s for s in grasps.sets}
         self._with_arm = with_arm
         self._lock = threading.RLock()
@@ -73,7 +71,7 @@ class SessionMotions:
         self._no_source = ""
         try:
             self._source = DemonstrationSource(
-                grasps, models, DemonstrationConfig(rate_hz=rate_hz), cameras=(), cache=cache
+                grasps, models, DemonstrationConfig(rate_hz=RATE_HZ), cameras=(), cache=cache
             )
         except InputError as error:
             self._no_source = str(error)
@@ -169,7 +167,7 @@ class SessionMotions:
         assert samples is not None, "the caller has looked"
         times, phases = attempts.time_s[samples], attempts.phase[samples]
         end = _shown_until(s, row, times, phases)
-        t = np.append(np.arange(0.0, end - 1e-6, 1.0 / self._rate), end)
+        t = np.append(np.arange(0.0, end - 1e-6, 1.0 / RATE_HZ), end)
         joints = np.stack([np.interp(t, times, q) for q in attempts.joints_rad[samples].T], axis=1)
         opening = np.interp(t, times, attempts.opening_m[samples])
         at = np.clip(np.searchsorted(times, t + 1e-9, side="right") - 1, 0, len(times) - 1)
@@ -202,7 +200,7 @@ class SessionMotions:
         """Return the hand's approach, with the hand's meshes."""
         made = hand_approach(
             s.instance, row, self._grasps.Ts_world_obj[s.instance], s.Ts_obj_grasp[row],
-            float(s.widths_m[row]), HandApproach(rate_hz=float(self._rate), hand=hand_of_set(s)),
+            float(s.widths_m[row]), hand_of_set(s),
             obj_mesh=self._mesh(s.obj_id), notes=notes,
         )  # fmt: skip
         if not self._with_arm or s.hand[0] != FRANKA:

@@ -43,20 +43,21 @@ class CloudNodes:
             if self._pieces:
                 self._send(0)
 
-    def refine(self, points: int, after: Callable[[], None] = lambda: None) -> None:
+    def refine(self, points: int | None = None, after: Callable[[], None] = lambda: None) -> None:
         """Send pieces in the background until there are about so many points.
 
         Args:
-            points: how many.
+            points: how many; None = all.
             after: returns when the first of them may leave; called in the background.
         """
         with self._lock:
-            self._wanted = max(self._wanted, sum(p.start < points for p in self._pieces))
+            most = len(self._cloud) if points is None else points
+            self._wanted = max(self._wanted, sum(p.start < most for p in self._pieces))
             if self._sender is None and len(self._handles) < self._wanted:
                 self._sender = threading.Thread(target=self._send_rest, args=(after,), daemon=True)
                 self._sender.start()
 
-    def wait(self, timeout_s: float | None) -> bool:
+    def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until all that was asked for is sent; return whether it is."""
         sender = self._sender
         if sender is not None:

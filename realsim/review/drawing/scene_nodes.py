@@ -6,13 +6,13 @@ switched by one message. What is rarely looked at is sent when it is first asked
 """
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Literal, get_args
 
 import numpy as np
 import viser
 
-from realsim.arrays import Array, Array32, UInt8
+from realsim.arrays import Array, Array32
 from realsim.errors import InputError
 from realsim.interop import viser_wxyz_position
 from realsim.records import View
@@ -28,7 +28,6 @@ __all__ = ["GraspFilter", "SceneConfig", "SceneNodes"]
 
 Look = Literal["appearance", "verdict", "faded", "hidden"]
 OnInstance = Callable[[int], None]
-OnGrasp = Callable[[int, int], None]
 FRUSTUM_RGB, DAMAGED_RGB = (70, 96, 140), (190, 190, 190)
 """Colours of a camera, and of one whose images cannot be read."""
 HIGHLIGHT_RGB = (255, 120, 0)
@@ -68,15 +67,16 @@ class SceneNodes:
         self._frustums: dict[int, viser.CameraFrustumHandle] = {}
         self._grid: viser.GridHandle | None = None
         self._box: viser.LineSegmentsHandle | None = None
-        self._cloud = CloudNodes(api, content.cloud, config)
-        self._grasps = GraspNodes(api)
+        self.cloud = CloudNodes(api, content.cloud, config)
+        self.grasps = GraspNodes(api)
+        """The measured points, and the grasps."""
         self._on_object: OnInstance = lambda _: None
         self._on_camera: OnInstance = lambda _: None
         # The pieces of the cloud come from a thread of their own while buttons are pressed.
         self._lock = threading.RLock()
 
     def build(self) -> None:
-        """Send the scene with the coarse cloud; `refine_cloud` sends the rest."""
+        """Send the scene with the coarse cloud; `cloud.refine` sends the rest."""
         with self._lock:
             self._api.set_up_direction(self._content.look.up)
             if self._content.scene.plane is not None:
@@ -84,14 +84,14 @@ class SceneNodes:
                 self._grid = add_table(self._api, T_world_table, self._config)
             for placed in self._content.scene.objects:
                 self._add_object(placed.instance, placed.T_world_obj)
-            self._cloud.build()
+            self.cloud.build()
             self._add_cameras()
 
     def clear(self) -> None:
         """Take everything away, and stop sending."""
-        self._cloud.clear()
+        self.cloud.clear()
         with self._lock:
-            self._grasps.clear()
+            self.grasps.clear()
             for handle in (*self._roots.values(), *self._ellipsoids.values(), self._cameras,
                            self._grid):  # fmt: skip
                 if handle is not None:
@@ -253,36 +253,6 @@ class SceneNodes:
 
     # --- cloud, cameras, table ----------------------------------------------------------------
 
-    def show_cloud(self, visible: bool) -> None:
-        """Show or hide the measured points."""
-        self._cloud.show(visible)
-
-    def refine_cloud(
-        self, points: int | None = None, after: Callable[[], None] = lambda: None
-    ) -> None:
-        """Send finer levels in the background, up to so many points in all; None = all.
-
-        Args:
-            points: how many.
-            after: returns when the first of them may leave; called in the background.
-        """
-        self._cloud.refine(len(self._content.cloud) if points is None else points, after)
-
-    def wait_for_cloud(self, timeout_s: float | None = None) -> bool:
-        """Wait until what was asked for of the cloud is sent; return whether it is."""
-        return self._cloud.wait(timeout_s)
-
-    def set_cloud_colors(self, colors: UInt8 | None) -> None:
-        """Colour the points; None = as photographed.
-
-        Args:
-            colors: (N, 3) of all points of `content.cloud`, in its order.
-
-        Raises:
-            InputError: another number of colours.
-        """
-        self._cloud.color(colors)
-
     def show_cameras(self, visible: bool) -> None:
         """Show or hide the cameras."""
         if self._cameras is not None:
@@ -340,7 +310,7 @@ class SceneNodes:
         poses = {o.instance: o.T_world_obj for o in self._content.scene.objects}
         found = chosen_grasps(self._content.grasp_sets, chosen, self._config.most_grasps)
         with self._lock:
-            return self._grasps.draw(found, poses | dict(Ts_world_obj or {}))
+            return self.grasps.draw(found, poses | dict(Ts_world_obj or {}))
 
     # --- clicks -------------------------------------------------------------------------------
 
@@ -351,15 +321,6 @@ class SceneNodes:
     def on_camera(self, callback: OnInstance) -> None:
         """Call back with the number of the view whose frustum is clicked."""
         self._on_camera = callback
-
-    @property
-    def drawn_grasps(self) -> Sequence[tuple[int, int]]:
-        """Instance and row of every grasp that is drawn."""
-        return self._grasps.drawn
-
-    def on_grasp(self, callback: OnGrasp) -> None:
-        """Call back with instance and row of a grasp that is clicked."""
-        self._grasps.on_click(callback)
 
 
 def light(api: viser.SceneApi, up: Array | tuple[float, float, float]) -> None:

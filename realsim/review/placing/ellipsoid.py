@@ -33,14 +33,16 @@ class Ellipsoid(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class TurnSigmas:
-    """How sure the turn of an object is."""
+class PoseSigmas:
+    """How sure position and turn of an object are."""
 
+    position_m: float
+    """1-sigma of the position along its worst axis [m]."""
     sigmas_deg: tuple[float, ...]
     """1-sigma about the principal axes, the greatest first [deg]; two of a body of revolution, none
     of a ball."""
     words: str
-    """The same for a person, and what was left out."""
+    """The turns for a person, and what was left out."""
 
 
 def ellipsoid_of(
@@ -92,8 +94,8 @@ def middle_of(model: ObjectModel) -> Array:
     return c
 
 
-def rotation_sigmas_deg(placed: ObjectPose, model: ObjectModel) -> TurnSigmas | None:
-    """Return how sure the turn is, turns that look alike left out; None = nothing is known.
+def pose_sigmas(placed: ObjectPose, model: ObjectModel) -> PoseSigmas | None:
+    """Return how sure the pose is, turns that look alike left out; None = nothing is known.
 
     Args:
         placed: the object with its covariance.
@@ -102,9 +104,11 @@ def rotation_sigmas_deg(placed: ObjectPose, model: ObjectModel) -> TurnSigmas | 
     C = placed.covariance
     if C is None or not np.all(np.isfinite(C)):
         return None
+    position_m = float(np.sqrt(max(float(np.linalg.eigvalsh(C[3:, 3:])[-1]), 0.0)))
     axes = _axes(model)
     if len(axes) > 1:
-        return TurnSigmas(sigmas_deg=(), words="a ball: every turn of it looks alike")
+        words = "a ball: every turn of it looks alike"
+        return PoseSigmas(position_m=position_m, sigmas_deg=(), words=words)
     basis = np.eye(3) if not axes else np.linalg.svd(axes[0][0][None])[2][1:]
     values = np.linalg.eigvalsh(basis @ (0.5 * (C + C.T))[:3, :3] @ basis.T)[::-1]
     found = tuple(float(s) for s in np.degrees(np.sqrt(np.maximum(values, 0.0))))
@@ -113,7 +117,7 @@ def rotation_sigmas_deg(placed: ObjectPose, model: ObjectModel) -> TurnSigmas | 
         words = f"{figures} across its own axis; turns about that axis look alike and are left out"
     else:
         words = f"{figures} about its principal axes"
-    return TurnSigmas(sigmas_deg=found, words=words)
+    return PoseSigmas(position_m=position_m, sigmas_deg=found, words=words)
 
 
 def _axes(model: ObjectModel) -> list[tuple[Array, Array]]:

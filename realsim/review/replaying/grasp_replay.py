@@ -118,20 +118,14 @@ class Motions(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class HandApproach:
-    """The motion of a hand without an arm: straight on, then closing."""
-
-    approach_m: float = 0.08
-    """Length of the straight way [m]: the school's own."""
-    speed_m_s: float = 0.10
-    """Speed of the hand [m/s]."""
-    closing_m_s: float = 0.05
-    """Speed of each finger [m/s]: Franka's hand at its usual speed."""
-    hand: Hand = field(default_factory=find_hand)
-    """What closes, from fully open."""
-    rate_hz: float = 20.0
-    """Samples per second: as many as are drawn."""
+APPROACH_M = 0.08
+"""Length of the straight way of a hand without an arm [m]: the school's own."""
+SPEED_M_S = 0.10
+"""Speed of that hand [m/s]."""
+CLOSING_M_S = 0.05
+"""Speed of each finger [m/s]: Franka's hand at its usual speed."""
+RATE_HZ = 20
+"""Frames per second: the school looks as often, and a dozen nodes a frame are 30 kB/s."""
 
 
 def hand_approach(
@@ -140,7 +134,7 @@ def hand_approach(
     T_world_obj: Array,
     T_obj_grasp: Array,
     width_m: float,
-    config: HandApproach,
+    hand: Hand,
     *,
     obj_mesh: Mesh | None = None,
     notes: tuple[str, ...] = (),
@@ -153,23 +147,23 @@ def hand_approach(
         T_world_obj: (4, 4) where the object stands [m].
         T_obj_grasp: (4, 4) the grasp [m].
         width_m: distance of the contacts [m]: the fingers stop there.
-        config: speeds.
+        hand: what closes, from fully open.
         obj_mesh: the object's mesh.
         notes: what is said of the motion.
     """
-    opened = max(config.hand.max_opening_m, width_m)
-    arrive = config.approach_m / config.speed_m_s
-    end = arrive + (opened - width_m) / (2.0 * config.closing_m_s)
+    opened = max(hand.max_opening_m, width_m)
+    arrive = APPROACH_M / SPEED_M_S
+    end = arrive + (opened - width_m) / (2.0 * CLOSING_M_S)
     # Both ends are samples: the grasp itself and the closed hand are shown exactly.
-    grid = np.arange(0.0, end, 1.0 / config.rate_hz)
+    grid = np.arange(0.0, end, 1.0 / RATE_HZ)
     t = np.unique(np.concatenate([grid, [arrive, end]])).astype(np.float64)
     t = t[np.append(np.diff(t) > 1e-6, True)]
-    back = np.maximum(config.approach_m - config.speed_m_s * t, 0.0)
+    back = np.maximum(APPROACH_M - SPEED_M_S * t, 0.0)
     back[t >= arrive - 1e-9] = 0.0
     Ts_grasp_hand = np.tile(np.eye(4), (len(t), 1, 1))
     Ts_grasp_hand[:, 2, 3] = -back
     closing = t >= arrive - 1e-9
-    opening = opened - 2.0 * config.closing_m_s * np.maximum(t - arrive, 0.0)
+    opening = opened - 2.0 * CLOSING_M_S * np.maximum(t - arrive, 0.0)
     return GraspMotion(
         instance=instance,
         row=row,
@@ -179,13 +173,11 @@ def hand_approach(
         phase=np.where(closing, PHASES.index("close"), PHASES.index("approach")),
         Ts_world_obj=np.tile(T_world_obj, (len(t), 1, 1)),
         obj_mesh=obj_mesh,
-        hand=config.hand,
+        hand=hand,
         notes=notes,
     )
 
 
-RATE_HZ = 20.0
-"""Frames per second: the school looks as often, and a dozen nodes a frame are 30 kB/s."""
 SLIDER_HZ = 4.0
 """How often the slider follows [1/s]: it tells where one is, the scene tells the rest."""
 

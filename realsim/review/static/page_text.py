@@ -10,7 +10,7 @@ from realsim.review.content.content import SceneContent
 from realsim.review.content.views import worst_first
 from realsim.review.corrections import DECIDED, corrected_scene, decision_on
 from realsim.review.journal import Entry, ReviewState
-from realsim.review.placing.ellipsoid import rotation_sigmas_deg
+from realsim.review.placing.ellipsoid import pose_sigmas
 from realsim.review.replaying.grasp_words import one_line
 from realsim.review.scene_list import VERDICT_ORDER
 
@@ -77,14 +77,12 @@ def _table(
 
 def sigma_rows(placed: ObjectPose, model: ObjectModel) -> list[tuple[str, str]]:
     """Return how sure position and turn are: words and figures."""
-    turns = rotation_sigmas_deg(placed, model)
-    C = placed.covariance
-    if C is None or turns is None or not np.all(np.isfinite(C)):
+    sure = pose_sigmas(placed, model)
+    if sure is None:
         return [("1 sigma of the pose", NOT_KNOWN)]
-    worst = float(np.sqrt(max(float(np.linalg.eigvalsh(C[3:, 3:])[-1]), 0.0)))
-    rows = [("1 sigma, position", f"{1e3 * worst:.2g} mm")]
-    if turns.sigmas_deg:
-        rows.append(("1 sigma, turn", f"{max(turns.sigmas_deg):.2g} deg"))
+    rows = [("1 sigma, position", f"{1e3 * sure.position_m:.2g} mm")]
+    if sure.sigmas_deg:
+        rows.append(("1 sigma, turn", f"{max(sure.sigmas_deg):.2g} deg"))
     return rows
 
 

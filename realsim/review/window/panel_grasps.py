@@ -149,7 +149,7 @@ class GraspsPanel:
 
     def _stepped(self) -> None:
         """Go to the next drawn grasp, or the one before, round the list."""
-        drawn = self._window.nodes.drawn_grasps
+        drawn = self._window.nodes.grasps.drawn
         if not self._show.value or not drawn:
             raise InputError("no grasps are drawn; tick Show grasps or set other filters.")
         step = 1 if "Next" in self._step.value else -1

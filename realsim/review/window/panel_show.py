@@ -59,7 +59,7 @@ class ShowPanel:
         self._colors.on_update(window.guarded(lambda _: self._color()))
         for control in (self._sure, self._factor):
             control.on_update(window.guarded(lambda _: self._draw_ellipsoids()))
-        every.on_click(window.guarded(lambda _: window.nodes.refine_cloud()))
+        every.on_click(window.guarded(lambda _: window.nodes.cloud.refine()))
 
     def opened(self) -> None:
         """Show another scene as the switches say."""
@@ -90,7 +90,7 @@ class ShowPanel:
             look = "faded"  # points inside a model are the ones that matter
         with self._window.client.atomic():
             nodes.show_objects(look)
-            nodes.show_cloud(self._cloud.value)
+            nodes.cloud.show(self._cloud.value)
             nodes.show_cameras(self._cameras.value)
             nodes.show_table(self._table.value)
 
@@ -121,7 +121,7 @@ class ShowPanel:
                 cells = zip(marks, said.rgb.tolist(), strict=True)
                 self._legend.content = window_text.legend_html(cells, f"mm. {said.words}")
             if self._colored is wanted:
-                window.nodes.set_cloud_colors(colors)
+                window.nodes.cloud.color(colors)
 
         window.attempt(paint)
 

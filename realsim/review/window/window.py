@@ -264,7 +264,7 @@ class Window:
                     nodes.build()
                 nodes.on_object(self._guarded_call(self.select))
                 nodes.on_camera(self._guarded_call(self.views.show_photograph))
-                nodes.on_grasp(self._guarded_call(self.grasps.clicked))
+                nodes.grasps.on_click(self._guarded_call(self.grasps.clicked))
                 self._opened = Opened(session, content, nodes, {})
                 self.selected, self._seen, self._standing = None, None, None
                 for panel in (self.grasps, self.show):
@@ -278,7 +278,7 @@ class Window:
             with self.lock:
                 self.stand.first_look()
             # A browser without a graphics card would draw the fine cloud before it shows anything.
-            nodes.refine_cloud(session.config.shown_points, self.browser.wait)
+            nodes.cloud.refine(session.config.shown_points, self.browser.wait)
             if words := content.remarks if content.views else [window_text.NO_PHOTOGRAPHS]:
                 more = f" {len(words) - 3} more stand in the tab Views." * (len(words) > 3)
                 self.refuse(" ".join(words[:3]) + more)

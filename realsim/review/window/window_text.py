@@ -15,7 +15,7 @@ from realsim.geometry.colors import light_of_bytes, luminance
 from realsim.records import ObjectModel, ObjectPose
 from realsim.rendering.overlay import VERDICT_RGB
 from realsim.review.journal import Entry
-from realsim.review.placing.ellipsoid import rotation_sigmas_deg
+from realsim.review.placing.ellipsoid import pose_sigmas
 from realsim.review.replaying.grasp_words import escaped, one_line
 from realsim.review.scene_list import ObjectRow
 
@@ -127,14 +127,12 @@ def certainty_text(placed: ObjectPose, model: ObjectModel) -> str:
     probability = placed.checks.get("probability")
     if probability is not None and np.isfinite(probability):
         lines.append(f"- right with a probability of {percent(probability)}")
-    turns = rotation_sigmas_deg(placed, model)
-    C = placed.covariance
-    if C is None or turns is None or not np.all(np.isfinite(C)):
+    sure = pose_sigmas(placed, model)
+    if sure is None:
         lines.append("- how sure the pose is, is not known: nothing was computed of it")
         return "\n".join(lines)
-    sigma = float(np.sqrt(max(float(np.linalg.eigvalsh(C[3:, 3:])[-1]), 0.0)))
-    lines.append(f"- 1 sigma of the position: {1e3 * sigma:.2g} mm along its worst axis")
-    lines.append(f"- 1 sigma of the turn: {turns.words}")
+    lines.append(f"- 1 sigma of the position: {1e3 * sure.position_m:.2g} mm along its worst axis")
+    lines.append(f"- 1 sigma of the turn: {sure.words}")
     return "\n".join(lines)
 
 
