@@ -95,8 +95,6 @@ class AlignmentFinding:
     """Where depth lies against colour: right and down, in pixels of the colour image."""
     stretch: tuple[float, float] = (1.0, 1.0)
     """By what depth is to be stretched along x and y to lie on colour."""
-    confidence: float = 0.0
-    """By how many robust standard deviations the best shift stands out."""
     outlines: int = 0
     """How many outline pixels were used."""
     agreeing: int = 0
@@ -226,7 +224,7 @@ def _finding(
     if kind != "aligned" and scores.cube is not None:
         best = _best_stretch(scores, few)
         if best is not None:
-            kind, stretch, moved, confidence, at = "not_aligned", *best
+            kind, stretch, moved, at = "not_aligned", *best
     shift = -moved * scores.px_factor
     agreeing = sum(_agrees(v, at) for v in votes) if votes else 1
     if 2 * agreeing < len(votes):
@@ -234,14 +232,14 @@ def _finding(
     words = _words(kind, shift, stretch, (agreeing, views))
     return AlignmentFinding(
         kind=kind, words=words, shift_px=(float(shift[0]), float(shift[1])),
-        stretch=(float(stretch[0]), float(stretch[1])), confidence=confidence,
+        stretch=(float(stretch[0]), float(stretch[1])),
         outlines=scores.outlines, agreeing=agreeing, views=views, px_factor=scores.px_factor,
         radius_px=scores.radius_px, shift_scores=s, stretch_scores=scores.cube,
     )  # fmt: skip
 
 
-def _best_stretch(scores: _Scores, few: bool) -> tuple[Array, Array, float, tuple[Any, ...]] | None:
-    """Return stretch, shift, confidence and place of the best stretch, if it is believed."""
+def _best_stretch(scores: _Scores, few: bool) -> tuple[Array, Array, tuple[Any, ...]] | None:
+    """Return stretch, shift and place of the best stretch, if it is believed."""
     cube = scores.cube
     assert cube is not None
     at = tuple(int(i) for i in np.unravel_index(int(np.argmax(cube)), cube.shape))
@@ -268,7 +266,7 @@ def _best_stretch(scores: _Scores, few: bool) -> tuple[Array, Array, float, tupl
         and peak > _least_gain(stretch) * float(cube[unit, unit].max())
     ):
         return None
-    return stretch, shift, float(sure), at
+    return stretch, shift, at
 
 
 def _least_gain(stretch: Array) -> float:

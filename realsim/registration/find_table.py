@@ -77,11 +77,6 @@ class TableFound:
     share: float = 0.0
     """Share of the points around the point looked at that lie on the plane."""
 
-    @property
-    def seen_by(self) -> tuple[int, ...]:
-        """The numbers of the views that see the table."""
-        return tuple(v.index for v in self.views if v.own_share > 0)
-
 
 def looked_at(views: Sequence[ViewPoints]) -> Array:
     """Return the point (3,) nearest to all optical axes, in world [m].

@@ -180,7 +180,6 @@ class ReviewedSession:
                     session=self.number,
                     instance=placed.instance,
                     name=self.names.get(placed.obj_id, f"object {placed.obj_id} (no model)"),
-                    computed=computed.verdict,
                     verdict=placed.verdict,
                     agree=placed.checks.get("agree", float("nan")),
                     is_decided=corrections.decision_on(computed, state) is not None,

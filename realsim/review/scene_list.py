@@ -32,10 +32,8 @@ class ObjectRow:
     """Number of its session in the list of sessions."""
     instance: int
     name: str
-    computed: str
-    """The verdict that was computed; `unchecked` where a reviewer moved the object."""
     verdict: str
-    """The reviewer's verdict; without one, the computed one."""
+    """The reviewer's verdict; without one, the computed one: `unchecked` where it was moved."""
     agree: float
     """Share of its pixels that agree with the measured depth; NaN where it was not measured."""
     is_decided: bool

@@ -33,7 +33,7 @@ def seen(session: ReviewedSession, instance: int) -> ObjectPose:
 
 def row(key: int, verdict: str, agree: float, *, decided: bool = False) -> ObjectRow:
     return ObjectRow(
-        session=key // 10, instance=key % 10, name="x", computed=verdict, verdict=verdict,
+        session=key // 10, instance=key % 10, name="x", verdict=verdict,
         agree=agree, is_decided=decided,
     )  # fmt: skip
 

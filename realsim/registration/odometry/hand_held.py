@@ -159,8 +159,6 @@ class HandHeld:
     """(F,) whether the view saw the table."""
     keys: tuple[int, ...]
     """Places of the key views."""
-    loops: int
-    """Pairs of key views that do not follow each other and were aligned."""
     residual_mm: float
     """Median of what is left of a pair's shift [mm]."""
     cpu_s: float
@@ -203,7 +201,6 @@ def hand_held_poses(
         overlaps=np.array(path.overlaps),
         levelled=levelled,
         keys=tuple(path.keys),
-        loops=len(loops),
         residual_mm=float(1e3 * np.median(np.linalg.norm(r[:, 3:], axis=1))),
         cpu_s=time.process_time() - began,
     )

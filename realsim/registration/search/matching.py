@@ -157,12 +157,7 @@ def match_templates(
     order = np.argsort(-found.score, kind="stable")
     most = MOST if region is None else MOST_IN_REGION
     return [
-        Hypothesis(
-            obj_id=templates.obj_id,
-            T_world_obj=Ts[k],
-            score=float(found.score[k]),
-            source=_source(found, k),
-        )
+        Hypothesis(T_world_obj=Ts[k], score=float(found.score[k]), source=_source(found, k))
         for k in _distinct(Ts, order[allowed[order]], templates, most)
     ]
 

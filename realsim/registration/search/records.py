@@ -37,7 +37,6 @@ class Wanted:
 class Hypothesis:
     """A pose that an object may have."""
 
-    obj_id: int
     T_world_obj: Array
     """(4, 4)."""
     score: float

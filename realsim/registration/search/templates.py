@@ -64,7 +64,6 @@ class TemplateConfig:
 class ModelTemplates:
     """The height templates of one object; D resting poses."""
 
-    obj_id: int
     rotations: Array
     """(D, 3, 3) R_table_obj at yaw 0."""
     offsets: Array
@@ -110,7 +109,7 @@ def model_templates(
         InputError: the mesh is flat, so it cannot rest.
     """
     path = None if folder is None else folder / f"templates_{content_key(model, config)}.npz"
-    known = None if path is None else _loaded(path, model)
+    known = None if path is None else _loaded(path)
     if known is None:
         known = _computed(model, config)
         if path is not None:
@@ -155,7 +154,6 @@ def _computed(model: ObjectModel, config: TemplateConfig) -> ModelTemplates:
     counts = np.array([max(1, math.ceil(p * config.yaws / (2 * np.pi) - 1e-6)) for p in periods])
     low, high = model.mesh.bounds
     return ModelTemplates(
-        obj_id=model.obj_id,
         rotations=np.stack([pose.R for pose, _ in poses]),
         offsets=np.stack([offset for offset, _, _ in sampled]),
         points=np.stack([points for _, points, _ in sampled]),
@@ -259,12 +257,12 @@ def _save(path: Path, t: ModelTemplates) -> None:
     write_arrays(path, arrays, {"is_ball": t.is_ball})
 
 
-def _loaded(path: Path, model: ObjectModel) -> ModelTemplates | None:
+def _loaded(path: Path) -> ModelTemplates | None:
     """Return the templates of a file, or None if there is none or it is damaged."""
     if not path.is_file():
         return None
     try:
         arrays, notes = read_arrays(path)
-        return ModelTemplates(obj_id=model.obj_id, is_ball=bool(notes["is_ball"]), **arrays)
+        return ModelTemplates(is_ball=bool(notes["is_ball"]), **arrays)
     except (InputError, TypeError, KeyError):
         return None

@@ -33,8 +33,6 @@ class Moved(NamedTuple):
     """Motion of the object's middle [mm]."""
     deg: float
     """Turn [deg]."""
-    greatest_mm: float
-    """Motion of the vertex that moved furthest [mm]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -122,7 +120,7 @@ def _orthonormal(R: Array) -> Array:
 
 
 def moved(T_before: ArrayLike, T_after: ArrayLike, mesh: Mesh) -> Moved:
-    """Return how far an object was moved: its middle, its turn, and its vertex that moved most.
+    """Return how far an object was moved: its middle, and its turn.
 
     Args:
         T_before: (4, 4) T_world_obj.
@@ -133,11 +131,9 @@ def moved(T_before: ArrayLike, T_after: ArrayLike, mesh: Mesh) -> Moved:
     after = np.asarray(T_after, dtype=np.float64)
     D = after - before
     step = D[:3, :3] @ middle_of(mesh) + D[:3, 3]
-    apart = np.linalg.norm(mesh.vertices @ D[:3, :3].T + D[:3, 3], axis=1)
     return Moved(
         mm=1e3 * float(np.linalg.norm(step)),
         deg=float(np.degrees(se3.angle(before[:3, :3].T @ after[:3, :3]))),
-        greatest_mm=1e3 * float(apart.max()),
     )
 
 
