@@ -162,6 +162,17 @@ def import_extra(module: str, extra: str, use: str, instead: str = "") -> Any:
         ) from error
 
 
+def import_pixar(modules: tuple[str, ...], use: str, instead: str) -> Any:
+    """Return Pixar's package `pxr` with those of its modules; `use` and `instead` as above.
+
+    Raises:
+        MissingLibraryError: one of them cannot be imported.
+    """
+    for name in modules:
+        import_extra(f"pxr.{name}", "usd", use, instead)
+    return importlib.import_module("pxr")
+
+
 @cache  # the search for its libraries is dear, and loops ask for it
 def import_open3d() -> Any:
     """Return the module `open3d`; the only way realsim imports it.

@@ -118,6 +118,26 @@ def hull_vertices(points: ArrayLike) -> Array:
     return _hull(_Content(points))[0]
 
 
+def hull_triangles(vertices: Array) -> tuple[Array, Int64]:
+    """Return the corners (H, 3) of the hull, in the order given, and its outward faces (F, 3).
+
+    Raises:
+        QhullError: the points are flat.
+    """
+    from scipy.spatial import ConvexHull
+
+    hull: Any = ConvexHull(vertices)
+    corners = np.sort(hull.vertices)
+    number = np.full(len(vertices), -1)
+    number[corners] = np.arange(len(corners))
+    faces: Int64 = number[hull.simplices].astype(np.int64)
+    at = vertices[corners]
+    a, b, c = np.moveaxis(at[faces], 1, 0)
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return at, faces
+
+
 def diameter(mesh: Mesh) -> float:
     """Return the greatest distance between two vertices [m] (BOP's diameter)."""
     return _diameter(_Content(mesh.vertices))

@@ -1,13 +1,13 @@
 """Convex parts as points: hulls, fewer corners, and the OBJ that physics engines load."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from realsim.arrays import Array, Int64
+from realsim.arrays import Array
 from realsim.errors import InputError
+from realsim.geometry.mesh_shape import hull_triangles
 from realsim.models.model_records import ConvexParts
 
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
@@ -52,26 +52,6 @@ def fewest(vertices: Array, count: int, most: int, loss: float) -> Array:
         if count >= most or hull_volume(kept) >= (1.0 - loss) * full:
             return kept
         count *= 2
-
-
-def hull_triangles(vertices: Array) -> tuple[Array, Int64]:
-    """Return the corners (H, 3) of the hull, in the order given, and its outward faces (F, 3).
-
-    Raises:
-        QhullError: the points are flat.
-    """
-    from scipy.spatial import ConvexHull
-
-    hull: Any = ConvexHull(vertices)
-    corners = np.sort(hull.vertices)
-    number = np.full(len(vertices), -1)
-    number[corners] = np.arange(len(corners))
-    faces: Int64 = number[hull.simplices].astype(np.int64)
-    at = vertices[corners]
-    a, b, c = np.moveaxis(at[faces], 1, 0)
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    return at, faces
 
 
 def collision_obj(parts: ConvexParts | Sequence[ArrayLike]) -> bytes:

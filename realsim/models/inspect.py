@@ -5,7 +5,7 @@ seams), and all of it is linear or n log n in the faces. Whether faces cut throu
 NOT checked: two overlapping closed bodies count the common volume twice, and nothing here says so.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -50,22 +50,24 @@ def problems_of(s: Survey) -> tuple[Problem, ...]:
     )
 
 
-def _surface_problems(s: Survey) -> list[Problem]:
-    """Return what keeps the surface from being closed."""
-    topo, problems = s.topology, list[Problem]()
+def _problem(kind: str, count: int, text: str) -> Problem:
+    return Problem(kind=kind, count=count, text=f"{kind}: {text}")
+
+
+def _surface_problems(s: Survey) -> Iterator[Problem]:
+    """Yield what keeps the surface from being closed."""
+    topo = s.topology
     holes, _, sizes = rims(topo)
     if holes:
         edges = int(np.count_nonzero(topo.edge_uses == 1))
         largest = _percent(float(sizes.max()) / topo.size)
         where = f"{counted(holes, 'hole')}, the largest {largest} of the extent"
-        problems.append(
-            Problem(
-                kind="open",
-                count=edges,
-                text=f"open: {counted(edges, 'boundary edge')} in {where}: volume and inertia are "
-                "not defined by the mesh and come from its convex parts or its hull; what is "
-                "inside is unknown near the holes.",
-            )
+        yield _problem(
+            "open",
+            edges,
+            f"{counted(edges, 'boundary edge')} in {where}: volume and inertia are "
+            "not defined by the mesh and come from its convex parts or its hull; what is "
+            "inside is unknown near the holes.",
         )
     crossed = int(np.count_nonzero(topo.edge_uses > 2))
     if crossed:
@@ -75,31 +77,26 @@ def _surface_problems(s: Survey) -> list[Problem]:
             if solid
             else "inside and outside, and with them volume and inertia, are not certain"
         )
-        problems.append(
-            Problem(
-                kind="non-manifold",
-                count=crossed,
-                text=f"non-manifold: {counted(crossed, 'edge')} with more than two faces (walls "
-                f"inside, or parts that touch along an edge): {volume}.",
-            )
+        yield _problem(
+            "non-manifold",
+            crossed,
+            f"{counted(crossed, 'edge')} with more than two faces (walls "
+            f"inside, or parts that touch along an edge): {volume}.",
         )
-    return problems
 
 
-def _winding_problems(s: Survey) -> list[Problem]:
-    """Return what is wrong with the directions in which the faces look."""
-    o, topo, problems = s.orientation, s.topology, list[Problem]()
+def _winding_problems(s: Survey) -> Iterator[Problem]:
+    """Yield what is wrong with the directions in which the faces look."""
+    o, topo = s.orientation, s.topology
     # A double-sided face looks both ways, so it cannot look the wrong way.
     against = int(np.count_nonzero(o.against & ~topo.two_sided))
     if against:
-        problems.append(
-            Problem(
-                kind="inconsistent winding",
-                count=against,
-                text=f"inconsistent winding: {counted(against, 'face')} wind against their "
-                "neighbours: their normals are turned, the volume comes out too small, and grasp "
-                "approaches there start from the wrong side. Repair turns them.",
-            )
+        yield _problem(
+            "inconsistent winding",
+            against,
+            f"{counted(against, 'face')} wind against their "
+            "neighbours: their normals are turned, the volume comes out too small, and grasp "
+            "approaches there start from the wrong side. Repair turns them.",
         )
     inward = o.inward & ~topo.two_sided
     if np.any(inward):
@@ -110,32 +107,26 @@ def _winding_problems(s: Survey) -> list[Problem]:
             if all_of_it
             else f"{counted(n, 'face')} ({_percent(share)} of the area)"
         )
-        problems.append(
-            Problem(
-                kind="inside-out",
-                count=n,
-                text=f"inside-out: the normals of {which} point into the solid: the volume is "
-                "negative there, depth and normals of rendered views are of the far side. Repair "
-                "turns the faces.",
-            )
+        yield _problem(
+            "inside-out",
+            n,
+            f"the normals of {which} point into the solid: the volume is "
+            "negative there, depth and normals of rendered views are of the far side. Repair "
+            "turns the faces.",
         )
     twisted = int(np.count_nonzero(o.is_one_sided))
     if twisted:
-        problems.append(
-            Problem(
-                kind="one-sided",
-                count=twisted,
-                text=f"one-sided: {counted(twisted, 'piece')} of surface cannot be wound "
-                "consistently (as a Moebius band): it has no outside and bounds no volume. It is "
-                "left as it is; model it again.",
-            )
+        yield _problem(
+            "one-sided",
+            twisted,
+            f"{counted(twisted, 'piece')} of surface cannot be wound "
+            "consistently (as a Moebius band): it has no outside and bounds no volume. It is "
+            "left as it is; model it again.",
         )
-    return problems
 
 
-def _body_problems(s: Survey) -> list[Problem]:
-    """Return that there are several bodies: separate ones, shells within shells, stray specks."""
-    problems: list[Problem] = []
+def _body_problems(s: Survey) -> Iterator[Problem]:
+    """Yield that there are several bodies: separate ones, shells within shells, stray specks."""
     specks = s.specks(SPECK_SIZE_SHARE, SPECK_AREA_SHARE)
     nested = np.zeros(s.body_count, dtype=bool)
     deep = np.r_[s.orientation.depth % 2 == 1, False][s.orientation.patch]
@@ -144,78 +135,67 @@ def _body_problems(s: Survey) -> list[Problem]:
     shares = s.body_areas / max(float(s.body_areas.sum()), np.finfo(np.float64).tiny)
     if np.any(specks):
         n, size = int(specks.sum()), s.body_sizes[specks].max() / s.topology.size
-        problems.append(
-            Problem(
-                kind="stray specks",
-                count=n,
-                text=f"stray specks: {counted(n, 'loose piece')} of at most "
-                f"{_percent(float(size))} of the extent, "
-                f"{_percent(float(shares[specks].sum()))} of the area in all: they widen the hull "
-                "and the extent. Repair drops them.",
-            )
+        yield _problem(
+            "stray specks",
+            n,
+            f"{counted(n, 'loose piece')} of at most "
+            f"{_percent(float(size))} of the extent, "
+            f"{_percent(float(shares[specks].sum()))} of the area in all: they widen the hull "
+            "and the extent. Repair drops them.",
         )
     if np.any(nested):
         n = int(nested.sum())
-        problems.append(
-            Problem(
-                kind="nested shells",
-                count=n,
-                text=f"nested shells: {counted(n, 'closed shell')} inside another "
-                f"({_percent(float(shares[nested].sum()))} of the area): taken for the walls of "
-                "cavities, whose volume and mass are subtracted. No camera sees them; remove them "
-                "if the object is solid.",
-            )
+        yield _problem(
+            "nested shells",
+            n,
+            f"{counted(n, 'closed shell')} inside another "
+            f"({_percent(float(shares[nested].sum()))} of the area): taken for the walls of "
+            "cavities, whose volume and mass are subtracted. No camera sees them; remove them "
+            "if the object is solid.",
         )
     others = ~specks & ~nested
     if others.sum() > 1:
         listed = np.sort(shares[others])[::-1]
         parts = ", ".join(_percent(float(x)) for x in listed[:NAMED_BODIES])
         more = f" and {len(listed) - NAMED_BODIES} smaller" if len(listed) > NAMED_BODIES else ""
-        problems.append(
-            Problem(
-                kind="several bodies",
-                count=len(listed),
-                text=f"several bodies: {len(listed)} separate pieces of surface with {parts}{more} "
-                "of the area: they move as one rigid object here. Where pieces reach into each "
-                "other their common volume counts twice (not checked).",
-            )
+        yield _problem(
+            "several bodies",
+            len(listed),
+            f"{len(listed)} separate pieces of surface with {parts}{more} "
+            "of the area: they move as one rigid object here. Where pieces reach into each "
+            "other their common volume counts twice (not checked).",
         )
-    return problems
 
 
-def _volume_problems(s: Survey) -> list[Problem]:
-    """Return that the mesh bounds no volume worth the name."""
+def _volume_problems(s: Survey) -> Iterator[Problem]:
+    """Yield that the mesh bounds no volume worth the name."""
     topo = s.topology
     if s.is_flat:
         size = ", ".join(_percent(float(t) / max(topo.size, 1e-300)) for t in s.thickness)
-        return [
-            Problem(
-                kind="flat",
-                count=1,
-                text=f"flat: the extents along the principal axes are {size} of the size: a sheet "
-                "or a line has no volume and no mass. It cannot be an object model.",
-            )
-        ]
+        yield _problem(
+            "flat",
+            1,
+            f"the extents along the principal axes are {size} of the size: a sheet "
+            "or a line has no volume and no mass. It cannot be an object model.",
+        )
+        return
     area = float(s.areas.sum())
     sheets = float(s.areas[topo.two_sided].sum())
     signed = float(np.where(s.orientation.flip, -s.volumes, s.volumes)[topo.proper].sum())
     is_closed = bool(np.all(s.orientation.is_closed)) and s.body_count > 0
     thickness = 2.0 * abs(signed) / area if area > 0 else 0.0
     if sheets > 0.5 * area or (is_closed and thickness < SHEET_SHARE * topo.size):
-        return [
-            Problem(
-                kind="thin sheet",
-                count=max(int(np.count_nonzero(topo.two_sided & topo.proper)), 1),
-                text="thin sheet: the surface lies back on itself with nearly no volume between: "
-                "mass and inertia from it are meaningless. Give the walls their thickness, or let "
-                "mass and inertia come from the convex parts.",
-            )
-        ]
-    return []
+        yield _problem(
+            "thin sheet",
+            max(int(np.count_nonzero(topo.two_sided & topo.proper)), 1),
+            "the surface lies back on itself with nearly no volume between: "
+            "mass and inertia from it are meaningless. Give the walls their thickness, or let "
+            "mass and inertia come from the convex parts.",
+        )
 
 
-def _row_problems(s: Survey) -> list[Problem]:
-    """Return what is wrong with the rows of the mesh rather than with its shape."""
+def _row_problems(s: Survey) -> Iterator[Problem]:
+    """Yield what is wrong with the rows of the mesh rather than with its shape."""
     topo, mesh = s.topology, s.mesh
     needles = topo.proper & (s.areas <= NEEDLE_AREA_SHARE * topo.size**2)
     unused = len(mesh.vertices) - int(np.count_nonzero(topo.index >= 0))
@@ -263,13 +243,9 @@ def _row_problems(s: Survey) -> list[Problem]:
         ),
     )
     plural = {"vertex": "vertices"}
-    return [
-        Problem(
-            kind=kind, count=n, text=f"{kind}: {counted(n, what, plural.get(what, ''))} {meaning}"
-        )
-        for kind, n, what, meaning in rows
-        if n
-    ]
+    for kind, n, what, meaning in rows:
+        if n:
+            yield _problem(kind, n, f"{counted(n, what, plural.get(what, ''))} {meaning}")
 
 
 def inspect_mesh(mesh: Mesh) -> MeshReport:

@@ -7,7 +7,8 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.errors import InputError, UnitError
 from realsim.geometry.mesh import MassProperties, diameter, hull_vertices, mass_properties
-from realsim.models.convex_hulls import hull_triangles, hull_volume
+from realsim.geometry.mesh_shape import hull_triangles
+from realsim.models.convex_hulls import hull_volume
 from realsim.models.model_records import ConvexParts, PhysicalProperties
 from realsim.records import Mesh
 

@@ -20,7 +20,7 @@ import numpy as np
 from realsim import errors
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.interop import import_extra, quiet_output
+from realsim.interop import import_pixar, quiet_output
 from realsim.models.mesh_atlas import FileContent, Piece, placed
 from realsim.models.mesh_loading import escape_error
 from realsim.models.mesh_usd_materials import (
@@ -42,7 +42,7 @@ TRIAL = """
 import pathlib, resource, sys
 from realsim.errors import RealsimError
 from realsim.models import usd_reading as usd
-path, pxr = pathlib.Path(sys.argv[1]), usd._Pxr()
+path, pxr = pathlib.Path(sys.argv[1]), usd._pixar()
 held = int(open("/proc/self/status").read().split("VmData:")[1].split()[0]) << 10
 room = held + (usd.TRIAL_MB << 20) + 30 * path.stat().st_size
 resource.setrlimit(resource.RLIMIT_DATA, (room, room))
@@ -73,7 +73,7 @@ def load_usd(path: Path) -> FileContent:
             states a unit that is none of m, cm, mm, inch.
         MissingLibraryError: Pixar's library is not installed.
     """
-    pxr = _Pxr()
+    pxr = _pixar()
     if path.suffix.lower() != TEXT_FORMAT:
         _require_survivable(path)
     return _content(pxr, path)
@@ -104,7 +104,7 @@ def _require_survivable(path: Path) -> None:
         )
 
 
-def _content(pxr: "_Pxr", path: Path) -> FileContent:
+def _content(pxr: Any, path: Path) -> FileContent:
     notes: list[str] = []
     with quiet_output():  # the library prints its warnings straight to stderr
         try:
@@ -134,20 +134,9 @@ def _reason(error: Exception) -> str:
     return lines[-1].strip() if lines and lines[-1].strip() else type(error).__name__
 
 
-class _Pxr:
-    """Pixar's modules, imported when a USD file is read."""
-
-    def __init__(self) -> None:
-        instead = "A mesh in a GLB is read without it."
-        modules = {
-            name: import_extra(f"pxr.{name}", "usd", "reading USD", instead)
-            for name in ("Usd", "UsdGeom", "UsdShade", "Sdf", "Ar")
-        }
-        self.Usd: Any = modules["Usd"]
-        self.UsdGeom: Any = modules["UsdGeom"]
-        self.UsdShade: Any = modules["UsdShade"]
-        self.Sdf: Any = modules["Sdf"]
-        self.Ar: Any = modules["Ar"]
+def _pixar() -> Any:
+    modules = ("Usd", "UsdGeom", "UsdShade", "Sdf", "Ar")
+    return import_pixar(modules, "reading USD", "A mesh in a GLB is read without it.")
 
 
 # --- files that a file names ---------------------------------------------------------------------
@@ -157,7 +146,7 @@ def _is_beside(path: Path, target: str) -> bool:
     return Path(target).resolve().is_relative_to(path.resolve().parent)
 
 
-def _check_layers(pxr: _Pxr, path: Path) -> None:
+def _check_layers(pxr: Any, path: Path) -> None:
     """Follow sublayers, references and payloads without opening any outside the folder.
 
     Raises:
@@ -200,7 +189,7 @@ def _check_used(path: Path, stage: Any) -> None:
 
 
 def _stated(
-    pxr: _Pxr, path: Path, stage: Any, notes: list[str]
+    pxr: Any, path: Path, stage: Any, notes: list[str]
 ) -> tuple[dict[str, str], ScanUnit | None, UpAxis]:
     """Return what the stage states, its unit and its up axis.
 
@@ -236,7 +225,7 @@ def _stated(
 class _Reader:
     """Reads the meshes below a stage."""
 
-    def __init__(self, pxr: _Pxr, path: Path, notes: list[str]) -> None:
+    def __init__(self, pxr: Any, path: Path, notes: list[str]) -> None:
         self._pxr, self._notes = pxr, notes
         self._transforms = pxr.UsdGeom.XformCache(pxr.Usd.TimeCode.Default())
         self._materials = Materials(pxr, path, notes)

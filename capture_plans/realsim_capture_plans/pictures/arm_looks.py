@@ -9,8 +9,8 @@ from realsim.arrays import Array, Int64
 from realsim.errors import MissingLibraryError, RealsimError
 from realsim.geometry import se3
 from realsim.geometry.mesh_files import load_mesh
+from realsim.geometry.mesh_shape import hull_triangles
 from realsim.interop import import_pinocchio, unbroken
-from realsim.models.convex_hulls import hull_triangles
 from realsim.robots.arm import arm_of
 from realsim.robots.link_shapes import LARGEST_MM_SCALE, link_placements, link_shape
 from realsim.robots.shapes import Shape

@@ -7,14 +7,14 @@ square of its own in its mean colour.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from realsim.arrays import Array, Int64, UInt8
+from realsim.arrays import Array, UInt8
 from realsim.errors import InputError
 from realsim.formats.robot_scenes.placed_scene import RigidBody
+from realsim.geometry.mesh_shape import hull_triangles
 from realsim.images.png import encode_png
 from realsim.records import Mesh
 
@@ -110,25 +110,17 @@ def convex_part(points: ArrayLike, name: str) -> Mesh:
     Raises:
         InputError: the points are flat: engines need a volume (MuJoCo four corners and more).
     """
-    from scipy.spatial import ConvexHull, QhullError
+    from scipy.spatial import QhullError
 
     points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
     try:
-        hull: Any = ConvexHull(points)
+        corners, faces = hull_triangles(points)
     except (QhullError, ValueError) as error:
         raise InputError(
             f"{name} ({len(points)} points) is flat: it has no volume that could be collided with. "
             "Leave it out."
         ) from error
-    corners: Int64 = np.sort(hull.vertices)
-    number = np.full(len(points), -1)
-    number[corners] = np.arange(len(corners))
-    faces = number[hull.simplices]
-    at = points[corners]
-    a, b, c = np.moveaxis(at[faces], 1, 0)
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    return Mesh(vertices=at, faces=faces.astype(np.int32))
+    return Mesh(vertices=corners, faces=faces.astype(np.int32))
 
 
 def collision_parts(body: RigidBody) -> tuple[Mesh, ...]:

@@ -8,33 +8,19 @@ from realsim.formats.robot_scenes.mesh_obj import PLAIN_RGB, Look, collision_par
 from realsim.formats.robot_scenes.placed_scene import RigidBody, principal_inertia
 from realsim.geometry import se3
 from realsim.images.png import encode_png
-from realsim.interop import import_extra
+from realsim.interop import import_pixar
 from realsim.records import Mesh
 
 MODULES = ("Gf", "Sdf", "Usd", "UsdGeom", "UsdPhysics", "UsdSemantics", "UsdShade", "Vt")
 
 
-class Pixar:
-    """Pixar's modules, imported when a scene is written."""
+def pixar() -> Any:
+    """Return Pixar's package with the modules that a scene is written by.
 
-    def __init__(self) -> None:
-        """Import them.
-
-        Raises:
-            MissingLibraryError: the extra is not installed.
-        """
-        instead = "URDF and MJCF are written without it."
-        found = {
-            name: import_extra(f"pxr.{name}", "usd", "writing USD", instead) for name in MODULES
-        }
-        self.Gf: Any = found["Gf"]
-        self.Sdf: Any = found["Sdf"]
-        self.Usd: Any = found["Usd"]
-        self.UsdGeom: Any = found["UsdGeom"]
-        self.UsdPhysics: Any = found["UsdPhysics"]
-        self.UsdSemantics: Any = found["UsdSemantics"]
-        self.UsdShade: Any = found["UsdShade"]
-        self.Vt: Any = found["Vt"]
+    Raises:
+        MissingLibraryError: the extra is not installed.
+    """
+    return import_pixar(MODULES, "writing USD", "URDF and MJCF are written without it.")
 
 
 LABEL = "class"
@@ -43,11 +29,11 @@ COMBINE_MODE = "physxMaterial:frictionCombineMode"
 """PhysX's own attribute: without it two frictions are averaged, not multiplied."""
 
 
-def body_stage(pxr: Pixar, body: RigidBody, name: str, texture: str) -> Any:
+def body_stage(pxr: Any, body: RigidBody, name: str, texture: str) -> Any:
     """Return the stage of a body.
 
     Args:
-        pxr: Pixar's modules.
+        pxr: Any's modules.
         body: the body.
         name: of its prim.
         texture: file of its texture, beside it; see `texture_png`.
@@ -87,7 +73,7 @@ def texture_png(body: RigidBody) -> bytes | None:
     return None if texture is None else encode_png(np.ascontiguousarray(texture))
 
 
-def new_stage(pxr: Pixar) -> Any:
+def new_stage(pxr: Any) -> Any:
     """Return an empty stage in metres and kilograms, z up."""
     stage = pxr.Usd.Stage.CreateInMemory("scene.usda")
     pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.z)
@@ -96,7 +82,7 @@ def new_stage(pxr: Pixar) -> Any:
     return stage
 
 
-def define_mesh(pxr: Pixar, stage: Any, path: str, mesh: Mesh) -> Any:
+def define_mesh(pxr: Any, stage: Any, path: str, mesh: Mesh) -> Any:
     """Define a mesh of triangles; points are float32, as USD has them."""
     found = pxr.UsdGeom.Mesh.Define(stage, path)
     points = np.ascontiguousarray(mesh.vertices, dtype=np.float32)
@@ -112,7 +98,7 @@ def define_mesh(pxr: Pixar, stage: Any, path: str, mesh: Mesh) -> Any:
     return found
 
 
-def friction_material(pxr: Pixar, stage: Any, path: str, friction: float) -> Any:
+def friction_material(pxr: Any, stage: Any, path: str, friction: float) -> Any:
     """Define the material of a surface with a Coulomb friction."""
     material = pxr.UsdShade.Material.Define(stage, path)
     physics = pxr.UsdPhysics.MaterialAPI.Apply(material.GetPrim())
@@ -124,13 +110,13 @@ def friction_material(pxr: Pixar, stage: Any, path: str, friction: float) -> Any
     return material
 
 
-def bind_friction(pxr: Pixar, prim: Any, material: Any) -> None:
+def bind_friction(pxr: Any, prim: Any, material: Any) -> None:
     """Make a shape rub as a material says; its look stays its own."""
     strength = pxr.UsdShade.Tokens.weakerThanDescendants
     pxr.UsdShade.MaterialBindingAPI.Apply(prim).Bind(material, strength, "physics")
 
 
-def _set_mass(pxr: Pixar, prim: Any, body: RigidBody) -> None:
+def _set_mass(pxr: Any, prim: Any, body: RigidBody) -> None:
     """Set mass, centre of mass, moments and the rotation from principal axes to the object's."""
     moments, R_obj_principal = principal_inertia(body.inertia)
     # Quaternions are w first in Pixar's library.
@@ -142,7 +128,7 @@ def _set_mass(pxr: Pixar, prim: Any, body: RigidBody) -> None:
     mass.CreatePrincipalAxesAttr().Set(pxr.Gf.Quatf(w, x, y, z))
 
 
-def _surface(pxr: Pixar, stage: Any, path: str, look: Look, texture: str) -> Any:
+def _surface(pxr: Any, stage: Any, path: str, look: Look, texture: str) -> Any:
     """Define a UsdPreviewSurface with a texture, or a plain colour."""
     types, shade = pxr.Sdf.ValueTypeNames, pxr.UsdShade
     material = shade.Material.Define(stage, path)

@@ -27,11 +27,11 @@ from realsim.formats.robot_scenes.placed_scene import (
     without_lens,
 )
 from realsim.formats.robot_scenes.usd_body import (
-    Pixar,
     bind_friction,
     body_stage,
     friction_material,
     new_stage,
+    pixar,
     texture_png,
 )
 from realsim.geometry import se3
@@ -61,7 +61,7 @@ def write_usd_scene(
         MissingLibraryError: the extra `usd` is not installed.
         StorageError: the disk is full, or refuses.
     """
-    pxr = Pixar()
+    pxr = pixar()
     names = scene.body_names()
     for obj_id, name in names.items():
         piece = f"{OBJECTS}/{name}"
@@ -90,11 +90,11 @@ def _usdc(layer: Any) -> bytes:
         return path.read_bytes()
 
 
-def _scene_layer(pxr: Pixar, scene: PlacedScene, files: dict[int, str]) -> Any:
+def _scene_layer(pxr: Any, scene: PlacedScene, files: dict[int, str]) -> Any:
     """Return the layer that puts everything together.
 
     Args:
-        pxr: Pixar's modules.
+        pxr: Any's modules.
         scene: the scene.
         files: of the bodies, by object id.
     """
@@ -122,12 +122,12 @@ def _scene_layer(pxr: Pixar, scene: PlacedScene, files: dict[int, str]) -> Any:
     return layer
 
 
-def _add_object(pxr: Pixar, stage: Any, o: PlacedObject) -> None:
+def _add_object(pxr: Any, stage: Any, o: PlacedObject) -> None:
     prim = stage.DefinePrim(f"{ROOT}/{o.name}", "Xform")
     _place(pxr, prim, o.T_world_obj)
 
 
-def _add_table(pxr: Pixar, stage: Any, table: TableBox) -> None:
+def _add_table(pxr: Any, stage: Any, table: TableBox) -> None:
     """Add the table: a cube that collides and, having no rigid body, stands still."""
     cube = pxr.UsdGeom.Cube.Define(stage, f"{ROOT}/table")
     cube.CreateSizeAttr().Set(1.0)
@@ -142,7 +142,7 @@ def _add_table(pxr: Pixar, stage: Any, table: TableBox) -> None:
     bind_friction(pxr, prim, friction_material(pxr, stage, f"{ROOT}/Looks/table", 1.0))
 
 
-def _add_camera(pxr: Pixar, stage: Any, camera: SceneCamera) -> None:
+def _add_camera(pxr: Any, stage: Any, camera: SceneCamera) -> None:
     """Add a pinhole camera; USD's look along -z with y up."""
     K = camera.intrinsics
     found = pxr.UsdGeom.Camera.Define(stage, f"{ROOT}/{camera.name}")
@@ -160,7 +160,7 @@ def _add_camera(pxr: Pixar, stage: Any, camera: SceneCamera) -> None:
     _place(pxr, found.GetPrim(), interop.T_world_gl_from_cam(camera.T_world_cam))
 
 
-def _place(pxr: Pixar, prim: Any, T: Array) -> None:
+def _place(pxr: Any, prim: Any, T: Array) -> None:
     """Set a prim's pose by the operations that Isaac Sim shows: translate, then orient."""
     w, x, y, z = se3.quaternion_wxyz(T[:3, :3]).tolist()
     xform, precision = pxr.UsdGeom.Xformable(prim), pxr.UsdGeom.XformOp.PrecisionDouble

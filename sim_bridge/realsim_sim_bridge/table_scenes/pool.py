@@ -15,8 +15,9 @@ import numpy as np
 
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
+from realsim.geometry.mesh_shape import hull_triangles
 from realsim.models.convex import ConvexConfig, convex_parts
-from realsim.models.convex_hulls import hull_triangles, hull_volume
+from realsim.models.convex_hulls import hull_volume
 from realsim.models.model_records import ConvexParts, ScanUnit
 from realsim.records import Mesh
 from realsim_sim_bridge.table_scenes.config import PoolConfig
