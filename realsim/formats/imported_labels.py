@@ -18,7 +18,7 @@ import numpy as np
 from realsim import images
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.formats.bop.labels import mask_path
+from realsim.formats.bop.labels import gt_row, mask_path
 from realsim.formats.labelled_scene import LabelledObject, LabelledScene
 from realsim.records import bop_units as units
 from realsim.records.checked_arrays import rigid
@@ -161,10 +161,7 @@ def row_of(labelled: LabelledObject) -> dict[str, Any]:
     """Return an object as a row of scene_gt.json: the source's own where that is BOP's."""
     entry = dict(labelled.entry or {})
     if not {"cam_R_m2c", "cam_t_m2c", "obj_id"} <= entry.keys():
-        rotation, translation = units.lists_from_rigid(labelled.T_cam_obj)
-        entry = {"cam_R_m2c": rotation, "cam_t_m2c": translation, "obj_id": labelled.obj_id}
-        if float(np.linalg.norm(translation)) < units.NEAREST_MM:
-            entry[units.AT_THE_LENS] = True
+        entry = gt_row(labelled.obj_id, labelled.T_cam_obj)
     return entry if labelled.instance is None else {**entry, INSTANCE: labelled.instance}
 
 

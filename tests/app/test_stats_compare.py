@@ -12,8 +12,11 @@ from bop_scenes import edit
 from labelled_scenes import SceneInMemory, labelled_scene, written_bop, written_graspnet
 from realsim import images
 from realsim.app.stats.compare import diff_scenes
-from realsim.formats.graspnet.collision_labels import write_collision_labels
-from realsim.formats.graspnet.grasp_labels import GraspLabels, write_grasp_labels
+from realsim.formats.graspnet.grasp_labels import (
+    GraspLabels,
+    write_collision_labels,
+    write_grasp_labels,
+)
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from tried_grasps import tried_set

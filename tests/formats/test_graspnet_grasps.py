@@ -8,14 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from realsim.formats.graspnet import gripper_frame as frame
-from realsim.formats.graspnet.collision_labels import write_collision_labels
 from realsim.formats.graspnet.grasp_group import (
     GraspGroup,
     grasp_group,
     read_grasp_group,
     write_grasp_group,
 )
-from realsim.formats.graspnet.grasp_labels import GraspLabels, read_grasp_labels, write_grasp_labels
+from realsim.formats.graspnet.grasp_labels import (
+    GraspLabels,
+    read_grasp_labels,
+    write_collision_labels,
+    write_grasp_labels,
+)
 from realsim.formats.graspnet.rect import rect_rows
 from realsim.formats.grasps.scene_grasps import untried_set
 from realsim.geometry import se3

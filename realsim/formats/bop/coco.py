@@ -10,16 +10,11 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from realsim.arrays import Mask
-from realsim.formats.bop.labels import bbox_of, rle_area_and_bbox, rle_of
+from realsim.formats.bop.labels import bbox_of, mask_entry, rle_of
 
 Json = dict[str, Any]
 IGNORED_BELOW = 0.1
 """Visible fraction below which BOP's evaluation does not ask for an object."""
-
-
-def image_entry(index: int, file_name: str, width: int, height: int) -> Json:
-    """Return an image's entry."""
-    return {"id": index, "file_name": file_name, "width": width, "height": height}
 
 
 def annotation_entry(
@@ -36,20 +31,11 @@ def annotation_entry(
     whole, visible = masks
     if visible is None:
         return None
-    rle = rle_of(visible)
-    area, box = rle_area_and_bbox(rle)
-    if area == 0:
+    entry = mask_entry(index, obj_id, rle_of(visible))
+    if entry is None:
         return None
-    entry: Json = {
-        "image_id": index,
-        "category_id": obj_id,
-        "iscrowd": 0,
-        "area": area,
-        "bbox": list(box if whole is None else bbox_of(whole, inclusive=True)),
-        "segmentation": rle,
-        "width": visible.shape[1],
-        "height": visible.shape[0],
-    }
+    if whole is not None:
+        entry["bbox"] = list(bbox_of(whole, inclusive=True))
     if visible_fraction is not None:
         entry["ignore"] = visible_fraction < IGNORED_BELOW
     return entry

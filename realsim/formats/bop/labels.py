@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.arrays import Mask
 from realsim.errors import InputError
-from realsim.records import bop_units
+from realsim.records import CameraIntrinsics, bop_units
 from realsim.store.atomic import json_bytes
 from realsim.store.session_store import SessionStore, rgb_path
 
@@ -151,6 +151,15 @@ def gt_info_entry(
     }
 
 
+def gt_row(obj_id: int, T_cam_obj: ArrayLike) -> Json:
+    """Return the row of scene_gt.json of an object whose pose is known in metres."""
+    rotation, translation = bop_units.lists_from_rigid(T_cam_obj)
+    row: Json = {"cam_R_m2c": rotation, "cam_t_m2c": translation, "obj_id": obj_id}
+    if float(np.linalg.norm(translation)) < bop_units.NEAREST_MM:
+        row[bop_units.AT_THE_LENS] = True
+    return row
+
+
 def write_scene_gt(
     store: SessionStore, annotations: Mapping[int, Sequence[tuple[int, ArrayLike]]]
 ) -> None:
@@ -167,12 +176,9 @@ def write_scene_gt(
     for index in sorted(annotations):
         rows: list[Json] = []
         for obj_id, T_cam_obj in annotations[index]:
-            rotation, translation = bop_units.lists_from_rigid(T_cam_obj)
+            row = gt_row(int(obj_id), T_cam_obj)
             name = f"object {obj_id} of image {index}"
-            bop_units.object_in_camera(rotation, translation, name, may_touch=True)
-            row = {"cam_R_m2c": rotation, "cam_t_m2c": translation, "obj_id": int(obj_id)}
-            if float(np.linalg.norm(translation)) < bop_units.NEAREST_MM:
-                row[bop_units.AT_THE_LENS] = True
+            bop_units.object_in_camera(row["cam_R_m2c"], row["cam_t_m2c"], name, may_touch=True)
             rows.append(row)
         scene[str(index)] = rows
     store.write_json("scene_gt.json", scene)
@@ -181,6 +187,29 @@ def write_scene_gt(
 def write_scene_gt_info(store: SessionStore, entries: Mapping[int, Sequence[Json]]) -> None:
     """Write scene_gt_info.json from the entries of `gt_info_entry`, by image."""
     store.write_json("scene_gt_info.json", {str(i): list(entries[i]) for i in sorted(entries)})
+
+
+def image_entry(index: int, file_name: str, camera: CameraIntrinsics) -> Json:
+    """Return an image's entry in scene_gt_coco.json."""
+    return {"id": index, "file_name": file_name, "width": camera.width, "height": camera.height}
+
+
+def mask_entry(index: int, obj_id: int, rle: Json) -> Json | None:
+    """Return the annotation of a mask without its id; None = no pixel."""
+    area, box = rle_area_and_bbox(rle)
+    if area == 0:
+        return None
+    height, width = rle["size"]
+    return {
+        "image_id": index,
+        "category_id": obj_id,
+        "iscrowd": 0,
+        "area": area,
+        "bbox": list(box),
+        "segmentation": rle,
+        "width": width,
+        "height": height,
+    }
 
 
 def write_scene_gt_coco(
@@ -199,34 +228,13 @@ def write_scene_gt_coco(
     """
     pictures: list[Json] = []
     annotations: list[Json] = []
-    camera = store.session.intrinsics
     for index in sorted(masks):
-        pictures.append(
-            {
-                "id": index,
-                "file_name": rgb_path(index),
-                "width": camera.width,
-                "height": camera.height,
-            }
-        )
+        pictures.append(image_entry(index, rgb_path(index), store.session.intrinsics))
         for obj_id, given in masks[index]:
             rle = given if isinstance(given, dict) else rle_of(given)
-            area, box = rle_area_and_bbox(rle)
-            if area == 0:
-                continue
-            annotations.append(
-                {
-                    "id": len(annotations) + 1,
-                    "image_id": index,
-                    "category_id": int(obj_id),
-                    "iscrowd": 0,
-                    "area": area,
-                    "bbox": list(box),
-                    "segmentation": rle,
-                    "width": camera.width,
-                    "height": camera.height,
-                }
-            )
+            entry = mask_entry(index, int(obj_id), rle)
+            if entry is not None:
+                annotations.append({"id": len(annotations) + 1} | entry)
     categories = [
         {"id": int(i), "name": names[i], "supercategory": store.session.name} for i in sorted(names)
     ]

@@ -19,6 +19,7 @@ from realsim.arrays import Mask
 from realsim.errors import InputError
 from realsim.formats.bop import coco
 from realsim.formats.bop.image_copies import ColourFormat, colour_content, depth_content
+from realsim.formats.bop.labels import image_entry
 from realsim.formats.bop.layout import ONBOARDING, SceneLayout, scene_number
 from realsim.formats.bop.row_writing import camera_row, info_rows, object_row
 from realsim.formats.export_folder import Content, ExportFolder
@@ -218,7 +219,6 @@ def _fraction(info: Json | None) -> float | None:
 
 
 def _coco_row(frame: LabelledFrame, masks: Masks, infos: list[Json] | None, name: str) -> Json:
-    camera = frame.intrinsics
     annotations = [
         coco.annotation_entry(
             frame.index,
@@ -229,7 +229,7 @@ def _coco_row(frame: LabelledFrame, masks: Masks, infos: list[Json] | None, name
         for k, o in enumerate(frame.objects)
     ]
     return {
-        "image": coco.image_entry(frame.index, name, camera.width, camera.height),
+        "image": image_entry(frame.index, name, frame.intrinsics),
         "annotations": [a for a in annotations if a is not None],
     }
 

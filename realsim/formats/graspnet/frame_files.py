@@ -2,7 +2,7 @@
 
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +36,6 @@ class Loss:
     """Pixels in the masks of two objects; the nearer object has them."""
     merged: int = 0
     """Objects that have a label value in common with an equal one."""
-
-    def row(self) -> dict[str, float]:
-        """Return plain JSON values."""
-        return asdict(self)
 
 
 def frame_files(

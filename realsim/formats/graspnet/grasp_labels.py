@@ -9,10 +9,16 @@ Unpacked, one object has hundreds of MB, of which few candidates close. So files
 written a few points at a time, and only the candidates that close are kept. `view_tried` (300,), an
 array of realsim's own, says which views were computed, if not all were; graspnetAPI ignores it.
 
+Collision labels of a scene, collision_label/scene_NNNN/collision_labels.npz, are arr_0, arr_1, ...
+of (P, 300, 12, 4) booleans, one array an object, in the order of the scene's object_id_list.txt:
+whether the gripper of that label is in another object or the table. The arrays have no names, so
+that the order is all that says whose they are; the number of points P is the one thing that can be
+compared with the object's label file.
+
 Poses: see `gripper_frame`. Source: graspnetAPI's loadGrasp; its documentation, "Grasp Format".
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -266,6 +272,29 @@ def write_grasp_labels(path: Path | str, labels: GraspLabels) -> Path:
     }
     if not labels.view_tried.all():
         arrays["view_tried"] = ((VIEWS,), np.bool_, iter([labels.view_tried]))
+    return write_blocks(path, arrays)
+
+
+def write_collision_labels(path: Path | str, objects: Sequence[tuple[GraspLabels, Mask]]) -> Path:
+    """Write the collision labels of a scene, whole or not at all.
+
+    Args:
+        path: the npz file.
+        objects: in the order of object_id_list.txt, the labels and whether each candidate collides
+            (N,). Candidates that are not among the labels get True: nobody looked at them.
+
+    Raises:
+        InputError: the numbers of candidates and collisions differ.
+    """
+    arrays: dict[str, tuple[tuple[int, ...], Any, Iterator[NDArray[Any]]]] = {}
+    for k, (labels, collides) in enumerate(objects):
+        if np.shape(collides) != (len(labels),):
+            raise InputError(
+                f"object {k}: {len(labels)} candidates and collisions of the shape "
+                f"{np.shape(collides)}; one each is needed."
+            )
+        shape = (len(labels.points), *GRID)
+        arrays[f"arr_{k}"] = (shape, np.bool_, _blocks(labels, np.asarray(collides), True))
     return write_blocks(path, arrays)
 
 

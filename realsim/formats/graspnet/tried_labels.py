@@ -19,9 +19,13 @@ import numpy as np
 
 from realsim.arrays import Array, Mask
 from realsim.formats.export_folder import STATE, ExportFolder
-from realsim.formats.graspnet.collision_labels import write_collision_labels
 from realsim.formats.graspnet.grasp_group import DEPTH_M, MOST_FRICTION, grasp_group
-from realsim.formats.graspnet.grasp_labels import MOST_POINTS, GraspLabels, write_grasp_labels
+from realsim.formats.graspnet.grasp_labels import (
+    MOST_POINTS,
+    GraspLabels,
+    write_collision_labels,
+    write_grasp_labels,
+)
 from realsim.formats.graspnet.gripper_frame import (
     ANGLES,
     DEPTHS_M,
@@ -182,20 +186,13 @@ def _joined(parts: Sequence[_Part]) -> tuple[GraspLabels, list[_Part]]:
         shown = p.labels.rows(rows)
         kept.append(_Part(p.scene, p.instance, replace(shown, points=p.labels.points[rows])))
         room -= len(rows)
-    whole = _blank()
-    for p in kept:
-        first = np.array([len(whole.points), 0, 0, 0], dtype=np.int32)
-        whole = GraspLabels(
-            points=np.concatenate([whole.points, p.labels.points]),
-            index=np.concatenate([whole.index, p.labels.index + first]),
-            angles_rad=np.concatenate([whole.angles_rad, p.labels.angles_rad]),
-            depths_m=np.concatenate([whole.depths_m, p.labels.depths_m]),
-            openings_m=np.concatenate([whole.openings_m, p.labels.openings_m]),
-            friction=np.concatenate([whole.friction, p.labels.friction]),
-            collision=np.concatenate([whole.collision, p.labels.collision]),
-            view_tried=whole.view_tried | p.labels.view_tried,
-        )
-    return whole, kept
+    some = [_blank(), *(p.labels for p in kept)]
+    columns = ("points", "index", "angles_rad", "depths_m", "openings_m", "friction", "collision")
+    joined = {name: np.concatenate([getattr(x, name) for x in some]) for name in columns}
+    counts = [len(x.points) for x in some]
+    joined["index"][:, 0] += np.repeat(np.cumsum([0, *counts[:-1]]), [len(x) for x in some])
+    tried = np.any([x.view_tried for x in some], axis=0)
+    return GraspLabels(**joined, view_tried=tried), kept
 
 
 def _blank() -> GraspLabels:

@@ -9,6 +9,7 @@ Grasps that physics tried become labels (`tried_labels`), when all scenes are th
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,6 @@ from realsim.formats.graspnet.cameras import FIRST, MATRIX, POSES, npy_bytes
 from realsim.formats.graspnet.frame_files import Loss, frame_files
 from realsim.formats.graspnet.grasp_group import grasp_group
 from realsim.formats.graspnet.instances import OBJECT_LIST
-from realsim.formats.graspnet.label_copies import label_files, rect_file
 from realsim.formats.graspnet.labelled import GraspnetLabelledScene
 from realsim.formats.graspnet.models import model_files
 from realsim.formats.graspnet.rect import rect_rows
@@ -35,6 +35,7 @@ __all__ = ["GraspnetWriteConfig", "write_graspnet_models", "write_graspnet_scene
 TAKEN = "graspnet_cameras.json"
 """Rows of the export that say which source a camera's folder is of."""
 FRAMES_FILE = "frames.json"
+RS_WRT_KN = "rs_wrt_kn.npy"
 Progress = Callable[[], None]
 
 
@@ -72,7 +73,7 @@ def write_graspnet_scene(
             progress()
     _write_cameras(scene, folder, camera, plan)
     _write_object_list(folder, home, plan)
-    labels = label_files(scene, plan)
+    labels = _label_files(scene, plan)
     for relative, file in labels.items():
         folder.write_piece(relative, {relative: file})
     held, told = (0, ()) if grasps is None else told_of(grasps)
@@ -125,13 +126,39 @@ def _write_frame(
     files: dict[str, Content] = {
         f"{camera}/{kind.replace('/', f'/{name}')}": content for kind, content in found.items()
     }
-    rect: Content | None = rect_file(scene, frame.index)
+    rect: Content | None = None
+    if isinstance(scene, GraspnetLabelledScene):
+        rect = scene.rect_file(frame.index)
     if rect is None and grasps is not None:
         rect = _rectangles(frame, grasps)
     if rect is not None:
         files[f"{camera}/rect/{name}.npy"] = rect
-    folder.write_piece(piece, files, {f"{camera}.losses": (name, loss.row())})
+    folder.write_piece(piece, files, {f"{camera}.losses": (name, asdict(loss))})
     return 1
+
+
+def _label_files(scene: LabelledScene, plan: WritePlan) -> dict[str, Path]:
+    """Return what holds for a copy unchanged and goes along: path in the new tree -> own file.
+
+    Such files name objects by their numbers, or by their place in the annotation: a scene whose
+    objects got other ids is no GraspNet source any more. dex_models are pickles, which run what
+    they hold: they stay behind.
+    """
+    if not isinstance(scene, GraspnetLabelledScene):
+        return {}
+    home = scene.ref.folder.parent
+    root = home.parent.parent
+    number = f"scene_{plan.number:04d}"
+    files = {
+        f"scenes/{number}/{RS_WRT_KN}": home / RS_WRT_KN,
+        f"collision_label/{number}/collision_labels.npz": (
+            root / "collision_label" / home.name / "collision_labels.npz"
+        ),
+    }
+    for n in plan.numbers.values():
+        name = f"grasp_label/{n:03d}_labels.npz"
+        files[name] = root / name
+    return {name: file for name, file in files.items() if file.is_file()}
 
 
 def _rectangles(frame: LabelledFrame, grasps: SceneGrasps) -> bytes:
