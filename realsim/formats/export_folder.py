@@ -12,7 +12,6 @@ names. `finish` writes SHA256SUMS out of the lines and takes .export away.
 import contextlib
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
@@ -244,20 +243,12 @@ class ExportFolder:
 
     def _stream(self, relative: str, chunks: Iterable[bytes]) -> list[Any]:
         """Write a file in chunks, whole or not at all; return its size and checksum."""
-        path = self.folder / relative
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}{atomic.TEMPORARY_SUFFIX}")
         digest, size = hashlib.sha256(), 0
-        try:
-            with temporary.open("wb") as file:
-                for chunk in chunks:
-                    file.write(chunk)
-                    digest.update(chunk)
-                    size += len(chunk)
-            os.replace(temporary, path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+        with atomic.replacing(self.folder / relative, flush=False) as file:
+            for chunk in chunks:
+                file.write(chunk)
+                digest.update(chunk)
+                size += len(chunk)
         return [size, digest.hexdigest()]
 
 

@@ -169,14 +169,8 @@ class LibraryReader:
         path = self.folder / model_file(obj_id)
         data = path.read_bytes() if path.is_file() else b""
         if properties.files.get(path.name) != sha256(data):
-            return (
-                None,
-                None,
-                [
-                    f"{path.name} has been changed since its properties were computed; import "
-                    "it again with --overwrite"
-                ],
-            )
+            problem = f"{path.name} has been changed since its properties were computed; import "
+            return None, None, [problem + "it again with --overwrite"]
         if properties.convex is None:
             return properties, None, []
         parts, problem = self._parts(obj_id, properties)

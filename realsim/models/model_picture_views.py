@@ -9,7 +9,7 @@ import numpy as np
 
 from realsim.arrays import Array, Array32, Image, Mask, UInt8
 from realsim.geometry import camera, se3
-from realsim.geometry.mesh_shape import welded
+from realsim.geometry.mesh_shape import hull_triangles, welded
 from realsim.models.model_records import Symmetries
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.photo import Lighting, PhotoRenderer
@@ -119,16 +119,10 @@ def rendered(meshes: Sequence[Mesh], view: View) -> tuple[Image, Array32]:
 
 def parts_mesh(vertices: Array, color: tuple[int, int, int]) -> Mesh:
     """Return the hull of a convex part, with flat faces in one colour."""
-    from scipy.spatial import ConvexHull
-
-    hull: Any = ConvexHull(vertices)
-    triangles: Array = vertices[hull.simplices]
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    inward = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0
-    triangles[inward] = triangles[inward][:, ::-1]
+    points, triangles = hull_triangles(vertices)
     # Slightly smaller, so that neighbours are told apart by a seam.
     middle = vertices.mean(axis=0)
-    corners = middle + SEAM * (triangles.reshape(-1, 3) - middle)
+    corners = middle + SEAM * (points[triangles.ravel()] - middle)
     faces = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
     return Mesh(vertices=corners, faces=faces, colors=painted_all(corners, color))
 

@@ -8,6 +8,8 @@ from realsim.records import Mesh
 
 ScanUnit = Literal["m", "cm", "mm", "inch", "none"]
 """What one unit of a mesh file is; 'none': the file has no metric scale (a generated mesh)."""
+METRES: dict[ScanUnit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+"""Length of each unit [m]."""
 UpAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
 """The axis of the file that points up when the object stands as its author drew it."""
 

@@ -13,7 +13,6 @@ What a file can and cannot tell:
   depth images) shows it, and for mirror-symmetric objects it does not matter.
 """
 
-import hashlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,13 +23,12 @@ from realsim.errors import InputError, UnitError
 from realsim.models.mesh_atlas import FileContent, Piece, one_mesh
 from realsim.models.mesh_loading import TRIMESH_FORMATS, load_pieces
 from realsim.models.mesh_topology import equal_rows
-from realsim.models.model_records import ReadScan, ScanUnit, UpAxis
+from realsim.models.model_records import METRES, ReadScan, ScanUnit, UpAxis
 from realsim.models.usd_reading import USD_FORMATS, load_usd
 from realsim.records import Mesh
+from realsim.store.provenance import sha256_of
 
 SCAN_FORMATS = (*TRIMESH_FORMATS, *USD_FORMATS)
-METRES: dict[ScanUnit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
-"""Length of each unit [m]."""
 SMALLEST_M, LARGEST_M = 0.004, 3.0
 """Largest extents outside of this are no object on a table: the unit is wrong [m]."""
 ROTATIONS: dict[UpAxis, tuple[tuple[int, int, int], ...]] = {
@@ -42,7 +40,6 @@ ROTATIONS: dict[UpAxis, tuple[tuple[int, int, int], ...]] = {
     "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
 }
 """The turn that brings each axis up: about x for y and z, about y for x."""
-BLOCK_BYTES = 1 << 20
 
 
 def read_scan(path: Path | str, unit: ScanUnit | None, up: UpAxis | None = None) -> ReadScan:
@@ -88,7 +85,7 @@ def read_scan(path: Path | str, unit: ScanUnit | None, up: UpAxis | None = None)
         unit=unit,
         factor=factor,
         R_up=R_up,
-        sha256=_sha256(path),
+        sha256=sha256_of(path),
         declared=content.declared,
         notes=(*notes, *made),
     )
@@ -228,11 +225,3 @@ def _welded(mesh: Mesh) -> Mesh:
     """Merge equal positions, in the order of their first use."""
     first, kind = equal_rows(mesh.vertices)
     return Mesh(vertices=mesh.vertices[first], faces=kind[mesh.faces].astype(np.int32))
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(BLOCK_BYTES):
-            digest.update(block)
-    return digest.hexdigest()

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from realsim.arrays import Array, Int32, Int64, Mask
+from realsim.arrays import Array, Int32, Mask
 from realsim.errors import DegenerateError
 from realsim.models.inspect import (
     GIGANTIC_FACES,
@@ -306,7 +306,7 @@ def _merged_rows(mesh: Mesh, actions: list[str]) -> Mesh:
         columns.append(equal_rows(mesh.uv[numbers])[1])
     if mesh.colors is not None:
         columns += [mesh.colors[numbers, k].astype(np.int64) for k in range(3)]
-    first, kind = equal_rows(np.stack(columns, axis=-1)) if len(columns) > 1 else _firsts(kind)
+    first, kind = equal_rows(np.stack(columns, axis=-1))
     equal = len(numbers) - len(first)
     if unused:
         actions.append(f"dropped {counted(unused, 'vertex', 'vertices')} that no face used.")
@@ -326,10 +326,6 @@ def _merged_rows(mesh: Mesh, actions: list[str]) -> Mesh:
         uv=None if mesh.uv is None else mesh.uv[rows],
         colors=None if mesh.colors is None else mesh.colors[rows],
     )
-
-
-def _firsts(kind: Int64) -> tuple[Int64, Int64]:
-    return equal_rows(kind[:, None])
 
 
 def _reduced(mesh: Mesh, max_faces: int, actions: list[str]) -> Mesh:

@@ -30,7 +30,7 @@ from realsim.models.mesh_usd_materials import (
     triangles_of,
     vertex_colors_of,
 )
-from realsim.models.model_records import ScanUnit, UpAxis
+from realsim.models.model_records import METRES, ScanUnit, UpAxis
 
 USD_FORMATS = (".usd", ".usda", ".usdc", ".usdz")
 TEXT_FORMAT = ".usda"
@@ -54,12 +54,6 @@ except RealsimError as error:
 """
 ONE_THREAD = {"PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1"}
 """The stacks of a thread a core would count as memory."""
-UNITS: tuple[tuple[ScanUnit, float], ...] = (
-    ("m", 1.0),
-    ("cm", 0.01),
-    ("mm", 0.001),
-    ("inch", 0.0254),
-)
 UNIT_TOLERANCE = 1e-6
 """Relative difference at which metersPerUnit is one of the units: it is often a float32."""
 SHOWN_PURPOSES = ("default", "render")
@@ -210,7 +204,7 @@ def _stated(
         return declared, None, up
     metres = float(pxr.UsdGeom.GetStageMetersPerUnit(stage))
     declared["unit"] = f"metersPerUnit {metres:g}"
-    for unit, length in UNITS:
+    for unit, length in METRES.items():
         if abs(metres - length) <= UNIT_TOLERANCE * length:
             return declared, unit, up
     raise InputError(

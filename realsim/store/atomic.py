@@ -17,7 +17,7 @@ import os
 import shutil
 from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -76,6 +76,28 @@ def _make_folder(folder: Path) -> None:
     _make_folder(folder.parent)
     folder.mkdir(exist_ok=True)
     sync_folder(folder.parent)
+
+
+@contextlib.contextmanager
+def replacing(path: Path, *, flush: bool) -> Generator[IO[bytes]]:
+    """Open a file that is written piece by piece; it gets its name when it is whole.
+
+    Args:
+        path: the file; its folder is made as needed.
+        flush: whether its bytes are on the disk before (see `write_bytes`).
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unnamed = temporary(path)
+    try:
+        with unnamed.open("wb") as file:
+            yield file
+            if flush:
+                file.flush()
+                os.fsync(file.fileno())
+        os.replace(unnamed, path)
+    except BaseException:
+        unnamed.unlink(missing_ok=True)
+        raise
 
 
 def write_bytes(

@@ -2,6 +2,7 @@
 
 import platform
 import shlex
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -39,7 +40,7 @@ def new_header(session: CaptureSession, extra: dict[str, Any]) -> dict[str, Any]
         "camera": to_json(session.intrinsics),
         "depth_unit_m": session.depth_unit_m,
         "T_world_cam": {},
-        "versions": _versions(),
+        "versions": {"python": platform.python_version()} | versions_of(VERSIONS_OF),
         "extra": extra,
     }
 
@@ -100,9 +101,10 @@ def _read(path: Path) -> dict[str, Any]:
     return {str(key): item for key, item in header.items()}  # pyright: ignore[reportUnknownVariableType]
 
 
-def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version()}
-    for name in VERSIONS_OF:
+def versions_of(names: Iterable[str]) -> dict[str, str]:
+    """Return the versions of installed packages."""
+    versions: dict[str, str] = {}
+    for name in names:
         try:
             versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

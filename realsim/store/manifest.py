@@ -81,6 +81,14 @@ def entry_from(line: str) -> Entry:
     return entry
 
 
+def take(entries: dict[str, Entry], entry: Entry) -> None:
+    """Put the entry of a line into those of the lines before it; some lines remove one."""
+    if entry.bytes == REMOVED:
+        entries.pop(entry.path, None)
+    else:
+        entries[entry.path] = entry
+
+
 def fault_of(folder: Path, entry: Entry) -> Fault | None:
     """Return what is wrong with a listed file; None if it has the bytes that were written."""
     file = folder / entry.path
@@ -122,21 +130,14 @@ class Manifest:
         atomic.repair_lines(self._file)
         self._entries: dict[str, Entry] = {}
         for number, line in enumerate(atomic.complete_lines(self._file), start=1):
-            entry = self._parsed(line, number)
-            if entry.bytes == REMOVED:
-                self._entries.pop(entry.path, None)
-            else:
-                self._entries[entry.path] = entry
-
-    def _parsed(self, line: str, number: int) -> Entry:
-        try:
-            return entry_from(line)
-        except ValueError as error:
-            raise InputError(
-                f"{self._file}, line {number} {error}. "
-                "`realsim check --repair` on the session takes the line out; its file is then "
-                "listed anew."
-            ) from error
+            try:
+                take(self._entries, entry_from(line))
+            except ValueError as error:
+                raise InputError(
+                    f"{self._file}, line {number} {error}. "
+                    "`realsim check --repair` on the session takes the line out; its file is then "
+                    "listed anew."
+                ) from error
 
     @property
     def entries(self) -> dict[str, Entry]:
@@ -168,12 +169,13 @@ class Manifest:
         self.forget(path)
         (self._folder / path).unlink(missing_ok=True)
 
-    def forget(self, path: str) -> None:
-        """Take a path off the list; the file stays."""
-        if path in self._entries:
-            gone = Entry(path=path, sha256="", bytes=REMOVED)
-            atomic.append_line(self._file, line_of(gone))
-            del self._entries[path]
+    def forget(self, *paths: str) -> None:
+        """Take paths off the list; the files stay."""
+        gone = [Entry(path=p, sha256="", bytes=REMOVED) for p in paths if p in self._entries]
+        if gone:
+            atomic.append_line(self._file, "\n".join(line_of(e) for e in gone))
+            for entry in gone:
+                del self._entries[entry.path]
 
     def write(self, path: str, data: bytes) -> None:
         """Write a file whole or not at all, and list it."""
@@ -187,11 +189,7 @@ class Manifest:
         system, so that a power cut may leave some that `verify` then names. Files that are replaced
         leave the list first: after a kill in between they are unlisted, not listed wrongly.
         """
-        old = [Entry(path=p, sha256="", bytes=REMOVED) for p in files if p in self._entries]
-        if old:
-            atomic.append_line(self._file, "\n".join(line_of(e) for e in old))
-            for entry in old:
-                del self._entries[entry.path]
+        self.forget(*files)
         for path, data in files.items():
             atomic.write_bytes(self._folder / path, data, flush=False)
         self.add([entry_of(path, data) for path, data in files.items()])

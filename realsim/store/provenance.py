@@ -16,11 +16,11 @@ import socket
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from realsim.store import atomic
+from realsim.store.header import versions_of
 from realsim.store.manifest import Manifest
 from realsim.store.session_store import SessionStore
 from realsim.untrusted.own_json import read_own, to_json
@@ -80,14 +80,8 @@ class Run:
 
 def versions(names: Iterable[str] = LIBRARIES) -> dict[str, str]:
     """Return the versions of distributions, of Python, and the platform; for every result alike."""
-    found: dict[str, str] = {}
-    for name in names:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
     machine = f"{platform.system()} {platform.machine()}"
-    return found | {"python": platform.python_version(), "platform": machine}
+    return versions_of(names) | {"python": platform.python_version(), "platform": machine}
 
 
 def plain_request(request: Any) -> tuple[dict[str, Any], dict[str, str]]:

@@ -164,18 +164,24 @@ def save_grasps(store_or_folder: SessionStore | Path | str, grasps: GraspSet) ->
     arrays["failures"] = np.array(grasps.failures, dtype=np.str_).reshape(len(grasps))
     stem = grasp_stem(grasps)
     # The npz comes last: a set whose npz is there is complete.
-    parts = {
-        f"{stem}.json": atomic.json_bytes(grasps_to_json(grasps)),
-        f"{stem}.npz": atomic.npz_bytes(**arrays),
-    }
-    in_store = isinstance(store_or_folder, SessionStore)
-    folder = store_or_folder.folder / GRASP_FOLDER if in_store else Path(store_or_folder)
-    for name, data in parts.items():
-        if isinstance(store_or_folder, SessionStore):
-            store_or_folder.write_bytes(f"{GRASP_FOLDER}/{name}", data)
-        else:
-            atomic.write_bytes(folder / name, data)
-    return folder / f"{stem}.npz"
+    write_beside_grasps(store_or_folder, f"{stem}.json", atomic.json_bytes(grasps_to_json(grasps)))
+    return write_beside_grasps(store_or_folder, f"{stem}.npz", atomic.npz_bytes(**arrays))
+
+
+def write_beside_grasps(place: SessionStore | Path | str, name: str, data: bytes) -> Path:
+    """Write a file into a session's folder grasps/, or into the folder itself; return its path."""
+    if isinstance(place, SessionStore):
+        place.write_bytes(f"{GRASP_FOLDER}/{name}", data)
+        return place.folder / GRASP_FOLDER / name
+    path = Path(place) / name
+    atomic.write_bytes(path, data)
+    return path
+
+
+def grasp_folder(place: SessionStore | Path | str) -> Path:
+    """Return the folder in which the grasps of a session, or of a folder, are looked for."""
+    folder = place.folder if isinstance(place, SessionStore) else Path(place)
+    return folder / GRASP_FOLDER if (folder / GRASP_FOLDER).is_dir() else folder
 
 
 def load_grasps(folder: SessionStore | Path | str) -> list[GraspSet]:
@@ -184,10 +190,7 @@ def load_grasps(folder: SessionStore | Path | str) -> list[GraspSet]:
     Raises:
         InputError: a file is broken, or of a newer format.
     """
-    path = folder.folder if isinstance(folder, SessionStore) else Path(folder)
-    if (path / GRASP_FOLDER).is_dir():
-        path = path / GRASP_FOLDER
-    return [_load_grasp_set(file) for file in sorted(path.glob("*_obj*.npz"))]
+    return [_load_grasp_set(file) for file in sorted(grasp_folder(folder).glob("*_obj*.npz"))]
 
 
 def _load_grasp_set(file: Path) -> GraspSet:

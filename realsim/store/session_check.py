@@ -18,7 +18,7 @@ from realsim.store import atomic
 from realsim.store.check_report import CheckReport, Kind, Lists, SessionFinding
 from realsim.store.header import SESSION_FILE, checked_header
 from realsim.store.manifest import NAME as MANIFEST_FILE
-from realsim.store.manifest import REMOVED, Entry, entry_from, entry_of, fault_of
+from realsim.store.manifest import entry_from, entry_of, fault_of, take
 from realsim.store.opening import CAMERA_FILE, ROBOT_FILE
 from realsim.store.robot_lines import record_of
 from realsim.store.session_notes import (
@@ -127,7 +127,7 @@ def read_lists(folder: Path) -> Lists:
         for number, line in enumerate(atomic.complete_lines(path), start=1):
             try:
                 if name == MANIFEST_FILE:
-                    _take_entry(lists.entries, entry_from(line))
+                    take(lists.entries, entry_from(line))
                 else:
                     record = record_of(line)
                     from_json(record, View, "a view")
@@ -152,13 +152,6 @@ def read_lists(folder: Path) -> Lists:
                 found += f": the checksum of {tail[1]} is lost"
             lists.findings.append(SessionFinding(path=name, kind="torn", found=found))
     return lists
-
-
-def _take_entry(entries: dict[str, Entry], entry: Entry) -> None:
-    if entry.bytes == REMOVED:
-        entries.pop(entry.path, None)
-    else:
-        entries[entry.path] = entry
 
 
 def _camera_of(folder: Path, findings: list[SessionFinding]) -> CameraIntrinsics | None:
@@ -227,9 +220,7 @@ def _sound_views(
             for k in known:
                 old = lists.findings[k]
                 whole = whole and not old.is_damage
-                lists.findings[k] = SessionFinding(
-                    path=path, kind=old.kind, found=old.found, view=index
-                )
+                lists.findings[k] = replace(old, view=index)
             if known:
                 continue
             fault = None

@@ -14,7 +14,7 @@ from realsim.errors import InputError
 from realsim.records import GraspSet
 from realsim.records.trajectories import PHASES, GraspTrajectories
 from realsim.store import atomic
-from realsim.store.results import GRASP_FOLDER, grasp_stem
+from realsim.store.results import grasp_folder, grasp_stem, write_beside_grasps
 from realsim.store.session_store import SessionStore
 from realsim.untrusted.arrays import read_npz
 
@@ -48,13 +48,7 @@ def save_trajectories(
         phases=np.array(PHASES),
         **arrays,
     )
-    name = f"{TRAJECTORY_FOLDER}/{grasp_stem(grasps)}.npz"
-    if isinstance(store_or_folder, SessionStore):
-        store_or_folder.write_bytes(f"{GRASP_FOLDER}/{name}", data)
-        return store_or_folder.folder / GRASP_FOLDER / name
-    path = Path(store_or_folder) / name
-    atomic.write_bytes(path, data)
-    return path
+    return write_beside_grasps(store_or_folder, _file_of(grasps), data)
 
 
 def load_trajectories(
@@ -65,11 +59,7 @@ def load_trajectories(
     Raises:
         InputError: the file is broken, of a newer format, or belongs to other grasps.
     """
-    is_store = isinstance(store_or_folder, SessionStore)
-    folder = store_or_folder.folder if is_store else Path(store_or_folder)
-    if (folder / GRASP_FOLDER).is_dir():
-        folder = folder / GRASP_FOLDER
-    path = folder / TRAJECTORY_FOLDER / f"{grasp_stem(grasps)}.npz"
+    path = grasp_folder(store_or_folder) / _file_of(grasps)
     if not path.is_file():
         return None
     try:
@@ -98,6 +88,10 @@ def load_trajectories(
         raise InputError(
             f"{path}: {error} Delete it, and run the school again for this object."
         ) from error
+
+
+def _file_of(grasps: GraspSet) -> str:
+    return f"{TRAJECTORY_FOLDER}/{grasp_stem(grasps)}.npz"
 
 
 def _identity(grasps: GraspSet) -> str:

@@ -10,7 +10,8 @@ from realsim.geometry.mesh import mass_properties, ply_bytes, sample_surface, sa
 from realsim.geometry.parts import part
 from realsim.models.inspect import inspect_mesh
 from realsim.models.mesh_atlas import Piece, one_mesh, transformed_uv
-from realsim.models.reading import METRES, ROTATIONS, read_scan
+from realsim.models.model_records import METRES
+from realsim.models.reading import ROTATIONS, read_scan
 from realsim.models.simplify import colors_at, deviation
 from realsim.records import Mesh
 from refusals import refused

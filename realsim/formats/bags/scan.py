@@ -5,7 +5,7 @@ The first decodes no image, only their headers; the second has bounded memory.
 
 from array import array
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -251,13 +251,10 @@ class StoredImages:
     def at(self, which: ArrayLike) -> "StoredImages":
         """Return the images with these numbers, or where a mask is true."""
         index = np.asarray(which)
-        return StoredImages(
-            topic=self.topic,
-            compressed=self.compressed,
-            stamp_ns=self.stamp_ns[index],
-            header_ns=self.header_ns[index],
+        return replace(
+            self, stamp_ns=self.stamp_ns[index], header_ns=self.header_ns[index],
             receive_ns=self.receive_ns[index],
-        )
+        )  # fmt: skip
 
     def key(self, n: int) -> "Key":
         """Return what finds image n again."""
@@ -314,11 +311,7 @@ class Messages:
                 size -= len(pending.pop(farthest))
                 gone.add(farthest)
         if following < end:
-            topic, receive_ns, _ = self._streams[0].key(following)
-            raise InputError(
-                f"{self._recording.path}: an image of {topic} recorded at "
-                f"{receive_ns / NS_PER_S:.6f} s is not there any more. Was the file changed?"
-            )
+            raise self._lost("an", self._streams[0].key(following))
 
     def one(self, stream: int, n: int) -> ImageMessage:
         """Return the image of frame n of a stream, fetched on its own.
@@ -326,13 +319,17 @@ class Messages:
         Raises:
             InputError: it is not there any more.
         """
-        topic, receive_ns, header_ns = self._streams[stream].key(n)
+        key = topic, receive_ns, header_ns = self._streams[stream].key(n)
         is_ros2 = self._recording.is_ros2
         for _, _, data in self._recording.messages([topic], receive_ns, receive_ns + 1):
             if header_of(data, is_ros2).stamp_ns == header_ns:
                 return self._image(stream, data)
-        raise InputError(
-            f"{self._recording.path}: the image of {topic} recorded at "
+        raise self._lost("the", key)
+
+    def _lost(self, article: str, key: Key) -> InputError:
+        topic, receive_ns, _ = key
+        return InputError(
+            f"{self._recording.path}: {article} image of {topic} recorded at "
             f"{receive_ns / NS_PER_S:.6f} s is not there any more. Was the file changed?"
         )
 

@@ -16,7 +16,7 @@ stage), one entry a grasp in the same order.
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -26,7 +26,12 @@ from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.formats.graspnet.cameras import npy_bytes
 from realsim.formats.graspnet.gripper_frame import HEIGHT_M, grasp_poses, graspnet_poses
-from realsim.formats.grasps.scene_grasps import executed, measures_of_json, untried_set
+from realsim.formats.grasps.scene_grasps import (
+    executed,
+    measures_of_json,
+    stored_values,
+    untried_set,
+)
 from realsim.geometry import se3
 from realsim.records import GraspSet
 from realsim.records.checked_arrays import frozen
@@ -92,27 +97,20 @@ class GraspGroup:
         """Return the number of grasps."""
         return len(self.scores)
 
-    def moved(self, T_b_a: Array) -> "GraspGroup":
-        """Return the grasps in another frame."""
-        return replace(self, Ts_a_grasp=se3.check_rigid(T_b_a, "T_b_a") @ self.Ts_a_grasp)
-
-    def of_object(
-        self, obj_id: int, T_a_obj: Array, instance: int = 0, *, from_labels: bool = False
-    ) -> GraspSet:
+    def of_object(self, obj_id: int, T_a_obj: Array, instance: int = 0) -> GraspSet:
         """Return the grasps of one object as a set that our physics has not tried.
 
         Args:
             obj_id: realsim's id.
             T_a_obj: (4, 4) where the object is in the group's frame [m].
             instance: of the object.
-            from_labels: whether the scores are 1.1 - friction; else they are a network's.
         """
         of = self.obj_ids == obj_id
         if "instance" in self.known:
             of &= self.known["instance"] == instance
         rows = np.flatnonzero(of)
         T_obj_a = se3.invert(se3.check_rigid(T_a_obj, "the object's pose"))
-        grasps = untried_set(
+        return untried_set(
             T_obj_a @ self.Ts_a_grasp[rows],
             obj_id=obj_id,
             instance=instance,
@@ -124,10 +122,6 @@ class GraspGroup:
             measures={name: self.known[name][rows] for name in MEASURES if name in self.known},
             widths_m=self.known["width_m"][rows] if "width_m" in self.known else None,
         )
-        if not from_labels:
-            return grasps
-        friction = MOST_FRICTION - self.scores[rows]
-        return replace(grasps, measures=grasps.measures | {"closure_friction": friction})
 
 
 def grasp_group(
@@ -195,7 +189,7 @@ def _group_of(grasps: GraspSet, Ts_a_obj: Mapping[int, Array], scores: Scores) -
         )
     value = _value(grasps, scores)
     rows = np.flatnonzero(~np.isnan(value))
-    openings = _stored(grasps, "openings_m", grasps.widths_m)[rows]
+    openings = stored_values(grasps, "openings_m", grasps.widths_m)[rows]
     if np.any(np.isnan(openings)):
         raise InputError(
             f"grasps of instance {grasps.instance} have neither a width nor an opening; a "
@@ -206,7 +200,7 @@ def _group_of(grasps: GraspSet, Ts_a_obj: Mapping[int, Array], scores: Scores) -
         scores=value[rows],
         openings_m=openings,
         heights_m=np.full(len(rows), HEIGHT_M),
-        depths_m=_stored(grasps, "depths_m", np.full(len(grasps), DEPTH_M))[rows],
+        depths_m=stored_values(grasps, "depths_m", np.full(len(grasps), DEPTH_M))[rows],
         obj_ids=np.full(len(rows), grasps.obj_id, dtype=np.int64),
         known={
             "instance": np.full(len(rows), float(grasps.instance)), "row": rows.astype(np.float64),
@@ -214,14 +208,6 @@ def _group_of(grasps: GraspSet, Ts_a_obj: Mapping[int, Array], scores: Scores) -
             "width_m": grasps.widths_m[rows],
         },
     )  # fmt: skip
-
-
-def _stored(grasps: GraspSet, name: str, other: Array) -> Array:
-    """Return a number a grasp out of a set's parameters, else the other (N,)."""
-    stored = grasps.parameters.get(name)
-    if isinstance(stored, list) and np.shape(stored) == (len(grasps),):  # pyright: ignore[reportUnknownArgumentType]
-        return np.array(stored, dtype=np.float64)
-    return other
 
 
 # --- files ------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ What a header claims is compared with what the archive says it has, before anyth
 plain numbers in C order are read, never a pickle.
 """
 
-import os
 import struct
 import tokenize
 import zipfile
@@ -169,21 +168,11 @@ def write_blocks(
         StorageError: the disk is full, or refuses.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}{atomic.TEMPORARY_SUFFIX}")
-    with atomic.storing(path.parent, path.name):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with temporary.open("wb") as file:
-                # Level 1: the arrays are nearly all zeros, higher levels only take longer.
-                with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-                    for name, (shape, dtype, blocks) in arrays.items():
-                        _write_array(archive, name, shape, np.dtype(dtype), blocks)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+    with atomic.storing(path.parent, path.name), atomic.replacing(path, flush=True) as file:
+        # Level 1: the arrays are nearly all zeros, higher levels only take longer.
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+            for name, (shape, dtype, blocks) in arrays.items():
+                _write_array(archive, name, shape, np.dtype(dtype), blocks)
     return path
 
 

@@ -35,7 +35,7 @@ from realsim import interop
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.formats.grasps.hand_frames import hand_of_set, hand_poses
-from realsim.formats.grasps.scene_grasps import check_values, labelled, measures_json
+from realsim.formats.grasps.scene_grasps import check_values, labelled, measures_json, stored_values
 from realsim.records import GraspSet
 from realsim.robots.hand import Hand
 from realsim.store import atomic
@@ -71,7 +71,9 @@ def write_isaac_grasp(
     ours |= measures_json(grasps, rows)
     hand = hand_of_set(grasps)
     Ts = hand_poses(grasps.Ts_obj_grasp[rows], "panda_hand", hand)
-    widths, openings = grasps.widths_m[rows], _openings(grasps, hand)[rows]
+    widths = grasps.widths_m[rows]
+    widest = np.full(len(grasps), hand.max_opening_m)
+    openings = stored_values(grasps, "openings_m", widest)[rows]
     _require_fits(widths, hand)
     _require_fits(openings, hand)
     closed, opened = _joint(hand, widths), _joint(hand, openings)
@@ -98,14 +100,6 @@ def write_isaac_grasp(
     path = Path(path)
     atomic.write_text(path, "\n".join(lines) + "\n")
     return path
-
-
-def _openings(grasps: GraspSet, hand: Hand) -> Array:
-    """Return the distance of the fingers (N,) before they close [m]."""
-    stored = grasps.parameters.get("openings_m")
-    if isinstance(stored, list) and np.shape(stored) == (len(grasps),):  # pyright: ignore[reportUnknownArgumentType]
-        return np.array(stored, dtype=np.float64)
-    return np.full(len(grasps), hand.max_opening_m)
 
 
 def _joint(hand: Hand, openings_m: Array) -> Array:

@@ -176,6 +176,14 @@ def measures_of_json(told: Any, n: int, where: str) -> dict[str, Array]:
     return found
 
 
+def stored_values(grasps: GraspSet, name: str, other: Array) -> Array:
+    """Return a number a grasp out of a set's parameters, else the other (N,)."""
+    stored = grasps.parameters.get(name)
+    if isinstance(stored, list) and np.shape(stored) == (len(grasps),):  # pyright: ignore[reportUnknownArgumentType]
+        return np.array(stored, dtype=np.float64)
+    return other
+
+
 def executed(grasps: GraspSet) -> Mask:
     """Return (N,) which grasps physics has tried: the first stage was executed."""
     return ~np.isnan(grasps.slip_m[:, 0])
