@@ -39,9 +39,6 @@ class GraspnetScene:
     scene: Scene
     """World is the table's frame, z up."""
     models: dict[int, ObjectModel]
-    camera: str
-    view: int
-    """The image whose annotations were used."""
     notes: tuple[str, ...]
 
 
@@ -50,59 +47,48 @@ def cameras_of(folder: Path) -> list[str]:
     return [c for c in CAMERAS if (folder / c / POSES).is_file()]
 
 
-def read_graspnet_scene(
-    folder: Path | str,
-    models: Path | str | None = None,
-    *,
-    camera: str | None = None,
-    view: int = 0,
-) -> GraspnetScene:
-    """Read one scene.
+def read_graspnet_scene(folder: Path | str, models: Path | str | None = None) -> GraspnetScene:
+    """Read one scene, its objects as image 0 is annotated.
 
     Args:
-        folder: scene_0000, or the folder of one of its cameras.
+        folder: scene_0000 (of its cameras realsense is read where it is there), or the folder of
+            one of its cameras.
         models: folder of the models; None = 'models' beside 'scenes', as the dataset has it.
-        camera: 'realsense' or 'kinect'; None = realsense where it is there.
-        view: number of the image whose annotations are used.
 
     Raises:
         InputError: a file is missing, damaged, or of another scene.
         NotRigidError: a matrix that is no rigid transform.
     """
-    folder = Path(folder)
-    if folder.name in CAMERAS and (folder / POSES).is_file():
-        folder, camera = folder.parent, folder.name
-    there = cameras_of(folder)
-    if not there or (camera is not None and camera not in there):
-        raise InputError(
-            f"{folder} has no {camera or ' or '.join(CAMERAS)}/{POSES}; a scene of "
-            f"GraspNet-1Billion is expected (cameras found: {', '.join(there) or 'none'})."
-        )
-    camera = camera or there[0]
-    root = folder / camera
+    root = Path(folder)
+    if root.name not in CAMERAS or not (root / POSES).is_file():
+        there = cameras_of(root)
+        if not there:
+            raise InputError(
+                f"{folder} has no {' or '.join(CAMERAS)}/{POSES}; a scene of GraspNet-1Billion is "
+                "expected (cameras found: none)."
+            )
+        root = root / there[0]
     Ts_table_cam = read_camera_poses(root)
     files = _annotation_files(root)
-    if view not in files or view >= len(Ts_table_cam):
+    if 0 not in files:
         raise InputError(
-            f"{root / ANNOTATIONS} has no annotation of image {view} with a camera pose; there are "
+            f"{root / ANNOTATIONS} has no annotation of image 0 with a camera pose; there are "
             f"{len(files)} annotations and {len(Ts_table_cam)} poses."
         )
-    Ts = _objects_on_table(files[view], Ts_table_cam[view])
-    models_folder = Path(models) if models is not None else folder.parent.parent / "models"
-    loaded, notes = _load_models(models_folder, Ts)
-    notes += _disagreements(files, Ts_table_cam, Ts, view)
+    Ts = _objects_on_table(files[0], Ts_table_cam[0])
+    folder = Path(models) if models is not None else root.parent.parent.parent / "models"
+    notes = ["ids are GraspNet's object numbers + 1; names are its numbers."]
+    loaded = load_models(folder, list(Ts), notes)
+    require_meshes([i + 1 for i in Ts], loaded, str(folder))
+    notes += _disagreements(files, Ts_table_cam, Ts)
     notes.append(_heights(loaded, Ts))
     objects = tuple(
         ObjectPose(obj_id=i + 1, instance=k, T_world_obj=T) for k, (i, T) in enumerate(Ts.items())
     )
     plane = SupportPlane(T_world_table=np.eye(4))
-    return GraspnetScene(
-        scene=Scene(name=f"{folder.name} {camera}", objects=objects, plane=plane),
-        models=loaded,
-        camera=camera,
-        view=view,
-        notes=tuple(notes),
-    )
+    name = f"{root.parent.name} {root.name}"
+    scene = Scene(name=name, objects=objects, plane=plane)
+    return GraspnetScene(scene=scene, models=loaded, notes=tuple(notes))
 
 
 def _annotation_files(root: Path) -> dict[int, Path]:
@@ -133,18 +119,9 @@ def read_annotation(path: Path) -> dict[int, Array]:
     return found
 
 
-def _load_models(folder: Path, Ts: dict[int, Array]) -> tuple[dict[int, ObjectModel], list[str]]:
-    notes = ["ids are GraspNet's object numbers + 1; names are its numbers."]
-    models = load_models(folder, list(Ts), notes)
-    require_meshes([i + 1 for i in Ts], models, str(folder))
-    return models, notes
-
-
-def _disagreements(
-    files: dict[int, Path], Ts_table_cam: Array, Ts: dict[int, Array], view: int
-) -> list[str]:
+def _disagreements(files: dict[int, Path], Ts_table_cam: Array, Ts: dict[int, Array]) -> list[str]:
     """Compare with other images' annotations: the objects stand still."""
-    others = [i for i in files if i != view and i < len(Ts_table_cam)]
+    others = [i for i in files if 0 < i < len(Ts_table_cam)]
     others = others[:: max(1, len(others) // CHECKED_VIEWS)][:CHECKED_VIEWS]
     worst, name, at = 0.0, -1, -1
     for i in others:
@@ -157,7 +134,7 @@ def _disagreements(
         return []
     return [
         f"object {name:03d} lies {1e3 * worst:.1f} mm elsewhere by the annotation of image {at}: "
-        f"that of image {view} was used."
+        "that of image 0 was used."
     ]
 
 
