@@ -102,7 +102,7 @@ def read_npz(
 
 def _array(file: IO[bytes], size: int, where: str, texts: bool = False) -> NDArray[Any]:
     """Return the array of an open file of `size` bytes."""
-    shape, fortran, dtype = _header(file, where, texts)
+    shape, fortran, dtype = read_header(file, where, texts)
     count = math.prod(shape)
     expected = count * dtype.itemsize
     left = size - file.tell()
@@ -129,8 +129,8 @@ def _array(file: IO[bytes], size: int, where: str, texts: bool = False) -> NDArr
     return native.reshape(shape, order="F" if fortran else "C")
 
 
-def _header(
-    file: IO[bytes], where: str, texts: bool
+def read_header(
+    file: IO[bytes], where: str, texts: bool = False
 ) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Return shape, order and type of the array.
 

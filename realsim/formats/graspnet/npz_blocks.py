@@ -4,8 +4,8 @@ What a header claims is compared with what the archive says it has, before anyth
 plain numbers in C order are read, never a pickle.
 """
 
+import math
 import struct
-import tokenize
 import zipfile
 import zlib
 from collections.abc import Generator, Iterator, Mapping
@@ -19,32 +19,18 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.store import atomic
+from realsim.untrusted.arrays import read_header
 from realsim.untrusted.zip_members import opened_zip
 
 _DAMAGE = (
     OSError, EOFError, ValueError, RuntimeError, KeyError, TypeError, IndexError, OverflowError,
-    SyntaxError, MemoryError, struct.error, zlib.error, zipfile.BadZipFile, tokenize.TokenError,
+    MemoryError, struct.error, zlib.error, zipfile.BadZipFile,
 )  # fmt: skip
-"""What zipfile, zlib and numpy's header reader raise on damaged files."""
+"""What zipfile and zlib raise on damaged files."""
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Written as every member's time, so that the same arrays are the same bytes."""
 MOST_BYTES = 4e9
 """Largest archive [bytes, packed]; it is never in memory as a whole."""
-MOST_HEADER_BYTES = 4096
-
-
-@contextmanager
-def _named(path: Path) -> Generator[None]:
-    """Turn what damaged archives raise into an InputError that names the file."""
-    try:
-        yield
-    except InputError:
-        raise
-    except _DAMAGE as error:
-        raise InputError(
-            f"{path} is no npz archive of plain arrays, or is damaged "
-            f"({type(error).__name__}: {str(error)[:120]})."
-        ) from error
 
 
 class NpzArray:
@@ -70,18 +56,16 @@ class NpzArray:
             )
         info = archive.getinfo(f"{name}.npy")
         self._file: IO[bytes] = archive.open(info)
-        shape, fortran, dtype = _header(self._file)
-        self.shape: tuple[int, ...] = tuple(int(n) for n in shape)
+        shape, fortran, dtype = read_header(self._file, f"'{name}' of {path}")
+        self.shape: tuple[int, ...] = shape
         self.dtype: np.dtype[Any] = dtype
         if dtype.kind not in kinds or dtype.itemsize > 8 or (fortran and len(self.shape) > 1):
             raise InputError(
                 f"{path}: '{name}' is of type {dtype.str}{' in column order' if fortran else ''}; "
                 f"plain numbers of kind {' or '.join(kinds)} in row order are expected."
             )
-        size, there = int(dtype.itemsize), info.file_size - self._file.tell()
-        for n in self.shape:
-            size *= n
-        if size != there or min(self.shape, default=0) < 0:
+        size, there = dtype.itemsize * math.prod(shape), info.file_size - self._file.tell()
+        if size != there:
             raise InputError(
                 f"{path}: '{name}' claims the shape {self.shape} of {dtype.str}, {size} bytes, and "
                 f"the archive has {there}."
@@ -125,24 +109,6 @@ class NpzArray:
             raise InputError(f"{self._path}: '{self.name}' has more bytes than its header says.")
 
 
-def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return shape, order and type of an array; a header that claims gigabytes is not read.
-
-    Raises:
-        ValueError: it is none.
-    """
-    version = npy.read_magic(file)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"npy version {version}")
-    at = file.tell()
-    length = int.from_bytes(file.read(2 * version[0]), "little")
-    if length > MOST_HEADER_BYTES:
-        raise ValueError(f"an npy header of {length} bytes")
-    file.seek(at)
-    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    return read(file, max_header_size=MOST_HEADER_BYTES)
-
-
 @contextmanager
 def opened(path: Path | str) -> Generator[zipfile.ZipFile]:
     """Open an npz archive.
@@ -151,8 +117,16 @@ def opened(path: Path | str) -> Generator[zipfile.ZipFile]:
         InputError: it does not exist, or is damaged where it is read.
     """
     path = Path(path)
-    with opened_zip(path, MOST_BYTES) as (archive, _), _named(path):
-        yield archive
+    with opened_zip(path, MOST_BYTES) as (archive, _):
+        try:
+            yield archive
+        except InputError:
+            raise
+        except _DAMAGE as error:
+            raise InputError(
+                f"{path} is no npz archive of plain arrays, or is damaged "
+                f"({type(error).__name__}: {str(error)[:120]})."
+            ) from error
 
 
 def write_blocks(

@@ -156,15 +156,12 @@ def data_bytes(
 def episodes_bytes(rows: Sequence[Mapping[str, Any]]) -> bytes:
     """Return the table of episodes: whole numbers, times, words and nested lists of numbers."""
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     columns = {
         key: pa.array([row[key] for row in rows], type=_kind(value))
         for key, value in rows[0].items()
     }
-    out = io.BytesIO()
-    pq.write_table(pa.table(columns), out, compression=COMPRESSION)
-    return out.getvalue()
+    return _parquet(pa.table(columns))
 
 
 def _kind(value: Any) -> Any:
@@ -181,7 +178,6 @@ def _kind(value: Any) -> Any:
 def tasks_bytes(tasks: Sequence[str]) -> bytes:
     """Return the table of tasks, as pandas writes a frame whose index is the task in words."""
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     column = {"field_name": "task_index", "metadata": None, "name": "task_index",
               "numpy_type": "int64", "pandas_type": "int64"}  # fmt: skip
@@ -198,7 +194,13 @@ def tasks_bytes(tasks: Sequence[str]) -> bytes:
     }
     table = pa.table(
         {"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(list(tasks))}
-    ).replace_schema_metadata({"pandas": json.dumps(pandas)})
+    )
+    return _parquet(table.replace_schema_metadata({"pandas": json.dumps(pandas)}))
+
+
+def _parquet(table: Any) -> bytes:
+    import pyarrow.parquet as pq
+
     out = io.BytesIO()
     pq.write_table(table, out, compression=COMPRESSION)
     return out.getvalue()
