@@ -1,7 +1,7 @@
 """What a hand-eye calibration says of itself: the estimate, every view, every check."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -10,18 +10,10 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check, HandEye, RobotErrorMap, Target
 from realsim.records.calibration import worst_sigmas
-from realsim.records.checked_arrays import frozen
+from realsim.records.checked_arrays import freeze
 from realsim.untrusted.own_json import Real
 
 Mode = Literal["eye_in_hand", "eye_to_hand"]
-
-
-def _freeze(record: Any, **shapes: tuple[int | None, ...]) -> None:
-    """Check and freeze the arrays of a record that are there."""
-    for name, shape in shapes.items():
-        value = getattr(record, name)
-        if value is not None:
-            object.__setattr__(record, name, frozen(value, np.float64, shape, name))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -100,7 +92,7 @@ class ViewReport:
         """Check that all points are there; freeze the arrays."""
         for name in ("uv", "residuals"):
             object.__setattr__(self, name, np.reshape(getattr(self, name), (-1, 2)))
-        _freeze(self, T_base_ee=(4, 4), joints=(None,), uv=(len(self.point_ids), 2),
+        freeze(self, T_base_ee=(4, 4), joints=(None,), uv=(len(self.point_ids), 2),
                 robot_error=(6,))  # fmt: skip
 
 
@@ -227,7 +219,7 @@ class HandEyeReport:
 
     def __post_init__(self) -> None:
         """Check the arrays' shapes and freeze them."""
-        _freeze(self, X=(4, 4), Z=(4, 4), X_alone=(4, 4), Z_alone=(4, 4), X_covariance=(6, 6),
+        freeze(self, X=(4, 4), Z=(4, 4), X_alone=(4, 4), Z_alone=(4, 4), X_covariance=(6, 6),
                 X_alone_covariance=(6, 6), intrinsics_covariance=(12, 12), joint_offsets=(None, 2),
                 X_here=(4, 4), X_here_covariance=(6, 6), X_alone_here_covariance=(6, 6),
                 T_points_board=(4, 4), information=(None, None))  # fmt: skip

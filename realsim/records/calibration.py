@@ -11,7 +11,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim.records.capture import CameraIntrinsics
-from realsim.records.checked_arrays import frozen, rigid
+from realsim.records.checked_arrays import freeze, rigid
 from realsim.untrusted.own_json import Real, Tagged
 
 MAP_FEATURES = 12
@@ -70,12 +70,8 @@ class RobotErrorMap(RobotMap):
 
     def __post_init__(self) -> None:
         """Freeze the arrays."""
-        for name, shape in (
-            ("mean", (MAP_FEATURES,)),
-            ("weights", (6, MAP_FEATURES)),
-            ("reach", (None, MAP_FEATURES)),
-        ):
-            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, shape, name))
+        n = MAP_FEATURES
+        freeze(self, mean=(n,), weights=(6, n), reach=(None, n))
 
     def features(self, T: ArrayLike) -> Array:
         """Return phi (..., 12) of robot poses (..., 4, 4)."""
@@ -125,9 +121,8 @@ class ArmErrorMap(RobotMap):
 
     def __post_init__(self) -> None:
         """Freeze the arrays, and keep of an arm its numbers alone."""
-        size = 4 * self.arm.joints
         object.__setattr__(self, "arm", self.arm.bare())
-        object.__setattr__(self, "errors", frozen(self.errors, np.float64, (size,), "errors"))
+        freeze(self, errors=(4 * self.arm.joints,))
         object.__setattr__(self, "T_flange_tool", rigid(self.T_flange_tool, "T_flange_tool"))
 
     def corrected(self, T: ArrayLike, joints: ArrayLike) -> Array:
@@ -184,16 +179,8 @@ class HandEye:
         """Check that the poses are rigid and freeze the arrays."""
         object.__setattr__(self, "T_ee_cam", rigid(self.T_ee_cam, "T_ee_cam"))
         object.__setattr__(self, "T_base_board", rigid(self.T_base_board, "T_base_board"))
-        for name, shape in (
-            ("covariance", (6, 6)),
-            ("intrinsics_sd", (12,)),
-            ("view_rms_px", (None,)),
-        ):
-            value = frozen(getattr(self, name), np.float64, shape, name)
-            object.__setattr__(self, name, value)
-        if self.here_covariance is not None:
-            value = frozen(self.here_covariance, np.float64, (6, 6), "here_covariance")
-            object.__setattr__(self, "here_covariance", value)
+        freeze(self, covariance=(6, 6), intrinsics_sd=(12,), view_rms_px=(None,))
+        freeze(self, here_covariance=(6, 6))
 
     @property
     def sigma_deg(self) -> float:

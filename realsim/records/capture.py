@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.records.checked_arrays import frozen, numbered, rigid
+from realsim.records.checked_arrays import freeze, frozen, numbered, rigid
 
 DISTORTION_TERMS = 8
 """OpenCV order k1 k2 p1 p2 k3 k4 k5 k6; the Brown model leaves k4 k5 k6 at zero."""
@@ -119,8 +119,7 @@ class View:
             T = getattr(self, name)
             if T is not None:
                 object.__setattr__(self, name, rigid(T, f"{name} of view {self.index}"))
-        if self.joints is not None:
-            object.__setattr__(self, "joints", frozen(self.joints, np.float64, (None,), "joints"))
+        freeze(self, joints=(None,))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -30,6 +30,14 @@ def frozen(value: ArrayLike, dtype: Any, shape: tuple[int | None, ...], name: st
     return array
 
 
+def freeze(record: Any, dtype: Any = np.float64, /, **shapes: tuple[int | None, ...]) -> None:
+    """Put read-only arrays of known shapes in the place of a record's fields; None stays None."""
+    for name, shape in shapes.items():
+        value = getattr(record, name)
+        if value is not None:
+            object.__setattr__(record, name, frozen(value, dtype, shape, name))
+
+
 def rigid(value: ArrayLike, name: str) -> Array:
     """Return a read-only rigid (4, 4) copy of `value`."""
     T = se3.check_rigid(value, name)

@@ -9,7 +9,7 @@ import numpy as np
 from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.records.checked_arrays import frozen
+from realsim.records.checked_arrays import freeze, frozen
 
 STAGES = ("close", "lift", "oscillate", "pendulum")
 """The four stages of the slip test, in order."""
@@ -124,12 +124,11 @@ class GraspSet:
         if n:
             T = se3.check_rigid(T, f"grasps of instance {self.instance}")
         object.__setattr__(self, "Ts_obj_grasp", frozen(T, np.float64, (n, 4, 4), "Ts_obj_grasp"))
-        for name in ("widths_m", "scores", "base_scores"):
-            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, (n,), name))
+        freeze(self, widths_m=(n,), scores=(n,), base_scores=(n,))
         for name in ("slip_m", "slip_rad"):
             value = np.asarray(getattr(self, name), dtype=np.float64).reshape(n, len(STAGES))
             object.__setattr__(self, name, frozen(value, np.float64, (n, len(STAGES)), name))
-        object.__setattr__(self, "reachable", frozen(self.reachable, np.bool_, (n,), "reachable"))
+        freeze(self, np.bool_, reachable=(n,))
         object.__setattr__(self, "measures", _checked_measures(self.measures, n))
         if len(self.failures) != n:
             raise InputError(f"{len(self.failures)} failure notes for {n} grasps.")

@@ -9,7 +9,7 @@ import numpy as np
 from realsim.arrays import Array, Int32, UInt8
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.records.checked_arrays import frozen, numbered, rigid
+from realsim.records.checked_arrays import freeze, frozen, numbered, rigid
 from realsim.untrusted.own_json import Real
 
 Verdict = Literal["accepted", "doubtful", "rejected", "unchecked"]
@@ -42,13 +42,8 @@ class Mesh:
             raise InputError(f"the mesh's faces name vertex {f.max()} of {len(v)}.")
         object.__setattr__(self, "vertices", v)
         object.__setattr__(self, "faces", f)
-        if self.colors is not None:
-            object.__setattr__(self, "colors", frozen(self.colors, np.uint8, (len(v), 3), "colors"))
-        if self.uv is not None:
-            object.__setattr__(self, "uv", frozen(self.uv, np.float64, (len(v), 2), "uv"))
-        if self.texture is not None:
-            t = frozen(self.texture, np.uint8, (None, None, 3), "texture")
-            object.__setattr__(self, "texture", t)
+        freeze(self, np.uint8, colors=(len(v), 3), texture=(None, None, 3))
+        freeze(self, uv=(len(v), 2))
 
     @property
     def bounds(self) -> Array:
@@ -110,9 +105,7 @@ class ObjectPose:
         numbered(self.instance, f"the instance of object {self.obj_id}")
         name = f"T_world_obj of object {self.obj_id} (instance {self.instance})"
         object.__setattr__(self, "T_world_obj", rigid(self.T_world_obj, name))
-        if self.covariance is not None:
-            C = frozen(self.covariance, np.float64, (6, 6), "covariance")
-            object.__setattr__(self, "covariance", C)
+        freeze(self, covariance=(6, 6))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

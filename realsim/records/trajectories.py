@@ -6,7 +6,7 @@ import numpy as np
 
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
-from realsim.records.checked_arrays import frozen
+from realsim.records.checked_arrays import freeze
 
 PHASES = ("reach", "approach", "close", "lift", "oscillate", "pendulum")
 """The parts of an attempt, in order: from home to the pre-grasp, straight on, and the stages."""
@@ -31,19 +31,14 @@ class GraspTrajectories:
 
     def __post_init__(self) -> None:
         """Check that everything fits together and freeze it."""
-        rows = np.asarray(self.rows)
         joints = np.asarray(self.joints_rad, dtype=np.float64)
         if joints.ndim != 2:
             raise InputError(
                 f"joints_rad has the shape {joints.shape}; (samples, joints) is expected."
             )
-        n, s = len(rows), len(joints)
-        object.__setattr__(self, "rows", frozen(rows, np.int64, (n,), "rows"))
-        object.__setattr__(self, "starts", frozen(self.starts, np.int64, (n + 1,), "starts"))
-        object.__setattr__(self, "joints_rad", frozen(joints, np.float64, joints.shape, "joints"))
-        for name in ("time_s", "opening_m"):
-            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, (s,), name))
-        object.__setattr__(self, "phase", frozen(self.phase, np.int64, (s,), "phase"))
+        n, s = len(self.rows), len(joints)
+        freeze(self, np.int64, rows=(n,), starts=(n + 1,), phase=(s,))
+        freeze(self, joints_rad=joints.shape, time_s=(s,), opening_m=(s,))
         for name in ("time_s", "opening_m", "joints_rad"):
             if not np.isfinite(getattr(self, name)).all():
                 raise InputError(f"{name} of the attempts has NaN or infinite numbers.")

@@ -10,7 +10,7 @@ import numpy as np
 from realsim.arrays import Array, Mask
 from realsim.errors import InputError, NotRigidError, UnitError
 from realsim.geometry.se3 import RIGID_TOLERANCE
-from realsim.records.checked_arrays import frozen
+from realsim.records.checked_arrays import freeze
 from realsim_calibration.inputs.readings import (
     EULER_ORDERS,
     MATRIX_TOLERANCE,
@@ -81,14 +81,8 @@ class RawPoses:
 
     def __post_init__(self) -> None:
         """Check that all rows are there and freeze the arrays."""
-        for name in ("values", "joints"):
-            array = getattr(self, name)
-            if array is not None:
-                shape = (len(self.where), None)
-                object.__setattr__(self, name, frozen(array, np.float64, shape, name))
-        if self.times is not None:
-            times = frozen(self.times, np.float64, (len(self.where),), "times")
-            object.__setattr__(self, "times", times)
+        n = len(self.where)
+        freeze(self, values=(n, None), joints=(n, None), times=(n,))
 
     def __len__(self) -> int:
         """Return the number of poses."""

@@ -34,7 +34,7 @@ from realsim.formats.grasps.scene_grasps import (
 )
 from realsim.geometry import se3
 from realsim.records import GraspSet
-from realsim.records.checked_arrays import frozen
+from realsim.records.checked_arrays import freeze, frozen
 from realsim.records.grasps import MEASURES, joined_measure
 from realsim.store import atomic
 from realsim.untrusted.arrays import read_npy, read_npz
@@ -84,9 +84,8 @@ class GraspGroup:
         Ts = np.asarray(self.Ts_a_grasp, dtype=np.float64).reshape(-1, 4, 4)
         Ts = se3.check_rigid(Ts, "grasps") if len(Ts) else Ts
         object.__setattr__(self, "Ts_a_grasp", frozen(Ts, np.float64, (n, 4, 4), "Ts_a_grasp"))
-        for name in ("scores", "openings_m", "heights_m", "depths_m"):
-            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, (n,), name))
-        object.__setattr__(self, "obj_ids", frozen(self.obj_ids, np.int64, (n,), "obj_ids"))
+        freeze(self, scores=(n,), openings_m=(n,), heights_m=(n,), depths_m=(n,))
+        freeze(self, np.int64, obj_ids=(n,))
         known = {k: np.asarray(v, dtype=np.float64) for k, v in self.known.items()}
         measures = {k: v.tolist() for k, v in known.items() if k not in OWN}
         own = {k: frozen(known[k], np.float64, (n,), k) for k in OWN if k in known}

@@ -37,7 +37,7 @@ from realsim.formats.graspnet.gripper_frame import (
     label_poses,
 )
 from realsim.formats.graspnet.npz_blocks import NpzArray, opened, write_blocks
-from realsim.records.checked_arrays import frozen
+from realsim.records.checked_arrays import freeze
 
 GRID = (VIEWS, ANGLES, DEPTHS)
 BLOCK = 16
@@ -81,15 +81,11 @@ class GraspLabels:
             InputError: they do not, or an index is out of range or there twice.
         """
         n = len(self.friction)
-        points = frozen(self.points, np.float64, (None, 3), "points")
-        object.__setattr__(self, "points", points)
-        object.__setattr__(self, "index", frozen(self.index, np.int32, (n, 4), "index"))
-        for name in ("angles_rad", "depths_m", "openings_m", "friction"):
-            object.__setattr__(self, name, frozen(getattr(self, name), np.float32, (n,), name))
-        object.__setattr__(self, "collision", frozen(self.collision, np.bool_, (n,), "collision"))
-        tried = frozen(self.view_tried, np.bool_, (VIEWS,), "view_tried")
-        object.__setattr__(self, "view_tried", tried)
-        most = np.array([len(points), *GRID])
+        freeze(self, points=(None, 3))
+        freeze(self, np.int32, index=(n, 4))
+        freeze(self, np.float32, angles_rad=(n,), depths_m=(n,), openings_m=(n,), friction=(n,))
+        freeze(self, np.bool_, collision=(n,), view_tried=(VIEWS,))
+        most = np.array([len(self.points), *GRID])
         if n and (self.index.min() < 0 or np.any(self.index.max(axis=0) >= most)):
             raise InputError(f"labels: an index is outside {tuple(most.tolist())}.")
         if np.any(np.diff(self.numbers) <= 0):

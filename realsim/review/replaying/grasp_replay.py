@@ -20,7 +20,7 @@ import viser
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.records import Mesh
-from realsim.records.checked_arrays import frozen
+from realsim.records.checked_arrays import freeze, frozen
 from realsim.records.trajectories import PHASES
 from realsim.review.replaying.grasp_words import escaped
 from realsim.review.replaying.replay_nodes import ReplayNodes
@@ -81,12 +81,8 @@ class GraspMotion:
         object.__setattr__(
             self, "Ts_world_link", frozen(given, np.float64, (s, links, 4, 4), "Ts_world_link")
         )
-        for name in ("time_s", "opening_m"):
-            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, (s,), name))
-        for name in ("Ts_world_hand", "Ts_world_obj"):
-            Ts = frozen(getattr(self, name), np.float64, (s, 4, 4), name)
-            object.__setattr__(self, name, Ts)
-        object.__setattr__(self, "phase", frozen(self.phase, np.int64, (s,), "phase"))
+        freeze(self, time_s=(s,), opening_m=(s,), Ts_world_hand=(s, 4, 4), Ts_world_obj=(s, 4, 4))
+        freeze(self, np.int64, phase=(s,))
         if np.any(np.diff(self.time_s) <= 0):
             raise InputError("the times of the motion do not increase; each sample needs its own.")
         if not (self.phase.min() >= 0 and self.phase.max() < len(PHASES)):
