@@ -4,7 +4,7 @@ Four shaded views, the convex parts, and the figures in words. The mesh is drawn
 own, so that a mesh in unknown units comes out as one in metres does.
 """
 
-from collections.abc import Sequence
+import textwrap
 from dataclasses import replace
 from io import BytesIO
 from typing import Any
@@ -174,7 +174,7 @@ def figure_lines(mesh: Mesh, properties: ModelProperties) -> list[tuple[str, str
     out: list[tuple[str, str]] = []
     for label, text in rows:
         mark = "! " if label == "look" else ""
-        for k, piece in enumerate(_wrapped(text)):
+        for k, piece in enumerate(textwrap.wrap(text, LINE_CHARS) or [""]):
             out.append((label if k == 0 else "", piece if k == 0 else mark + piece))
     return out
 
@@ -244,12 +244,6 @@ def scale_text(properties: ModelProperties) -> str:
     sigma = "" if s.sigma_percent is None else f" ± {s.sigma_percent:.2g} %"
     where = f" in {s.session}" if s.session else ""
     return f"{s.scale:.6g} m per unit{sigma}, {s.verdict} ({s.how or 'not said how'}{where})"
-
-
-def _wrapped(text: str) -> Sequence[str]:
-    import textwrap
-
-    return textwrap.wrap(text, LINE_CHARS) or [""]
 
 
 def sheet_png(

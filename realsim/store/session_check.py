@@ -184,10 +184,8 @@ def _note_leftovers(folder: Path, lists: Lists) -> bool:
         found = f"{temporary.name}, of a run that is over"
         if whole:
             found += "; opening the session gives it its name"
-            lists.findings.append(SessionFinding(path=path, kind="leftover", found=found))
-        else:
-            name = temporary.relative_to(folder).as_posix()
-            lists.findings.append(SessionFinding(path=name, kind="leftover", found=found))
+        name = path if whole else temporary.relative_to(folder).as_posix()
+        lists.findings.append(SessionFinding(path=name, kind="leftover", found=found))
     return finished
 
 

@@ -157,10 +157,6 @@ def _rows(message: ImageMessage, used: int, name: str) -> UInt8:
     return pixels[: step * message.height].reshape(message.height, step)[:, :used]
 
 
-def _is_depth_transport(message: ImageMessage) -> bool:
-    return "compressedDepth" in message.encoding
-
-
 def _decompressed(message: ImageMessage, name: str = "image") -> NDArray[Any]:
     """Return a compressed image as OpenCV decodes it: (H, W) or (H, W, 3 or 4) BGR.
 
@@ -169,7 +165,7 @@ def _decompressed(message: ImageMessage, name: str = "image") -> NDArray[Any]:
     """
     import cv2
 
-    skip = DEPTH_HEADER_BYTES if _is_depth_transport(message) else 0
+    skip = DEPTH_HEADER_BYTES if "compressedDepth" in message.encoding else 0
     data = message.pixels[skip:]
     image: Any = None
     # cv2.error: of images that end within a header.

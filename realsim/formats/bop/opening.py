@@ -12,15 +12,9 @@ from realsim.errors import InputError
 from realsim.formats.bop import evidence
 from realsim.formats.bop.instances import stated_instances, tell_apart
 from realsim.formats.bop.labelled import BopLabelledScene, SceneContent, model_ids
-from realsim.formats.bop.rows import (
-    GroundTruth,
-    Json,
-    read_cameras,
-    read_ground_truth,
-    read_object_lists,
-)
+from realsim.formats.bop.rows import GroundTruth, Json, read_ground_truth, read_object_lists
 from realsim.formats.bop.run_lengths import read_coco_masks
-from realsim.formats.bop.scene import GT_FILE, BopSceneRef, ground_truth_file
+from realsim.formats.bop.scene import GT_FILE, BopSceneRef, cameras_with_images, ground_truth_file
 from realsim.formats.bop.source import choose_scene
 from realsim.formats.evidence import depth_ratio
 from realsim.formats.folders.listing import image_header, shown
@@ -75,20 +69,13 @@ def open_labelled_scene(
     """
     layout = ref.layout
     notes: list[str] = []
-    path = layout.document("scene_camera")
-    cameras = read_cameras(path)
-    colour, depth = layout.colour_files(), layout.depth_files()
-    missing = [i for i in cameras if i not in colour]
-    cameras = {i: row for i, row in cameras.items() if i in colour}
-    if not cameras:
-        raise InputError(
-            f"{ref.folder} is an empty scene: {path.name} lists {len(missing)} images and none of "
-            f"them is in rgb{layout.suffix}/ or gray{layout.suffix}/."
-        )
+    cameras, colour, missing = cameras_with_images(ref)
     if missing:
         listed = shown([str(i) for i in missing], 12)
-        notes.append(f"{path.name} lists images that are not there: {listed}.")
-    depth = {i: depth[i] for i in cameras if i in depth}
+        name = layout.document("scene_camera").name
+        notes.append(f"{name} lists images that are not there: {listed}.")
+    there = layout.depth_files()
+    depth = {i: there[i] for i in cameras if i in there}
     truth = _ground_truth(ref, cameras, notes)
     infos = _infos(layout.document("scene_gt_info"), truth, notes)
     masks = (layout.mask_numbers(visible=False), layout.mask_numbers(visible=True))

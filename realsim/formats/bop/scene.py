@@ -161,6 +161,26 @@ def _refs(folder: Path) -> list[BopSceneRef]:
     ]
 
 
+def cameras_with_images(
+    ref: BopSceneRef,
+) -> tuple[dict[int, dict[str, Any]], dict[int, Path], tuple[int, ...]]:
+    """Return the rows of scene_camera, the colour images they are of, and those that are missing.
+
+    Raises:
+        InputError: no image is there.
+    """
+    path, there = ref.layout.document("scene_camera"), ref.layout.colour_files()
+    cameras = read_cameras(path)
+    missing = tuple(i for i in cameras if i not in there)
+    cameras = {i: row for i, row in cameras.items() if i in there}
+    if not cameras:
+        raise InputError(
+            f"{ref.folder} is an empty scene: {path.name} lists {len(missing)} images and none "
+            f"of them is in rgb{ref.layout.suffix}/ or gray{ref.layout.suffix}/."
+        )
+    return cameras, {i: there[i] for i in cameras}, missing
+
+
 def read_scene(ref: BopSceneRef) -> BopScene:
     """Read the cameras and the ground truth of a scene.
 
@@ -169,17 +189,7 @@ def read_scene(ref: BopSceneRef) -> BopScene:
         NotRigidError: a rotation that is none.
         UnitError: a translation that is not in millimetres.
     """
-    path = ref.layout.document("scene_camera")
-    cameras = read_cameras(path)
-    there = ref.layout.colour_files()
-    color = {i: there[i] for i in cameras if i in there}
-    missing = tuple(sorted(set(cameras) - set(color)))
-    cameras = {i: cameras[i] for i in sorted(color)}
-    if not cameras:
-        raise InputError(
-            f"{ref.folder} is an empty scene: {path.name} lists {len(missing)} images and none "
-            f"of them is in rgb{ref.layout.suffix}/ or gray{ref.layout.suffix}/."
-        )
+    cameras, color, missing = cameras_with_images(ref)
     file, annotations = _read_ground_truth(ref)
     deep = ref.layout.depth_files()
     return BopScene(

@@ -125,16 +125,24 @@ def _is_scene(camera_m: float, object_m: float) -> bool:
 
 def _wandering(images: Sequence[PosedImage], Ts: Sequence[Array]) -> dict[int, float]:
     """Return by object number the median distance [m] from its median place over the images."""
-    places: dict[int, list[Array]] = {}
-    for image, T in zip(images, Ts, strict=True):
-        for o in single_objects(image.objects):
-            places.setdefault(o.number, []).append((T @ o.T_cam_obj)[:3, 3])
     found: dict[int, float] = {}
-    for number, points in places.items():
-        if len(points) > 1:
-            off = np.linalg.norm(np.array(points) - np.median(points, axis=0), axis=1)
+    for number, rows in _places(images, Ts).items():
+        if len(rows) > 1:
+            points = np.array([point for _, point in rows])
+            off = np.linalg.norm(points - np.median(points, axis=0), axis=1)
             found[number] = float(np.median(off))
     return found
+
+
+def _places(
+    images: Sequence[PosedImage], Ts: Sequence[Array]
+) -> dict[int, list[tuple[int, Array]]]:
+    """Return by object number where the images put it: (number of the image, place [m])."""
+    places: dict[int, list[tuple[int, Array]]] = {}
+    for image, T in zip(images, Ts, strict=True):
+        for o in single_objects(image.objects):
+            places.setdefault(o.number, []).append((image.index, (T @ o.T_cam_obj)[:3, 3]))
+    return places
 
 
 def single_objects(objects: Sequence[ImageObject]) -> list[ImageObject]:
@@ -144,13 +152,8 @@ def single_objects(objects: Sequence[ImageObject]) -> list[ImageObject]:
 
 
 def _worst_annotation(images: Sequence[PosedImage]) -> list[str]:
-    places: dict[int, list[tuple[int, Array]]] = {}
-    for image in images:
-        for o in single_objects(image.objects):
-            T = image.T_0_cam @ o.T_cam_obj
-            places.setdefault(o.number, []).append((image.index, T[:3, 3]))
     worst, text = NAMED_M, ""
-    for number, rows in places.items():
+    for number, rows in _places(images, [i.T_0_cam for i in images]).items():
         centre = np.median([p for _, p in rows], axis=0)
         for index, point in rows:
             off = float(np.linalg.norm(point - centre))

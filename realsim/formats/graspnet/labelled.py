@@ -108,7 +108,9 @@ class GraspnetLabelledScene:
         T_0_cam = None if self._Ts_0_cam is None else self._Ts_0_cam[index]
         T_world_cam = None if T_0_cam is None else self._T_world_0 @ T_0_cam
         K = self._matrix(found, index)
-        size = image_files.same_size(self._images(index))
+        kinds = (image_files.RGB, image_files.DEPTH, image_files.LABEL)
+        files = [self._image(kind, index) for kind in kinds]
+        size = image_files.same_size([file for file in files if file is not None])
         instances = self._instances.of(
             [o.number for o in found.objects], stands_at(found.objects, T_0_cam)
         )
@@ -129,15 +131,11 @@ class GraspnetLabelledScene:
 
     def depth_file(self, index: int) -> Path | None:
         """Return the file of the 16-bit depth image; None = there is none."""
-        self._require(index)
-        path = image_files.image_file(self.ref.folder, image_files.DEPTH, index)
-        return path if path.is_file() else None
+        return self._image(image_files.DEPTH, index)
 
     def label_file(self, index: int) -> Path | None:
         """Return the file of the label image; None = there is none."""
-        self._require(index)
-        path = image_files.image_file(self.ref.folder, image_files.LABEL, index)
-        return path if path.is_file() else None
+        return self._image(image_files.LABEL, index)
 
     def label(self, index: int) -> UInt16 | None:
         """Return the label image (H, W) of object ids, 0 = none; None = there is none.
@@ -211,12 +209,10 @@ class GraspnetLabelledScene:
             self._objects = (index, read_image_objects(self.ref.folder, index))
         return self._objects[1]
 
-    def _images(self, index: int) -> list[Path]:
-        files = [
-            image_files.image_file(self.ref.folder, kind, index)
-            for kind in (image_files.RGB, image_files.DEPTH, image_files.LABEL)
-        ]
-        return [f for f in files if f.is_file()]
+    def _image(self, kind: str, index: int) -> Path | None:
+        self._require(index)
+        path = image_files.image_file(self.ref.folder, kind, index)
+        return path if path.is_file() else None
 
     def _matrix(self, found: ImageObjects, index: int) -> Array:
         """Return the camera matrix (3, 3) of an image [px]: of its meta file, or of all images."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from realsim import images
 from realsim.errors import InputError
+from realsim.formats.bop.evidence import sampled
 from realsim.formats.graspnet import evidence, image_files
 from realsim.formats.graspnet.annotations import ANNOTATIONS
 from realsim.formats.graspnet.cameras import FIRST, MATRIX, POSES, CameraFiles, read_camera_files
@@ -41,7 +42,7 @@ def open_scene(ref: GraspnetSceneRef) -> GraspnetLabelledScene:
     notes: list[str] = []
     cameras = read_camera_files(ref.folder)
     indices = _indices(ref.folder, cameras, notes)
-    chosen = _spread(indices, COMPARED)
+    chosen = sampled(indices, COMPARED)
     found = {i: read_image_objects(ref.folder, i) for i in chosen}
     _compare_matrices(found, cameras, ref.folder)
     poses = cameras.poses
@@ -60,7 +61,7 @@ def open_scene(ref: GraspnetSceneRef) -> GraspnetLabelledScene:
     notes += said + _missing_models(ref, set(instances.places))
     _count_meta(found, notes)
     scene = GraspnetLabelledScene(ref, indices, cameras, instances, notes)
-    notes += _check_pixels(scene, {i: found[i] for i in _spread(tuple(chosen), LOOKED_AT)})
+    notes += _check_pixels(scene, {i: found[i] for i in sampled(chosen, LOOKED_AT)})
     return scene
 
 
@@ -95,12 +96,6 @@ def _indices(folder: Path, cameras: CameraFiles, notes: list[str]) -> tuple[int,
             first = ", ".join(map(str, sorted(numbers)[:5]))
             notes.append(f"{len(numbers)} {what}: {first}{', ...' * (len(numbers) > 5)}.")
     return indices
-
-
-def _spread(indices: tuple[int, ...], count: int) -> tuple[int, ...]:
-    """Return some of the images, evenly spread, the first and the last among them."""
-    places = np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int)
-    return tuple(indices[int(k)] for k in places)
 
 
 def _compare_matrices(found: dict[int, ImageObjects], cameras: CameraFiles, folder: Path) -> None:

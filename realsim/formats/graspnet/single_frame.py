@@ -13,7 +13,7 @@ from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.formats.graspnet import evidence, image_files
 from realsim.formats.graspnet.image_objects import joined_objects
-from realsim.formats.graspnet.instances import Instances, number_instances
+from realsim.formats.graspnet.instances import number_instances
 from realsim.formats.graspnet.labelled import ENTRY
 from realsim.formats.graspnet.meta import read_meta
 from realsim.formats.graspnet.models import load_models
@@ -124,7 +124,7 @@ def open_graspnet_frame(folder: Path | str, *, models: Path | str | None = None)
         depth_m=images.read_depth(folder / DEPTH_FILE, unit_m),
     )  # fmt: skip
     evidence.check_depth([seen], unit_m, str(folder))
-    instances, notes = _instances(meta.numbers)
+    instances, notes = number_instances(meta.numbers, [(meta.numbers, None)])
     frame = LabelledFrame(
         index=0,
         intrinsics=intrinsics,
@@ -138,8 +138,3 @@ def open_graspnet_frame(folder: Path | str, *, models: Path | str | None = None)
     )
     notes.append("one image on its own: no camera pose, no table, no masks.")
     return GraspnetFrame(folder, None if models is None else Path(models), frame, notes)
-
-
-def _instances(numbers: tuple[int, ...]) -> tuple[Instances, list[str]]:
-    # In one image nothing wanders: the order of the file is the list.
-    return number_instances(numbers, [(numbers, None)])

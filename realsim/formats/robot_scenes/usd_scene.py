@@ -19,7 +19,6 @@ from realsim.formats.export_folder import ExportFolder
 from realsim.formats.labelled_scene import WrittenScene
 from realsim.formats.robot_scenes.mesh_obj import TABLE_RGB
 from realsim.formats.robot_scenes.placed_scene import (
-    PlacedObject,
     PlacedScene,
     SceneCamera,
     TableBox,
@@ -108,7 +107,7 @@ def _scene_layer(pxr: Any, scene: PlacedScene, files: dict[int, str]) -> Any:
     physics.CreateGravityMagnitudeAttr().Set(strength)
     _add_table(pxr, stage, scene.table)
     for o in scene.objects:
-        _add_object(pxr, stage, o)
+        _place(pxr, stage.DefinePrim(f"{ROOT}/{o.name}", "Xform"), o.T_world_obj)
     for camera in scene.cameras:
         _add_camera(pxr, stage, camera)
     light = stage.DefinePrim(f"{ROOT}/light", "DomeLight")
@@ -120,11 +119,6 @@ def _scene_layer(pxr: Any, scene: PlacedScene, files: dict[int, str]) -> Any:
         reference = pxr.Sdf.Reference(files[o.obj_id])
         layer.GetPrimAtPath(f"{ROOT}/{o.name}").referenceList.Prepend(reference)
     return layer
-
-
-def _add_object(pxr: Any, stage: Any, o: PlacedObject) -> None:
-    prim = stage.DefinePrim(f"{ROOT}/{o.name}", "Xform")
-    _place(pxr, prim, o.T_world_obj)
 
 
 def _add_table(pxr: Any, stage: Any, table: TableBox) -> None:
