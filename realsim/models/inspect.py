@@ -270,9 +270,3 @@ def report(s: Survey) -> MeshReport:
         boundary_edges=int(np.count_nonzero(topo.edge_uses == 1)),
         problems=problems_of(s),
     )
-
-
-def solved(before: MeshReport, after: MeshReport) -> tuple[str, ...]:
-    """Return the kinds of problems that the first report has and the second has not."""
-    left = {p.kind for p in after.problems}
-    return tuple(p.kind for p in before.problems if p.kind not in left)

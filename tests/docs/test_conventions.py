@@ -11,6 +11,7 @@ from realsim.formats.grasps.hand_frames import grasp_poses, hand_poses
 from realsim.geometry import camera, se3
 from realsim.interop import colmap_from_opencv_px
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
+from realsim_sim_bridge.annotation import frame_maps
 
 PAGE = " ".join((ROOT / "docs/conventions.md").read_text(encoding="utf-8").split())
 LENS = CameraIntrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.0, cy=23.0)
@@ -94,12 +95,18 @@ def test_label_maps_are_coded_as_the_table_says() -> None:
     states("instance + 1; 0 = no object")
     assert label_maps.instance_counts(np.array([[-1, 0, 6]], np.int32)).tolist() == [[0, 1, 7]]
     states("0 to 65535 over the model's box", "the box's own corner is 1 1 1")
-    low, high = np.zeros(3), np.array([0.1, 0.2, 0.3])
-    counts = label_maps.coordinate_counts([low, high], low, high)
-    assert counts.tolist() == [[1, 1, 1], [65535, 65535, 65535]]
+    high = np.array([0.1, 0.2, 0.3])
+    Ts = np.stack([se3.from_translation(corner - [0, 0, 1]) for corner in (0 * high, high)])
+    scale = np.tile(65535 / high, (2, 1)).astype(np.float32)
+    counts = frame_maps._coordinates(
+        np.zeros((1, 2, 2)), np.ones((1, 2), np.float32), np.array([[0, 1]], np.int32), Ts,
+        np.ones((1, 2), bool), np.zeros((2, 3), np.float32), scale,
+    )  # fmt: skip
+    assert counts.tolist() == [[[1, 1, 1], [65535, 65535, 65535]]]
     states("round((n + 1) * 32767.5)")
     n = np.array([[0.6, 0.0, -0.8]], np.float32)
-    assert np.abs(label_maps.normal_counts(n) - np.round((n + 1) * 32767.5)).max() <= 1
+    counts = np.round((n + 1) * 32767.5).astype(np.uint16)
+    assert np.abs(label_maps.normals_of(counts) - n).max() < 2e-5
 
 
 @pytest.mark.parametrize(("frame", "closing"), [("grasp", 1), ("panda_hand", 1), ("acronym", 0)])

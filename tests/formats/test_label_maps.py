@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from map_formulas import normal_counts
 from realsim.formats import label_maps
 from realsim.formats.bop import labels as bop_labels
 from refusals import refused
@@ -13,24 +14,13 @@ def test_instances_come_back():
     refused("65535 are in this view", label_maps.instance_counts, np.full((2, 2), 65535, np.int32))
 
 
-def test_coordinates_come_back_within_a_count_and_corners_are_no_hole():
-    rng = np.random.default_rng(1)
-    low, high = np.array([-0.1, 0.0, 0.02]), np.array([0.1, 0.3, 0.05])
-    points = rng.uniform(low, high, (500, 3))
-    points[:2] = low, high
-    counts = label_maps.coordinate_counts(points, low, high)
-    assert counts.any(axis=-1).all()
-    back = low + counts * ((high - low) / 65535)
-    assert np.all(np.abs(back - points) <= 1.01 * (high - low) / 65535 + 1e-8)
-
-
 def test_normals_come_back_and_nothing_stays_nothing():
     rng = np.random.default_rng(2)
     n = rng.normal(size=(40, 50, 3)).astype(np.float32)
     n /= np.linalg.norm(n, axis=-1, keepdims=True)
     n[0, :3] = [[0, 0, -1], [-1, 0, 0], [1, 0, 0]]
     n[5:9] = 0
-    counts = label_maps.normal_counts(n)
+    counts = normal_counts(n)
     assert not counts[5:9].any() and counts[:5].any(axis=-1).all()
     np.testing.assert_array_equal(counts[0, 0], [32768, 32768, 0])
     np.testing.assert_allclose(label_maps.normals_of(counts), n, atol=2e-5)

@@ -1,9 +1,9 @@
-"""Maps as counts: the same as what label_maps makes of the labels' own maps."""
+"""Maps as counts: the same as what the formulas make of the labels' own maps."""
 
 import numpy as np
 
+from map_formulas import coordinate_counts, normal_counts
 from plain_meshes import box
-from realsim.formats import label_maps
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.rendering.labels import LabelRenderer
@@ -34,10 +34,10 @@ def test_counts_equal_those_of_the_float_maps() -> None:
     for k in range(3):
         mask = seen & (labels.ids[window] == k)
         assert mask.any()
-        wanted = label_maps.coordinate_counts(points[mask], *boxes[k])
+        wanted = coordinate_counts(points[mask], *boxes[k])
         # Float32 products may fall on either side of a half.
         assert np.max(np.abs(got[mask].astype(int) - wanted)) <= 1
     assert not got[~seen].any()
     normals = frame_maps.normal_counts(labels).astype(int)
-    assert np.max(np.abs(normals - label_maps.normal_counts(labels.normals()))) <= 1
+    assert np.max(np.abs(normals - normal_counts(labels.normals()))) <= 1
     assert np.array_equal(normals.any(axis=-1), labels.geometry >= 0)
