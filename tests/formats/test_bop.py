@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from begun_sessions import begun
+from begun_sessions import begun, random_views
 from bop_scenes import edit
 from realsim.errors import InputError, NotRigidError, UnitError
 from realsim.formats.bop import labels as bop_labels
@@ -14,7 +14,7 @@ from realsim.formats.bop import models as bop_models
 from realsim.formats.bop import scene as bop
 from realsim.geometry import se3
 from realsim.geometry.mesh import symmetry_transforms
-from realsim.records import CameraIntrinsics, Mesh, ObjectModel, View
+from realsim.records import CameraIntrinsics, Mesh, ObjectModel
 from refusals import refused
 from trimesh_solids import box
 
@@ -26,10 +26,8 @@ def make_scene(folder, n=2):
     store = begun(folder, CAMERA)
     rng = np.random.default_rng(0)
     annotations = {}
+    random_views(store, range(n))
     for i in range(n):
-        rgb = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
-        T = se3.look_at(rng.uniform(0.3, 0.5, 3), [0, 0, 0])
-        store.add_view(View(index=i, T_world_cam=T), rgb, rng.uniform(0.2, 1, (48, 64)))
         poses = se3.random_transform(rng, 2, spread=0.05)
         poses[:, 2, 3] += 0.5
         annotations[i] = [(3, poses[0]), (5, poses[1])]

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from begun_sessions import begun
+from begun_sessions import begun, random_views
 from realsim.formats.bop.source import open_bop
-from realsim.geometry import se3
-from realsim.records import CameraIntrinsics, View
+from realsim.records import CameraIntrinsics
 from realsim.store import SessionStore
 from refusals import refused
 
@@ -19,11 +18,7 @@ CAMERA = CameraIntrinsics(
 
 def make_scene(folder: Path, n: int = 4) -> SessionStore:
     store = begun(folder, CAMERA)
-    rng = np.random.default_rng(0)
-    for i in range(n):
-        T = se3.look_at(rng.uniform(0.3, 0.5, 3), [0, 0, 0])
-        rgb = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
-        store.add_view(View(index=3 * i, T_world_cam=T), rgb, rng.uniform(0.2, 1, (48, 64)))
+    random_views(store, range(0, 3 * n, 3))
     return store
 
 

@@ -7,10 +7,10 @@ import pytest
 
 from file_trees import bytes_of
 from labelled_scenes import INTRINSICS, MODELS, labelled_scene
+from labelled_scenes import graspnet_tree as write
+from labelled_scenes import opened_graspnet as opened
 from realsim import CameraIntrinsics, images
 from realsim.formats.export_folder import ExportFolder
-from realsim.formats.graspnet.opening import open_scene
-from realsim.formats.graspnet.tree import open_graspnet
 from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
 from realsim.formats.renumbered import RenumberedScene
 from realsim.geometry import se3
@@ -19,17 +19,6 @@ from realsim.records import Mesh
 from refusals import refused
 
 HOME = "scenes/scene_0003/realsense"
-
-
-def write(scene, out, **config):
-    return write_graspnet_scene(
-        scene, ExportFolder.begin(out, {"what": "test"}), GraspnetWriteConfig(**config)
-    )
-
-
-def opened(out):
-    (ref,) = open_graspnet(out).scenes
-    return open_scene(ref)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from realsim.arrays import Array, UInt8
+from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.rendering.labels import LabelRenderer
 from realsim.store import SessionStore
@@ -23,6 +24,16 @@ def begun(
     """Return a new session that has no views yet."""
     session = CaptureSession(name=name, intrinsics=camera, views=(), depth_unit_m=unit_m)
     return SessionStore.create(folder, session, extra)
+
+
+def random_views(store: SessionStore, indices: Iterable[int]) -> None:
+    """Add views of noise whose cameras look at the world's origin."""
+    camera = store.session.intrinsics
+    rng = np.random.default_rng(0)
+    for index in indices:
+        T = se3.look_at(rng.uniform(0.3, 0.5, 3), [0, 0, 0])
+        rgb = rng.integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
+        store.add_view(View(index=index, T_world_cam=T), rgb, rng.uniform(0.2, 1, rgb.shape[:2]))
 
 
 def light_things(ids: Array) -> UInt8:

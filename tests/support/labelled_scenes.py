@@ -10,6 +10,8 @@ from realsim import CameraIntrinsics, ObjectModel, images
 from realsim.formats.bop.root_files import write_bop_models, write_bop_root
 from realsim.formats.bop.writing import write_bop_scene
 from realsim.formats.export_folder import ExportFolder
+from realsim.formats.graspnet.opening import open_scene
+from realsim.formats.graspnet.tree import open_graspnet
 from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.geometry import se3
@@ -151,3 +153,15 @@ def written_graspnet(folder, scene):
     write_graspnet_scene(scene, export, GraspnetWriteConfig())
     export.finish({})
     return folder
+
+
+def graspnet_tree(scene, out, **config):
+    """Write a scene as an unfinished GraspNet tree; return what the writer says."""
+    folder = ExportFolder.begin(out, {"what": "test"})
+    return write_graspnet_scene(scene, folder, GraspnetWriteConfig(**config))
+
+
+def opened_graspnet(out, **which):
+    """Return the only scene of a GraspNet tree."""
+    (ref,) = open_graspnet(out, **which).scenes
+    return open_scene(ref)

@@ -90,9 +90,9 @@ def _instances(masks: Masks, window: Window) -> Int32:
 
 
 # --- Coordinate and normal maps as 16-bit counts, in one walk over the pixels each ---------------
-# The codes of `label_maps`, of what `Labels.object_coordinates()` and `Labels.normals()` are, without
-# the maps of float32 in between: those are twice as large, and allocating them costs as much as
-# filling them.
+# Codes of `label_maps` for `Labels.object_coordinates()` and `Labels.normals()`, without the maps
+# of float32 in between: those are twice as large, and allocating them costs as much as filling
+# them.
 
 
 FULL = np.float32(label_maps.FULL)
