@@ -189,11 +189,11 @@ def depth_evidence(Ts_world_cam: ArrayLike, depth_of: DepthOf) -> DirectionEvide
     """
     Ts = np.asarray(Ts_world_cam, dtype=np.float64).reshape(-1, 4, 4)
     views = sampled_views(Ts, depth_of)
-    spreads: dict[Direction, Spread] = {}
-    for name, candidate in readings(Ts).items():
-        # Which views are near depends on the reading: each one is judged where it says they are.
-        mm = disagreement_mm(candidate, views, near_pairs(candidate, views))
-        spreads[name] = Spread(mm=mm)
+    # Which views are near depends on the reading: each one is judged where it says they are.
+    spreads: dict[Direction, Spread] = {
+        name: Spread(mm=disagreement_mm(candidate, views, near_pairs(candidate, views)))
+        for name, candidate in readings(Ts).items()
+    }
     compared = f"the depth of near views, out of {len(views)}" if len(views) > 1 else ""
     return DirectionEvidence(spreads=spreads, compared=compared)
 

@@ -208,9 +208,13 @@ def _repeats(piece: Piece) -> bool:
     return uv is not None and bool(uv.min() < -TILE_SLACK or uv.max() > 1.0 + TILE_SLACK)
 
 
-def _split(piece: Piece, kind: Int64) -> tuple[Piece, Int64]:
-    """Split vertices whose faces differ in kind (F,); return the piece and a face per vertex."""
-    corners = np.stack([piece.faces.ravel(), np.repeat(kind, 3)], axis=-1).astype(np.int64)
+def split_by(piece: Piece, kinds: Int64) -> tuple[Piece, Int64]:
+    """Give corners of a vertex that differ in kinds (3 F, K) vertices of their own.
+
+    Returns:
+        The piece, and for each of its vertices a corner (of 3 F) that it was made for.
+    """
+    corners = np.column_stack([piece.faces.ravel().astype(np.int64), kinds])
     first, index = equal_rows(corners)
     rows = corners[first, 0]
     new = replace(
@@ -220,7 +224,7 @@ def _split(piece: Piece, kind: Int64) -> tuple[Piece, Int64]:
         colors=None if piece.colors is None else piece.colors[rows],
         uv=None if piece.uv is None else piece.uv[rows],
     )
-    return new, first // 3
+    return new, first
 
 
 def _unrolled(piece: Piece, notes: list[str]) -> Piece:
@@ -231,7 +235,8 @@ def _unrolled(piece: Piece, notes: list[str]) -> Piece:
     # Every face is shifted by whole repeats until its least corner lies in the first one.
     base = np.floor(piece.uv[piece.faces].min(axis=1) + TILE_SLACK).astype(np.int64)
     _, kind = equal_rows(base)
-    new, face = _split(piece, kind)
+    new, corner = split_by(piece, np.repeat(kind, 3))
+    face = corner // 3
     assert new.uv is not None
     uv = new.uv - base[face]
     across, up = (max(1, math.ceil(float(m) - TILE_SLACK)) for m in uv.max(axis=0))
@@ -280,7 +285,8 @@ def _with_swatches(pieces: Sequence[Piece], notes: list[str]) -> list[Piece]:
     for i in bare:
         mine = kind[start : start + len(pieces[i].faces)]
         start += len(mine)
-        new, face = _split(pieces[i], mine)
+        new, corner = split_by(pieces[i], np.repeat(mine, 3))
+        face = corner // 3
         column, row = mine[face] % side + 0.5, mine[face] // side + 0.5
         uv = np.stack([column / side, 1.0 - row / side], axis=-1)
         out[i] = replace(new, uv=uv, image=image, image_key="swatches", colors=None)

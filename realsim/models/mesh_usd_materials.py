@@ -12,7 +12,7 @@ import numpy as np
 
 from realsim.arrays import Array, Image, Int64
 from realsim.errors import InputError
-from realsim.models.mesh_atlas import Piece, image_array, rgb8, srgb8, transformed_uv
+from realsim.models.mesh_atlas import Piece, image_array, rgb8, split_by, srgb8, transformed_uv
 from realsim.models.mesh_loading import escape_error
 from realsim.models.mesh_topology import equal_rows
 
@@ -76,26 +76,15 @@ def corner_values(
 def vertex_colors_of(piece: Piece, linear: Array) -> Piece:
     """Return the piece with linear colours (T, 3, 3) at its corners as sRGB per vertex."""
     rgb = srgb8(linear.reshape(-1, 3)).astype(np.int64)
-    first, index = equal_rows(np.column_stack([piece.faces.ravel().astype(np.int64), rgb]))
-    return replace(
-        piece,
-        vertices=piece.vertices[piece.faces.ravel()[first]],
-        faces=index.reshape(-1, 3).astype(np.int32),
-        colors=rgb[first].astype(np.uint8),
-    )
+    new, corner = split_by(piece, rgb)
+    return replace(new, colors=rgb[corner].astype(np.uint8))
 
 
 def with_corner_uv(piece: Piece, uv: Array) -> Piece:
     """Return the piece with texture coordinates (T, 3, 2) at its corners, split at seams."""
     _, kind = equal_rows(uv.reshape(-1, 2))
-    vertex: Int64 = piece.faces.ravel().astype(np.int64)
-    first, index = equal_rows(np.column_stack([vertex, kind]))
-    return replace(
-        piece,
-        vertices=piece.vertices[vertex[first]],
-        faces=index.reshape(-1, 3).astype(np.int32),
-        uv=uv.reshape(-1, 2)[first],
-    )
+    new, corner = split_by(piece, kind)
+    return replace(new, uv=uv.reshape(-1, 2)[corner])
 
 
 def joined_corners(piece: Piece) -> Piece:
