@@ -241,11 +241,6 @@ def rim_layer(mesh: Mesh, factor: float) -> Layer:
     return Layer(lines=lines, color=RIM, width=2.0, hidden=0.45)
 
 
-def mass_layer(center: Array) -> Layer:
-    """Return the mark of the centre of mass (3,), in the drawn size."""
-    return Layer(lines=(center[None],), marker="mass")
-
-
 def symmetry_layers(mesh: Mesh, symmetries: Symmetries, factor: float) -> list[Layer]:
     """Return the axes of the symmetries with their orders, drawn in the second view."""
     layers: list[Layer] = []

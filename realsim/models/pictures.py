@@ -22,7 +22,6 @@ from realsim.models.model_picture_views import (
     box_layer,
     draw_layer,
     drawn_size,
-    mass_layer,
     parts_mesh,
     rendered,
     rim_layer,
@@ -95,7 +94,8 @@ def _layers(mesh: Mesh, properties: ModelProperties, factor: float) -> list[Laye
     if properties.symmetries is not None:
         layers += symmetry_layers(mesh, properties.symmetries, factor)
     if properties.matter is not None:
-        layers.append(mass_layer(properties.matter.center_of_mass * factor))
+        center = properties.matter.center_of_mass * factor
+        layers.append(Layer(lines=(center[None],), marker="mass"))
     return layers
 
 

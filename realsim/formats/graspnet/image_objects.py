@@ -44,16 +44,6 @@ class ImageObjects:
     has_annotation: bool
 
 
-def annotation_file(folder: Path, index: int) -> Path:
-    """Return the XML of an image."""
-    return folder / ANNOTATIONS / f"{index:04d}.xml"
-
-
-def meta_file(folder: Path, index: int) -> Path:
-    """Return the meta file of an image."""
-    return folder / META / f"{index:04d}.mat"
-
-
 def read_image_objects(folder: Path, index: int) -> ImageObjects:
     """Return the objects of an image.
 
@@ -65,7 +55,8 @@ def read_image_objects(folder: Path, index: int) -> ImageObjects:
         InputError: neither file is there, one is damaged, or the two contradict each other.
         UnitError: millimetres.
     """
-    annotation, meta = annotation_file(folder, index), meta_file(folder, index)
+    annotation = folder / ANNOTATIONS / f"{index:04d}.xml"
+    meta = folder / META / f"{index:04d}.mat"
     seen = read_objects(annotation) if annotation.is_file() else None
     said = read_meta(meta) if meta.is_file() else None
     if seen is None and said is None:

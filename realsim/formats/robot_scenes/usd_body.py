@@ -1,4 +1,4 @@
-"""Pixar's library, which comes with an extra."""
+"""One body as a stage of USD, by Pixar's library, which comes with an extra."""
 
 from typing import Any
 
@@ -8,21 +8,10 @@ from realsim.formats.robot_scenes.mesh_obj import PLAIN_RGB, Look, collision_par
 from realsim.formats.robot_scenes.placed_scene import RigidBody, principal_inertia
 from realsim.geometry import se3
 from realsim.images.png import encode_png
-from realsim.interop import import_pixar
 from realsim.records import Mesh
 
 MODULES = ("Gf", "Sdf", "Usd", "UsdGeom", "UsdPhysics", "UsdSemantics", "UsdShade", "Vt")
-
-
-def pixar() -> Any:
-    """Return Pixar's package with the modules that a scene is written by.
-
-    Raises:
-        MissingLibraryError: the extra is not installed.
-    """
-    return import_pixar(MODULES, "writing USD", "URDF and MJCF are written without it.")
-
-
+"""Those of Pixar's modules that a scene is written by."""
 LABEL = "class"
 """Kind of the semantic label; Isaac's Replicator takes its classes from it."""
 COMBINE_MODE = "physxMaterial:frictionCombineMode"

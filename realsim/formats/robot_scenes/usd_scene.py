@@ -26,14 +26,15 @@ from realsim.formats.robot_scenes.placed_scene import (
     without_lens,
 )
 from realsim.formats.robot_scenes.usd_body import (
+    MODULES,
     bind_friction,
     body_stage,
     friction_material,
     new_stage,
-    pixar,
     texture_png,
 )
 from realsim.geometry import se3
+from realsim.interop import import_pixar
 
 SCENE_FILE, OBJECTS = "scene.usda", "objects"
 ROOT = "/World"
@@ -60,7 +61,7 @@ def write_usd_scene(
         MissingLibraryError: the extra `usd` is not installed.
         StorageError: the disk is full, or refuses.
     """
-    pxr = pixar()
+    pxr = import_pixar(MODULES, "writing USD", "URDF and MJCF are written without it.")
     names = scene.body_names()
     for obj_id, name in names.items():
         piece = f"{OBJECTS}/{name}"
