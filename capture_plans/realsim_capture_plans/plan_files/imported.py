@@ -26,21 +26,17 @@ axes meet at: axes within 8 degrees of each other do not determine it."""
 
 IMPORT_MEANINGS = {
     "rows_after_last_view": Meaning(
-        text="rows of the file after its last view, left out", unit="", good="0", better="less"
+        "rows of the file after its last view, left out", "", "0", "less"
     ),
     "tool_pose_gap_m": Meaning(
-        text="what is left between the file's tool poses and the arm's, middle row",
-        unit="m",
-        good="< 0.005 nominal, < 0.001 calibrated",
-        better="less",
+        "what is left between the file's tool poses and the arm's, middle row",
+        "m", "< 0.005 nominal, < 0.001 calibrated", "less",
     ),
     "tool_offset_m": Meaning(
-        text="length of the tool offset that the file's poses were of",
-        unit="m",
-        good="as configured then",
-        better="as asked",
+        "length of the tool offset that the file's poses were of", "m", "as configured then",
+        "as asked",
     ),
-}
+}  # fmt: skip
 """What the metrics say that only imported plans have."""
 
 

@@ -5,7 +5,7 @@
 
 import re
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,8 +33,7 @@ MOST_JOINTS = 9
 """Joints of other arms whose turns are explained."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Meaning:
+class Meaning(NamedTuple):
     """What one metric says."""
 
     text: str
@@ -103,12 +102,6 @@ def _words(name: str) -> str:
     return f"{'' if name.startswith('joint') else 'joint '}{name.replace('_', ' ')}"
 
 
-def _meaning(
-    text: str, unit: str, good: str, better: Literal["more", "less", "as asked"]
-) -> Meaning:
-    return Meaning(text=text, unit=unit, good=good, better=better)
-
-
 _GROUP_TEXTS = {
     "self": "between the arm's own parts",
     "tool": "between the arm and its camera with the bracket",
@@ -116,135 +109,90 @@ _GROUP_TEXTS = {
     "scene": "to the keep-out box and the obstacles",
 }
 
+M = Meaning
 METRIC_MEANINGS: dict[str, Meaning] = {
-    "views": _meaning("views of the plan", "", "as many as asked for", "as asked"),
+    "views": M("views of the plan", "", "as many as asked for", "as asked"),
     # --- where the views are ---------------------------------------------------------------
-    "hole_deg": _meaning(
-        "farthest place from any view, over the elevations that the plan was made for",
-        "deg", "<= 8 (an ideal spiral of 256 from 15 to 90 deg has 7.7)", "less",
-    ),
-    "hole_cap_deg": _meaning(
-        "the same over all elevations from 15 deg up", "deg", "<= 8", "less"
-    ),
-    "spacing_min_deg": _meaning("least angle to the nearest other view", "deg", "> 3", "more"),
-    "spacing_median_deg": _meaning("middle angle to the nearest other view", "deg", "> 5", "more"),
-    "radius_min_m": _meaning("nearest camera to the centre", "m", ">= 0.25 (D405)", "as asked"),
-    "radius_max_m": _meaning("farthest camera from the centre", "m", "<= 0.45 (D405)", "as asked"),
-    "parallax_median_deg": _meaning(
-        "middle angle at the centre between consecutive views", "deg", "5 to 15", "as asked"
-    ),
-    "parallax_max_deg": _meaning(
-        "greatest angle at the centre between consecutive views", "deg", "< 60", "less"
-    ),
+    "hole_deg": M("farthest place from any view, over the elevations that the plan was made for",
+        "deg", "<= 8 (an ideal spiral of 256 from 15 to 90 deg has 7.7)", "less"),
+    "hole_cap_deg": M("the same over all elevations from 15 deg up", "deg", "<= 8", "less"),
+    "spacing_min_deg": M("least angle to the nearest other view", "deg", "> 3", "more"),
+    "spacing_median_deg": M("middle angle to the nearest other view", "deg", "> 5", "more"),
+    "radius_min_m": M("nearest camera to the centre", "m", ">= 0.25 (D405)", "as asked"),
+    "radius_max_m": M("farthest camera from the centre", "m", "<= 0.45 (D405)", "as asked"),
+    "parallax_median_deg": M("middle angle at the centre between consecutive views", "deg",
+        "5 to 15", "as asked"),
+    "parallax_max_deg": M("greatest angle at the centre between consecutive views", "deg", "< 60",
+        "less"),
     # --- how far and how long ----------------------------------------------------------------
-    "travel_leading_rad": _meaning("sum of the leading joint's turns", "rad", "< 60", "less"),
-    "travel_total_rad": _meaning("sum of all joints' turns", "rad", "< 200", "less"),
-    "largest_step_rad": _meaning("greatest turn of a joint in one leg", "rad", "< 3.2", "less"),
-    "seconds": _meaning(
-        "moving, stop to stop, at the plan's speed and acceleration", "s", "< 190", "less"
-    ),
-    "seconds_settling": _meaning("waiting for the arm to stand still", "s", "0.3 a view", "less"),
-    "seconds_total": _meaning(
-        "moving and settling; exposures come on top", "s", "< 270", "less"
-    ),
-    "moves_with_vias": _meaning("moves that are not straight", "", "a few", "less"),
+    "travel_leading_rad": M("sum of the leading joint's turns", "rad", "< 60", "less"),
+    "travel_total_rad": M("sum of all joints' turns", "rad", "< 200", "less"),
+    "largest_step_rad": M("greatest turn of a joint in one leg", "rad", "< 3.2", "less"),
+    "seconds": M("moving, stop to stop, at the plan's speed and acceleration", "s", "< 190",
+        "less"),
+    "seconds_settling": M("waiting for the arm to stand still", "s", "0.3 a view", "less"),
+    "seconds_total": M("moving and settling; exposures come on top", "s", "< 270", "less"),
+    "moves_with_vias": M("moves that are not straight", "", "a few", "less"),
     # --- how near to trouble -----------------------------------------------------------------
-    "colliding_legs": _meaning(
-        "straight pieces on which the clearance is not kept", "", "0, always", "less"
-    ),
-    "sigma_min": _meaning(
-        "least singular value of the Jacobian at the worst view", "", ">= 0.05", "more"
-    ),
-    "sigma_median": _meaning("the same at the middle view", "", "> 0.15", "more"),
-    "yoshikawa_min": _meaning(
-        "Yoshikawa's manipulability sqrt(det J J^T) at the worst view", "", "> 0.005", "more"
-    ),
-    "yoshikawa_median": _meaning("the same at the middle view", "", "> 0.03", "more"),
-    "limit_margin_deg": _meaning(
-        "least distance of a joint to its limit, anywhere on the tour", "deg", "> 10", "more"
-    ),
+    "colliding_legs": M("straight pieces on which the clearance is not kept", "", "0, always",
+        "less"),
+    "sigma_min": M("least singular value of the Jacobian at the worst view", "", ">= 0.05", "more"),
+    "sigma_median": M("the same at the middle view", "", "> 0.15", "more"),
+    "yoshikawa_min": M("Yoshikawa's manipulability sqrt(det J J^T) at the worst view", "",
+        "> 0.005", "more"),
+    "yoshikawa_median": M("the same at the middle view", "", "> 0.03", "more"),
+    "limit_margin_deg": M("least distance of a joint to its limit, anywhere on the tour", "deg",
+        "> 10", "more"),
     **{
-        f"turn_{name}_deg": _meaning(
+        f"turn_{name}_deg": M(
             f"greatest turn of {_words(name)} away from home: winds up cables",
             "deg", "< 240", "less",
         )
         for name in (*UR_JOINTS, *(f"joint_{k + 1}" for k in range(MOST_JOINTS)))
     },
     **{
-        f"clearance_{group}_m": _meaning(
-            f"least distance {_GROUP_TEXTS.get(group, group)}, at the views",
-            "m", ">= the plan's clearance", "more",
+        f"clearance_{moves}{group}_m": M(
+            f"least distance {_GROUP_TEXTS[group]}, {where}", "m", ">= the plan's clearance", "more"
         )
-        for group in dict.fromkeys((*_GROUP_TEXTS, *GROUPS))
-    },
-    **{
-        f"clearance_moves_{group}_m": _meaning(
-            f"least distance {_GROUP_TEXTS.get(group, group)}, along all moves",
-            "m", ">= the plan's clearance", "more",
-        )
-        for group in dict.fromkeys((*_GROUP_TEXTS, *GROUPS))
+        for moves, where in (("", "at the views"), ("moves_", "along all moves"))
+        for group in GROUPS
     },
     # --- what the camera sees ----------------------------------------------------------------
-    "in_view_min": _meaning(
-        "share of the scene's volume in the image, worst view", "", "> 0.6", "more"
-    ),
-    "in_view_median": _meaning("the same, middle view", "", "> 0.9", "more"),
-    "overlap_min": _meaning(
-        "share of the scene's volume in both of two consecutive views, worst pair", "",
-        "> 0.5", "more",
-    ),
-    "overlap_median": _meaning("the same, middle pair", "", "> 0.85", "more"),
-    "seen_by_min": _meaning(
-        "views that have the worst-seen place of the scene's volume in the image", "",
-        "> half of them", "more",
-    ),
-    "seen_by_median": _meaning("the same, middle place", "", "> 0.9 of them", "more"),
-    "seen_from_min_deg": _meaning(
-        "greatest angle between two views of a place, worst place", "deg", "> 90", "more"
-    ),
-    "seen_from_median_deg": _meaning("the same, middle place", "deg", "> 110", "more"),
-    "depth_noise_median_m": _meaning(
+    "in_view_min": M("share of the scene's volume in the image, worst view", "", "> 0.6", "more"),
+    "in_view_median": M("the same, middle view", "", "> 0.9", "more"),
+    "overlap_min": M("share of the scene's volume in both of two consecutive views, worst pair", "",
+        "> 0.5", "more"),
+    "overlap_median": M("the same, middle pair", "", "> 0.85", "more"),
+    "seen_by_min": M("views that have the worst-seen place of the scene's volume in the image", "",
+        "> half of them", "more"),
+    "seen_by_median": M("the same, middle place", "", "> 0.9 of them", "more"),
+    "seen_from_min_deg": M("greatest angle between two views of a place, worst place", "deg",
+        "> 90", "more"),
+    "seen_from_median_deg": M("the same, middle place", "deg", "> 110", "more"),
+    "depth_noise_median_m": M(
         "standard deviation of the depth at the centre, z^2 s / (f B), middle view", "m",
-        "< 0.0010", "less",
-    ),
-    "depth_noise_max_m": _meaning("the same, worst view", "m", "< 0.0014", "less"),
-    "nearest_depth_m": _meaning(
-        "least depth of the scene's volume in an image", "m",
-        ">= 0.10 (D405: nearer, it measures nothing)", "more",
-    ),
+        "< 0.0010", "less"),
+    "depth_noise_max_m": M("the same, worst view", "m", "< 0.0014", "less"),
+    "nearest_depth_m": M("least depth of the scene's volume in an image", "m",
+        ">= 0.10 (D405: nearer, it measures nothing)", "more"),
     # --- boards ------------------------------------------------------------------------------
-    "roll_gap_deg": _meaning(
-        "widest gap between the board's rolls about the optical axis", "deg", "< 720 / views",
-        "less",
-    ),
-    "tilt_min_deg": _meaning(
-        "least angle between optical axis and board normal", "deg", "< 15", "less"
-    ),
-    "tilt_max_deg": _meaning(
-        "greatest angle between optical axis and board normal", "deg", "35 to 45", "as asked"
-    ),
-    "distance_min_m": _meaning(
-        "nearest, along the optical axis to the board", "m", "0.22", "as asked"
-    ),
-    "distance_max_m": _meaning(
-        "farthest, along the optical axis to the board", "m", "0.40", "as asked"
-    ),
+    "roll_gap_deg": M("widest gap between the board's rolls about the optical axis", "deg",
+        "< 720 / views", "less"),
+    "tilt_min_deg": M("least angle between optical axis and board normal", "deg", "< 15", "less"),
+    "tilt_max_deg": M("greatest angle between optical axis and board normal", "deg", "35 to 45",
+        "as asked"),
+    "distance_min_m": M("nearest, along the optical axis to the board", "m", "0.22", "as asked"),
+    "distance_max_m": M("farthest, along the optical axis to the board", "m", "0.40", "as asked"),
     # --- known only when a plan is made ------------------------------------------------------
-    "hole_reachable_deg": _meaning(
-        "farthest direction that the arm reaches freely from any view", "deg", "<= 6", "less"
-    ),
-    "tour_bound_s": _meaning(
-        "no tour of these views can be shorter (Held and Karp)", "s", "near seconds", "as asked"
-    ),
-    "tour_bound_two_nearest_s": _meaning(
-        "a weaker bound: half of the two shortest moves at every view", "s", "near seconds",
-        "as asked",
-    ),
-    "tour_over_bound": _meaning("seconds over tour_bound_s", "", "<= 1.22", "less"),
-    "reachable_share": _meaning(
-        "of the directions or board poses tried, those the arm reaches freely", "", "> 0.95",
-        "more",
-    ),
+    "hole_reachable_deg": M("farthest direction that the arm reaches freely from any view", "deg",
+        "<= 6", "less"),
+    "tour_bound_s": M("no tour of these views can be shorter (Held and Karp)", "s", "near seconds",
+        "as asked"),
+    "tour_bound_two_nearest_s": M("a weaker bound: half of the two shortest moves at every view",
+        "s", "near seconds", "as asked"),
+    "tour_over_bound": M("seconds over tour_bound_s", "", "<= 1.22", "less"),
+    "reachable_share": M("of the directions or board poses tried, those the arm reaches freely", "",
+        "> 0.95", "more"),
 }  # fmt: skip
 """Every key that `metrics.plan_metrics` returns, and what making a plan adds."""
 
