@@ -165,18 +165,6 @@ def test_recovery_before_the_stop_is_cleared_says_what_to_do(
     arm.move(HOME + 0.1, acceleration=4.0)
 
 
-def test_a_protective_stop_is_unlocked_only_when_asked(
-    arm: UrArm, controller: LoopbackController
-) -> None:
-    controller.inject("protective_stop")
-    refused("5 s", arm.unlock_protective_stop, error=ArmStoppedError)
-    time.sleep(5.5 / SPEEDUP)
-    refused("protective stop", arm.recover, error=ArmStoppedError)
-    arm.unlock_protective_stop()
-    arm.recover()
-    arm.move(HOME + 0.1, acceleration=4.0)
-
-
 def test_ctrl_c_stops_the_arm(arm: UrArm, controller: LoopbackController) -> None:
     # Tests that a shell runs in the background are born deaf to it.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)

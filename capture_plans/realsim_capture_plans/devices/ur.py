@@ -151,16 +151,6 @@ class UrArm:
         self._connection.close()
         self._connection.open()
 
-    def unlock_protective_stop(self) -> None:
-        """Unlock a protective stop, as the pendant's button does; `recover` goes on from there.
-
-        Only to be called when a person at the robot has said that the arm is free.
-
-        Raises:
-            ArmStoppedError: the controller does not unlock it (it does 5 s after the stop).
-        """
-        self._connection.unlock()
-
     def stop(self) -> None:
         """Brake whatever move is under way, from any thread; return when the arm stands.
 

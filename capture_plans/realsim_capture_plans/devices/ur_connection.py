@@ -4,7 +4,7 @@ import contextlib
 import threading
 import time
 from dataclasses import dataclass
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -174,7 +174,7 @@ class UrConnection:
         """
         seen = self.ask("look", self.config.packet_s + 1.0, timeout_s=self.config.packet_s)
         if not seen["fresh"]:
-            self._lost("its readings have stopped")
+            raise self._loss("its readings have stopped")
         return cast("dict[str, Any]", seen)
 
     def ask(self, do: str, deadline_s: float, **arguments: Any) -> Any:
@@ -185,7 +185,7 @@ class UrConnection:
         """
         with self._lock:
             if self._link is None or not self._link.alive:
-                self._lost("the connection was closed")
+                raise self._loss("the connection was closed")
             try:
                 return self._link.ask(do, deadline_s, **arguments)
             except LinkError as error:
@@ -229,24 +229,6 @@ class UrConnection:
         if self.alive:
             with contextlib.suppress(ArmStoppedError):
                 self.ask("stop_move", self.config.call_s, deceleration=self.config.stop_rad_s2)
-
-    def unlock(self) -> None:
-        """Unlock a protective stop.
-
-        Raises:
-            ArmStoppedError: the controller does not unlock it.
-        """
-        link = UrLink()
-        try:
-            link.ask("unlock", self.config.call_s, host=self.host)
-        except LinkError as error:
-            raise self.stop_error(
-                "protective stop",
-                f"the controller did not unlock it ({error})",
-                "wait 5 s after the stop, check that the arm is free, and try again",
-            ) from error
-        finally:
-            link.close()
 
     def refuse_trouble(self, seen: dict[str, Any], *, program: bool = True) -> None:
         """Raise what keeps the arm from moving.
@@ -335,9 +317,6 @@ class UrConnection:
             "connection lost",
         )
         return self._stopped
-
-    def _lost(self, why: str) -> NoReturn:
-        raise self._loss(why)
 
 
 def _pose_text(pose: list[float]) -> str:

@@ -28,16 +28,11 @@ LAST_LINES = 4
 _VERSION, _SETUP_OUTPUTS, _SETUP_INPUTS, _START, _PAUSE = 118, 79, 73, 83, 80
 _DATA, _PROTOCOL = 85, 86
 _COMMAND_REGISTER = b"input_int_register_0"
-_GLANCE = ("output_int_register_0", "runtime_state")
+_SCRIPT_REGISTER = b"output_int_register_0"
 
 
 class LinkError(Exception):
-    """A request to ur_rtde failed: `ended` says whether its process is gone with it."""
-
-    def __init__(self, message: str, *, ended: bool) -> None:
-        """Keep what ur_rtde said."""
-        super().__init__(message)
-        self.ended = ended
+    """A request to ur_rtde failed, or ended its process."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -48,8 +43,6 @@ class Glance:
     """Controller software: major, minor, bugfix, build."""
     script_register: int
     """output_int_register_0: 1 or 2 while ur_rtde's script is up (ready, done)."""
-    runtime_state: int
-    """RTDE's runtime_state; 2 = a program is running."""
     control_free: bool
     """Whether no other connection holds the register that ur_rtde commands with."""
 
@@ -88,18 +81,18 @@ class UrLink:
             self._process.stdin.write(json.dumps(request).encode() + b"\n")
             self._process.stdin.flush()
         except (BrokenPipeError, ValueError) as error:
-            raise LinkError(self._last_words(do, deadline_s), ended=True) from error
+            raise LinkError(self._last_words(do, deadline_s)) from error
         end = time.monotonic() + deadline_s + DEADLINE_SLACK_S
         while line := self._line(end):
             answer = json.loads(line)
             if answer["number"] != self._asked:
                 continue  # of a request that Ctrl-C cut short
             if "error" in answer:
-                raise LinkError(str(answer["error"]), ended=False)
+                raise LinkError(str(answer["error"]))
             return answer["value"]
         message = self._last_words(do, deadline_s)
         self.kill()
-        raise LinkError(message, ended=True)
+        raise LinkError(message)
 
     def close(self) -> None:
         """End the process; a move that is still under way is braked first."""
@@ -226,19 +219,17 @@ def _glance(link: socket.socket) -> Glance:
     _answer(link, _PROTOCOL)
     _send(link, _VERSION, b"")
     version = struct.unpack(">4I", _answer(link, _VERSION)[:16])
-    names = ",".join(_GLANCE)
-    _send(link, _SETUP_OUTPUTS, struct.pack(">d", 125.0) + names.encode())
+    _send(link, _SETUP_OUTPUTS, struct.pack(">d", 125.0) + _SCRIPT_REGISTER)
     _answer(link, _SETUP_OUTPUTS)
     _send(link, _START, b"")
     _answer(link, _START)
-    register, runtime = struct.unpack(">iI", _answer(link, _DATA)[1:9])
+    (register,) = struct.unpack(">i", _answer(link, _DATA)[1:5])
     _send(link, _PAUSE, b"")
     _answer(link, _PAUSE)
     _send(link, _SETUP_INPUTS, _COMMAND_REGISTER)
     return Glance(
         version=version,
         script_register=register,
-        runtime_state=runtime,
         control_free=b"IN_USE" not in _answer(link, _SETUP_INPUTS),
     )
 

@@ -34,7 +34,6 @@ class UrProcess:
 
     def __init__(self) -> None:
         """Begin without any connection."""
-        self._host = ""
         self._receive: Any = None
         self._control: Any = None
         self._with_payload = False
@@ -137,15 +136,6 @@ class UrProcess:
         while self._playing() and time.monotonic() < end:
             time.sleep(0.01)
 
-    def unlock(self, host: str) -> None:
-        """Clear a protective stop, as the pendant's button does."""
-        dashboard = self._dashboard(host)
-        try:
-            dashboard.closeSafetyPopup()
-            dashboard.unlockProtectiveStop()
-        finally:
-            dashboard.disconnect()
-
     def last_word(self) -> None:
         """Brake, if a move is under way: nobody watches it any more."""
         if self._control is not None and self._under_way():
@@ -157,7 +147,6 @@ class UrProcess:
             self._control.stopScript()
 
     def _dashboard(self, host: str) -> Any:
-        self._host = host
         dashboard = import_module("dashboard_client").DashboardClient(host)
         dashboard.connect(2000)
         return dashboard

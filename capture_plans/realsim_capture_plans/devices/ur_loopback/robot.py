@@ -90,8 +90,6 @@ NORMAL, PROTECTIVE, SAFEGUARD, EMERGENCY = 1, 3, 5, 7
 STOPPED, PLAYING, PAUSED = 1, 2, 4
 STOP_RAD_S2 = 12.0
 """Deceleration of a safety stop [rad/s^2]."""
-UNLOCK_AFTER_S = 5.0
-"""A protective stop cannot be unlocked sooner than this [s of the controller's clock]."""
 SWING_HZ, SWING_DECAY_S = 8.0, 0.15
 """Frequency and decay of the arm's swing after a move."""
 READY, DONE = 1, 2
@@ -139,7 +137,6 @@ class Controller:
         self.stalled = False
         self.foreign = False
         """Whether the program that runs is somebody else's, which answers no command."""
-        self.speed_fraction = 1.0
         self.input_ints = [0] * 48
         self.input_doubles = [0.0] * 48
         self.output_ints = [0] * 48
@@ -148,7 +145,6 @@ class Controller:
         self._asynchronous = False
         self._executing = False
         self._stood_s = 0.0
-        self._stopped_s = 0.0
         self._operation = self._writes = 0
         self._at_progress: tuple[float, str] | None = None
         self._commands: dict[int, Callable[[], None]] = {
@@ -199,7 +195,7 @@ class Controller:
         """Let the controller's clock go on [s] and its program do what it is told."""
         self.time_s += seconds
         if self._motion is not None and not self.stalled:
-            self._motion.advance(seconds * self.speed_fraction)
+            self._motion.advance(seconds)
             self.joints, self.speeds = self._motion.joints, self._motion.speeds
             if self._at_progress is not None and self._motion.progress >= self._at_progress[0]:
                 what = self._at_progress[1]
@@ -259,21 +255,12 @@ class Controller:
         """Do what a person does at the pendant: no stop any more, arm on, no program."""
         self.robot_mode, self.safety_mode, self.runtime = RUNNING, NORMAL, STOPPED
         self.remote, self.stalled, self.foreign = True, False, False
-        self.speed_fraction = 1.0
         self._motion = self._at_progress = None
         self.speeds = np.zeros(6)
         self.output_ints[0] = 0
 
-    def unlock(self) -> str:
-        """Unlock a protective stop; return what the dashboard says."""
-        if self.safety_mode == PROTECTIVE:
-            if self.time_s - self._stopped_s < UNLOCK_AFTER_S:
-                return "Cannot unlock protective stop until 5s after occurrence."
-            self.safety_mode = NORMAL
-        return "Protective stop releasing"
-
     def _safety(self, mode: int, runtime: int, robot_mode: int | None = None) -> None:
-        self.safety_mode, self._stopped_s = mode, self.time_s
+        self.safety_mode = mode
         self.runtime = runtime if self.runtime != STOPPED else STOPPED
         self.robot_mode = self.robot_mode if robot_mode is None else robot_mode
         if self._motion is not None:

@@ -38,45 +38,38 @@ READINGS: dict[str, Reading] = {
     "runtime_state": ("UINT32", lambda c: c.runtime),
     "robot_status_bits": ("UINT32", lambda c: c.status_bits),
     "safety_status_bits": ("UINT32", lambda c: c.safety_bits),
-    "speed_scaling": ("DOUBLE", lambda c: c.speed_fraction),
-    "target_speed_fraction": ("DOUBLE", lambda c: c.speed_fraction),
-    "payload": ("DOUBLE", lambda c: 0.35),
     "payload_cog": ("VECTOR3D", lambda c: (0.0, 0.0, 0.03)),
 }
 """What the loopback knows about its arm."""
-CONSTANTS: dict[str, tuple[str, float]] = {
-    "target_qdd": ("VECTOR6D", 0.0),
-    "target_current": ("VECTOR6D", 0.0),
-    "target_moment": ("VECTOR6D", 0.0),
-    "actual_current": ("VECTOR6D", 0.0),
-    "joint_control_output": ("VECTOR6D", 0.0),
-    "actual_TCP_speed": ("VECTOR6D", 0.0),
-    "actual_TCP_force": ("VECTOR6D", 0.0),
-    "target_TCP_speed": ("VECTOR6D", 0.0),
-    "actual_digital_input_bits": ("UINT64", 0),
-    "joint_temperatures": ("VECTOR6D", 30.0),
-    "actual_execution_time": ("DOUBLE", 0.0),
-    "joint_mode": ("VECTOR6INT32", 253),
-    "actual_tool_accelerometer": ("VECTOR3D", 0.0),
-    "actual_momentum": ("DOUBLE", 0.0),
-    "actual_main_voltage": ("DOUBLE", 48.0),
-    "actual_robot_voltage": ("DOUBLE", 48.0),
-    "actual_robot_current": ("DOUBLE", 0.5),
-    "actual_joint_voltage": ("VECTOR6D", 48.0),
-    "actual_digital_output_bits": ("UINT64", 0),
-    "standard_analog_input0": ("DOUBLE", 0.0),
-    "standard_analog_input1": ("DOUBLE", 0.0),
-    "standard_analog_output0": ("DOUBLE", 0.0),
-    "standard_analog_output1": ("DOUBLE", 0.0),
-    "ft_raw_wrench": ("VECTOR6D", 0.0),
-    "payload_inertia": ("VECTOR6D", 0.0),
-}
-"""What ur_rtde reads by default and the loopback has no notion of: always the same."""
+CONSTANTS: dict[tuple[str, float], tuple[str, ...]] = {
+    ("VECTOR6D", 0.0): (
+        "target_qdd", "target_current", "target_moment", "actual_current", "joint_control_output",
+        "actual_TCP_speed", "actual_TCP_force", "target_TCP_speed", "ft_raw_wrench",
+        "payload_inertia",
+    ),
+    ("VECTOR6D", 30.0): ("joint_temperatures",),
+    ("VECTOR6D", 48.0): ("actual_joint_voltage",),
+    ("VECTOR6INT32", 253): ("joint_mode",),
+    ("VECTOR3D", 0.0): ("actual_tool_accelerometer",),
+    ("DOUBLE", 0.0): (
+        "actual_execution_time", "actual_momentum", "standard_analog_input0",
+        "standard_analog_input1", "standard_analog_output0", "standard_analog_output1",
+    ),
+    ("DOUBLE", 0.35): ("payload",),
+    ("DOUBLE", 0.5): ("actual_robot_current",),
+    ("DOUBLE", 1.0): ("speed_scaling", "target_speed_fraction"),
+    ("DOUBLE", 48.0): ("actual_main_voltage", "actual_robot_voltage"),
+    ("UINT64", 0): ("actual_digital_input_bits", "actual_digital_output_bits"),
+}  # fmt: skip
+"""What ur_rtde reads by default and the loopback has no notion of, by its kind and its value."""
 
 
 def _constant(kind: str, value: float) -> Reading:
     count = int(FORMATS[kind][0]) if FORMATS[kind][0].isdigit() else 1
     return kind, lambda c: (value,) * count if count > 1 else value
+
+
+READINGS |= {name: _constant(*same) for same, names in CONSTANTS.items() for name in names}
 
 
 def _reading(name: str) -> Reading | None:
@@ -86,8 +79,6 @@ def _reading(name: str) -> Reading | None:
     if name.startswith("output_double_register_"):
         k = int(name.rsplit("_", 1)[1])
         return "DOUBLE", lambda c: c.output_doubles[k]
-    if name in CONSTANTS:
-        return _constant(*CONSTANTS[name])
     return READINGS.get(name)  # anything else is NOT_FOUND, as on a controller
 
 
@@ -270,8 +261,6 @@ class LoopbackServer:
             "running": lambda: f"Program running: {str(playing).lower()}",
             "robotmode": lambda: f"Robotmode: {MODES[c.robot_mode]}",
             "safetystatus": lambda: f"Safetystatus: {SAFETY[c.safety_mode]}",
-            "close safety popup": lambda: "closing safety popup",
-            "unlock protective stop": c.unlock,
             "stop": self._stop_answer,
         }
         return answers.get(command, lambda: unknown)()
