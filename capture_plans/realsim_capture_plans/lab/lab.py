@@ -20,7 +20,7 @@ from realsim.records import Mesh, ObjectModel, ObjectPose, TagBoard
 from realsim.robots.arm import find_arm
 from realsim_capture_plans.lab import truth as lab_truth
 from realsim_capture_plans.lab.devices import SimulatedArm, SimulatedDepthCamera
-from realsim_capture_plans.lab.placement import CrowdedError, PlacementConfig, place_objects
+from realsim_capture_plans.lab.placement import CrowdedError, place_objects
 from realsim_capture_plans.lab.truth import LabConfig, LabTruth
 from realsim_capture_plans.planning.advise import LONG_ARM_M
 from realsim_capture_plans.planning.elbow import reach_m
@@ -191,11 +191,11 @@ def _layout(config: LabConfig, instances: Sequence[ObjectModel], center: Array) 
     for radius in narrow:
         rng = lab_truth.stream(config.seed, lab_truth.LAYOUT)
         try:
-            return place_objects(instances, center, rng, PlacementConfig(radius_m=radius))
+            return place_objects(instances, center, rng, radius)
         except CrowdedError:
             continue
     rng = lab_truth.stream(config.seed, lab_truth.LAYOUT)
-    return place_objects(instances, center, rng, PlacementConfig(radius_m=widest))
+    return place_objects(instances, center, rng, widest)
 
 
 def _slab(size_m: tuple[float, float, float]) -> Mesh:

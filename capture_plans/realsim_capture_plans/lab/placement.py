@@ -6,7 +6,6 @@ centre of mass sees it (Boothroyd's energy-free estimate).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -27,22 +26,16 @@ class CrowdedError(InputError):
     """The objects do not fit into the disc."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PlacementConfig:
-    """How objects are laid out."""
-
-    radius_m: float = 0.17
-    """Radius of the disc that holds every footprint [m]: what a camera at 0.35 m sees whole."""
-    gap_m: float = 0.008
-    """Least distance of two footprints [m]: room for a fingertip's edge, and no contact."""
-    stability_m: float = 0.0004
-    """Least distance of the projected centre of mass from the rim of its facet [m]. Small, because
-    a cylinder lies on a facet 2 mm wide; what stands on a point is still refused."""
-    tries: int = 400
-    """Random spots tried for an object before the layout is started anew."""
-    restarts: int = 12
-    """Layouts tried before giving up. The first third scatters the objects evenly over the disc,
-    the rest packs them from its middle outward, which fits about a third more."""
+GAP_M = 0.008
+"""Least distance of two footprints [m]: room for a fingertip's edge, and no contact."""
+STABILITY_M = 0.0004
+"""Least distance of the projected centre of mass from the rim of its facet [m]. Small, because
+a cylinder lies on a facet 2 mm wide; what stands on a point is still refused."""
+TRIES = 400
+"""Random spots tried for an object before the layout is started anew."""
+RESTARTS = 12
+"""Layouts tried before giving up. The first third scatters the objects evenly over the disc,
+the rest packs them from its middle outward, which fits about a third more."""
 
 
 def _merged_facets(equations: Array) -> NDArray[np.intp]:
@@ -66,12 +59,9 @@ def _solid_angles(triangles: Array, eye: Array) -> Array:
     return np.asarray(2 * np.arctan2(volume, la * lb * lc + dots))
 
 
-def stable_rests(mesh: Mesh, margin_m: float) -> tuple[Array, Array]:
+@lru_cache(maxsize=256)
+def stable_rests(mesh: Mesh) -> tuple[Array, Array]:
     """Return the ways in which an object can rest on a plane.
-
-    Args:
-        mesh: the object [m].
-        margin_m: least distance of the projected centre of mass from its facet's rim [m].
 
     Returns:
         down (K, 3), the outward normals of the facets it rests on, and probabilities (K,).
@@ -96,20 +86,20 @@ def stable_rests(mesh: Mesh, margin_m: float) -> tuple[Array, Array]:
     normals = equations[order[starts], :3]
     feet = center - (normals @ center + equations[order[starts], 3])[:, None] * normals
     members = np.split(order, starts[1:])
-    for k in np.flatnonzero(~_is_beside(triangles[order], starts, feet, margin_m)):
-        if _inside_by(triangles[members[k]].reshape(-1, 3), normals[k], feet[k]) >= margin_m:
+    for k in np.flatnonzero(~_is_beside(triangles[order], starts, feet)):
+        if _inside_by(triangles[members[k]].reshape(-1, 3), normals[k], feet[k]) >= STABILITY_M:
             down.append(normals[k])
             weights.append(float(angles[members[k]].sum()))
     if not down:
         raise DegenerateError(
-            f"no facet of the object's hull holds its centre of mass by {margin_m * 1e3:.2g} mm; "
-            "it would roll. A smaller stability margin is accepted."
+            "no facet of the object's hull holds its centre of mass by "
+            f"{STABILITY_M * 1e3:.2g} mm; it would roll."
         )
     total = np.array(weights)
     return np.array(down), total / total.sum()
 
 
-def _is_beside(triangles: Array, starts: Rows, feet: Array, margin_m: float) -> Mask:
+def _is_beside(triangles: Array, starts: Rows, feet: Array) -> Mask:
     """Return which feet (G,) surely miss their facets; these start in triangles (F, 3, 3)."""
     count = np.diff(np.r_[starts, len(triangles)])
     away = feet - np.add.reduceat(triangles.mean(1), starts) / count[:, None]
@@ -117,7 +107,7 @@ def _is_beside(triangles: Array, starts: Rows, feet: Array, margin_m: float) -> 
     from_foot = triangles - feet.repeat(count, axis=0)[:, None]
     ahead = np.einsum("fij,fj->fi", from_foot, away.repeat(count, axis=0))
     reach = np.maximum.reduceat(ahead.max(1), starts)
-    return (far > SURELY_M) & (reach < (margin_m - SURELY_M) * far)
+    return (far > SURELY_M) & (reach < (STABILITY_M - SURELY_M) * far)
 
 
 def _inside_by(points: Array, normal: Array, foot: Array) -> float:
@@ -134,14 +124,9 @@ def _inside_by(points: Array, normal: Array, foot: Array) -> float:
     return float(-np.asarray(outline.equations)[:, 2].max())
 
 
-@lru_cache(maxsize=256)
-def _rests_of(model: ObjectModel, margin_m: float) -> tuple[Array, Array]:
-    return stable_rests(model.mesh, margin_m)
-
-
-def random_rest(model: ObjectModel, rng: np.random.Generator, margin_m: float) -> Array:
+def random_rest(model: ObjectModel, rng: np.random.Generator) -> Array:
     """Return T_table_obj (4, 4) of a resting pose over the origin, its lowest vertex at z = 0."""
-    down, probability = _rests_of(model, margin_m)
+    down, probability = stable_rests(model.mesh)
     normal = down[rng.choice(len(down), p=probability)]
     yaw = se3.exp_so3([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
     R = yaw @ _turn_onto(normal, np.array([0.0, 0.0, -1.0]))
@@ -199,10 +184,7 @@ def footprint_gap(a: Array, b: Array, shifts: Array = UNMOVED) -> Array:
 
 
 def place_objects(
-    models: Sequence[ObjectModel],
-    center_world: Array,
-    rng: np.random.Generator,
-    config: PlacementConfig = PlacementConfig(),
+    models: Sequence[ObjectModel], center_world: Array, rng: np.random.Generator, radius_m: float
 ) -> Array:
     """Return resting, non-overlapping poses Ts_world_obj (n, 4, 4) on a table.
 
@@ -210,7 +192,7 @@ def place_objects(
         models: the objects, one for each instance.
         center_world: (3,) middle of the disc on the table's surface [m].
         rng: the same generator state gives the same layout.
-        config: how they are laid out.
+        radius_m: of the disc that holds every footprint [m].
 
     Raises:
         CrowdedError: they do not fit; the message says how many did.
@@ -218,12 +200,12 @@ def place_objects(
     reach = [float(np.linalg.norm(m.mesh.extent)) for m in models]
     order = sorted(range(len(models)), key=lambda k: -reach[k])  # the bulky ones first
     best = 0
-    for attempt in range(config.restarts):
-        packed = 3 * attempt >= config.restarts
+    for attempt in range(RESTARTS):
+        packed = 3 * attempt >= RESTARTS
         poses: dict[int, Array] = {}
         outlines: list[Array] = []
         for k in order:
-            spot = _free_spot(models[k], outlines, rng, config, packed=packed)
+            spot = _free_spot(models[k], outlines, rng, radius_m, packed=packed)
             if spot is None:
                 break
             poses[k] = spot[0]
@@ -233,8 +215,8 @@ def place_objects(
             lift = se3.from_translation(center_world)
             return np.stack([lift @ poses[k] for k in range(len(models))])
     raise CrowdedError(
-        f"only {best} of {len(models)} objects fit into a disc of radius {config.radius_m:.3g} m "
-        f"with {config.gap_m * 1e3:.3g} mm between them; give fewer objects or a larger radius."
+        f"only {best} of {len(models)} objects fit into a disc of radius {radius_m:.3g} m "
+        f"with {GAP_M * 1e3:.3g} mm between them; give fewer objects or a larger radius."
     )
 
 
@@ -242,7 +224,7 @@ def _free_spot(
     model: ObjectModel,
     outlines: Sequence[Array],
     rng: np.random.Generator,
-    config: PlacementConfig,
+    radius_m: float,
     *,
     packed: bool,
 ) -> tuple[Array, Array] | None:
@@ -252,17 +234,17 @@ def _free_spot(
     """
     rests = 8  # resting poses and yaws drawn, each tried in its share of the spots
     for _ in range(rests):
-        T = random_rest(model, rng, config.stability_m)
+        T = random_rest(model, rng)
         shape = footprint(model.mesh, T)
-        room = config.radius_m - float(np.linalg.norm(shape, axis=1).max())
+        room = radius_m - float(np.linalg.norm(shape, axis=1).max())
         if room < 0:
             continue
-        n = -(-config.tries // rests)
+        n = -(-TRIES // rests)
         angles, r = rng.uniform(-np.pi, np.pi, n), room * np.sqrt(rng.uniform(size=n))
         spots = np.stack([r * np.cos(angles), r * np.sin(angles)], -1)
         free = np.ones(n, dtype=bool)
         for other in outlines:
-            free &= footprint_gap(shape, other, spots) >= config.gap_m
+            free &= footprint_gap(shape, other, spots) >= GAP_M
         if free.any():
             first = np.where(free, r, np.inf).argmin() if packed else free.argmax()
             return se3.from_translation([*spots[first], 0.0]) @ T, shape + spots[first]

@@ -182,9 +182,8 @@ def true_intrinsics(config: LabConfig) -> CameraIntrinsics:
     factory = factory_intrinsics(config)
     focal = 1 + config.focal_percent / 100 * rng.normal()
     center = config.center_px * config.width / FACTORY_WIDTH_PX * rng.normal(size=2)
-    k1, k2, p1, p2, k3 = np.array(config.distortion)
     radial = 1 + 0.2 * rng.uniform(-1, 1, size=2)
-    d = np.array([k1, k2, p1, p2, k3]) * np.concatenate([radial, rng.normal(size=3)])
+    d = np.array(config.distortion) * np.concatenate([radial, rng.normal(size=3)])
     return replace(
         factory,
         fx=factory.fx * focal,

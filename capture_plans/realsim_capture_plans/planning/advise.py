@@ -186,13 +186,11 @@ def _placement(
     one_side = found.where(bend(chain, found.joints) * better_elbow(found, chain) > 0)
     holes: list[float] = []
     for ok in (np.unique(found.item), np.unique(one_side.item)):
-        few = len(ok) < n
-        chosen = (
-            directions[ok]
-            if few
-            else directions[ok][thin_directions(directions[ok], n, directions)]
-        )
-        holes.append(NO_PLAN_DEG if few else hole_deg(chosen, here.elevation_deg))
+        hole = NO_PLAN_DEG
+        if len(ok) >= n:
+            chosen = directions[ok][thin_directions(directions[ok], n, directions)]
+            hole = hole_deg(chosen, here.elevation_deg)
+        holes.append(hole)
     return Placement(
         center=center,
         table_height_m=table_height_m,
