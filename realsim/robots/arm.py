@@ -210,13 +210,11 @@ def _arm_of(file: ArmFile, folder: RobotFolder) -> RobotArm:
             f"{where} has {' and '.join(ways) or 'no kinematics'}; exactly one of [dh], [urdf] and "
             "[mjcf] is needed."
         )
-    urdf = None
-    if file.urdf is not None:
-        urdf = read_chain(folder, file.urdf.file, file.urdf.base, file.urdf.flange)
-        arm = _dh_of_urdf(file.name, file.urdf, urdf)
-    elif file.mjcf is not None:
-        urdf = read_mjcf_chain(folder, file.mjcf.file, file.mjcf.base, file.mjcf.flange)
-        arm = _dh_of_urdf(file.name, file.mjcf, urdf)
+    urdf, table = None, file.urdf or file.mjcf
+    if table is not None:
+        read = read_mjcf_chain if file.urdf is None else read_chain
+        urdf = read(folder, table.file, table.base, table.flange)
+        arm = _dh_of_urdf(file.name, table, urdf)
     else:
         assert file.dh is not None  # one of them is there
         alpha, a, d = file.dh.alpha_rad, file.dh.a_m, file.dh.d_m

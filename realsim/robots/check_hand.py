@@ -12,7 +12,7 @@ from realsim.robots.check_arm import Finding
 from realsim.robots.hand import Hand, hand_of
 from realsim.robots.hand_file import HandFile
 from realsim.robots.robot_files import RobotFolder, robot_file
-from realsim.robots.urdf import floats, origin_of
+from realsim.robots.urdf import floats, mimicked, origin_of
 from realsim.untrusted.xml_tree import read_xml
 
 MEET_M = 1e-3
@@ -243,12 +243,7 @@ def _positions(path: Path, joint: Element, joints: dict[str, Element]) -> Array:
                 raise InputError(f"{path}: the joint '{name}' has no limits; lower and upper are.")
             low, high = floats(" ".join(map(str, ends)), (2,), f"the limits of '{name}' in {path}")
             return offset + scale * np.linspace(low, high, STEPS)
-        asked = mimic.get("joint", "")
-        if asked not in joints:
-            raise InputError(
-                f"{path}: the joint '{name[:60]}' mimics '{asked[:60]}', which is no joint of this "
-                f"file. Its joints: {', '.join(sorted(joints))}."
-            )
+        asked = mimicked(mimic, name, joints, path)
         text = f"{mimic.get('multiplier', '1')} {mimic.get('offset', '0')}"
         factor, shift = floats(text, (2,), f"the mimic of '{name}' in {path}")
         scale, offset, joint = scale * factor, offset + scale * shift, joints[asked]

@@ -8,7 +8,7 @@ is moved rigidly with the calibrated frame i, from where both agree best.
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -35,9 +35,8 @@ PLACEMENT_SAMPLES = 64
 """Joint vectors over which nominal and calibrated link frames are brought together."""
 LARGEST_MM_SCALE = 0.02
 """A URDF whose meshes are in millimetres scales them by 0.001."""
-_KINDS: dict[str, Kind] = {
-    "box": "box", "cylinder": "cylinder", "capsule": "capsule", "sphere": "sphere"
-}  # fmt: skip
+BOX_REACH_M = 5.0
+"""Infinite bounds of boxes end here: several times the reach of any arm."""
 CALIBRATION_LIMIT_M = 0.020
 """A controller's calibration moves a link by 1-5 mm; another arm's calibration by 100 mm."""
 
@@ -60,13 +59,15 @@ def rod_shape(rod: Rod) -> Shape:
 def block_shape(block: Block) -> Shape:
     """Return a box."""
     part, frame, low, high = block
-    lower, upper = np.array(low) / 1e3, np.array(high) / 1e3
-    x, y, z = (upper - lower).tolist()
+    return _box_shape(part, frame, np.array(low) / 1e3, np.array(high) / 1e3)
+
+
+def _box_shape(part: str, frame: int, lower: Array, upper: Array) -> Shape:
     return Shape(
         part=part,
         frame=frame,
         kind="box",
-        size_m=(x, y, z),
+        size_m=tuple((upper - lower).tolist()),
         T_frame_shape=se3.from_translation((lower + upper) / 2),
     )
 
@@ -80,8 +81,8 @@ def link_shape(shape: UrdfShape, part: str, frame: int, T_frame_link: Array) -> 
     """
     T = T_frame_link @ shape.T_link_shape
     if shape.file is None and shape.points is None:
-        return Shape(part=part, frame=frame, kind=_KINDS[shape.kind], size_m=shape.size_m,
-                     T_frame_shape=T)  # fmt: skip
+        kind = cast(Kind, shape.kind)
+        return Shape(part=part, frame=frame, kind=kind, size_m=shape.size_m, T_frame_shape=T)
     points = _mesh_points(shape.file, shape.size_m) if shape.points is None else shape.points
     try:
         corners = points[ConvexHull(points).vertices]
@@ -128,7 +129,8 @@ def link_placements(arm: "RobotArm") -> Array:
         if i < n:
             R = se3.mean_rotation(between[:, :3, :3])
             # The rotations' scatter swings the far-away origin; the mean keeps what is common.
-            at = np.mean(is_at[:, i, :3, :3].swapaxes(-1, -2) @ _offset(should, is_at, i), axis=0)
+            off = (should - is_at)[:, i, :3, 3, None]
+            at = np.mean(is_at[:, i, :3, :3].swapaxes(-1, -2) @ off, axis=0)
             placements[i] = se3.from_rt(R, at[:, 0])
         moved = is_at[:, i] @ placements[i]
         shift = float(np.linalg.norm(moved[:, :3, 3] - should[:, i, :3, 3], axis=-1).max())
@@ -141,23 +143,12 @@ def link_placements(arm: "RobotArm") -> Array:
     return placements
 
 
-def _offset(should: Array, is_at: Array, i: int) -> Array:
-    return (should[:, i, :3, 3] - is_at[:, i, :3, 3])[..., None]
-
-
-def finite_box(name: str, box: Box, reach_m: float) -> Shape:
-    """Return a box as a shape in base; bounds beyond `reach_m` end there [m]."""
-    lower, upper = np.clip(box.lower, -reach_m, reach_m), np.clip(box.upper, -reach_m, reach_m)
+def finite_box(name: str, box: Box) -> Shape:
+    """Return a box as a shape in base; bounds beyond `BOX_REACH_M` end there."""
+    lower, upper = np.clip([box.lower, box.upper], -BOX_REACH_M, BOX_REACH_M)
     if np.any(upper <= lower):
         raise InputError(
-            f"'{name}' from {box.lower} to {box.upper} m lies beyond {reach_m} m of the arm's "
+            f"'{name}' from {box.lower} to {box.upper} m lies beyond {BOX_REACH_M} m of the arm's "
             "base. Boxes are in metres in the controller's base; were millimetres given?"
         )
-    x, y, z = (upper - lower).tolist()
-    return Shape(
-        part=name,
-        frame=0,
-        kind="box",
-        size_m=(x, y, z),
-        T_frame_shape=se3.from_translation((lower + upper) / 2),
-    )
+    return _box_shape(name, 0, lower, upper)

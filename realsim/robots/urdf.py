@@ -1,5 +1,6 @@
 """The chain of turning joints in a URDF, and the shapes of its links."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -102,6 +103,21 @@ def sizes(shape: Element, key: str, count: int, where: str) -> Array:
     return values
 
 
+def mimicked(mimic: Element, joint: str, names: Collection[str], path: Path) -> str:
+    """Return the joint of a file that another one follows by its <mimic>.
+
+    Raises:
+        InputError: it is none of them.
+    """
+    asked = mimic.get("joint", "")
+    if asked not in names:
+        raise InputError(
+            f"{path}: the joint '{joint[:60]}' mimics '{asked[:60]}', which is no "
+            f"joint of this file. Its joints: {', '.join(sorted(names))}."
+        )
+    return asked
+
+
 def read_chain(folder: RobotFolder, file: str, base: str, flange: str) -> UrdfChain:
     """Return the chain between two links of a URDF.
 
@@ -142,13 +158,8 @@ class _Reader:
     def _check_mimics(self) -> None:
         names = {j.get("name", "") for j in self._joints}
         for joint in self._joints:
-            mimic = joint.find("mimic")
-            if mimic is not None and mimic.get("joint", "") not in names:
-                raise InputError(
-                    f"{self._path}: the joint '{joint.get('name', '')[:60]}' mimics "
-                    f"'{mimic.get('joint', '')[:60]}', which is no joint of this file. Its joints: "
-                    f"{', '.join(sorted(names))}."
-                )
+            if (mimic := joint.find("mimic")) is not None:
+                mimicked(mimic, joint.get("name", ""), names, self._path)
 
     def _end(self, joint: Element, end: str) -> str:
         element = joint.find(end)

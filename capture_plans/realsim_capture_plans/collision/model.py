@@ -25,8 +25,6 @@ from realsim_capture_plans.collision.pairs import choose_pairs
 GROUPS = ("self", "tool", "table", "scene")
 """`self`: the arm's links among themselves; `tool`: camera and bracket against the links; `table`;
 `scene`: the keep-out box and the obstacles."""
-BOX_REACH_M = 5.0
-"""Infinite bounds of boxes end here: several times the reach of any arm."""
 LEAST_FIRST = ("table", "tool", "scene", "self")
 """Order in which `free` asks: what is hit most often first."""
 
@@ -152,9 +150,9 @@ def bodies_of(arm: RobotArm, mount: Mount, cell: WorkCell) -> tuple[Body, ...]:
         Body(replace(s, frame=arm.joints), "mount", mount.cover_m)
         for s in (camera_shape(mount), *mount.bracket)
     ]
-    table = [Body(finite_box("table", cell.table, BOX_REACH_M), "table")]
+    table = [Body(finite_box("table", cell.table), "table")]
     scene = [
-        Body(finite_box(name, box, BOX_REACH_M), "scene")
+        Body(finite_box(name, box), "scene")
         for name, box in (("keep-out box", cell.keep_out), *cell.obstacles)
     ]
     return (*links, *carried, *table, *scene)
