@@ -185,22 +185,18 @@ def import_open3d() -> Any:
         _plotly_when_called()
         stand_ins.for_windows(_folder_of("open3d").glob("libOpen3D.so*"))
         with unbroken():  # half loaded, it ends the process with a code of its own
-            import open3d  # pyright: ignore[reportMissingTypeStubs]
+            return importlib.import_module("open3d")
     except (ImportError, OSError) as error:
         raise missing_library("open3d", error) from error
-    module: ModuleType = open3d
-    return module
 
 
 def import_pinocchio() -> Any:
     """Return the module `pinocchio`, with an OpenMP of another wheel where the system has none."""
     try:
         stand_ins.lend("libgomp.so.1", _folder_of("numpy").parent.glob("*.libs/libgomp-*"))
-        import pinocchio  # pyright: ignore[reportMissingImports]
+        return importlib.import_module("pinocchio")
     except (ImportError, OSError) as error:
         raise missing_library("pinocchio", error) from error
-    module: ModuleType = pinocchio
-    return module
 
 
 def import_pycolmap() -> Any:
@@ -218,11 +214,9 @@ def import_pyrealsense2() -> Any:
     """
     try:
         _preload_libusb()
-        import pyrealsense2
+        return importlib.import_module("pyrealsense2")
     except (ImportError, OSError) as error:
         raise missing_library("pyrealsense2", error) from error
-    module: ModuleType = pyrealsense2
-    return module
 
 
 # --- rotations --------------------------------------------------------------------------------
