@@ -13,14 +13,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.errors import InputError, MissingLibraryError
 from realsim.geometry import parts_prismatic as prismatic
 from realsim.geometry import parts_turned as turned
 from realsim.geometry.parts_prismatic import PartShape
 from realsim.geometry.parts_solids import weld
 from realsim.records import Mesh, ObjectModel
-
-Array = NDArray[np.float64]
 
 _PARTS: dict[str, tuple[int, Callable[[], PartShape]]] = {
     "box": (1, prismatic.box),

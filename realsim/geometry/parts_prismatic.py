@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from realsim.arrays import Array
 from realsim.geometry import parts_solids as solids
 from realsim.geometry import se3
 
-Array = NDArray[np.float64]
 Color = tuple[int, int, int]
 
 

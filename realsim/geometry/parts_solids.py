@@ -11,9 +11,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
-
-Array = NDArray[np.float64]
 
 WELD_M = 1e-9
 """Corners nearer than this are one vertex [m]: a thousandth of the tightest tolerance here."""

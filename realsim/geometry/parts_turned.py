@@ -1,12 +1,11 @@
 """The parts that are turned on a lathe or bent from a tube: profiles swept about z or a path."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from realsim.arrays import Array
 from realsim.geometry import parts_solids as solids
 from realsim.geometry.parts_prismatic import Color, PartShape, cyclic
-
-Array = NDArray[np.float64]
 
 FACETS = 96
 """Facets around a turned part: 0.02 mm off the circle at a radius of 38 mm."""

@@ -24,8 +24,8 @@ GREY, COLOUR = 0, 2
 """IHDR's colour types."""
 NONE, UP, AVERAGE = 0, 2, 3
 """IHDR's row filters."""
-DEEP_RGB = 3
-"""Channels of a map with three values a pixel."""
+LEVEL = 1
+"""ISA-L's level; those above cost more time and gain less than 1 %."""
 LONGEST_SIDE = 2**31 - 1
 
 
@@ -37,8 +37,6 @@ class Coding:
     """The filter of every row: what is left of the pixels should be small and repeat itself."""
     window_bits: int
     """Deflate looks back 2**window_bits bytes."""
-    level: int = 1
-    """ISA-L's level; those above cost more time and gain less than 1 %."""
 
 
 PHOTO = Coding(row_filter=AVERAGE, window_bits=9)
@@ -59,8 +57,6 @@ def encode_png(image: NDArray[Any]) -> bytes:
     Raises:
         InputError: another shape or type, or an image without pixels.
     """
-    from isal import isal_zlib
-
     is_mask = image.dtype == np.bool_ and image.ndim == 2
     if is_mask:
         image = image.astype(np.uint8) * np.uint8(MASK_VALUE)
@@ -76,15 +72,10 @@ def encode_png(image: NDArray[Any]) -> bytes:
         raise InputError(f"an image of {width}x{height} pixels cannot be written as PNG.")
     coding = MASK if is_mask else _coding(image)
     rows = _filtered(_bytes_of(image), _bytes_per_pixel(image), coding.row_filter)
-    deflate = isal_zlib.compressobj(coding.level, isal_zlib.DEFLATED, coding.window_bits)
-    data = deflate.compress(rows) + deflate.flush()
-    header = struct.pack(">IIBBBBB", width, height, bits, COLOUR if is_rgb else GREY, 0, 0, 0)
-    return _file(header, data)
+    return _file((width, height), bits, COLOUR if is_rgb else GREY, rows, coding.window_bits)
 
 
-def encode_window(
-    window: NDArray[Any], origin: tuple[int, int], size: tuple[int, int]
-) -> bytes:  # fmt: skip
+def encode_window(window: NDArray[Any], origin: tuple[int, int], size: tuple[int, int]) -> bytes:
     """Return the PNG of an image that holds `window` and is zero elsewhere.
 
     Args:
@@ -96,13 +87,11 @@ def encode_window(
     Raises:
         InputError: another type, or a window that reaches out of the image.
     """
-    from isal import isal_zlib
-
     if window.dtype == np.bool_:
         window = window.astype(np.uint8) * np.uint8(MASK_VALUE)
-    channels = window.shape[2] if window.ndim == DEEP_RGB else 1
+    channels = window.shape[2] if window.ndim == 3 else 1
     bits = 8 * window.dtype.itemsize if window.dtype.kind == "u" else 0
-    if window.ndim not in (2, 3) or (channels, bits) not in ((1, 8), (1, 16), (DEEP_RGB, 16)):
+    if window.ndim not in (2, 3) or (channels, bits) not in ((1, 8), (1, 16), (RGB_CHANNELS, 16)):
         raise InputError(
             f"a window of shape {window.shape} and type {window.dtype} was given; (h, w) bool, "
             "uint8 or uint16, and (h, w, 3) uint16 can be written."
@@ -114,12 +103,9 @@ def encode_window(
             f"a window of {w}x{h} pixels at ({x}, {y}) reaches out of an image of {width}x{height}."
         )
     coding = MASK if bits == 8 else COUNTS
-    data = _window_rows(window, (x, y), size, coding.row_filter).data
-    deflate = isal_zlib.compressobj(coding.level, isal_zlib.DEFLATED, coding.window_bits)
-    body = deflate.compress(data) + deflate.flush()
-    color = COLOUR if channels == DEEP_RGB else GREY
-    header = struct.pack(">IIBBBBB", width, height, bits, color, 0, 0, 0)
-    return _file(header, body)
+    rows = _window_rows(window, (x, y), size, coding.row_filter)
+    color = COLOUR if channels == RGB_CHANNELS else GREY
+    return _file(size, bits, color, rows, coding.window_bits)
 
 
 def _window_rows(
@@ -128,13 +114,12 @@ def _window_rows(
     """Return the filtered rows of the image, each after the byte that names its filter."""
     (x, y), (width, height) = origin, size
     h, w = window.shape[:2]
-    pixel = window.dtype.itemsize * (window.shape[2] if window.ndim == DEEP_RGB else 1)
+    pixel = _bytes_per_pixel(window)
     out = np.zeros((height, 1 + width * pixel), np.uint8)
     out[:, 0] = row_filter
     if h == 0 or w == 0:
         return out
-    big_endian = window.astype(">u2") if window.dtype.itemsize == 2 else window
-    rows = np.ascontiguousarray(big_endian).view(np.uint8).reshape(h, w * pixel)
+    rows = _bytes_of(window)
     columns = slice(1 + x * pixel, 1 + (x + w) * pixel)
     if row_filter == NONE:
         out[y : y + h, columns] = rows
@@ -191,9 +176,12 @@ def _filtered(rows: UInt8, step: int, row_filter: int) -> UInt8:
     return out
 
 
-def _file(header: bytes, data: bytes) -> bytes:
+def _file(size: tuple[int, int], bits: int, color: int, rows: UInt8, window_bits: int) -> bytes:
     from isal import isal_zlib
 
+    deflate = isal_zlib.compressobj(LEVEL, isal_zlib.DEFLATED, window_bits)
+    data = deflate.compress(rows) + deflate.flush()
+    header = struct.pack(">IIBBBBB", *size, bits, color, 0, 0, 0)
     parts = [SIGNATURE]
     for name, content in ((b"IHDR", header), (b"IDAT", data), (b"IEND", b"")):
         crc = struct.pack(">I", isal_zlib.crc32(content, isal_zlib.crc32(name)))
