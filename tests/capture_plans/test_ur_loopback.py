@@ -57,7 +57,7 @@ def test_ends_with_its_parent() -> None:
     code = (
         "import os\n"
         "from realsim_capture_plans.devices.ur_loopback import LoopbackController\n"
-        "print(LoopbackController.start()._process.pid, flush=True)\n"
+        "print(LoopbackController.start()._process.process.pid, flush=True)\n"
         "os.kill(os.getpid(), 9)\n"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).stdout

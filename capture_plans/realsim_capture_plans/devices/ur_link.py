@@ -10,9 +10,10 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from realsim_capture_plans.devices.interfaces import ArmStoppedError
 
@@ -47,76 +48,30 @@ class Glance:
     """Whether no other connection holds the register that ur_rtde commands with."""
 
 
-class UrLink:
-    """ur_rtde in a process of its own; every call has a deadline, after which it is ended."""
+class LineProcess:
+    """A Python process that is told lines and answers each with a line."""
 
-    def __init__(self) -> None:
-        """Start the process, without any connection."""
-        self._said = tempfile.TemporaryFile()
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", str(Path(__file__).with_name("ur_process.py"))],
+    def __init__(self, words: Sequence[str], said: IO[bytes] | None = None) -> None:
+        """Start it with these words of a command line; what it prints as errors goes to `said`."""
+        self.process = subprocess.Popen(
+            [sys.executable, *words],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=self._said,
+            stderr=said,
             start_new_session=True,  # Ctrl-C in the terminal is for the capture alone
         )
         self._unread = b""
-        self._asked = 0
 
-    @property
-    def alive(self) -> bool:
-        """Whether the process still runs."""
-        return self._process.poll() is None
+    def tell(self, line: str) -> None:
+        """Send a line."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(line.encode() + b"\n")
+        self.process.stdin.flush()
 
-    def ask(self, do: str, deadline_s: float, **arguments: Any) -> Any:
-        """Return the answer to one request.
-
-        Raises:
-            LinkError: it failed, or there was no answer within the deadline [s].
-        """
-        self._asked += 1
-        request = {"do": do, "with": arguments, "deadline_s": deadline_s, "number": self._asked}
-        assert self._process.stdin is not None
-        try:
-            self._process.stdin.write(json.dumps(request).encode() + b"\n")
-            self._process.stdin.flush()
-        except (BrokenPipeError, ValueError) as error:
-            raise LinkError(self._last_words(do, deadline_s)) from error
-        end = time.monotonic() + deadline_s + DEADLINE_SLACK_S
-        while line := self._line(end):
-            answer = json.loads(line)
-            if answer["number"] != self._asked:
-                continue  # of a request that Ctrl-C cut short
-            if "error" in answer:
-                raise LinkError(str(answer["error"]))
-            return answer["value"]
-        message = self._last_words(do, deadline_s)
-        self.kill()
-        raise LinkError(message)
-
-    def close(self) -> None:
-        """End the process; a move that is still under way is braked first."""
-        assert self._process.stdin is not None
-        with contextlib.suppress(OSError):
-            self._process.stdin.close()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(CLOSE_S)
-        self.kill()
-
-    def kill(self) -> None:
-        """End the process at once."""
-        self._process.kill()
-        self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout):
-            if stream is not None:
-                with contextlib.suppress(OSError):
-                    stream.close()
-        self._said.close()
-
-    def _line(self, end: float) -> bytes:
+    def line(self, end: float) -> bytes:
         """Return the next line, or nothing if none came before `end` or the process ended."""
-        assert self._process.stdout is not None
-        number = self._process.stdout.fileno()
+        assert self.process.stdout is not None
+        number = self.process.stdout.fileno()
         while b"\n" not in self._unread:
             left = end - time.monotonic()
             if left <= 0 or not select.select([number], [], [], left)[0]:
@@ -127,6 +82,71 @@ class UrLink:
             self._unread += piece
         line, self._unread = self._unread.split(b"\n", 1)
         return line
+
+    def close(self, wait_s: float = CLOSE_S) -> None:
+        """Close its stdin and let it end by itself within this time [s], else end it."""
+        assert self.process.stdin is not None
+        with contextlib.suppress(OSError):
+            self.process.stdin.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(wait_s)
+        self.kill()
+
+    def kill(self) -> None:
+        """End it at once."""
+        self.process.kill()
+        self.process.wait()
+        for stream in (self.process.stdin, self.process.stdout):
+            if stream is not None:
+                with contextlib.suppress(OSError):
+                    stream.close()
+
+
+class UrLink(LineProcess):
+    """ur_rtde in a process of its own; every call has a deadline, after which it is ended.
+
+    It ends with `close`, which brakes a move that is still under way, or with `kill`.
+    """
+
+    def __init__(self) -> None:
+        """Start the process, without any connection."""
+        self._said = tempfile.TemporaryFile()
+        super().__init__(["-P", str(Path(__file__).with_name("ur_process.py"))], self._said)
+        self._asked = 0
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process still runs."""
+        return self.process.poll() is None
+
+    def ask(self, do: str, deadline_s: float, **arguments: Any) -> Any:
+        """Return the answer to one request.
+
+        Raises:
+            LinkError: it failed, or there was no answer within the deadline [s].
+        """
+        self._asked += 1
+        request = {"do": do, "with": arguments, "deadline_s": deadline_s, "number": self._asked}
+        try:
+            self.tell(json.dumps(request))
+        except (BrokenPipeError, ValueError) as error:
+            raise LinkError(self._last_words(do, deadline_s)) from error
+        end = time.monotonic() + deadline_s + DEADLINE_SLACK_S
+        while line := self.line(end):
+            answer = json.loads(line)
+            if answer["number"] != self._asked:
+                continue  # of a request that Ctrl-C cut short
+            if "error" in answer:
+                raise LinkError(str(answer["error"]))
+            return answer["value"]
+        message = self._last_words(do, deadline_s)
+        self.kill()
+        raise LinkError(message)
+
+    def kill(self) -> None:
+        """End the process at once."""
+        super().kill()
+        self._said.close()
 
     def _last_words(self, do: str, deadline_s: float) -> str:
         """Return why the process is gone, with what ur_rtde printed last."""

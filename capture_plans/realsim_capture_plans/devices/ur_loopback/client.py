@@ -1,16 +1,12 @@
 """A loopback controller in a process of its own: for tests, and for a plan without a robot."""
 
-import contextlib
 import json
-import os
 import random
-import select
-import subprocess
-import sys
 import time
 from typing import Any
 
 from realsim_capture_plans.devices.interfaces import DeviceError
+from realsim_capture_plans.devices.ur_link import LineProcess
 
 MODULE = "realsim_capture_plans.devices.ur_loopback"
 READY_S = 60.0
@@ -24,7 +20,7 @@ ADDRESSES_TRIED = 20
 class LoopbackController:
     """A running loopback controller at `host`; it ends with `close` or with this process."""
 
-    def __init__(self, host: str, process: "subprocess.Popen[bytes]", options: list[str]) -> None:
+    def __init__(self, host: str, process: LineProcess, options: list[str]) -> None:
         """Take over a process that is ready; use `start`."""
         self.host = host
         self._process = process
@@ -81,7 +77,6 @@ class LoopbackController:
     def kill(self) -> None:
         """End the process without a word, as a power cut does."""
         self._process.kill()
-        self._end()
 
     def restart(self) -> None:
         """Start it anew at the same address."""
@@ -92,14 +87,7 @@ class LoopbackController:
 
     def close(self) -> None:
         """End it."""
-        if self._process.stdin is not None:
-            with contextlib.suppress(OSError):
-                self._process.stdin.close()
-        try:
-            self._process.wait(5.0)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-        self._end()
+        self._process.close(5.0)
 
     def __enter__(self) -> "LoopbackController":
         """Return itself."""
@@ -109,51 +97,26 @@ class LoopbackController:
         """End it."""
         self.close()
 
-    def _end(self) -> None:
-        self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout):
-            if stream is not None:
-                with contextlib.suppress(OSError):
-                    stream.close()
-
     def _tell(self, line: str) -> Any:
         """Send one command and return its answer."""
-        assert self._process.stdin is not None
-        self._process.stdin.write(line.encode() + b"\n")
-        self._process.stdin.flush()
-        answer = json.loads(_line(self._process, ANSWER_S) or b'{"error": "no answer"}')
+        self._process.tell(line)
+        answer = _answer(self._process, ANSWER_S, "no answer")
         if "error" in answer:
             raise DeviceError(f"the loopback controller on '{line}': {answer['error']}")
         return answer["value"]
 
 
-def _spawn(host: str, options: list[str]) -> "tuple[subprocess.Popen[bytes] | None, str]":
+def _spawn(host: str, options: list[str]) -> tuple[LineProcess | None, str]:
     """Return a process whose ports are open; or None and why not."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", MODULE, f"--host={host}", "--piped", *options],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        start_new_session=True,
-    )
-    line = _line(process, READY_S)
-    answer = json.loads(line) if line else {"error": "it ended or did not get ready"}
+    process = LineProcess(["-m", MODULE, f"--host={host}", "--piped", *options])
+    answer = _answer(process, READY_S, "it ended or did not get ready")
     if "error" not in answer:
         return process, ""
     process.kill()
-    process.wait()
     return None, str(answer["error"])
 
 
-def _line(process: "subprocess.Popen[bytes]", timeout_s: float) -> bytes:
-    """Return the next line of a process, or nothing."""
-    assert process.stdout is not None
-    line, end = b"", time.monotonic() + timeout_s
-    while not line.endswith(b"\n"):
-        left = end - time.monotonic()
-        if left <= 0 or not select.select([process.stdout], [], [], left)[0]:
-            return b""
-        piece = os.read(process.stdout.fileno(), 4096)
-        if not piece:
-            return b""
-        line += piece
-    return line
+def _answer(process: LineProcess, timeout_s: float, without: str) -> dict[str, Any]:
+    """Return what a process answers; the error `without` where it does not."""
+    line = process.line(time.monotonic() + timeout_s)
+    return json.loads(line) if line else {"error": without}
