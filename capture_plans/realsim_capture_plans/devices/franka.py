@@ -28,7 +28,6 @@ from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
 from realsim.interop import import_extra
 from realsim.robots.kinematics import DhChain
-from realsim.robots.limits import JointLimits
 from realsim_capture_plans.devices.franka_messages import lost, named, off_goal, stopped, trouble
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, checked_goal
 
@@ -93,26 +92,17 @@ class FrankaArm:
         """
         self._franky = import_extra("franky", "franka", "a Franka arm")
         self._host, self._chain, self._who = host, chain, f"{chain.name} at {host}"
+        self.name, self.limits = chain.name, chain.limits
         self._config = FrankaConfig() if config is None else config
         # franky's robot: whatever else keeps it keeps the connection.
         self._held: list[Any] = []
         self._connect()
 
     @property
-    def name(self) -> str:
-        """Model name."""
-        return self._chain.name
-
-    @property
-    def limits(self) -> JointLimits:
-        """Limits of the joints."""
-        return self._chain.limits
-
-    @property
     def description(self) -> dict[str, Any]:
         """What is kept with the session."""
         driver = f"franky {metadata.version('franky-control')}"
-        return {"model": self._chain.name, "host": self._host, **self._told, "driver": driver}
+        return {"model": self.name, "host": self._host, **self._told, "driver": driver}
 
     def move(self, joints: ArrayLike, speed: float = 1.05, acceleration: float = 1.4) -> None:
         """Go to joints (7,) [rad] as `Arm.move` says; return when the arm stands there.
@@ -121,7 +111,7 @@ class FrankaArm:
             InputError: the goal is outside the limits, or the speed; the arm has not moved.
             ArmStoppedError: the arm stopped on its way, or does not move.
         """
-        goal, c = checked_goal(joints, self._chain.limits), self._config
+        goal, c = checked_goal(joints, self.limits), self._config
         way = np.abs(goal - np.array(self._standing(None).q_d))
         share = np.maximum(way / max(float(way.max()), 1e-9), LEAST_SHARE)
         self._check_rates(share, speed, acceleration)
@@ -192,7 +182,7 @@ class FrankaArm:
 
     def _check_rates(self, share: Array, speed: float, acceleration: float) -> None:
         """Refuse a speed or an acceleration that a joint cannot have; nothing has moved."""
-        held, limits = self._held, self._chain.limits
+        held, limits = self._held, self.limits
         fastest = np.minimum(limits.speed, held[0].joint_velocity_limit.max) / share
         hardest = np.minimum(limits.acceleration, held[0].joint_acceleration_limit.max) / share
         most = self._config.acceleration_max_rad_s2

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.interop import import_pyrealsense2
-from realsim.records import CameraIntrinsics
 from realsim_capture_plans.devices import realsense_facts as facts
 from realsim_capture_plans.devices.interfaces import DeviceError, Frame
 from realsim_capture_plans.devices.realsense_facts import intrinsics_of
@@ -122,21 +121,24 @@ class RealSenseCamera:
         rs = self._rs
         self._device: Any = device
         self._facts = facts.device_json(rs, device)
-        self._name = f"{self._facts.get('model', 'RealSense')} {self._facts.get('serial', '')}"
+        self.name = f"{self._facts.get('model', 'RealSense')} {self._facts.get('serial', '')}"
+        """Model and serial number."""
         self._serial = self._facts.get("serial", self._serial)
         self._check_size()
         depth_sensor, depth = self._stream(rs.stream.depth, rs.format.z16)
         color_sensor, color = self._stream(rs.stream.color, rs.format.rgb8)
         self._lenses = (depth.get_intrinsics(), color.get_intrinsics())
-        self._intrinsics = intrinsics_of(self._lenses[COLOR])
+        self.intrinsics = intrinsics_of(self._lenses[COLOR])
+        """The factory's model of the colour image, which the depth is aligned to."""
         units = facts.options_json(rs, depth_sensor).get("depth_units")
         if not units:
-            raise DeviceError(f"{self._name} does not report its depth unit.")
-        self._depth_unit_m = units
+            raise DeviceError(f"{self.name} does not report its depth unit.")
+        self.depth_unit_m = units
+        """Metres per count, as the device says (0.0001 on a D405)."""
         self._T_color_depth = facts.T_of(depth.get_extrinsics_to(color))
         self._alignment = None
         if not _same_pixels(*self._lenses, self._T_color_depth):
-            self._alignment = Alignment(rs, self._intrinsics, self._T_color_depth)
+            self._alignment = Alignment(rs, self.intrinsics, self._T_color_depth)
         # A D405 has both streams in one sensor, which opens them together; others have two.
         self._together = _name_of(rs, depth_sensor) == _name_of(rs, color_sensor)
         self._pairs = PairBuffer(
@@ -156,7 +158,7 @@ class RealSenseCamera:
     def _check_size(self) -> None:
         width, height = self._config.width, self._config.height
         four_to_three = width * 9 != height * 16 and (width, height) != (848, 480)
-        if self._recording is None and four_to_three and "D405" in self._name:
+        if self._recording is None and four_to_three and "D405" in self.name:
             raise InputError(
                 f"{width}x{height} is not 16:9; the SDK aligns depth wrongly to a D405's 4:3 "
                 "colour crops. Use 1280x720, 848x480 or 640x360."
@@ -189,7 +191,7 @@ class RealSenseCamera:
                 f"{', '.join(sorted(set(there))) or 'none of that kind'}."
             )
         raise DeviceError(
-            f"{self._name} has no stream {wanted}, {c.width}, {c.height}, {c.fps}; there is "
+            f"{self.name} has no stream {wanted}, {c.width}, {c.height}, {c.fps}; there is "
             f"{', '.join(sorted(set(there))[:12]) or 'none of that kind'}. On a USB 2 port or "
             "cable the larger sizes are missing."
         )
@@ -224,7 +226,7 @@ class RealSenseCamera:
             self.close()
             c = self._config
             raise DeviceError(
-                f"{self._name} does not start {c.width}x{c.height} at {c.fps} per second ({error})."
+                f"{self.name} does not start {c.width}x{c.height} at {c.fps} per second ({error})."
                 " Is it on a USB 3 port, and is no other program using it?"
             ) from error
 
@@ -244,26 +246,11 @@ class RealSenseCamera:
         if not span.min <= value <= span.max:
             raise InputError(
                 f"an exposure of {exposure:g} us was asked for; the {_name_of(rs, sensor)} of "
-                f"{self._name} takes {span.min * unit:g} to {span.max * unit:g} us."
+                f"{self.name} takes {span.min * unit:g} to {span.max * unit:g} us."
             )
         sensor.set_option(rs.option.exposure, value)
 
     # --- what it is ---------------------------------------------------------------------------
-
-    @property
-    def name(self) -> str:
-        """Model and serial number."""
-        return self._name
-
-    @property
-    def intrinsics(self) -> CameraIntrinsics:
-        """The factory's model of the colour image, which the depth is aligned to."""
-        return self._intrinsics
-
-    @property
-    def depth_unit_m(self) -> float:
-        """Metres per count, as the device says (0.0001 on a D405)."""
-        return self._depth_unit_m
 
     @property
     def description(self) -> dict[str, Any]:
@@ -277,9 +264,9 @@ class RealSenseCamera:
                 _name_of(self._rs, s): facts.options_json(self._rs, s) for s in self._sensors
             }
         return {
-            "name": self._name,
+            "name": self.name,
             **self._facts,
-            "depth_unit_m": self._depth_unit_m,
+            "depth_unit_m": self.depth_unit_m,
             "factory": {
                 "color": facts.raw_intrinsics_json(self._lenses[COLOR]),
                 "depth": facts.raw_intrinsics_json(self._lenses[DEPTH]),
@@ -339,7 +326,7 @@ class RealSenseCamera:
 
     def _trouble(self) -> str:
         """Return what is wrong with a camera that gives no pairs, and what to do."""
-        why = f"{self._name} gave no frame within {self._config.timeout_s:g} s: "
+        why = f"{self.name} gave no frame within {self._config.timeout_s:g} s: "
         if self._recording is not None:
             return why + f"{self._pairs.why_none()} from {self._recording}."
         if self._serial not in _serials(self._rs, list(self._devices())):
@@ -359,9 +346,9 @@ class RealSenseCamera:
         }
         if self._alignment is None:
             counts = np.asanyarray(pair.depth.get_data())
-            depth_m = (counts * np.float64(self._depth_unit_m)).astype(np.float32)
+            depth_m = (counts * np.float64(self.depth_unit_m)).astype(np.float32)
         else:
-            depth_m = self._alignment.depth_m(pair, self._depth_unit_m)
+            depth_m = self._alignment.depth_m(pair, self.depth_unit_m)
         return Frame(
             rgb=np.asanyarray(pair.color.get_data()),
             depth_m=depth_m,
@@ -394,7 +381,7 @@ class RealSenseCamera:
         if self._serial not in _serials(self._rs, devices):
             there = ", ".join(_serials(self._rs, devices)) or "no other"
             raise DeviceError(
-                f"{self._name} is not connected (connected: {there}). Plug it in again; another "
+                f"{self.name} is not connected (connected: {there}). Plug it in again; another "
                 "camera cannot replace it, because its lens and mount differ."
             )
         self._start(_chosen(self._rs, devices, self._serial))

@@ -58,7 +58,9 @@ class PairBuffer:
         self._waiting: tuple[deque[Any], deque[Any]] = (deque(), deque())
         self._last_number: list[int | None] = [None, None]
         self._changed = threading.Condition()
-        self._closed = self._ended = False
+        self._closed = False
+        self.ended = False
+        """Whether the recording is over."""
         self.received = [0, 0]
         """Frames that came, depth and colour."""
 
@@ -116,7 +118,7 @@ class PairBuffer:
         """Return the next pair; None if none came in time [s] or the recording has ended."""
         with self._changed:
             self._changed.wait_for(
-                lambda: bool(self._pairs) or self._ended or self._closed, timeout_s
+                lambda: bool(self._pairs) or self.ended or self._closed, timeout_s
             )
             pair = self._pairs.popleft() if self._pairs else None
             self._changed.notify_all()
@@ -132,7 +134,7 @@ class PairBuffer:
     def end(self) -> None:
         """Note that no more frames will come: the recording is over."""
         with self._changed:
-            self._ended = True
+            self.ended = True
             self._changed.notify_all()
 
     def close(self) -> None:
@@ -143,11 +145,6 @@ class PairBuffer:
             for waiting in self._waiting:
                 waiting.clear()
             self._changed.notify_all()
-
-    @property
-    def ended(self) -> bool:
-        """Whether the recording is over."""
-        return self._ended
 
     def why_none(self) -> str:
         """Return what came instead of a pair, for a message."""

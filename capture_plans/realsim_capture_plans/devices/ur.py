@@ -22,7 +22,6 @@ from realsim.geometry import se3
 from realsim.interop import T_from_rotation_vector_pose
 from realsim.robots.arm import ur_chains
 from realsim.robots.kinematics import DhChain
-from realsim.robots.limits import JointLimits
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, checked_goal
 from realsim_capture_plans.devices.ur_connection import Identity, UrConfig, UrConnection
 
@@ -59,26 +58,17 @@ class UrArm:
         self._stop_asked = False
         try:
             self._connection.open()
-            self._name, self._chain, self._gap_m = self._checked_model(chain)
+            self.name, self._chain, self._gap_m = self._checked_model(chain)
+            self.limits = self._chain.limits
         except BaseException:
             self.close()
             raise
 
     @property
-    def name(self) -> str:
-        """Model name, a key of `kinematics.CHAINS`."""
-        return self._name
-
-    @property
-    def limits(self) -> JointLimits:
-        """Limits of the joints."""
-        return self._chain.limits
-
-    @property
     def description(self) -> dict[str, Any]:
         """What is kept with the session."""
         return {
-            "model": self._name,
+            "model": self.name,
             "host": self._connection.host,
             "serial_number": self._identity.serial,
             "polyscope": self._identity.polyscope,

@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from realsim.records import CameraIntrinsics
 from realsim.robots.arm import UR5, find_arm
 from realsim.robots.kinematics import DhChain
-from realsim.robots.limits import JointLimits
 from realsim_capture_plans.devices.interfaces import Arm, ArmState, Frame, checked_goal
 from realsim_capture_plans.lab.truth import NOISE, LabConfig, LabTruth, factory_intrinsics, stream
 from realsim_capture_plans.planning.ordering import move_seconds
@@ -38,21 +36,8 @@ class SimulatedArm:
         self._chain = chain
         self._joints = np.array(find_arm(chain.name).home)
         self._time_s = 0.0
-
-    @property
-    def name(self) -> str:
-        """Name of the arm."""
-        return self._chain.name
-
-    @property
-    def limits(self) -> JointLimits:
-        """Limits of the joints."""
-        return self._chain.limits
-
-    @property
-    def description(self) -> dict[str, Any]:
-        """What is kept with the session."""
-        return {"model": self.name, "simulated": True}
+        self.name, self.limits = chain.name, chain.limits
+        self.description: dict[str, Any] = {"model": chain.name, "simulated": True}
 
     def recover(self) -> None:
         """Do nothing: this arm never stops by itself."""
@@ -104,31 +89,15 @@ class SimulatedDepthCamera:
         self._truth = truth
         self._arm = arm
         self._table = table
-        self._factory = factory_intrinsics(config)
         self._depth = _depth_camera(config)
         self._seen: Sequence[PlacedMesh] | None = None
         self._renderer: PhotoRenderer | None = None
         self._frames = 0
-
-    @property
-    def name(self) -> str:
-        """Model and serial number."""
-        return f"simulated D405 {self._config.seed:06d}"
-
-    @property
-    def intrinsics(self) -> CameraIntrinsics:
+        self.name = f"simulated D405 {config.seed:06d}"
+        self.intrinsics = factory_intrinsics(config)
         """The factory's camera model: near the truth, and without its distortion."""
-        return self._factory
-
-    @property
-    def depth_unit_m(self) -> float:
-        """Metres per count of the sensor's own 16-bit depth."""
-        return DEPTH_UNIT_M
-
-    @property
-    def description(self) -> dict[str, Any]:
-        """What is kept with the session."""
-        return {"name": self.name, "simulated": True}
+        self.depth_unit_m = DEPTH_UNIT_M
+        self.description: dict[str, Any] = {"name": self.name, "simulated": True}
 
     def grab(self) -> Frame:
         """Return a frame of what is on the table.
