@@ -59,13 +59,13 @@ def draw_arm(axes: Any, curves: PlanCurves) -> None:
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
     from trimesh.remesh import subdivide_to_size
 
-    plan = curves.plan
+    plan, camera = curves.plan, curves.sensor.intrinsics
     # The order is given: matplotlib would guess it, and draw the table over the arm.
     axes.computed_zorder = False
     for box, color in [(scene_box(plan), ORANGE), *((b, RED) for _, b in plan.cell.obstacles)]:
         lines = Line3DCollection(box_edges(box), colors=color, linewidths=1.6, zorder=2)
         axes.add_collection3d(lines)
-    small = _frustums(plan.Ts_base_cam, curves, SMALL_FRUSTUM_M)
+    small = frustum_lines(plan.Ts_base_cam, camera, SMALL_FRUSTUM_M)
     axes.add_collection3d(Line3DCollection(small, colors="0.45", linewidths=0.5, zorder=1))
     everything = [plan.Ts_base_cam[:, :3, 3], np.zeros((1, 3))]
     triangles: list[Array] = []
@@ -78,7 +78,7 @@ def draw_arm(axes: Any, curves: PlanCurves) -> None:
             triangles.append(corner)
             colors.append(_shaded(corner, color))
             everything.append(vertices)
-        near = _frustums(plan.Ts_base_cam[k : k + 1], curves, FRUSTUM_M)
+        near = frustum_lines(plan.Ts_base_cam[k : k + 1], camera, FRUSTUM_M)
         axes.add_collection3d(Line3DCollection(near, colors=color, linewidths=1.6, zorder=4))
     # One collection, so that triangles are sorted among each other.
     axes.add_collection3d(
@@ -119,7 +119,7 @@ def _draw_flat(axes: Any, curves: PlanCurves, plane: tuple[int, int], title: str
         flat = list(lines[..., [a, b]])
         axes.add_collection(LineCollection(flat, colors=color, linewidths=width, label=label))
 
-    small = _frustums(plan.Ts_base_cam, curves, SMALL_FRUSTUM_M)
+    small = frustum_lines(plan.Ts_base_cam, curves.sensor.intrinsics, SMALL_FRUSTUM_M)
     draw(small, "0.3", 0.4, "every view's camera")
     draw(box_edges(scene_box(plan)), ORANGE, 1.8, "keep-out box")
     for k, (_, obstacle) in enumerate(plan.cell.obstacles):
@@ -174,10 +174,6 @@ def box_edges(box: Box) -> Array:
     corners = np.where(bits == 1, high, low)
     pairs = [(i, i | 1 << k) for i in range(8) for k in range(3) if not i & 1 << k]
     return corners[np.array(pairs)]
-
-
-def _frustums(Ts_base_cam: Array, curves: PlanCurves, length_m: float) -> Array:
-    return frustum_lines(Ts_base_cam, curves.sensor.intrinsics, length_m)
 
 
 def frustum_lines(Ts_base_cam: Array, camera: CameraIntrinsics, length_m: float) -> Array:

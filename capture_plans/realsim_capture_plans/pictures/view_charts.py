@@ -21,10 +21,13 @@ from realsim_capture_plans.pictures.drawing import (
 )
 from realsim_capture_plans.planning.view_quality import (
     board_views,
+    centre_depth,
     hole_deg,
     nearest_deg,
     parallax_deg,
     scene_box,
+    scene_points,
+    seen,
     spacing_deg,
 )
 
@@ -159,16 +162,19 @@ GOOD_IN_VIEW = 0.9
 
 def quality_chart(curves: PlanCurves) -> Any:
     """Return the figure: histograms of what the views are worth."""
-    plan, config = curves.plan, curves.plan.config
+    plan, sensor = curves.plan, curves.sensor
     figure = new_figure(11.5, 7.0)
     axes = figure.subplots(2, 3).ravel()
-    noise_mm = 1000 * curves.depth_noise_m
-    _histogram(axes[0], curves.radius_m, BLUE, "camera to the scene's centre [m]")
-    _histogram(axes[1], noise_mm, ORANGE, f"depth noise at the centre [mm], {curves.sensor.name}")
-    _histogram(axes[2], 100 * curves.in_view, GREEN, "share of the scene in the image [%]",
+    radius = np.linalg.norm(plan.Ts_base_cam[:, :3, 3] - plan.center_world, axis=-1)
+    noise_mm = 1000 * sensor.depth_noise(centre_depth(plan))
+    in_view = seen(plan, scene_points(plan), sensor).mean(axis=1)
+    _histogram(axes[0], radius, BLUE, "camera to the scene's centre [m]")
+    _histogram(axes[1], noise_mm, ORANGE, f"depth noise at the centre [mm], {sensor.name}")
+    _histogram(axes[2], 100 * in_view, GREEN, "share of the scene in the image [%]",
                line=(100 * GOOD_IN_VIEW, "good"))  # fmt: skip
-    _histogram(axes[3], curves.sigma, PURPLE, "least singular value of the Jacobian",
-               line=(config.sigma_min, "required"))  # fmt: skip
+    sigma = plan.chain.sigma_min(plan.joints)
+    _histogram(axes[3], sigma, PURPLE, "least singular value of the Jacobian",
+               line=(plan.config.sigma_min, "required"))  # fmt: skip
     if len(plan) > 1:
         spacing = spacing_deg(plan.directions())
         _histogram(axes[4], spacing, SKY, "angle to the nearest other view [deg]")
