@@ -134,10 +134,6 @@ class PairDistances:
             row[:] = [result.min_distance for result in self._results]
         return np.round(rows, DIGITS)
 
-    def collider(self, margin_m: float) -> "Collider":
-        """Return the same pairs as a yes-or-no question with a margin [m]."""
-        return Collider(self, margin_m)
-
 
 class Collider:
     """Is any pair nearer than a margin? Bounding boxes first, then coal, until the first hit."""

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.arrays import Array, Mask
 from realsim.errors import InputError
 from realsim.robots.arm import RobotArm, arm_of
-from realsim.robots.coal_geometry import Body, Geometry
+from realsim.robots.coal_geometry import Body, Collider, Geometry
 from realsim.robots.kinematics import DhChain
 from realsim.robots.link_shapes import finite_box, link_placements
 from realsim.robots.shapes import Mount, WorkCell
@@ -65,14 +65,10 @@ class CollisionModel:
         )
         self._pairs = [chosen.pairs[k] for k in order]
         self._groups = np.array([chosen.groups[k] for k in order])
-        self._mount_gap_m = chosen.mount_gap_m
-        self._distances = geometry.with_pairs(self._pairs)
-        self._hits = self._distances.collider(self.clearance_m)
-
-    @property
-    def mount_gap_m(self) -> float:
+        self.mount_gap_m = chosen.mount_gap_m
         """Distance of the camera's body from wrist 3, which never changes [m]."""
-        return self._mount_gap_m
+        self._distances = geometry.with_pairs(self._pairs)
+        self._hits = Collider(self._distances, self.clearance_m)
 
     @property
     def pairs(self) -> tuple[tuple[str, str, str], ...]:
