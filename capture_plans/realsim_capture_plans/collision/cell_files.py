@@ -229,15 +229,13 @@ def _piece(table: dict[str, Any], where: str, folder: Path) -> Shape:
         _turn(fields, fields.finite_row("rotation_vector_rad", 3, (0.0, 0.0, 0.0))),
         _length_row(fields, "position_m", 3, (0.0, 0.0, 0.0)),
     )
-    if kind == "convex":
-        points = _corners(fields, folder)
-        return Shape(
-            part="bracket", frame=FLANGE, kind="convex", size_m=(), T_frame_shape=T, points=points
-        )
-    size = tuple(_length_row(fields, "size_m", SIZES[kind]))
+    is_mesh = kind == "convex"
+    size = () if is_mesh else tuple(_length_row(fields, "size_m", SIZES[kind]))
+    points = _corners(fields, folder) if is_mesh else None
+    kind = cast(Kind, kind)
     try:
         return Shape(
-            part="bracket", frame=FLANGE, kind=cast(Kind, kind), size_m=size, T_frame_shape=T
+            part="bracket", frame=FLANGE, kind=kind, size_m=size, T_frame_shape=T, points=points
         )
     except InputError as error:
         raise InputError(f"{where}: {error}") from None

@@ -104,39 +104,30 @@ def readings(joints: Array, Ts: Array, chains: tuple[DhChain, ...], *, tool: boo
             continue
         T_flange_base = se3.invert(chain.forward(q))
         for length, base in product(("m", "mm"), ("base", "base_link")):
-            T = np.array(Ts)
-            T[:, :3, 3] *= 1.0 if length == "m" else 1e-3
-            offsets = T_flange_base @ (T if base == "base" else TURNED @ T)
-            found.append(_reading(chain, unit, length, base, offsets, tool))
+            Ts_base = np.array(Ts)
+            Ts_base[:, :3, 3] *= 1.0 if length == "m" else 1e-3
+            offsets = T_flange_base @ (Ts_base if base == "base" else TURNED @ Ts_base)
+            T = np.eye(4)
+            if tool:
+                R = se3.mean_rotation(offsets[:, :3, :3])
+                T = se3.from_rt(R, np.median(offsets[:, :3, 3], axis=0))
+            gaps = np.linalg.norm(offsets[:, :3, 3] - T[:3, 3], axis=-1)
+            angles = np.degrees(np.asarray(se3.angle(T[:3, :3].T @ offsets[:, :3, :3])))
+            reading = Reading(
+                chain=chain,
+                joint_unit=unit,
+                length_unit=length,
+                base=base,
+                T_ee_tcp=T,
+                gap_m=float(np.median(gaps)),
+                gap_deg=float(np.median(angles)),
+                worst=int(np.argmax(gaps)),
+                worst_m=float(gaps.max()),
+            )
+            found.append(reading)
     # What makes metres of millimetres and radians of degrees lets all positions fall together, and
     # small gaps are then no proof: orientations that fit go first.
     return sorted(found, key=lambda r: (r.gap_m > FITS_M, r.gap_deg > FITS_DEG, r.gap_m))
-
-
-def _reading(
-    chain: DhChain,
-    unit: JointUnit,
-    length: Literal["m", "mm"],
-    base: Literal["base", "base_link"],
-    offsets: Array,
-    tool: bool,
-) -> Reading:
-    T = np.eye(4)
-    if tool:
-        T = se3.from_rt(se3.mean_rotation(offsets[:, :3, :3]), np.median(offsets[:, :3, 3], axis=0))
-    gaps = np.linalg.norm(offsets[:, :3, 3] - T[:3, 3], axis=-1)
-    angles = np.degrees(np.asarray(se3.angle(T[:3, :3].T @ offsets[:, :3, :3])))
-    return Reading(
-        chain=chain,
-        joint_unit=unit,
-        length_unit=length,
-        base=base,
-        T_ee_tcp=T,
-        gap_m=float(np.median(gaps)),
-        gap_deg=float(np.median(angles)),
-        worst=int(np.argmax(gaps)),
-        worst_m=float(gaps.max()),
-    )
 
 
 def why_poses_disagree(joints: ArrayLike, Ts_base_ee: ArrayLike, chain: DhChain) -> str:

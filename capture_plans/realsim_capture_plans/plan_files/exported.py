@@ -59,8 +59,8 @@ def export_csv(plan: CapturePlan, path: Path | str) -> None:
     write_text(path, "\n".join(lines) + "\n")
 
 
-def urscript(plan: CapturePlan) -> str:
-    """Return a program that drives the plan: a stop at every corner, a message at every view.
+def export_urscript(plan: CapturePlan, path: Path | str) -> None:
+    """Write a program that drives the plan: a stop at every corner, a message at every view.
 
     It moves nothing unless the arm stands at the plan's home: only the moves from there on have
     been checked. Nothing is blended, so the path is the straight one in joint space. Where moves
@@ -75,6 +75,7 @@ def urscript(plan: CapturePlan) -> str:
             "table instead (.csv: joints and expected camera poses in the order of the tour), and "
             "drive it with that arm's own program."
         )
+    from realsim.store.atomic import write_text
     from realsim_capture_plans.plan_files.imported import colliding_legs
 
     c = plan.config
@@ -112,14 +113,7 @@ def urscript(plan: CapturePlan) -> str:
             lines.append(f"  movej({_list(q)}, {how})")
         lines.append(f"  sleep({c.settle_s:.6f})")
         lines.append(f'  textmsg("realsim view ", {k})')
-    return "\n".join([*lines, '  textmsg("realsim plan done")', "end", ""])
-
-
-def export_urscript(plan: CapturePlan, path: Path | str) -> None:
-    """Write the plan's program, see `urscript`."""
-    from realsim.store.atomic import write_text
-
-    write_text(path, urscript(plan))
+    write_text(path, "\n".join([*lines, '  textmsg("realsim plan done")', "end", ""]))
 
 
 def _list(q: Array) -> str:

@@ -19,6 +19,7 @@ from realsim_capture_plans.plan_files.evidence import FITS_M, MILLIMETRES_FROM_M
 from realsim_capture_plans.plan_files.joint_paths import JointPath
 from realsim_capture_plans.planning.metrics import Meaning, joint_names
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from realsim_capture_plans.planning.tour_time import TourTime
 
 LEAST_AXIS_SPREAD = 0.02
 """Least eigenvalue, relative to the number of views, of the system for the point that the optical
@@ -105,27 +106,21 @@ def plan_of_path(
 
 def colliding_legs(plan: CapturePlan) -> tuple[str, ...]:
     """Return one line for every straight piece of a move that does not keep the clearance."""
-    model = plan.collision_model()
-    corners = [plan.move(k) for k in range(len(plan))]
-    start = np.concatenate([c[:-1] for c in corners])
-    goal = np.concatenate([c[1:] for c in corners])
-    step = plan.config.edge_step_rad
-    named = [
-        ("home" if k == 0 else f"view {k - 1}", k, leg + 1, len(c) - 1)
-        for k, c in enumerate(corners)
-        for leg in range(len(c) - 1)
-    ]
+    model, step = plan.collision_model(), plan.config.edge_step_rad
+    tour = TourTime.of(plan)
     lines: list[str] = []
-    for i in np.flatnonzero(~model.edges_free(start, goal, step)):
-        samples, _ = interpolate(start[i], goal[i], step)
+    for i in np.flatnonzero(~model.edges_free(tour.start, tour.goal, step)).tolist():
+        samples, _ = interpolate(tour.start[i], tour.goal[i], step)
         least = np.min(np.stack(list(model.clearance(samples).values())), axis=0)
         at = int(np.argmin(least))
         _, part, other, distance = model.nearest(samples[at])
         how = (
             f"{-1e3 * distance:.0f} mm inside" if distance < 0 else f"{1e3 * distance:.0f} mm from"
         )
-        source, k, leg, legs = named[i]
-        piece = "" if legs == 1 else f" (piece {leg} of {legs})"
+        k = int(tour.move[i])
+        legs = np.flatnonzero(tour.move == k)
+        source = "home" if k == 0 else f"view {k - 1}"
+        piece = "" if len(legs) == 1 else f" (piece {i - legs[0] + 1} of {len(legs)})"
         share = at / max(len(samples) - 1, 1)
         lines.append(f"{source} -> view {k}{piece}, {share:.0%} of the way: {part} {how} {other}")
     return tuple(lines)

@@ -16,6 +16,7 @@ import numpy as np
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.records.checked_arrays import rows_of
 from realsim.records.trajectories import PHASES
 from realsim.robots.compiled_chain import follow_lines
 from realsim_sim_bridge.arm.timing import trapezoid, trapezoid_share
@@ -154,6 +155,7 @@ class PlacingSource(DemonstrationSource):
             why = grasped.outcome.failure or "the object was lost before it was lifted"
             outcome = replace(grasped.outcome, success=False, failure=why)
             return replace(grasped, outcome=outcome)
+        lifted = replace(rows_of(motion, slice(end + 1)), notes=())
         T_lifted = motion.Ts_table_obj[end]
         corners = se3.transform(T_lifted, self.scenery.models[name.instance].mesh.vertices)
         # What has slipped in the hand is put where it is to be, not the hand.
@@ -161,10 +163,9 @@ class PlacingSource(DemonstrationSource):
         path = self._path(motion.joints_rad[end], (float(x), float(y)), float(corners[:, 2].min()))
         if path is None:
             why = "place: the arm cannot carry the object there as the hand holds it"
-            cut = _cut(motion, end)
             outcome = replace(grasped.outcome, success=False, failure=why)
-            return replace(grasped, motion=cut, outcome=outcome)
-        motion = self._placed(name, _cut(motion, end), path)
+            return replace(grasped, motion=lifted, outcome=outcome)
+        motion = self._placed(name, lifted, path)
         missing = unmet(
             place, self.standing, name.instance,
             self.scenery.Ts_table_obj[name.instance], motion.Ts_table_obj[-1],
@@ -223,17 +224,6 @@ class PlacingSource(DemonstrationSource):
             Ts_base_ee=np.concatenate([lifted.Ts_base_ee, Ts_base_ee]),
             Ts_table_obj=np.concatenate([lifted.Ts_table_obj, Ts]),
         )
-
-
-def _cut(motion: AttemptMotion, end: int) -> AttemptMotion:
-    """Return the steps of a motion up to `end`."""
-    to = slice(0, end + 1)
-    return replace(
-        motion, time_s=motion.time_s[to], joints_rad=motion.joints_rad[to],
-        opening_m=motion.opening_m[to], command_m=motion.command_m[to], phase=motion.phase[to],
-        held=motion.held[to], Ts_base_ee=motion.Ts_base_ee[to],
-        Ts_table_obj=motion.Ts_table_obj[to], notes=(),
-    )  # fmt: skip
 
 
 def _trapezoid(length_m: float, dt: float) -> Array:
