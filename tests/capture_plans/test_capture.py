@@ -19,7 +19,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from begun_sessions import begun
-from given_plans import joints_looking_at, plan_through
+from given_plans import driven_clear, joints_looking_at, plan_through
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry.camera import ray_table
@@ -38,6 +38,7 @@ from realsim_capture_plans.capturing.log import LOG_FILE, CaptureLog
 from realsim_capture_plans.capturing.look import SettleConfig
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, DeviceError, Frame
+from realsim_capture_plans.plan_files.imported import colliding_legs
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan
 from refusals import refused
@@ -122,8 +123,7 @@ def plan() -> CapturePlan:
     joints = joints_looking_at(center, eyes, home)
     vias = tuple((k, (joints[k - 1] + joints[k])[None] / 2) for k in range(3, VIEWS, 3))
     made = plan_through(np.stack(joints), home, center, "calibration", vias=vias)
-    corners = np.concatenate([made.move(k) for k in range(VIEWS)])
-    assert driven_clear(list(corners[1:]), corners[0], made)
+    assert colliding_legs(made) == ()
     return made
 
 
@@ -159,13 +159,6 @@ def load_plan_of(store: SessionStore) -> CapturePlan:
     return load_plan(store.path(PLAN_FILE))
 
 
-def driven_clear(path: list[Array], start: Array, of: CapturePlan | None = None) -> bool:
-    p = plan() if of is None else of
-    corners = np.stack([start, *path])
-    model = p.collision_model()
-    return bool(np.all(model.edges_free(corners[:-1], corners[1:], p.config.edge_step_rad)))
-
-
 def test_going_on_takes_only_what_is_missing_and_stays_clear(
     tmp_path: Path, arm: KinematicArm
 ) -> None:
@@ -180,7 +173,7 @@ def test_going_on_takes_only_what_is_missing_and_stays_clear(
     summary = capture(plan(), arm, TableCamera(arm), part, config=QUICK)
     assert (summary.captured, summary.skipped) == (VIEWS - len(already), len(already))
     assert part.completed == set(range(VIEWS))
-    assert driven_clear(arm.path, start)
+    assert driven_clear(plan(), [start, *arm.path])
     # What was taken later is what would have been taken in one go.
     for k in range(VIEWS):
         assert np.array_equal(part.rgb(k), full.rgb(k))

@@ -16,9 +16,10 @@ import pytest
 from numpy.typing import ArrayLike
 
 from begun_sessions import begun
-from given_plans import joints_looking_at, plan_through
+from given_plans import driven_clear, joints_looking_at, plan_through
+from plain_meshes import square
 from realsim.arrays import Array
-from realsim.records import CameraIntrinsics, Mesh
+from realsim.geometry import se3
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.robots.arm import find_arm
 from realsim.store import SessionStore
@@ -98,24 +99,10 @@ class SpoiltCamera:
     ) -> None:
         """Spoil these grabs, counted from 1; each is given the frame and the one before."""
         self._arm, self._camera, self.spoil = arm, camera, spoil or {}
+        self.name, self.description = camera.name, camera.description
+        self.intrinsics, self.depth_unit_m = camera.intrinsics, camera.depth_unit_m
         self.grabs, self.recovered = 0, 0
         self._last: Frame | None = None
-
-    @property
-    def name(self) -> str:
-        return self._camera.name
-
-    @property
-    def intrinsics(self) -> CameraIntrinsics:
-        return self._camera.intrinsics
-
-    @property
-    def depth_unit_m(self) -> float:
-        return self._camera.depth_unit_m
-
-    @property
-    def description(self) -> dict[str, Any]:
-        return self._camera.description
 
     def grab(self) -> Frame:
         self.grabs += 1
@@ -201,15 +188,12 @@ class Person(NoOperator):
 def lab() -> tuple[SimulatedLab, Sequence[PlacedMesh]]:
     """The lab, and its objects as they stand on a ground of two triangles."""
     made = SimulatedLab(LabConfig(seed=3, n_objects=4, width=640, height=360))
-    x, y = np.array([[-0.5, -0.5], [1.5, -0.5], [1.5, 0.5], [-0.5, 0.5]]).T
-    ground = Mesh(
-        vertices=np.stack([x, y, np.zeros(4)], axis=1), faces=np.array([[0, 1, 2], [0, 2, 3]])
-    )
     objects = [
         PlacedMesh(o.instance, made.models[o.obj_id].mesh, o.T_world_obj)
         for o in made.truth.objects
     ]
-    return made, [PlacedMesh(BACKGROUND, ground, np.eye(4)), *objects]
+    ground = PlacedMesh(BACKGROUND, square(1.0), se3.from_translation([0.5, 0.0, 0.0]))
+    return made, [ground, *objects]
 
 
 @dataclass
@@ -256,12 +240,6 @@ def assert_same_views(store: SessionStore, reference: SessionStore) -> None:
         assert np.array_equal(store.depth_m(k), reference.depth_m(k))
 
 
-def clear(path: Sequence[Array]) -> bool:
-    corners = np.stack(path)
-    model = plan().collision_model()
-    return bool(np.all(model.edges_free(corners[:-1], corners[1:], plan().config.edge_step_rad)))
-
-
 def test_a_stop_that_a_person_clears_costs_no_view(tmp_path: Path, reference: SessionStore) -> None:
     arm = StoppingArm({4: "protective stop", 7: "connection lost"}, patience=1)
     b = bench(tmp_path / "s", arm=arm)
@@ -270,7 +248,7 @@ def test_a_stop_that_a_person_clears_costs_no_view(tmp_path: Path, reference: Se
     assert summary.complete and arm.recovered == 2
     assert len(person.asked) == 3  # one recovery was refused
     assert sum("release it at the pendant" in t for t in person.told) == 2
-    assert clear(arm.path)
+    assert driven_clear(plan(), arm.path)
     assert_same_views(b.store, reference)
     events = [e["event"] for e in CaptureLog(b.store).entries]
     assert events.count("trouble") == 3 and events.count("recovered") == 2
@@ -291,7 +269,7 @@ def test_an_arm_moved_by_hand_during_a_pause_is_led_back(
     b.capture(operator=person)
     assert "paused" in person.asked[0]
     after = next(i for i, q in enumerate(arm.path) if np.array_equal(q, away))
-    assert clear(arm.path[after:])
+    assert driven_clear(plan(), arm.path[after:])
     assert_same_views(b.store, reference)
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from given_plans import calibrated
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.interop import import_pinocchio
@@ -41,13 +42,7 @@ def piece(kind: str, size: tuple[float, ...], at: list[float]) -> Shape:
     )  # fmt: skip
 
 
-def calibrated(seed: int = 1) -> DhChain:
-    rng = np.random.default_rng(seed)
-    deltas = {f"delta_{n}": rng.normal(0, 5e-4, 6) for n in ("a", "d", "alpha", "theta")}
-    return replace(UR5, **deltas)
-
-
-@pytest.mark.parametrize("chain", [UR5E, calibrated()], ids=["UR5e", "calibrated"])
+@pytest.mark.parametrize("chain", [UR5E, calibrated(UR5, 1)], ids=["UR5e", "calibrated"])
 def test_pinocchio_walks_the_same_chain(chain: DhChain) -> None:
     pin = import_pinocchio()
 

@@ -7,13 +7,10 @@ import numpy as np
 import pytest
 
 from begun_sessions import begun
-from given_plans import plan_through
-from realsim.geometry import se3
-from realsim.robots.arm import UR5
+from given_plans import joints_looking_at, plan_through
 from realsim.store import SessionStore
 from realsim_capture_plans.capturing.capture import CaptureJob, capture
 from realsim_capture_plans.capturing.operator import Command, NoOperator
-from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import ArmStoppedError
 from realsim_capture_plans.devices.ur import UrArm
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
@@ -28,22 +25,10 @@ HOME = np.radians([180.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 
 def small_plan(center: np.ndarray) -> CapturePlan:
     """Views on a narrow ring that look down at a point of the table."""
-    joints = [HOME]
-    for turn in np.linspace(0.0, 2 * np.pi, VIEWS, endpoint=False):
-        eye = center + 0.32 * np.array([0.25 * np.cos(turn), 0.25 * np.sin(turn), 1.0])
-        T = se3.look_at(eye, center)
-        candidates = np.concatenate(
-            [
-                UR5.inverse(T @ se3.from_rt(se3.exp_so3([0, 0, a]), np.zeros(3)) @ T_cam_ee())
-                for a in np.linspace(0, 2 * np.pi, 8, endpoint=False)
-            ]
-        )
-        joints.append(candidates[np.argmin(np.abs(candidates - joints[-1]).max(-1))])
-    return plan_through(np.stack(joints[1:]), HOME, center, "calibration")
-
-
-def T_cam_ee() -> np.ndarray:
-    return se3.invert(d405_mount().T_ee_cam)
+    turns = np.linspace(0.0, 2 * np.pi, VIEWS, endpoint=False)
+    eyes = [center + 0.32 * np.array([0.25 * np.cos(a), 0.25 * np.sin(a), 1.0]) for a in turns]
+    joints = joints_looking_at(center, eyes, HOME)
+    return plan_through(np.stack(joints), HOME, center, "calibration")
 
 
 class PersonAtThePendant(NoOperator):

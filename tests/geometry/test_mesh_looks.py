@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from realsim.geometry.mesh import load_mesh
+from realsim.records import Mesh
 
 VERTICES = "v 0 0 0\nv .1 0 0\nv .1 .1 0\nv 0 .1 0\n"
 UV = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
@@ -29,17 +30,21 @@ def obj(folder: Path, body: str, table: str | None = None) -> Path:
     return folder / "m.obj"
 
 
+def loaded(path: Path) -> tuple[Mesh, list[str]]:
+    """A mesh in metres, and what was said about it."""
+    notes: list[str] = []
+    return load_mesh(path, "m", notes), notes
+
+
 def test_a_whole_texture_is_kept_without_a_word(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "t.png"), np.full((4, 4, 3), (10, 200, 30), np.uint8))
-    notes: list[str] = []
-    mesh = load_mesh(obj(tmp_path, UV + WITH_UV, RED + "map_Kd t.png\n"), "m", notes)
+    mesh, notes = loaded(obj(tmp_path, UV + WITH_UV, RED + "map_Kd t.png\n"))
     assert mesh.texture is not None and tuple(mesh.texture[0, 0]) == (30, 200, 10)
     assert notes == []
 
 
 def test_a_missing_texture_leaves_the_materials_colour(tmp_path: Path) -> None:
-    notes: list[str] = []
-    mesh = load_mesh(obj(tmp_path, UV + WITH_UV, RED + "map_Kd gone.png\n"), "m", notes)
+    mesh, notes = loaded(obj(tmp_path, UV + WITH_UV, RED + "map_Kd gone.png\n"))
     assert mesh.texture is None and mesh.colors is not None
     assert tuple(mesh.colors[0]) == (204, 26, 26)
     assert len(notes) == 1
@@ -48,23 +53,20 @@ def test_a_missing_texture_leaves_the_materials_colour(tmp_path: Path) -> None:
 
 def test_a_broken_texture_is_named(tmp_path: Path) -> None:
     (tmp_path / "bad.png").write_bytes(b"no picture")
-    notes: list[str] = []
-    mesh = load_mesh(obj(tmp_path, UV + WITH_UV, RED + "map_Kd bad.png\n"), "m", notes)
+    mesh, notes = loaded(obj(tmp_path, UV + WITH_UV, RED + "map_Kd bad.png\n"))
     assert mesh.texture is None
     assert "'bad.png'" in notes[0] and "cannot be decoded" in notes[0]
 
 
 def test_a_missing_material_table_leaves_no_colour_instead_of_grey(tmp_path: Path) -> None:
-    notes: list[str] = []
-    mesh = load_mesh(obj(tmp_path, UV + WITH_UV), "m", notes)
+    mesh, notes = loaded(obj(tmp_path, UV + WITH_UV))
     assert mesh.texture is None and mesh.colors is None
     assert "'m.mtl'" in notes[0] and "procedural material" in notes[0]
 
 
 def test_a_texture_without_coordinates_is_named(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "t.png"), np.zeros((4, 4, 3), np.uint8))
-    notes: list[str] = []
-    mesh = load_mesh(obj(tmp_path, WITHOUT_UV, RED + "map_Kd t.png\n"), "m", notes)
+    mesh, notes = loaded(obj(tmp_path, WITHOUT_UV, RED + "map_Kd t.png\n"))
     assert mesh.texture is None
     assert "'t.png'" in notes[0] and "no texture coordinates" in notes[0]
 
@@ -73,8 +75,7 @@ def test_a_ply_without_its_texture_is_named_and_prints_no_traceback(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "m.ply").write_text(PLY)
-    notes: list[str] = []
-    mesh = load_mesh(tmp_path / "m.ply", "m", notes)
+    mesh, notes = loaded(tmp_path / "m.ply")
     assert mesh.texture is None and mesh.colors is None and mesh.uv is not None
     assert "'gone.png'" in notes[0]
     assert "Traceback" not in capfd.readouterr().err
@@ -82,8 +83,7 @@ def test_a_ply_without_its_texture_is_named_and_prints_no_traceback(
 
 def test_texture_coordinates_alone_make_no_texture(tmp_path: Path) -> None:
     (tmp_path / "m.obj").write_text(VERTICES + UV + WITH_UV)
-    notes: list[str] = []
-    mesh = load_mesh(tmp_path / "m.obj", "m", notes)
+    mesh, notes = loaded(tmp_path / "m.obj")
     assert mesh.texture is None and mesh.colors is None and mesh.uv is not None
     assert notes == []
 

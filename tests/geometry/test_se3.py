@@ -54,29 +54,13 @@ def test_look_at_needs_a_direction():
     refused("target", se3.look_at, [0, 0, 1], [0, 0, 1], error=NotRigidError)
 
 
-def scaled():
-    return se3.from_rt(1.02 * QUARTER_Z, [0, 0, 0])
-
-
-def mirrored():
-    return se3.from_rt(np.diag([1.0, 1, -1]), [0, 0, 0])
-
-
-def transposed():
-    return se3.from_rt(QUARTER_Z, [1, 2, 3]).T
-
-
-def unmeasured():
-    return se3.from_rt(QUARTER_Z, [np.nan, 0, 0])
-
-
 @pytest.mark.parametrize(
     ("matrix", "says"),
     [
-        (scaled(), "mean scale 1.02"),
-        (mirrored(), "mirrored"),
-        (transposed(), "transposed"),
-        (unmeasured(), "not measured"),
+        (se3.from_rt(1.02 * QUARTER_Z, [0, 0, 0]), "mean scale 1.02"),
+        (se3.from_rt(np.diag([1.0, 1, -1]), [0, 0, 0]), "mirrored"),
+        (se3.from_rt(QUARTER_Z, [1, 2, 3]).T, "transposed"),
+        (se3.from_rt(QUARTER_Z, [np.nan, 0, 0]), "not measured"),
         (np.eye(3), r"shape \(3, 3\)"),
     ],
 )

@@ -2,16 +2,14 @@
 
 import numpy as np
 
+from plain_meshes import square
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.rays import BACKGROUND, PlacedMesh, RayScene, rotated
 from realsim.scanning.fusion.fuse import FusionFrame
 
-TABLE = Mesh(
-    vertices=np.array([[-0.6, -0.6, 0], [0.6, -0.6, 0], [0.6, 0.6, 0], [-0.6, 0.6, 0]]),
-    faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32),
-)
+TABLE = square(0.6)
 
 
 def exact_frames(

@@ -1,6 +1,7 @@
 """Capture plans of joints that a test gives, and joints of a camera that looks down."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import ArrayLike
 from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.robots.arm import UR5
+from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
@@ -32,6 +34,24 @@ def plan_through(
     return CapturePlan(
         kind=kind, home=home, joints=joints, center_world=np.asarray(center), config=config, **given
     )
+
+
+def calibrated(chain: DhChain, seed: int) -> DhChain:
+    """A chain as a factory calibration leaves it: about 0.5 mm and 1 mrad off in every number."""
+    rng = np.random.default_rng(seed)
+    return replace(
+        chain,
+        delta_a=rng.normal(0, 5e-4, 6),
+        delta_d=rng.normal(0, 5e-4, 6),
+        delta_alpha=rng.normal(0, 1e-3, 6),
+        delta_theta=rng.normal(0, 1e-3, 6),
+    )
+
+
+def driven_clear(plan: CapturePlan, path: Iterable[Array]) -> bool:
+    """Return whether straight moves from station to station keep the plan's clearance."""
+    corners, step = np.stack(list(path)), plan.config.edge_step_rad
+    return bool(np.all(plan.collision_model().edges_free(corners[:-1], corners[1:], step)))
 
 
 def joints_looking_at(center: Array, eyes: Iterable[Array], home: Array) -> list[Array]:

@@ -17,15 +17,10 @@ from realsim.formats.grasps.graspgen import write_graspgen
 from realsim.formats.grasps.hand_frames import grasp_poses
 from realsim.formats.grasps.isaac_grasp import write_isaac_grasp
 from realsim.formats.grasps.scene_grasps import executed
+from realsim.geometry import se3
 
 MOUNT, TIP = 0.1034, 0.1122
 """Tool centre point and fingertips before the hand's mounting face [m] (franka_description)."""
-
-
-def from_rt(R, t):
-    out = np.tile(np.eye(4), (len(R), 1, 1))
-    out[:, :3, :3], out[:, :3, 3] = R, t
-    return out
 
 
 class Acronym:
@@ -67,7 +62,7 @@ class IsaacGrasp:
         rows = YAML(typ="safe").load(path)["grasps"].values()
         q = [[*r["orientation"]["xyz"], r["orientation"]["w"]] for r in rows]
         R = Rotation.from_quat(q).as_matrix()
-        return from_rt(R, np.array([r["position"] for r in rows]))
+        return se3.from_rt(R, np.array([r["position"] for r in rows]))
 
 
 class GraspGroupNpy:
@@ -83,7 +78,7 @@ class GraspGroupNpy:
 
     def raw(self, path):
         rows = np.load(path).astype(float)
-        return from_rt(rows[:, 4:13].reshape(-1, 3, 3), rows[:, 13:16])
+        return se3.from_rt(rows[:, 4:13].reshape(-1, 3, 3), rows[:, 13:16])
 
 
 class GraspitHdf5:

@@ -9,15 +9,12 @@ from realsim.formats.export_folder import ExportFolder
 from realsim.formats.robot_scenes.placed_scene import SceneCamera
 from realsim.formats.robot_scenes.placing import Matter, place_scene
 from realsim.geometry import se3
-from realsim.records import CameraIntrinsics, Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
+from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene, SupportPlane
+from trimesh_solids import solid
 
 T_WORLD_TABLE = se3.from_rt(se3.exp_so3([0, 0, 0.3]), [0.5, 0.1, 0.7])
 CAMERA = CameraIntrinsics(width=640, height=480, fx=600, fy=610, cx=300.5, cy=250.25)
 FRICTION = 0.6
-
-
-def mesh(solid, **look):
-    return Mesh(vertices=np.array(solid.vertices), faces=np.array(solid.faces), **look)
 
 
 def bracket_bars():
@@ -45,15 +42,15 @@ def bracket():
         inertia=1000 * inertia,
         parts=[np.array(b.vertices) for b in bars],
     )
-    return ObjectModel(obj_id=1, name="bracket", mesh=mesh(both, colors=colors)), matter
+    return ObjectModel(obj_id=1, name="bracket", mesh=solid(both, colors=colors)), matter
 
 
 def textured_box():
-    solid = trimesh.creation.box((0.05, 0.06, 0.1))
+    shape = trimesh.creation.box((0.05, 0.06, 0.1))
     rng = np.random.default_rng(1)
     texture = rng.integers(0, 255, (32, 16, 3)).astype(np.uint8)
     return ObjectModel(
-        obj_id=2, name="2 box/é", mesh=mesh(solid, uv=rng.random((8, 2)), texture=texture)
+        obj_id=2, name="2 box/é", mesh=solid(shape, uv=rng.random((8, 2)), texture=texture)
     )
 
 

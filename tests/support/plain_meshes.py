@@ -1,4 +1,4 @@
-"""Boxes and balls of a few triangles, and a wedge with a texture."""
+"""Boxes, squares and balls of a few triangles, and a wedge with a texture."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,6 +15,12 @@ def box(size: Sequence[float], color: tuple[int, int, int] | None = None) -> Mes
     half = np.array(size) / 2
     paint = None if color is None else np.tile(np.array(color, np.uint8), (8, 1))
     return replace(box_mesh(-half, half), colors=paint)
+
+
+def square(half: float) -> Mesh:
+    """A square round the origin in z = 0, as a table."""
+    corners = half * np.array([[-1.0, -1.0, 0.0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    return Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
 
 
 def ball(radius: float, rings: int = 16) -> Mesh:

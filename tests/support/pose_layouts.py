@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
+from pictured_folders import save_pictures
 from pose_rows import rows_of
 from realsim.arrays import Array, UInt8
 from realsim.geometry import se3
@@ -29,12 +29,7 @@ def tiny(k: int) -> UInt8:
 
 def save_images(folder: Path, shots: list[UInt8], pattern: str = "{:02d}.png") -> list[str]:
     """Write pictures; return their names."""
-    folder.mkdir(parents=True, exist_ok=True)
-    names = [pattern.format(k) for k in range(len(shots))]
-    for name, shot in zip(names, shots, strict=True):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(shot).save(folder / name)
-    return names
+    return [str(p.relative_to(folder)) for p in save_pictures(folder, shots, pattern)]
 
 
 def quaternion(T: Array) -> dict[str, float]:

@@ -5,21 +5,14 @@ from pathlib import Path
 import numpy as np
 
 from begun_sessions import begun, light_things
+from plain_meshes import square
 from realsim.app.register.files import write_result
 from realsim.app.register.results import CameraChange, Registered, Remark
 from realsim.arrays import Array
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.parts import part
-from realsim.records import (
-    CameraIntrinsics,
-    Mesh,
-    ObjectModel,
-    ObjectPose,
-    Scene,
-    SupportPlane,
-    View,
-)
+from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene, SupportPlane, View
 from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.registration.search.records import NotPlaced
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
@@ -62,10 +55,8 @@ def true_cameras(views: int, *, posed: bool = True) -> list[Array]:
 def table_renderer() -> LabelRenderer:
     """Return what renders the objects on the table, a square metre of the plane z = 0."""
     models = models_of()
-    corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
-    table = Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
     placed = [PlacedMesh(o.instance, models[o.obj_id].mesh, o.T_world_obj) for o in true_poses()]
-    return LabelRenderer([*placed, PlacedMesh(-1, table, np.eye(4))])
+    return LabelRenderer([*placed, PlacedMesh(-1, square(0.5), np.eye(4))])
 
 
 def table_session(

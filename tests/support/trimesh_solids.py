@@ -1,13 +1,15 @@
 """Meshes made by trimesh."""
 
+from typing import Any
+
 import numpy as np
 import trimesh
 
 from realsim.records import Mesh
 
 
-def solid(shape: trimesh.Trimesh) -> Mesh:
-    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
+def solid(shape: trimesh.Trimesh, **look: Any) -> Mesh:
+    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces), **look)
 
 
 def box(size=(0.1, 0.06, 0.04), at=(0.0, 0.0, 0.0)) -> Mesh:

@@ -8,23 +8,18 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from plain_meshes import square
 from realsim.arrays import Array, UInt8
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.mesh import save_ply
 from realsim.geometry.parts import part
-from realsim.records import CameraIntrinsics, Mesh
+from realsim.records import CameraIntrinsics
 from realsim.rendering.labels import LabelRenderer, Labels, PlacedMesh
 
 CAMERA = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
 NAMES = ("box", "wedge")
 EYES = ([0.0, -0.45, 0.45], [0.3, -0.35, 0.42])
-
-
-def slab() -> Mesh:
-    """Return a piece of table in z = 0."""
-    v = [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]]
-    return Mesh(vertices=np.array(v, dtype=float), faces=np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def standing(turn: float = 0.0) -> list[PlacedMesh]:
@@ -44,7 +39,7 @@ def cameras(views: int) -> list[Array]:
 
 def looks(placed: Sequence[PlacedMesh], views: int) -> list[Labels]:
     """Return the labels of the parts on the table."""
-    renderer = LabelRenderer([*placed, PlacedMesh(-1, slab(), np.eye(4))])
+    renderer = LabelRenderer([*placed, PlacedMesh(-1, square(0.5), np.eye(4))])
     return [renderer.render(CAMERA, T) for T in cameras(views)]
 
 

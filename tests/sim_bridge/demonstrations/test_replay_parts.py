@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+from held_boxes import held_box
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
@@ -16,22 +17,10 @@ from realsim_sim_bridge.school import run_school_results
 from realsim_sim_bridge.school.object_slips import stand_of
 from realsim_sim_bridge.school.sweep import SweepConfig
 from realsim_sim_bridge.slip.engines import make_engine, settings_of
-from realsim_sim_bridge.slip.world import SlipBody
 from school_scenes import CONFIG, at, model, scene, small_worlds
 from tried_grasps import plain_grasps
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.025
-
-
-def grasps_with(parameters):
-    return plain_grasps(0, parameters=parameters)
-
-
-def box_body(half=0.025, mass=0.1):
-    inertia = np.eye(3) * mass * (2 * half) ** 2 / 6
-    return SlipBody(
-        parts=(CORNERS * half / 0.025,), mass_kg=mass, center_of_mass=np.zeros(3), inertia=inertia
-    )
 
 
 def test_a_configuration_comes_back_from_the_parameters():
@@ -42,7 +31,7 @@ def test_a_configuration_comes_back_from_the_parameters():
         sweep=SweepConfig(),
     )
     stored = json.loads(json.dumps(dataclasses.asdict(base)))
-    assert school_config_of(grasps_with({"config": stored})) == base
+    assert school_config_of(plain_grasps(0, parameters={"config": stored})) == base
 
 
 @pytest.mark.parametrize("change", ["gone", "new", "type"])
@@ -55,7 +44,7 @@ def test_a_configuration_of_another_version_is_refused(change):
     else:
         stored["slip"]["physics"]["friction"] = "much"
     with pytest.raises(InputError, match=r"slip is not there|glue|friction is str"):
-        school_config_of(grasps_with({"config": stored}))
+        school_config_of(plain_grasps(0, parameters={"config": stored}))
 
 
 def test_a_field_that_a_version_did_not_have_takes_its_default():
@@ -65,15 +54,16 @@ def test_a_field_that_a_version_did_not_have_takes_its_default():
     stored["hand"] = {n: stored["hand"][n] for n in [*sizes.split(), "mount_z_m"]}
     del stored["reach"]["arm"]  # the Panda's, before arms had names
     stored["reach"]["joint7_samples"] = stored["reach"].pop("held_values")
-    assert school_config_of(grasps_with({"config": stored})) == CONFIG  # Franka's, before names
+    # Franka's, before names.
+    assert school_config_of(plain_grasps(0, parameters={"config": stored})) == CONFIG
     stored["hand"]["mount_z_m"] = -0.15
     with pytest.raises(InputError, match="without a name"):
-        school_config_of(grasps_with({"config": stored}))
+        school_config_of(plain_grasps(0, parameters={"config": stored}))
 
 
 def test_a_box_that_is_dropped_lands_on_its_face():
     T = se3.from_translation([0.0, 0.0, 0.12])
-    Ts = fall(box_body(), T, np.zeros(6), [], np.array([0.0, 0.1, 1.0]))
+    Ts = fall(held_box(0.1), T, np.zeros(6), [], np.array([0.0, 0.1, 1.0]))
     np.testing.assert_allclose(Ts[0], T, atol=1e-6)
     assert Ts[1, 2, 3] == pytest.approx(0.12 - 0.5 * 9.81 * 0.1**2, abs=3e-3)
     assert Ts[2, 2, 3] == pytest.approx(0.025, abs=1e-3)
@@ -84,7 +74,7 @@ def test_a_thrown_box_flies_on_and_lands_on_what_stands_there():
     twist = np.array([0, 0, 0, 0.5, 0, 0.0])
     block = CORNERS * [4, 4, 1] + [0.07, 0, 0.025]
     Ts = fall(
-        box_body(), se3.from_translation([0.0, 0, 0.2]), twist, [block], np.array([0.1, 1.0]),
+        held_box(0.1), se3.from_translation([0.0, 0, 0.2]), twist, [block], np.array([0.1, 1.0]),
         )  # fmt: skip
     assert Ts[0, 0, 3] == pytest.approx(0.05, abs=2e-3)
     assert Ts[1, 2, 3] == pytest.approx(0.075, abs=2e-3)
