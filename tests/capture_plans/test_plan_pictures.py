@@ -22,13 +22,7 @@ from realsim.robots.shapes import Box
 from realsim_capture_plans.pictures.drawing import PlanCurves
 from realsim_capture_plans.pictures.motion_charts import clearance_chart
 from realsim_capture_plans.pictures.plan_pictures import plan_pictures
-from realsim_capture_plans.pictures.replay import (
-    NEAR_RGB,
-    PlanReplay,
-    near_parts,
-    serve_replay,
-    write_replay,
-)
+from realsim_capture_plans.pictures.replay import NEAR_RGB, PlanReplay, near_parts, write_replay
 from realsim_capture_plans.pictures.view_charts import board_chart, coverage_chart
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
@@ -137,7 +131,7 @@ SHOWN = 8
 
 @pytest.fixture(scope="module")
 def replay() -> Iterator[PlanReplay]:
-    running = serve_replay(make(n=SHOWN), port=0, looks=False)
+    running = PlanReplay(make(n=SHOWN), port=0, looks=False)
     yield running
     running.stop()
 
@@ -165,7 +159,7 @@ def test_it_answers_on_this_machine(replay: PlanReplay) -> None:
 def test_a_host_that_others_reach_is_refused() -> None:
     for host in ("0.0.0.0", "::", "lab-pc"):
         with pytest.raises(InputError, match=r"no login.*ssh -L"):
-            serve_replay(make(n=SHOWN), host, 0)
+            PlanReplay(make(n=SHOWN), host=host, port=0)
 
 
 def test_a_foreign_page_cannot_connect(replay: PlanReplay) -> None:

@@ -34,7 +34,6 @@ def capture(
     store: "SessionStore",
     *,
     progress: Callable[[int, int], None] | None = None,
-    settle_s: float = 0.0,
     config: CaptureConfig | None = None,
     job: CaptureJob | None = None,
 ) -> CaptureSummary:
@@ -46,7 +45,6 @@ def capture(
         camera: the camera on its flange.
         store: the session; created with `extra={"plan_hash": plan.content_hash}`.
         progress: called with (views stored, views of the plan); used where no job is given.
-        settle_s: waited after every move [s]; used where no config is given.
         config: when a frame counts, and how fast the arm goes.
         job: which views, and whom to tell and ask.
 
@@ -54,7 +52,7 @@ def capture(
         InputError: the session belongs to another plan, arm or camera.
         DeviceError: a device stopped, or a view gave no good frame, and nobody could be asked.
     """
-    settings = CaptureConfig(settle_s=settle_s) if config is None else config
+    config = CaptureConfig() if config is None else config
     job = CaptureJob(progress=progress) if job is None else job
     check_views(plan, [*(job.views or ()), *job.retake])
     state = check_arm(plan, arm)
@@ -63,10 +61,10 @@ def capture(
     first = next((e for e in log.entries if e.get("event") == "begun"), None)
     tool = state.T_ee_tcp if first is None else np.asarray(first["T_ee_tcp"], dtype=np.float64)
     looker = Looker(
-        plan, arm, camera, settings, board_check=job.board_check, earlier=log.views(),
+        plan, arm, camera, config, board_check=job.board_check, earlier=log.views(),
         T_ee_tcp=tool,
     )  # fmt: skip
-    return Run(plan, arm, camera, settings, looker, log, job, store).carry_out()
+    return Run(plan, arm, camera, config, looker, log, job, store).carry_out()
 
 
 def dry_run(

@@ -187,23 +187,6 @@ def near_parts(model: CollisionModel, joints: Array) -> set[str]:
     return {first, second} if distance < model.clearance_m else set()
 
 
-def serve_replay(
-    plan: CapturePlan, host: str = "127.0.0.1", port: int = 8080, *, looks: bool = True
-) -> PlanReplay:
-    """Return the running replay of a plan; `url` is where to look, `stop` ends it.
-
-    Args:
-        plan: what is shown.
-        host: where to listen; only this machine can reach 127.0.0.1.
-        port: the next free one is taken if it is in use, 0 = any.
-        looks: whether to draw the arm as it looks, where the extra `looks` is installed.
-
-    Raises:
-        InputError: see `PlanReplay`.
-    """
-    return PlanReplay(plan, host=host, port=port, looks=looks)
-
-
 def write_replay(plan: CapturePlan, path: Path | str, *, looks: bool = True) -> Path:
     """Write the replay as one HTML file that plays in any browser, without a server or a network.
 

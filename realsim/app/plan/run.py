@@ -160,9 +160,9 @@ def run_show(
     document = {"plan": text, "pictures": files, "replay": replay_file}
     console.result(_document(plan, metrics) | document)
     if replay:
-        from realsim_capture_plans.pictures.replay import serve_replay
+        from realsim_capture_plans.pictures.replay import PlanReplay
 
-        _serve(serve_replay(plan, host, port), console)
+        _serve(PlanReplay(plan, host=host, port=port), console)
     return free
 
 
