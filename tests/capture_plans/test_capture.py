@@ -19,12 +19,12 @@ import pytest
 from numpy.typing import ArrayLike
 
 from begun_sessions import begun
-from given_plans import driven_clear, joints_looking_at, plan_through
+from given_plans import QUICK, TURNED_HOME, driven_clear, joints_looking_at, plan_through
 from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics
-from realsim.robots.arm import UR5, UR5E, find_arm
+from realsim.robots.arm import UR5, UR5E
 from realsim.robots.limits import JointLimits
 from realsim.store import SessionStore, atomic
 from realsim_capture_plans.capturing.capture import (
@@ -35,7 +35,6 @@ from realsim_capture_plans.capturing.capture import (
     dry_run,
 )
 from realsim_capture_plans.capturing.log import LOG_FILE, CaptureLog
-from realsim_capture_plans.capturing.look import SettleConfig
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, DeviceError, Frame
 from realsim_capture_plans.plan_files.imported import colliding_legs
@@ -43,11 +42,7 @@ from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan
 from refusals import refused
 
-UR5_HOME = find_arm("ur5").home
-
 VIEWS = 10
-QUICK = CaptureConfig(still=SettleConfig(window_s=0.0))
-"""The arms of this file stand at once."""
 CAMERA = CameraIntrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
 
 
@@ -117,12 +112,11 @@ class TableCamera:
 def plan() -> CapturePlan:
     """A ring of views that look down at the middle of the table, every third over a via point."""
     center = np.array([0.40, 0.0, 0.0])
-    home = UR5_HOME + np.pi * np.eye(6)[0]  # turned to the side where the table is
     turns = np.linspace(0.0, 2 * np.pi, VIEWS, endpoint=False)
     eyes = [center + 0.32 * np.array([0.25 * np.cos(a), 0.25 * np.sin(a), 1.0]) for a in turns]
-    joints = joints_looking_at(center, eyes, home)
+    joints = joints_looking_at(center, eyes, TURNED_HOME)
     vias = tuple((k, (joints[k - 1] + joints[k])[None] / 2) for k in range(3, VIEWS, 3))
-    made = plan_through(np.stack(joints), home, center, "calibration", vias=vias)
+    made = plan_through(np.stack(joints), TURNED_HOME, center, "calibration", vias=vias)
     assert colliding_legs(made) == ()
     return made
 

@@ -7,18 +7,17 @@ from typing import Any
 import pytest
 
 from begun_sessions import begun
+from given_plans import QUICK
 from realsim.store import SessionStore
 from realsim.store.opening import BEGUN_FILE
 from realsim.store.session_repair import repair_session
-from realsim_capture_plans.capturing.capture import CaptureConfig, CaptureJob, capture
-from realsim_capture_plans.capturing.look import SettleConfig
+from realsim_capture_plans.capturing.capture import CaptureJob, capture
 from realsim_capture_plans.capturing.run import CaptureSummary
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
 from realsim_capture_plans.plan_files.plan_json import resolve_plan
 from realsim_capture_plans.planning.record import CapturePlan
 from refusals import refused
 
-QUICK = CaptureConfig(still=SettleConfig(window_s=0.0))
 LAB = {"seed": 3, "objects": 2}
 
 

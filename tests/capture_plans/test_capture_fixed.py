@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from given_plans import QUICK
 from realsim.app.capture.fixed import fixed_stores, open_fixed, serials_of
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.store import SessionStore
 from realsim.store.cameras import open_cameras
 from realsim_capture_plans.capturing.capture import capture
-from realsim_capture_plans.capturing.run import CaptureJob
+from realsim_capture_plans.capturing.run import CaptureJob, CaptureSummary
 from realsim_capture_plans.devices.interfaces import DeviceError, Frame
 from refusals import refused
-from tests.capture_plans.test_capture import QUICK, KinematicArm, TableCamera, new_store, plan
+from tests.capture_plans.test_capture import KinematicArm, TableCamera, new_store, plan
 
 LENS = CameraIntrinsics(width=32, height=24, fx=30.0, fy=30.0, cx=15.5, cy=11.5)
 
@@ -45,6 +46,11 @@ class StillCamera:
         pass
 
 
+def taken(arm: KinematicArm, store: SessionStore, fixed: Any, **job: Any) -> CaptureSummary:
+    work = CaptureJob(fixed=fixed, **job)
+    return capture(plan(), arm, TableCamera(arm), store, config=QUICK, job=work)
+
+
 @pytest.fixture
 def arm() -> KinematicArm:
     return KinematicArm(joints=plan().home.copy())
@@ -52,8 +58,7 @@ def arm() -> KinematicArm:
 
 def test_each_view_has_a_frame_of_each_fixed_camera(tmp_path: Path, arm: KinematicArm) -> None:
     store, still = new_store(tmp_path / "s", plan().content_hash), StillCamera()
-    job = CaptureJob(views=(0, 2, 3), fixed=fixed_stores(store, {"left": still}))
-    assert capture(plan(), arm, TableCamera(arm), store, config=QUICK, job=job).complete
+    assert taken(arm, store, fixed_stores(store, {"left": still}), views=(0, 2, 3)).complete
     left = open_cameras(SessionStore.open(store.folder))["left"]
     assert [v.index for v in left.session.views] == [0, 2, 3]
     assert [int(left.rgb(k)[0, 0, 0]) for k in (0, 2, 3)] == [1, 2, 3]
@@ -64,29 +69,19 @@ def test_each_view_has_a_frame_of_each_fixed_camera(tmp_path: Path, arm: Kinemat
 
 def test_a_view_counts_when_all_cameras_have_it(tmp_path: Path, arm: KinematicArm) -> None:
     store, still = new_store(tmp_path / "s", plan().content_hash), StillCamera(fails_at=1)
-    job = CaptureJob(views=(0, 1), fixed=fixed_stores(store, {"left": still}))
-    with pytest.raises(DeviceError, match="fixed camera gave no frame"):
-        capture(plan(), arm, TableCamera(arm), store, config=QUICK, job=job)
+    fixed = fixed_stores(store, {"left": still})
+    refused("camera gave no frame", taken, arm, store, fixed, views=(0, 1), error=DeviceError)
     assert store.completed == {0}
     again = SessionStore.open(store.folder)
-    job = CaptureJob(views=(0, 1), fixed=fixed_stores(again, {"left": still}))
-    assert capture(plan(), arm, TableCamera(arm), again, config=QUICK, job=job).complete
+    assert taken(arm, again, fixed_stores(again, {"left": still}), views=(0, 1)).complete
     assert open_cameras(again)["left"].completed == again.completed == {0, 1}
 
 
 def test_a_view_that_is_taken_again_is_of_all_cameras(tmp_path: Path, arm: KinematicArm) -> None:
     store, still = new_store(tmp_path / "s", plan().content_hash), StillCamera()
     fixed = fixed_stores(store, {"left": still})
-    job = CaptureJob(views=(0, 1), fixed=fixed)
-    capture(plan(), arm, TableCamera(arm), store, config=QUICK, job=job)
-    capture(
-        plan(),
-        arm,
-        TableCamera(arm),
-        store,
-        config=QUICK,
-        job=CaptureJob(views=(), retake=(1,), fixed=fixed),
-    )
+    taken(arm, store, fixed, views=(0, 1))
+    taken(arm, store, fixed, views=(), retake=(1,))
     left = open_cameras(store)["left"]
     assert [int(left.rgb(k)[0, 0, 0]) for k in (0, 1)] == [1, 3]
 
@@ -96,8 +91,7 @@ def test_a_capture_goes_on_with_the_cameras_it_was_begun_with(
 ) -> None:
     store, still = new_store(tmp_path / "s", plan().content_hash), StillCamera()
     fixed = fixed_stores(store, {"left": still})
-    job = CaptureJob(views=(0,), fixed=fixed)
-    capture(plan(), arm, TableCamera(arm), store, config=QUICK, job=job)
+    taken(arm, store, fixed, views=(0,))
     refused(r"begun with the fixed cameras left, and .* names none", fixed_stores, store, {})
     refused("names left, right", fixed_stores, store, {"left": still, "right": StillCamera()})
     with pytest.raises(InputError, match=r"'left' of .* is still 1, .* connects still 2"):

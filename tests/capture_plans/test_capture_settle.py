@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from realsim.robots.arm import UR5, find_arm
+from given_plans import UR5_HOME
+from realsim.robots.arm import UR5
 from realsim_capture_plans.capturing.checks import SHARPNESS_OF_MEDIAN, sharpness
 from realsim_capture_plans.capturing.look import SettleConfig, until_still
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError
 from realsim_capture_plans.lab.devices import SimulatedArm
-
-UR5_HOME = find_arm("ur5").home
 
 
 class RingingArm(SimulatedArm):

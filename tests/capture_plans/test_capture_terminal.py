@@ -20,9 +20,8 @@ from typing import Any
 import numpy as np
 
 from begun_sessions import begun
-from given_plans import plan_through
+from given_plans import TURNED_HOME, plan_through
 from realsim.records import CameraIntrinsics
-from realsim.robots.arm import find_arm
 from realsim.store import SessionStore
 from realsim_capture_plans.capturing.capture import CaptureJob, capture
 from realsim_capture_plans.capturing.log import LOG_FILE, CaptureLog
@@ -31,19 +30,16 @@ from realsim_capture_plans.devices.interfaces import Frame
 from realsim_capture_plans.lab.devices import SimulatedArm
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
-UR5_HOME = find_arm("ur5").home
-
 VIEWS = 40
 CAMERA = CameraIntrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
 
 
 def plan() -> CapturePlan:
     """The wrist turns a little from view to view, above the middle of the table."""
-    home = UR5_HOME + np.pi * np.eye(6)[0]
-    joints = home + 0.02 * np.arange(1, VIEWS + 1)[:, None] * np.eye(6)[5]
+    joints = TURNED_HOME + 0.02 * np.arange(1, VIEWS + 1)[:, None] * np.eye(6)[5]
     center = np.array([0.45, 0.0, 0.0])
     cell = PlanConfig().work_cell(center, "calibration")
-    return plan_through(joints, home, center, "imported", cell=cell)
+    return plan_through(joints, TURNED_HOME, center, "imported", cell=cell)
 
 
 class SlowCamera:

@@ -16,44 +16,33 @@ import pytest
 from numpy.typing import ArrayLike
 
 from begun_sessions import begun
-from given_plans import driven_clear, joints_looking_at, plan_through
+from given_plans import QUICK, TURNED_HOME, driven_clear, joints_looking_at, plan_through
 from plain_meshes import square
 from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
-from realsim.robots.arm import find_arm
 from realsim.store import SessionStore
-from realsim_capture_plans.capturing.capture import (
-    CaptureConfig,
-    CaptureJob,
-    CaptureSummary,
-    capture,
-)
+from realsim_capture_plans.capturing.capture import CaptureJob, CaptureSummary, capture
 from realsim_capture_plans.capturing.contact_sheet import SHEET_FILE, write_contact_sheet
 from realsim_capture_plans.capturing.log import CaptureLog
-from realsim_capture_plans.capturing.look import SettleConfig
 from realsim_capture_plans.capturing.operator import CaptureStatus, Command, NoOperator
 from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError, Frame, Stop
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
 from realsim_capture_plans.lab.devices import SimulatedArm, SimulatedDepthCamera
 from realsim_capture_plans.planning.record import CapturePlan
 
-UR5_HOME = find_arm("ur5").home
-
 VIEWS = 9
 RENDERED: dict[bytes, Frame] = {}
 CLOCK = count(1)
-QUICK = CaptureConfig(still=SettleConfig(window_s=0.0))
 
 
 @lru_cache(maxsize=1)
 def plan() -> CapturePlan:
     """An arc of views round the lab's objects."""
     center = np.array([0.45, 0.0, 0.03])
-    home = UR5_HOME + np.pi * np.eye(6)[0]
     turns = np.linspace(0.0, np.pi, VIEWS)
     eyes = [center + 0.36 * np.array([-0.3 * np.sin(a), 0.3 * np.cos(a), 0.95]) for a in turns]
-    return plan_through(np.stack(joints_looking_at(center, eyes, home)), home, center)
+    return plan_through(np.stack(joints_looking_at(center, eyes, TURNED_HOME)), TURNED_HOME, center)
 
 
 class StoppingArm(SimulatedArm):

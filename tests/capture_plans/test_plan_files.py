@@ -9,35 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from given_plans import plan_through
+from given_plans import HOME, a_plan
 from realsim.errors import InputError, RealsimError
-from realsim.geometry import se3
 from realsim.robots.arm import UR5, UR5E
 from realsim.robots.kinematics import DhChain
-from realsim.robots.shapes import Box
-from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.plan_files import plan_json
 from realsim_capture_plans.plan_files.imported import colliding_legs
 from realsim_capture_plans.plan_files.plan_json import load_plan, plan_to_json, save_plan
 from realsim_capture_plans.planning.ordering import move_seconds
-from realsim_capture_plans.planning.record import CapturePlan, PlanConfig, hash_of
+from realsim_capture_plans.planning.record import CapturePlan, hash_of
 from refusals import refused as refused_by
-
-HOME = np.array([0.1, -1.6, 1.7, -1.7, -1.5, 0.3])
-CENTER = np.array([0.37, 0.02, 0.05])
-
-
-def a_plan(chain: DhChain = UR5, n: int = 9, seed: int = 0) -> CapturePlan:
-    """Views scattered round home, two moves over via points: files do not ask how it was made."""
-    rng = np.random.default_rng(seed)
-    lamp = Box(lower=(-np.inf, 0.5, 0.0), upper=(-0.6, 0.6, 0.8))
-    return plan_through(
-        HOME + rng.normal(0, 0.4, (n, 6)), HOME, CENTER, obstacles=(("lamp", lamp),), chain=chain,
-        config=PlanConfig(settle_s=0.4),
-        mount=d405_mount(se3.exp([0.02, -0.1, 0.3, 0.0, -0.065, 0.035])),
-        vias=((0, HOME + rng.normal(0, 0.2, (2, 6))), (4, HOME + rng.normal(0, 0.2, (1, 6)))),
-        reference_view=3, metrics={"views": float(n), "seconds": 12.345678901234567},
-    )  # fmt: skip
 
 
 def rewritten(plan: CapturePlan, change: Callable[[dict[str, Any]], None]) -> dict[str, Any]:

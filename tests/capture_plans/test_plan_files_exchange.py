@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bop_scenes import edit
-from given_plans import plan_through
+from given_plans import CENTER, HOME, MOUNT, a_plan
 from realsim.errors import InputError, UnitError
 from realsim.formats.graspnet.cameras import read_camera_poses
 from realsim.geometry import se3
@@ -31,19 +31,7 @@ from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig, plan_content, plan_of
 from refusals import refused
 
-HOME = np.array([0.1, -1.6, 1.7, -1.7, -1.5, 0.3])
-CENTER = np.array([0.37, 0.02, 0.05])
-MOUNT = d405_mount()
 REAL = Path(os.environ.get("REALSIM_DATA", "../shared/data")) / "motion" / "koch_ur5_paths"
-
-
-def a_plan() -> CapturePlan:
-    rng = np.random.default_rng(0)
-    return plan_through(
-        HOME + rng.normal(0, 0.3, (9, 6)), HOME, CENTER, config=PlanConfig(table_height_m=-0.02),
-        mount=MOUNT, reference_view=3,
-        vias=((0, HOME + rng.normal(0, 0.2, (2, 6))), (4, HOME + rng.normal(0, 0.2, (1, 6)))),
-    )  # fmt: skip
 
 
 def write_path(

@@ -9,11 +9,21 @@ from numpy.typing import ArrayLike
 
 from realsim.arrays import Array
 from realsim.geometry import se3
-from realsim.robots.arm import UR5
+from realsim.robots.arm import UR5, find_arm
 from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box
+from realsim_capture_plans.capturing.look import CaptureConfig, SettleConfig
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+
+HOME, CENTER = np.array([0.1, -1.6, 1.7, -1.7, -1.5, 0.3]), np.array([0.37, 0.02, 0.05])
+MOUNT = d405_mount(se3.exp([0.02, -0.1, 0.3, 0.0, -0.065, 0.035]))
+"""Of `a_plan`."""
+UR5_HOME = find_arm("ur5").home
+TURNED_HOME = UR5_HOME + np.pi * np.eye(6)[0]
+"""On the side where the table is."""
+QUICK = CaptureConfig(still=SettleConfig(window_s=0.0))
+"""For arms that stand at once."""
 
 
 def plan_through(
@@ -34,6 +44,18 @@ def plan_through(
     return CapturePlan(
         kind=kind, home=home, joints=joints, center_world=np.asarray(center), config=config, **given
     )
+
+
+def a_plan(chain: DhChain = UR5, n: int = 9, seed: int = 0) -> CapturePlan:
+    """Views scattered round home, two moves over via points: files do not ask how it was made."""
+    rng = np.random.default_rng(seed)
+    lamp = Box(lower=(-np.inf, 0.5, 0.0), upper=(-0.6, 0.6, 0.8))
+    return plan_through(
+        HOME + rng.normal(0, 0.4, (n, 6)), HOME, CENTER, obstacles=(("lamp", lamp),), chain=chain,
+        config=PlanConfig(settle_s=0.4, table_height_m=-0.02), mount=MOUNT, reference_view=3,
+        vias=((0, HOME + rng.normal(0, 0.2, (2, 6))), (4, HOME + rng.normal(0, 0.2, (1, 6)))),
+        metrics={"views": float(n), "seconds": 12.345678901234567},
+    )  # fmt: skip
 
 
 def calibrated(chain: DhChain, seed: int) -> DhChain:
