@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 
+from pictured_targets import pose
 from realsim.arrays import Array, Array32
 from realsim.geometry import se3
 from realsim.geometry.camera import pixel_grid, project, undistort
@@ -21,13 +22,10 @@ EXACT = DepthBiasConfig(board_scale_sd=0.0, focal_sd=1e-9)
 FAR = np.linspace(0.2, 0.5, 12)
 
 
-def pose_at(rng: np.random.Generator, distance: float, tilt_deg: float = 35.0) -> Array:
+def pose_at(rng: np.random.Generator, distance: float) -> Array:
     """Return T_cam_board of a camera that looks at the board's middle."""
-    middle = np.array([*BOARD.size_m, 0.0]) / 2
-    tilt, azimuth = np.radians(rng.uniform(0.3, 1.0) * tilt_deg), rng.uniform(0, 2 * np.pi)
-    away = [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)]
-    eye = middle + distance * np.array(away)
-    return se3.invert(se3.look_at(eye, middle, rng.uniform(-np.pi, np.pi)))
+    tilt, azimuth = 35.0 * rng.uniform(0.3, 1.0), rng.uniform(0, 360)
+    return pose(BOARD, tilt, azimuth, rng.uniform(-180, 180), distance)
 
 
 @cache

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pictured_targets import pose
 from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.camera import project
@@ -26,10 +27,7 @@ ROBOT_SD = RATIO * SIGMA / 648.0 * np.array([1.0] * 3 + [DISTANCE] * 3)
 
 def board_at(tilt: float, azimuth: float, roll: float, distance: float = DISTANCE) -> Array:
     """Return T_cam_board; angles in degrees."""
-    t, a = np.radians([tilt, azimuth])
-    middle = np.array([*BOARD.size_m, 0.0]) / 2
-    away = np.array([np.sin(t) * np.cos(a), np.sin(t) * np.sin(a), -np.cos(t)])
-    return se3.invert(se3.look_at(middle + distance * away, middle, np.radians(roll)))
+    return pose(BOARD, tilt, azimuth, roll, distance)
 
 
 def hand_at(T_cam_board: Array, mode: str = "eye_in_hand") -> Array:
@@ -53,18 +51,21 @@ def random_hands(
 # ---- a Gauss-Newton of its own: numerical derivatives, generalised least squares
 
 
-def predict(theta: Array, A: Array, errors: Array, mode: str, board: Target = BOARD) -> Array:
-    """Return pixels (p, 2); theta (18,) steps about X0, Z0, CAMERA and scale 1."""
-    X, Z = X0 @ se3.exp(theta[:6]), Z0 @ se3.exp(theta[6:12])
+def lens_of(theta: Array) -> CameraIntrinsics:
     d = np.zeros(8)
     d[0] = theta[16]
     fx, fy, cx, cy = np.array([648.0, 648.0, 639.5, 359.5]) + theta[12:16]
-    lens = replace(CAMERA, fx=fx, fy=fy, cx=cx, cy=cy, distortion=d)
+    return replace(CAMERA, fx=fx, fy=fy, cx=cx, cy=cy, distortion=d)
+
+
+def predict(theta: Array, A: Array, errors: Array, mode: str, board: Target = BOARD) -> Array:
+    """Return pixels (p, 2); theta (18,) steps about X0, Z0, CAMERA and scale 1."""
+    X, Z = X0 @ se3.exp(theta[:6]), Z0 @ se3.exp(theta[6:12])
     middle = np.array([*board.size_m, 0.0]) / 2
     points = middle + (1 + theta[17]) * (board.points_board - middle)
     hand = A @ se3.exp(errors)
     hand = se3.invert(hand) if mode == "eye_in_hand" else hand
-    return project(lens, se3.transform(se3.invert(X) @ hand @ Z, points))
+    return project(lens_of(theta), se3.transform(se3.invert(X) @ hand @ Z, points))
 
 
 @lru_cache(maxsize=512)
@@ -133,9 +134,7 @@ def report_of(
     camera_cov = np.zeros((12, 12))
     camera_cov[:5, :5] = C[12:17, 12:17]
     sd = np.array([np.sqrt(C[17, 17]), 0, 0, 0, 0])
-    d = np.zeros(8)
-    d[0] = theta[16]
-    fx, fy, cx, cy = np.array([648.0, 648.0, 639.5, 359.5]) + theta[12:16]
+    lens = lens_of(theta)
     X, Z = X0 @ se3.exp(theta[:6]), Z0 @ se3.exp(theta[6:12])
     views = tuple(
         ViewReport(
@@ -146,7 +145,6 @@ def report_of(
         )
         for k, (A, uv, r) in enumerate(zip(hands, seen, residuals, strict=True))
     )  # fmt: skip
-    lens = replace(CAMERA, fx=fx, fy=fy, cx=cx, cy=cy, distortion=d)
     return HandEyeReport(
         mode=mode, target=BOARD, X=X, X_covariance=C[:6, :6], Z=Z, X_alone=X,
         X_alone_covariance=C[:6, :6], Z_alone=Z, intrinsics_alone=lens, intrinsics=lens,

@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from plain_meshes import box
 from realsim.arrays import Array
 from realsim.geometry import se3
+from realsim.geometry.mesh import merged
 from realsim.geometry.parts import object_model
 from realsim.records import Mesh
 from realsim.registration.evidence import DepthFrame, measure_noise
@@ -145,11 +147,7 @@ def mirrored(mesh: Mesh) -> Mesh:
 
 def joined(*meshes: Mesh) -> Mesh:
     """Return several meshes as one."""
-    at = np.cumsum([0, *(len(m.vertices) for m in meshes)])
-    return Mesh(
-        vertices=np.concatenate([m.vertices for m in meshes]),
-        faces=np.concatenate([m.faces + k for m, k in zip(meshes, at, strict=False)]),
-    )
+    return merged(meshes)
 
 
 def subdivided(mesh: Mesh, least_faces: int) -> Mesh:
@@ -164,10 +162,7 @@ def subdivided(mesh: Mesh, least_faces: int) -> Mesh:
 
 def block(size: tuple[float, float, float] = (0.08, 0.05, 0.06)) -> Mesh:
     """Return a box [m] about the origin, 12 triangles outward."""
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
-    return Mesh(vertices=corners * size, faces=np.array(faces, dtype=np.int32))
+    return box(size)
 
 
 def shifted(mesh: Mesh, x: float, y: float, z: float) -> Mesh:

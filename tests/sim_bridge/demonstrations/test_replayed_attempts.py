@@ -19,6 +19,13 @@ pytestmark = pytest.mark.slow  # the school of all of them takes long
 LIFT = PHASES.index("lift")
 
 
+def sourced(school, grasps=None, **options):
+    """A school's attempts, or those of its grasps as a test has changed them."""
+    stored, models = stored_grasps(school)
+    cache = school / "grasps/cache"
+    return DemonstrationSource(grasps or stored, models, cache=cache, **options)
+
+
 @pytest.fixture(scope="module")
 def all_of_them(source):
     return list(source)
@@ -35,15 +42,12 @@ def lost(all_of_them):
 
 
 def test_an_attempt_tells_its_p_hold(weak_school):
-    grasps, models = stored_grasps(weak_school)
+    grasps, _ = stored_grasps(weak_school)
     told = [
         replace(s, measures={"p_hold": np.arange(len(s)) / len(s), "safety": np.ones((len(s), 4))})
         for s in grasps.sets
     ]
-    known = DemonstrationSource(
-        replace(grasps, sets=tuple(told)), models, cameras=(), cache=weak_school / "grasps/cache"
-    )
-    d = known[0]
+    d = sourced(weak_school, replace(grasps, sets=tuple(told)), cameras=())[0]
     count = next(len(s) for s in told if s.instance == d.name.instance)
     assert d.outcome.labels == {"p_hold": d.name.grasp / count, "safety": [1.0] * 4}
 
@@ -95,23 +99,16 @@ def test_a_lost_object_falls_onto_the_table_and_stays_there(lost):
 
 
 def test_nothing_jumps(weak_school):
-    grasps, models = stored_grasps(weak_school)
-    fast = DemonstrationSource(
-        grasps, models, DemonstrationConfig(rate_hz=100), cache=weak_school / "grasps/cache"
-    )
-    for d in fast:
+    for d in sourced(weak_school, config=DemonstrationConfig(rate_hz=100)):
         m = d.motion
-        center = models[d.goal.obj_id].mesh.vertices.mean(axis=0)
+        center = d.scenery.models[d.name.instance].mesh.vertices.mean(axis=0)
         moved = np.diff(se3.transform(m.Ts_table_obj, center[None])[:, 0], axis=0)
         assert np.linalg.norm(moved, axis=1).max() * 100 < 3.0, d.name
         assert np.abs(np.diff(m.joints_rad, axis=0)).max() * 100 < 5.0
 
 
 def test_half_the_rate_is_every_second_step(weak_school, source):
-    grasps, models = stored_grasps(weak_school)
-    slow = DemonstrationSource(
-        grasps, models, DemonstrationConfig(rate_hz=10), cache=weak_school / "grasps/cache"
-    )
+    slow = sourced(weak_school, config=DemonstrationConfig(rate_hz=10))
     for k in (1, 4):
         a, b = slow[k].motion, source[k].motion
         for name in ("time_s", "joints_rad", "opening_m", "command_m", "phase", "held"):
