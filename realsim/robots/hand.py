@@ -344,7 +344,7 @@ _RANGES = {
     "max_opening_m": (0.001, 0.5, "m"),
     "finger_length_m": (0.001, 0.5, "m"),
     "finger_width_m": (0.001, 0.3, "m"),
-    "finger_thickness_m": (0.0005, 0.3, "m"),
+    "finger_thickness_m": (0.0005, 0.1, "m"),
     "pad_width_m": (0.001, 0.3, "m"),
     "pad_length_m": (0.001, 0.3, "m"),
     "friction": (0.01, 10.0, ""),
@@ -367,8 +367,10 @@ def _faults(hand: Hand) -> list[str]:
         if least <= value <= most:
             continue
         told = f"{name} is {value:g} {unit}; {least:g} to {most:g} {unit} can be"
-        if unit == "m" and least <= value / 1e3 <= most:
-            told += f": {value:g} is in millimetres, write {value / 1e3:g}"
+        units = {"millimetres": 1e3, "centimetres": 1e2} if unit == "m" else {}
+        meant = [f"{value / per:g} if {value:g} is in {what}" for what, per in units.items()
+                 if least <= value / per <= most]  # fmt: skip
+        told += f": write {' or '.join(meant)}" * bool(meant)
         faults.append(told)
     if not hand.least_force_n <= hand.force_n <= hand.greatest_force_n:
         faults.append(

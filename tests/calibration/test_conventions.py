@@ -184,6 +184,7 @@ def test_a_mirrored_axis_is_named(what):
     assert d.fault == "mirrored_axis", d.sentence
     said = {"frames": "x, y or z"}.get(what, f"the z axis of the {what} is mirrored")
     assert said in d.sentence and d.advice
+    assert ("images are mirrored" in d.sentence) == (what == "frames")
 
 
 def test_a_hand_that_does_not_turn_cannot_be_tested():

@@ -1,4 +1,4 @@
-"""The hypothesis that a program counts an axis of the robot the other way: left-handed poses."""
+"""The hypothesis that the robot's poses, or the images, are mirrored."""
 
 from dataclasses import replace
 
@@ -14,7 +14,8 @@ def mirrored(p: Poses) -> list[Hypothesis]:
 
     A left-handed frame turns T into S T S with one sign of S flipped. Which axis it is cannot be
     told then, because two flips are a half turn, which X and Z take up; where only positions or
-    only rotations are mirrored it can.
+    only rotations are mirrored it can. Images that are mirrored left to right look the same, too:
+    following the advice for poses then gives a camera that looks backwards.
     """
     R, t = p.T[:, :3, :3], p.T[:, :3, 3]
     found: list[Hypothesis] = []
@@ -33,9 +34,10 @@ def mirrored(p: Poses) -> list[Hypothesis]:
             found.append(_hypothesis(
                 p, turned, moved,
                 "the poses are read as left-handed: an axis of the robot's frames is mirrored (x, "
-                "y or z, the poses cannot tell which)",
-                "Export right-handed poses; or, with S = diag(1, 1, -1), give S t as position and "
-                "S R S as rotation.",
+                "y or z, the poses cannot tell which), or all images are mirrored left to right",
+                "Look at writing in an image first. If it is mirrored, flip the images back. If "
+                "not, export right-handed poses; or, with S = diag(1, 1, -1), give S t as position "
+                "and S R S as rotation.",
             ))  # fmt: skip
     return found
 
