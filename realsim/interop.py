@@ -190,6 +190,15 @@ def import_open3d() -> Any:
         raise missing_library("open3d", error) from error
 
 
+def pybullet_client() -> Any:
+    """Return a physics world of PyBullet's own, which nothing else is in; `disconnect` frees it."""
+    with quiet_output():
+        import pybullet
+        from pybullet_utils.bullet_client import BulletClient
+
+        return BulletClient(connection_mode=pybullet.DIRECT)
+
+
 def import_pinocchio() -> Any:
     """Return the module `pinocchio`, with an OpenMP of another wheel where the system has none."""
     try:

@@ -9,7 +9,6 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -88,7 +87,7 @@ class TableWorld:
         self.statics: list[int] = []
         """Body numbers of the table and the supports."""
         self._Ts_obj_body: dict[int, Array] = {}
-        self._engine: Any = _connected()
+        self._engine = interop.pybullet_client()
         with ExitStack() as on_failure:
             # Not `.disconnect` itself: BulletClient ends its connection when the name is looked up.
             on_failure.callback(self._close)
@@ -263,14 +262,6 @@ class TableWorld:
             "contact_friction": float(info[1]) ** 2,
             "collision_margin_m": float(info[_INFO["collisionMargin"]]),
         }
-
-
-def _connected() -> Any:
-    with interop.quiet_output():
-        import pybullet
-        from pybullet_utils.bullet_client import BulletClient
-
-        return BulletClient(connection_mode=pybullet.DIRECT)
 
 
 def _require_taken(name: str, found: float, wanted: float, of: str) -> None:

@@ -16,8 +16,9 @@ millimetres. One pair, built once and reset for every grasp, costs no more.
 
 import tempfile
 import weakref
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -27,11 +28,9 @@ from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.bullet_shapes import drawn_in, hand_urdf, massless_link, wavefront
+from realsim_sim_bridge.slip.engines import BulletSettings
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import SlipBody, SlipPhysics
-
-if TYPE_CHECKING:
-    from realsim_sim_bridge.slip.engines import BulletSettings
 
 FINGERS = ("left_slide", "right_slide")
 """Joints of the two fingers; the first is at +y."""
@@ -61,7 +60,7 @@ class BulletPair:
         body: SlipBody,
         physics: SlipPhysics,
         geometry: Hand,
-        settings: "BulletSettings",
+        settings: BulletSettings,
         stand: Stand | None = None,
     ) -> None:
         """Build the pair, and what the object stands on while the fingers close.
@@ -69,11 +68,7 @@ class BulletPair:
         Raises:
             RealsimError: PyBullet does not take the shape, or a setting.
         """
-        with interop.quiet_output():
-            import pybullet
-            from pybullet_utils.bullet_client import BulletClient
-
-            self.engine: Any = BulletClient(connection_mode=pybullet.DIRECT)
+        self.engine = interop.pybullet_client()
         # When Python ends, its modules may be gone before this object: a finalizer runs earlier.
         weakref.finalize(self, _disconnect, self.engine)
         self._physics, self._settings = physics, settings
@@ -143,13 +138,7 @@ class BulletPair:
             if self._physics.pads:
                 engine.changeDynamics(hand, finger, frictionAnchor=int(settings.friction_anchor))
                 self._check(hand, finger, wanted)
-        gear = engine.createConstraint(
-            hand, self._fingers[0], hand, self._fingers[1], engine.JOINT_GEAR,
-            [0, 1, 0], [0, 0, 0], [0, 0, 0],
-        )  # fmt: skip
-        engine.changeConstraint(
-            gear, gearRatio=-1, erp=settings.gear_erp, maxForce=settings.gear_force_n
-        )
+        couple(engine, hand, self._fingers, settings.gear_erp, settings.gear_force_n)
         return hand
 
     def _shape(self, parts: list[Array], path: Path) -> int:
@@ -278,14 +267,7 @@ class BulletPair:
 
     def drive(self, speed: float) -> None:
         """Let the fingers close at a speed [m/s] each, with at most the hand's force."""
-        for finger in self._fingers:
-            self.engine.setJointMotorControl2(
-                self.hand,
-                finger,
-                self.engine.VELOCITY_CONTROL,
-                targetVelocity=-speed,
-                force=self._physics.force_n,
-            )
+        close(self.engine, self.hand, self._fingers, speed, self._physics.force_n)
 
     def follow_arc(self, *, still: bool = False) -> None:
         """Put the fingers of an arc where it has them in the next step; `still`: and stay there."""
@@ -373,6 +355,22 @@ class BulletPair:
             "substeps": float(parameters["numSubSteps"]),
             "force_n": abs(float(engine.getJointState(self.hand, self._fingers[0])[3])),
         }
+
+
+def couple(engine: Any, hand: int, fingers: Sequence[int], erp: float, force_n: float) -> None:
+    """Let a gear keep two fingers (link numbers) at the same distance from the middle."""
+    gear = engine.createConstraint(
+        hand, fingers[0], hand, fingers[1], engine.JOINT_GEAR, [0, 1, 0], [0, 0, 0], [0, 0, 0]
+    )
+    engine.changeConstraint(gear, gearRatio=-1, erp=erp, maxForce=force_n)
+
+
+def close(engine: Any, hand: int, fingers: Sequence[int], speed: float, force_n: float) -> None:
+    """Let fingers (link numbers) close at a speed [m/s] each, with at most a force [N]."""
+    for finger in fingers:
+        engine.setJointMotorControl2(
+            hand, finger, engine.VELOCITY_CONTROL, targetVelocity=-speed, force=force_n
+        )
 
 
 def _disconnect(engine: Any) -> None:

@@ -8,7 +8,6 @@ other, and the mass is read back.
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -47,11 +46,7 @@ class DropWorld:
         self.config = config
         self.bodies: dict[int, _Body] = {}
         """Key of an object -> its body."""
-        with interop.quiet_output():
-            import pybullet
-            from pybullet_utils.bullet_client import BulletClient
-
-            self._engine: Any = BulletClient(connection_mode=pybullet.DIRECT)
+        self._engine = interop.pybullet_client()
         self._folder = tempfile.TemporaryDirectory(prefix="realsim_drop_")
         self._shapes = 0
         self._rolling = 0.0

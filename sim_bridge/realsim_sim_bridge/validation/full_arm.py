@@ -8,7 +8,6 @@ in common is the hand's motion alone.
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from realsim.geometry import se3
 from realsim.records import STAGES
 from realsim.robots.compiled_chain import follow_lines
 from realsim.robots.hand import Hand, find_hand
-from realsim_sim_bridge.slip.bullet_pair import LIFT_N, LIFT_PULL
+from realsim_sim_bridge.slip.bullet_pair import LIFT_N, LIFT_PULL, close, couple
 from realsim_sim_bridge.slip.bullet_shapes import hand_urdf
 from realsim_sim_bridge.slip.motion import SlipMotion, min_jerk, pendulum_angle
 from realsim_sim_bridge.slip.score import ScoreLimits
@@ -178,11 +177,7 @@ class _ArmWorld:
     """An arm with a hand and a cube in PyBullet."""
 
     def __init__(self, mass_kg: float, T_obj_grasp: Array, config: SlipConfig, hand: Hand) -> None:
-        with interop.quiet_output():
-            import pybullet
-            from pybullet_utils.bullet_client import BulletClient
-
-            self._engine: Any = BulletClient(connection_mode=pybullet.DIRECT)
+        self._engine = interop.pybullet_client()
         self._config, self._hand, self.dt = config, hand, 1.0 / RATE_HZ
         self._engine.setPhysicsEngineParameter(
             fixedTimeStep=self.dt, numSolverIterations=ITERATIONS, numSubSteps=0,
@@ -200,11 +195,7 @@ class _ArmWorld:
 
     def close_fingers(self, speed: float) -> None:
         """Let the fingers close at `speed` [m/s] and press with the hand's force from then."""
-        for finger in self._fingers:
-            self._engine.setJointMotorControl2(
-                self._arm, finger, self._engine.VELOCITY_CONTROL, targetVelocity=-speed,
-                force=self._config.physics.force_n,
-            )  # fmt: skip
+        close(self._engine, self._arm, self._fingers, speed, self._config.physics.force_n)
 
     def set_gravity(self, gravity: float) -> None:
         """Turn gravity on [m/s^2]."""
@@ -291,11 +282,7 @@ class _ArmWorld:
                     self._arm, finger,
                     contactStiffness=STIFFNESS, contactDamping=DAMPING,
                 )  # fmt: skip
-        gear = engine.createConstraint(
-            self._arm, self._fingers[0], self._arm, self._fingers[1], engine.JOINT_GEAR,
-            [0, 1, 0], [0, 0, 0], [0, 0, 0],
-        )  # fmt: skip
-        engine.changeConstraint(gear, gearRatio=-1, erp=GEAR_ERP, maxForce=GEAR_FORCE_N)
+        couple(engine, self._arm, self._fingers, GEAR_ERP, GEAR_FORCE_N)
 
     def _add_cube(self, mass_kg: float, T_base_cube: Array) -> None:
         """Add the cube, weightless until gravity is turned on."""
