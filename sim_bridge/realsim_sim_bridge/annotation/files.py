@@ -107,8 +107,8 @@ def part_of_view(
     entries = [
         {
             "mask": k,
-            "instance": label.instance,
-            "obj_id": label.obj_id,
+            "instance": placed.instance,
+            "obj_id": placed.obj_id,
             "name": inputs.models[placed.obj_id].name,
             "verdict": placed.verdict,
             "reasons": list(placed.reasons),
@@ -118,7 +118,7 @@ def part_of_view(
             "px_hidden_by_unknown": label.unknown.px if label.unknown.is_removed else 0,
             "unknown_occluder": _json(label.unknown),
             "depth": _json(label.agreement),
-            "grasps": dict(grasp_counts.get(label.instance, {})),
+            "grasps": dict(grasp_counts.get(placed.instance, {})),
             "mask_visib_rle": label.visible_rle,
         }
         for k, (placed, label) in enumerate(zip(inputs.objects, frame, strict=True))

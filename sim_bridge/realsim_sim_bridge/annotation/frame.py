@@ -18,7 +18,6 @@ from realsim_sim_bridge.annotation import files
 from realsim_sim_bridge.annotation.frame_grasps import GraspsInView, GraspVisibility, grasps_in_view
 from realsim_sim_bridge.annotation.frame_labels import (
     DepthAgreement,
-    FrameLabel,
     UnknownOccluder,
     depth_agreement,
     label_object,
@@ -47,14 +46,8 @@ class FrameFiles:
     """The annotation as JSON values."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class _Seen:
-    """Masks of all objects of a view, and how the measured depth bears them out."""
-
-    masks: list[ObjectMasks]
-    agreements: list[DepthAgreement]
-    unknowns: list[UnknownOccluder]
-    region: UnmodelledRegion | None
+Evidence = tuple[DepthAgreement, UnknownOccluder]
+"""How the measured depth bears out an object's mask, and what hides it that is not in the scene."""
 
 
 @lru_cache(maxsize=1)
@@ -83,30 +76,30 @@ def frame_files(inputs: FrameInputs, view: FrameView, depth_m: Depth) -> FrameFi
     """
     renderer, intrinsics, config = renderer_of(inputs), inputs.intrinsics, inputs.config
     labels = renderer.render(intrinsics, view.T_world_cam)
-    seen, boxes = _seen(inputs, labels, depth_m), boxes_of(inputs)
-    frame: list[FrameLabel] = [
+    (all_masks, evidence, region), boxes = _seen(inputs, labels, depth_m), boxes_of(inputs)
+    own_boxes = boxes[: len(inputs.objects)]
+    frame = [
         label_object(
             placed, (inputs.models[placed.obj_id].mesh, box), masks, labels, depth_m,
-            (intrinsics, view.T_world_cam), (agreement, unknown),
+            (intrinsics, view.T_world_cam), said,
         )
-        for placed, box, masks, agreement, unknown in zip(
-            inputs.objects, boxes[: len(inputs.objects)], seen.masks, seen.agreements,
-            seen.unknowns, strict=True,
+        for placed, box, masks, said in zip(
+            inputs.objects, own_boxes, all_masks, evidence, strict=True
         )
     ]  # fmt: skip
     poses = {o.instance: o.T_world_obj for o in inputs.objects}
     grasps = grasps_in_view(
         renderer, intrinsics, view.T_world_cam,
-        [(poses[g.instance], g) for g in inputs.grasp_sets], config.sight, seen.region,
+        [(poses[g.instance], g) for g in inputs.grasp_sets], config.sight, region,
     )  # fmt: skip
 
     size = (intrinsics.width, intrinsics.height)
     out: dict[str, bytes] = {}
-    for k, masks in enumerate(seen.masks):
+    for k, masks in enumerate(all_masks):
         for is_visible, mask in ((False, masks.amodal), (True, masks.visible)):
             path = mask_path(view.index, k, visible=is_visible)
             out[path] = encode_window(mask, masks.origin, size)
-    by_instance = list(zip((o.instance for o in inputs.objects), seen.masks, strict=True))
+    by_instance = list(zip((o.instance for o in inputs.objects), all_masks, strict=True))
     out |= map_files(config.maps, view.index, labels, by_instance, boxes, inputs.depth_unit_m)
     out[files.grasps_path(view.index)] = files.grasps_bytes(grasps)
     part = files.part_of_view(inputs, view, labels, frame, _counts(grasps))
@@ -114,28 +107,28 @@ def frame_files(inputs: FrameInputs, view: FrameView, depth_m: Depth) -> FrameFi
     return FrameFiles(files=out, part=part)
 
 
-def _seen(inputs: FrameInputs, labels: Labels, depth_m: Depth) -> _Seen:
-    """Return the masks of all objects, checked against the measured depth."""
+def _seen(
+    inputs: FrameInputs, labels: Labels, depth_m: Depth
+) -> tuple[list[ObjectMasks], list[Evidence], UnmodelledRegion | None]:
+    """Return the masks of all objects, checked against the measured depth, and what hides them."""
     config, instances = inputs.config, [o.instance for o in inputs.objects]
     masks = [object_masks(labels, i) for i in instances]
     window = union_of([m.window for m in masks])
     region = unmodelled_region(labels.depth_m, depth_m, window, inputs.intrinsics, config.occluder)
-    agreements: list[DepthAgreement] = []
-    unknowns: list[UnknownOccluder] = []
+    evidence: list[Evidence] = []
     for k, i in enumerate(instances):
         rendered_m, measured_m = labels.depth_m[masks[k].window], depth_m[masks[k].window]
-        agreements.append(
-            depth_agreement(masks[k].rendered, rendered_m, measured_m, config.agreement_tolerance_m)
+        agreement = depth_agreement(
+            masks[k].rendered, rendered_m, measured_m, config.agreement_tolerance_m
         )
         covered = object_masks(labels, i, region)
-        unknowns.append(
-            unknown_occluder(covered, rendered_m, measured_m, agreements[k], config.occluder)
-        )
-        if unknowns[k].is_removed:
+        unknown = unknown_occluder(covered, rendered_m, measured_m, agreement, config.occluder)
+        evidence.append((agreement, unknown))
+        if unknown.is_removed:
             masks[k] = covered
         elif region is not None:
             region = region.without(masks[k].window, masks[k].rendered)
-    return _Seen(masks=masks, agreements=agreements, unknowns=unknowns, region=region)
+    return masks, evidence, region
 
 
 def _counts(grasps: Sequence[GraspsInView]) -> dict[int, dict[str, int]]:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.arrays import Array, Array32, Mask
 from realsim.formats.bop.labels import NO_BBOX, Bbox, bbox_of, gt_info_entry, rle_of
 from realsim.geometry import camera, se3
+from realsim.geometry.mesh import box_mesh
 from realsim.records import CameraIntrinsics, Mesh, ObjectPose
 from realsim.rendering.labels import Labels
 from realsim_sim_bridge.annotation.config import OccluderConfig
@@ -57,8 +58,6 @@ class UnknownOccluder:
 class FrameLabel:
     """One object in one frame."""
 
-    obj_id: int
-    instance: int
     T_cam_obj: Array
     """(4, 4) object in camera [m]."""
     info: dict[str, Any]
@@ -71,13 +70,6 @@ class FrameLabel:
     """The visible mask as COCO's run lengths."""
     agreement: DepthAgreement
     unknown: UnknownOccluder
-
-
-def box_corners(bounds: ArrayLike) -> Array:
-    """Return the corners (8, 3) of a box (2, 3), least and greatest corner; z varies fastest."""
-    low, high = np.asarray(bounds, dtype=np.float64)
-    xyz = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), -1)
-    return xyz.reshape(8, 3)
 
 
 def silhouette_box(
@@ -199,7 +191,7 @@ def object_info(
 
 def label_object(
     placed: ObjectPose,
-    mesh: tuple[Mesh, ArrayLike],
+    mesh: tuple[Mesh, Array],
     masks: ObjectMasks,
     labels: Labels,
     depth_m: Array32,
@@ -219,16 +211,15 @@ def label_object(
     """
     (intrinsics, T_world_cam), (agreement, unknown) = camera_pose, evidence
     shape, bounds = mesh
+    corners = box_mesh(*bounds).vertices
     T_cam_obj = se3.invert(T_world_cam) @ placed.T_world_obj
     info = object_info(
         masks, labels.px_count_all[placed.instance], depth_m, (intrinsics, shape, T_cam_obj)
     )
     return FrameLabel(
-        obj_id=placed.obj_id,
-        instance=placed.instance,
         T_cam_obj=T_cam_obj,
         info=info,
-        corners_px=camera.project(intrinsics, se3.transform(T_cam_obj, box_corners(bounds))),
+        corners_px=camera.project(intrinsics, se3.transform(T_cam_obj, corners)),
         visible_rle=rle_of(masks.visible, origin=masks.origin, shape=labels.ids.shape),
         agreement=agreement,
         unknown=unknown,
