@@ -1,10 +1,10 @@
 """One picture of a fitted depth sensor: what was measured, and what the fitted one makes of it."""
 
-import io
 from typing import Any
 
 import numpy as np
 
+from realsim.pages.plots import png
 from realsim.rendering.depth_sensors.autocovariance import LAGS, detrended_correlation
 from realsim.rendering.depth_sensors.fit import FittedDepthModel
 from realsim.rendering.stereo.fit import FittedStereo
@@ -24,24 +24,15 @@ def fit_picture(fit: FittedDepthModel) -> bytes:
         f"{fit.profile}: noise {e.value:.3f} ± {e.uncertainty:.3f} px of disparity, "
         f"{len(fit.frames)} frames"
     )
-    return _png(figure)
+    return png(figure)
 
 
 def _figure() -> tuple[Any, Any]:
     """Return a figure and its four axes (2, 2)."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure: Any = Figure(figsize=(13, 9), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure: Any = Figure(figsize=(13, 9), dpi=90, layout="constrained")
     return figure, figure.subplots(2, 2)
-
-
-def _png(figure: Any) -> bytes:
-    """Return a figure as PNG."""
-    out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=90, metadata={"Software": None})
-    return out.getvalue()
 
 
 def _residual(figure: Any, axis: Any, fit: FittedDepthModel) -> None:
@@ -129,7 +120,7 @@ def stereo_fit_picture(fit: FittedStereo) -> bytes:
     _pair(axes[1, 0], z, fit, ("sigma_px", 1.0, 0.05), "noise of disparity [px]")
     _pair(axes[1, 1], z, fit, ("hole_share", 100.0, 1.0), "pixels without depth [%]")
     figure.suptitle(f"stereo simulator of a {fit.profile}; planes compared: {len(fit.frames)}")
-    return _png(figure)
+    return png(figure)
 
 
 def _pair(

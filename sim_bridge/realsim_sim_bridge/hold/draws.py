@@ -17,7 +17,6 @@ is one of a few levels alike, the force is uniform in a range, to which the fact
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
@@ -272,7 +271,7 @@ def draw_holds(
     at = _worst(factors, loads)
     palms = len(hand.palm_boxes)
     fingers = hand.boxes(trial.openings_m)[:, palms:]
-    draws: list[_Draw] = []
+    draws: list[tuple[Array | Mask, ...]] = []
     for k in range(count):
         Ts, touched = obj.stopped(Ts_moved[k], hand, PALM_M)
         blocked = first_triangle_inside(fingers, Ts, obj.tree, -config.touch_m) >= 0
@@ -284,26 +283,14 @@ def draw_holds(
         )
         holds, skewed = _borne(patches, wrenches, config.friction, low, high)
         free = ~blocked & patches.both
-        draws.append(_Draw(free * holds, blocked, ~blocked & ~patches.both, free * skewed, touched))
-    held = np.stack([draw.holds for draw in draws], axis=1)
-    blocked, missed, skewed, palm = (
-        np.stack(column, axis=1).mean(axis=1) for column in list(zip(*draws, strict=True))[1:]
-    )
+        draws.append((free * holds, blocked, ~blocked & ~patches.both, free * skewed, touched))
+    held, *rare = (np.stack(column, axis=1) for column in zip(*draws, strict=True))
+    blocked, missed, skewed, palm = (column.mean(axis=1) for column in rare)
     rest = 1.0 - held.mean(axis=1) - (blocked + missed + skewed)
     return Drawn(
         holds=held, blocked=blocked, missed=missed, skewed=skewed,
         overloaded=np.maximum(rest, 0.0), palm=palm,
     )  # fmt: skip
-
-
-class _Draw(NamedTuple):
-    """What one draw makes of N grasps, each (N,)."""
-
-    holds: Array
-    blocked: Mask
-    missed: Mask
-    skewed: Array
-    palm: Mask
 
 
 def _borne(

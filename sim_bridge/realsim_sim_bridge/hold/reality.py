@@ -26,10 +26,10 @@ from realsim_sim_bridge.hold.calibration import (
     shipped,
 )
 from realsim_sim_bridge.hold.draws import PALM_M, GraspedObject, HoldConfig, chance_columns
+from realsim_sim_bridge.school.object_slips import stand_of
 from realsim_sim_bridge.slip.engines import make_engine
-from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
+from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
-from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import SlipBody
 from realsim_sim_bridge.validation.specimens import ready_trial
 
@@ -146,9 +146,8 @@ def judge_trials(
         )  # fmt: skip
         slips = run_slip_test(reached, config.slip, ScoreLimits(), config.hand, engine)
         found["safety"] = slips.safety[:, 1:].min(axis=1)
-        every = np.ones(len(trial), dtype=np.bool_)
         for name, limits in (("score", ScoreLimits()), ("score_old", ScoreLimits.paper())):
-            found[name] = score_stages(slips.slip_m, slips.slip_rad, every, limits)[1]
+            found[name] = slips.scores(limits)[1]
         parts.append(found)
         done += len(trial)
         if progress is not None:
@@ -184,13 +183,9 @@ def _trial_of(
     else:
         matter = physical_properties(obj.mesh, mass_kg=obj.mass_kg, parts=parts)
     body = SlipBody.of(parts, matter)
-    T = obj.T_board_obj
-    standing = [part @ T[:3, :3].T + T[:3, 3] for part in body.parts]
-    gravity = config.slip.motion.gravity
     trial = ready_trial(body, obj.Ts_obj_grasp, obj.Ts_board_grasp, config.hand.max_opening_m)
     surface = GraspedObject.of(obj.mesh)
-    friction = config.slip.closing.table_friction
-    stand = None if friction is None else Stand.around(standing, (), friction, gravity)
+    stand = stand_of(config.slip, obj.T_board_obj, body, ())
     return replace(trial, stand=stand), surface
 
 

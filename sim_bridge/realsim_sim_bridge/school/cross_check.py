@@ -13,7 +13,7 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.records import GraspSet
 from realsim.robots.hand import Hand
-from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
+from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig, Slips, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import Engine
 
@@ -47,9 +47,8 @@ def cross_check(
         scores|.
     """
     seen = run_slip_test(trial, config, limits, geometry, second)
-    tried = np.ones(len(slips.slip_m), dtype=np.bool_)
-    _, first_score = score_stages(slips.slip_m, slips.slip_rad, tried, limits)
-    base, score = score_stages(seen.slip_m, seen.slip_rad, tried, limits)
+    _, first_score = slips.scores(limits)
+    base, score = seen.scores(limits)
     return {
         "second_score": score,
         "second_base_score": base,

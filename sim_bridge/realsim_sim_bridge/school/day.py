@@ -21,13 +21,7 @@ from realsim_sim_bridge.school.kept_sets import (
     write_result,
 )
 from realsim_sim_bridge.school.object_slips import in_words, result_of, stand_of
-from realsim_sim_bridge.school.object_task import (
-    ObjectTask,
-    Prepared,
-    not_prepared,
-    prepare,
-    trial_of,
-)
+from realsim_sim_bridge.school.object_task import ObjectTask, Prepared, prepare, trial_of, untried
 from realsim_sim_bridge.school.shards import Tested, read_tested, run_shard, shards_of, write_tested
 from realsim_sim_bridge.slip.stand import Stand
 
@@ -216,7 +210,7 @@ class Day:
             raise _with_name(outcome.error, job.name) from None
         if job.rows is None:
             if gave_up:
-                nothing = not_prepared(job.pupil.task, f"the preparation failed: {outcome.why}")
+                nothing = untried(job.pupil.task, f"the preparation failed: {outcome.why}")
                 job.pupil.take_prepared(nothing, keep=False)
                 job.pupil.given_up.append((np.zeros(0, dtype=np.int64), outcome.why))
             else:

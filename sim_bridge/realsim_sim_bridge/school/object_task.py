@@ -206,7 +206,7 @@ def prepare(task: ObjectTask, labels_file: Path | None = None) -> Prepared:
         notes["analytic"] = analytic.counts
     body, why_not = _body(task, notes)
     if body is None:
-        return _untried(found, why_not, notes, config.reach.arm.found().joints)
+        return untried(task, why_not, found, notes)
     reach = reach_of(task, found, rng)
     notes["counts"] |= {"reachable": int(reach.reachable.sum()), "by_a_planned_path": reach.planned}
     notes["arm"] = {"stage_possible": reach.stage_possible.tolist(), "notes": list(reach.notes)}
@@ -319,14 +319,19 @@ def reach_of(task: ObjectTask, found: Candidates, rng: np.random.Generator) -> R
     return check_reach(reach, config.reach, arm, rng, config.slip.motion)
 
 
-def _untried(found: Candidates, why_not: str, notes: dict[str, Any], joints: int) -> Prepared:
-    """Return the candidates of an object that cannot be tried."""
-    n = len(found.widths_m)
-    nowhere = np.full((n, joints), np.nan)
+def untried(
+    task: ObjectTask,
+    why_not: str,
+    found: Candidates | None = None,
+    notes: dict[str, Any] | None = None,
+) -> Prepared:
+    """Return the candidates of an object that cannot be tried; None = not even they were found."""
+    n = 0 if found is None else len(found.widths_m)
+    nowhere = np.full((n, task.config.reach.arm.found().joints), np.nan)
     return Prepared(
-        Ts_obj_grasp=found.Ts_obj_grasp,
-        widths_m=found.widths_m,
-        openings_m=found.openings_m,
+        Ts_obj_grasp=np.zeros((0, 4, 4)) if found is None else found.Ts_obj_grasp,
+        widths_m=np.zeros(0) if found is None else found.widths_m,
+        openings_m=np.zeros(0) if found is None else found.openings_m,
         reachable=np.zeros(n, dtype=np.bool_),
         joints=nowhere,
         joints_lifted=nowhere,
@@ -334,7 +339,7 @@ def _untried(found: Candidates, why_not: str, notes: dict[str, Any], joints: int
         trajectories=None,
         measures={},
         body=None,
-        notes=notes | {"not_tried": why_not},
+        notes={**(notes or {}), "not_tried": why_not},
     )
 
 
@@ -346,25 +351,6 @@ def _with_names(reason: str, names: dict[int, str]) -> str:
         return f"'{names[instance]}' (instance {instance})" if instance in names else found[0]
 
     return re.sub(r"the object of instance (\d+)", named, reason)
-
-
-def not_prepared(task: ObjectTask, why: str) -> Prepared:
-    """Return what there is of an object whose preparation could not be finished: no candidate."""
-    nothing = np.zeros(0)
-    joints = np.zeros((0, task.config.reach.arm.found().joints))
-    return Prepared(
-        Ts_obj_grasp=np.zeros((0, 4, 4)),
-        widths_m=nothing,
-        openings_m=nothing,
-        reachable=np.zeros(0, dtype=np.bool_),
-        joints=joints,
-        joints_lifted=joints,
-        reasons=(),
-        trajectories=None,
-        measures={},
-        body=None,
-        notes={"not_tried": why},
-    )
 
 
 def _body(task: ObjectTask, notes: dict[str, Any]) -> tuple[SlipBody | None, str]:

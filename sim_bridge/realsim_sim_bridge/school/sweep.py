@@ -24,7 +24,7 @@ import numpy as np
 from realsim.arrays import Array, Int64, Mask, Rows
 from realsim.errors import InputError
 from realsim.robots.hand import Hand
-from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
+from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig, Slips, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import STIFFNESS_N_PER_M, Engine, SlipPhysics
 
@@ -146,7 +146,7 @@ def run_sweep(
         sweep: the levels.
     """
     sweep = sweep or SweepConfig()
-    known = scores_of(slips, limits)
+    known = slips.scores(limits)[1]
     physics, pads = config.physics, config.physics.pads
 
     def along(
@@ -154,7 +154,8 @@ def run_sweep(
     ) -> LevelScores:
         def run(level: float, rows: Rows) -> Array:
             at = replace(config, physics=of(level))
-            return scores_of(run_slip_test(trial.part(rows), at, limits, geometry, engine), limits)
+            tried = run_slip_test(trial.part(rows), at, limits, geometry, engine)
+            return tried.scores(limits)[1]
 
         return find_levels(run, known, own, levels, search)
 
@@ -174,15 +175,6 @@ def run_sweep(
         force=along(lambda v: replace(physics, force_n=v), physics.force_n, forces, sweep.search),
         stiffness=along(physics.with_pads, own, stiffnesses, "every"),
     )
-
-
-def scores_of(slips: Slips, limits: ScoreLimits) -> Array:
-    """Return the scores (N,) of grasps that were all tried: 1 = passed all four stages.
-
-    A failed stage is never free: its base score is 0.25 less and it carries a penalty.
-    """
-    tried = np.ones(len(slips.slip_m), dtype=np.bool_)
-    return score_stages(slips.slip_m, slips.slip_rad, tried, limits)[1]
 
 
 def find_levels(

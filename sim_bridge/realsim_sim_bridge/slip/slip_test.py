@@ -23,7 +23,7 @@ from realsim_sim_bridge.grasping.antipodal import RaySurface
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings, make_engine
 from realsim_sim_bridge.slip.motion import SlipMotion, stage_wrenches
 from realsim_sim_bridge.slip.safety import closed_safety, hull_surface, resting
-from realsim_sim_bridge.slip.score import ScoreLimits
+from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import (
     Closing,
@@ -142,6 +142,11 @@ class Slips:
     """(N,) where and why it stopped; '' = passed all."""
     safety: Array
     """(N, 4) of the closed hand, see `closed_safety`; 0 = it did not close on the object."""
+
+    def scores(self, limits: ScoreLimits) -> tuple[Array, Array]:
+        """Return the base score and the score (N,) of grasps all of which were tried."""
+        tried = np.ones(len(self.slip_m), dtype=np.bool_)
+        return score_stages(self.slip_m, self.slip_rad, tried, limits)
 
     @property
     def passed(self) -> Mask:

@@ -7,8 +7,8 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim_sim_bridge.slip.motion import SlipMotion, lift_acceleration, oscillation_acceleration
-from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
-from realsim_sim_bridge.slip.slip_test import Slips, run_slip_test
+from realsim_sim_bridge.slip.score import ScoreLimits
+from realsim_sim_bridge.slip.slip_test import run_slip_test
 from realsim_sim_bridge.slip.world import Engine, PadModel
 from realsim_sim_bridge.validation.config import ValidationConfig
 from realsim_sim_bridge.validation.loads import with_hand
@@ -26,6 +26,7 @@ def box_checks(engine: Engine, config: ValidationConfig) -> Iterator[CheckResult
             geometry=config.hand,
             engine=engine,
         )
+        least_score = float(slips.scores(ScoreLimits())[1].min())
         label = f"{1e3 * mass:g} g"
         size = f"{label} cube of 5 cm, {config.slip.physics.force_n:g} N"
         failed = "; ".join(dict.fromkeys(f for f in slips.failures if f))
@@ -37,7 +38,7 @@ def box_checks(engine: Engine, config: ValidationConfig) -> Iterator[CheckResult
         yield from (
             CheckResult(
                 group="box", name=f"box {label}, score", what=f"least score of the {size}",
-                measured=float(_scores(slips).min()), unit="", limit=1.0, at_least=True,
+                measured=least_score, unit="", limit=1.0, at_least=True,
                 detail=failed or f"{len(slips.failures)} approaches",
             ),
             CheckResult(
@@ -119,12 +120,6 @@ def _approaches() -> Array:
     side = se3.exp_so3([0.0, np.pi / 2, 0.0])
     askew = se3.exp_so3([0.2, 0.6, 0.3]) @ DOWN
     return np.stack([DOWN, side, askew])
-
-
-def _scores(slips: Slips) -> Array:
-    """Return the scores (N,)."""
-    tried = np.ones(len(slips.failures), dtype=np.bool_)
-    return score_stages(slips.slip_m, slips.slip_rad, tried, ScoreLimits())[1]
 
 
 def _per_stage(values: Array) -> str:

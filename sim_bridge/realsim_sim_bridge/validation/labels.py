@@ -8,7 +8,7 @@ import numpy as np
 
 from realsim.arrays import Array, Mask
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings
-from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
+from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import Engine
 from realsim_sim_bridge.validation.config import ValidationConfig
@@ -185,11 +185,9 @@ def reference_labels(engine: Engine, config: ValidationConfig) -> ReferenceLabel
                 lean_deg=asked.lean_deg,
             ).part(slice(k * asked.grasps, (k + 1) * asked.grasps))  # fmt: skip
             slips = run_slip_test(trial, slip, PATIENT, config.hand, engine)
-            tried = np.ones(len(trial), dtype=np.bool_)
-            score = score_stages(slips.slip_m, slips.slip_rad, tried, ScoreLimits())[1]
             shapes += [f"{shape} {mass:g} kg"] * len(trial)
             held.append(slips.passed)
-            passed.append(slips.passed & (score >= 1.0))
+            passed.append(slips.passed & (slips.scores(ScoreLimits())[1] >= 1.0))
     return ReferenceLabels(
         shapes=tuple(shapes), held=np.concatenate(held), passed=np.concatenate(passed)
     )

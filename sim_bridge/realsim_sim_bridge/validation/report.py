@@ -1,12 +1,12 @@
 """What the validation suite found: checks, each with its figure, its limit and a verdict."""
 
-import io
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from realsim.errors import InputError
+from realsim.pages.plots import png
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -159,9 +159,7 @@ def picture(report: ValidationReport) -> bytes:
         f"{report.engine} {report.version}: {verdict}{shown}", x=0.01, ha="left", fontsize=11,
         fontweight="bold", color=GOOD if report.passed else BAD,
     )  # fmt: skip
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    return buffer.getvalue()
+    return png(figure)
 
 
 def _draw_ratios(axes: Any, ratios: list[LimitRatio], limit_pct: float) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from realsim.arrays import Array, Mask
 from realsim_sim_bridge.slip.slip_test import SlipConfig
-from realsim_sim_bridge.slip.world import Engine, PadModel, SlipBody
+from realsim_sim_bridge.slip.world import Engine, PadModel
 from realsim_sim_bridge.validation.config import ValidationConfig
 from realsim_sim_bridge.validation.loads import LOST_M, Held, hand_patch, hold, with_hand
 from realsim_sim_bridge.validation.report import CheckResult, LimitRatio
@@ -101,10 +101,7 @@ def creep_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
             limits.creep_share * size * load.wrench()
             for size, load in zip(sizes, loads, strict=True)
         ]
-        held = hold(
-            engine, slip, config.hand, _cube(config, slip), np.stack(wrenches),
-            ramp_s=limits.ramp_s, hold_s=limits.creep_s,
-        )  # fmt: skip
+        held = _held_cube(engine, config, slip, np.stack(wrenches), limits.creep_s)
         k = int(np.argmax(held.creep_m))
         if held.creep_m[k] >= worst_m:
             worst_m, where = float(held.creep_m[k]), f"{_case(slip)}, {loads[k].name}"
@@ -168,7 +165,7 @@ def force_check(engine: Engine, config: ValidationConfig) -> CheckResult:
             engine,
             slip,
             config.hand,
-            _cube(config, slip),
+            cube(_mass(config, slip)),
             np.zeros((1, 6)),
             ramp_s=0.05,
             hold_s=0.05,
@@ -231,21 +228,20 @@ def _ratio(
     shares: tuple[float, ...],
 ) -> LimitRatio:
     """Return between which loads the cube begins to slip, in units of the computed limit."""
-    limits = config.limits
     slip = with_hand(config.slip, *case)
     ascending = np.sort(np.array(shares))
     wrenches = ascending[:, None] * _limit(load, slip) * load.wrench()
-    held = hold(
-        engine,
-        slip,
-        config.hand,
-        _cube(config, slip),
-        wrenches,
-        ramp_s=limits.ramp_s,
-        hold_s=limits.hold_s,
-    )
+    held = _held_cube(engine, config, slip, wrenches, config.limits.hold_s)
     low, high = bracket(ascending, _slipped(held, config))
     return LimitRatio(group=group, load=load.name, case=_case(slip), held=low, slipped=high)
+
+
+def _held_cube(
+    engine: Engine, config: ValidationConfig, slip: SlipConfig, loads: Array, hold_s: float
+) -> Held:
+    """Return what cubes do under loads (K, 6) that grow as the suite's do and then stand."""
+    body, ramp_s = cube(_mass(config, slip)), config.limits.ramp_s
+    return hold(engine, slip, config.hand, body, loads, ramp_s=ramp_s, hold_s=hold_s)
 
 
 def _slipped(held: Held, config: ValidationConfig) -> Mask:
@@ -266,11 +262,6 @@ def _mass(config: ValidationConfig, slip: SlipConfig) -> float:
     physics, limits = slip.physics, config.limits
     carried = 2.0 * physics.friction * physics.force_n / limits.limit_acceleration
     return float(np.clip(carried, *limits.masses_kg))
-
-
-def _cube(config: ValidationConfig, slip: SlipConfig) -> SlipBody:
-    """Return the cube."""
-    return cube(_mass(config, slip))
 
 
 def _case(slip: SlipConfig) -> str:
