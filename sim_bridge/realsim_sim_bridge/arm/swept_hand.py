@@ -12,6 +12,7 @@ import numpy as np
 from realsim.arrays import Array, Int64
 from realsim.compiled import njit
 from realsim_sim_bridge.arm.obstacles import CELL_M, Obstacles
+from realsim_sim_bridge.grasping.hand_free import OUTWARDS
 
 
 def first_touched(
@@ -33,11 +34,8 @@ def first_touched(
         clearance_m: the boxes are grown by this on all sides [m].
         own_too: whether points on the object that is grasped count.
     """
-    grown = boxes.astype(np.float64, copy=True)
-    grown[:, :, 0] -= clearance_m
-    grown[:, :, 1] += clearance_m
     return _search(
-        grown,
+        boxes + clearance_m * OUTWARDS,
         np.ascontiguousarray(Ts_table_grasp, dtype=np.float64),
         np.ascontiguousarray(moves, dtype=np.float64),
         obstacles,

@@ -10,6 +10,8 @@ import numpy as np
 from realsim.arrays import Array, Int64, Mask
 from realsim.compiled import njit
 
+OUTWARDS = np.array([[-1.0], [1.0]])
+"""Ways in which the least and the greatest corner of a box move when it grows."""
 STRIDE = 61
 """The points are looked at in steps of this (and then the rest), so that a hand that is not free is
 found out early; a matter of speed alone."""
@@ -38,9 +40,7 @@ def first_point_inside(
     boxes: Array, Ts_a_grasp: Array, points_a: Array, clearance_m: float
 ) -> Int64:
     """Return the number (N,) of a point in one of hand n's grown boxes, or -1; as `boxes_free`."""
-    grown = boxes.astype(np.float64, copy=True)
-    grown[:, :, 0] -= clearance_m
-    grown[:, :, 1] += clearance_m
+    grown = boxes + clearance_m * OUTWARDS
     return _search(grown, np.ascontiguousarray(Ts_a_grasp), np.ascontiguousarray(points_a))
 
 

@@ -12,7 +12,7 @@ from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.mesh import sample_surface
 from realsim.records import Mesh
-from realsim_sim_bridge.grasping.hand_free import boxes_free
+from realsim_sim_bridge.grasping.hand_free import OUTWARDS, boxes_free
 
 # --- Which hands meet a surface: the hand's boxes against all triangles of a mesh, exactly -------
 # The triangles hang in a tree of bounding boxes. A hand goes down only those branches whose boxes
@@ -103,9 +103,7 @@ def first_triangle_inside(
     """
     if tree is None or len(boxes) == 0:
         return np.full(len(boxes), -1, dtype=np.int64)
-    grown = boxes.astype(np.float64, copy=True)
-    grown[:, :, 0] -= clearance_m
-    grown[:, :, 1] += clearance_m
+    grown = boxes + clearance_m * OUTWARDS
     Ts = np.ascontiguousarray(Ts_a_grasp, dtype=np.float64)
     return _search(grown, Ts, tree.centers, tree.halves, tree.triangles, tree.numbers)
 

@@ -20,7 +20,7 @@ from realsim.models.convex import ConvexConfig, collision_obj, convex_parts
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectPose
 from realsim_sim_bridge.scenes.school_scene import SchoolScene, Support
-from realsim_sim_bridge.slip.bullet_shapes import drawn_in
+from realsim_sim_bridge.slip.bullet_shapes import drawn_in, shape_in
 from realsim_sim_bridge.slip.world import SlipBody
 
 # --- Settings under which a box on a table rests; each is read back from the engine --------------
@@ -211,14 +211,7 @@ class TableWorld:
 
     def _shape(self, parts: list[Array], path: Path) -> int:
         path.write_bytes(collision_obj(parts))
-        shape: int = self._engine.createCollisionShape(
-            self._engine.GEOM_MESH, fileName=str(path), meshScale=[1.0, 1.0, 1.0]
-        )
-        if shape < 0:
-            raise RealsimError(
-                f"PyBullet refused the collision shape of {len(parts)} convex parts."
-            )
-        return shape
+        return shape_in(self._engine, path, len(parts))
 
     def _check(self, body: int, link: int, wanted: dict[str, float], name: str) -> None:
         info = self._engine.getDynamicsInfo(body, link)

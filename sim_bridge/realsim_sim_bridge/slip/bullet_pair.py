@@ -27,7 +27,13 @@ from realsim.arrays import Array
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
-from realsim_sim_bridge.slip.bullet_shapes import drawn_in, hand_urdf, massless_link, wavefront
+from realsim_sim_bridge.slip.bullet_shapes import (
+    drawn_in,
+    hand_urdf,
+    massless_link,
+    shape_in,
+    wavefront,
+)
 from realsim_sim_bridge.slip.engines import BulletSettings
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import SlipBody, SlipPhysics
@@ -142,19 +148,9 @@ class BulletPair:
         return hand
 
     def _shape(self, parts: list[Array], path: Path) -> int:
-        """Return the collision shape of convex parts (V, 3), body frame, through a file.
-
-        Bullet keeps what it has read by the file's name: no two shapes may have the same.
-        """
+        """Return the collision shape of convex parts (V, 3), body frame, through a file."""
         path.write_text(wavefront(parts))
-        shape: int = self.engine.createCollisionShape(
-            self.engine.GEOM_MESH, fileName=str(path), meshScale=[1.0, 1.0, 1.0]
-        )
-        if shape < 0:
-            raise RealsimError(
-                f"PyBullet refused the collision shape of {len(parts)} convex parts."
-            )
-        return shape
+        return shape_in(self.engine, path, len(parts))
 
     def _add_object(self, shape: int, margin_m: float, whole: int | None) -> int:
         """Add the object; its frame in the engine is the principal one.

@@ -1,10 +1,12 @@
 """The hand and convex parts as PyBullet takes them."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from realsim.arrays import Array
+from realsim.errors import RealsimError
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.world import PadModel
 
@@ -163,6 +165,22 @@ def wavefront(parts: list[Array]) -> str:
         lines += [f"f {first} {first + j} {first + j + 1}" for j in range(1, len(part) - 1)]
         first += len(part)
     return "\n".join(lines) + "\n"
+
+
+def shape_in(engine: Any, path: Path, parts: int) -> int:
+    """Return the collision shape of the convex parts in a file.
+
+    Bullet keeps what it has read by the file's name: no two shapes may have the same.
+
+    Raises:
+        RealsimError: PyBullet does not take it.
+    """
+    shape: int = engine.createCollisionShape(
+        engine.GEOM_MESH, fileName=str(path), meshScale=[1.0, 1.0, 1.0]
+    )
+    if shape < 0:
+        raise RealsimError(f"PyBullet refused the collision shape of {parts} convex parts.")
+    return shape
 
 
 def massless_link(shape: int, fixed: int) -> dict[str, list[Any]]:

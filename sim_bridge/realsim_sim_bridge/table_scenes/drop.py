@@ -237,16 +237,12 @@ def _second_settles(
     fell: list[int] = []
     overhung: list[int] = []
     restless: list[int] = []
-    seconds, turn = 0.0, 0
+    turn, ways, depth = 0, dict[int, float](), 0.0
     while poses:
         after, ways, depth = settle(table, solids, poses, config)
-        seconds, turn = seconds + config.check_s, turn + 1
+        turn += 1
         if max(ways.values()) <= config.stays_m:
-            return Resting(
-                Ts_table_obj=poses, fell=tuple(fell), overhung=tuple(overhung),
-                restless=tuple(restless), moved_m=max(ways.values()), penetration_m=depth,
-                simulated_s=seconds,
-            )  # fmt: skip
+            break
         gone = [k for k in poses if k not in after]
         over = [k for k, T in after.items() if not _on_table(_at(solids[k], T), table, config)]
         fell, overhung = [*fell, *gone], [*overhung, *over]
@@ -256,8 +252,9 @@ def _second_settles(
             restless.append(worst)
             poses = {k: T for k, T in poses.items() if k != worst}
     return Resting(
-        Ts_table_obj={}, fell=tuple(fell), overhung=tuple(overhung), restless=tuple(restless),
-        simulated_s=seconds,
+        Ts_table_obj=poses, fell=tuple(fell), overhung=tuple(overhung), restless=tuple(restless),
+        moved_m=max((ways[k] for k in poses), default=0.0), penetration_m=depth if poses else 0.0,
+        simulated_s=turn * config.check_s,
     )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from realsim.arrays import Array
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.models.convex import collision_obj
-from realsim_sim_bridge.slip.bullet_shapes import drawn_in
+from realsim_sim_bridge.slip.bullet_shapes import drawn_in, shape_in
 from realsim_sim_bridge.slip.world import SlipBody
 from realsim_sim_bridge.table_scenes.config import DropConfig
 from realsim_sim_bridge.table_scenes.tables import TableModel
@@ -103,16 +103,10 @@ class DropWorld:
     def _shape(self, parts: list[Array]) -> tuple[int, float]:
         """Return a collision shape of convex parts and the margin that makes it as large."""
         cores, margin = drawn_in(parts, self.config.margin_m)
-        # PyBullet keeps what it has read by the file's name: every shape has its own.
         self._shapes += 1
         path = Path(self._folder.name) / f"shape{self._shapes}.obj"
         path.write_bytes(collision_obj(cores))
-        shape: int = self._engine.createCollisionShape(
-            self._engine.GEOM_MESH, fileName=str(path), meshScale=[1.0, 1.0, 1.0]
-        )
-        if shape < 0:
-            raise RealsimError(f"PyBullet refused a collision shape of {len(parts)} convex parts.")
-        return shape, margin
+        return shape_in(self._engine, path, len(parts)), margin
 
     def _static(self, parts: list[Array]) -> int:
         shape, margin = self._shape(parts)
