@@ -34,7 +34,6 @@ from realsim.scanning.fusion.surface import (
     Surface,
     VertexEvidence,
     closed_surface,
-    in_world,
     patch_widths,
     vertex_evidence,
 )
@@ -121,7 +120,7 @@ def _judged(
     coverage = _coverage(surface, normals[:, 2] < FACING_DOWN, measured)
     verdict, reasons = _verdict(coverage, alignment, config)
     mesh = Mesh(
-        vertices=in_world(alignment.plane.T_world_table, surface),
+        vertices=se3.transform(alignment.plane.T_world_table, surface.vertices),
         faces=surface.faces,
         colors=seen.colors,
     )

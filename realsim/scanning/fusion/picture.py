@@ -30,7 +30,6 @@ def fusion_picture(fused: FusedObject) -> bytes:
     The upper row shows the mesh in its own colours (grey without), the lower the 1-sigma of every
     vertex; what is invented is orange in both.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
@@ -44,7 +43,6 @@ def fusion_picture(fused: FusedObject) -> bytes:
     mesh = Mesh(vertices=standing, faces=fused.mesh.faces)
 
     figure = Figure(figsize=(14.5, 8.0), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
     axes: Any = figure.subplots(2, len(SIDES))
     for row, colors in enumerate(rows):
         pictures = shaded_views(mesh, color_paint(255.0 * colors), LOOK)

@@ -17,7 +17,6 @@ import numpy as np
 from realsim.arrays import Array, Array32, Int32, Int64, Mask, UInt8
 from realsim.compiled import njit
 from realsim.errors import InputError
-from realsim.geometry import se3
 from realsim.geometry.point_loops import move, turn
 from realsim.scanning.fusion.evidence import Crops, pixel_of
 from realsim.scanning.fusion.result import FusionConfig, FusionFrame
@@ -195,11 +194,6 @@ def patch_widths(surface: Surface, patch: Mask) -> Array:
     third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
     area = np.bincount(f.ravel(), np.repeat(third, 3), minlength=n)
     return np.sqrt(4 / np.pi * np.bincount(labelled[1][patch], area[patch]))
-
-
-def in_world(T_world_table: Array, surface: Surface) -> Array:
-    """Return the vertices (V, 3) in world [m]."""
-    return se3.transform(T_world_table, surface.vertices)
 
 
 # --- what every vertex rests on ------------------------------------------------------------------

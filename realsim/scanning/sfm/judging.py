@@ -25,6 +25,11 @@ FEW_MATCHES = 30
 """A view with fewer verified matches in its best pair is called weak."""
 
 
+def _finding(text: str, level: Literal["doubtful", "rejected"] = "doubtful") -> Finding:
+    """Return what speaks against a result, and how much."""
+    return level, text
+
+
 def judge(result: SfmResult, config: SfmConfig) -> tuple[Verdict, tuple[str, ...]]:
     """Return the verdict and why it is not 'accepted'."""
     findings = [
@@ -61,40 +66,30 @@ def _registration(result: SfmResult, trust: TrustConfig) -> Iterator[Finding]:
         level = "rejected" if share < trust.least_share else "doubtful"
         weak = weak_views(result)
         why = f" Few matches: {shown(weak)}." if weak else ""
-        yield (
+        yield _finding(
+            f"only {registered} of {total} views found a place; missing: "
+            f"{shown(result.unregistered)}.{why} Put newspaper or the tag board under the "
+            "object, or take views nearer to one another (15 deg).",
             level,
-            (
-                f"only {registered} of {total} views found a place; missing: "
-                f"{shown(result.unregistered)}.{why} Put newspaper or the tag board under the "
-                "object, or take views nearer to one another (15 deg)."
-            ),
         )
     rest = tuple(n for n in result.models[1:] if n >= 3)
     if rest:
-        yield (
-            "doubtful",
-            (
-                f"the views fall into {1 + len(rest)} parts of {result.models[0]}, "
-                f"{', '.join(map(str, rest))} views that share too few matches; the first is used. "
-                "Views between the parts would join them."
-            ),
+        yield _finding(
+            f"the views fall into {1 + len(rest)} parts of {result.models[0]}, "
+            f"{', '.join(map(str, rest))} views that share too few matches; the first is used. "
+            "Views between the parts would join them."
         )
     if points < trust.min_points:
-        yield (
+        yield _finding(
+            f"only {points} points were found ({trust.min_points} are the least): the surface "
+            "has too little texture, or the poses do not agree with the pictures.",
             "rejected",
-            (
-                f"only {points} points were found ({trust.min_points} are the least): the surface "
-                "has too little texture, or the poses do not agree with the pictures."
-            ),
         )
     if result.reprojection_px > trust.reprojection_px:
-        yield (
-            "doubtful",
-            (
-                f"the median reprojection error is {result.reprojection_px:.2f} px (at most "
-                f"{trust.reprojection_px} px is good): blurred pictures, wrong intrinsics"
-                + (", or wrong robot poses." if result.poses != "unknown" else ".")
-            ),
+        yield _finding(
+            f"the median reprojection error is {result.reprojection_px:.2f} px (at most "
+            f"{trust.reprojection_px} px is good): blurred pictures, wrong intrinsics"
+            + (", or wrong robot poses." if result.poses != "unknown" else ".")
         )
 
 
@@ -102,22 +97,17 @@ def _scale(result: SfmResult, config: SfmConfig) -> Iterator[Finding]:
     """Look at the metric scale and at the robot's agreement."""
     trust = config.trust
     if not result.is_metric:
-        yield (
-            "doubtful",
-            (
-                "there is no metric scale: no robot poses were given, so the unit is COLMAP's own. "
-                "Give a calibrated session, or scale the model by `realsim scan scale`."
-            ),
+        yield _finding(
+            "there is no metric scale: no robot poses were given, so the unit is COLMAP's own. "
+            "Give a calibrated session, or scale the model by `realsim scan scale`."
         )
         return
     if not result.sigma_percent <= trust.sigma_percent:
         level = "rejected" if not result.sigma_percent <= 4 * trust.sigma_percent else "doubtful"
-        yield (
+        yield _finding(
+            f"the scale is known to {result.sigma_percent:.2f} % only (1 sigma; "
+            f"{trust.sigma_percent} % is good): more views, farther apart, would help.",
             level,
-            (
-                f"the scale is known to {result.sigma_percent:.2f} % only (1 sigma; "
-                f"{trust.sigma_percent} % is good): more views, farther apart, would help."
-            ),
         )
     if result.alignment is None:
         return
@@ -129,31 +119,23 @@ def _scale(result: SfmResult, config: SfmConfig) -> Iterator[Finding]:
             f"{v.name} ({v.offset_mm:.1f} mm, {v.turn_deg:.2f} deg)" for v in views if v.outlier
         )
         if share > trust.outlier_share or level == "rejected":
-            yield (
+            yield _finding(
+                f"{len(told)} of {len(views)} views disagree with their robot pose: "
+                f"{shown(told)}. Either the pictures hold too little to place them, or "
+                "the mount slipped, the images are paired with other views' poses, or the "
+                "hand-eye is wrong.",
                 level,
-                (
-                    f"{len(told)} of {len(views)} views disagree with their robot pose: "
-                    f"{shown(told)}. Either the pictures hold too little to place them, or "
-                    "the mount slipped, the images are paired with other views' poses, or the "
-                    "hand-eye is wrong."
-                ),
             )
         else:
-            yield (
-                "doubtful",
-                (
-                    "the robot's pose and the pictures disagree beyond both their errors: "
-                    f"{shown(told)}."
-                ),
+            yield _finding(
+                "the robot's pose and the pictures disagree beyond both their errors: "
+                f"{shown(told)}."
             )
     middle = float(np.median([v.offset_mm for v in views]))
     if middle > trust.residual_mm:
-        yield (
-            "doubtful",
-            (
-                f"the cameras lie {middle:.1f} mm from the robot's in the median view (at most "
-                f"{trust.residual_mm} mm is good): the poses or the reconstruction are bent."
-            ),
+        yield _finding(
+            f"the cameras lie {middle:.1f} mm from the robot's in the median view (at most "
+            f"{trust.residual_mm} mm is good): the poses or the reconstruction are bent."
         )
 
 
@@ -164,20 +146,14 @@ def _geometry(result: SfmResult, config: AlignmentConfig) -> Iterator[Finding]:
     local = se3.transform(se3.invert(g.Ts_world_cam), g.points)[..., 2]
     distance = float(np.median(np.abs(local))) if len(g.points) else float("nan")
     if spread[0] < config.min_baseline_ratio * distance:
-        yield (
-            "doubtful",
-            (
-                f"the cameras' spread is {spread[0] / distance:.1%} of the distance to the scene: "
-                f"nearly a turn on the spot. {config.min_baseline_ratio:.0%} is the least."
-            ),
+        yield _finding(
+            f"the cameras' spread is {spread[0] / distance:.1%} of the distance to the scene: "
+            f"nearly a turn on the spot. {config.min_baseline_ratio:.0%} is the least."
         )
     elif len(spread) > 1 and spread[1] < config.min_line_ratio * spread[0]:
-        yield (
-            "doubtful",
-            (
-                "all cameras stand on a line: how the scene is turned about it rests on the "
-                "robot's orientations alone. Add views off the line."
-            ),
+        yield _finding(
+            "all cameras stand on a line: how the scene is turned about it rests on the "
+            "robot's orientations alone. Add views off the line."
         )
 
 
@@ -188,21 +164,17 @@ def _depth(depth: DepthScale | None, trust: TrustConfig) -> Iterator[Finding]:
     factor = next((f for f in UNIT_FACTORS if abs(depth.ratio / f - 1) < UNIT_MARGIN), None)
     told = f"measured depth is {depth.ratio:.4g} +- {depth.sigma:.2g} times the reconstruction's"
     if factor is not None:
-        yield (
+        yield _finding(
+            f"{told}, a factor of {factor:g}: the depth unit or the unit of the robot's poses "
+            "is wrong. Set the session's depth unit (0.001 = millimetres, 0.0001 = a D405).",
             "rejected",
-            (
-                f"{told}, a factor of {factor:g}: the depth unit or the unit of the robot's poses "
-                "is wrong. Set the session's depth unit (0.001 = millimetres, 0.0001 = a D405)."
-            ),
         )
         return
     level = "doubtful" if abs(depth.ratio - 1) < 0.05 else "rejected"
-    yield (
+    yield _finding(
+        f"{told}, {abs(depth.ratio - 1) / depth.sigma:.0f} sigmas from 1: a bias of the depth "
+        "camera, wrong intrinsics, depth not aligned with colour, or wrong robot poses.",
         level,
-        (
-            f"{told}, {abs(depth.ratio - 1) / depth.sigma:.0f} sigmas from 1: a bias of the depth "
-            "camera, wrong intrinsics, depth not aligned with colour, or wrong robot poses."
-        ),
     )
 
 
