@@ -76,6 +76,15 @@ class DepthView:
     """(H, W) index of the placed mesh; -1 = nothing."""
 
 
+def scene_center(vertices_world: Sequence[Array]) -> Array:
+    """Return the middle (3,) of meshes by their vertices, on a 4 m grid [m]."""
+    if not vertices_world:
+        return np.zeros(3)
+    low = np.min([v.min(0) for v in vertices_world], axis=0)
+    high = np.max([v.max(0) for v in vertices_world], axis=0)
+    return GRID_M * np.round((low + high) / (2 * GRID_M))
+
+
 class RayScene:
     """Placed meshes, ready to be hit by rays.
 
@@ -97,13 +106,7 @@ class RayScene:
         open3d = import_open3d()
         self.placed = tuple(placed)
         world = [se3.transform(p.T_world_obj, p.mesh.vertices) for p in self.placed]
-        self.center: Array = np.zeros(3)
-        if center is not None:
-            self.center = np.array(center, dtype=np.float64)
-        elif world:
-            low = np.min([v.min(0) for v in world], axis=0)
-            high = np.max([v.max(0) for v in world], axis=0)
-            self.center = GRID_M * np.round((low + high) / (2 * GRID_M))
+        self.center = scene_center(world) if center is None else np.array(center, np.float64)
         self._core: Any = open3d.core
         self._scene: Any = open3d.t.geometry.RaycastingScene()
         for p, v in zip(self.placed, world, strict=True):

@@ -12,7 +12,7 @@ from realsim.geometry import se3
 from realsim.geometry.colors import srgb_decoded
 from realsim.rendering.appearance import LEAST_ROUGHNESS, Environment, Material
 from realsim.rendering.embedded.materials import box_uv, corner_normals, look_of, repeats
-from realsim.rendering.rays import GRID_M, PlacedMesh, rotated
+from realsim.rendering.rays import PlacedMesh, rotated, scene_center
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -31,16 +31,6 @@ class MeshPart:
     """Whether (u, v up, normal) is left-handed on these faces."""
     repeats: bool
     """Whether the images repeat beyond [0, 1]; else their border continues."""
-
-
-def scene_center(placed: tuple[PlacedMesh, ...]) -> Array:
-    """Return where the float32 coordinates have their origin (3,), the same as of `RayScene`."""
-    if not placed:
-        return np.zeros(3)
-    world = [se3.transform(p.T_world_obj, p.mesh.vertices) for p in placed]
-    low = np.min([v.min(0) for v in world], axis=0)
-    high = np.max([v.max(0) for v in world], axis=0)
-    return GRID_M * np.round((low + high) / (2 * GRID_M))
 
 
 def mesh_parts(
@@ -105,27 +95,15 @@ def _signed_area(uv: Array32) -> Array32:
 Bsdf = dict[str, Any]
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class BsdfOptions:
-    """How a material's images lie on the part of a mesh that carries them."""
-
-    has_vertex_colors: bool = False
-    """Whether the colour comes from the mesh's attribute `vertex_color`."""
-    repeats: bool = True
-    """Whether the images repeat; else their border continues."""
-    is_mirrored: bool = False
-    """Whether v turns the other way round the normal: the normal map's v is turned too."""
-
-
-def bsdf_of(mi: Any, material: Material, options: BsdfOptions) -> Bsdf:
+def bsdf_of(mi: Any, material: Material, part: MeshPart) -> Bsdf:
     """Return a material as a Mitsuba BSDF: `principled` is the metallic-roughness model.
 
     Args:
         mi: the module mitsuba, set to a variant.
         material: the look.
-        options: how its images lie.
+        part: what it lies on.
     """
-    wrap = "repeat" if options.repeats else "clamp"
+    wrap = "repeat" if part.repeats else "clamp"
 
     def bitmap(values: NDArray[np.floating]) -> Bsdf:
         return {
@@ -134,7 +112,7 @@ def bsdf_of(mi: Any, material: Material, options: BsdfOptions) -> Bsdf:
         }  # fmt: skip
 
     tint = np.array(material.base_color, np.float32)
-    if options.has_vertex_colors:
+    if part.colors is not None:
         color: Any = {"type": "mesh_attribute", "name": "vertex_color"}
     elif material.base_color_image is not None:
         decode = srgb_decoded(np.arange(256) / 255.0).astype(np.float32)
@@ -152,7 +130,7 @@ def bsdf_of(mi: Any, material: Material, options: BsdfOptions) -> Bsdf:
     if material.normal_image is not None:
         # 8-bit images say 128 for "not bent", half a step off the middle.
         normals = np.maximum((material.normal_image.astype(np.float32) - 128) / 127, -1)
-        if options.is_mirrored:
+        if part.is_mirrored:
             normals[..., 1] *= -1
         normals = 0.5 * normals + 0.5
         surface = {"type": "normalmap", "normalmap": bitmap(normals), "of": surface}
@@ -189,24 +167,19 @@ def mitsuba_scene(mi: Any, placed: Sequence[PlacedMesh], environment: Environmen
         environment: panorama and sun.
     """
     meshes = tuple(placed)
-    center = scene_center(meshes)
+    center = scene_center([se3.transform(p.T_world_obj, p.mesh.vertices) for p in meshes])
     content: dict[str, Any] = {"type": "scene"}
     geometry_of: dict[str, int] = {}
-    bsdfs: dict[tuple[int, BsdfOptions], Any] = {}
+    bsdfs: dict[tuple[int, bool, bool, bool], Any] = {}
     kept: list[Any] = []  # an id is only good as long as its object lives
     radius = 0.1
     for index, p in enumerate(meshes):
         material, colors = look_of(index, p)
         kept.append(material)
         for part in mesh_parts(p, material, colors, center):
-            options = BsdfOptions(
-                has_vertex_colors=colors is not None,
-                repeats=part.repeats,
-                is_mirrored=part.is_mirrored,
-            )
-            key = (id(material), options)
+            key = (id(material), colors is None, part.repeats, part.is_mirrored)
             if key not in bsdfs:
-                bsdfs[key] = mi.load_dict(bsdf_of(mi, material, options))
+                bsdfs[key] = mi.load_dict(bsdf_of(mi, material, part))
             name = f"mesh_{index}_{int(part.is_mirrored)}"
             content[name] = _shape(mi, part, bsdfs[key], name)
             geometry_of[name] = index

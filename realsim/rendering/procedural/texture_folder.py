@@ -1,7 +1,6 @@
 """A material out of the pictures of a texture pack, told apart by their names."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -35,14 +34,6 @@ SIZES = ("1k", "2k", "4k", "8k", "16k", "gl", "dx", "png", "jpg", "tiff", "8bit"
          "01", "1")  # fmt: skip
 
 
-@dataclass(kw_only=True, slots=True)
-class _Pack:
-    """The files of a pack by kind, and those that are not used."""
-
-    files: dict[str, Path] = field(default_factory=dict[str, Path])
-    unnamed: list[Path] = field(default_factory=list[Path])
-
-
 def material_from_images(
     source: Path | str | Sequence[Path | str], period_m: float, notes: list[str] | None = None
 ) -> Material:
@@ -62,11 +53,11 @@ def material_from_images(
     notes = [] if notes is None else notes
     paths, name = _paths(source)
     pack = _sorted(paths, name)
-    color = read_picture(pack.files["color"])
+    color = read_picture(pack["color"])
     rough, base_roughness = _roughness(pack, name, notes)
     return Material(
         base_color=(1.0, 1.0, 1.0),
-        base_color_image=_square(_rgb8(color), pack.files["color"], notes),
+        base_color_image=_square(_rgb8(color), pack["color"], notes),
         roughness=base_roughness,
         roughness_image=rough,
         metallic=_metallic(pack, name, notes),
@@ -120,43 +111,44 @@ def kind_of(path: Path) -> str | None:
     return None
 
 
-def _sorted(paths: Sequence[Path], name: str) -> _Pack:
+def _sorted(paths: Sequence[Path], name: str) -> dict[str, Path]:
     """Return the files by the map they are.
 
     Raises:
         InputError: two files for one map, or none for the base colour.
     """
-    pack = _Pack()
+    pack: dict[str, Path] = {}
+    unnamed: list[Path] = []
     for path in paths:
         kind = kind_of(path)
         if kind == "unused":
             continue
         if kind is None:
-            pack.unnamed.append(path)
-        elif kind in pack.files:
+            unnamed.append(path)
+        elif kind in pack:
             raise InputError(
-                f"material '{name}': both {pack.files[kind].name} and {path.name} are its {kind}. "
+                f"material '{name}': both {pack[kind].name} and {path.name} are its {kind}. "
                 "Give one pack at a time, in one size."
             )
         else:
-            pack.files[kind] = path
-    if "color" not in pack.files:
+            pack[kind] = path
+    if "color" not in pack:
         # A picture whose name tells nothing is the base colour, if it is the only one.
-        alone = list(paths) if len(paths) == 1 else pack.unnamed
+        alone = list(paths) if len(paths) == 1 else unnamed
         if len(alone) != 1:
             raise InputError(
                 f"material '{name}': none of {', '.join(p.name for p in paths)} is the base "
                 f"colour; a name that ends in {', '.join(WORDS['color'])} is."
             )
-        pack.files = {k: p for k, p in pack.files.items() if p != alone[0]}
-        pack.files["color"] = alone[0]
+        pack = {k: p for k, p in pack.items() if p != alone[0]}
+        pack["color"] = alone[0]
     return pack
 
 
-def _roughness(pack: _Pack, name: str, notes: list[str]) -> tuple[Image | None, float]:
+def _roughness(pack: dict[str, Path], name: str, notes: list[str]) -> tuple[Image | None, float]:
     """Return the roughness image and the factor of it."""
     for kind in ("roughness", "gloss", "packed"):
-        path = pack.files.get(kind)
+        path = pack.get(kind)
         if path is None:
             continue
         image = _rgb8(read_picture(path), linear=True)
@@ -166,13 +158,13 @@ def _roughness(pack: _Pack, name: str, notes: list[str]) -> tuple[Image | None, 
     return None, max(PLAIN_ROUGHNESS, LEAST_ROUGHNESS)
 
 
-def _metallic(pack: _Pack, name: str, notes: list[str]) -> float:
+def _metallic(pack: dict[str, Path], name: str, notes: list[str]) -> float:
     """Return how much of the material is metal."""
-    if "metallic" not in pack.files and "packed" not in pack.files:
+    if "metallic" not in pack and "packed" not in pack:
         notes.append(f"material '{name}' has no metallic map; it is no metal.")
         return 0.0
-    own = "metallic" in pack.files
-    image = _rgb8(read_picture(pack.files["metallic" if own else "packed"]), linear=True)
+    own = "metallic" in pack
+    image = _rgb8(read_picture(pack["metallic" if own else "packed"]), linear=True)
     share = image[..., 0 if own else 2].astype(np.float64) / 255.0
     if float(share.std()) > 0.1:
         notes.append(
@@ -182,10 +174,10 @@ def _metallic(pack: _Pack, name: str, notes: list[str]) -> float:
     return float(share.mean())
 
 
-def _normal(pack: _Pack, name: str, notes: list[str]) -> Image | None:
+def _normal(pack: dict[str, Path], name: str, notes: list[str]) -> Image | None:
     """Return the normal image with OpenGL's y up."""
     for kind in ("normal", "normal_dx"):
-        path = pack.files.get(kind)
+        path = pack.get(kind)
         if path is None:
             continue
         try:

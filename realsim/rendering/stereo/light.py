@@ -13,6 +13,7 @@ import numpy as np
 from realsim.arrays import Array, Array32
 from realsim.geometry.colors import LUMINANCE
 from realsim.rendering.appearance import Environment
+from realsim.rendering.procedural.skies import directions
 
 MAP_SIDE = 64
 """Edge of the octahedral maps [texels]: 3 deg each, finer than what a roughness of 0.1 keeps."""
@@ -99,13 +100,8 @@ def _plain_room() -> Environment:
 
 def _sphere(rows: int) -> tuple[Array, Array]:
     """Return directions (2 rows^2, 3) of a panorama's pixels and their solid angles."""
-    theta = np.pi * (np.arange(rows) + 0.5) / rows
-    phi = np.pi * (np.arange(2 * rows) + 0.5) / rows
-    theta, phi = (a.ravel() for a in np.meshgrid(theta, phi, indexing="ij"))
-    directions = np.stack(
-        [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1
-    )
-    return directions, np.sin(theta) * (np.pi / rows) ** 2
+    sine = np.sin(np.pi * (np.arange(rows) + 0.5) / rows)
+    return directions(rows).reshape(-1, 3), np.repeat(sine, 2 * rows) * (np.pi / rows) ** 2
 
 
 def _harmonics(d: Array) -> Array:
