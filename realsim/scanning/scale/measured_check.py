@@ -13,10 +13,8 @@ from realsim.scanning.scale.measured import (
     AGREE_Z,
     KINDS,
     MEANING,
-    LengthScale,
     Measurement,
     contradiction,
-    length_of,
     scale_of,
     typo,
     weighted,
@@ -124,15 +122,7 @@ def with_measurements(
         return fit, ()
     checks = tuple(compare(fit, mesh, m) for m in measurements)
     R_up, shape_m = as_it_stands(fit), shape_error_m(fit)
-    each = [
-        LengthScale(
-            measurement=m,
-            length=length_of(mesh, m, R_up),
-            scale=c.scale,
-            sigma=scale_of(mesh, m, R_up).sigma,
-        )
-        for m, c in zip(measurements, checks, strict=True)
-    ]
+    each = [scale_of(mesh, m, R_up) for m in measurements]
     between = contradiction([scale_of(mesh, m, R_up, shape_m) for m in measurements])
     faults = [*(c.text for c in checks if not c.agrees), *([between] if between else [])]
     if faults:
