@@ -8,6 +8,7 @@ import io
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -21,7 +22,7 @@ from realsim.formats.labelled_scene import WrittenScene
 from realsim.formats.robot_scenes.mesh_obj import part_file
 from realsim.formats.robot_scenes.placed_scene import PlacedScene, TableBox, seen_from, unique_names
 from realsim.geometry import se3
-from realsim.geometry.mesh import face_normals
+from realsim.geometry.mesh import box_mesh, face_normals
 from realsim.records import GraspSet, Mesh
 
 ASSETS = "assets"
@@ -197,9 +198,6 @@ def stl_bytes(mesh: Mesh) -> bytes:
 
 def table_mesh(table: TableBox) -> Mesh:
     """Return the table in world, 12 triangles [m]."""
-    x, y, z = np.array([*table.size_m, table.thickness_m]) / 2.0
-    corners = np.array([[a, b, c] for a in (-x, x) for b in (-y, y) for c in (-z, z)])
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = [f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))]
-    at = se3.transform(table.T_world_box, corners)
-    return Mesh(vertices=at, faces=np.array(faces, dtype=np.int32))
+    half = np.array([*table.size_m, table.thickness_m]) / 2.0
+    box = box_mesh(-half, half)
+    return replace(box, vertices=se3.transform(table.T_world_box, box.vertices))

@@ -13,6 +13,7 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.records import GraspSet
 from realsim.robots.hand import Hand
+from realsim_sim_bridge.school.measure_statistics import joined
 from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig, Slips, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import Engine
@@ -127,8 +128,6 @@ def agreement(first: Array, second: Array) -> Agreement:
 def agreement_of(sets: Iterable[GraspSet]) -> Agreement:
     """Return how far two engines agree over several grasp sets; those without are left out."""
     checked = [s for s in sets if "second_score" in s.measures]
-    nothing = np.zeros(0)
     return agreement(
-        np.concatenate([nothing, *(s.scores for s in checked)]),
-        np.concatenate([nothing, *(s.measures["second_score"] for s in checked)]),
+        joined(s.scores for s in checked), joined(s.measures["second_score"] for s in checked)
     )

@@ -4,9 +4,10 @@ Only grasps that physics has tried are counted: of the others nobody knows what 
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,7 +160,7 @@ def label_histogram(sets: Sequence[GraspSet]) -> Int64:
 
     Counted are the grasps with a label of their own, not those that the arm does not reach.
     """
-    values = np.concatenate([np.zeros(0), *(s.labels[labelled(s)] for s in sets)])
+    values = joined(s.labels[labelled(s)] for s in sets)
     return np.histogram(values, LABEL_BINS, (0.0, 1.0))[0].astype(np.int64)
 
 
@@ -188,7 +189,7 @@ def p_hold_spread(sets: Sequence[GraspSet]) -> "PHoldSpread | None":
     if not told:
         return None
     counts = label_histogram(told)
-    known = np.concatenate([s.labels[labelled(s)] for s in told])
+    known = joined(s.labels[labelled(s)] for s in told)
     return PHoldSpread(
         grasps=len(known), mean=float(known.mean()), tenths=tuple(counts.tolist()),
         unsure=sum(int(s.unsure.sum()) for s in told), entropy_bits=p_hold_entropy_bits(told),
@@ -240,9 +241,14 @@ def _quality(sets: Sequence[GraspSet], name: str, *, tried: bool = True) -> Arra
         name: of the quality.
         tried: whether those that physics has not tried are NaN, whatever they have.
     """
-    parts: list[Array] = [np.zeros(0)]
+    parts: list[Array] = []
     for s in sets:
         nothing = np.full(len(s), np.nan)
         value = s.scores if name == "score" else s.measures.get(name, nothing)
         parts.append(np.where(executed(s), value, np.nan) if tried else value)
-    return np.concatenate(parts)
+    return joined(parts)
+
+
+def joined(parts: Iterable[NDArray[Any]]) -> Array:
+    """Return values of several sets, one after the other; there may be no set."""
+    return np.concatenate([np.zeros(0), *parts])

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
@@ -19,7 +18,7 @@ from realsim.pages.plots import png
 from realsim.records import GraspSet, ObjectModel
 from realsim.records.grasps import label_words
 from realsim.rendering.overlay import score_hex, score_rgb
-from realsim_sim_bridge.school.measure_statistics import LABEL_BINS, label_chart, mean_label
+from realsim_sim_bridge.school.measure_statistics import LABEL_BINS, joined, label_chart, mean_label
 from realsim_sim_bridge.school.sheet_object import (
     STOPS,
     Box,
@@ -122,7 +121,7 @@ def _require_models(sets: Sequence[GraspSet], models: Mapping[int, ObjectModel])
 def _title(figure: Any, sets: Sequence[GraspSet], title: str) -> None:
     """Write the title and the figures of the scene."""
     text_at(figure, MARGIN_PX, 34, title[:70], 19, INK, bold=True)
-    scores = _joined([s.scores for s in sets])
+    scores = joined([s.scores for s in sets])
     known = scores[~np.isnan(scores)]
     plural = "" if len(sets) == 1 else "s"
     said = f"{len(sets)} object{plural}, {len(scores):,} candidates"
@@ -133,7 +132,7 @@ def _title(figure: Any, sets: Sequence[GraspSet], title: str) -> None:
 
 def _charts(figure: Any, sets: Sequence[GraspSet]) -> None:
     """Draw the stages' attrition, and the distributions of scores and margins."""
-    margins = _joined([s.measures["margin"] for s in sets if "margin" in s.measures])
+    margins = joined([s.measures["margin"] for s in sets if "margin" in s.measures])
     margins = margins[~np.isnan(margins)]
     charts: list[Any] = [_attrition, _label_histogram]
     if len(margins):
@@ -165,7 +164,7 @@ def _named(ax: Any, title: str, below: str, beside: str = "") -> None:
 
 def left_after(sets: Sequence[GraspSet]) -> Int64:
     """Return how many candidates are left: all, with a trajectory, and after each stage."""
-    stops = _joined([stops_of(s) for s in sets])
+    stops = joined([stops_of(s) for s in sets])
     return np.array([len(stops), *(int(np.sum(stops > k)) for k in range(1, len(STOPS) - 1))])
 
 
@@ -175,7 +174,7 @@ def _attrition(ax: Any, sets: Sequence[GraspSet]) -> None:
     lost = -np.diff(counts, prepend=counts[0])
     places = np.arange(len(counts))[::-1]
     ax.barh(places, counts, height=0.72, color=BAR_COLOR)
-    untried = int(np.sum(_joined([stops_of(s) for s in sets]) == 0))
+    untried = int(np.sum(joined([stops_of(s) for s in sets]) == 0))
     taken = [0, lost[1] - untried, *lost[2:]]
     colors = [color for _, color in STOPS[:-1]]
     ax.barh(places, taken, left=counts, height=0.72, color=colors)
@@ -211,7 +210,7 @@ def _label_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
 
 def _margin_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
     """Draw how many grasps have which margin: 1 = held at every friction and force tried."""
-    margins = _joined([s.measures["margin"] for s in sets if "margin" in s.measures])
+    margins = joined([s.measures["margin"] for s in sets if "margin" in s.measures])
     counts = np.histogram(margins[~np.isnan(margins)], LABEL_BINS, (0.0, 1.0))[0]
     _ten_bars(ax, counts, BAR_COLOR, "Margins over friction and force", "margin")
 
@@ -262,7 +261,3 @@ def _swatch(left: float, middle: float, color: str) -> Any:
     from matplotlib.patches import Rectangle
 
     return Rectangle((left, middle - 7), 14, 14, fc=color, ec="none")
-
-
-def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    return np.concatenate([np.zeros(0), *parts])

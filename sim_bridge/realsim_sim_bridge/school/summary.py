@@ -19,7 +19,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
@@ -31,6 +30,7 @@ from realsim_sim_bridge.school.measure_statistics import (
     PHoldSpread,
     RankCorrelation,
     closure_confusions,
+    joined,
     p_hold_spread,
     rank_correlations,
 )
@@ -312,13 +312,13 @@ def _counted_up(by_scene: Mapping[str, Sequence[GraspSet]]) -> SchoolSummary:
     """Return what became of the candidates by the sets' scores."""
     sets = [s for part in by_scene.values() for s in part]
     outcome = [outcomes_of(s) for s in sets]
-    scores = _joined([s.scores for s in sets])
+    scores = joined([s.scores for s in sets])
     scored = scores[~np.isnan(scores)]
     is_good = scored >= GOOD_FROM
     by_object: dict[tuple[str, ...], list[GraspSet]] = {}
     for s in sets:
         by_object.setdefault(_identity(s), []).append(s)
-    counts = np.bincount(_joined(outcome).astype(np.int64), minlength=len(OUTCOMES))
+    counts = np.bincount(joined(outcome).astype(np.int64), minlength=len(OUTCOMES))
     return SchoolSummary(
         scenes=len(by_scene),
         objects=len(by_object),
@@ -354,9 +354,9 @@ def _hands_on_same_objects(
     shared = [sets for sets in by_object.values() if {s.hand[0] for s in sets} == set(names)]
     for name in names:
         mine = [s for sets in shared for s in sets if s.hand[0] == name]
-        scores = _joined([s.scores for s in mine])
+        scores = joined([s.scores for s in mine])
         known = ~np.isnan(scores)
-        reached = _joined([s.reachable for s in mine])[known]
+        reached = joined([s.reachable for s in mine])[known]
         scores = scores[known]
         yield HandResult(
             hand=name, objects=len(shared), judged=len(scores), reached=int(reached.sum()),
@@ -411,10 +411,6 @@ def _numbers(groups: Sequence[Sequence[GraspSet]]) -> dict[str, Spread]:
     )
     total = np.array([sum(len(s) for s in group) for group in groups], dtype=np.float64)
     return {"candidates": _spread(total), "good": _spread(good), "bad": _spread(judged - good)}
-
-
-def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    return np.concatenate([np.zeros(0), *parts])
 
 
 def _spread(values: Array) -> Spread:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from realsim.arrays import Array, Int32
 from realsim.geometry import parts_solids as solids
+from realsim.geometry.mesh import box_mesh
 from realsim.records import Mesh
 
 Role = Literal["top", "frame", "detail", "floor", "wall"]
@@ -70,8 +71,7 @@ def box(low: Sequence[float], high: Sequence[float], bevel: float = 0.0) -> Arra
 
 def corners(low: Sequence[float], high: Sequence[float]) -> Array:
     """Return the eight corners (8, 3) of a box [m]."""
-    grid = np.meshgrid(*zip(low, high, strict=True), indexing="ij")
-    return np.stack([g.ravel() for g in grid], -1).astype(np.float64)
+    return box_mesh(low, high).vertices
 
 
 def turned(profile: ArrayLike, x: float = 0.0, y: float = 0.0, segments: int = 48) -> Array:
