@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from plain_meshes import square
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
-from realsim.records import CameraIntrinsics, Mesh, TagBoard
+from realsim.records import CameraIntrinsics, TagBoard
 from realsim.rendering.board import board_mesh
 from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.photo import Lighting, PhotoRenderer, PlacedMesh
@@ -115,16 +116,9 @@ def test_board_mesh_faces_its_viewer_and_carries_its_corners() -> None:
 
 
 def scene() -> list[PlacedMesh]:
-    top = Mesh(
-        vertices=np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * 0.5,
-        faces=np.array([[0, 1, 2], [0, 2, 3]]),
-    )
-    plate = Mesh(
-        vertices=np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * 0.05,
-        faces=np.array([[0, 1, 2], [0, 2, 3]]),
-        colors=np.full((4, 3), (200, 40, 40), np.uint8),
-    )
-    return [PlacedMesh(-1, top, np.eye(4)), PlacedMesh(0, plate, se3.from_translation([0, 0, 0.1]))]
+    plate = replace(square(0.05), uv=None, colors=np.full((4, 3), (200, 40, 40), np.uint8))
+    above = se3.from_translation([0, 0, 0.1])
+    return [PlacedMesh(-1, square(), np.eye(4)), PlacedMesh(0, plate, above)]
 
 
 SMALL = CameraIntrinsics(width=160, height=120, fx=120, fy=120, cx=79.5, cy=59.5, distortion=LENS)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from fault_sessions import losses
+from plain_meshes import square
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Material
 from realsim.rendering.depth_sensors.loss import material_loss, signal_loss
@@ -20,10 +21,8 @@ fit_losses = losses.fit_losses
 CAMERA = CameraIntrinsics(width=320, height=240, fx=320, fy=320, cx=159.5, cy=119.5)
 
 
-def square(instance: int, z: float, half: float, x: float = 0.0) -> PlacedMesh:
-    corners = np.array([[x - half, -half, z], [x + half, -half, z], [x + half, half, z],
-                        [x - half, half, z]])  # fmt: skip
-    mesh = Mesh(vertices=corners, faces=np.array([[0, 2, 1], [0, 3, 2]], np.int32))
+def facing(instance: int, z: float, half: float, x: float = 0.0) -> PlacedMesh:
+    mesh = Mesh(vertices=square(half).vertices + np.array([x, 0, z]), faces=square().faces[:, ::-1])
     return PlacedMesh(instance, mesh, np.eye(4))
 
 
@@ -57,7 +56,7 @@ def test_loss_depends_only_on_range_over_distance_and_on_reflectance_times_its_s
 
 def view(model: DepthSensorModel, reflectance: dict[int, float], seed: int) -> Any:
     """Return what a sensor sees of two squares before a wall, with the truth."""
-    placed = [square(BACKGROUND, 0.9, 1.2), square(0, 0.6, 0.09, -0.13), square(1, 0.6, 0.09, 0.15)]
+    placed = [facing(BACKGROUND, 0.9, 1.2), facing(0, 0.6, 0.09, -0.13), facing(1, 0.6, 0.09, 0.15)]
     labels = LabelRenderer(placed).render(CAMERA, np.eye(4))
     rho = np.ones(labels.ids.shape, np.float32)
     for instance, value in reflectance.items():

@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
 
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
-from realsim.records import CameraIntrinsics, Mesh
+from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.shadow import half_occluded, shadow_mask
 from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.rays import PlacedMesh, RayScene
+from trimesh_solids import ball, box
 
 CAMERA = CameraIntrinsics(width=96, height=72, fx=90, fy=90, cx=47.5, cy=35.5)
 SMALL = CameraIntrinsics(width=48, height=36, fx=45, fy=45, cx=23.5, cy=17.5)
@@ -22,20 +22,14 @@ LENS = replace(SMALL, distortion=np.array([-0.12, 0.05, 0.001, -0.002, 0.0]))
 
 def placed(behind: bool = False) -> list[PlacedMesh]:
     """Return a ball and a turned box before a wall; a second wall behind the camera."""
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.07)
-    box = trimesh.creation.box((0.1, 0.06, 0.08))
-    wall = trimesh.creation.box((3.0, 3.0, 0.01))
-
-    def put(k: int, mesh: trimesh.Trimesh, xyz: tuple[float, float, float]) -> PlacedMesh:
-        T = np.eye(4)
-        T[:3, 3] = xyz
-        if k == 1:
-            T[:3, :3] = se3.exp(np.array([0.5, 0.4, 0.3, 0, 0, 0]))[:3, :3]
-        return PlacedMesh(k, Mesh(vertices=mesh.vertices, faces=mesh.faces), T)
-
-    things = [put(0, ball, (-0.06, 0.02, 0.5)), put(1, box, (0.12, -0.03, 0.42)),
-              put(-1, wall, (0, 0, 0.8))]  # fmt: skip
-    return [*things, put(-1, wall, (0, 0, -0.3))] if behind else things
+    turned, wall = se3.exp_so3([0.5, 0.4, 0.3]), box((3.0, 3.0, 0.01))
+    things = [
+        PlacedMesh(0, ball(0.07, 2), se3.from_translation([-0.06, 0.02, 0.5])),
+        PlacedMesh(1, box((0.1, 0.06, 0.08)), se3.from_rt(turned, [0.12, -0.03, 0.42])),
+        PlacedMesh(-1, wall, se3.from_translation([0, 0, 0.8])),
+    ]
+    back = PlacedMesh(-1, wall, se3.from_translation([0, 0, -0.3]))
+    return [*things, back] if behind else things
 
 
 def brute_force_hidden(points: np.ndarray, eye: np.ndarray, things: list[PlacedMesh]) -> np.ndarray:

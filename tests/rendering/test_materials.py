@@ -1,8 +1,11 @@
 """Materials: images lie where coordinates say, in both lights, and what lacks them is named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from plain_meshes import square
 from realsim.geometry import camera, se3
 from realsim.geometry.colors import srgb_encoded
 from realsim.records import CameraIntrinsics, Mesh
@@ -17,14 +20,6 @@ VIEW = CameraIntrinsics(
 ABOVE = se3.look_at([0, 0, 1.2], [0, 0, 0])
 SHARP = Lighting(psf_px=0.0)
 WHITE_SKY = Environment(panorama=np.ones((8, 16, 3), np.float32))
-
-
-def unit_square() -> Mesh:
-    return Mesh(
-        vertices=np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]) - [0.5, 0.5, 0],
-        faces=np.array([[0, 1, 2], [0, 2, 3]]),
-        uv=np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]),
-    )
 
 
 def lit(mesh: Mesh, material: Material | None, sky: Environment | None = WHITE_SKY,
@@ -54,9 +49,7 @@ def test_an_image_lies_where_the_coordinates_say(sky: Environment | None, projec
         base_color=(1, 1, 1), base_color_image=four_colors(), roughness=1.0, period_m=1.0,
         projection=projection,  # pyright: ignore[reportArgumentType]
     )  # fmt: skip
-    mesh = unit_square()
-    if projection == "box":
-        mesh = Mesh(vertices=mesh.vertices, faces=mesh.faces)
+    mesh = replace(square(), uv=None) if projection == "box" else square()
     picture = lit(mesh, material, sky)
     shift = 0.5 if projection == "box" else 0.0  # the tile's corner is the mesh's origin
     for x, y, channel in ((-0.25, 0.25, 0), (0.25, 0.25, 1), (-0.25, -0.25, 2)):
@@ -71,7 +64,7 @@ def test_a_printed_edge_lies_where_it_is_projected(sky: Environment | None) -> N
     material = Material(base_color=(1, 1, 1), base_color_image=image, roughness=1.0,
                         projection="uv")  # fmt: skip
     T = se3.look_at([0.1, -0.2, 1.1], [0.02, 0.03, 0])
-    row = lit(unit_square(), material, sky, T)[60, :, 1]
+    row = lit(square(), material, sky, T)[60, :, 1]
     dark, bright = row[55:58].mean(), row[70:90].mean()
     share = (row - dark) / (bright - dark)
     found = share[40:80].sum(), share[80:125].sum()
@@ -86,7 +79,7 @@ def test_far_away_a_pattern_becomes_its_mean() -> None:
     checks = np.kron(np.indices((64, 64)).sum(0) % 2, np.ones((2, 2)))
     image = np.repeat((255 * checks).astype(np.uint8)[..., None], 3, -1)
     material = Material(base_color=(1, 1, 1), base_color_image=image, roughness=1.0, period_m=0.02)
-    light = lit(unit_square(), material)
+    light = lit(square(), material)
     inside = light[50:70, 60:100]
     assert inside.mean() == pytest.approx(0.5, abs=0.04) and inside.std() < 0.01
 
@@ -98,7 +91,7 @@ def test_a_roughness_image_says_where_the_lamp_is_mirrored() -> None:
     image[:, :8] = 20
     material = Material(base_color=(0.9, 0.9, 0.9), metallic=1.0, roughness=1.0,
                         roughness_image=image, projection="uv")  # fmt: skip
-    light = lit(unit_square(), material, Environment(panorama=panorama))
+    light = lit(square(), material, Environment(panorama=panorama))
     assert at(light, -0.05, 0)[0] > 3 * at(light, 0.05, 0)[0]
 
 
@@ -115,7 +108,7 @@ def test_a_normal_image_turns_the_surface_towards_the_light() -> None:
         material = Material(
             base_color=(1, 1, 1), roughness=1.0, normal_image=image, projection="uv"
         )
-        light = lit(unit_square(), material, Environment(panorama=panorama))
+        light = lit(square(), material, Environment(panorama=panorama))
         assert at(light, 0, 0)[0] == pytest.approx(expected, abs=0.06)
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from realsim.arrays import Array
 from realsim.geometry import camera, se3
+from realsim.geometry.mesh import box_mesh
 from realsim.geometry.parts import part
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.casting.pixel_caster import (
@@ -28,13 +29,6 @@ WEDGE, CUBE = 1, 2
 """Numbers of the two bodies that move."""
 
 
-def table() -> Mesh:
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-0.02, 0)])
-    quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-    faces = [f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))]
-    return Mesh(vertices=corners.astype(float), faces=np.array(faces))
-
-
 def printed() -> Mesh:
     """An open square with a print, standing upright."""
     image = np.random.default_rng(2).integers(0, 256, (32, 32, 3)).astype(np.uint8)
@@ -46,13 +40,13 @@ def printed() -> Mesh:
 def coloured() -> Mesh:
     mesh = part("cube").mesh
     shades = np.random.default_rng(1).integers(0, 256, (len(mesh.vertices), 3)).astype(np.uint8)
-    return Mesh(vertices=mesh.vertices, faces=mesh.faces, colors=shades)
+    return replace(mesh, colors=shades)
 
 
 def placed(shift: float = 0.0) -> list[PlacedMesh]:
     turned = se3.exp_so3([0.3 * shift, 0.0, 0.4 + 2 * shift])
     return [
-        PlacedMesh(-1, table(), np.eye(4)),
+        PlacedMesh(-1, box_mesh((-1, -1, -0.02), (1, 1, 0)), np.eye(4)),
         PlacedMesh(0, part("wedge").mesh, se3.from_rt(turned, [0.06 - shift, 0.0, 0.05 + shift])),
         PlacedMesh(1, coloured(), se3.from_translation([-0.07, 0.02 - shift, 0.03])),
         PlacedMesh(-1, printed(), se3.from_translation([0.0, 0.12, 0.0])),

@@ -1,13 +1,18 @@
 """Views under a panorama and a sun: energy, known answers, and the same pixel grid as labels."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import trimesh
 
+from plain_meshes import square
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.photo import Lighting, LightSampling, PhotoRenderer, PlacedMesh
 from refusals import refused
+from trimesh_solids import solid
 
 LENS = np.array([-0.25, 0.09, 0.0006, -0.0009, 0.0])
 WIDE = CameraIntrinsics(width=160, height=120, fx=110, fy=110, cx=79.2, cy=60.1, distortion=LENS)
@@ -21,30 +26,8 @@ def even_sky(level: float = 1.0, rows: int = 16, **more: object) -> Environment:
     return Environment(panorama=np.full((rows, 2 * rows, 3), level, np.float32), **more)  # pyright: ignore[reportArgumentType]
 
 
-def square(half: float = 0.5, uv: bool = False) -> Mesh:
-    return Mesh(
-        vertices=np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * half,
-        faces=np.array([[0, 1, 2], [0, 2, 3]]),
-        uv=np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]) if uv else None,
-    )
-
-
 def ball(radius: float, segments: int = 48) -> Mesh:
-    polar, azimuth = np.meshgrid(
-        np.linspace(0, np.pi, segments + 1),
-        np.arange(2 * segments) * np.pi / segments,
-        indexing="ij",
-    )
-    v = np.stack(
-        [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], -1
-    )
-    n = 2 * segments
-    i, j = np.meshgrid(np.arange(segments), np.arange(n), indexing="ij")
-    a, b = i * n + j, i * n + (j + 1) % n
-    c, d = (i + 1) * n + j, (i + 1) * n + (j + 1) % n
-    lower, upper = np.stack([a, c, d], -1)[:-1], np.stack([a, d, b], -1)[1:]
-    faces = np.concatenate([lower.reshape(-1, 3), upper.reshape(-1, 3)])
-    return Mesh(vertices=radius * v.reshape(-1, 3), faces=faces)
+    return solid(trimesh.creation.uv_sphere(radius, count=[segments + 1, 2 * segments]))
 
 
 def light_of(
@@ -55,11 +38,16 @@ def light_of(
     return PhotoRenderer(placed, SHARP, sky, how).radiance(intrinsics, T)[0]
 
 
+def pixel_of(x: float, y: float, T: np.ndarray = ABOVE) -> tuple[int, int]:
+    """Row and column where the wide camera sees a place of the table."""
+    u, v = np.round(camera.project(WIDE, se3.transform(se3.invert(T), [[x, y, 0]]))[0])
+    return int(v), int(u)
+
+
 def cluttered() -> list[PlacedMesh]:
     """A table with a ball, a small plate in the air and a textured square."""
     texture = np.random.default_rng(0).integers(0, 255, (16, 16, 3), dtype=np.uint8)
-    card = square(0.08, uv=True)
-    card = Mesh(vertices=card.vertices, faces=card.faces, uv=card.uv, texture=texture)
+    card = replace(square(0.08), texture=texture)
     return [
         PlacedMesh(-1, square(0.45), np.eye(4), WHITE),
         PlacedMesh(0, ball(0.1), se3.from_translation([0.2, 0.1, 0.1]),
@@ -119,22 +107,16 @@ def test_the_sun_shadow_falls_where_geometry_says() -> None:
         PlacedMesh(0, square(0.05), se3.from_translation([0, 0, 0.1])),
     ]
     light = light_of(placed, sky, ambient_rays=0)
-
-    def at(x: float, y: float) -> float:
-        uv = camera.project(WIDE, se3.transform(se3.invert(ABOVE), [[x, y, 0]]))[0]
-        u, v = np.round(uv).astype(int)
-        return float(light[v, u, 0])
-
-    open_light = at(0.3, 0.3)
+    open_light = light[pixel_of(0.3, 0.3)][0]
     assert open_light == pytest.approx(0.2 + np.sqrt(0.5), rel=0.05)
     for x, y, shaded in ((-0.13, 0, True), (-0.17, 0, False), (-0.1, 0.035, True),
                          (-0.1, 0.07, False)):  # fmt: skip
-        assert (at(x, y) < 0.5 * open_light) == shaded
+        assert (light[pixel_of(x, y)][0] < 0.5 * open_light) == shaded
 
 
 def test_a_wide_sun_makes_a_penumbra_of_the_right_width() -> None:
     # A half plane's edge 0.2 m up, a sun of 4 deg radius overhead: penumbra 2 * 0.2 * tan 4 deg.
-    half = Mesh(vertices=square(1.0).vertices + np.array([1.0, 0, 0]), faces=square().faces)
+    half = replace(square(1.0), vertices=square(1.0).vertices + np.array([1.0, 0, 0]))
     sky = even_sky(0.0, sun=(1, 1, 1), sun_direction=(0, 0, 1), sun_radius_deg=4.0)
     view = CameraIntrinsics(width=120, height=40, fx=300, fy=300, cx=59.5, cy=19.5)
     T = se3.look_at([0, 0, 0.15], [0, 0, 0])
@@ -154,10 +136,9 @@ def test_a_round_body_of_few_faces_has_a_round_terminator() -> None:
     # Of the light of a side sun a matte ball sends cos(angle to the sun), whatever its facets.
     sky = even_sky(0.0, sun=(1, 1, 1), sun_direction=(1, 0, 0), sun_radius_deg=0.0)
     view = CameraIntrinsics(width=120, height=120, fx=500, fy=500, cx=59.5, cy=59.5)
-    dark = Material(base_color=(1.0, 1.0, 1.0), roughness=1.0)
     T = se3.look_at([0, 0, 1.0], [0, 0, 0])
     few, many = (
-        light_of([PlacedMesh(0, ball(0.1, n), np.eye(4), dark)], sky, T, view, ambient_rays=0,
+        light_of([PlacedMesh(0, ball(0.1, n), np.eye(4), WHITE)], sky, T, view, ambient_rays=0,
                  reflections=False)[..., 0]
         for n in (9, 96)
     )  # fmt: skip
@@ -188,14 +169,10 @@ def test_a_deep_corner_is_darker_than_the_open_table() -> None:
         PlacedMesh(-1, square(0.8), np.eye(4), WHITE),
         PlacedMesh(0, square(0.5), wall, black),
     ]
-    sky = even_sky()
-    light = light_of(placed, sky, se3.look_at([0, -0.3, 1.2], [0, 0, 0]), ambient_rays=4)
     T = se3.look_at([0, -0.3, 1.2], [0, 0, 0])
-    seen = []
-    for y in (0.19, 0.0, -0.5):
-        uv = camera.project(WIDE, se3.transform(se3.invert(T), [[0, y, 0]]))[0]
-        u, v = np.round(uv).astype(int)
-        seen.append(light[v, u - 3 : u + 4].mean())
+    light = light_of(placed, even_sky(), T, ambient_rays=4)
+    places = (pixel_of(0, y, T) for y in (0.19, 0.0, -0.5))
+    seen = [light[v, u - 3 : u + 4].mean() for v, u in places]
     assert 0.4 < seen[0] < 0.7  # beside an endless black wall it would be half
     assert seen[0] < seen[1] < seen[2] and seen[2] > 0.8
 
@@ -205,12 +182,11 @@ def test_colour_bleeds_off_a_sunlit_neighbour() -> None:
     red = Material(base_color=(0.9, 0.05, 0.05), roughness=1.0)
     placed = [PlacedMesh(-1, square(0.8), np.eye(4), WHITE), PlacedMesh(0, square(0.3), wall, red)]
     sky = even_sky(0.3, sun=(1, 1, 1), sun_direction=(0, -1, 0.4))
-    light = light_of(placed, sky, se3.look_at([0, -0.5, 0.8], [0, 0, 0]))
     T = se3.look_at([0, -0.5, 0.8], [0, 0, 0])
+    light = light_of(placed, sky, T)
     ratio = []
     for y in (0.07, -0.3):
-        uv = camera.project(WIDE, se3.transform(se3.invert(T), [[0, y, 0]]))[0]
-        u, v = np.round(uv).astype(int)
+        v, u = pixel_of(0, y, T)
         patch = light[v - 1 : v + 2, u - 2 : u + 3].mean((0, 1))
         ratio.append(patch[0] / patch[1])
     assert ratio[0] > 1.15 and ratio[1] < 0.5 * ratio[0] + 0.6
@@ -223,10 +199,9 @@ def test_a_mirror_shows_the_thing_above_it() -> None:
     placed = [PlacedMesh(0, square(0.3), np.eye(4), mirror),
               PlacedMesh(1, square(0.2), upright, green)]  # fmt: skip
     T = se3.look_at([0, -0.6, 0.4], [0, 0.1, 0.0])
-    uv = camera.project(WIDE, se3.transform(se3.invert(T), [[0, 0.1, 0.0]]))[0]
-    u, v = np.round(uv).astype(int)
-    with_it = light_of(placed, even_sky(), T)[v, u]
-    without = light_of(placed, even_sky(), T, reflections=False, ambient_rays=0)[v, u]
+    at = pixel_of(0, 0.1, T)
+    with_it = light_of(placed, even_sky(), T)[at]
+    without = light_of(placed, even_sky(), T, reflections=False, ambient_rays=0)[at]
     assert with_it[1] > 3 * with_it[0] and without[0] == pytest.approx(1.0, abs=0.02)
 
 

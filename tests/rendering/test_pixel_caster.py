@@ -1,13 +1,17 @@
 """Pixel rays against triangles: the same hits as an independent ray caster, through any lens."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import trimesh
 
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.casting.pixel_caster import PixelCaster, body_of
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.rendering.rays import RayScene, rotated
+from trimesh_solids import ball, box, solid
 
 SIZE = (320, 240)
 LENSES = {
@@ -19,31 +23,25 @@ LENSES = {
     "tangential": np.array([-0.1, 0.05, 0.01, -0.008, 0.0]),
 }
 
+MESHES = {
+    "ball": ball(),
+    "ring": solid(trimesh.creation.torus(0.05, 0.02)),
+    "box": box((0.09, 0.05, 0.07)),
+}
+
 
 def a_camera(name: str, f: float = 210.0) -> CameraIntrinsics:
     K = np.array([[f, 0, SIZE[0] / 2 - 0.7], [0, f * 1.01, SIZE[1] / 2 + 0.4], [0, 0, 1]])
     return CameraIntrinsics.from_K(K, *SIZE, LENSES[name])
 
 
-def a_mesh(kind: str) -> Mesh:
-    import trimesh
-
-    made = {
-        "ball": lambda: trimesh.creation.icosphere(subdivisions=4, radius=0.05),
-        "ring": lambda: trimesh.creation.torus(0.05, 0.02),
-        "box": lambda: trimesh.creation.box((0.09, 0.05, 0.07)),
-    }[kind]()
-    return Mesh(vertices=np.asarray(made.vertices), faces=np.asarray(made.faces))
-
-
 def a_scene(seed: int) -> list[PlacedMesh]:
     rng = np.random.default_rng(seed)
-    slab = Mesh(vertices=a_mesh("box").vertices * [12, 20, 0.3], faces=a_mesh("box").faces)
-    placed = [PlacedMesh(-1, slab, se3.from_translation([0, 0, -0.0105]))]
+    placed = [PlacedMesh(-1, box((1.08, 1, 0.021)), se3.from_translation([0, 0, -0.0105]))]
     for i, kind in enumerate(("ball", "ring", "box", "ring", "ball", "box")):
         at = [*rng.uniform(-0.12, 0.12, 2), 0.04]
         T = se3.from_rt(se3.exp_so3(rng.normal(size=3)), at)
-        placed.append(PlacedMesh(i, a_mesh(kind), T))
+        placed.append(PlacedMesh(i, MESHES[kind], T))
     return placed
 
 
@@ -134,9 +132,9 @@ def test_object_coordinates_lie_on_the_object_and_come_back_to_the_camera() -> N
 
 
 def test_normals_are_those_of_the_faces_and_look_at_the_camera() -> None:
-    ball = PlacedMesh(0, a_mesh("ball"), se3.from_translation([0, 0, 0.3]))
+    alone = PlacedMesh(0, MESHES["ball"], se3.from_translation([0, 0, 0.3]))
     lens = a_camera("d405")
-    labels = LabelRenderer([ball]).render(lens, np.eye(4))
+    labels = LabelRenderer([alone]).render(lens, np.eye(4))
     normals = labels.normals()
     rays = camera.ray_table(lens)
     seen = labels.ids == 0
@@ -153,9 +151,7 @@ def test_turning_a_face_round_changes_no_label() -> None:
     # Only closed meshes may skip faces seen from behind; a mesh turned inside out must not.
     placed = a_scene(5)
     turned = [
-        PlacedMesh(
-            p.instance, Mesh(vertices=p.mesh.vertices, faces=p.mesh.faces[:, ::-1]), p.T_world_obj
-        )
+        PlacedMesh(p.instance, replace(p.mesh, faces=p.mesh.faces[:, ::-1]), p.T_world_obj)
         for p in placed
     ]
     assert body_of(placed[1].mesh).is_solid and not body_of(turned[1].mesh).is_solid
@@ -167,10 +163,10 @@ def test_turning_a_face_round_changes_no_label() -> None:
 
 
 def test_a_mesh_with_a_hole_is_seen_from_within() -> None:
-    ball = a_mesh("ball")
-    top = ball.vertices[ball.faces].mean(1)[:, 2] > 0.03
-    bowl = Mesh(vertices=ball.vertices, faces=ball.faces[~top])
-    assert body_of(ball).is_solid and not body_of(bowl).is_solid
+    whole = MESHES["ball"]
+    top = whole.vertices[whole.faces].mean(1)[:, 2] > 0.03
+    bowl = replace(whole, faces=whole.faces[~top])
+    assert body_of(whole).is_solid and not body_of(bowl).is_solid
     T = se3.look_at([0, 0, 0.3], [0, 0, 0])
     labels = LabelRenderer([PlacedMesh(0, bowl, np.eye(4))]).render(a_camera("none"), T)
     middle = labels.depth_m[SIZE[1] // 2, SIZE[0] // 2]
@@ -179,9 +175,7 @@ def test_a_mesh_with_a_hole_is_seen_from_within() -> None:
 
 def test_a_camera_inside_an_object_is_said() -> None:
     scene = a_scene(6)
-    room = PlacedMesh(
-        9, Mesh(vertices=a_mesh("box").vertices * 60, faces=a_mesh("box").faces), np.eye(4)
-    )
+    room = PlacedMesh(9, box((5.4, 3, 4.2)), np.eye(4))
     T = views(1)[0]
     lens = a_camera("d405")
     assert LabelRenderer(scene).render(lens, T).camera_inside == ()
@@ -189,5 +183,5 @@ def test_a_camera_inside_an_object_is_said() -> None:
     assert labels.camera_inside == (9,)
     assert labels.amodal[9].all()  # its inner walls fill the picture
     # Inside its box but outside its body is not inside.
-    hole = PlacedMesh(3, a_mesh("ring"), T @ se3.from_translation([0, 0, 0.0]))
+    hole = PlacedMesh(3, MESHES["ring"], T @ se3.from_translation([0, 0, 0.0]))
     assert LabelRenderer([hole]).render(lens, T).camera_inside == ()

@@ -188,10 +188,7 @@ CONFIG = FusionConfig(refine=False, rounds=1, voxel_m=0.0015)
 
 def block(x: float, y: float, size: tuple[float, float, float]) -> Mesh:
     """A box on the table."""
-    import trimesh
-
-    box = trimesh.creation.box(size)
-    return Mesh(vertices=box.vertices + np.array([x, y, size[2] / 2]), faces=box.faces)
+    return box(size, (x, y, size[2] / 2))
 
 
 def frames_of(meshes: tuple[Mesh, ...], table: bool = True) -> list[FusionFrame]:
@@ -252,21 +249,15 @@ def test_several_objects_are_named_and_one_can_be_chosen() -> None:
 
 
 def test_no_table_is_named() -> None:
-    import trimesh
-
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
-    alone = Mesh(vertices=ball.vertices, faces=ball.faces)
-    refused("no table was found", fuse, frames_of((alone,), table=False), error=DegenerateError)
+    refused("no table was found", fuse, frames_of((ball(),), table=False), error=DegenerateError)
 
 
 def test_an_object_that_is_mostly_holes_is_not_accepted() -> None:
     frames: list[FusionFrame] = []
     for f in good():
-        points = ray_table(NARROW) * f.depth_m[..., None]
-        height = se3.transform(f.T_world_cam, points)[..., 2]
+        points = se3.transform(f.T_world_cam, ray_table(NARROW) * f.depth_m[..., None])
         # Only a stripe of the object reflects anything: the rest is transparent.
-        x = se3.transform(f.T_world_cam, points)[..., 0]
-        lost = (height > 0.002) & (np.abs(x - 0.025) > 0.010)
+        lost = (points[..., 2] > 0.002) & (np.abs(points[..., 0] - 0.025) > 0.010)
         frames.append(replace(f, depth_m=np.where(lost, np.float32(0), f.depth_m)))
     fused = fuse(frames)
     assert fused.verdict in ("doubtful", "rejected")

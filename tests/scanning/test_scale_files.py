@@ -1,7 +1,7 @@
 """scale.json: what is written comes back bit for bit, and what is damaged is named."""
 
 import json
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -25,6 +25,7 @@ from realsim.scanning.scale.pictures import candidates_png, residuals_png, views
 from realsim.scanning.shading import UNSEEN, ShadingConfig, diverging, shaded_views, value_paint
 from refusals import refused
 from scale_fits import fit_of, known_scan
+from tried_grasps import assert_same
 
 
 @pytest.fixture(scope="module")
@@ -44,24 +45,11 @@ def record(known):
     )  # fmt: skip
 
 
-def same(a, b) -> bool:
-    """Whether two values are the same to the last bit; NaN is the same as NaN."""
-    if isinstance(a, np.ndarray):
-        return a.dtype == b.dtype and a.tobytes() == b.tobytes()
-    if hasattr(a, "__dataclass_fields__"):
-        return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
-    if isinstance(a, tuple | list):
-        return len(a) == len(b) and all(map(same, a, b))
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
-    return a == b or (a != a and b != b)
-
-
 def test_a_record_comes_back_and_is_written_the_same_again(record, tmp_path):
     path = tmp_path / "scale.json"
     path.write_text(json_lines(record_to_json(record)))
     loaded = load_record(path)
-    assert same(loaded, record)
+    assert_same(loaded, record)
     assert json_lines(record_to_json(loaded)) == path.read_text()
     with pytest.raises(TypeError, match="JSON"):
         json_lines(record_to_json(replace(record, inputs={"bad": object()})))

@@ -1,5 +1,7 @@
 """The bundle adjustment, the depth's scale and the choice of pairs on made-up geometry."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -37,19 +39,13 @@ def scene(rng: np.random.Generator, views: int = 10, points: int = 200) -> Geome
     )  # fmt: skip
 
 
-def changed(g: Geometry, **values: np.ndarray) -> Geometry:
-    from dataclasses import replace
-
-    return replace(g, **values)  # pyright: ignore[reportArgumentType]
-
-
 def test_wrong_poses_are_pulled_to_the_pictures_at_the_robots_scale() -> None:
     rng = np.random.default_rng(1)
     true = scene(rng)
     noise = RobotNoise(position_mm=2.0, rotation_deg=0.3)
     s = np.repeat([np.radians(0.3), 2e-3], 3)
     robot = true.Ts_world_cam @ se3.exp(s * rng.standard_normal((len(true.names), 6)))
-    start = changed(
+    start = replace(
         true, Ts_world_cam=robot, points=true.points + 2e-3 * rng.standard_normal((200, 3)),
         uv_px=true.uv_px + 0.2 * rng.standard_normal(true.uv_px.shape),
     )  # fmt: skip
@@ -74,7 +70,7 @@ def test_wrong_matches_do_not_move_the_result() -> None:
     uv = true.uv_px + 0.1 * rng.standard_normal(true.uv_px.shape)
     uv[rng.choice(len(uv), len(uv) // 10, replace=False)] += rng.uniform(-60, 60, 2)
     T = true.Ts_world_cam
-    b = adjust(changed(true, uv_px=uv), T, RobotNoise(), MappingConfig())
+    b = adjust(replace(true, uv_px=uv), T, RobotNoise(), MappingConfig())
     apart = se3.log(se3.invert(T) @ b.geometry.Ts_world_cam)
     assert 1e3 * np.abs(apart[:, 3:]).max() < 0.3
 
@@ -84,7 +80,7 @@ def test_point_sigmas_are_those_of_repeated_noise() -> None:
     true = scene(rng, points=60)
     tight = RobotNoise(position_mm=1e-4, rotation_deg=1e-5, hand_eye_mm=1e-4, hand_eye_deg=1e-5)
     said = np.sqrt(np.einsum("pii->p", point_covariances(true, 0.3)))
-    noisy = changed(true, uv_px=true.uv_px + 0.3 * rng.standard_normal(true.uv_px.shape))
+    noisy = replace(true, uv_px=true.uv_px + 0.3 * rng.standard_normal(true.uv_px.shape))
     moved = adjust(noisy, true.Ts_world_cam, tight, MappingConfig(robust_px=50.0)).geometry.points
     found = np.linalg.norm(moved - true.points, axis=1)
     assert np.sqrt(np.mean((found / said) ** 2)) == pytest.approx(1.0, abs=0.2)
@@ -93,9 +89,9 @@ def test_point_sigmas_are_those_of_repeated_noise() -> None:
 def test_measured_depth_gives_the_ratio() -> None:
     rng = np.random.default_rng(4)
     true = scene(rng)
-    flat = changed(true, points=true.points * [1.0, 1.0, 0.0])
+    flat = replace(true, points=true.points * [1.0, 1.0, 0.0])
     local = se3.transform(se3.invert(flat.Ts_world_cam), flat.points)
-    flat = changed(flat, uv_px=project(CAMERA, local.reshape(-1, 3)))
+    flat = replace(flat, uv_px=project(CAMERA, local.reshape(-1, 3)))
     from realsim.geometry.camera import ray_table
 
     def table(name: str) -> np.ndarray:

@@ -8,6 +8,7 @@ import pytest
 from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
+from realsim.geometry.mesh import box_mesh
 from realsim.records import Mesh
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.scanning.simulated import T_EE_CAM, ScanLabConfig, ScanViews, scan_views, standing
@@ -19,10 +20,7 @@ SMALL = ScanLabConfig(width=64, height=36, focal_px=32.4, sensor=DepthSensorMode
 
 def block() -> Mesh:
     """Return a block of 60 x 40 x 100 mm about the origin, 12 triangles."""
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * HALF_M
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
-    return Mesh(vertices=corners, faces=np.array(faces, dtype=np.int32))
+    return box_mesh(-HALF_M, HALF_M)
 
 
 def scanned(config: ScanLabConfig, seed: int) -> ScanViews:

@@ -9,6 +9,7 @@ from scipy.spatial import ConvexHull, KDTree
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.interop import pybullet_client
 from realsim.robots.arm import find_arm
 from realsim.robots.coal_geometry import Body, Geometry
 from realsim.robots.compiled_chain import follow_lines, in_dh_frame
@@ -258,41 +259,29 @@ def test_followed_lines_are_straight_and_their_slopes_are_derivatives():
 
 @pytest.mark.parametrize("name", FOUR_ARMS)
 def test_pybullet_has_the_same_forward_kinematics(tmp_path, name):
-    import pybullet
-
     arm = GraspingArm(find_arm(name), HAND)
     path, n = tmp_path / "arm.urdf", arm.joints
     links = (PANDA_LINKS[1],) * (n + 1)
     path.write_text(arm_urdf(arm.arm, HAND, hand_urdf(HAND, PadModel()), links), encoding="utf-8")
-    client = pybullet.connect(pybullet.DIRECT)
-    try:
-        body = pybullet.loadURDF(str(path), useFixedBase=True, physicsClientId=client)
-        names = [
-            pybullet.getJointInfo(body, i, physicsClientId=client)[12].decode()
-            for i in range(pybullet.getNumJoints(body, physicsClientId=client))
-        ]
-        last = names.index("palm")
-        for q in random_turns(20, arm=arm):
-            for i in range(n):
-                pybullet.resetJointState(body, i, q[i], physicsClientId=client)
-            state = pybullet.getLinkState(
-                body, last, computeForwardKinematics=True, physicsClientId=client
-            )
-            R = np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)
-            T = se3.from_rt(R, state[4])
-            # It reads a URDF's vectors as float32.
-            assert np.allclose(T, arm.forward(q), rtol=0, atol=1e-6)
+    engine = pybullet_client()
+    body = engine.loadURDF(str(path), useFixedBase=True)
+    infos = [engine.getJointInfo(body, i) for i in range(engine.getNumJoints(body))]
+    last = [info[12] for info in infos].index(b"palm")
+    for q in random_turns(20, arm=arm):
         for i in range(n):
-            info = pybullet.getJointInfo(body, i, physicsClientId=client)
-            limits = (arm.limits.lower[i], arm.limits.upper[i], arm.limits.speed[i])
-            assert np.allclose((*info[8:10], info[11]), limits)
-    finally:
-        pybullet.disconnect(client)
+            engine.resetJointState(body, i, q[i])
+        state = engine.getLinkState(body, last, computeForwardKinematics=True)
+        R = np.array(engine.getMatrixFromQuaternion(state[5])).reshape(3, 3)
+        # It reads a URDF's vectors as float32.
+        assert np.allclose(se3.from_rt(R, state[4]), arm.forward(q), rtol=0, atol=1e-6)
+    for i, info in enumerate(infos[:n]):
+        limits = (arm.limits.lower[i], arm.limits.upper[i], arm.limits.speed[i])
+        assert np.allclose((*info[8:10], info[11]), limits)
+    engine.disconnect()
 
 
 # --- Paths round obstacles and the time along them.
 
-PANDA = GraspingArm(find_arm("panda"), find_hand())
 SIDE, LOW = np.eye(7)[0], np.eye(7)[1]
 LEFT, RIGHT = READY - 0.9 * SIDE + 0.5 * LOW, READY + 0.9 * SIDE + 0.5 * LOW
 OPEN = 0.08

@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
+from held_boxes import DOWN, held_from_above
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand import find_hand
@@ -21,13 +22,11 @@ from realsim_sim_bridge.slip.engines import (
     settings_of,
 )
 from realsim_sim_bridge.slip.mujoco_model import lift_law
-from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
+from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import Closing, Grips, PadModel, Replay, SlipBody, SlipPhysics
 from realsim_sim_bridge.validation.specimens import cube_trial
 from refusals import refused
-
-DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 def ellipsoid():
@@ -47,25 +46,14 @@ def askew(n):
             for k in range(n)
         ]
     )
-    return SlipTrial(
-        body=ellipsoid(),
-        Ts_obj_grasp=Ts,
-        Ts_table_grasp=Ts,
-        openings_m=np.full(n, 0.06),
-        swing_axes=np.tile([0.0, 1.0, 0.0], (n, 1)),
-        swing_points=np.tile([-0.088, 0.0, -0.21], (n, 1)),
-        swing_ranges=np.tile([-2.0, 2.0], (n, 1)),
-    )
+    straight = held_from_above(ellipsoid(), np.zeros(n))
+    return replace(straight, Ts_obj_grasp=Ts, Ts_table_grasp=Ts, openings_m=np.full(n, 0.06))
 
 
 def crawl_mm(settings):
     """Return how far an object crawls in a second that is squeezed, and nothing else."""
     trial = askew(3)
-    grips = Grips(
-        Ts_table_grasp=trial.Ts_table_grasp,
-        Ts_obj_grasp=trial.Ts_obj_grasp,
-        openings_m=trial.openings_m,
-    )
+    grips = trial.grips(headroom_m=1.0)
     with BulletEngine(settings).world(trial.body, grips, SlipPhysics(), find_hand()) as world:
         world.close(Closing())
         seen = world.play(np.zeros((3, 240, 6)), 60, 1.0).Ts_world_body[:, :, :3, 3]
@@ -167,6 +155,14 @@ def block(side, low=0.0, off=(0.0, 0.0)):
     return corners + np.array([*off, low])
 
 
+COLUMNS = tuple(block([0.02, 0.02, 0.04], 0.0, xy) for xy in product((-0.01, 0.01), repeat=2))
+
+
+def gripped(off_m):
+    Ts = se3.from_rt(DOWN, [0.0, off_m, 0.02])[None]
+    return Grips(Ts_table_grasp=Ts, Ts_obj_grasp=Ts, openings_m=np.array([0.07]))
+
+
 def standing(engine, corners, stand, physics=None, closing=None, off_m=0.0, parts=None):
     """Return what a hand that closes from above at z = 2 cm does to a body of 100 g, in steps."""
     body = SlipBody(
@@ -175,10 +171,8 @@ def standing(engine, corners, stand, physics=None, closing=None, off_m=0.0, part
         center_of_mass=corners.mean(axis=0),
         inertia=1e-4 * np.eye(3),
     )
-    Ts = se3.from_rt(DOWN, [0.0, off_m, 0.02])[None]
-    grips = Grips(Ts_table_grasp=Ts, Ts_obj_grasp=Ts, openings_m=np.array([0.07]))
     made = make_engine(settings_of(engine))
-    with made.world(body, grips, physics or SlipPhysics(), find_hand(), stand) as world:
+    with made.world(body, gripped(off_m), physics or SlipPhysics(), find_hand(), stand) as world:
         start = world.states().Ts_world_body[0]
         motion = world.close(closing or Closing())
     return start, motion.Ts_world_body[0], motion.finger_n[0]
@@ -200,9 +194,8 @@ def test_a_table_far_below_and_no_weight_are_no_table(engine):
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_body_of_parts_is_pushed_over_the_table_as_one(engine):
-    columns = tuple(block([0.02, 0.02, 0.04], 0.0, xy) for xy in product((-0.01, 0.01), repeat=2))
     ends = []
-    for parts in (None, columns):
+    for parts in (None, COLUMNS):
         start, seen, forces = standing(engine, block([0.04] * 3), table(), off_m=0.01, parts=parts)
         assert forces[-1].min() > 60.0
         ends.append(seen[-1])
@@ -212,14 +205,11 @@ def test_a_body_of_parts_is_pushed_over_the_table_as_one(engine):
 
 
 def test_the_hull_alone_stands_on_the_table_of_bullet():
-    columns = tuple(block([0.02, 0.02, 0.04], 0.0, xy) for xy in product((-0.01, 0.01), repeat=2))
     body = SlipBody(
-        parts=columns, mass_kg=0.5, center_of_mass=np.array([0, 0, 0.02]), inertia=1e-4 * np.eye(3)
+        parts=COLUMNS, mass_kg=0.5, center_of_mass=np.array([0, 0, 0.02]), inertia=1e-4 * np.eye(3)
     )
-    Ts = se3.from_rt(DOWN, [0.0, 0.2, 0.02])[None]
-    grips = Grips(Ts_table_grasp=Ts, Ts_obj_grasp=Ts, openings_m=np.array([0.07]))
     with BulletEngine(BulletSettings()).world(
-        body, grips, SlipPhysics(), find_hand(), table()
+        body, gripped(0.2), SlipPhysics(), find_hand(), table()
     ) as world:
         pair, far = world._pair, se3.from_translation([0.0, 0.0, 1.0])
         pair.place_stand(world._Ts_hand_table[0])

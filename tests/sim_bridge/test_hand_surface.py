@@ -8,18 +8,14 @@ import pytest
 import trimesh
 
 from realsim.geometry import se3
-from realsim.records import Mesh
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.grasping.antipodal import CandidateConfig, RaySurface
 from realsim_sim_bridge.grasping.candidates import IN_OBJECT, HandPoses, Stand
 from realsim_sim_bridge.grasping.surroundings import hands_free, surface_tree
+from trimesh_solids import box, cup
 
 HAND = find_hand()
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
-
-
-def cup():
-    return trimesh.creation.annulus(0.028, 0.032, 0.08, sections=48)
 
 
 def hands(count, seed, spread=0.07):
@@ -51,7 +47,8 @@ def free_by_coal(boxes, Ts, triangles):
 def test_the_verdict_is_that_of_a_collision_library():
     clearance = 0.002
     boxes, Ts = hands(400, 0)
-    triangles = np.array(cup().triangles)
+    mesh = cup(48)
+    triangles = mesh.vertices[mesh.faces]
     grown = boxes + np.array([[-clearance], [clearance]])
     expected = free_by_coal(grown, Ts, triangles)
     assert 100 < expected.sum() < 300
@@ -59,10 +56,8 @@ def test_the_verdict_is_that_of_a_collision_library():
 
 
 def test_a_hand_wholly_inside_a_large_block_is_not_free():
-    shape = trimesh.creation.box((0.6, 0.6, 0.6))
-    mesh = Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
     T = se3.from_translation([0.0, 0.0, 0.5])
-    stand = Stand(RaySurface(mesh), T, None, CandidateConfig(), HAND)
+    stand = Stand(RaySurface(box((0.6, 0.6, 0.6))), T, None, CandidateConfig(), HAND)
     poses = HandPoses(
         Ts_obj_grasp=np.eye(4)[None],
         widths_m=np.array([0.05]),

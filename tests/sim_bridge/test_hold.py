@@ -64,9 +64,14 @@ def loads(trial):
     return stage_loads(trial, SlipMotion())
 
 
+def draws_of(grasped, trial, config=None, stiffness_n_per_m=2e5, hand=HAND, force_n=FORCE):
+    loads = stage_loads(trial, SlipMotion())
+    return draw_holds(grasped, trial, loads, hand, force_n, None, config, stiffness_n_per_m)
+
+
 @pytest.fixture(scope="module")
-def drawn(bar, trial, loads):
-    return draw_holds(bar, trial, loads, HAND, FORCE, stiffness_n_per_m=2e5)
+def drawn(bar, trial):
+    return draws_of(bar, trial)
 
 
 def shares(drawn):
@@ -86,41 +91,28 @@ def test_shares_and_what_holds_are_one_and_a_centred_grasp_holds_best(drawn):
 
 
 def test_the_same_seed_is_the_same_draw_in_any_order(bar, trial, drawn):
-    again = draw_holds(
-        bar, trial, stage_loads(trial, SlipMotion()), HAND, FORCE, stiffness_n_per_m=2e5
-    )
-    np.testing.assert_array_equal(again.holds, drawn.holds)
-    back = trial.part(np.arange(len(trial))[::-1])
-    turned = draw_holds(
-        bar, back, stage_loads(back, SlipMotion()), HAND, FORCE, stiffness_n_per_m=2e5
-    )
+    np.testing.assert_array_equal(draws_of(bar, trial).holds, drawn.holds)
+    turned = draws_of(bar, trial.part(np.arange(len(trial))[::-1]))
     np.testing.assert_allclose(turned.holds[::-1], drawn.holds, atol=1e-9)
-    other = draw_holds(
-        bar, trial, stage_loads(trial, SlipMotion()), HAND, FORCE, None, HoldConfig(seed=1), 2e5
-    )
-    assert not np.array_equal(other.holds, drawn.holds)
+    assert not np.array_equal(draws_of(bar, trial, HoldConfig(seed=1)).holds, drawn.holds)
 
 
 def test_more_spread_is_less_share_of_a_tight_grasp(bar):
     tight = bar_trial(np.array([0.0, 0.01]))
-    loads = stage_loads(tight, SlipMotion())
     found = []
     for times in (0.0, 1.0, 2.0, 4.0):
         spread = PoseSpread(
             **{f.name: times * getattr(PoseSpread(), f.name) for f in fields(PoseSpread)}
         )
-        config = HoldConfig(draws=32, spread=spread)
-        found.append(draw_holds(bar, tight, loads, HAND, FORCE, None, config, 2e5).share)
+        found.append(draws_of(bar, tight, HoldConfig(draws=32, spread=spread)).share)
     assert np.all(np.diff(found, axis=0) < 0) and np.all(found[0] > 0.98)
 
 
 def test_the_error_tells_how_far_the_share_is_off_and_falls_with_the_root_of_the_draws(bar, trial):
     some = trial.part(np.array([0, 3, 5]))
-    loads = stage_loads(some, SlipMotion())
 
     def draw(count, seed):
-        config = HoldConfig(draws=count, seed=seed)
-        return draw_holds(bar, some, loads, HAND, FORCE, None, config, 2e5)
+        return draws_of(bar, some, HoldConfig(draws=count, seed=seed))
 
     truth = draw(256, 99)
     few = [draw(8, seed) for seed in range(8)]
@@ -139,11 +131,11 @@ def test_a_draw_without_spread_says_what_the_nominal_safety_says(bar):
         loads = stage_loads(trial, SlipMotion())
         factors = nominal_factors(bar, trial, loads, HAND, 0.5, FORCE, 0.0015)
         safety = factors[:, 1:].min(axis=1)
-        said = draw_holds(bar, trial, loads, HAND, FORCE, None, CERTAIN).share
+        said = draws_of(bar, trial, CERTAIN, np.inf).share
         sure = np.abs(safety - 1.0) > 0.002
         np.testing.assert_array_equal(said[sure], safety[sure] > 1)
         spread = replace(CERTAIN, draws=64, mass_spread=0.3)
-        said_of_masses = draw_holds(bar, trial, loads, HAND, FORCE, None, spread).share
+        said_of_masses = draws_of(bar, trial, spread, np.inf).share
         np.testing.assert_allclose(said_of_masses, ndtr((safety - 1.0) / 0.3), atol=0.03)
     assert 0 < said.mean() < 1
 
@@ -152,7 +144,7 @@ def test_point_contacts_on_a_ball_are_overloaded_by_a_torque_not_skewed():
     ball = GraspedObject.of(solid(trimesh.creation.icosphere(3, 0.025)))
     rigid = replace(CERTAIN, conformity_m=0.0)
     trial = bar_trial(np.array([0.0, 0.004]), z=0.0)
-    found = draw_holds(ball, trial, stage_loads(trial, SlipMotion()), HAND, FORCE, None, rigid)
+    found = draws_of(ball, trial, rigid, np.inf)
     assert found.skewed.sum() == 0 and found.overloaded[1] == 1.0
 
 
@@ -239,20 +231,15 @@ def test_a_hand_whose_palm_is_in_the_object_stops_outside(bar):
 
 def test_hands_on_an_arc_and_open_meshes_work(bar, trial):
     arc = find_hand("robotiq_2f85")
-    force = arc.force_n
     on_arc = bar_trial(np.array([0.0, 0.03, 0.12]), arc)
-    loads = stage_loads(on_arc, SlipMotion())
-    found = draw_holds(bar, on_arc, loads, arc, force, stiffness_n_per_m=2e5)
+    found = draws_of(bar, on_arc, hand=arc, force_n=arc.force_n)
     np.testing.assert_allclose(shares(found).sum(axis=0) + found.share, 1.0, atol=1e-12)
     assert found.share[0] > 0.6 and found.missed[2] == 1.0
 
     up = np.cross(*(BAR.vertices[BAR.faces][:, k] - BAR.vertices[BAR.faces][:, 0] for k in (1, 2)))
     lidless = GraspedObject.of(Mesh(vertices=BAR.vertices, faces=BAR.faces[up[:, 2] <= 0]))
     assert not lidless.rays.is_closed
-    whole = draw_holds(bar, trial, stage_loads(trial, SlipMotion()), HAND, FORCE, None, CERTAIN)
-    opened = draw_holds(
-        lidless, trial, stage_loads(trial, SlipMotion()), HAND, FORCE, None, CERTAIN
-    )
+    whole, opened = (draws_of(o, trial, CERTAIN, np.inf) for o in (bar, lidless))
     np.testing.assert_array_equal(opened.share, whole.share)
 
 

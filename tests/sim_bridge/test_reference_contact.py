@@ -35,14 +35,14 @@ from refusals import refused
 HAND = find_hand()
 MIRROR = np.diag([1.0, -1.0, 1.0])
 EDGE = with_hand(SlipConfig.of(HAND), 20.0, 0.5)
+GRIPS = Grips(
+    Ts_table_grasp=np.eye(4)[None], Ts_obj_grasp=np.eye(4)[None], openings_m=np.array([0.06])
+)
 
 
 def closed(body, physics=EDGE.physics, settings=None):
     """Return a world of one hand that has closed on a body, with its origin between the pads."""
-    grips = Grips(
-        Ts_table_grasp=np.eye(4)[None], Ts_obj_grasp=np.eye(4)[None], openings_m=np.array([0.06])
-    )
-    world = ReferenceEngine(settings).world(body, grips, physics, HAND)
+    world = ReferenceEngine(settings).world(body, GRIPS, physics, HAND)
     world.close(Closing())
     return world
 
@@ -183,15 +183,12 @@ def test_a_ball_rolls_between_flat_pads_and_does_not_slip_along_them():
 
 
 def test_no_pads_a_flat_part_and_a_table_are_named():
-    grips = Grips(
-        Ts_table_grasp=np.eye(4)[None], Ts_obj_grasp=np.eye(4)[None], openings_m=np.array([0.06])
-    )
-    with pytest.raises(InputError, match=r"sphere pads.*PadModel\.of"):
-        ReferenceEngine().world(cube(0.1), grips, SlipPhysics(pads=None), HAND)
+    world, bare = ReferenceEngine().world, SlipPhysics(pads=None)
+    refused(r"sphere pads.*PadModel\.of", world, cube(0.1), GRIPS, bare, HAND)
     stand = Stand(height_m=0.0, friction=0.4, gravity=9.81)
-    refused("free objects", ReferenceEngine().world, cube(0.1), grips, EDGE.physics, HAND, stand)
+    refused("free objects", world, cube(0.1), GRIPS, EDGE.physics, HAND, stand)
     flat = replace(cube(0.1), parts=(np.eye(4)[:, :3] * [1.0, 1.0, 0.0],))
-    refused("has no volume", ReferenceEngine().world, flat, grips, EDGE.physics, HAND)
+    refused("has no volume", world, flat, GRIPS, EDGE.physics, HAND)
 
 
 # --- The suite's specimens, its loads, and the arm that carries a cube.

@@ -6,13 +6,15 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+from bop_scenes import mm, png
 from realsim.errors import InputError, RealsimError
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
+from realsim.geometry.camera import ray_table
 from realsim.models.library_records import KnownSolid
 from realsim.models.model_records import ConvexParts
 from realsim.models.properties import physical_properties
-from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
+from realsim.records import CameraIntrinsics, Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.store.atomic import write_json
 from realsim_sim_bridge.scenes import stable_state, table_world
 from realsim_sim_bridge.scenes.importers import from_bop, load_scene_source
@@ -78,20 +80,22 @@ def test_nothing_depends_on_where_the_table_is_in_the_world():
         assert abs(a.moved_m - b.moved_m) < 5e-4 and abs(a.turned_deg - b.turned_deg) < 0.5
 
 
-@pytest.mark.parametrize("degrees", [44, 46])
-def test_a_box_on_a_wedge_slides_just_where_coulomb_says(degrees):
-    """A flat box of mu 1 holds up to 45 degrees and slides beyond; it is too low to tip over."""
-    angle = np.radians(degrees)
-    R = se3.exp_so3(np.array([0.0, angle, 0.0]))
-    slab = box((0.8, 0.4, 0.02))
+def on_slope(degrees):
+    """A flat box on a slope: it is too low to tip over."""
+    R = se3.exp_so3(np.array([0.0, np.radians(degrees), 0.0]))
     T_slope = se3.from_rt(R, [0.0, 0.0, 0.4])
     flat = ObjectModel(obj_id=1, name="flat", mesh=box((0.06, 0.06, 0.01)))
     T = T_slope @ se3.from_translation([0.0, 0.0, 0.015])
     pose = ObjectPose(obj_id=1, instance=0, T_world_obj=T)
-    support = Support(name="slope", T_world_support=T_slope, mesh=slab)
-    scene = school_scene(pose, models={1: flat}, supports=(support,))
-    seconds = 0.3
-    (stand,) = run(scene, seconds).objects
+    support = Support(name="slope", T_world_support=T_slope, mesh=box((0.8, 0.4, 0.02)))
+    return school_scene(pose, models={1: flat}, supports=(support,))
+
+
+@pytest.mark.parametrize("degrees", [44, 46])
+def test_a_box_on_a_wedge_slides_just_where_coulomb_says(degrees):
+    """A flat box of mu 1 holds up to 45 degrees and slides beyond."""
+    angle, seconds = np.radians(degrees), 0.3
+    (stand,) = run(on_slope(degrees), seconds).objects
     expected = 0.5 * 9.81 * seconds**2 * max(0.0, np.sin(angle) - np.cos(angle))
     assert abs(stand.moved_m - expected) < 1e-4 + 0.02 * expected
     assert stand.verdict == ("stands" if degrees < 45 else "falls")
@@ -99,16 +103,8 @@ def test_a_box_on_a_wedge_slides_just_where_coulomb_says(degrees):
 
 def test_friction_is_of_the_contact_not_its_square():
     """At mu 0.5 the limit is 26.6 degrees; a product of 0.25 would give 14."""
-    angle = np.radians(22)
-    T_slope = se3.from_rt(se3.exp_so3(np.array([0.0, angle, 0.0])), [0, 0, 0.3])
-    flat = ObjectModel(obj_id=1, name="flat", mesh=box((0.06, 0.06, 0.01)))
-    T = T_slope @ se3.from_translation([0.0, 0.0, 0.015])
-    support = Support(name="slope", T_world_support=T_slope, mesh=box((0.8, 0.4, 0.02)))
-    scene = school_scene(
-        ObjectPose(obj_id=1, instance=0, T_world_obj=T), models={1: flat}, supports=(support,)
-    )
-    assert verdicts(run(scene, friction=0.5)) == ["stands"]
-    assert verdicts(run(scene, friction=0.3)) == ["falls"]
+    assert verdicts(run(on_slope(22), friction=0.5)) == ["stands"]
+    assert verdicts(run(on_slope(22), friction=0.3)) == ["falls"]
 
 
 def test_a_heavy_end_shifts_the_centre_of_mass():
@@ -244,54 +240,30 @@ def test_rows_and_picture_say_what_happened():
 SIZE = (0.06, 0.08, 0.1)
 
 
-def block():
-    import trimesh
-
-    shape = trimesh.creation.box(SIZE)
-    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
-
-
 def write_bop(root, cameras=1, with_poses=False, depth=True):
     """Write a dataset of one scene: two blocks on a table, seen by cameras that look down at it."""
-    import cv2
-
-    from realsim.geometry.camera import ray_table
-    from realsim.records import CameraIntrinsics
-
     folder = root / "test" / "000003"
     K = CameraIntrinsics(fx=200.0, fy=200.0, cx=159.5, cy=119.5, width=320, height=240)
     camera, truth = {}, {}
     placed = [se3.from_translation([x, 0.0, SIZE[2] / 2]) for x in (-0.1, 0.12)]
     for k in range(cameras):
         T_world_cam = se3.look_at([0.15 * k, -0.5, 0.5], [0.0, 0.0, 0.0])
-        entry = {"cam_K": K.K.ravel().tolist(), "depth_scale": 0.1}
+        T_cam_world = se3.invert(T_world_cam)
+        camera[str(k)] = {"cam_K": K.K.ravel().tolist(), "depth_scale": 0.1}
         if with_poses:
-            T = se3.invert(T_world_cam)
-            entry |= {"cam_R_w2c": T[:3, :3].ravel().tolist()}
-            entry |= {"cam_t_w2c": (1e3 * T[:3, 3]).tolist()}
-        camera[str(k)] = entry
-        Ts = [se3.invert(T_world_cam) @ T for T in placed]
-        truth[str(k)] = [
-            {
-                "obj_id": 4,
-                "cam_R_m2c": T[:3, :3].ravel().tolist(),
-                "cam_t_m2c": (1e3 * T[:3, 3]).tolist(),
-            }
-            for T in Ts
-        ]
+            R, t = mm(T_cam_world)
+            camera[str(k)] |= {"cam_R_w2c": R, "cam_t_w2c": t}
+        seen = [mm(T_cam_world @ T) for T in placed]
+        truth[str(k)] = [{"obj_id": 4, "cam_R_m2c": R, "cam_t_m2c": t} for R, t in seen]
         rays = ray_table(K) @ T_world_cam[:3, :3].T
         z = -T_world_cam[2, 3] / rays[..., 2]  # rays have z = 1 in the camera: depth of the table
-        for name, image in (
-            ("rgb", np.full((240, 320, 3), 90, np.uint8)),
-            ("depth", np.where((z > 0) & (z < 3), z * 1e4, 0).astype(np.uint16)),
-        ):
-            if name == "depth" and not depth:
-                continue
-            (folder / name).mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(folder / name / f"{k:06d}.png"), image)
+        png(folder / f"rgb/{k:06d}.png", np.full((240, 320, 3), 90, np.uint8))
+        if depth:
+            counts = np.where((z > 0) & (z < 3), z * 1e4, 0).astype(np.uint16)
+            png(folder / f"depth/{k:06d}.png", counts)
     write_json(folder / "scene_camera.json", camera)
     write_json(folder / "scene_gt.json", truth)
-    save_models(root / "models", {4: ObjectModel(obj_id=4, name="block", mesh=block())})
+    save_models(root / "models", {4: ObjectModel(obj_id=4, name="block", mesh=box(SIZE))})
     return root
 
 

@@ -8,7 +8,7 @@ from realsim.geometry import se3
 from realsim.records import ObjectPose, Scene, SupportPlane
 from realsim.records.grasps import MEASURES
 from realsim_sim_bridge.school import recompute_scores, run_school, run_school_results
-from school_scenes import CONFIG, at, model, same, same_motion, scene
+from school_scenes import CONFIG, at, model, same_result, scene
 
 
 @pytest.fixture(scope="module")
@@ -79,8 +79,7 @@ def test_a_second_run_takes_everything_from_the_cache(tmp_path, one_result):
     again, seen = run()
     assert seen == [(6, 6)] and (tmp_path / files[0]).stat().st_mtime_ns == made
     for result in (first, again):
-        assert same(result.grasp_set, one_result.grasp_set)
-        assert same_motion(result.trajectories, one_result.trajectories)
+        assert same_result(result, one_result)
 
 
 def test_rejected_objects_are_obstacles_but_not_grasped():

@@ -18,7 +18,7 @@ from realsim_sim_bridge.school import recompute_scores, run_school, run_school_r
 from realsim_sim_bridge.school.object_slips import in_words
 from realsim_sim_bridge.school.run_record import RUN_FILE, folder_of_run
 from refusals import refused
-from school_scenes import at, model, same, same_motion, scene, small_worlds
+from school_scenes import at, model, same_result, scene, small_worlds
 
 CONFIG = small_worlds()
 SHARD = 2
@@ -34,12 +34,6 @@ def run(cache=None, config=CONFIG, objects=None, models=None, **kwargs):
 def whole():
     """The result of an uninterrupted run."""
     return run()[0]
-
-
-def is_whole_again(result, whole):
-    return same(result.grasp_set, whole.grasp_set) and same_motion(
-        result.trajectories, whole.trajectories
-    )
 
 
 def names(folder, what):
@@ -69,7 +63,7 @@ def test_ctrl_c_says_how_to_go_on_and_the_next_run_does_no_shard_again(tmp_path,
             assert before.get(name, 0) in (0, (tmp_path / name).stat().st_mtime_ns)
 
     result = run(tmp_path, progress=look)[0]
-    assert seen[0] >= judged and is_whole_again(result, whole)
+    assert seen[0] >= judged and same_result(result, whole)
     assert names(tmp_path, "") == ["instance_000000.grasps.npz"]
 
 
@@ -82,7 +76,7 @@ def test_a_damaged_piece_is_made_again(tmp_path, whole):
         run(tmp_path, progress=stop)
     for path in tmp_path.glob("instance_*.npz"):
         path.write_bytes(path.read_bytes()[:100])
-    assert is_whole_again(run(tmp_path)[0], whole)
+    assert same_result(run(tmp_path)[0], whole)
 
 
 SCRIPT = """
@@ -132,7 +126,7 @@ def test_a_run_killed_at_random_moments_ends_as_if_it_had_not_been(tmp_path):
     objects = scene(at(0, 0), at(0.2, 0.1, instance=1))
     kept = run(tmp_path / "cache", objects=objects)
     for a, b in zip(kept, run(objects=objects), strict=True):
-        assert is_whole_again(a, b)
+        assert same_result(a, b)
     assert not list((tmp_path / "cache").glob(".*"))
 
 
@@ -197,7 +191,7 @@ def test_a_shard_that_kills_its_workers_is_given_up_with_its_grasps_named(
     others = np.setdiff1d(np.arange(6), shard)
     assert np.array_equal(found.scores[others], whole.grasp_set.scores[others])
     monkeypatch.undo()
-    assert is_whole_again(run(tmp_path)[0], whole)
+    assert same_result(run(tmp_path)[0], whole)
 
 
 def test_an_error_in_a_shard_names_object_and_grasps(deadly):
@@ -273,7 +267,7 @@ def test_two_runs_at_once_in_one_folder_are_refused(tmp_path):
 def test_only_a_finished_run_gives_way_to_another(tmp_path, whole):
     other = dataclasses.replace(CONFIG, seed=7)
     run(tmp_path, other)
-    assert is_whole_again(run(tmp_path, restart="finished")[0], whole)
+    assert same_result(run(tmp_path, restart="finished")[0], whole)
     grasps = names(tmp_path, "grasps")
     written = [(tmp_path / name).stat().st_mtime_ns for name in grasps]
     run(tmp_path, restart="finished")

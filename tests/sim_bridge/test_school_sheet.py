@@ -16,17 +16,11 @@ from realsim_sim_bridge.school.sheet_object import STOPS, stops_of
 from realsim_sim_bridge.school.summary import summarise
 from refusals import refused
 from tried_grasps import tried_set
+from trimesh_solids import box
 
 
 def model(obj_id=1, name="box"):
-    import trimesh
-
-    from realsim.records import Mesh
-
-    solid = trimesh.creation.box((0.05, 0.08, 0.1))
-    return ObjectModel(
-        obj_id=obj_id, name=name, mesh=Mesh(vertices=solid.vertices, faces=solid.faces)
-    )
+    return ObjectModel(obj_id=obj_id, name=name, mesh=box((0.05, 0.08, 0.1)))
 
 
 def some_sets(n_sets=3, n=50, seed=0, **how):
@@ -92,11 +86,12 @@ def test_no_two_words_overlap_and_all_are_on_the_sheet(measures):
     boxes = [(t.get_text(), t.get_window_extent()) for t in shown]
     width, height = figure.get_size_inches() * figure.dpi
     assert len(boxes) > 20
-    for text, box in boxes:
-        assert box.x0 >= 0 and box.x1 <= width and box.y0 >= 0 and box.y1 <= height, text
-    for (a, box), (b, other) in combinations(boxes, 2):
-        across = min(box.x1, other.x1) - max(box.x0, other.x0)
-        down = min(box.y1, other.y1) - max(box.y0, other.y0)
+    for text, frame in boxes:
+        assert frame.x0 >= 0 and frame.x1 <= width
+        assert frame.y0 >= 0 and frame.y1 <= height, text
+    for (a, frame), (b, other) in combinations(boxes, 2):
+        across = min(frame.x1, other.x1) - max(frame.x0, other.x0)
+        down = min(frame.y1, other.y1) - max(frame.y0, other.y0)
         assert across <= 0.5 or down <= 0.5, (a, b)
 
 

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import entropy, spearmanr
 
+from realsim.formats.grasps.scene_grasps import untried_set
 from realsim.geometry import se3
 from realsim_sim_bridge.school.measure_statistics import (
     LEAST_GRASPS,
@@ -24,7 +25,7 @@ from refusals import refused
 from tried_grasps import plain_grasps
 
 
-def scored_set(rng, n, *, obj_id=1, instance=0, tried=True, **measures):
+def scored_set(rng, n, *, obj_id=1, instance=0, **measures):
     """Return a set whose scores follow from its slips, as the School's do."""
     slip_m, slip_rad = rng.gamma(0.6, 0.012, (n, 4)), rng.gamma(0.6, 0.1, (n, 4))
     slip_m[rng.random((n, 4)) < 0.08] = np.inf
@@ -32,9 +33,7 @@ def scored_set(rng, n, *, obj_id=1, instance=0, tried=True, **measures):
     lost = np.cumsum(np.isinf(slip_m), axis=1) - np.isinf(slip_m) > 0
     reachable = rng.random(n) < 0.8
     slip_m[lost | ~reachable[:, None]] = slip_rad[lost | ~reachable[:, None]] = np.nan
-    base, scores = score_stages(slip_m, slip_rad, np.full(n, tried), ScoreLimits())
-    if not tried:
-        reachable, slip_m, slip_rad = np.zeros(n, bool), slip_m * np.nan, slip_rad * np.nan
+    base, scores = score_stages(slip_m, slip_rad, np.ones(n, bool), ScoreLimits())
     return plain_grasps(
         se3.random_transform(rng, n) if n else 0, obj_id=obj_id, instance=instance, scores=scores,
         base_scores=base, slip_m=slip_m, slip_rad=slip_rad, reachable=reachable, measures=measures,
@@ -43,9 +42,10 @@ def scored_set(rng, n, *, obj_id=1, instance=0, tried=True, **measures):
 
 def some_scenes(seed):
     rng = np.random.default_rng(seed)
+    untried = untried_set(se3.random_transform(rng, 9), obj_id=9)
     return {
         "a": [scored_set(rng, int(rng.integers(0, 80)), obj_id=k, instance=k) for k in (1, 2, 3)],
-        "b": [scored_set(rng, 50, obj_id=1), scored_set(rng, 9, obj_id=9, tried=False)],
+        "b": [scored_set(rng, 50, obj_id=1), untried],
         "c": [],
     }
 

@@ -21,7 +21,7 @@ from realsim_sim_bridge.slip.motion import (
     pendulum_angle,
     pendulum_wrenches,
 )
-from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
+from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
 from realsim_sim_bridge.slip.world import Closing, Replay, SlipPhysics
 from refusals import refused
@@ -40,8 +40,7 @@ def run(physics=None, engine=None, **kwargs):
 
 
 def score(slips):
-    tried = np.ones(len(slips.failures), dtype=bool)
-    return score_stages(slips.slip_m, slips.slip_rad, tried, ScoreLimits())[1]
+    return slips.scores(ScoreLimits())[1]
 
 
 def test_the_box_is_held_through_all_stages_without_slip():

@@ -17,10 +17,11 @@ def box(size: Sequence[float], color: tuple[int, int, int] | None = None) -> Mes
     return replace(box_mesh(-half, half), colors=paint)
 
 
-def square(half: float) -> Mesh:
-    """A square round the origin in z = 0, as a table."""
-    corners = half * np.array([[-1.0, -1.0, 0.0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    return Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
+def square(half: float = 0.5) -> Mesh:
+    """A level square round the origin, to be seen from above, with texture coordinates."""
+    ring = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    vertices, faces = half * (2 * ring - [1, 1, 0]), np.array([[0, 1, 2], [0, 2, 3]])
+    return Mesh(vertices=vertices, faces=faces, uv=ring[:, :2])
 
 
 def ball(radius: float, rings: int = 16) -> Mesh:

@@ -45,6 +45,11 @@ def same(a, b):
     )
 
 
+def same_result(a, b):
+    """Return whether the school made the same of an object, attempts included."""
+    return same(a.grasp_set, b.grasp_set) and same_motion(a.trajectories, b.trajectories)
+
+
 def same_motion(a, b):
     """Return whether two trajectories are the same, bit for bit."""
     if a is None or b is None:

@@ -117,5 +117,7 @@ def same_value(x, y, name, atol):
         assert isinstance(y, tuple) and len(x) == len(y), name
         for k, (p, q) in enumerate(zip(x, y, strict=True)):
             same_value(p, q, f"{name}[{k}]", atol)
+    elif isinstance(x, float):
+        assert x.hex() == y.hex(), name  # NaN is not equal to itself
     else:
-        assert repr(x) == repr(y), name  # NaN is not equal to itself
+        assert repr(x) == repr(y), name

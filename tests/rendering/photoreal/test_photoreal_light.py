@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from plain_meshes import square
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Environment, Material
@@ -13,11 +14,6 @@ from realsim.rendering.rays import PlacedMesh
 CAMERA = CameraIntrinsics(width=40, height=30, fx=40.0, fy=40.0, cx=19.5, cy=14.5)
 WHITE = Material(base_color=(1.0, 1.0, 1.0), roughness=1.0)
 SUN = (0.5, 0.5, 0.5)
-
-
-def square(edge: float) -> Mesh:
-    xy = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]]) * edge
-    return Mesh(vertices=xy, faces=np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def octahedron(radius: float) -> Mesh:
@@ -75,7 +71,7 @@ def test_the_sun_adds_what_it_says_to_a_white_surface(radius_deg: float) -> None
     direction = np.array([0.6, 0.0, 0.8])
     sky = Environment(panorama=panorama(4), sun=SUN, sun_direction=(0.6, 0.0, 0.8),
                       sun_radius_deg=radius_deg)  # fmt: skip
-    placed = [PlacedMesh(-1, square(4.0), np.eye(4), WHITE)]
+    placed = [PlacedMesh(-1, square(2.0), np.eye(4), WHITE)]
     T = se3.look_at([0.0, 0.0, 0.5], [0.0, 0.0, 0.0])
     rgb = PhotorealRenderer(placed, sky, plain(16)).render(CAMERA, T).rgb
     expected = developed(np.full((1, 1, 3), SUN[0] * direction[2], np.float32))

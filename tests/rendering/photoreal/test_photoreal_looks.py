@@ -2,17 +2,18 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from llvm_library import NEEDS_LLVM
-from plain_meshes import box
+from plain_meshes import box, square
 from realsim.errors import InputError, MissingLibraryError
 from realsim.geometry import se3
 from realsim.geometry.colors import srgb_decoded
-from realsim.records import CameraIntrinsics, Mesh
+from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.embedded.materials import PLAIN_COLORS
 from realsim.rendering.photoreal import PhotorealConfig, PhotorealRenderer, find_llvm, llvm_probe
@@ -26,14 +27,6 @@ WHITE_ROOM = Environment(panorama=np.full((4, 8, 3), 0.5, np.float32))
 HUE = 0.12
 """The coat adds some white; a wrong image or paint is 0.3 or more off."""
 COLORS = np.array([[[220, 30, 30], [30, 220, 30]], [[30, 30, 220], [220, 220, 30]]], np.uint8)
-
-
-def square(uv: np.ndarray | None = None, **look: np.ndarray) -> Mesh:
-    """The unit square in x and y, looking up; its texture coordinates are x + 0.5, y + 0.5."""
-    xy = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    corners = np.column_stack([xy - 0.5, np.zeros(4)])
-    return Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]]),
-                uv=xy if uv is None else uv, **look)  # fmt: skip
 
 
 def picture(placed: PlacedMesh, sky: Environment = WHITE_ROOM) -> np.ndarray:
@@ -53,7 +46,7 @@ def hues(colors: np.ndarray) -> np.ndarray:
 
 def test_a_texture_s_first_row_is_at_the_top_of_v() -> None:
     image = np.repeat(np.repeat(COLORS, 16, 0), 16, 1)
-    own = PlacedMesh(0, square(texture=image), np.eye(4))
+    own = PlacedMesh(0, replace(square(), texture=image), np.eye(4))
     material = Material(base_color=(1, 1, 1), base_color_image=image, projection="uv")
     given = PlacedMesh(0, square(), np.eye(4), material)
     for placed in (own, given):
@@ -64,7 +57,7 @@ def test_a_texture_s_first_row_is_at_the_top_of_v() -> None:
 def test_box_projection_repeats_the_image_every_period_along_the_face() -> None:
     image = np.repeat(np.repeat(COLORS, 16, 0), 16, 1)
     material = Material(base_color=(1, 1, 1), base_color_image=image, period_m=1.0)
-    mesh = Mesh(vertices=square().vertices, faces=square().faces)
+    mesh = replace(square(), uv=None)
     # u = x and v = y: half a tile further the image begins anew, so quadrants change places.
     seen = quadrants(picture(PlacedMesh(0, mesh, np.eye(4), material)))
     assert np.abs(hues(seen) - hues(COLORS[::-1, ::-1])).max() < HUE
@@ -75,11 +68,10 @@ def test_box_projection_repeats_the_image_every_period_along_the_face() -> None:
 
 def test_vertex_colours_and_paints_are_seen_as_they_are() -> None:
     color = np.array([200, 60, 90], np.uint8)
-    mesh = Mesh(vertices=square().vertices, faces=square().faces, colors=np.tile(color, (4, 1)))
+    mesh = replace(square(), colors=np.tile(color, (4, 1)))
     seen = picture(PlacedMesh(0, mesh, np.eye(4)))[8:24, 8:24].mean((0, 1))
     assert np.abs(hues(seen) - hues(color)).max() < HUE
-    bare = Mesh(vertices=square().vertices, faces=square().faces)
-    seen = picture(PlacedMesh(13, bare, np.eye(4)))[8:24, 8:24].mean((0, 1))
+    seen = picture(PlacedMesh(13, square(), np.eye(4)))[8:24, 8:24].mean((0, 1))
     paint = np.array(PLAIN_COLORS[13 % len(PLAIN_COLORS)])
     assert np.abs(hues(seen) - hues(paint)).max() < HUE
 
@@ -96,13 +88,11 @@ def lit_from(x: float, y: float) -> Environment:
 
 @pytest.mark.parametrize(("axis", "mirrored"), [(0, True), (1, False)])
 def test_a_normal_image_tilts_the_surface_towards_u_and_v(axis: int, mirrored: bool) -> None:
-    uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    if mirrored:
-        uv[:, 0] = 1 - uv[:, 0]
+    uv = square().uv * [-1, 1] + [1, 0] if mirrored else square().uv
     tilt = np.eye(2)[axis] * 0.5
     material = Material(base_color=(0.8, 0.8, 0.8), roughness=1.0, projection="uv",
                         normal_image=tilted(*tilt))  # fmt: skip
-    placed = PlacedMesh(0, square(uv), np.eye(4), material)
+    placed = PlacedMesh(0, replace(square(), uv=uv), np.eye(4), material)
     along = tilt * (-1 if mirrored and axis == 0 else 1)
     facing = picture(placed, lit_from(*along))[8:24, 8:24].mean()
     averted = picture(placed, lit_from(*-along))[8:24, 8:24].mean()
@@ -119,7 +109,7 @@ def test_metal_mirrors_the_room_in_its_own_colour() -> None:
 
 
 def test_a_material_that_needs_coordinates_on_a_mesh_without_is_named() -> None:
-    mesh = Mesh(vertices=square().vertices, faces=square().faces)
+    mesh = replace(square(), uv=None)
     material = Material(base_color_image=COLORS, projection="uv", name="label")
     with pytest.raises(InputError, match=r"label.*box"):
         PhotorealRenderer([PlacedMesh(4, mesh, np.eye(4), material)], WHITE_ROOM,

@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 from grey_planes import grey_plane
+from plain_meshes import square
 from realsim.errors import InputError
 from realsim.geometry import camera as lens
+from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Material
-from realsim.rendering.depth_sensors.profiles import profile
+from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
 from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.rays import PlacedMesh
-from realsim.rendering.stereo import StereoCamera, StereoConfig
+from realsim.rendering.stereo import StereoCamera, StereoConfig, StereoDepth
 
 CAMERA = CameraIntrinsics(width=360, height=240, fx=360, fy=360, cx=179.5, cy=119.5)
 RICH = StereoConfig(texture_contrast=0.25)
@@ -23,23 +25,24 @@ WIDE = replace(profile("d435"), pattern="none", quantum_px=0.0)
 
 
 def card(z: float, half: float, material: Material) -> PlacedMesh:
-    corners = half * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    mesh = Mesh(vertices=corners, faces=np.array([[0, 2, 1], [0, 3, 2]], np.int32))
-    T = np.eye(4)
-    T[2, 3] = z
-    return PlacedMesh(0, mesh, T, material)
+    mesh = Mesh(vertices=square(half).vertices, faces=square().faces[:, ::-1])
+    return PlacedMesh(0, mesh, se3.from_translation([0, 0, z]), material)
 
 
 MATTE = Material(base_color=(0.6, 0.6, 0.6), roughness=1.0)
 CARD_BEFORE_WALL = [grey_plane(CAMERA, FAR), card(NEAR, 0.08, MATTE)]
 
 
+def seen(
+    scene: list[PlacedMesh], camera: DepthProfile, config: StereoConfig, seed: int = 0
+) -> StereoDepth:
+    rng = np.random.default_rng(seed)
+    return StereoCamera(scene, camera, config).measure(CAMERA, np.eye(4), rng)
+
+
 def test_shadows_lie_left_of_near_things_and_nowhere_else() -> None:
     camera = replace(profile("d435"), quantum_px=0.0, baseline_m=0.05)
-    depth = StereoCamera(CARD_BEFORE_WALL, camera, RICH).measure(
-        CAMERA, np.eye(4), np.random.default_rng(0)
-    )
-    hole = depth.depth_m == 0
+    hole = seen(CARD_BEFORE_WALL, camera, RICH).depth_m == 0
     # The card spans u = 179.5 +- 57.6, v = 119.5 +- 57.6; it hides fB (1/near - 1/far) columns.
     left, right, top, bottom = 122, 237, 62, 177
     shadow = int(360 * 0.05 * (1 / NEAR - 1 / FAR))
@@ -59,8 +62,7 @@ def test_shadows_lie_left_of_near_things_and_nowhere_else() -> None:
 
 def test_a_blank_wall_has_no_depth_until_dots_fall_on_it() -> None:
     def fill(name: str, config: StereoConfig) -> float:
-        wall = StereoCamera([grey_plane(CAMERA, 0.6)], profile(name), config)
-        depth = wall.measure(CAMERA, np.eye(4), np.random.default_rng(0)).depth_m
+        depth = seen([grey_plane(CAMERA, 0.6)], profile(name), config).depth_m
         return float(np.mean(depth[10:-10, 50:-10] > 0))
 
     assert fill("d405", BLANK) < 0.1
@@ -72,10 +74,7 @@ def test_a_blank_wall_has_no_depth_until_dots_fall_on_it() -> None:
 def test_a_highlight_of_polished_metal_misleads_or_is_lost_and_matte_paint_is_not() -> None:
     def good(material: Material) -> float:
         scene = [grey_plane(CAMERA, FAR), card(NEAR, 0.1, material)]
-        d = StereoCamera(scene, WIDE, StereoConfig()).measure(
-            CAMERA, np.eye(4), np.random.default_rng(0)
-        )
-        on = d.depth_m[80:160, 140:220]
+        on = seen(scene, WIDE, StereoConfig()).depth_m[80:160, 140:220]
         return float(np.mean(np.abs(on - NEAR) < 0.005))
 
     assert good(MATTE) > 0.98
@@ -85,8 +84,7 @@ def test_a_highlight_of_polished_metal_misleads_or_is_lost_and_matte_paint_is_no
 def test_dark_things_far_away_are_lost_by_structured_light() -> None:
     def fill(grey: float, z: float) -> float:
         paint = Material(base_color=(grey,) * 3, roughness=1.0)
-        scene = StereoCamera([card(z, z, paint)], profile("structured_light"), StereoConfig())
-        d = scene.measure(CAMERA, np.eye(4), np.random.default_rng(0)).depth_m
+        d = seen([card(z, z, paint)], profile("structured_light"), StereoConfig()).depth_m
         return float(np.mean(d[40:-40, 60:-40] > 0))
 
     assert fill(0.5, 0.6) == 1.0 and fill(0.5, 2.0) == 1.0
@@ -98,9 +96,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not() -> None:
     first, again, other = (
         camera.measure(CAMERA, np.eye(4), np.random.default_rng(seed)) for seed in (5, 5, 6)
     )
-    fresh = StereoCamera(CARD_BEFORE_WALL, profile("d435"), RICH).measure(
-        CAMERA, np.eye(4), np.random.default_rng(5)
-    )
+    fresh = seen(CARD_BEFORE_WALL, profile("d435"), RICH, seed=5)
     for b in (again, fresh):
         assert first.depth_m.tobytes() == b.depth_m.tobytes()
         assert first.left.tobytes() == b.left.tobytes()
@@ -113,13 +109,12 @@ def test_a_distorted_camera_reports_depth_on_its_raw_pixels() -> None:
         width=360, height=240, fx=360, fy=360, cx=179.5, cy=119.5, distortion=[-0.15, 0.05]
     )
     exact = LabelRenderer(CARD_BEFORE_WALL).render(raw, np.eye(4)).depth_m
-    seen = StereoCamera(CARD_BEFORE_WALL, WIDE, RICH).measure(
-        raw, np.eye(4), np.random.default_rng(0)
-    )
-    assert seen.depth_m.shape == (240, 360)
-    known = (seen.depth_m > 0) & (exact > 0)
+    rng = np.random.default_rng(0)
+    found = StereoCamera(CARD_BEFORE_WALL, WIDE, RICH).measure(raw, np.eye(4), rng)
+    assert found.depth_m.shape == (240, 360)
+    known = (found.depth_m > 0) & (exact > 0)
     assert known[:, 40:].mean() > 0.9
-    assert np.mean(np.abs(seen.depth_m - exact)[known] < 0.01) > 0.96
+    assert np.mean(np.abs(found.depth_m - exact)[known] < 0.01) > 0.96
     # The card's corners bulge: the undistorted camera would miss the border by 3 px there.
     corner = lens.project(raw, np.array([[0.08, 0.08, NEAR]]))[0]
     assert abs(corner[0] - (179.5 + 57.6)) > 0.4
