@@ -116,13 +116,7 @@ def _body(folder: Path, scale: float, keep: Path) -> tuple[SlipBody, str]:
     parts = convex_parts(mesh, CONVEX, keep / "convex")
     matter = physical_properties(mesh, density=DENSITY, parts=parts)
     closed = mass_properties(mesh, DENSITY).is_watertight
-    body = SlipBody(
-        parts=parts.parts,
-        mass_kg=matter.mass_kg,
-        center_of_mass=matter.center_of_mass,
-        inertia=matter.inertia,
-    )
-    return body, (
+    return SlipBody.of(parts, matter), (
         f"a mug of {1e3 * matter.mass_kg:.0f} g, {'closed' if closed else 'not closed'}, in "
         f"{len(parts.parts)} convex parts of {parts.volume_ratio:.2f} times its volume"
     )

@@ -1,6 +1,7 @@
 """What a depth sensor was is what a fit to its pictures of a plane says, or says it cannot."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -33,9 +34,13 @@ def wall(z: float, tilt_u: float = 0.3, tilt_v: float = 0.2) -> np.ndarray:
 WALLS = (wall(0.3, 0.3, 0.2), wall(0.5, 0.1, -0.3))
 
 
+def frames_of(model: DepthSensorModel, exact: Sequence[np.ndarray] = WALLS) -> list[np.ndarray]:
+    return [model.measure(z, CAMERA, np.random.default_rng(k)) for k, z in enumerate(exact)]
+
+
 @lru_cache
 def fitted(model: DepthSensorModel, kind: str = "d405") -> FittedDepthModel:
-    frames = [model.measure(w, CAMERA, np.random.default_rng(k)) for k, w in enumerate(WALLS)]
+    frames = frames_of(model)
     return fit_depth_model(frames, CAMERA, kind)
 
 
@@ -63,18 +68,18 @@ def test_holes_without_cause_are_counted() -> None:
 
 def test_what_things_before_a_wall_show_is_recovered() -> None:
     model = DepthSensorModel.from_profile("d405", edge_dropout=0.6, border_margin_px=4.0)
-    frames = []
-    for k, exact in enumerate(WALLS):
-        scene = exact.copy()
+    scenes = [exact.copy() for exact in WALLS]
+    for scene in scenes:
         for u in range(50, 400, 60):
             scene[40:260, u : u + 14] *= 0.8
-        frames.append(model.measure(scene, CAMERA, np.random.default_rng(k)))
-    found = edges_of(frames, CAMERA, replace(model, edge_dropout=0.3, border_margin_px=0.0))
+    found = edges_of(
+        frames_of(model, scenes), CAMERA, replace(model, edge_dropout=0.3, border_margin_px=0.0)
+    )
     for name in ("edge_dropout", "border_margin_px"):
         off = abs(found[name].value - getattr(model, name))
         # Notches that edges tear make more edges: a sixth of the loss is not seen as such.
         assert found[name].determined and off <= 0.2 * getattr(model, name), name
-    bare = edges_of([SOFT.measure(WALLS[0], CAMERA, np.random.default_rng(0))], CAMERA, SOFT)
+    bare = edges_of(frames_of(SOFT, WALLS[:1]), CAMERA, SOFT)
     assert not bare["edge_dropout"].determined and "depth edges" in bare["edge_dropout"].note
 
 
@@ -84,7 +89,7 @@ def test_stripes_and_slow_noise_are_found() -> None:
         "structured_light", column_band_px=0.2, slow_noise_px=0.1, slow_correlation_px=7.0,
         depth_unit_m=1e-4, min_z_m=0.1, band_width_px=40.0,
     )  # fmt: skip
-    frames = [model.measure(w * 2, CAMERA, np.random.default_rng(k)) for k, w in enumerate(WALLS)]
+    frames = frames_of(model, [2 * w for w in WALLS])
     found = fit_depth_model(frames, CAMERA, "structured_light", unit_m=1e-4).estimates
     assert found["column_band_px"].value == pytest.approx(0.2, rel=0.4)
     assert found["row_band_px"].value < 0.05
@@ -97,9 +102,7 @@ def test_noise_of_depth_grows_with_the_square_of_depth_over_focal_length_and_bas
     )
     sigma = []
     for z in (0.25, 0.5):
-        plane = find_plane(
-            model.measure(wall(z, 0, 0), CAMERA, np.random.default_rng(0)), CAMERA, 0.018
-        )
+        plane = find_plane(*frames_of(model, [wall(z, 0, 0)]), CAMERA, 0.018)
         sigma.append(float(np.nanstd(plane.residual)) * plane.distance_m**2 / (380 * 0.018))
     assert sigma[1] / sigma[0] == pytest.approx(4, rel=0.05)
     assert sigma == pytest.approx([float(model.sigma_z(z, CAMERA)) for z in (0.25, 0.5)], rel=0.05)
@@ -108,9 +111,8 @@ def test_noise_of_depth_grows_with_the_square_of_depth_over_focal_length_and_bas
 @pytest.mark.slow
 def test_bias_is_found_only_against_the_truth() -> None:
     model = replace(SOFT, bias_px=0.25)
-    frames = [model.measure(w, CAMERA, np.random.default_rng(k)) for k, w in enumerate(WALLS)]
     blind = fitted(model).estimates["bias_px"]
-    told = fit_depth_model(frames, CAMERA, "d405", truths=WALLS).estimates["bias_px"]
+    told = fit_depth_model(frames_of(model), CAMERA, "d405", truths=WALLS).estimates["bias_px"]
     assert not blind.determined and blind.value == 0 and "another plane" in blind.note
     assert abs(told.value - 0.25) <= 3 * told.uncertainty < 0.05
 
@@ -121,19 +123,15 @@ def test_loss_by_obliquity_is_found_from_oblique_planes() -> None:
         "d405", grazing_from_deg=60.0, grazing_to_deg=80.0, blobs_per_megapixel=0.0, max_z_m=10.0,
         correlation_px=2.0,
     )  # fmt: skip
-    tilts = (1.4, 2.0, 2.6, 3.2)
-    frames = [
-        model.measure(np.clip(wall(0.5, 0.0, t), 0.05, 9), CAMERA, np.random.default_rng(k))
-        for k, t in enumerate(tilts)
-    ]
-    found = fit_depth_model(frames, CAMERA, "d405").estimates
+    oblique = [np.clip(wall(0.5, 0.0, tilt), 0.05, 9) for tilt in (1.4, 2.0, 2.6, 3.2)]
+    found = fit_depth_model(frames_of(model, oblique), CAMERA, "d405").estimates
     assert found["grazing_from_deg"].determined
     for name, true in (("grazing_from_deg", 60), ("grazing_to_deg", 80)):
         assert abs(found[name].value - true) <= 2.5 * found[name].uncertainty < 15
 
 
 def test_what_frames_do_not_determine_is_said() -> None:
-    frame = SOFT.measure(WALLS[0], CAMERA, np.random.default_rng(0))
+    (frame,) = frames_of(SOFT, WALLS[:1])
     fit = fit_depth_model([frame], CAMERA, "d405")
     assert not fit.estimates["distance_exponent"].determined
     assert "one distance only" in fit.estimates["distance_exponent"].note

@@ -30,8 +30,9 @@ READY = PANDA.arm.home
 ARMS = ("panda", "ur5", "ur5e", "iiwa14", "xarm6")
 
 
-def random_joints(n, seed=0, arm=PANDA):
-    return np.random.default_rng(seed).uniform(arm.limits.lower, arm.limits.upper, (n, arm.joints))
+def random_turns(n, seed=0, arm=PANDA):
+    low, high = np.maximum(arm.limits.lower, -np.pi), np.minimum(arm.limits.upper, np.pi)
+    return np.random.default_rng(seed).uniform(low, high, (n, arm.joints))
 
 
 def cloud(n=3000, seed=0):
@@ -102,7 +103,7 @@ def test_the_surface_of_every_link_is_inside_its_spheres_which_are_few_and_close
 def test_levers_bound_how_far_a_sphere_is_from_each_axis(name):
     arm = GraspingArm(find_arm(name), HAND)
     body = space_of(arm=arm).bodies[True]
-    q = random_joints(300, arm=arm)
+    q = random_turns(300, arm=arm)
     frames, centers = placed(arm, body, q, 0.05)
     for j in range(arm.joints):
         axes, at = frames[:, j, :3, 2], frames[:, j, :3, 3]
@@ -115,7 +116,7 @@ def test_levers_bound_how_far_a_sphere_is_from_each_axis(name):
 @pytest.mark.parametrize("name", ARMS)
 def test_what_is_called_free_of_itself_never_penetrates_by_coal(name):
     arm = GraspingArm(find_arm(name), HAND)
-    q = random_joints(500, arm=arm)
+    q = random_turns(500, arm=arm)
     space = space_of(T_table_base=upright(5.0), arm=arm)
     free = space.blame(q, np.full(len(q), 0.05), with_hand=False) == FREE
     shapes = arm.arm.shapes
@@ -156,7 +157,7 @@ def test_a_free_move_keeps_half_its_clearance_along_its_whole_length():
     obstacles, config = cloud(400), ArmSpaceConfig()
     space = space_of(obstacles)
     tree, body = KDTree(obstacles.points), space.bodies[True]
-    q = random_joints(3000, seed=5)
+    q = random_turns(3000, seed=5)
     q = q[space.blame(q, np.full(len(q), 0.05), with_hand=True) == FREE]
     moves = np.stack([q[:-1], q[:-1] + np.clip(np.diff(q, axis=0), -0.5, 0.5)], axis=1)
     free = space.blame_moves(moves, np.full(len(moves), 0.05), with_hand=True) == FREE
@@ -193,11 +194,6 @@ def test_clearances_that_cannot_be_checked_are_refused():
 
 # --- An arm with a hand: kinematics both ways, how far it reaches, and its URDF.
 FOUR_ARMS = ("panda", "ur5", "iiwa14", "xarm6")
-
-
-def random_turns(n, seed=0, arm=PANDA):
-    low, high = np.maximum(arm.limits.lower, -np.pi), np.minimum(arm.limits.upper, np.pi)
-    return np.random.default_rng(seed).uniform(low, high, (n, arm.joints))
 
 
 def test_the_ready_pose_is_franka_s():

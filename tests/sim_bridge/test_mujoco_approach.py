@@ -1,19 +1,13 @@
 """Fingers are moved together in free air only."""
 
-from itertools import product
-
 import numpy as np
 
 from realsim.geometry import se3
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.slip.mujoco_approach import CLEARANCE_M, advanced_fingers, surface_triangles
+from trimesh_solids import box
 
 HAND = find_hand()
-
-
-def box(center, size):
-    signs = np.array(list(product((-0.5, 0.5), repeat=3)))
-    return np.asarray(center) + signs * np.asarray(size)
 
 
 def advanced(parts, Ts, opening=0.08):
@@ -27,7 +21,7 @@ def scattered(n, seed=0):
 
 def test_no_point_of_the_surface_is_nearer_than_the_clearance_and_one_is_as_near():
     rng = np.random.default_rng(1)
-    parts = (rng.uniform(-0.03, 0.03, (20, 3)), box([0.02, 0.0, 0.0], [0.06, 0.01, 0.02]))
+    parts = (rng.uniform(-0.03, 0.03, (20, 3)), box([0.06, 0.01, 0.02], [0.02, 0.0, 0.0]).vertices)
     triangles, Ts = surface_triangles(parts), scattered(40)
     weights = rng.dirichlet(np.ones(3), size=(len(triangles), 3000))
     points = np.einsum("tnc,tcd->tnd", weights, triangles).reshape(-1, 3)
@@ -35,9 +29,8 @@ def test_no_point_of_the_surface_is_nearer_than_the_clearance_and_one_is_as_near
     found, exact = advanced(parts, Ts), 0
     for T, y in zip(Ts, found, strict=True):
         p = se3.transform(se3.invert(T), points)
-        within = (low[[0, 2]] < p[:, [0, 2]]).all(axis=1) & (p[:, [0, 2]] < high[[0, 2]]).all(
-            axis=1
-        )
+        across = p[:, [0, 2]]
+        within = np.all((low[[0, 2]] < across) & (across < high[[0, 2]]), axis=1)
         between = np.abs(p[within & (np.abs(p[:, 1]) < 0.04), 1])
         if len(between) and between.max() + CLEARANCE_M < 0.04:
             assert between.max() <= y - CLEARANCE_M + 1e-12
@@ -46,7 +39,7 @@ def test_no_point_of_the_surface_is_nearer_than_the_clearance_and_one_is_as_near
 
 
 def test_the_fingers_never_open_and_stay_where_nothing_is_between_them():
-    small = (box([0, 0, 0], [0.02, 0.02, 0.02]),)
+    small = (box([0.02, 0.02, 0.02]).vertices,)
     Ts = scattered(40, 3)
     assert (advanced(small, Ts, 0.03) <= 0.015).all()
     away = se3.from_translation([0.0, 0.0, -0.2])[None]
@@ -54,5 +47,5 @@ def test_the_fingers_never_open_and_stay_where_nothing_is_between_them():
 
 
 def test_a_face_that_passes_through_the_sweep_counts_although_no_corner_is_inside():
-    beam = (box([0, 0, 0], [0.3, 0.03, 0.3]),)
+    beam = (box([0.3, 0.03, 0.3]).vertices,)
     assert np.allclose(advanced(beam, np.eye(4)[None]), 0.015 + CLEARANCE_M)

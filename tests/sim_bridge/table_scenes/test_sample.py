@@ -55,13 +55,7 @@ def _built() -> BuiltScene:
 
 def _bodies(built: BuiltScene) -> dict[int, SlipBody]:
     return {
-        obj_id: SlipBody(
-            parts=solid.parts.parts,
-            mass_kg=solid.matter.mass_kg,
-            center_of_mass=solid.matter.center_of_mass,
-            inertia=solid.matter.inertia,
-        )
-        for obj_id, solid in built.solids.items()
+        obj_id: SlipBody.of(solid.parts, solid.matter) for obj_id, solid in built.solids.items()
     }
 
 
