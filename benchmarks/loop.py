@@ -21,7 +21,7 @@ from realsim.app.demo.run import DemoConfig, run_demo
 from realsim.app.truth import GOALS
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.slip.engines import BulletSettings
-from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
+from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
 from realsim_sim_bridge.slip.world import Replay, SlipPhysics
 from realsim_sim_bridge.validation.specimens import DOWN, cube_trial
@@ -68,12 +68,10 @@ def held_box(given: argparse.Namespace) -> Found:
         engine=BulletSettings(iterations=50, friction_anchor=False, replay=Replay()),
     )
     ours, default = (run_slip_test(trial, config) for config in (SlipConfig(sure=None), bare))
-    tried = np.ones(1, dtype=bool)
-    score = score_stages(default.slip_m, default.slip_rad, tried, ScoreLimits())[1][0]
     return Found(figures={
         "box_slip_mm": 1e3 * float(ours.slip_m.max()),
         "box_slip_deg": float(np.degrees(ours.slip_rad.max())),
-        "default_world_score": float(score),
+        "default_world_score": float(default.scores(ScoreLimits())[1][0]),
     })  # fmt: skip
 
 

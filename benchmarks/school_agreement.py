@@ -37,7 +37,7 @@ from realsim_sim_bridge.school.measure_statistics import closure_confusions, ran
 from realsim_sim_bridge.school.school import run_school
 from realsim_sim_bridge.school.sweep import SweepConfig
 from realsim_sim_bridge.slip.engines import make_engine, settings_of
-from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
+from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import run_slip_test
 from realsim_sim_bridge.validation.config import ReferenceConfig, ValidationConfig
 from realsim_sim_bridge.validation.labels import PATIENT, ReferenceLabels, reference_labels
@@ -83,9 +83,7 @@ def labels_of(attempt: Attempt) -> Labels:
     if attempt.kind == "fast":
         config = replace(config, sure=None)
     slips = run_slip_test(trial, config, PATIENT)
-    tried = np.ones(len(trial), dtype=np.bool_)
-    _, score = score_stages(slips.slip_m, slips.slip_rad, tried, ScoreLimits())
-    return Labels(held=slips.passed, passed=score >= 1.0)
+    return Labels(held=slips.passed, passed=slips.scores(ScoreLimits())[1] >= 1.0)
 
 
 def agreement(seed: int, keep: Path, quick: bool) -> Found:

@@ -7,7 +7,6 @@ has none, and the reference is where the scene has it: the slip is how far the c
 it. In the other stages the reference is where the stage before left it.
 """
 
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
@@ -216,10 +215,9 @@ class _SlipTest:
         """Go through all stages with all worlds side by side."""
         config = self._config
         with ExitStack() as stack:
-            worlds = [
-                (rows, stack.enter_context(self._world(rows)))
-                for rows in self._parts(np.arange(len(self._trial)))
-            ]
+            every = np.arange(len(self._trial))
+            parts = (every[k] for k in batches(len(every), self._engine.pairs_per_world))
+            worlds = [(rows, stack.enter_context(self._world(rows))) for rows in parts]
             for rows, world in worlds:
                 start = world.states().Ts_world_body
                 self._observe(CLOSE, rows, start, world.close(self._config.closing))
@@ -346,11 +344,6 @@ class _SlipTest:
             self._geometry,
             self._trial.stand,
         )
-
-    def _parts(self, rows: Rows) -> Iterator[Rows]:
-        """Yield rows in worlds' worth."""
-        for part in batches(len(rows), self._engine.pairs_per_world):
-            yield rows[part]
 
     # --- what is seen --------------------------------------------------------------------------
 
