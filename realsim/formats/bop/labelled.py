@@ -20,6 +20,7 @@ from realsim.formats.bop.scene import BopSceneRef
 from realsim.formats.folders.listing import shown
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
+from realsim.formats.plausible_camera import require_plausible
 from realsim.records import CameraIntrinsics, ObjectModel
 from realsim.records import bop_units as units
 from realsim.untrusted.json_text import read_json
@@ -152,6 +153,7 @@ class BopLabelledScene:
                     "distortion, such as HOT3D's fisheye. Undistort the images first."
                 )
             self._intrinsics[key] = units.intrinsics_of(row, *size, self._named(index))
+            require_plausible(self._intrinsics[key], self._named(index))
         return self._intrinsics[key]
 
     def depth_unit_m(self, index: int) -> float | None:

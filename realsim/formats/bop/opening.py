@@ -118,6 +118,11 @@ def _ground_truth(
     without = [i for i in cameras if i not in truth.rows]
     if without:
         notes.append(f"{file.name} has no entry for {len(without)} of {len(cameras)} images.")
+    if beyond := [str(i) for i in truth.rows if i not in cameras]:
+        notes.append(
+            f"{file.name} has labels of images that are not there; they are left out: "
+            f"{shown(beyond, 12)}."
+        )
     return truth
 
 
@@ -198,6 +203,7 @@ def _models(
 def _check(scene: BopLabelledScene, infos: Mapping[int, Sequence[Json]]) -> None:
     """Check every camera and what the labels say of units, directions and order."""
     poses: dict[int, Array | None] = {}
+    beside: list[str] = []
     where = str(scene.ref.folder)
     for i in scene.indices:
         camera = scene.intrinsics(i)
@@ -205,6 +211,13 @@ def _check(scene: BopLabelledScene, infos: Mapping[int, Sequence[Json]]) -> None
         if unit_m is not None:  # the record knows which units a count may have
             CaptureSession(name=scene.name, intrinsics=camera, views=(), depth_unit_m=unit_m)
         poses[i] = scene.T_world_cam(i)
+        if not (0 <= camera.cx < camera.width and 0 <= camera.cy < camera.height):
+            beside.append(str(i))
+    if beside:
+        scene.notes_found.append(
+            f"cam_K has its principal point outside of image {shown(beside, 12)}: is it of another "
+            "camera, or of another image size?"
+        )
     truth = scene.truth
     if truth is None:
         return
