@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from realsim.arrays import Int64, UInt8
+from realsim.arrays import Int64
 
 INK, MUTED, FAINT = "#22303c", "#8a99a8", "#dfe5ea"
 GOOD, WARN, BAD = "#1b9e8a", "#e69f00", "#c8502f"
@@ -38,10 +38,15 @@ def figure(width_px: float = WIDTH_PX, height_px: float = HEIGHT_PX) -> Any:
     return Figure(figsize=size, dpi=PIXELS_A_POINT * DPI, layout="constrained")
 
 
-def axes(height_px: float = HEIGHT_PX, width_px: float = WIDTH_PX) -> tuple[Any, Any]:
-    """Return a figure and its axes without the frame that nobody reads."""
+def axes(
+    title: str = "", x: str = "", y: str = "", *,
+    height_px: float = HEIGHT_PX, width_px: float = WIDTH_PX,
+) -> tuple[Any, Any]:  # fmt: skip
+    """Return a figure and its axes, titled, without the frame that nobody reads."""
     drawn = figure(width_px, height_px)
-    return drawn, plain(drawn.add_subplot(1, 1, 1))
+    ax = plain(drawn.add_subplot(1, 1, 1))
+    titled(ax, title, x, y)
+    return drawn, ax
 
 
 def columns(count: int, height_px: float = HEIGHT_PX) -> tuple[Any, list[Any]]:
@@ -93,11 +98,10 @@ def bars(
     names: Sequence[str], values: Sequence[float], colors: str | Sequence[str], title: str, x: str
 ) -> tuple[Any, Any]:
     """Return a figure and its axes with a named horizontal bar a row, the first one on top."""
-    drawn, ax = axes(height_px=90 + BAR_PX * max(3, len(names)))
+    drawn, ax = axes(title, x, height_px=90 + BAR_PX * max(3, len(names)))
     ax.barh(range(len(names)), values, 0.7, color=colors)
     ax.set_yticks(range(len(names)), names)
     ax.invert_yaxis()
-    titled(ax, title, x, "")
     return drawn, ax
 
 
@@ -113,11 +117,3 @@ def png(drawn: Any, software: str | None = None, paper: str = "white") -> bytes:
             drawn.set_layout_engine(None)
         drawn.savefig(buffer, format="png", facecolor=paper, metadata={"Software": software})
     return buffer.getvalue()
-
-
-def rgb(drawn: Any) -> UInt8:
-    """Return the figure as a picture (H, W, 3)."""
-    import cv2
-
-    data = np.frombuffer(png(drawn), np.uint8)
-    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR_RGB), np.uint8)

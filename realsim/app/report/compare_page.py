@@ -29,7 +29,6 @@ from realsim.pages.plots import (
     axes,
     legend,
     png,
-    titled,
     whole_numbers,
 )
 
@@ -286,7 +285,7 @@ def overlaid(sessions: Series) -> list[tuple[bytes, str]]:
     for name, title, x, y in BY_VIEW:
         mine = [(label, s[name], k) for k, (label, s) in enumerate(sessions) if _views(s, name)]
         if len(mine) > 1:
-            figure, ax = axes()
+            figure, ax = axes(title, x, y)
             for label, values, k in mine:
                 style = {"color": SERIES[k % 6], "marker": MARKERS[k % 6], "ls": STYLES[k % 6]}
                 # The first ones larger: equal values would hide them.
@@ -295,12 +294,11 @@ def overlaid(sessions: Series) -> list[tuple[bytes, str]]:
             ax.set_ylim(0, 1.3 * max(ax.get_ylim()[1], 1e-9))
             whole_numbers(ax.xaxis)
             legend(ax, loc="upper left", ncols=2)
-            titled(ax, title, x, y)
             drawn.append((png(figure), f"{title}: {_labels(mine)}."))
     for name, title, x, y in SHARES:
         mine = [(label, s[name], k) for k, (label, s) in enumerate(sessions) if s.get(name)]
         if len(mine) > 1:
-            figure, ax = axes()
+            figure, ax = axes(title, x, y)
             edges = np.linspace(0, 1, 21)
             for label, values, k in mine:
                 counts, _ = np.histogram(values, edges)
@@ -308,7 +306,6 @@ def overlaid(sessions: Series) -> list[tuple[bytes, str]]:
                 ax.stairs(share, edges, color=SERIES[k % 6], ls=STYLES[k % 6], lw=2, label=label)
             ax.set_ylim(0, 1.25 * max(ax.get_ylim()[1], 1e-9))
             legend(ax, loc="upper left", ncols=2)
-            titled(ax, title, x, y)
             drawn.append((png(figure), f"{title}: {_labels(mine)}."))
     return drawn
 
@@ -326,7 +323,9 @@ def moves(objects: Sequence[ObjectDifference], labels: str) -> bytes | None:
     rows = [o for o in objects if o.shift_mm is not None]
     if not rows:
         return None
-    figure, ax = axes(height_px=100 + BAR_PX * max(3, len(rows)))
+    title = f"How far the objects stand apart, {labels}"
+    height_px = 100 + BAR_PX * max(3, len(rows))
+    figure, ax = axes(title, "distance of the middle [mm]", height_px=height_px)
     places = np.arange(len(rows))
     ax.barh(places, [o.shift_mm or 0.0 for o in rows], 0.6, color=SERIES[0])
     noise = [2 * o.sigma_mm if o.sigma_mm is not None else np.nan for o in rows]
@@ -336,5 +335,4 @@ def moves(objects: Sequence[ObjectDifference], labels: str) -> bytes | None:
     ax.margins(x=0.1)
     ax.tick_params(axis="y", colors=INK)
     ax.axvline(0, color=MUTED, lw=1)
-    titled(ax, f"How far the objects stand apart, {labels}", "distance of the middle [mm]", "")
     return png(figure)

@@ -19,7 +19,6 @@ from realsim.pages.plots import (
     legend,
     png,
     share_bars,
-    titled,
     whole_numbers,
 )
 from realsim.records import STAGES, GraspSet, HandEye
@@ -30,7 +29,7 @@ OUTLIER = 2.5
 
 def board_residuals(hand_eye: HandEye) -> bytes:
     """Plot how well every board view is predicted through the robot pose."""
-    figure, ax = axes()
+    figure, ax = axes("Residuals of the board views", "board view", "RMS reprojection [px]")
     views, rms = list(hand_eye.view_indices), np.asarray(hand_eye.view_rms_px)
     far = rms > OUTLIER * np.median(rms)
     ax.bar(views, rms, 0.8, color=np.where(far, WARN, GOOD).tolist())
@@ -41,13 +40,16 @@ def board_residuals(hand_eye: HandEye) -> bytes:
         legend(ax, loc="upper left")
     ax.set_ylim(0, 1.25 * max(float(rms.max()), unseen))
     whole_numbers(ax.xaxis)
-    titled(ax, "Residuals of the board views", "board view", "RMS reprojection [px]")
     return png(figure)
 
 
 def board_directions(hand_eye: HandEye, Ts_base_ee: Sequence[Array]) -> bytes:
     """Plot how the arm turned the camera: tilt from straight down, and roll."""
-    figure, ax = axes()
+    figure, ax = axes(
+        "Diversity of the board views: spread is good",
+        "direction of the image's x axis [deg]",
+        "tilt from straight down [deg]",
+    )
     T = np.stack(Ts_base_ee) @ hand_eye.T_ee_cam
     tilt = np.degrees(np.arccos(np.clip(-T[:, 2, 2], -1, 1)))
     roll = np.degrees(np.arctan2(T[:, 1, 0], T[:, 0, 0]))
@@ -55,27 +57,26 @@ def board_directions(hand_eye: HandEye, Ts_base_ee: Sequence[Array]) -> bytes:
     ax.set_xlim(-185, 185)
     ax.set_xticks([-180, -90, 0, 90, 180])
     ax.set_ylim(bottom=0)
-    titled(
-        ax, "Diversity of the board views: spread is good", "direction of the image's x axis [deg]",
-        "tilt from straight down [deg]",
-    )  # fmt: skip
     return png(figure)
 
 
 def intrinsics_change(names: Sequence[str], values: Sequence[float], sd: Sequence[float]) -> bytes:
     """Plot the calibrated lens against the camera that was given, in pixels."""
-    figure, ax = axes()
+    figure, ax = axes(
+        "Lens as calibrated less the given camera (bars: 2 sigma)", "", "difference [px]"
+    )
     ax.axhline(0, color=MUTED, lw=1)
     ax.errorbar(range(len(names)), values, yerr=2 * np.asarray(sd), fmt="o", color=INK, capsize=4)
     ax.set_xticks(range(len(names)), names)
     ax.margins(x=0.2)
-    titled(ax, "Lens as calibrated less the given camera (bars: 2 sigma)", "", "difference [px]")
     return png(figure)
 
 
 def coverage(Ts_base_cam: Array, center: Array, captured: Sequence[bool]) -> bytes:
     """Plot from which directions the planned views look at the scene's middle, as from above."""
-    figure, ax = axes()
+    figure, ax = axes(
+        "Directions from which the views look at the scene", "azimuth [deg]", "elevation [deg]"
+    )
     away = Ts_base_cam[:, :3, 3] - center
     distance = np.linalg.norm(away, axis=1)
     azimuth = np.degrees(np.arctan2(away[:, 1], away[:, 0]))
@@ -93,24 +94,20 @@ def coverage(Ts_base_cam: Array, center: Array, captured: Sequence[bool]) -> byt
     ax.set_ylim(0, 95)
     if not done.all():
         legend(ax, loc="upper right")
-    titled(
-        ax, "Directions from which the views look at the scene", "azimuth [deg]", "elevation [deg]"
-    )
     return png(figure)
 
 
 def settling(settle_s: Mapping[int, float]) -> bytes:
     """Plot how long the arm took to stand still before every view."""
-    figure, ax = axes()
+    figure, ax = axes("Time until the arm stood still", "view", "settling [ms]")
     ax.bar(list(settle_s), [1e3 * v for v in settle_s.values()], 0.8, color=GOOD)
     whole_numbers(ax.xaxis)
-    titled(ax, "Time until the arm stood still", "view", "settling [ms]")
     return png(figure)
 
 
 def photographs(measured: Mapping[int, Mapping[str, float]]) -> bytes:
     """Plot the sharpness and the depth of every photograph."""
-    figure, ax = axes()
+    figure, ax = axes("Checks of the photographs", "view", "share")
     views = list(measured)
     for name, label, marker, color in (
         ("depth_fill", "pixels with depth", "o", GOOD),
@@ -122,20 +119,18 @@ def photographs(measured: Mapping[int, Mapping[str, float]]) -> bytes:
     ax.set_ylim(0, 1.25)
     legend(ax, loc="upper left", ncols=2)
     whole_numbers(ax.xaxis)
-    titled(ax, "Checks of the photographs", "view", "share")
     return png(figure)
 
 
 def camera_moves(before: Mapping[int, Array], after: Mapping[int, Array]) -> bytes:
     """Plot how far registration moved every camera."""
-    figure, ax = axes()
+    figure, ax = axes("Cameras before and after registration", "view", "moved by [mm]")
     views = [k for k in sorted(after) if k in before]
     deltas = np.stack([se3.invert(before[k]) @ after[k] for k in views])
     mm = 1e3 * np.linalg.norm(deltas[:, :3, 3], axis=1)
     far = mm > OUTLIER * max(1e-12, float(np.median(mm)))
     ax.bar(views, mm, 0.8, color=np.where(far, WARN, GOOD).tolist())
     whole_numbers(ax.xaxis)
-    titled(ax, "Cameras before and after registration", "view", "moved by [mm]")
     return png(figure)
 
 
@@ -166,7 +161,7 @@ def probabilities(
 
 def view_uncertainty(sigma_px: Mapping[int, Sequence[float]], left_out: Sequence[int]) -> bytes:
     """Plot how certain the objects are in every view: median, least and greatest."""
-    figure, ax = axes()
+    figure, ax = axes("Where the labels lie in every view, 1 sigma", "view", "1 sigma [px]")
     views = sorted(sigma_px)
     rows = [np.asarray(sigma_px[k], dtype=np.float64) for k in views]
     middle = np.array([np.median(r) for r in rows])
@@ -179,7 +174,6 @@ def view_uncertainty(sigma_px: Mapping[int, Sequence[float]], left_out: Sequence
     ax.set_ylim(0, 1.35 * float(high.max()))
     whole_numbers(ax.xaxis)
     legend(ax, loc="upper left", ncols=3)
-    titled(ax, "Where the labels lie in every view, 1 sigma", "view", "1 sigma [px]")
     return png(figure)
 
 
@@ -197,14 +191,15 @@ def stages(tried: int, reachable: int, base_scores: Array) -> bytes:
     names = ["tried", "reached by the arm", *[f"passed: {s}" for s in STAGES]]
     passed = [int(np.sum(base_scores >= 0.25 * (k + 1))) for k in range(len(STAGES))]
     counts = [tried, reachable, *passed]
-    figure, ax = axes(height_px=90 + BAR_PX * len(names))
+    figure, ax = axes(
+        "Grasps through the four stages", "grasps", "", height_px=90 + BAR_PX * len(names)
+    )
     bars = ax.barh(names, counts, 0.7, color=[MUTED, MUTED, *[GOOD] * len(STAGES)])
     labels = [f"{n} ({100 * n / max(1, tried):.0f} %)" for n in counts]
     ax.bar_label(bars, labels, fontsize=8, padding=3, color=INK)
     ax.set_xlim(0, 1.2 * max(1, *counts))
     ax.invert_yaxis()
     whole_numbers(ax.xaxis)
-    titled(ax, "Grasps through the four stages", "grasps", "")
     return png(figure)
 
 
@@ -220,7 +215,11 @@ def labels(sets: Sequence[GraspSet]) -> bytes:
 
 def slips(slip_mm: Array, slip_deg: Array) -> bytes:
     """Plot how far objects slipped in grasps that kept them, and how far they turned."""
-    figure, ax = axes()
+    figure, ax = axes(
+        f"Largest slip of {len(slip_mm)} grasps that kept their object",
+        "slip in the hand [mm]",
+        "turn in the hand [deg]",
+    )
     ax.scatter(slip_mm, slip_deg, s=14, color=INK, alpha=0.6, linewidths=0)
     ax.set_xscale("symlog", linthresh=0.1)
     ax.set_yscale("symlog", linthresh=0.1)
@@ -228,8 +227,6 @@ def slips(slip_mm: Array, slip_deg: Array) -> bytes:
     ax.set_ylim(bottom=0)
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_formatter("{x:g}")
-    titled(ax, f"Largest slip of {len(slip_mm)} grasps that kept their object",
-           "slip in the hand [mm]", "turn in the hand [deg]")  # fmt: skip
     return png(figure)
 
 
@@ -240,14 +237,13 @@ def failures(counts: Mapping[str, int]) -> bytes:
     if rest:
         shown.append((f"{len(rest)} other reasons", sum(n for _, n in rest)))
     names = [_shortened(name) for name, _ in shown]
-    figure, ax = axes(height_px=90 + BAR_PX * len(shown))
+    figure, ax = axes("Where grasps failed", "grasps", "", height_px=90 + BAR_PX * len(shown))
     bars = ax.barh(range(len(shown)), [n for _, n in shown], 0.7, color=WARN)
     ax.set_yticks(range(len(shown)), names, fontsize=8)
     ax.bar_label(bars, fontsize=8, padding=3, color=INK)
     ax.margins(x=0.15)
     ax.invert_yaxis()
     whole_numbers(ax.xaxis)
-    titled(ax, "Where grasps failed", "grasps", "")
     return png(figure)
 
 
@@ -258,8 +254,9 @@ def _shortened(name: str) -> str:
 
 def visibility(shares: Array) -> bytes:
     """Plot how visible the objects are in the frames."""
-    figure, ax = axes()
+    figure, ax = axes(
+        f"Visible share of {len(shares)} objects in frames", "visible share", "number"
+    )
     ax.hist(shares, np.linspace(0, 1, 21).tolist(), color=GOOD, rwidth=0.9)
     whole_numbers(ax.yaxis)
-    titled(ax, f"Visible share of {len(shares)} objects in frames", "visible share", "number")
     return png(figure)

@@ -44,8 +44,8 @@ def figures(stats: Statistics) -> list[tuple[str, int, list[Drawn]]]:
 
 
 def _outcomes(stats: Statistics) -> Drawn:
-    figure, ax = plots.axes()
     school = stats.school.by_paper or stats.school
+    figure, ax = plots.axes(f"{school.judged:,} candidates, score_paper", "share [%]")
     names = [n for n in OUTCOME_NAMES if school.outcomes[n] or n in PAPER_OUTCOMES]
     rows = np.arange(len(names))
     here = [100 * school.share(school.outcomes[n]) for n in names]
@@ -61,7 +61,6 @@ def _outcomes(stats: Statistics) -> Drawn:
     ax.set_yticks(rows, [OUTCOME_NAMES[n] for n in names])
     ax.invert_yaxis()
     ax.margins(x=0.12)
-    plots.titled(ax, f"{school.judged:,} candidates, score_paper", "share [%]", "")
     return plots.png(figure), "Coloured: here. Grey: in the paper."
 
 
@@ -77,9 +76,11 @@ def _sets(stats: Statistics) -> list[GraspSet]:
 
 
 def _closure(stats: Statistics) -> Drawn:
-    figure, right = plots.axes()
     sets = _sets(stats)
     name = label_chart(sets)[2]
+    figure, right = plots.axes(
+        f"{name} by the friction that closes", "least friction that closes", name
+    )
     groups: dict[float, list[float]] = {}
     for s in sets:
         friction = s.measures.get("closure_friction")
@@ -96,7 +97,6 @@ def _closure(stats: Statistics) -> Drawn:
         right.text(k, 1.04, f"{len(values)}", ha="center", fontsize=7, color=plots.MUTED)
     right.set_xticks(range(len(levels)), ["none" if np.isinf(v) else f"{v:g}" for v in levels])
     right.set_ylim(-0.02, 1.12)
-    plots.titled(right, f"{name} by the friction that closes", "least friction that closes", name)
     if not levels:
         right.text(
             0.5, 0.5, "force closure was not computed", ha="center", color=plots.MUTED, fontsize=9
