@@ -46,7 +46,7 @@ def test_records_can_be_compared_and_hashed_as_things():
         (lambda: CameraIntrinsics(width=1, height=1, fx=-1, fy=1, cx=0, cy=0), "focal length fx"),
         (lambda: dataclasses.replace(CAMERA, distortion=np.ones(12)), "12 distortion coefficients"),
         (
-            lambda: CaptureSession(name="s", intrinsics=CAMERA, views=(), depth_unit_m=1.0),
+            lambda: CaptureSession(name="s", intrinsics=CAMERA, depth_unit_m=1.0),
             "depth unit is 1.0",
         ),
         (

@@ -86,10 +86,11 @@ def loop_errors(store: SessionStore, truth_folder: Path) -> LoopErrors:
 
     truth = load_truth(truth_folder)
     models = session_models(store)
-    views = [(v.index, v.T_world_cam) for v in store.session.views if v.T_world_cam is not None]
     reported = [(v.index, v.T_base_ee) for v in store.session.views if v.T_base_ee is not None]
     true_cameras = {v.index: v.T_world_cam for v in truth.views}
-    cameras = np.stack([se3.invert(true_cameras[i]) @ T for i, T in views])
+    cameras = np.stack(
+        [se3.invert(true_cameras[i]) @ T for i, T in store.session.Ts_world_cam.items()]
+    )
     true_objects = {o.instance: o.T_world_obj for o in truth.objects}
 
     seen = np.stack([se3.invert(T) @ true_cameras[i] for i, T in reported])

@@ -109,7 +109,7 @@ def open(
     done = sorted(path.stem for path in store.path("stages").glob("*.json"))
     rows = [["views", f"{len(views)}, {camera.width} x {camera.height} px"],
             ["views with a robot pose", str(sum(v.T_base_ee is not None for v in views))],
-            ["views with a camera pose", str(sum(v.T_world_cam is not None for v in views))],
+            ["views with a camera pose", str(len(store.session.Ts_world_cam))],
             ["stages done", ", ".join(done) or "none"]]  # fmt: skip
     told.tables.append((store.session.name, ["session", "value"], rows))
     return _made("open", store.folder, store.session, told, "reports/views.png")

@@ -128,7 +128,7 @@ class CaptureSession:
 
     name: str
     intrinsics: CameraIntrinsics
-    views: tuple[View, ...]
+    views: tuple[View, ...] = ()
     depth_unit_m: float
     """Metres per unit of the 16-bit depth images (BOP's depth_scale / 1000)."""
 
@@ -142,6 +142,11 @@ class CaptureSession:
         indices = [v.index for v in self.views]
         if len(set(indices)) != len(indices):
             raise InputError(f"session '{self.name}' has two views of the same number.")
+
+    @property
+    def Ts_world_cam(self) -> dict[int, Array]:
+        """Return where the camera stood, of every view that says it, by the view's number."""
+        return {v.index: v.T_world_cam for v in self.views if v.T_world_cam is not None}
 
     def view(self, index: int) -> View:
         """Return the view with this number.

@@ -280,7 +280,6 @@ def _recovered_header(folder: Path, begun: dict[str, Any] | None) -> dict[str, A
         session = CaptureSession(
             name=folder.resolve().name,
             intrinsics=bop_units.intrinsics_of(entry, width, height, CAMERA_FILE),
-            views=(),
             depth_unit_m=bop_units.depth_unit_of(entry, CAMERA_FILE),
         )
         Ts = {k: bop_units.T_world_cam_of(e, f"{CAMERA_FILE}, {k}") for k, e in cameras.items()}

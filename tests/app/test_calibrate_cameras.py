@@ -286,7 +286,7 @@ def test_board_views_of_a_session(photos: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     views = tuple(View(index=k, T_base_ee=T) for k, T in enumerate(hands(rng)))
     capture = tmp_path / "session/calibration/capture"
-    session = CaptureSession(name="board", intrinsics=CAMERA, views=(), depth_unit_m=0.001)
+    session = CaptureSession(name="board", intrinsics=CAMERA, depth_unit_m=0.001)
     store = SessionStore.create(capture, session)
     depth = np.zeros((CAMERA.height, CAMERA.width), np.uint16)
     for view in views:

@@ -12,7 +12,7 @@ from realsim.app import stages
 from realsim.app.console import Console
 from realsim.app.register.config import RegisterRequest, config_of, load_depth_bias
 from realsim.app.register.inputs import read_inputs
-from realsim.app.register.results import cameras_now, claimed_cameras, load_registered
+from realsim.app.register.results import claimed_cameras, load_registered
 from realsim.app.register.run import register_session
 from realsim.errors import InputError
 from realsim.formats.bop.models import save_models
@@ -76,9 +76,9 @@ def test_a_second_run_computes_nothing_and_starts_from_the_claimed_cameras(
 ) -> None:
     folder, first = registered
     store = SessionStore.open(folder)
-    claimed = cameras_now(SessionStore.open(few_views))
+    claimed = SessionStore.open(few_views).session.Ts_world_cam
     assert all(np.array_equal(claimed_cameras(store)[k], claimed[k]) for k in claimed)
-    refined = cameras_now(store)
+    refined = store.session.Ts_world_cam
     assert not np.array_equal(refined[0], claimed[0])
     before = {p: p.stat().st_mtime_ns for p in folder.rglob("*.json")}
     assert invoked("register", folder, "--quiet").output == first.output
@@ -86,7 +86,7 @@ def test_a_second_run_computes_nothing_and_starts_from_the_claimed_cameras(
     # A calibration that sets the same claims again does not undo the refinement.
     store.set_cameras(store.session.intrinsics, claimed)
     register_session(SessionStore.open(folder), QUIET)
-    now = cameras_now(SessionStore.open(folder))
+    now = SessionStore.open(folder).session.Ts_world_cam
     assert all(np.allclose(now[k], refined[k], rtol=0, atol=1e-14) for k in refined)
 
 
@@ -192,7 +192,8 @@ def test_the_key_changes_with_everything_that_matters(session: Path) -> None:
     save_models(store.path("models"), models | {larger.obj_id: larger})
     keys.add(read_inputs(store, base).key)
     store.set_cameras(
-        store.session.intrinsics, {0: cameras_now(store)[0] @ se3.from_translation([1e-4, 0, 0])}
+        store.session.intrinsics,
+        {0: store.session.Ts_world_cam[0] @ se3.from_translation([1e-4, 0, 0])},
     )
     keys.add(read_inputs(store, base).key)
     assert len(keys) == len(others) + 2 and key not in keys
@@ -260,4 +261,4 @@ def test_hand_held_cameras_are_found_once_and_kept(tmp_path: Path) -> None:
         np.testing.assert_allclose(inputs.claimed[k], T, atol=1e-12)
     again = SessionStore.open(store.folder)
     assert read_inputs(again, request).key == inputs.key
-    assert set(cameras_now(again)) == set(range(5))
+    assert set(again.session.Ts_world_cam) == set(range(5))

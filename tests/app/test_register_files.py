@@ -16,14 +16,13 @@ from realsim.app.register.results import (
     NEXT_FILE,
     SCENE_FILE,
     Registered,
-    cameras_now,
     claimed_cameras,
     is_same_cameras,
     load_registered,
     load_seen,
 )
 from realsim.app.register.run import colour_remark
-from realsim.app.report.session import write_report
+from realsim.app.report.session import report_of, write_report
 from realsim.app.stages import judged_scene, registered_views
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectPose, bop_units
@@ -74,10 +73,10 @@ def test_what_is_written_is_read_bit_for_bit(store: SessionStore) -> None:
 def test_the_session_has_the_refined_cameras_and_a_rerun_the_claimed_ones(
     store: SessionStore,
 ) -> None:
-    before = cameras_now(store)
+    before = store.session.Ts_world_cam
     result = registered_by_hand(store, left_out=3)
     write_result(store, result, MODELS, {})
-    now = cameras_now(SessionStore.open(store.folder))
+    now = SessionStore.open(store.folder).session.Ts_world_cam
     for k in (0, 1, 2):
         np.testing.assert_allclose(now[k], result.cameras.refined[k], atol=1e-15)
     assert np.array_equal(now[3], before[3])  # it took no part
@@ -90,7 +89,7 @@ def test_the_session_has_the_refined_cameras_and_a_rerun_the_claimed_ones(
 
 
 def test_cameras_that_were_calibrated_anew_are_the_claim(store: SessionStore) -> None:
-    before = cameras_now(store)
+    before = store.session.Ts_world_cam
     write_result(store, registered_by_hand(store), MODELS, {})
     other = {2: before[2] @ se3.from_translation([0.0, 0.001, 0.0])}
     store.set_cameras(store.session.intrinsics, other)
@@ -182,7 +181,7 @@ def test_an_interrupted_result_of_other_cameras_is_thrown_away(store: SessionSto
     again.set_cameras(again.session.intrinsics, calibrated)
     assert not finish_interrupted(again)
     assert not again.has(NEXT_FILE) and again.path(SCENE_FILE).read_bytes() == scene
-    np.testing.assert_allclose(cameras_now(again)[0], calibrated[0], atol=1e-15)
+    np.testing.assert_allclose(again.session.Ts_world_cam[0], calibrated[0], atol=1e-15)
 
 
 def test_bop_files_are_in_millimetres_and_leave_rejected_objects_out(store: SessionStore) -> None:
@@ -232,20 +231,20 @@ def test_views_that_were_left_out_get_no_labels_and_are_named(store: SessionStor
     assert set(store.read_json("scene_gt.json")) == {"0", "1", "3"}
     assert not store.has("annotations/000002.json") and store.has("annotations/000003.json")
     assert not store.has("mask_visib/000002_000000.png")
-    page = write_report(store, None)
+    page = write_report(store, report_of(store, pictures="kept"))
     shown = {p.name for p in page.parent.glob("overlay_*.png")}
     assert shown == {f"overlay_{k:06d}.png" for k in (0, 1, 3)}
 
 
 def test_an_interrupted_registration_is_finished_by_whoever_comes_next(store: SessionStore) -> None:
     result = registered_by_hand(store, left_out=1)
-    before = {str(k): T.tolist() for k, T in cameras_now(store).items()}
+    before = {str(k): T.tolist() for k, T in store.session.Ts_world_cam.items()}
     files = documents(result, store, MODELS)
     store.write_bytes(NEXT_FILE, atomic.json_bytes({"before": before, "files": files}))
     assert not store.has(SCENE_FILE)
     scene = judged_scene(store)
     assert [o.instance for o in scene.objects] == [0, 1] and not store.has(NEXT_FILE)
-    np.testing.assert_allclose(cameras_now(store)[0], result.cameras.refined[0], atol=1e-15)
+    np.testing.assert_allclose(store.session.Ts_world_cam[0], result.cameras.refined[0], atol=1e-15)
 
 
 # --- depth against colour ---------------------------------------------------------------------

@@ -53,10 +53,7 @@ def test_real_scenes_are_read(tmp_path):
 def test_a_real_scene_makes_the_round_trip(tmp_path):
     scene = bop.read_scene(bop.find_scenes(YCBV)[0])
     session = CaptureSession(
-        name="copy",
-        intrinsics=scene.session.intrinsics,
-        views=(),
-        depth_unit_m=scene.session.depth_unit_m,
+        name="copy", intrinsics=scene.session.intrinsics, depth_unit_m=scene.session.depth_unit_m
     )
     store = SessionStore.create(tmp_path / "test/000050", session)
     store.add_view(View(index=1), scene.rgb(1), scene.depth_m(1))

@@ -16,7 +16,7 @@ from realsim.store.session_check import check_session
 from refusals import refused
 
 CAMERA = CameraIntrinsics(width=60, height=40, fx=60, fy=60, cx=29.5, cy=19.5)
-SESSION = CaptureSession(name="full", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+SESSION = CaptureSession(name="full", intrinsics=CAMERA, depth_unit_m=1e-4)
 PAGE = 4096
 DISK_PAGES = 120
 

@@ -26,7 +26,7 @@ UNIT = 1e-4
 
 
 def empty_session(name="table"):
-    return CaptureSession(name=name, intrinsics=CAMERA, views=(), depth_unit_m=UNIT)
+    return CaptureSession(name=name, intrinsics=CAMERA, depth_unit_m=UNIT)
 
 
 def make_view(index):

@@ -22,7 +22,7 @@ def begun(
     unit_m: float = 1e-4,
 ) -> SessionStore:
     """Return a new session that has no views yet."""
-    session = CaptureSession(name=name, intrinsics=camera, views=(), depth_unit_m=unit_m)
+    session = CaptureSession(name=name, intrinsics=camera, depth_unit_m=unit_m)
     return SessionStore.create(folder, session, extra)
 
 

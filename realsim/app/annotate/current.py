@@ -97,8 +97,8 @@ def annotate_session(
 
 def _is_placed(store: SessionStore) -> bool:
     """Return whether it is known where a further camera stands, in all of its views."""
-    views = store.session.views
-    return bool(views) and all(v.T_world_cam is not None for v in views)
+    session = store.session
+    return 0 < len(session.views) == len(session.Ts_world_cam)
 
 
 def is_annotated(store: SessionStore) -> bool:

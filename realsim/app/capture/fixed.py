@@ -81,7 +81,7 @@ def fixed_stores(
                 )
         else:
             session = CaptureSession(
-                name=f"{store.session.name}-{name}", intrinsics=camera.intrinsics, views=(),
+                name=f"{store.session.name}-{name}", intrinsics=camera.intrinsics,
                 depth_unit_m=camera.depth_unit_m,
             )  # fmt: skip
             header = {"camera": camera.name, "camera_description": camera.description}

@@ -335,10 +335,7 @@ def _session(
         if request.simulated:
             header["lab"] = {"seed": request.seed, "objects": request.objects}
         session = CaptureSession(
-            name=out.resolve().name,
-            intrinsics=camera.intrinsics,
-            views=(),
-            depth_unit_m=camera.depth_unit_m,
+            name=out.resolve().name, intrinsics=camera.intrinsics, depth_unit_m=camera.depth_unit_m
         )
         store = SessionStore.create(folder, session, header)
     _keep_board(out, target)

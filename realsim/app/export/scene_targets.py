@@ -54,12 +54,11 @@ def placed_scene(session: SessionScene) -> "PlacedScene":
         )
         for i, s in solids.items()
     }  # fmt: skip
-    posed = [v for v in store.session.views if v.T_world_cam is not None]
+    posed = list(store.session.Ts_world_cam.items())
     camera = store.session.intrinsics
     cameras = [
-        SceneCamera(name=f"view_{v.index:06d}", intrinsics=camera, T_world_cam=v.T_world_cam)
-        for v in posed[:: max(1, len(posed) // CAMERAS)][:CAMERAS]
-        if v.T_world_cam is not None
+        SceneCamera(name=f"view_{k:06d}", intrinsics=camera, T_world_cam=T)
+        for k, T in posed[:: max(1, len(posed) // CAMERAS)][:CAMERAS]
     ]
     return place_scene(found.scene, found.models, matter, cameras=cameras)
 
@@ -103,7 +102,7 @@ def _engine_scene(
     """Write a session's scene for an engine, under its own name; note the views that stay out."""
     session = session_of(scene)
     written = write(placed_scene(session), folder.below(job.place.name), progress=job.tick)
-    posed = sum(v.T_world_cam is not None for v in session.store.session.views)
+    posed = len(session.store.session.Ts_world_cam)
     notes = list(written.notes)
     if posed > CAMERAS:
         notes.append(f"{CAMERAS} of {posed} views are there as cameras.")

@@ -117,7 +117,7 @@ def _place_cameras(
 
     World is then the first image's camera.
     """
-    if any(v.T_world_cam is not None for v in store.session.views):
+    if store.session.Ts_world_cam:
         return
     placer = CameraPlacer()
     try:

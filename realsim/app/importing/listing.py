@@ -68,7 +68,7 @@ def _bop_rows(root: Path) -> tuple[Sequence[str], list[Sequence[object]]]:
             rows.append((ref.scene_id, place, "-", "-", "-", str(error)))
             continue
         camera = scene.session.intrinsics
-        posed = sum(v.T_world_cam is not None for v in scene.session.views)
+        posed = len(scene.session.Ts_world_cam)
         rows.append(
             (ref.scene_id, place, len(scene.session.views), len(scene.depth_files), posed,
              f"{camera.width}x{camera.height}, fx {camera.fx:.2f}")

@@ -188,7 +188,6 @@ def _opened(folder: Path, source: FrameSource, key: str) -> SessionStore:
     session = CaptureSession(
         name=source.name,
         intrinsics=source.intrinsics,
-        views=(),
         depth_unit_m=source.depth_unit_m or NO_DEPTH_UNIT_M,
     )
     described = {**source.extra, "key": key, "notes": list(source.notes)}
@@ -287,10 +286,10 @@ def _add(store: SessionStore, index: int, frame: SourceFrame) -> None:
 
 def _warn_of_unit(store: SessionStore, console: Console) -> None:
     """Say it where the cameras turn but stand in one place: metres taken for millimetres."""
-    Ts = [v.T_world_cam for v in store.session.views if v.T_world_cam is not None]
+    Ts = store.session.Ts_world_cam
     if len(Ts) < MIN_FOR_UNIT:
         return
-    stack = np.array(Ts)
+    stack = np.array(list(Ts.values()))
     extent = float(np.ptp(stack[:, :3, 3], axis=0).max())
     cosine = (np.einsum("ij,nij->n", stack[0, :3, :3], stack[:, :3, :3]) - 1) / 2
     turn = float(np.arccos(np.clip(cosine, -1, 1)).max())
@@ -326,7 +325,7 @@ def _summary(
         with_depth=sum(store.has_depth(v.index) for v in views),
         with_joints=sum(v.joints is not None for v in views),
         with_tool_pose=sum(v.T_base_ee is not None for v in views),
-        with_camera_pose=sum(v.T_world_cam is not None for v in views),
+        with_camera_pose=len(store.session.Ts_world_cam),
         time_span_s=max(times) - min(times), seconds=seconds, notes=tuple(source.notes),
         contact_sheet=sheet,
     )  # fmt: skip

@@ -15,12 +15,12 @@ in place.
 """
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from realsim.app.register import results
-from realsim.app.register.results import CameraChange, Json, Registered, Remark
+from realsim.app.register.results import CameraChange, Json, Registered
 from realsim.app.register.uncertainty import sigmas
 from realsim.arrays import Array
 from realsim.geometry import se3
@@ -164,22 +164,6 @@ def _bop_cameras(result: Registered, store: SessionStore) -> Json:
     }
 
 
-class FoundThing(Protocol):
-    """A finding; that of a view has an `index` as well, that of a robot pose a `view`."""
-
-    @property
-    def kind(self) -> str: ...  # noqa: D102
-
-    @property
-    def words(self) -> str: ...  # noqa: D102
-
-
-def remark_of(finding: FoundThing) -> Remark:
-    """Return a finding as it is stored."""
-    view: int | None = getattr(finding, "index", getattr(finding, "view", None))
-    return Remark(view=view, kind=str(finding.kind), words=finding.words)
-
-
 # --- writing ----------------------------------------------------------------------------------
 
 
@@ -197,7 +181,7 @@ def write_result(
         models: obj_id -> model, for the names.
         pictures: path -> bytes of pictures and page.
     """
-    before = results.cameras_now(store)
+    before = store.session.Ts_world_cam
     value = {"before": _poses_to_json(before), "files": documents(result, store, models)}
     store.remove(results.STAGE_FILE)  # from here on the old result is not known to be whole
     store.write_bytes(results.NEXT_FILE, atomic.json_bytes(value, indent=None))
@@ -227,7 +211,7 @@ def finish_interrupted(store: SessionStore) -> bool:
     value = store.read_json(results.NEXT_FILE)
     files: Json = value["files"]
     change = results.cameras_from_json(files[results.CAMERAS_FILE])
-    now = results.cameras_now(store)
+    now = store.session.Ts_world_cam
     known = any(
         results.is_same_cameras(now, cameras)
         for cameras in (results.poses_from_json(value["before"]), change.session)

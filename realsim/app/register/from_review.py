@@ -15,7 +15,6 @@ from realsim.app.register.results import (
     STAGE_FILE,
     VIEWS_FILE,
     Registered,
-    cameras_now,
     load_cameras,
     with_objects,
 )
@@ -177,7 +176,7 @@ def stayed(
     object is where it is found.
     """
     before, record, state = load_scene(store), load_cameras(store), review_of(store)
-    cameras = cameras_now(store) if record is None else record.session
+    cameras = store.session.Ts_world_cam if record is None else record.session
     corrected = corrected_scene(before, state)
     fitted = {o.instance: o for o in result.scene.objects}
     words: list[str] = []

@@ -7,8 +7,9 @@ import numpy as np
 
 from realsim.app.first_surfaces import FirstSurfaces
 from realsim.app.register.results import Registered
-from realsim.arrays import Array, Image, Mask
+from realsim.arrays import Image, Mask
 from realsim.geometry import camera, se3
+from realsim.geometry.mesh import box_corners
 from realsim.records import CameraIntrinsics, ObjectModel
 from realsim.rendering.overlay import contact_sheet, draw_outlines
 from realsim.rendering.rays import PlacedMesh
@@ -45,7 +46,7 @@ def camera_shifts_px(
         if claimed is None:
             continue
         for o in result.scene.objects:
-            corners = _corners(models[o.obj_id].mesh.bounds)
+            corners = box_corners(*models[o.obj_id].mesh.bounds)
             world = se3.transform(o.T_world_obj, corners)
             a, b = (
                 camera.project(intrinsics, se3.transform(se3.invert(T), world))
@@ -55,12 +56,6 @@ def camera_shifts_px(
             if np.all(np.isfinite(a)) and np.all((b > 0) & (b < size)):
                 out[index, o.instance] = float(np.mean(np.linalg.norm(a - b, axis=1)))
     return out
-
-
-def _corners(bounds: Array) -> Array:
-    """Return the corners (8, 3) of a box (2, 3)."""
-    pick = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-    return np.stack([bounds[pick[:, axis], axis] for axis in range(3)], axis=1)
 
 
 def gain_picture(

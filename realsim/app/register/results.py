@@ -47,7 +47,7 @@ class CameraChange:
         return self.claimed | self.refined
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Remark:
     """Something that is wrong with a view, or with the scene."""
 
@@ -83,12 +83,6 @@ class Registered:
 # --- reading ----------------------------------------------------------------------------------
 
 
-def cameras_now(store: SessionStore) -> dict[int, Array]:
-    """Return T_world_cam of every view that has one."""
-    views = store.session.views
-    return {v.index: v.T_world_cam for v in views if v.T_world_cam is not None}
-
-
 def is_same_pose(a: Array, b: Array) -> bool:
     """Whether two poses are the same but for rounding."""
     return bool(np.allclose(a, b, rtol=0.0, atol=SAME))
@@ -110,7 +104,7 @@ def claimed_cameras(store: SessionStore) -> dict[int, Array]:
     A view whose camera is the one that a registration set was claimed to be where the record says;
     any other has been calibrated since, and is its own claim.
     """
-    now, record = cameras_now(store), load_cameras(store)
+    now, record = store.session.Ts_world_cam, load_cameras(store)
     if record is None:
         return now
     return {
@@ -172,15 +166,10 @@ def load_registered(store: SessionStore) -> Registered:
     findings: Sequence[Json] = report.get("findings", ())
     return Registered(
         scene=scene, single_view=single,
-        cameras=cameras or CameraChange(claimed=cameras_now(store), refined={}),
+        cameras=cameras or CameraChange(claimed=store.session.Ts_world_cam, refined={}),
         seen=load_seen(store),
-        not_placed=tuple(
-            NotPlaced(obj_id=m["obj_id"], instance=m["instance"], reason=m["reason"])
-            for m in missing
-        ),
-        remarks=tuple(
-            Remark(view=f.get("view"), kind=f["kind"], words=f["words"]) for f in findings
-        ),
+        not_placed=tuple(NotPlaced(**m) for m in missing),
+        remarks=tuple(Remark(f.get("view"), f["kind"], f["words"]) for f in findings),
         report=report,
     )  # fmt: skip
 

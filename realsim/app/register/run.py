@@ -8,7 +8,7 @@ import numpy as np
 from realsim.app.console import Console
 from realsim.app.register import from_review, results
 from realsim.app.register.config import RegisterRequest
-from realsim.app.register.files import costs_of, finish_interrupted, remark_of, write_result
+from realsim.app.register.files import costs_of, finish_interrupted, write_result
 from realsim.app.register.inputs import RegisterInputs, read_inputs
 from realsim.app.register.results import CameraChange, Registered, Remark
 from realsim.app.reviewed import damage_words, review_of, stray_words
@@ -107,29 +107,25 @@ def _with_review(
 ) -> Registered:
     """Return the result with what came of the review, and what it means for its decisions."""
     state = review_of(store)
-    remarks = [Remark(view=None, kind="review", words=w) for w in told]
-    remarks += [
-        Remark(view=None, kind="review", words=(
-            f"instance {placed.instance} was accepted by {entry.reviewer}, {mm:.2g} mm and "
-            f"{deg:.2g} deg from here: that decision counts no longer, look at it again."
-        ))
+    moved = [
+        f"instance {placed.instance} was accepted by {entry.reviewer}, {mm:.2g} mm and "
+        f"{deg:.2g} deg from here: that decision counts no longer, look at it again."
         for placed, entry, mm, deg in from_review.moved_since_accepted(result.scene.objects, state)
-    ]  # fmt: skip
+    ]
     instances = from_review.instances_ever(store) | {o.instance for o in result.scene.objects}
     views = {v.index for v in store.session.views}
     models = {int(p.stem[4:]) for p in store.path("models").glob("obj_[0-9]*.*")}
     strays = stray_words(state, instances, views, models | set(inputs.models))
-    remarks += [
-        Remark(view=None, kind="review", words=w) for w in (*strays, damage_words(store)) if w
-    ]
-    return replace(result, remarks=(*result.remarks, *remarks)) if remarks else result
+    words = (*told, *moved, *strays, damage_words(store))
+    remarks = [Remark(None, "review", w) for w in words if w]
+    return replace(result, remarks=(*result.remarks, *remarks))
 
 
 def _as_it_was(store: SessionStore) -> Registered:
     """Return the registration that is there, its cameras in place."""
     record = results.load_cameras(store)
     if record is not None and not results.is_same_cameras(
-        results.cameras_now(store), record.session
+        store.session.Ts_world_cam, record.session
     ):
         store.set_cameras(store.session.intrinsics, record.session)
     return results.load_registered(store)
@@ -185,9 +181,7 @@ def colour_remark(store: SessionStore, views: Sequence[int]) -> Remark | None:
     if not findings:
         return None
     found = pooled_alignment(findings)
-    return (
-        None if found.kind in QUIET_KINDS else Remark(view=None, kind=found.kind, words=found.words)
-    )
+    return None if found.kind in QUIET_KINDS else Remark(None, found.kind, found.words)
 
 
 def as_registered(
@@ -198,12 +192,13 @@ def as_registered(
 ) -> Registered:
     """Return what a registration found with what was asked of it."""
     seen = found.seen or seen_at_their_word(found, inputs.models, intrinsics)
-    remarks = [Remark(view=k, kind="left_out", words=why) for k, why in inputs.left_out]
+    left_out = [*inputs.left_out, *((None, w) for w in (*inputs.fixed_out, *inputs.models_out))]
+    remarks = [Remark(k, "left_out", why) for k, why in left_out]
+    # A finding of a view has an index as well, that of a robot pose a view.
     remarks += [
-        Remark(view=None, kind="left_out", words=why)
-        for why in (*inputs.fixed_out, *inputs.models_out)
+        Remark(getattr(f, "index", getattr(f, "view", None)), str(f.kind), f.words)
+        for f in found.findings
     ]
-    remarks += [remark_of(f) for f in found.findings]
     asked = {
         "method": request.method,
         "cameras_refined": bool(found.seen),

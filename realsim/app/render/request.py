@@ -196,8 +196,8 @@ def wanted_views(store: SessionStore, scene: Scene, request: RenderRequest) -> W
     Raises:
         InputError: no real view has a camera pose.
     """
-    known = [v for v in store.session.views if v.T_world_cam is not None]
-    real = np.array([v.T_world_cam for v in known]).reshape(-1, 4, 4)
+    known = store.session.Ts_world_cam
+    real = np.array(list(known.values())).reshape(-1, 4, 4)
     if request.new_views is None:
         if not known:
             raise InputError(
@@ -205,9 +205,8 @@ def wanted_views(store: SessionStore, scene: Scene, request: RenderRequest) -> W
                 "render a twin of. Calibrate or register it, or give --views N for new views."
             )
         return WantedViews(
-            intrinsics=store.session.intrinsics, Ts_world_cam=real,
-            real=tuple(v.index for v in known),
-        )  # fmt: skip
+            intrinsics=store.session.intrinsics, Ts_world_cam=real, real=tuple(known)
+        )
     intrinsics, size = store.session.intrinsics, size_of(request.size)
     if size is not None:
         intrinsics = resized(intrinsics, *size)

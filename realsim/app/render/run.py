@@ -13,7 +13,7 @@ from realsim.app.render.compare import (
     pairs,
     sheet,
 )
-from realsim.app.render.request import RenderRequest, WantedViews, wanted_views
+from realsim.app.render.request import RenderRequest, wanted_views
 from realsim.app.render.scene import TwinScene, require_shown, twin_scene
 from realsim.errors import InputError
 from realsim.images import image_size
@@ -73,7 +73,7 @@ def run_render(session: Path, request: RenderRequest, console: Console) -> Rende
     _refuse_folder(folder, store.folder)
     with threadpool_limits(limits=1):
         wanted = wanted_views(store, scene, request)
-        _require_sizes(store, wanted)
+        _require_sizes(store)
         with console.stage("light and table", "from the photographs"):
             look = twin_scene(store, scene, models, request)
         with console.stage("render", f"{len(wanted.Ts_world_cam)} views") as tick:
@@ -102,15 +102,14 @@ def run_render(session: Path, request: RenderRequest, console: Console) -> Rende
     return outcome
 
 
-def _require_sizes(store: SessionStore, wanted: WantedViews) -> None:
+def _require_sizes(store: SessionStore) -> None:
     """Raise if a photograph that is looked at is not of the camera's size.
 
     Raises:
         InputError: it is not; it is named.
     """
     camera = store.session.intrinsics
-    known = [v.index for v in store.session.views if v.T_world_cam is not None]
-    for index in known if wanted.real is None else wanted.real:
+    for index in store.session.Ts_world_cam:
         path = store.path(rgb_path(index))
         width, height = image_size(path)
         if (width, height) != (camera.width, camera.height):

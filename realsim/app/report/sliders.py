@@ -5,7 +5,8 @@ claim them. After: the registered poses, through the refined cameras. A pose or 
 registration did not change is the same in both.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from realsim.app.register.inputs import STARTS_FILE
@@ -14,7 +15,7 @@ from realsim.app.stages import evenly, registered_views, session_models
 from realsim.arrays import Array, UInt8
 from realsim.geometry import se3
 from realsim.pages import View
-from realsim.records import ObjectModel, ObjectPose
+from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore
 
 VIEWS = 3
@@ -36,40 +37,26 @@ def registration_pairs(store: SessionStore) -> tuple[list[View], str]:
     started = _starts(store)
     claimed = claimed_cameras(store)
     told = registered_views(store)
-    seen = [
-        v
-        for v in store.session.views
-        if v.T_world_cam is not None and v.index in claimed and (told is None or v.index in told)
-    ]
+    cameras = store.session.Ts_world_cam
+    seen = [k for k in cameras if k in claimed and (told is None or k in told)]
     moved = [o for o in after if o.instance in started]
-    refined = [
-        v
-        for v in seen
-        if v.T_world_cam is not None and not is_same_pose(claimed[v.index], v.T_world_cam)
-    ]
+    refined = [k for k in seen if not is_same_pose(claimed[k], cameras[k])]
     if not seen or not after or not (moved or refined):
         return [], ""
-    what = [f"{len(moved)} of {len(after)} objects at the rough pose they started from"] * bool(
-        moved
-    ) + [f"{len(refined)} of {len(seen)} cameras as robot and calibration claim them"] * bool(
-        refined
-    )
-    before: list[tuple[ObjectPose, Array]] = [
-        (o, started.get(o.instance, o.T_world_obj)) for o in after
-    ]
-    kept: list[tuple[ObjectPose, Array]] = [(o, o.T_world_obj) for o in after]
+    what: list[str] = []
+    if moved:
+        what.append(f"{len(moved)} of {len(after)} objects at the rough pose they started from")
+    if refined:
+        what.append(f"{len(refined)} of {len(seen)} cameras as robot and calibration claim them")
+    kept = [PlacedMesh(o.instance, models[o.obj_id].mesh, o.T_world_obj) for o in after]
+    before = [replace(p, T_world_obj=started.get(p.instance, p.T_world_obj)) for p in kept]
     pairs: list[View] = []
-    for view in evenly(seen, VIEWS):
-        assert view.T_world_cam is not None
-        pairs.append(
-            View(
-                f"view {view.index}",
-                {
-                    "before": _outlined(store, view.index, claimed[view.index], before, models),
-                    "registered": _outlined(store, view.index, view.T_world_cam, kept, models),
-                },
-            )
-        )
+    for k in evenly(seen, VIEWS):
+        pictures = {
+            "before": _outlined(store, k, claimed[k], before),
+            "registered": _outlined(store, k, cameras[k], kept),
+        }
+        pairs.append(View(f"view {k}", pictures))
     return pairs, f"Before: {', and '.join(what)}."
 
 
@@ -85,16 +72,11 @@ def _starts(store: SessionStore) -> dict[int, Array]:
 
 
 def _outlined(
-    store: SessionStore,
-    index: int,
-    T_world_cam: Array,
-    poses: Sequence[tuple[ObjectPose, Array]],
-    models: Mapping[int, ObjectModel],
+    store: SessionStore, index: int, T_world_cam: Array, placed: Sequence[PlacedMesh]
 ) -> UInt8:
     """Return a photograph with the outlines of objects at given poses, by instance colours."""
-    from realsim.rendering.labels import LabelRenderer, PlacedMesh
+    from realsim.rendering.labels import LabelRenderer
     from realsim.rendering.overlay import draw_outlines
 
-    placed = [PlacedMesh(o.instance, models[o.obj_id].mesh, T) for o, T in poses]
     ids = LabelRenderer(placed).render(store.session.intrinsics, T_world_cam).ids
     return draw_outlines(store.rgb(index), ids)

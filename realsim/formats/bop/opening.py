@@ -209,7 +209,7 @@ def _check(scene: BopLabelledScene, infos: Mapping[int, Sequence[Json]]) -> None
         camera = scene.intrinsics(i)
         unit_m = scene.depth_unit_m(i)
         if unit_m is not None:  # the record knows which units a count may have
-            CaptureSession(name=scene.name, intrinsics=camera, views=(), depth_unit_m=unit_m)
+            CaptureSession(name=scene.name, intrinsics=camera, depth_unit_m=unit_m)
         poses[i] = scene.T_world_cam(i)
         if not (0 <= camera.cx < camera.width and 0 <= camera.cy < camera.height):
             beside.append(str(i))

@@ -82,9 +82,7 @@ def claimed_session(
         _require_same(store, inputs)
         _require_same_cameras(store, Ts_world_cam)
         return store
-    session = CaptureSession(
-        name=synthetic.name, intrinsics=intrinsics, views=(), depth_unit_m=config.unit_m
-    )
+    session = CaptureSession(name=synthetic.name, intrinsics=intrinsics, depth_unit_m=config.unit_m)
     note = {"inputs": inputs, "provenance": synthetic.provenance, "config": asdict(config)}
     about = {"camera": f"simulated {config.profile}", "gravity_up_world": _up(synthetic)}
     return SessionStore.create(folder, session, {**about, NOTE: note})

@@ -108,11 +108,10 @@ def _pictures(fit: ScaleFit, mesh: Mesh, store: SessionStore) -> dict[str, bytes
         made["views.png"] = lambda: views_png(fit)
     if any(np.isfinite(c.score) for c in fit.candidates):
         made["candidates.png"] = lambda: candidates_png(fit)
+    cameras = store.session.Ts_world_cam
     photographs = [
-        Photograph(index=v.index, rgb=store.rgb(v.index), depth_m=store.depth_m(v.index),
-                   T_world_cam=v.T_world_cam)
-        for v in (store.session.view(k) for k in chosen_views(fit))
-        if v.T_world_cam is not None
+        Photograph(index=k, rgb=store.rgb(k), depth_m=store.depth_m(k), T_world_cam=cameras[k])
+        for k in chosen_views(fit) if k in cameras
     ]  # fmt: skip
     if photographs:
         made["overlays.png"] = lambda: overlays_png(

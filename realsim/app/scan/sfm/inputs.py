@@ -98,7 +98,7 @@ def _session_inputs(request: SfmRequest) -> SfmInputs:
     if request.intrinsics is not None:
         raise InputError("a session has its own camera; --intrinsics is for photographs.")
     views = store.session.views
-    posed = sum(v.T_world_cam is not None for v in views)
+    posed = len(store.session.Ts_world_cam)
     poses = request.poses or ("refined" if posed == len(views) else "unknown")
     notes: list[str] = []
     if not posed and poses != "unknown":
