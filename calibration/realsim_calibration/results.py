@@ -248,9 +248,7 @@ class HandEyeReport:
     @property
     def warnings(self) -> tuple[str, ...]:
         """The sentence of every check that is not good."""
-        return tuple(
-            f"{c.sentence} {c.advice}".strip() for c in self.checks if c.verdict in ("warn", "bad")
-        )
+        return tuple(c.words for c in self.checks if c.verdict in ("warn", "bad"))
 
     @property
     def sigma_mm(self) -> float:

@@ -1,5 +1,6 @@
 """What a calibration found: the hand-eye, the robot's error map, the checks with their advice."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -40,6 +41,17 @@ class Check:
     unit: str = ""
     views: tuple[int, ...] = ()
     """Views that the check names."""
+
+    @property
+    def words(self) -> str:
+        """Return what was found and what to do about it."""
+        return f"{self.sentence} {self.advice}".strip()
+
+
+def worst_first(checks: Sequence[Check]) -> list[Check]:
+    """Return checks, worst first, else in their own order."""
+    order = ("bad", "warn", "unknown", "good")
+    return sorted(checks, key=lambda c: order.index(c.verdict))
 
 
 class RobotMap(Tagged):

@@ -4,10 +4,10 @@ import numpy as np
 
 from realsim.pages import Cell, Page
 from realsim.records import Check
+from realsim.records.calibration import worst_first
 from realsim_calibration.cameras.results import ROBOT_BASE, CamerasReport
 from realsim_calibration.cameras.rig import MOUNTS
 
-ORDER = ("bad", "warn", "unknown", "good")
 KIND = {"unknown": "off"}
 PAGE = "cameras_report.html"
 
@@ -65,7 +65,7 @@ def odd_rows(report: CamerasReport) -> list[list[str]]:
 
 def cameras_page(report: CamerasReport) -> Page:
     """Return the page."""
-    checks = sorted(report.all_checks, key=lambda c: ORDER.index(c.verdict))
+    checks = worst_first(report.all_checks)
     worst = checks[0].verdict if checks else "good"
     page = Page(
         title="Cameras calibrated together",
@@ -75,7 +75,7 @@ def cameras_page(report: CamerasReport) -> Page:
     said = {"bad": "A check is bad.", "warn": "Usable; look at the warnings."}
     amiss = [c for c in checks if c.verdict in {"bad", "warn"}]
     page.verdict(KIND.get(worst, worst), said.get(worst, "No check found anything wrong."), "",
-                 [[f"{c.name}: {c.sentence} {c.advice}".strip()] for c in amiss])  # fmt: skip
+                 [[f"{c.name}: {c.words}"] for c in amiss])  # fmt: skip
     page.cards([
         (f"{r.held_out_mm:.2f} mm", f"unseen views of {c.name}")
         for c, r in zip(report.rig.cameras, report.cameras, strict=True)
@@ -101,5 +101,5 @@ def _row(check: Check) -> list[object]:
     return [
         check.name,
         Cell(check.verdict, kind=KIND.get(check.verdict, check.verdict)),
-        f"{check.sentence} {check.advice}".strip(),
+        check.words,
     ]

@@ -90,9 +90,7 @@ class IntrinsicsReport:
     @property
     def warnings(self) -> tuple[str, ...]:
         """The sentence of every check that is not good."""
-        return tuple(
-            f"{c.sentence} {c.advice}".strip() for c in self.checks if c.verdict in ("warn", "bad")
-        )
+        return tuple(c.words for c in self.checks if c.verdict in ("warn", "bad"))
 
     def projection_sd_px(self, uv: ArrayLike) -> Array:
         """Return how well the lens is known at pixels (N, 2): 1-sigma of a coordinate (N,) [px].

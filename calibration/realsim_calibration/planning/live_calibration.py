@@ -220,7 +220,7 @@ class LiveCalibration:
         move = "" if best is None else self._move(report, best)
         more = {"report": report, "next_view": best, "move": move}
         if bad:
-            told = f"{bad[0].sentence} {bad[0].advice}".strip()
+            told = bad[0].words
             return self._status("bad", note, needs, f"Something is wrong: {told}", **more)
         # Told beside the next pose, not in its place: sentence and `next_view` must agree.
         lacking = f" Still missing: {needs[0].sentence}." if needs else ""

@@ -9,14 +9,13 @@ import numpy as np
 from realsim.arrays import Array
 from realsim.geometry import metrics, se3
 from realsim.records import ArmErrorMap, Check, RobotErrorMap
-from realsim.records.calibration import worst_sigmas
+from realsim.records.calibration import worst_first, worst_sigmas
 from realsim_calibration.exports.frames import quaternion_xyzw, roll_pitch_yaw
 from realsim_calibration.results import Clock, HandEyeReport, ViewReport
 from realsim_calibration.views import target_middle
 
 Verdict = Literal["good", "warn", "bad", "unknown"]
 NOT_KNOWN = "not known"
-WORST_FIRST: tuple[Verdict, ...] = ("bad", "warn", "unknown", "good")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -33,11 +32,6 @@ class Judgement:
 def amount(value: float, digits: int, unit: str = "") -> str:
     """Return a number with its unit, "not known" where it is none."""
     return f"{value:.{digits}f} {unit}".strip() if np.isfinite(value) else NOT_KNOWN
-
-
-def worst_first(checks: Sequence[Check]) -> list[Check]:
-    """Return checks, worst first, else in their own order."""
-    return sorted(checks, key=lambda c: WORST_FIRST.index(c.verdict))
 
 
 def verdict(report: HandEyeReport, lens: Sequence[Check] = ()) -> Judgement:

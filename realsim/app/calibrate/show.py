@@ -9,6 +9,7 @@ from realsim.app.console import Console
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.records import Check, HandEye, RobotErrorMap, View
+from realsim.records.calibration import worst_first
 from realsim_calibration import HandEyeReport
 
 NEXT_VIEWS = 3
@@ -19,7 +20,6 @@ MAP_REACH = 2.0
 """Gaps between the calibrated poses up to which a robot map holds (`RobotErrorMap.beyond`)."""
 FAR_NAMED = 6
 """Views outside that are named."""
-ORDER = ("bad", "warn", "unknown", "good")
 
 
 def report_document(
@@ -139,6 +139,5 @@ def show_checks(checks: Sequence[Check], console: Console) -> None:
     """Print checks, the worst first."""
     if not checks:
         return
-    ordered = sorted(checks, key=lambda c: ORDER.index(c.verdict))
-    rows = [[c.name, c.verdict, f"{c.sentence} {c.advice}".strip()] for c in ordered]
+    rows = [[c.name, c.verdict, c.words] for c in worst_first(checks)]
     console.table("Checks", ["check", "verdict", "what was found"], rows)

@@ -10,8 +10,10 @@ from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count, shown
 from realsim.app.report.section import Section, attempted, counted, drawn
 from realsim.app.stages import BOARD_VIEWS
+from realsim.arrays import Array
 from realsim.pages import Cell
 from realsim.records import Check, HandEye
+from realsim.records.calibration import worst_first
 from realsim.store import SessionStore
 from realsim.untrusted.own_json import from_json
 
@@ -25,7 +27,6 @@ KIND: dict[str, str] = {"good": "good", "warn": "warn", "bad": "bad", "unknown":
 CONVENTIONS = "conventions"
 """Name of the check that says whether the robot's poses were read right."""
 CHECK_HEADER = ("check", "verdict", "what was found")
-ORDER = ("bad", "warn", "unknown", "good")
 BIAS = "depth bias"
 """Check of the depth camera; a bias that it finds is taken out by registration."""
 READING = (
@@ -40,7 +41,7 @@ def calibration_section(section: Section, store: SessionStore) -> None:
     from realsim.store import load_hand_eye
 
     if not store.has(HAND_EYE):
-        posed = sum(v.T_world_cam is not None for v in store.session.views)
+        posed = len(store.session.Ts_world_cam)
         if posed:
             section.command = ""
             section.missing(
@@ -63,7 +64,7 @@ def calibration_section(section: Section, store: SessionStore) -> None:
     section.page.table(["figure", "value"], hand_eye_rows(hand_eye))
     drawn(section, "the plots", lambda: _plots(section, store, hand_eye))
     attempted(section, "how poses were read", lambda: _reading(section, store, hand_eye))
-    _checks(section, "Checks", hand_eye.checks)
+    _checks(section, hand_eye.checks)
     attempted(section, "the depth camera's bias", lambda: _depth(section, store))
     if hand_eye.rejected:
         section.page.heading("Board views left out")
@@ -73,9 +74,7 @@ def calibration_section(section: Section, store: SessionStore) -> None:
 def hand_eye_rows(hand_eye: HandEye) -> list[list[object]]:
     """Return the table of a hand-eye calibration."""
     i, sd = hand_eye.intrinsics, hand_eye.intrinsics_sd
-    t = 1e3 * hand_eye.T_ee_cam[:3, 3]
-    each = 1e3 * np.sqrt(np.clip(np.diagonal(_covariance_in_tool(hand_eye)), 0, None))
-    place = ", ".join(shown(v, s) for v, s in zip(t, each, strict=True))
+    place = ", ".join(shown(v, s) for v, s in zip(*_place_mm(hand_eye), strict=True))
     values = (i.fx, i.fy, i.cx, i.cy, *i.distortion)
     lens: list[list[object]] = [
         [name, f"{shown(v, s)} px" if k < 4 else shown(v, s)]
@@ -92,16 +91,18 @@ def hand_eye_rows(hand_eye: HandEye) -> list[list[object]]:
     ]
 
 
-def _covariance_in_tool(hand_eye: HandEye) -> Any:
-    """Return the covariance (3, 3) of the camera's place along the tool's axes [m^2]."""
+def _place_mm(hand_eye: HandEye) -> tuple[Array, Array]:
+    """Return where the camera is in the tool, and its 1 sigma along the tool's axes [mm]."""
     R = hand_eye.T_ee_cam[:3, :3]
-    return R @ np.asarray(hand_eye.covariance)[3:, 3:] @ R.T
+    covariance = R @ np.asarray(hand_eye.covariance)[3:, 3:] @ R.T
+    each = np.sqrt(np.clip(np.diagonal(covariance), 0, None))
+    return 1e3 * hand_eye.T_ee_cam[:3, 3], 1e3 * each
 
 
 def _figures(hand_eye: HandEye) -> list[Figure]:
     rms = np.asarray(hand_eye.view_rms_px, dtype=np.float64)
-    t = 1e3 * hand_eye.T_ee_cam[:3, 3]
-    each = 1e3 * np.sqrt(np.clip(np.diagonal(_covariance_in_tool(hand_eye)), 0, None))
+    t, each = _place_mm(hand_eye)
+    conventions = _conventions(hand_eye)
     verdicts = [c.verdict for c in hand_eye.checks]
     found = [
         ("sigma_mm", hand_eye.sigma_mm, None),
@@ -109,7 +110,7 @@ def _figures(hand_eye: HandEye) -> list[Figure]:
         ("held_out_px", hand_eye.held_out_px, _mean_error(rms)),
         # The median of n normal values scatters 1.2533 times as much as their mean.
         ("view_rms_px", float(np.median(rms)) if len(rms) else np.nan, 1.2533 * _mean_error(rms)),
-        ("mismatch_deg", _value(hand_eye.checks, CONVENTIONS), None),
+        ("mismatch_deg", conventions.value if conventions else np.nan, None),
         ("camera_x_mm", t[0], each[0]),
         ("camera_y_mm", t[1], each[1]),
         ("camera_z_mm", t[2], each[2]),
@@ -138,8 +139,8 @@ def _mean_error(values: Any) -> float:
     return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
 
 
-def _value(checks: Sequence[Check], name: str) -> float:
-    return next((c.value for c in checks if c.name == name), float("nan"))
+def _conventions(hand_eye: HandEye) -> Check | None:
+    return next((c for c in hand_eye.checks if c.name == CONVENTIONS), None)
 
 
 def _plots(section: Section, store: SessionStore, hand_eye: HandEye) -> None:
@@ -162,39 +163,34 @@ def _plots(section: Section, store: SessionStore, hand_eye: HandEye) -> None:
     section.page.plots(plots)
 
 
-def _checks(section: Section, title: str, checks: Sequence[Check]) -> None:
+def _checks(section: Section, checks: Sequence[Check]) -> None:
     """Add checks, worst first; those that are not good are findings."""
     if not checks:
         return
-    section.page.heading(title)
-    ordered = sorted(checks, key=lambda c: ORDER.index(c.verdict))
+    section.page.heading("Checks")
+    ordered = worst_first(checks)
     # The check of the conventions stands with the reading of the poses.
     section.page.table(CHECK_HEADER, _rows([c for c in ordered if c.name != CONVENTIONS]))
     for c in ordered:
         if c.verdict in ("bad", "warn"):
-            text = f"{section.title}, {c.name}: {c.sentence} {c.advice}".strip()
-            section.say("bad" if c.verdict == "bad" else "warn", text)
+            section.say(c.verdict, f"{section.title}, {c.name}: {c.words}")
 
 
 def _rows(checks: Sequence[Check]) -> list[list[object]]:
-    return [
-        [c.name, Cell(text=c.verdict, kind=KIND[c.verdict]), f"{c.sentence} {c.advice}".strip()]
-        for c in checks
-    ]
+    return [[c.name, _verdict(c), c.words] for c in checks]
+
+
+def _verdict(check: Check) -> Cell:
+    return Cell(text=check.verdict, kind=KIND[check.verdict])
 
 
 def _reading(section: Section, store: SessionStore, hand_eye: HandEye) -> None:
     """Add how robot poses were read and joined to photographs, and what speaks for it."""
     section.page.heading("How the robot's poses were read and paired with photographs")
     section.page.text(READING)
-    proof = next((c for c in hand_eye.checks if c.name == CONVENTIONS), None)
-    rows: list[list[object]] = []
-    if proof is not None:
-        verdict = Cell(text=proof.verdict, kind=KIND[proof.verdict])
-        rows.append(["do hand and camera turn alike?", verdict, proof.sentence])
-    else:
-        rows.append(["do hand and camera turn alike?", Cell(text="unknown", kind="off"),
-                     "no check of it is stored; calibrate again to have it"])  # fmt: skip
+    unknown = "no check of it is stored; calibrate again to have it"
+    proof = _conventions(hand_eye) or Check(name=CONVENTIONS, verdict="unknown", sentence=unknown)
+    rows: list[list[object]] = [["do hand and camera turn alike?", _verdict(proof), proof.sentence]]
     if store.has(EXPORT):
         told: Any = store.read_json(EXPORT)
         frames: Any = told.get("frames", {})
@@ -241,8 +237,7 @@ def _depth(section: Section, store: SessionStore) -> None:
             ["measured over", f"{low:.2f} to {high:.2f} m"],
         ],
     )
-    checks = [from_json(c, Check, "a check") for c in told.get("checks", ())]
-    ordered = sorted(checks, key=lambda c: ORDER.index(c.verdict))
+    ordered = worst_first([from_json(c, Check, "a check") for c in told.get("checks", ())])
     rows = _rows(ordered)
     for c, row in zip(ordered, rows, strict=True):
         if c.name == BIAS and c.verdict == "warn":
@@ -251,4 +246,4 @@ def _depth(section: Section, store: SessionStore) -> None:
     section.page.text("Registration takes a bias that is known out of the depth by itself.", "foot")
     for c in ordered:
         if c.verdict == "bad":
-            section.say("bad", f"Depth camera, {c.name}: {c.sentence} {c.advice}".strip())
+            section.say("bad", f"Depth camera, {c.name}: {c.words}")
