@@ -147,6 +147,15 @@ def image_size(path: Path | str) -> tuple[int, int]:
     return size
 
 
+def resized(picture: UInt8, width_px: int) -> UInt8:
+    """Return a picture at another width, every pixel the mean of what it covers."""
+    import cv2
+
+    height = max(1, round(picture.shape[0] * width_px / picture.shape[1]))
+    made = cv2.resize(picture, (width_px, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(made, dtype=np.uint8)
+
+
 # --- what a header claims, looked at before a decoder allocates it -------------------------------
 
 

@@ -9,6 +9,7 @@ from markupsafe import Markup
 
 from realsim.arrays import Image
 from realsim.errors import InputError
+from realsim.images import resized
 
 Picture = bytes | Image | Callable[[], Image]
 """PNG or JPEG, (H, W, 3) RGB or (H, W) grey, or what makes it: only shown views are made."""
@@ -99,13 +100,9 @@ def shown(picture: Picture, alt: str, quality: int = QUALITY, label: str = "") -
             f"a picture of shape {image.shape} and type {image.dtype} cannot be shown; (H, W, 3) "
             "or (H, W) of uint8 is accepted."
         )
+    if image.shape[1] > WIDTH_PX:
+        image = resized(image, WIDTH_PX)
     height, width = image.shape[:2]
-    if width > WIDTH_PX:
-        import cv2
-
-        height, width = max(1, round(height * WIDTH_PX / width)), WIDTH_PX
-        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        image = np.asarray(small, np.uint8)
     src = _data_url(jpeg_bytes(image, quality))
     return Shown(src=src, alt=alt, label=label, size=(width, height))
 

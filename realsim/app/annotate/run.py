@@ -103,16 +103,10 @@ def _write_sheet(
     pictures: Sequence[Image],
 ) -> None:
     """Write the contact sheet of these pictures."""
-    import cv2
-
+    from realsim.images import resized
     from realsim.rendering.overlay import contact_sheet
 
-    small: list[Image] = []
-    for picture in pictures:
-        height = round(picture.shape[0] * SHEET_WIDTH_PX / picture.shape[1])
-        size = (SHEET_WIDTH_PX, height)
-        fitted = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-        small.append(np.asarray(fitted, dtype=np.uint8))
+    small = [resized(picture, SHEET_WIDTH_PX) for picture in pictures]
     captions = [f"view {v}" + (": look here" if v in summary.flagged_views else "") for v in views]
     store.write_image(SHEET_FILE, contact_sheet(small, columns=2, captions=captions))
 

@@ -252,12 +252,9 @@ def label_picture(rgb: Rgb, ids: Int32) -> Rgb:
 
 def fitted(rgb: Rgb, width_px: int = CELL_WIDTH_PX) -> Rgb:
     """Return a picture at the width of a cell; small ones stay as they are."""
-    import cv2
+    from realsim.images import resized
 
-    if rgb.shape[1] <= width_px:
-        return rgb
-    size = (width_px, round(rgb.shape[0] * width_px / rgb.shape[1]))
-    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return rgb if rgb.shape[1] <= width_px else resized(rgb, width_px)
 
 
 # --- for the page -----------------------------------------------------------------------------

@@ -9,7 +9,6 @@ from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count
 from realsim.app.report.section import READING, Section, attempted, counted, drawn
 from realsim.app.stages import evenly
-from realsim.arrays import UInt8
 from realsim.store import SessionStore
 from realsim.store.atomic import complete_lines
 
@@ -68,7 +67,7 @@ def capture_section(section: Section, store: SessionStore) -> None:
         section.missing("No view has been captured.")
         return
     i = store.session.intrinsics
-    posed = sum(v.T_world_cam is not None for v in views)
+    posed = len(store.session.Ts_world_cam)
     deep = sum(store.has_depth(v.index) for v in views)
     section.add(count("capture.views", len(views)))
     section.headline = counted(len(views), "view")
@@ -151,23 +150,15 @@ def _log(section: Section, store: SessionStore) -> None:
 
 def _sheet(section: Section, store: SessionStore) -> None:
     """Add thumbnails of views spread over the session."""
+    from realsim.images import resized
     from realsim.rendering.overlay import contact_sheet, save_png
 
     indices = [v.index for v in store.session.views]
     if len(indices) < 2:
         return
     shown = evenly(indices, SHEET_VIEWS)
-    small = [_thumbnail(store.rgb(k)) for k in shown]
+    small = [resized(store.rgb(k), THUMBNAIL_WIDTH_PX) for k in shown]
     sheet = contact_sheet(small, columns=4, captions=[f"view {k}" for k in shown])
     if section.pictures == "kept":
         save_png(store.folder / "reports/views.png", sheet)
     section.page.picture(sheet, f"{len(shown)} of {len(indices)} captured views")
-
-
-def _thumbnail(rgb: UInt8) -> UInt8:
-    """Return a picture at the width of a thumbnail."""
-    import cv2
-
-    height = max(1, round(rgb.shape[0] * THUMBNAIL_WIDTH_PX / rgb.shape[1]))
-    small = cv2.resize(rgb, (THUMBNAIL_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(small, dtype=np.uint8)

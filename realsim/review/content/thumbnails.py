@@ -11,10 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
-
 from realsim.arrays import UInt8
 from realsim.errors import InputError
+from realsim.images import resized
 from realsim.pages.pictures import jpeg_bytes
 from realsim.review.content import quick_png
 from realsim.store import SessionStore, atomic
@@ -125,11 +124,7 @@ def thumbnail(rgb: UInt8, width_px: int, quality: int) -> bytes:
         width_px: width of the JPEG [px].
         quality: of the JPEG [%].
     """
-    import cv2
-
-    height = max(1, round(rgb.shape[0] * width_px / rgb.shape[1]))
-    small = cv2.resize(rgb, (width_px, height), interpolation=cv2.INTER_AREA)
-    return jpeg_bytes(np.asarray(small, np.uint8), quality)
+    return jpeg_bytes(resized(rgb, width_px), quality)
 
 
 def _line(jpeg: bytes, origin: str) -> bytes:
