@@ -54,7 +54,7 @@ def store(registered_few: Path, tmp_path: Path) -> SessionStore:
 @pytest.fixture(scope="module")
 def page(registered: SessionStore) -> Path:
     """Its report."""
-    return write_report(registered, None)
+    return write_report(registered, report_of(registered, pictures="kept"))
 
 
 def embedded(text: str) -> dict[str, object]:
@@ -74,7 +74,8 @@ def test_the_report_of_the_same_session_is_the_same_bytes(
     registered: SessionStore, page: Path
 ) -> None:
     first, document = page.read_bytes(), (page.parent / "report.json").read_bytes()
-    again = write_report(SessionStore.open(registered.folder), None)
+    store = SessionStore.open(registered.folder)
+    again = write_report(store, report_of(store, pictures="kept"))
     assert again == page and again.read_bytes() == first
     assert (again.parent / "report.json").read_bytes() == document
 
@@ -177,7 +178,9 @@ def test_what_reviewers_decided_is_told(store: SessionStore) -> None:
 
 def test_a_hostile_name_is_only_text(tmp_path: Path) -> None:
     store = begun(tmp_path / "s", CAMERA, {"camera": HOSTILE, "x": "</script><b>"}, name=HOSTILE)
-    text = write_report(store, None, notes=[HOSTILE]).read_text("utf-8")
+    text = write_report(store, report_of(store, pictures="kept"), notes=[HOSTILE]).read_text(
+        "utf-8"
+    )
     Tags(text)
     assert "<script>alert" not in text and "<b>" not in text.partition("</div>")[2]
     assert embedded(text)["session"] == HOSTILE
@@ -235,7 +238,7 @@ def pages(registered_few: Path, tmp_path_factory: pytest.TempPathFactory) -> dic
     sources = sources_of([store.folder, store.folder])
     comparison.write_bytes(comparison_page(comparison_of(sources)).encode())
     return {
-        "report": write_report(store, None),
+        "report": write_report(store, report_of(store, pictures="kept")),
         "comparison": comparison,
         "annotation": store.path("reports/annotated.html"),
     }

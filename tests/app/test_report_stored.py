@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from realsim.app.report.session import write_report
+from realsim.app.report.session import report_of, write_report
 from realsim.app.report.sources import read_stored
 from registered_sessions import models_of, registered_by_hand, table_session
 from typed_commands import refused
@@ -20,7 +20,7 @@ def document(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
     store = table_session(tmp_path_factory.mktemp("stored") / "s", views=2)
     write_result(store, registered_by_hand(store), models_of(), {})
-    page = write_report(store, None)
+    page = write_report(store, report_of(store, pictures="kept"))
     return json.loads((page.parent / "report.json").read_text("utf-8"))
 
 

@@ -16,7 +16,8 @@ from realsim.app.annotate.current import annotate_session
 from realsim.app.calibrate.session import calibrate_session
 from realsim.app.console import Console, StageTime
 from realsim.app.register.run import register_session
-from realsim.app.school.run import school_session
+from realsim.app.school.inputs import SchoolRequest
+from realsim.app.school.run import run_in_session
 from realsim.app.stages import BOARD_VIEWS, save_starts
 from realsim.errors import InputError
 from realsim.records import CaptureSession, GraspSet, HandEye, Scene
@@ -74,21 +75,22 @@ def run_demo(config: DemoConfig, out: Path, console: Console) -> DemoResult:
     """
     from threadpoolctl import threadpool_limits
 
-    from realsim.app.report.session import write_report
+    from realsim.app.report.session import report_of, write_report
     from realsim.app.truth import loop_errors
 
     _claim(out, config)
     # One BLAS thread: on small matrices the spinning of more costs more than the work.
     with only_run_in(out), threadpool_limits(limits=1):
         store, _, _ = capture_and_register(config, out, console)
-        grasps = school_session(
-            store, console, grasps_per_object=config.grasps_per_object, seed=config.seed,
-            workers=config.workers,
+        asked = SchoolRequest(
+            grasps=config.grasps_per_object, seed=config.seed, where=config.workers,
+            restart="finished",
         )  # fmt: skip
+        grasps = run_in_session(store, asked, console).sets
         annotate_session(store, console)
         with console.stage("report"):
             errors = loop_errors(store, out / "truth")
-            report = write_report(store, errors, times=console.times)
+            report = write_report(store, report_of(store, errors, "kept"), times=console.times)
     return DemoResult(store=store, grasps=grasps, errors=errors, report=report, times=console.times)
 
 
@@ -203,7 +205,6 @@ def _open_or_create(
     session = CaptureSession(
         name=f"simulated lab, seed {config.seed}",
         intrinsics=lab.camera.intrinsics,
-        views=(),
         depth_unit_m=lab.camera.depth_unit_m,
     )
     about = {"arm": lab.arm.name, "camera": lab.camera.name, "gravity_up_world": [0.0, 0.0, 1.0]}

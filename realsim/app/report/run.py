@@ -9,7 +9,7 @@ from typing import Any
 from realsim.app.console import Console
 from realsim.app.report import compare_page
 from realsim.app.report.limits import Limit, broken, limit_of, read_limits
-from realsim.app.report.session import hidden_of, page_of, report_of, write_report_of
+from realsim.app.report.session import hidden_of, page_of, report_of, write_report
 from realsim.app.report.sources import sources_of
 from realsim.app.report.summary import VERDICTS
 from realsim.errors import InputError
@@ -63,7 +63,7 @@ def _one(request: ReportRequest, limits: Sequence[Limit], console: Console) -> b
     errors = None if request.truth is None else loop_errors(store, request.truth)
     if request.out is None:
         report = report_of(store, errors, "kept")
-        path = write_report_of(store, report)
+        path = write_report(store, report)
         asked = {"truth": request.truth}
         note(store, "report", console, request=asked, inputs=MADE_FROM)
     else:

@@ -27,33 +27,22 @@ Build = Callable[[Section], None]
 
 def write_report(
     store: SessionStore,
-    errors: LoopErrors | None,
+    report: Report,
     *,
     notes: Sequence[str] = (),
     times: Sequence[StageTime] = (),
 ) -> Path:
-    """Write SESSION/reports/report.html, report.json and pictures from what the session holds.
+    """Write SESSION/reports/report.html and report.json.
 
     Args:
-        store: the session; stages that have not been run are named with what runs them.
-        errors: the errors against the simulated lab's truth; None on real data.
+        store: the session.
+        report: what `report_of` made of it.
         notes: what the reader must know first.
         times: cost of the stages of the run that made it.
 
     Returns:
         The path of the page.
     """
-    return write_report_of(store, report_of(store, errors, "kept"), notes=notes, times=times)
-
-
-def write_report_of(
-    store: SessionStore,
-    report: Report,
-    *,
-    notes: Sequence[str] = (),
-    times: Sequence[StageTime] = (),
-) -> Path:
-    """Write a report that has been made; see `write_report`."""
     page = page_of(store, report, notes=notes, times=times)
     data = page.encode(math.inf)
     store.write_json(DOCUMENT, page.document)

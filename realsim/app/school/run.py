@@ -18,8 +18,7 @@ from realsim.app.school.inputs import (
 from realsim.app.school.settle import warn_of_falls
 from realsim.app.stages import note
 from realsim.errors import InputError
-from realsim.many import Workers
-from realsim.records import GraspSet, Scene
+from realsim.records import Scene
 from realsim.robots.robot_files import same_name
 from realsim.store import SessionStore
 
@@ -122,6 +121,10 @@ def run(source: Path, out: Path | None, request: SchoolRequest, console: Console
 def run_in_session(store: SessionStore, request: SchoolRequest, console: Console) -> SchoolOutcome:
     """Try grasps on the registered objects of a session that is open and held by the caller.
 
+    Models that came from a library bring their convex parts, mass, centre of mass and inertia; they
+    are taken as long as the session's mesh is the one they were computed of. Of other models the
+    School makes the parts itself, and takes the mass from the mesh and its density.
+
     Raises:
         InputError: as `run`.
     """
@@ -173,25 +176,3 @@ def _tried(
         },
         unfinished={r.grasp_set.instance: r.unfinished for r in results if r.unfinished},
     )
-
-
-def school_session(
-    store: SessionStore,
-    console: Console,
-    *,
-    grasps_per_object: int,
-    seed: int = 0,
-    workers: Workers = 2,
-) -> list[GraspSet]:
-    """Try grasps on every registered object in the Robot School and keep them in the session.
-
-    Models that came from a library bring their convex parts, mass, centre of mass and inertia; they
-    are taken as long as the session's mesh is the one they were computed of. Of other models the
-    School makes the parts itself, and takes the mass from the mesh and its density.
-
-    Raises:
-        InputError: the session has not been registered, or has no supporting plane, or holds
-            unfinished results of other parameters.
-    """
-    request = SchoolRequest(grasps=grasps_per_object, seed=seed, where=workers, restart="finished")
-    return run_in_session(store, request, console).sets

@@ -14,7 +14,8 @@ from realsim.app.register.config import RegisterRequest
 from realsim.app.register.pictures import bias_of
 from realsim.app.register.results import Registered, with_objects
 from realsim.app.register.run import run_register
-from realsim.app.school.run import school_session
+from realsim.app.school.inputs import SchoolRequest
+from realsim.app.school.run import run_in_session
 from realsim.app.school.tables import why_no_grasp
 from realsim.app.stages import note, save_starts
 from realsim.app.upgrade.analytic import agreement_of, try_analytic
@@ -95,7 +96,7 @@ def upgrade_scene(job: SceneJob, source: SceneSource, shown: Console | None) -> 
         InputError: it cannot be registered or tried, another run is working on it, or its folder
             holds something else.
     """
-    from realsim.app.report.session import write_report
+    from realsim.app.report.session import report_of, write_report
     from realsim.formats.bop.models import save_models
 
     key, console = job.key, SceneConsole(shown)
@@ -109,17 +110,18 @@ def upgrade_scene(job: SceneJob, source: SceneSource, shown: Console | None) -> 
             store, console, RegisterRequest(), lambda found: settled(store, source, found, console)
         )
         scene = result.scene
-        grasps = school_session(
-            store, console, grasps_per_object=job.config.grasps_per_object, seed=job.config.seed,
-            workers=job.workers,
+        asked = SchoolRequest(
+            grasps=job.config.grasps_per_object, seed=job.config.seed, where=job.workers,
+            restart="finished",
         )  # fmt: skip
+        grasps = run_in_session(store, asked, console).sets
         analytic: list[GraspSet] = []
         if job.config.analytic:
             analytic = try_analytic(store, job, console)
         annotate_session(store, console)
         notes = [*source.notes, *registration_notes(store), *console.told]
         with console.stage("report"):
-            write_report(store, None, notes=notes)
+            write_report(store, report_of(store, pictures="kept"), notes=notes)
         record = _record(job, source, store, scene, starts, grasps, notes)
         record["analytic"] = agreement_of(analytic)
         note(
@@ -205,7 +207,7 @@ def _session_of(job: SceneJob, source: SceneSource) -> SessionStore:
         store = SessionStore.open(folder)
     else:
         session = CaptureSession(
-            name=job.ref.place.replace("/", " "), intrinsics=source.intrinsics, views=(),
+            name=job.ref.place.replace("/", " "), intrinsics=source.intrinsics,
             depth_unit_m=source.depth_unit_m,
         )  # fmt: skip
         extra: dict[str, Any] = {"source": f"{job.ref.kind} scene {scene.number}"}
@@ -292,7 +294,7 @@ def _shown(
 
     None = the images that it was registered in have no annotation of it.
     """
-    cameras = {v.index: v.T_world_cam for v in store.session.views if v.T_world_cam is not None}
+    cameras = store.session.Ts_world_cam
     visible = _visible_fractions(store, pose)
     best: tuple[float, int] | None = None
     for index, rows in source.seen.items():
