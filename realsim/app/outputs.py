@@ -253,6 +253,15 @@ def require_free_folder(
             "it is not replaced. Give "
             + ("another folder, or delete it first." if files else "a new or an empty folder.")
         )
+    require_writable(path, name)
+
+
+def require_writable(path: Path, name: str) -> None:
+    """Raise unless a folder, or the nearest one above it that is there, can be written.
+
+    Raises:
+        InputError: it cannot; the message says why.
+    """
     parent = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
     try:
         tempfile.TemporaryDirectory(dir=parent).cleanup()

@@ -6,12 +6,11 @@ the data set said of it goes along in OUT/SPLIT/SCENE/imported.
 """
 
 import contextlib
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 from realsim.app.console import Console
-from realsim.app.outputs import require_outside
+from realsim.app.outputs import require_outside, require_writable
 from realsim.app.register.from_review import REVIEW_FILE
 from realsim.app.upgrade import files
 from realsim.app.upgrade.analytic import agreement_of, all_sets
@@ -122,7 +121,7 @@ def _write_together(out: Path, failed: dict[str, str], console: Console) -> Reco
     """
     from realsim.app.upgrade.page import write_page
 
-    records = files.all_records(out)
+    records = list(files.all_records(out))
     places = [str(r["place"]) for r in records]
     with console.stage("together", f"{len(records)} scenes"):
         console.warn(*files.gather_models(out, places))
@@ -144,20 +143,7 @@ def _refuse_what_cannot_be_written(out: Path) -> None:
             f"--out '{out}' is not empty and holds no upgrade. Choose another folder: nothing of "
             "yours is overwritten."
         )
-    made = [p for p in (out, *out.parents) if not p.exists()]
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass
-    except OSError as error:
-        raise InputError(
-            f"--out '{out}' cannot be written ({error.strerror}); choose another folder or change "
-            "its permissions."
-        ) from error
-    finally:
-        for path in made:
-            with contextlib.suppress(OSError):
-                path.rmdir()
+    require_writable(out, "--out")
 
 
 def _remove_empty(out: Path) -> None:
