@@ -133,9 +133,8 @@ def arm_at(
     order = np.flatnonzero(known)[np.unique(times[known], return_index=True)[1]]
     t, at = times[order], frames - offset_s
     Ts_at, inside = interpolated(*checked_stream(t, Ts[order], "the arm's stream"), at)
-    if joints is None:
-        return Stamped(Ts_base_ee=Ts_at, joints=None, inside=inside)
-    q = np.stack([np.interp(at, t, column) for column in np.unwrap(joints[order], axis=0).T], -1)
+    columns = () if joints is None else np.unwrap(joints[order], axis=0).T
+    q = np.stack([np.interp(at, t, column) for column in columns], -1) if len(columns) else None
     return Stamped(Ts_base_ee=Ts_at, joints=q, inside=inside)
 
 

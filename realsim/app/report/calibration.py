@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from realsim.app.report import plots as drawing
-from realsim.app.report.figures import Figure, count, shown
+from realsim.app.report.figures import MEDIAN_SCATTER, Figure, count, mean_error, shown
 from realsim.app.report.section import Section, attempted, counted, drawn
 from realsim.app.stages import BOARD_VIEWS
 from realsim.arrays import Array
@@ -107,9 +107,12 @@ def _figures(hand_eye: HandEye) -> list[Figure]:
     found = [
         ("sigma_mm", hand_eye.sigma_mm, None),
         ("sigma_deg", hand_eye.sigma_deg, None),
-        ("held_out_px", hand_eye.held_out_px, _mean_error(rms)),
-        # The median of n normal values scatters 1.2533 times as much as their mean.
-        ("view_rms_px", float(np.median(rms)) if len(rms) else np.nan, 1.2533 * _mean_error(rms)),
+        ("held_out_px", hand_eye.held_out_px, mean_error(rms)),
+        (
+            "view_rms_px",
+            float(np.median(rms)) if len(rms) else np.nan,
+            MEDIAN_SCATTER * mean_error(rms),
+        ),
         ("mismatch_deg", conventions.value if conventions else np.nan, None),
         ("camera_x_mm", t[0], each[0]),
         ("camera_y_mm", t[1], each[1]),
@@ -117,26 +120,13 @@ def _figures(hand_eye: HandEye) -> list[Figure]:
         ("fx_px", hand_eye.intrinsics.fx, hand_eye.intrinsics_sd[0]),
         ("fy_px", hand_eye.intrinsics.fy, hand_eye.intrinsics_sd[1]),
     ]
-    figures = [
-        Figure(
-            name=f"calibration.{name}", value=float(value),
-            sigma=None if sigma is None or not np.isfinite(sigma) else float(sigma),
-        )
-        for name, value, sigma in found
-        if np.isfinite(value)
-    ]  # fmt: skip
     return [
-        *figures,
+        *[Figure(f"calibration.{n}", float(v), s) for n, v, s in found if np.isfinite(v)],
         count("calibration.views_used", len(hand_eye.view_indices)),
         count("calibration.views_rejected", len(hand_eye.rejected)),
         count("calibration.checks_bad", verdicts.count("bad")),
         count("calibration.checks_warn", verdicts.count("warn")),
     ]
-
-
-def _mean_error(values: Any) -> float:
-    """Return the standard error of a mean; NaN of fewer than two."""
-    return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
 
 
 def _conventions(hand_eye: HandEye) -> Check | None:

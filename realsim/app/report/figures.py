@@ -8,7 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from realsim.app.report.catalogue import CATALOGUE, Meaning
+from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.untrusted.values import mapping, number
 
@@ -34,6 +37,8 @@ class Figure:
             raise InputError(f"a report {NOT_A_FIGURE}: '{self.name}'.")
         if not math.isfinite(self.value):
             raise InputError(f"the figure {self.name} is {self.value}; a number is needed.")
+        if self.sigma is not None and not math.isfinite(self.sigma):
+            object.__setattr__(self, "sigma", None)
 
     @property
     def meaning(self) -> Meaning:
@@ -59,6 +64,15 @@ def share(name: str, part: int, whole: int) -> Figure:
     """
     p = (part + 0.5) / (whole + 1)
     return Figure(name=name, value=part / whole, sigma=math.sqrt(p * (1 - p) / (whole + 1)))
+
+
+def mean_error(values: Array) -> float:
+    """Return the standard error of a mean; NaN of fewer than two."""
+    return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else math.nan
+
+
+MEDIAN_SCATTER = 1.2533
+"""The median of many normal values scatters so many times as much as their mean."""
 
 
 def shown(value: float, sigma: float | None) -> str:

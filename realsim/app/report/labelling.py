@@ -1,6 +1,6 @@
 """The section on the labels: what is visible, what hides it, and frames to look at."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -65,16 +65,22 @@ def _figures(section: Section, frames: Mapping[int, Any], rows: list[tuple[int, 
     } | {view for view, frame in frames.items() if frame.get("camera_inside")}
     section.add(count("labels.frames", len(frames)), count("labels.frames_flagged", len(flagged)))
     seen = [o for _, o in rows if o["px_count_all"] > 0]
-    agree = [o["depth"]["agree"] for o in seen if o["depth"]["agree"] is not None]
-    rendered = sum(o["px_count_visib"] + o["px_hidden_by_unknown"] for o in seen)
+    agree, hidden = _depth_figures(seen)
     if seen:
         mean = float(np.mean([o["visib_fract"] for o in seen]))
         section.add(Figure(name="labels.visibility_mean", value=mean, sigma=0.0))
-    if rendered:
-        hidden = sum(o["px_hidden_by_unknown"] for o in seen) / rendered
-        section.add(Figure(name="labels.hidden_by_unknown", value=float(hidden)))
-    if agree:
-        section.add(Figure(name="labels.depth_agree", value=float(np.median(agree))))
+    if hidden is not None:
+        section.add(Figure(name="labels.hidden_by_unknown", value=hidden))
+    if agree is not None:
+        section.add(Figure(name="labels.depth_agree", value=agree))
+
+
+def _depth_figures(objects: Sequence[Any]) -> tuple[float | None, float | None]:
+    """Return how well depth agrees with labels (median), and the share hidden by unknown things."""
+    agree = [o["depth"]["agree"] for o in objects if o["depth"]["agree"] is not None]
+    rendered = sum(o["px_count_visib"] + o["px_hidden_by_unknown"] for o in objects)
+    hidden = sum(o["px_hidden_by_unknown"] for o in objects)
+    return float(np.median(agree)) if agree else None, hidden / rendered if rendered else None
 
 
 def _object_table(section: Section, frames: Mapping[int, Any]) -> None:
@@ -86,17 +92,15 @@ def _object_table(section: Section, frames: Mapping[int, Any]) -> None:
     rows: list[list[object]] = []
     for instance, mine in sorted(by.items()):
         seen = [o for o in mine if o["px_count_visib"] > 0]
-        agree = [o["depth"]["agree"] for o in seen if o["depth"]["agree"] is not None]
-        rendered = sum(o["px_count_visib"] + o["px_hidden_by_unknown"] for o in mine)
-        hidden = sum(o["px_hidden_by_unknown"] for o in mine)
+        (agree, _), (_, hidden) = _depth_figures(seen), _depth_figures(mine)
         names = {o["unknown_occluder"]["finding"] for o in mine} - {"none"}
         rows.append(
             [
                 f"{instance} {mine[0]['name']}",
                 f"{len(seen)} of {len(mine)}",
                 f"{100 * np.mean([o['visib_fract'] for o in seen]):.0f}" if seen else "-",
-                f"{100 * np.median(agree):.1f}" if agree else "-",
-                f"{100 * hidden / rendered:.2f}" if rendered else "-",
+                "-" if agree is None else f"{100 * agree:.1f}",
+                "-" if hidden is None else f"{100 * hidden:.2f}",
                 "; ".join(sorted(names)) or "-",
             ]
         )

@@ -5,7 +5,7 @@ from collections import Counter
 import numpy as np
 
 from realsim.app.report import plots as drawing
-from realsim.app.report.figures import Figure, count, share
+from realsim.app.report.figures import MEDIAN_SCATTER, Figure, count, mean_error, share
 from realsim.app.report.section import Section, drawn
 from realsim.app.school.tables import p_hold_line, school_table, why_no_grasp
 from realsim.formats.grasps.scene_grasps import labelled
@@ -88,26 +88,20 @@ def _figures(section: Section, sets: list[GraspSet]) -> None:
         share("school.close_share", int(np.sum(base >= 0.25)), n),
         share("school.pendulum_share", int(np.sum(base >= 1.0)), n),
         share("school.good_share", good, n),
-        Figure(name="school.mean_score", value=float(scores.mean()), sigma=_mean_error(scores)),
+        Figure(name="school.mean_score", value=float(scores.mean()), sigma=mean_error(scores)),
     )
     mm, _ = _kept(sets)
     if len(mm):
-        # The median of n normal values scatters 1.2533 times as much as their mean.
-        sigma = None if (error := _mean_error(mm)) is None else 1.2533 * error
+        sigma = MEDIAN_SCATTER * mean_error(mm)
         section.add(Figure("school.slip_mm", float(np.median(mm)), sigma))
     section.series["school.scores"] = [round(float(v), 4) for v in scores]
     if (p := p_hold_spread(sets)) is not None:
         told = np.concatenate([s.labels[labelled(s)] for s in sets if s.label == "p_hold"])
         section.add(
-            Figure(name="school.mean_p_hold", value=p.mean, sigma=_mean_error(told)),
+            Figure(name="school.mean_p_hold", value=p.mean, sigma=mean_error(told)),
             Figure(name="school.p_hold_entropy_bits", value=p.entropy_bits),
         )
         section.series["school.p_hold"] = [round(float(v), 4) for v in told]
-
-
-def _mean_error(values: np.ndarray) -> float | None:
-    """Return the standard error of a mean; None of fewer than two."""
-    return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
 
 
 def _plots(section: Section, sets: list[GraspSet]) -> None:

@@ -25,8 +25,8 @@ def files_section(section: Section, store: SessionStore) -> None:
     lists = read_lists(store.folder)
     entries = {p: e for p, e in lists.entries.items() if not p.startswith(OWN)}
     total = sum(e.bytes for e in entries.values())
-    found = [(r, f) for r in _all(report) for f in r.findings if not f.path.startswith(OWN)]
-    damage = [(r, f) for r, f in found if f.is_damage]
+    found = [f for r in _all(report) for f in r.findings if not f.path.startswith(OWN)]
+    damage = [f for f in found if f.is_damage]
     section.add(
         count("files.listed", len(entries)), count("files.damaged", len(damage)),
         Figure(name="files.megabytes", value=total / 1e6, sigma=0.0),
@@ -35,14 +35,13 @@ def files_section(section: Section, store: SessionStore) -> None:
         f"{len(damage)} damaged" if damage else "all as they were written"
     )
     if damage:
-        names = ", ".join(f.path for _, f in damage[:3]) + (", ..." if len(damage) > 3 else "")
+        names = ", ".join(f.path for f in damage[:3]) + (", ..." if len(damage) > 3 else "")
         section.say("bad", f"Files: {len(damage)} are missing or changed since they were written "
                     f"({names}). `realsim check SESSION` lists them.")  # fmt: skip
     folders: dict[str, list[int]] = {}
     for path, entry in entries.items():
-        folders.setdefault(path.split("/")[0] if "/" in path else "(session)", []).append(
-            entry.bytes
-        )
+        folder = path.split("/")[0] if "/" in path else "(session)"
+        folders.setdefault(folder, []).append(entry.bytes)
     section.page.table(
         ["folder", "files with a checksum", "size [MB]"],
         [[name, len(sizes), f"{sum(sizes) / 1e6:.2f}"] for name, sizes in sorted(folders.items())],
@@ -50,7 +49,7 @@ def files_section(section: Section, store: SessionStore) -> None:
     if found:
         rows = [
             [f.path, Cell(text=f.kind, kind="bad" if f.is_damage else "off"), f.found]
-            for _, f in sorted(found, key=lambda x: not x[1].is_damage)
+            for f in sorted(found, key=lambda f: not f.is_damage)
         ]
         section.page.table(["file", "", "found"], rows[:SHOWN])
         if len(rows) > SHOWN:

@@ -121,18 +121,17 @@ def write_summary(
     if report.verdict == "sound" and report.missing:
         title = "What was run passed its checks"
     rows: list[list[object]] = [
-        [Cell(f.severity, kind=f.severity), textwrap.shorten(f.text, LONGEST, placeholder="…"),
-         Cell("more", href=f.section)]
-        for f in found[:SHOWN]
-    ]  # fmt: skip
-    page.verdict(kind, f"{title}.", f"{_why(report)} {_next(report)}".strip(), rows)
+        [Cell(f.severity, kind=f.severity), f.text, Cell("more", href=f.section)] for f in found
+    ]
+    first = [
+        [severity, textwrap.shorten(str(text), LONGEST, placeholder="…"), more]
+        for severity, text, more in rows[:SHOWN]
+    ]
+    page.verdict(kind, f"{title}.", f"{_why(report)} {_next(report)}".strip(), first)
     page.lead(*picture, _leading(report))
     if len(found) > SHOWN:
-        more = [
-            [Cell(f.severity, kind=f.severity), f.text, Cell("more", href=f.section)]
-            for f in found[SHOWN:]
-        ]
-        page.table(["", "what", ""], more, folded=f"{len(more)} more things to look at")
+        rest = rows[SHOWN:]
+        page.table(["", "what", ""], rest, folded=f"{len(rest)} more things to look at")
     rows = []
     for s in report.sections:
         run = f"run {s.command}" if s in report.missing else ""
