@@ -11,16 +11,8 @@ from numpy.typing import ArrayLike
 from begun_sessions import add_drawn, begun, light_things
 from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
+from realsim.app.register import results
 from realsim.app.register.files import documents, finish_interrupted, write_result
-from realsim.app.register.results import (
-    NEXT_FILE,
-    SCENE_FILE,
-    Registered,
-    claimed_cameras,
-    is_same_cameras,
-    load_registered,
-    load_seen,
-)
 from realsim.app.register.run import colour_remark
 from realsim.app.report.session import report_of, write_report
 from realsim.app.stages import judged_scene, registered_views
@@ -38,7 +30,7 @@ def store(few_views: Path, tmp_path: Path) -> SessionStore:
     return SessionStore.open(copy_of(few_views, tmp_path / "s"))
 
 
-def moved(result: Registered, by_m: float) -> Registered:
+def moved(result: results.Registered, by_m: float) -> results.Registered:
     """Return the same registration with everything elsewhere."""
     T = se3.from_translation([by_m, 0.0, 0.0])
     objects = tuple(replace(o, T_world_obj=T @ o.T_world_obj) for o in result.scene.objects)
@@ -52,7 +44,7 @@ def moved(result: Registered, by_m: float) -> Registered:
 def test_what_is_written_is_read_bit_for_bit(store: SessionStore) -> None:
     result = registered_by_hand(store)
     write_result(store, result, MODELS, {"registration/pictures/a.jpg": b"picture"})
-    read = load_registered(SessionStore.open(store.folder))
+    read = results.load_registered(SessionStore.open(store.folder))
     for a, b in zip(read.scene.objects, result.scene.objects, strict=True):
         assert np.array_equal(a.T_world_obj, b.T_world_obj)
         assert a.covariance is not None and b.covariance is not None
@@ -65,8 +57,8 @@ def test_what_is_written_is_read_bit_for_bit(store: SessionStore) -> None:
             assert read.seen[k][i].sigma_px == pose.sigma_px
     assert [n.reason for n in read.not_placed] == [n.reason for n in result.not_placed]
     assert read.remarks == result.remarks
-    assert is_same_cameras(read.cameras.claimed, result.cameras.claimed)
-    assert not store.has(NEXT_FILE)
+    assert results.is_same_cameras(read.cameras.claimed, result.cameras.claimed)
+    assert not store.has(results.NEXT_FILE)
     assert store.verify() == []
 
 
@@ -80,12 +72,12 @@ def test_the_session_has_the_refined_cameras_and_a_rerun_the_claimed_ones(
     for k in (0, 1, 2):
         np.testing.assert_allclose(now[k], result.cameras.refined[k], atol=1e-15)
     assert np.array_equal(now[3], before[3])  # it took no part
-    claimed = claimed_cameras(store)
+    claimed = results.claimed_cameras(store)
     assert set(claimed) == set(before)
     assert all(np.array_equal(claimed[k], before[k]) for k in before)
     # And once more: a second result does not make the first one's cameras the claim.
     write_result(store, moved(result, 1e-3), MODELS, {})
-    assert all(np.array_equal(claimed_cameras(store)[k], before[k]) for k in before)
+    assert all(np.array_equal(results.claimed_cameras(store)[k], before[k]) for k in before)
 
 
 def test_cameras_that_were_calibrated_anew_are_the_claim(store: SessionStore) -> None:
@@ -93,7 +85,7 @@ def test_cameras_that_were_calibrated_anew_are_the_claim(store: SessionStore) ->
     write_result(store, registered_by_hand(store), MODELS, {})
     other = {2: before[2] @ se3.from_translation([0.0, 0.001, 0.0])}
     store.set_cameras(store.session.intrinsics, other)
-    claimed = claimed_cameras(store)
+    claimed = results.claimed_cameras(store)
     np.testing.assert_allclose(claimed[2], other[2], atol=1e-15)
     assert np.array_equal(claimed[1], before[1])
 
@@ -157,7 +149,7 @@ def test_a_kill_between_any_two_files_leaves_the_old_or_the_new_state(
             again = SessionStore.open(folder)
             finish_interrupted(again)
             seen.add(states.index(state_of(SessionStore.open(folder), paths)))
-            assert again.verify() == [] and not again.has(NEXT_FILE)
+            assert again.verify() == [] and not again.has(results.NEXT_FILE)
             continue
         assert state_of(SessionStore.open(folder), paths) == states[1]
         break
@@ -169,7 +161,7 @@ def test_a_kill_between_any_two_files_leaves_the_old_or_the_new_state(
 def test_an_interrupted_result_of_other_cameras_is_thrown_away(store: SessionStore) -> None:
     result = registered_by_hand(store)
     write_result(store, result, MODELS, {})
-    scene = store.path(SCENE_FILE).read_bytes()
+    scene = store.path(results.SCENE_FILE).read_bytes()
     mortal = MortalStore.open(store.folder)
     assert isinstance(mortal, MortalStore)
     mortal.left = 1
@@ -180,7 +172,7 @@ def test_an_interrupted_result_of_other_cameras_is_thrown_away(store: SessionSto
     calibrated = {k: T @ shift for k, T in result.cameras.claimed.items()}
     again.set_cameras(again.session.intrinsics, calibrated)
     assert not finish_interrupted(again)
-    assert not again.has(NEXT_FILE) and again.path(SCENE_FILE).read_bytes() == scene
+    assert not again.has(results.NEXT_FILE) and again.path(results.SCENE_FILE).read_bytes() == scene
     np.testing.assert_allclose(again.session.Ts_world_cam[0], calibrated[0], atol=1e-15)
 
 
@@ -207,7 +199,7 @@ def test_unknown_uncertainties_are_null_and_come_back_as_nan(store: SessionStore
     bare = ObjectPose(obj_id=MODELS[min(MODELS)].obj_id, instance=5, T_world_obj=np.eye(4))
     scene = replace(result.scene, objects=(*result.scene.objects, bare), plane=None)
     write_result(store, replace(result, seen=seen, scene=scene), MODELS, {})
-    read = load_seen(store)[0][0]
+    read = results.load_seen(store)[0][0]
     assert np.isnan(read.sigma_px) and np.isnan(read.covariance).all()
     assert store.read_json("registration/views.json")["views"]["0"]["0"]["sigma_mm"] is None
     assert store.read_json("registration/scene_table.json")["frame"] == "world"
@@ -240,10 +232,10 @@ def test_an_interrupted_registration_is_finished_by_whoever_comes_next(store: Se
     result = registered_by_hand(store, left_out=1)
     before = {str(k): T.tolist() for k, T in store.session.Ts_world_cam.items()}
     files = documents(result, store, MODELS)
-    store.write_bytes(NEXT_FILE, atomic.json_bytes({"before": before, "files": files}))
-    assert not store.has(SCENE_FILE)
+    store.write_bytes(results.NEXT_FILE, atomic.json_bytes({"before": before, "files": files}))
+    assert not store.has(results.SCENE_FILE)
     scene = judged_scene(store)
-    assert [o.instance for o in scene.objects] == [0, 1] and not store.has(NEXT_FILE)
+    assert [o.instance for o in scene.objects] == [0, 1] and not store.has(results.NEXT_FILE)
     np.testing.assert_allclose(store.session.Ts_world_cam[0], result.cameras.refined[0], atol=1e-15)
 
 

@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 
 from realsim.app.register.files import write_result
-from realsim.app.report.compare import (
-    Difference,
-    ObjectDifference,
-    differences,
-    object_differences,
-    pose_difference,
-)
+from realsim.app.report import compare
 from realsim.app.report.compare_page import as_json, comparison_of, comparison_page
 from realsim.app.report.figures import Figure, count
 from realsim.app.report.sources import Source, sources_of
@@ -62,7 +56,7 @@ def test_a_report_against_itself_has_no_difference(folders: dict[str, Path]) -> 
 
 def test_a_against_b_is_the_opposite_of_b_against_a(both: list[Source]) -> None:
     a, b = both
-    forward, back = differences(a, b), differences(b, a)
+    forward, back = compare.differences(a, b), compare.differences(b, a)
     assert [d.name for d in forward] == [d.name for d in back]
     mirrored = {"better": "worse", "worse": "better"}
     for d, e in zip(forward, back, strict=True):
@@ -70,20 +64,20 @@ def test_a_against_b_is_the_opposite_of_b_against_a(both: list[Source]) -> None:
         assert d.value is None or e.value is None or d.value == -e.value
         assert d.sigma == e.sigma
         assert d.outcome is None or mirrored.get(d.outcome, d.outcome) == e.outcome
-    there, here = object_differences(a, b), object_differences(b, a)
+    there, here = compare.object_differences(a, b), compare.object_differences(b, a)
     assert [(o.name, o.mssd_mm, o.shift_mm, o.turn_deg, o.sigma_mm) for o in there] == [
         (o.name, o.mssd_mm, o.shift_mm, o.turn_deg, o.sigma_mm) for o in here
     ]
 
 
 def test_what_moved_is_told_in_millimetres_and_against_its_noise(both: list[Source]) -> None:
-    moved, still = object_differences(*both)
+    moved, still = compare.object_differences(*both)
     assert moved.shift_mm == pytest.approx(1e3 * SHIFT_M)
     assert moved.mssd_mm == pytest.approx(1e3 * SHIFT_M)
     assert moved.turn_deg == pytest.approx(0, abs=1e-4)
     assert moved.sigma_mm == pytest.approx(0.3 * np.sqrt(2))
     assert moved.is_moved and not still.is_moved
-    by = {d.name: d for d in differences(*both)}
+    by = {d.name: d for d in compare.differences(*both)}
     assert by["registration.views_used"].value == -1
     assert by["registration.views_used"].outcome == "worse"
 
@@ -100,14 +94,14 @@ def test_pose_differences_know_symmetries_and_no_order(name: str) -> None:
         turn = se3.exp(np.concatenate([np.asarray(axis) * 2.0, np.zeros(3)]))
         S = se3.from_translation(p) @ turn @ se3.from_translation(-p) @ S
     T_b = T_a @ small
-    mine = pose_difference(T_a, T_b, model)
-    assert mine == pose_difference(T_b, T_a, model)
+    mine = compare.pose_difference(T_a, T_b, model)
+    assert mine == compare.pose_difference(T_b, T_a, model)
     # Turned by a symmetry it is the same pose.
-    np.testing.assert_allclose(pose_difference(T_a, T_b @ S, model), mine, atol=2e-3)
-    assert pose_difference(T_a, T_a @ S, model)[0] == pytest.approx(0, abs=1e-4)
+    np.testing.assert_allclose(compare.pose_difference(T_a, T_b @ S, model), mine, atol=2e-3)
+    assert compare.pose_difference(T_a, T_a @ S, model)[0] == pytest.approx(0, abs=1e-4)
     # In another world the distances are the same.
     T = se3.random_transform(rng, 1, 1.0)[0]
-    np.testing.assert_allclose(pose_difference(T @ T_a, T @ T_b, model), mine, atol=1e-6)
+    np.testing.assert_allclose(compare.pose_difference(T @ T_a, T @ T_b, model), mine, atol=1e-6)
 
 
 def row(instance: int, obj_id: int) -> dict[str, object]:
@@ -126,9 +120,9 @@ def source(label: str, *objects: dict[str, object]) -> Source:
 def test_objects_are_matched_by_number_and_model_then_by_their_only_model() -> None:
     a = source("A", row(0, 1), row(1, 2), row(2, 5), row(3, 5))
     b = source("B", row(0, 1), row(7, 2), row(8, 5), row(2, 9))
-    found = {o.name: o for o in object_differences(a, b)}
+    found = {o.name: o for o in compare.object_differences(a, b)}
 
-    def sides(o: ObjectDifference) -> tuple[bool, bool]:
+    def sides(o: compare.ObjectDifference) -> tuple[bool, bool]:
         return o.first is not None, o.second is not None
 
     assert sides(found["0 m1"]) == sides(found["1 m2"]) == (True, True)
@@ -171,12 +165,15 @@ def test_a_difference_within_two_sigmas_is_noise() -> None:
     def outcome(value: float, sigma: float | None) -> str | None:
         first = Figure(name=name, value=0.5, sigma=0.03)
         second = Figure(name=name, value=value, sigma=sigma)
-        return Difference(name=name, first=first, second=second).outcome
+        return compare.Difference(name=name, first=first, second=second).outcome
 
     assert outcome(0.59, 0.04) == "same" and outcome(0.61, 0.04) == "better"
     assert outcome(0.39, 0.04) == "worse" and outcome(0.39, None) == "unknown"
     lower = "registration.doubtful"
-    assert Difference(name=lower, first=count(lower, 1), second=count(lower, 2)).outcome == "worse"
+    assert (
+        compare.Difference(name=lower, first=count(lower, 1), second=count(lower, 2)).outcome
+        == "worse"
+    )
 
 
 def test_the_page_of_three_holds_its_document_and_escapes_names(

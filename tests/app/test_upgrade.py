@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import Result
 
+import upgradable_datasets as datasets
 from realsim.app.console import Console
 from realsim.app.upgrade.analytic import FOLDER, agreement_of
 from realsim.app.upgrade.dataset import scenes_of
@@ -33,18 +34,6 @@ from realsim.rendering.casting.pixel_caster import PixelCaster
 from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore, load_grasps
 from typed_commands import invoked
-from upgradable_datasets import (
-    CAMERA,
-    NAMES,
-    bop_dataset,
-    cameras,
-    content_and_times,
-    graspnet_dataset,
-    grey_of,
-    looks,
-    slab,
-    standing,
-)
 
 OFF_M = 0.003
 """Annotations of the BOP scenes are off by this along the camera's x."""
@@ -68,12 +57,12 @@ def failed_with(dataset: Path, out: Path, *more: str) -> str:
 def upgraded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Result]:
     """A BOP scene of one image and one that is broken, upgraded."""
     root = tmp_path_factory.mktemp("upgrade")
-    dataset = bop_dataset(root / "dataset", 2, off_m=OFF_M)
+    dataset = datasets.bop_dataset(root / "dataset", 2, off_m=OFF_M)
     file = dataset / "test/000002/depth/000003.png"
     file.write_bytes(file.read_bytes()[:200])
-    before = content_and_times(dataset)
+    before = datasets.content_and_times(dataset)
     done = upgrade(dataset, root / "out", "--workers", "1")
-    assert content_and_times(dataset) == before, "the data set is only read"
+    assert datasets.content_and_times(dataset) == before, "the data set is only read"
     return dataset, root / "out", done
 
 
@@ -126,14 +115,14 @@ def test_a_second_run_does_nothing_again_and_takes_in_what_was_mended(upgraded, 
     copy, again = tmp_path / "dataset", tmp_path / "out"
     shutil.copytree(dataset, copy)  # keeps the times
     shutil.copytree(out, again)
-    before = content_and_times(again / "test")
+    before = datasets.content_and_times(again / "test")
     mended = dataset / "test/000001/depth/000003.png"
     (copy / "test/000002/depth/000003.png").write_bytes(mended.read_bytes())
     # Of another scene: the objects lie elsewhere, so the pose is judged, the scene is not refused.
     done = upgrade(copy, again, "--workers", "1")
     assert done.exit_code == 0, done.output
     assert "1 of 2 scenes are upgraded already" in done.output
-    after = content_and_times(again / "test")
+    after = datasets.content_and_times(again / "test")
     assert {k: after[k] for k in before} == before
     assert json.loads((again / "upgrade.json").read_text())["summary"]["scenes"] == 2
     (again / "test/000001/registration/review.json").write_text("{}")
@@ -199,7 +188,7 @@ def test_a_camera_that_no_scene_of_a_bop_data_set_names_is_refused(upgraded) -> 
 
 
 def test_a_camera_and_a_number_of_images_can_be_asked_for(tmp_path) -> None:
-    dataset = graspnet_dataset(tmp_path / "dataset")
+    dataset = datasets.graspnet_dataset(tmp_path / "dataset")
     for place in (dataset, dataset / "scenes", dataset / "scenes/scene_0100/kinect"):
         assert [r.place for r in scenes_of(place, UpgradeConfig())] == ["test_kinect/000100"]
     with pytest.raises(InputError, match="realsense"):
@@ -245,25 +234,27 @@ def judged(
 
     All of the depth is too far by `far_m`, and the new poses with it.
     """
-    placed, (T,) = standing(0.5), cameras(1)
+    placed, (T,) = datasets.standing(0.5), datasets.cameras(1)
     things = [*placed]
     if hidden:  # a board between the camera and the parts
         board = se3.from_translation([0.0, -0.2, 0.2]) @ se3.exp([0.8, 0, 0, 0, 0, 0])
-        things.append(PlacedMesh(-1, slab(), board))
-    (labels,) = looks(things, 1)
+        things.append(PlacedMesh(-1, datasets.slab(), board))
+    (labels,) = datasets.looks(things, 1)
     depth_m = np.where(labels.depth_m > 0, labels.depth_m + far_m, 0).astype(np.float32)
-    picture = Picture(intrinsics=CAMERA, depth_m=depth_m, T_world_cam=T, rgb=grey_of(labels))
+    picture = Picture(
+        intrinsics=datasets.CAMERA, depth_m=depth_m, T_world_cam=T, rgb=datasets.grey_of(labels)
+    )
 
     def at(off: float, far: float = 0.0) -> list[ObjectPose]:
         step = T @ se3.from_translation([off, 0, far]) @ se3.invert(T)
         return [
             ObjectPose(obj_id=part(n).obj_id, instance=p.instance, verdict="accepted",
                        T_world_obj=step @ p.T_world_obj, covariance=SURE)
-            for n, p in zip(NAMES, placed, strict=True)
+            for n, p in zip(datasets.NAMES, placed, strict=True)
         ]  # fmt: skip
 
     table = SupportPlane(T_world_table=np.eye(4))
-    return decide([picture], {part(n).obj_id: part(n) for n in NAMES}, at(off_m),
+    return decide([picture], {part(n).obj_id: part(n) for n in datasets.NAMES}, at(off_m),
                   at(found_off_m, far_m), table)  # fmt: skip
 
 
@@ -277,7 +268,7 @@ def test_a_right_annotation_stays_whatever_is_proposed(off_m: float) -> None:
 
 @pytest.mark.parametrize("off_m", [0.004, -0.008])
 def test_a_wrong_annotation_is_replaced_by_the_right_pose(off_m: float) -> None:
-    for outcome, right in zip(judged(off_m, 0.0), standing(0.5), strict=True):
+    for outcome, right in zip(judged(off_m, 0.0), datasets.standing(0.5), strict=True):
         assert outcome.kind == "improved", outcome.words
         off = se3.transform(outcome.T_world_obj, right.mesh.vertices)
         off -= se3.transform(right.T_world_obj, right.mesh.vertices)
@@ -288,7 +279,7 @@ def test_a_wrong_annotation_is_replaced_by_the_right_pose(off_m: float) -> None:
 def test_one_view_takes_little_distance_from_depth_that_may_be_off_as_a_whole(
     off_m: float, far_m: float, most_m: float
 ) -> None:
-    for outcome, right in zip(judged(off_m, 0.0, far_m=far_m), standing(0.5), strict=True):
+    for outcome, right in zip(judged(off_m, 0.0, far_m=far_m), datasets.standing(0.5), strict=True):
         assert outcome.kind == "improved" and "mm are sure" in outcome.words, outcome.words
         step = outcome.T_world_obj[:3, 3] - right.T_world_obj[:3, 3]
         assert np.linalg.norm(step) < most_m
@@ -300,18 +291,18 @@ def test_a_hidden_thing_keeps_its_annotation_and_says_how_little_is_seen() -> No
 
 
 def test_poses_follow_a_photograph_that_lies_beside_its_depth() -> None:
-    placed, (T,) = standing(0.5), cameras(1)
-    (labels,) = looks(placed, 1)
+    placed, (T,) = datasets.standing(0.5), datasets.cameras(1)
+    (labels,) = datasets.looks(placed, 1)
     off_px = 3
     picture = Picture(
-        intrinsics=CAMERA, depth_m=labels.depth_m.astype(np.float32), T_world_cam=T,
+        intrinsics=datasets.CAMERA, depth_m=labels.depth_m.astype(np.float32), T_world_cam=T,
         rgb=np.roll(PAINTS[labels.ids], off_px, axis=1),
     )  # fmt: skip
     poses = [p.T_world_obj for p in placed]
     moved = shifted(picture, [p.mesh for p in placed], poses)
     for before, after in zip(poses, moved, strict=True):
         a, b = (se3.invert(T) @ X for X in (before, after))
-        px = CAMERA.fx * (b[:3, 3] - a[:3, 3]) / a[2, 3]
+        px = datasets.CAMERA.fx * (b[:3, 3] - a[:3, 3]) / a[2, 3]
         np.testing.assert_allclose(px, [off_px, 0, 0], atol=0.5)
 
 
@@ -331,10 +322,10 @@ def test_the_print_tells_which_way_round_a_box_stands() -> None:
         faces=np.arange(3 * len(side), dtype=np.int32).reshape(-1, 3),
         colors=np.repeat(paints[side], 3, axis=0),
     )
-    T, (T_cam,) = standing(0.5)[0].T_world_obj, cameras(1)
-    hits = PixelCaster([PlacedMesh(0, mesh, T)]).cast(CAMERA, T_cam)
+    T, (T_cam,) = datasets.standing(0.5)[0].T_world_obj, datasets.cameras(1)
+    hits = PixelCaster([PlacedMesh(0, mesh, T)]).cast(datasets.CAMERA, T_cam)
     rgb = np.where(hits.geometry[..., None] == 0, paints[side[hits.face]], 90).astype(np.uint8)
-    picture = Picture(intrinsics=CAMERA, depth_m=hits.depth_m, T_world_cam=T_cam, rgb=rgb)
+    picture = Picture(intrinsics=datasets.CAMERA, depth_m=hits.depth_m, T_world_cam=T_cam, rgb=rgb)
     half = T @ se3.exp([0, 0, np.pi, 0, 0, 0])
     for paint, expected in ((mesh, True), (bare, False)):
         model = replace(part("box"), mesh=paint)
@@ -378,16 +369,16 @@ def test_labels_and_scores_that_rank_alike_have_the_correlation_minus_one() -> N
 
 @pytest.mark.slow
 def test_analytic_grasps_are_tried_and_kept_beside_the_schools_own(tmp_path: Path) -> None:
-    dataset, out = bop_dataset(tmp_path / "dataset"), tmp_path / "out"
+    dataset, out = datasets.bop_dataset(tmp_path / "dataset"), tmp_path / "out"
     config = UpgradeConfig(grasps_per_object=2, where=1)
     run_upgrade(config, dataset, out, QUIET)
     scene = out / "test/000001"
-    own = content_and_times(scene / "grasps")
+    own = datasets.content_and_times(scene / "grasps")
     result = run_upgrade(replace(config, analytic=8), dataset, out, QUIET)
-    assert content_and_times(scene / "grasps").keys() == own.keys()
+    assert datasets.content_and_times(scene / "grasps").keys() == own.keys()
     assert [len(s) for s in load_grasps(scene)] == [2, 2]
     sets = load_grasps(scene / FOLDER)
-    assert [s.obj_id for s in sets] == [part(n).obj_id for n in NAMES]
+    assert [s.obj_id for s in sets] == [part(n).obj_id for n in datasets.NAMES]
     for s in sets:
         assert 0 < len(s) <= 8
         labels = read_grasp_labels(out / f"grasp_label/{s.obj_id - 1:03d}_labels.npz")
@@ -407,27 +398,27 @@ def test_analytic_grasps_are_tried_and_kept_beside_the_schools_own(tmp_path: Pat
     told = json.loads((out / "upgrade.json").read_text())
     assert told["analytic"]["levels"] == result.analytic["levels"]
     assert "Analytic grasps, tried" in (out / "upgrade.html").read_text()
-    kept = content_and_times(scene / FOLDER)
+    kept = datasets.content_and_times(scene / FOLDER)
     (scene / "stages/upgrade.json").unlink()  # gone through again: what is finished stays
     run_upgrade(replace(config, analytic=8), dataset, out, QUIET)
-    assert content_and_times(scene / FOLDER) == kept
+    assert datasets.content_and_times(scene / FOLDER) == kept
     _a_graspnet_roots_own_labels_are_taken(tmp_path, out / "grasp_label")
 
 
 def _a_graspnet_roots_own_labels_are_taken(tmp_path: Path, labels: Path) -> None:
-    dataset = graspnet_dataset(tmp_path / "graspnet")
+    dataset = datasets.graspnet_dataset(tmp_path / "graspnet")
     (dataset / "grasp_label").mkdir()
     for file in labels.glob("*.npz"):
         shutil.copy(file, dataset / "grasp_label" / file.name)
-    before, out = content_and_times(dataset), tmp_path / "from_graspnet"
+    before, out = datasets.content_and_times(dataset), tmp_path / "from_graspnet"
     run_upgrade(UpgradeConfig(grasps_per_object=2, analytic=4, where=1), dataset, out, QUIET)
-    assert content_and_times(dataset) == before
+    assert datasets.content_and_times(dataset) == before
     scene = out / "test_kinect/000100"
     xml = "annotations/0001.xml"
     home = dataset / "scenes/scene_0100/kinect"
     assert (scene / "imported" / xml).read_bytes() == (home / xml).read_bytes()
     placed = json.loads((scene / "registration/scene.json").read_text())["objects"]
-    for o, p in zip(placed, standing(), strict=True):
+    for o, p in zip(placed, datasets.standing(), strict=True):
         # The world is the table's frame, as GraspNet has it; depth is in whole millimetres.
         T = np.array(o["T_world_obj"])
         np.testing.assert_allclose(T[:3, 3], p.T_world_obj[:3, 3], atol=1.5e-3)

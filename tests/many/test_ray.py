@@ -8,34 +8,10 @@ import sys
 
 import pytest
 
-from many_tasks import (
-    dies_first,
-    doubled,
-    fills_the_disk,
-    odd_fails,
-    rewrites,
-    sizes,
-    spoils_and_fails,
-)
-from ray_on_loopback import (
-    SCENES,
-    generated,
-    generated_with_a_loss,
-    listening_beyond_loopback,
-    two_nodes,
-)
+import many_tasks
+import ray_on_loopback
+from realsim import many
 from realsim.errors import InputError
-from realsim.many import (
-    ForeignNodeError,
-    PoolConfig,
-    Sent,
-    Shared,
-    Task,
-    Worked,
-    WorkerDiedError,
-    open_pool,
-    run_many,
-)
 from realsim.many.ray_driver import on_node
 from realsim.many.ray_node import work
 from realsim.many.ray_pool import _ending
@@ -48,12 +24,12 @@ def test_what_is_no_address_is_named():
     for address in ("10.0.0.1", "ray://10.0.0.1:10001", ":6379", "head:port"):
         with (
             pytest.raises(InputError, match="no address of a Ray cluster"),
-            open_pool(PoolConfig(address=address)),
+            many.open_pool(many.PoolConfig(address=address)),
         ):
             pass
     with (
         pytest.raises(InputError, match=r"no machine of the name 'nowhere\.invalid' is known"),
-        open_pool(PoolConfig(address="nowhere.invalid:6379")),
+        many.open_pool(many.PoolConfig(address="nowhere.invalid:6379")),
     ):
         pass
 
@@ -62,19 +38,19 @@ def test_a_cluster_is_not_joined_without_a_token(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     for name in ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH", "RAY_AUTH_MODE"):
         monkeypatch.delenv(name, raising=False)
-    config = PoolConfig(address="192.0.2.77:6379")
-    with pytest.raises(InputError, match="no token for the Ray cluster"), open_pool(config):
+    config = many.PoolConfig(address="192.0.2.77:6379")
+    with pytest.raises(InputError, match="no token for the Ray cluster"), many.open_pool(config):
         pass
     monkeypatch.setenv("RAY_AUTH_TOKEN", "t" * 64)
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
-    with pytest.raises(InputError, match="RAY_AUTH_MODE=token"), open_pool(config):
+    with pytest.raises(InputError, match="RAY_AUTH_MODE=token"), many.open_pool(config):
         pass
 
 
 def test_without_ray_it_is_said_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    config = PoolConfig(address="local")
-    with pytest.raises(InputError, match=r"realsim\[cluster\]"), open_pool(config):
+    config = many.PoolConfig(address="local")
+    with pytest.raises(InputError, match=r"realsim\[cluster\]"), many.open_pool(config):
         pass
 
 
@@ -82,16 +58,16 @@ def test_a_machine_with_another_version_does_nothing_and_is_named():
     (told,) = on_node("0.0.7", "run", (), b"", {})
     assert "realsim" in told and "this one 0.0.7" in told
     error = _ending("foreign", told)
-    assert isinstance(error, ForeignNodeError) and "Install the same version" in str(error)
+    assert isinstance(error, many.ForeignNodeError) and "Install the same version" in str(error)
 
 
 @pytest.mark.parametrize("is_stored", [False, True])
 def test_a_machine_whose_disk_is_full_counts_as_lost(is_stored, monkeypatch, tmp_path):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    job = pickle.dumps((fills_the_disk, (str(tmp_path), is_stored)))
+    job = pickle.dumps((many_tasks.fills_the_disk, (str(tmp_path), is_stored)))
     (ended,) = work("run", job, lambda digest: b"")
     found = _ending("ended", ended)
-    assert isinstance(found, WorkerDiedError) and "the disk of" in str(found)
+    assert isinstance(found, many.WorkerDiedError) and "the disk of" in str(found)
 
 
 # --- one machine ----------------------------------------------------------------------------------
@@ -100,7 +76,7 @@ def test_a_machine_whose_disk_is_full_counts_as_lost(is_stored, monkeypatch, tmp
 @pytest.fixture(scope="module")
 def cluster():
     pytest.importorskip("ray")
-    with open_pool(PoolConfig(workers=2, address="local")) as pool:
+    with many.open_pool(many.PoolConfig(workers=2, address="local")) as pool:
         yield pool
 
 
@@ -110,8 +86,8 @@ def ran(pool, *tasks):
     def keep(outcome):
         outcomes[outcome.task.name] = outcome
 
-    named = [Task(name=str(k), fn=fn, args=tuple(args)) for k, (fn, *args) in enumerate(tasks)]
-    summary = run_many(named, pool, keep)
+    named = [many.Task(name=str(k), fn=fn, args=tuple(args)) for k, (fn, *args) in enumerate(tasks)]
+    summary = many.run_many(named, pool, keep)
     return summary, [outcomes[t.name] for t in named]
 
 
@@ -119,10 +95,10 @@ def ran(pool, *tasks):
 def test_tasks_on_a_cluster_do_what_they_do_here(cluster, tmp_path):
     summary, found = ran(
         cluster,
-        *((doubled, k) for k in range(8)),
-        (odd_fails, 3),
-        (dies_first, str(tmp_path), 1),
-        (doubled, Shared([1, 2])),
+        *((many_tasks.doubled, k) for k in range(8)),
+        (many_tasks.odd_fails, 3),
+        (many_tasks.dies_first, str(tmp_path), 1),
+        (many_tasks.doubled, many.Shared([1, 2])),
     )
     assert [o.value for o in found[:8]] == [2 * k for k in range(8)]
     assert found[8].why == "3 is odd" and isinstance(found[8].error, InputError)
@@ -132,7 +108,7 @@ def test_tasks_on_a_cluster_do_what_they_do_here(cluster, tmp_path):
 
 @pytest.mark.slow
 def test_a_task_that_kills_three_workers_is_named(cluster, tmp_path):
-    summary, (found,) = ran(cluster, (dies_first, str(tmp_path), 9))
+    summary, (found,) = ran(cluster, (many_tasks.dies_first, str(tmp_path), 9))
     assert "3 workers ended in the middle of it" in found.why and len(summary.failed) == 1
     assert len(list(tmp_path.iterdir())) == 3
 
@@ -144,10 +120,14 @@ def test_files_travel_and_changes_come_back_or_nothing_does(cluster, tmp_path):
     for name in ("changed.txt", "log.txt", "gone.txt", "same.txt"):
         (folder / name).write_text("before ")
     untouched = (folder / "same.txt").stat().st_mtime_ns
-    summary, found = ran(cluster, (spoils_and_fails, Worked(folder)))
+    summary, found = ran(cluster, (many_tasks.spoils_and_fails, many.Worked(folder)))
     assert found[0].why == "it cannot be done"
     assert {p.read_text() for p in folder.iterdir()} == {"before "} and len(summary.failed) == 1
-    _, found = ran(cluster, (sizes, Sent(folder), Sent(b"1234")), (rewrites, Worked(folder), "x"))
+    _, found = ran(
+        cluster,
+        (many_tasks.sizes, many.Sent(folder), many.Sent(b"1234")),
+        (many_tasks.rewrites, many.Worked(folder), "x"),
+    )
     names = ("changed.txt", "gone.txt", "log.txt", "same.txt")
     assert found[0].value == [dict.fromkeys(names, 7), 4]
     kept = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
@@ -158,7 +138,10 @@ def test_files_travel_and_changes_come_back_or_nothing_does(cluster, tmp_path):
     assert (folder / "below/large.bin").stat().st_size == 20_000_000
     assert (folder / "same.txt").stat().st_mtime_ns == untouched
     with only_run_in(folder):  # nobody else may work in it meanwhile
-        assert "another run is working" in ran(cluster, (sizes, Worked(folder)))[1][0].why
+        assert (
+            "another run is working"
+            in ran(cluster, (many_tasks.sizes, many.Worked(folder)))[1][0].why
+        )
 
 
 # --- several machines, and commands ---------------------------------------------------------------
@@ -167,23 +150,23 @@ def test_files_travel_and_changes_come_back_or_nothing_does(cluster, tmp_path):
 @pytest.fixture(scope="module")
 def nodes():
     pytest.importorskip("ray")
-    with two_nodes() as cluster:
+    with ray_on_loopback.two_nodes() as cluster:
         yield cluster
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """The scenes that one machine makes."""
-    said, scenes = generated(tmp_path_factory.mktemp("whole") / "out")
+    said, scenes = ray_on_loopback.generated(tmp_path_factory.mktemp("whole") / "out")
     assert said.returncode == 0 and scenes, said.stderr
     return scenes
 
 
 @pytest.mark.slow
 def test_of_two_nodes_one_is_killed_and_the_result_is_that_of_one_machine(nodes, whole, tmp_path):
-    assert not listening_beyond_loopback(nodes[0])
-    at, said, scenes = generated_with_a_loss(tmp_path / "out", nodes, "node")
-    assert 1 <= at < SCENES, "the node was killed in the middle"
+    assert not ray_on_loopback.listening_beyond_loopback(nodes[0])
+    at, said, scenes = ray_on_loopback.generated_with_a_loss(tmp_path / "out", nodes, "node")
+    assert 1 <= at < ray_on_loopback.SCENES, "the node was killed in the middle"
     assert said.returncode == 0, said.stderr
     assert scenes == whole and not list(tmp_path.rglob("*.part"))
 
@@ -191,15 +174,15 @@ def test_of_two_nodes_one_is_killed_and_the_result_is_that_of_one_machine(nodes,
 @pytest.mark.slow
 def test_a_lost_head_ends_in_a_sentence_and_the_same_command_goes_on(nodes, whole, tmp_path):
     out = tmp_path / "out"
-    at, said, kept = generated_with_a_loss(out, nodes, "head")
-    assert 1 <= at < SCENES, "the head was killed in the middle"
+    at, said, kept = ray_on_loopback.generated_with_a_loss(out, nodes, "head")
+    assert 1 <= at < ray_on_loopback.SCENES, "the head was killed in the middle"
     assert said.returncode == 2
     told = [line for line in said.stderr.splitlines() if line.strip()]
     assert told[-1].startswith("error: the Ray cluster (127.0.0.1:")
     assert "is lost: its head is gone. Until then" in told[-1] and "goes on from here" in told[-1]
     assert not any("ray." in line or "Traceback" in line for line in told), told
     assert kept and kept.items() <= whole.items()
-    again, scenes = generated(out)
+    again, scenes = ray_on_loopback.generated(out)
     assert again.returncode == 0 and scenes == whole and not list(out.rglob("*.part"))
 
 

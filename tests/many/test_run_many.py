@@ -10,34 +10,24 @@ from concurrent.futures import Future
 import pytest
 
 from many_tasks import dies_first, doubled, odd_fails, sizes, waits_then
+from realsim import many
 from realsim.errors import InputError
-from realsim.many import (
-    ClusterLostError,
-    ForeignNodeError,
-    PoolConfig,
-    Sent,
-    Task,
-    Worked,
-    WorkerDiedError,
-    open_pool,
-    run_many,
-)
 from realsim.store.atomic import StorageError
 
 
 @pytest.fixture(scope="module")
 def two():
-    with open_pool(PoolConfig(workers=2)) as pool:
+    with many.open_pool(many.PoolConfig(workers=2)) as pool:
         yield pool
 
 
 def tasks_of(fn, *args):
-    return [Task(name=f"task {k}", fn=fn, args=given) for k, given in enumerate(args)]
+    return [many.Task(name=f"task {k}", fn=fn, args=given) for k, given in enumerate(args)]
 
 
 def ran(pool, tasks, **kwargs):
     outcomes = []
-    summary = run_many(tasks, pool, outcomes.append, **kwargs)
+    summary = many.run_many(tasks, pool, outcomes.append, **kwargs)
     return outcomes, summary
 
 
@@ -45,7 +35,7 @@ def test_every_task_is_told_once_whoever_does_it(two):
     tasks = tasks_of(doubled, *((k,) for k in range(20)))
     for where in (two, None):
         if where is None:
-            with open_pool(1) as alone:
+            with many.open_pool(1) as alone:
                 outcomes, summary = ran(alone, tasks)
         else:
             outcomes, summary = ran(where, tasks)
@@ -73,10 +63,10 @@ def test_a_task_whose_worker_is_killed_is_begun_again(two, tmp_path):
 
 
 def test_a_task_that_kills_three_workers_is_named_and_the_rest_go_on(two, tmp_path):
-    deadly = Task(name="deadly", fn=dies_first, args=(str(tmp_path), 100))
+    deadly = many.Task(name="deadly", fn=dies_first, args=(str(tmp_path), 100))
     _, summary = ran(two, [deadly, *tasks_of(doubled, (1,), (2,))])
     assert [o.task.name for o in summary.failed] == ["deadly"]
-    assert isinstance(summary.failed[0].error, WorkerDiedError)
+    assert isinstance(summary.failed[0].error, many.WorkerDiedError)
     assert "3 workers ended in the middle of it" in summary.failed[0].why
     assert "killed (signal SIGKILL), as the system does when" in summary.failed[0].why
     assert summary.done == 2 and len(list(tmp_path.iterdir())) == 3
@@ -134,7 +124,7 @@ def test_results_come_in_order_where_that_is_asked_for(two):
         seen.append(outcome.value)
         assert len(begun) <= outcome.value + 1 + 2 * two.capacity()
 
-    run_many(lazily(), two, done, in_order=True)
+    many.run_many(lazily(), two, done, in_order=True)
     assert seen == list(range(6))
 
 
@@ -145,7 +135,7 @@ def test_an_outcome_may_bring_further_tasks(two):
         seen.append(outcome.value)
         return tasks_of(doubled, (outcome.value,)) if outcome.value < 40 else None
 
-    summary = run_many(tasks_of(doubled, (1,), (3,)), two, done)
+    summary = many.run_many(tasks_of(doubled, (1,), (3,)), two, done)
     assert sorted(seen) == [2, 4, 6, 8, 12, 16, 24, 32, 48, 64] and summary.done == 10
 
 
@@ -153,8 +143,8 @@ def test_files_folders_and_bytes_become_paths(two, tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "a").write_bytes(b"12")
     (tmp_path / "file").write_bytes(b"123")
-    given = (Sent(tmp_path / "folder"), Sent(tmp_path / "file"), Sent(b"1234"),
-             Worked(tmp_path / "folder"))  # fmt: skip
+    given = (many.Sent(tmp_path / "folder"), many.Sent(tmp_path / "file"), many.Sent(b"1234"),
+             many.Worked(tmp_path / "folder"))  # fmt: skip
     (outcome,), _ = ran(two, tasks_of(sizes, given))
     assert outcome.found() == [{"a": 2}, 3, 4, {"a": 2}]
 
@@ -183,8 +173,11 @@ class Broken:
 @pytest.mark.parametrize(
     ("error", "told"),
     [
-        (ClusterLostError("the head is gone."), "gone. Until then 2 tasks are done, and what they"),
-        (ForeignNodeError("x has realsim 0.0.1"), "x has realsim 0.0.1"),
+        (
+            many.ClusterLostError("the head is gone."),
+            "gone. Until then 2 tasks are done, and what they",
+        ),
+        (many.ForeignNodeError("x has realsim 0.0.1"), "x has realsim 0.0.1"),
         (StorageError("no room"), "no room"),
         (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/f"), "disk is full.* goes on from"),
     ],
@@ -193,7 +186,7 @@ def test_what_would_befall_every_task_ends_the_run_with_a_sentence(error, told):
     expected = StorageError if isinstance(error, OSError) else type(error)
     outcomes = []
     with pytest.raises(expected, match=told):
-        run_many(tasks_of(doubled, *[(1,)] * 5), Broken(error, good=2), outcomes.append)
+        many.run_many(tasks_of(doubled, *[(1,)] * 5), Broken(error, good=2), outcomes.append)
     assert len(outcomes) == 2
 
 
@@ -208,7 +201,7 @@ def test_ctrl_c_tells_how_far_it_came_and_ends_the_workers():
     tasks = [*tasks_of(doubled, (1,)), *tasks_of(waits_then, (0.1, 5), (60.0, 7), (60.0, 8))]
     with (
         pytest.raises(KeyboardInterrupt, match="interrupted: 1 task is done"),
-        open_pool(PoolConfig(workers=2)) as pool,
+        many.open_pool(many.PoolConfig(workers=2)) as pool,
     ):
-        run_many(tasks, pool, stop)
+        many.run_many(tasks, pool, stop)
     assert sorted(done) == [2, 5]
