@@ -3,12 +3,7 @@
 import os
 
 import click
-from click.shell_completion import (
-    BashComplete,
-    CompletionItem,
-    add_completion_class,
-    get_completion_class,
-)
+from click import shell_completion
 
 from realsim.app.command import Command
 
@@ -17,7 +12,7 @@ VARIABLE = "_REALSIM_COMPLETE"
 """The variable by which the shell asks for completions; click's own name."""
 
 
-class ColonBash(BashComplete):
+class ColonBash(shell_completion.BashComplete):
     """Completion in bash, which takes `shipped:NAME` for three words.
 
     The colon is one of the characters at which readline breaks words (COMP_WORDBREAKS): the words
@@ -31,7 +26,7 @@ class ColonBash(BashComplete):
         self._before_colon = len(words[-1].rpartition(":")[0]) + 1 if ":" in words[-1] else 0
         return words[:-1], words[-1]
 
-    def format_completion(self, item: CompletionItem[str]) -> str:
+    def format_completion(self, item: shell_completion.CompletionItem[str]) -> str:
         """Leave out what bash has on the line already."""
         item.value = str(item.value)[self._before_colon :] if self._before_colon else item.value
         return super().format_completion(item)
@@ -54,7 +49,7 @@ def _joined(words: list[str]) -> list[str]:
 def add_bash_completion() -> None:
     """Let bash's requests be answered by `ColonBash`."""
     if VARIABLE in os.environ:
-        add_completion_class(ColonBash, "bash")
+        shell_completion.add_completion_class(ColonBash, "bash")
 
 
 @click.command(
@@ -73,6 +68,6 @@ def completion_command(shell: str) -> None:
 
     Open a new shell afterwards.
     """  # noqa: D301 - click's own mark for lines that stay as they are
-    kind = get_completion_class(shell)
+    kind = shell_completion.get_completion_class(shell)
     assert kind is not None, "click knows all three"
     click.echo(kind(click.Group(), {}, "realsim", VARIABLE).source())

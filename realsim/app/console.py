@@ -7,7 +7,7 @@ holds that document and nothing else.
 import os
 import sys
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -131,30 +131,23 @@ class Console:
     @contextmanager
     def _bar(self, label: str) -> Generator[Tick]:
         """Draw a progress bar on the terminal."""
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
+        from rich import progress as parts
         from rich.table import Column
 
         columns = (
-            TextColumn(
+            parts.TextColumn(
                 "{task.description}",
                 markup=False,
                 # The label gives way where the terminal is narrow, the figures never.
                 table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis"),
             ),
-            BarColumn(bar_width=20),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
+            parts.BarColumn(bar_width=20),
+            parts.MofNCompleteColumn(),
+            parts.TimeElapsedColumn(),
+            parts.TextColumn("left"),
+            parts.TimeRemainingColumn(),
         )
-        with Progress(*columns, console=self._err, expand=self._err.width < 100) as bar:
+        with parts.Progress(*columns, console=self._err, expand=self._err.width < 100) as bar:
             task = bar.add_task(label, total=None)
 
             def tick(done: int, total: int) -> None:
@@ -220,7 +213,7 @@ class Console:
             sys.stdout.write(json_document(document) + "\n")
             sys.stdout.flush()
 
-    def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    def table(self, title: str, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
         """Print a table: text is left-aligned (the first column, and sentences), figures right.
 
         Where it is too wide for its words, each row becomes a block of lines instead: no number is

@@ -4,7 +4,7 @@ Moves, swaps, accepts and rejects count wherever the scene is used; excluded vie
 symmetry count in every command that looks at views or models.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 
 from realsim.app.console import Console
 from realsim.review.journal import JOURNAL_FILE, Entry, ReviewState, read, replay
@@ -43,7 +43,7 @@ def damage_words(store: SessionStore) -> str:
 
 def stray_words(
     state: ReviewState, instances: Collection[int], views: Collection[int], models: Collection[int]
-) -> list[str]:
+) -> Iterator[str]:
     """Return, of every line about what is not in the session, that it counts for nothing.
 
     Args:
@@ -52,16 +52,14 @@ def stray_words(
         views: the session's.
         models: ids of its models.
     """
-    words: list[str] = []
     for entry in state.standing:
         by = f"{entry.action} by {entry.reviewer}, {entry.time[:16]}"
         if entry.view is not None and entry.view not in views:
-            words.append(f"{by}: there is no view {entry.view}, so it counts for nothing.")
+            yield f"{by}: there is no view {entry.view}, so it counts for nothing."
         elif entry.action == "symmetric" and entry.obj_id not in models:
-            words.append(f"{by}: there is no model {entry.obj_id}, so it counts for nothing.")
+            yield f"{by}: there is no model {entry.obj_id}, so it counts for nothing."
         elif entry.instance is not None and entry.instance not in instances:
-            words.append(f"{by}: there is no instance {entry.instance}, so it counts for nothing.")
-    return words
+            yield f"{by}: there is no instance {entry.instance}, so it counts for nothing."
 
 
 def exclusion_words(entry: Entry) -> str:

@@ -6,7 +6,7 @@ argument, by its name with `_` for `-`; None leaves it to the command.
 """
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -287,7 +287,7 @@ def run(
     return told
 
 
-def _words(name: str, path: Sequence[str], options: Mapping[str, Any]) -> list[str]:
+def _words(name: str, path: Sequence[str], options: Mapping[str, Any]) -> Iterator[str]:
     """Return options as they are typed.
 
     Raises:
@@ -302,7 +302,6 @@ def _words(name: str, path: Sequence[str], options: Mapping[str, Any]) -> list[s
     known = {
         spelling(p).replace("-", "_"): p for p in command.params if isinstance(p, click.Option)
     }
-    words: list[str] = []
     for key, value in options.items():
         if value is None:
             continue
@@ -310,5 +309,4 @@ def _words(name: str, path: Sequence[str], options: Mapping[str, Any]) -> list[s
             raise InputError(f"{name} has no option '{key}'; it has {', '.join(sorted(known))}.")
         option = known[key]
         single = option.multiple and isinstance(value, str | os.PathLike)
-        words += [str(w) for w in typed(option, (value,) if single else value)]
-    return words
+        yield from [str(w) for w in typed(option, (value,) if single else value)]

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
@@ -135,7 +135,7 @@ class Page:
     def table(
         self,
         header: Sequence[object],
-        rows: Sequence[Sequence[object]],
+        rows: Iterable[Sequence[object]],
         *,
         colors: Sequence[tuple[int, int, int]] | None = None,
         folded: str = "",
@@ -221,7 +221,7 @@ class Page:
                 or a budget that does not hold one view of every gallery.
         """
         galleries = self._galleries()
-        parts = _once(self.parts)
+        parts = list(_once(self.parts))
         fixed = sum(len(s.src) for p in parts for s in p.get("pictures", ()))
         fit(galleries, budget_bytes - MARKUP_BYTES - fixed, self.title)
         # "</" would end the script, "<!--" would begin a comment in it.
@@ -240,15 +240,13 @@ class Page:
         return data
 
 
-def _once(parts: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def _once(parts: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
     """Return the parts without pictures that stand further up already."""
     seen: set[str] = set()
-    kept: list[dict[str, Any]] = []
     for part in parts:
         new: list[Shown] = [p for p in part.get("pictures", ()) if p.src not in seen]
         seen |= {p.src for p in new}
-        kept.append(part | {"pictures": new})
-    return kept
+        yield part | {"pictures": new}
 
 
 @pass_context

@@ -151,7 +151,7 @@ def test_an_acceptance_outlives_a_registration_also_that_of_a_moved_object(
     state = journal.replay(journal.read(session.path(journal.JOURNAL_FILE)).entries)
     now = load_scene(session).objects
     assert all(decision_on(o, state) is not None for o in now)
-    assert moved_since_accepted(now, state) == []
+    assert not list(moved_since_accepted(now, state))
     beside = se3.from_translation([0.003, 0.0, 0.0])
     elsewhere = [replace(o, T_world_obj=beside @ o.T_world_obj) for o in now]
     assert [found[1].action for found in moved_since_accepted(elsewhere, state)] == ["accept"] * 2

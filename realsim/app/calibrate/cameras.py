@@ -6,22 +6,15 @@ themselves, every other one `cameras/NAME` inside them (or just its images, `rgb
 numbers of the views. The session's own `cameras/NAME` are then placed.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from realsim.app.calibrate import camera_frames
 from realsim.app.calibrate.board_views import BOARD_FILE, known_arm, note_depth_bias
-from realsim.app.calibrate.camera_frames import (
-    Frames,
-    boards_of,
-    cameras_of,
-    frames_of,
-    pose_file_of,
-    with_intrinsics,
-)
 from realsim.app.calibrate.folder import MADE_OF, made_of, require_free_results
 from realsim.app.calibrate.images import find_in_images, why_not_found
 from realsim.app.calibrate.show import show_checks
@@ -62,7 +55,7 @@ def run_cameras(source: Path, console: Console, options: dict[str, Any]) -> bool
         InputError: source or options cannot be used; says what is accepted.
         DegenerateError: the views do not determine the cameras.
     """
-    cameras = cameras_of(options["cameras"])
+    cameras = camera_frames.cameras_of(options["cameras"])
     for name in ("board_poses", "eye_to_hand"):
         if options.get(name):
             raise InputError(
@@ -75,14 +68,14 @@ def run_cameras(source: Path, console: Console, options: dict[str, Any]) -> bool
         raise InputError(f"'{source}' is not a folder; one with a folder per camera is expected.")
     out: Path = options["out"]
     require_free_results(out, source, console)
-    boards = boards_of(options)
-    poses = pose_file_of(source, options["poses"], [c.name for c in cameras])
+    boards = camera_frames.boards_of(options)
+    poses = camera_frames.pose_file_of(source, options["poses"], [c.name for c in cameras])
     raw = None if poses is None else read_pose_file(poses, key=options["key"] or None)
-    frames = frames_of(source, cameras, raw)
+    frames = camera_frames.frames_of(source, cameras, raw)
     console.warn(*frames.left_out)
-    cameras = with_intrinsics(cameras, options["intrinsics"])
+    cameras = camera_frames.with_intrinsics(cameras, options["intrinsics"])
     write_text(out / MADE_OF, made_of(source))
-    sightings = _sightings(frames, cameras, boards, out, console)
+    sightings = tuple(_sightings(frames, cameras, boards, out, console))
     rig = Rig(
         cameras=cameras, boards=boards, sightings=sightings,
         instants=tuple(Instant(name=name) for name in frames.instants),
@@ -102,7 +95,7 @@ def _run_session(
 
     store = SessionStore.open(source / BOARD_VIEWS)
     folder = source / "calibration"
-    boards = boards_of(options, needed=False)
+    boards = camera_frames.boards_of(options, needed=False)
     if not any(b.place == "table" for b in boards) and (source / BOARD_FILE).is_file():
         target = target_from_json(read_values(source / BOARD_FILE))
         boards = (RigBoard(name="table", target=target, place="table"), *boards)
@@ -119,16 +112,18 @@ def _run_session(
         images[camera.name] = {
             i: found[f"{v.index:06d}"] for i, v in enumerate(views) if f"{v.index:06d}" in found
         }
-    frames = Frames(instants=tuple(f"{v.index:06d}" for v in views), images=images, rows={})
+    frames = camera_frames.Frames(
+        instants=tuple(f"{v.index:06d}" for v in views), images=images, rows={}
+    )
     lenses = {name: s.session.intrinsics for name, s in inner.items()}
     lenses |= {c.name: store.session.intrinsics for c in cameras if c.mount == "hand"}
     known = tuple(
         replace(c, intrinsics0=lenses[c.name]) if c.name in lenses else c for c in cameras
     )
-    known = with_intrinsics(known, options["intrinsics"])
+    known = camera_frames.with_intrinsics(known, options["intrinsics"])
     rig = Rig(
         cameras=known, boards=boards,
-        sightings=_sightings(frames, known, boards, folder, console),
+        sightings=tuple(_sightings(frames, known, boards, folder, console)),
         instants=tuple(
             Instant(name=f"{v.index:06d}", T_base_ee=v.T_base_ee, joints=v.joints) for v in views
         ),
@@ -144,22 +139,20 @@ def _run_session(
 
 
 def _sightings(
-    frames: Frames, cameras: Sequence[RigCamera], boards: Sequence[RigBoard], out: Path,
-    console: Console,
-) -> tuple[Sighting, ...]:  # fmt: skip
+    frames: camera_frames.Frames, cameras: Sequence[RigCamera], boards: Sequence[RigBoard],
+    out: Path, console: Console,
+) -> Iterator[Sighting]:  # fmt: skip
     """Return what every camera sees of every board, images without a board among them."""
-    found: list[Sighting] = []
     for c, camera in enumerate(cameras):
         own = sorted(frames.images[camera.name].items())
         for b, board in enumerate(boards):
             seen = find_in_images([p for _, p in own], board.target, out, console)
             _require_one_size(camera.name, [p.name for _, p in own], [d.image_size for d in seen])
-            found += [
+            yield from [
                 Sighting(camera=c, board=b, instant=i, detection=d, name=f"{camera.name}/{p.name}")
                 for (i, p), d in zip(own, seen, strict=True)
                 if len(d) or len(boards) == 1
             ]
-    return tuple(found)
 
 
 def _require_one_size(camera: str, names: list[str], sizes: list[tuple[int, int]]) -> None:
@@ -174,7 +167,7 @@ def _require_one_size(camera: str, names: list[str], sizes: list[tuple[int, int]
         )
 
 
-def _require_seen(rig: Rig, frames: Frames) -> None:
+def _require_seen(rig: Rig, frames: camera_frames.Frames) -> None:
     """Raise if a camera never sees a board, saying what is wrong with its images."""
     for c, camera in enumerate(rig.cameras):
         own = [frames.images[camera.name][i] for i in sorted(frames.images[camera.name])]
@@ -192,7 +185,7 @@ def _require_seen(rig: Rig, frames: Frames) -> None:
 
 
 def _with_poses(
-    rig: Rig, frames: Frames, raw: RawPoses | None, reading: str, console: Console
+    rig: Rig, frames: camera_frames.Frames, raw: RawPoses | None, reading: str, console: Console
 ) -> Rig:
     """Return the rig with the arm's poses, read as is said, stated or proven by the images."""
     moving = any(rig.moves(s.camera, s.board) for s in rig.sightings if len(s.detection))

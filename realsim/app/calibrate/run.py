@@ -124,20 +124,16 @@ def require_no_bag(source: Path, board: str) -> None:
 
 def _run_session(source: Path, console: Console, arm: str, clock: str) -> bool:
     """Calibrate a session, also one that has board views only; return whether no check is bad."""
-    from realsim.app.calibrate.session import (
-        calibrate_board_only,
-        calibrate_session,
-        has_board_views_only,
-    )
+    from realsim.app.calibrate import session
     from realsim.app.stages import open_session
     from realsim.store.results import hand_eye_to_json
 
-    board_only = has_board_views_only(source)
+    board_only = session.has_board_views_only(source)
     if board_only:
-        hand_eye = calibrate_board_only(source, console, arm, clock)
+        hand_eye = session.calibrate_board_only(source, console, arm, clock)
     else:
         store = open_session(source)
-        hand_eye = calibrate_session(store, console, arm, clock)
+        hand_eye = session.calibrate_session(store, console, arm, clock)
         show.warn_of_far_views(hand_eye, store.session.views, console)
     show.show_hand_eye(hand_eye, console)
     console.say(f"report and pictures: {source / 'calibration' / 'report'}")

@@ -5,12 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from realsim.app.calibrate.board_views import (
-    CalibrationFolder,
-    SessionFiles,
-    read_board_views,
-    write_results,
-)
+from realsim.app.calibrate import board_views
 from realsim.app.calibrate.clock import mend_views
 from realsim.app.console import Console, Tick
 from realsim.app.stages import BOARD_VIEWS, content_key, note, require_sound
@@ -107,7 +102,7 @@ def calibrate_board_only(
         InputError: no calibration/board.json, or a view is not as it was captured.
         DegenerateError: the views do not determine the hand-eye.
     """
-    files = CalibrationFolder(folder=folder)
+    files = board_views.CalibrationFolder(folder=folder)
     views_store = SessionStore.open(folder / BOARD_VIEWS)
     require_sound(views_store)
     with console.stage("calibrate", f"{len(views_store.session.views)} board views") as tick:
@@ -117,16 +112,16 @@ def calibrate_board_only(
 
 
 def _fitted(
-    files: SessionFiles, views_store: SessionStore, arm: str, clock: str,
+    files: board_views.SessionFiles, views_store: SessionStore, arm: str, clock: str,
     console: Console, tick: Tick,
 ) -> HandEye:  # fmt: skip
     """Calibrate from the board views, and write the report."""
     from realsim_calibration import calibrate_hand_eye_report
 
-    seen, target, known = read_board_views(files, views_store, arm, tick)
+    seen, target, known = board_views.read_board_views(files, views_store, arm, tick)
     camera = views_store.session.intrinsics
     times = np.array([v.time_s for v in views_store.session.views])
     seen, at = mend_views(seen, times, target, camera, clock, console)
     report = replace(calibrate_hand_eye_report(seen, target, camera, arm=known), clock=at)
-    write_results(report, seen, files, views_store)
+    board_views.write_results(report, seen, files, views_store)
     return report.hand_eye

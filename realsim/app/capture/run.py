@@ -20,6 +20,7 @@ from realsim.errors import InputError
 from realsim.records import CaptureSession, Target
 from realsim.store import SessionStore
 from realsim.store.lock import only_run_in
+from realsim_capture_plans.capturing import contact_sheet
 from realsim_capture_plans.capturing.capture import (
     CaptureConfig,
     CaptureJob,
@@ -27,12 +28,6 @@ from realsim_capture_plans.capturing.capture import (
     capture,
     check_views,
     dry_run,
-)
-from realsim_capture_plans.capturing.contact_sheet import (
-    SHEET_FILE,
-    Thumbnails,
-    cell_size,
-    write_contact_sheet,
 )
 from realsim_capture_plans.capturing.operator import LineOperator, Operator
 from realsim_capture_plans.devices.interfaces import Arm, DepthCamera, DeviceError
@@ -151,7 +146,7 @@ def _carry_out(
     config, store, target, lab, fixed = work
     intrinsics = camera.intrinsics
     size = (intrinsics.width, intrinsics.height)
-    taken, is_due = Thumbnails(cell_size(len(plan), size)[1:]), False
+    taken, is_due = contact_sheet.Thumbnails(contact_sheet.cell_size(len(plan), size)[1:]), False
     try:
         with _operator(request, f"{request.out}   {arm.name}, {camera.name}", console) as operator:
             job = CaptureJob(
@@ -159,7 +154,9 @@ def _carry_out(
                 on_view=taken.add, board_check=_board_check(target), fixed=fixed,
             )  # fmt: skip
             summary = capture(plan, arm, camera, store, config=config, job=job)
-        is_due = not store.has(SHEET_FILE)  # an earlier run was killed before it wrote it
+        is_due = not store.has(
+            contact_sheet.SHEET_FILE
+        )  # an earlier run was killed before it wrote it
         if lab is not None and target is None:
             _give_models(lab, store)
         show_summary(summary, console)
@@ -167,7 +164,7 @@ def _carry_out(
     finally:
         if taken.images or is_due:  # a run that was refused changes nothing
             title = f"{request.out.resolve().name}, {arm.name}, {camera.name}"
-            sheet = write_contact_sheet(store, len(plan), title, taken)
+            sheet = contact_sheet.write_contact_sheet(store, len(plan), title, taken)
             console.say(f"contact sheet  {store.folder / sheet}")
             console.say(
                 f"stored         {len(store.completed)} of {len(plan)} views, {store.folder}"

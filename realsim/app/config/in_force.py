@@ -1,7 +1,7 @@
 """What is in force of every option, and where it came from."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
@@ -93,15 +93,13 @@ def _one(
     return InForce(command=" ".join(path), option=name, value=value, origin=origin)
 
 
-def strange_variables(commands: Commands) -> list[str]:
+def strange_variables(commands: Commands) -> Iterator[str]:
     """Return a sentence for every variable that looks like an option's and is none's."""
     known = {variable(path, o) for path, command in commands.items() for o in settable(command)}
     heads = {"_".join([ENVIRONMENT, *path]).replace("-", "_").upper() + "_" for path in commands}
-    said: list[str] = []
     for name in sorted(os.environ):
         if name in known or not any(name.startswith(head) for head in heads):
             continue
         close = get_close_matches(name, sorted(known), n=1)
         perhaps = f" Did you mean {close[0]}?" if close else ""
-        said.append(f"the variable {name} is of no option; nothing reads it.{perhaps}")
-    return said
+        yield f"the variable {name} is of no option; nothing reads it.{perhaps}"

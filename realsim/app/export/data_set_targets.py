@@ -2,23 +2,12 @@
 
 from collections.abc import Sequence
 
-from realsim.app.export.target import (
-    IMAGES,
-    LABELLED,
-    METRES,
-    OPENCV,
-    PIXEL,
-    TABLE,
-    TRIED,
-    RootJob,
-    SceneJob,
-    Target,
-)
+from realsim.app.export import target
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene
 
 
-def _bop(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
+def _bop(scene: LabelledScene, folder: ExportFolder, job: target.SceneJob) -> WrittenScene:
     from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
 
     request, place = job.request, job.place
@@ -31,7 +20,7 @@ def _bop(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenSc
     return write_bop_scene(scene, folder, config, progress=job.tick)
 
 
-def _bop_root(folder: ExportFolder, job: RootJob) -> Sequence[str]:
+def _bop_root(folder: ExportFolder, job: target.RootJob) -> Sequence[str]:
     from realsim.formats.bop.root_files import write_bop_models, write_bop_root
 
     write_bop_models(job.models, folder, infos=job.infos)
@@ -43,7 +32,7 @@ def _bop_root(folder: ExportFolder, job: RootJob) -> Sequence[str]:
     return (f"{write_shards(folder)} images of all scenes are in tar shards (SPLIT_web), too.",)
 
 
-def _graspnet(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
+def _graspnet(scene: LabelledScene, folder: ExportFolder, job: target.SceneJob) -> WrittenScene:
     from realsim.formats.graspnet.tree import CAMERAS
     from realsim.formats.graspnet.write_plan import GraspnetWriteConfig
     from realsim.formats.graspnet.writing import write_graspnet_scene
@@ -57,7 +46,7 @@ def _graspnet(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> Writ
     return write_graspnet_scene(scene, folder, config, progress=job.tick)
 
 
-def _graspnet_root(folder: ExportFolder, job: RootJob) -> Sequence[str]:
+def _graspnet_root(folder: ExportFolder, job: target.RootJob) -> Sequence[str]:
     from realsim.formats.graspnet.tried_labels import write_tried_labels
     from realsim.formats.graspnet.writing import write_graspnet_models
 
@@ -65,14 +54,14 @@ def _graspnet_root(folder: ExportFolder, job: RootJob) -> Sequence[str]:
     return write_tried_labels(folder, ((n, again().grasps()) for n, again in job.scenes))
 
 
-def _colmap(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
+def _colmap(scene: LabelledScene, folder: ExportFolder, job: target.SceneJob) -> WrittenScene:
     from realsim.formats.colmap.writing import write_colmap
 
     place = folder.below(job.place.name)
     return write_colmap(scene, place, job.request.points, progress=job.tick)
 
 
-def _nerfstudio(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
+def _nerfstudio(scene: LabelledScene, folder: ExportFolder, job: target.SceneJob) -> WrittenScene:
     from realsim.formats.nerfstudio.writing import NerfstudioWriteConfig, write_nerfstudio
 
     return write_nerfstudio(
@@ -80,15 +69,15 @@ def _nerfstudio(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> Wr
     )
 
 
-DATA_SETS: dict[str, Target] = {
-    "bop": Target(
+DATA_SETS: dict[str, target.Target] = {
+    "bop": target.Target(
         name="BOP",
         kind="dataset",
         help="scenewise BOP: images, poses, masks, models, targets",
         conventions=(
             ("units", "millimetres; depth png * depth_scale = mm"),
-            OPENCV,
-            PIXEL,
+            target.OPENCV,
+            target.PIXEL,
             ("cam_R_m2c, cam_t_m2c", "object -> camera, row-major"),
             ("cam_R_w2c, cam_t_w2c", "world -> camera, row-major; left out where not known"),
             ("visib_fract", "visible pixels / all of the silhouette, beyond the border too"),
@@ -107,16 +96,16 @@ DATA_SETS: dict[str, Target] = {
         write_root=_bop_root,
         is_pinhole=True,
         holds_cameras=True,
-        no_place=(TABLE, TRIED),
-        options=(*LABELLED, "split", "colour", "jpeg_quality", "shards"),
+        no_place=(target.TABLE, target.TRIED),
+        options=(*target.LABELLED, "split", "colour", "jpeg_quality", "shards"),
     ),
-    "graspnet": Target(
+    "graspnet": target.Target(
         name="GraspNet-1Billion",
         kind="dataset",
         help="GraspNet's tree: annotations, camera poses, meta, labels, models, grasps",
         conventions=(
             ("units", "metres; depth png in millimetres (factor_depth 1000)"),
-            OPENCV,
+            target.OPENCV,
             ("camera_poses.npy", "camera i -> camera 0: p_0 = camera_poses[i] @ p_i"),
             ("cam0_wrt_table.npy", "camera 0 -> table, z up"),
             ("pos_in_world, ori_in_world", "object -> THIS image's camera; wxyz; nine decimals"),
@@ -137,36 +126,36 @@ DATA_SETS: dict[str, Target] = {
         write_root=_graspnet_root,
         is_pinhole=True,
         holds_grasps=True,
-        options=(*LABELLED, "table_is_world"),
+        options=(*target.LABELLED, "table_is_world"),
     ),
-    "colmap": Target(
+    "colmap": target.Target(
         name="COLMAP",
         kind="cameras",
         help="cameras, images and points of a sparse model, one project a scene",
         conventions=(
-            METRES,
-            OPENCV,
+            target.METRES,
+            target.OPENCV,
             ("poses", "world -> camera, quaternion wxyz"),
             ("pixels", "the first pixel's centre is at 0.5"),
         ),
         loading='import pycolmap\nmodel = pycolmap.Reconstruction("{scene}/sparse/0")',
         write_scene=_colmap,
-        no_place=(TABLE, TRIED),
-        options=(*IMAGES, "points"),
+        no_place=(target.TABLE, target.TRIED),
+        options=(*target.IMAGES, "points"),
     ),
-    "nerfstudio": Target(
+    "nerfstudio": target.Target(
         name="nerfstudio",
         kind="cameras",
         help="transforms.json with images, depth and masks, one folder a scene",
         conventions=(
-            METRES,
+            target.METRES,
             ("camera axes", "OpenGL: x right, y up, z backward"),
             ("transform_matrix", "camera -> world"),
             ("depth", "16-bit PNG; depth_unit_scale_factor = metres per count"),
         ),
         loading='import json\nframes = json.load(open("{scene}/transforms.json"))["frames"]',
         write_scene=_nerfstudio,
-        no_place=(TABLE, TRIED),
-        options=IMAGES,
+        no_place=(target.TABLE, target.TRIED),
+        options=target.IMAGES,
     ),
 }

@@ -11,19 +11,13 @@ from typing import Any
 
 from realsim.app.annotate.current import refresh_labels
 from realsim.app.console import Console
+from realsim.app.export import sources
 from realsim.app.export.card import CARD_FILE, DatasetCard, SceneFacts, card_bytes
 from realsim.app.export.croissant import CROISSANT_FILE, croissant_bytes
 from realsim.app.export.data_set_targets import DATA_SETS
 from realsim.app.export.grasp_targets import GRASPS
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.scene_targets import SCENES
-from realsim.app.export.sources import (
-    SourceScene,
-    content_of,
-    licence_files,
-    source_scenes,
-    trust_in,
-)
 from realsim.app.export.target import TABLE, TRIED, RootJob, SceneJob, ScenePlace, Target
 from realsim.app.outputs import require_outside
 from realsim.app.stages import made_of, open_session
@@ -72,14 +66,14 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
             something else, or two scenes would have one name.
     """
     target = target_of(request)
-    scenes = source_scenes(request, all_cameras=target.holds_cameras)
+    scenes = sources.source_scenes(request, all_cameras=target.holds_cameras)
     require_outside(out, request.sources)
     _tell_left_out(scenes, target, console)
     places = scene_places(scenes, target)
     if request.labels in ("auto", "annotated"):
         for folder in dict.fromkeys(s.folder for s in scenes if s.kind == "session"):
             refresh_labels(open_session(folder), console)
-    asked = request.asked() | {CONTENT: content_of(scenes)}
+    asked = request.asked() | {CONTENT: sources.content_of(scenes)}
     if ExportFolder.is_finished(out, asked) or _is_of(out, request):
         shutil.rmtree(out / STATE, ignore_errors=True)  # left by a run that ended just there
         return ExportResult(folder=out, card=out / CARD_FILE, scenes=(), was_finished=True)
@@ -118,7 +112,7 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
                 job = RootJob(request=request, models=models, infos=infos, scenes=again)
                 told = target.write_root(folder, job)
                 facts[-1] = _with_notes(facts[-1], told)
-        licences = licence_files(request.sources)
+        licences = sources.licence_files(request.sources)
         folder.write_piece("licences", licences)
         card = _card(request, out, target, facts, models, licences)
         record, run = made_of("export", console, request=request, inputs=_hashes(request))
@@ -196,7 +190,7 @@ def option_name(field: str) -> str:
     return "--" + OPTION_NAMES.get(field, field).replace("_", "-")
 
 
-def scene_places(scenes: Sequence[SourceScene], target: Target) -> list[ScenePlace]:
+def scene_places(scenes: Sequence[sources.SourceScene], target: Target) -> list[ScenePlace]:
     """Return what each scene is called in the export: numbers in data sets, else its own name.
 
     Raises:
@@ -222,7 +216,7 @@ def scene_places(scenes: Sequence[SourceScene], target: Target) -> list[ScenePla
     return [ScenePlace(number=k, name=n, camera="") for k, n in enumerate(names)]
 
 
-def _tell_left_out(scenes: Sequence[SourceScene], target: Target, console: Console) -> None:
+def _tell_left_out(scenes: Sequence[sources.SourceScene], target: Target, console: Console) -> None:
     """Tell which cameras the format has no place for."""
     folders = [] if target.holds_cameras else [s.folder for s in scenes if s.kind == "session"]
     left = sorted({name for folder in folders for name in camera_folders(folder)})
@@ -279,14 +273,14 @@ def _numbered(scene: LabelledScene, ids: Mapping[int, int]) -> LabelledScene:
     return scene if all(i == new for i, new in ids.items()) else RenumberedScene(scene, ids)
 
 
-def _opened(source: SourceScene, ids: Mapping[int, int]) -> LabelledScene:
+def _opened(source: sources.SourceScene, ids: Mapping[int, int]) -> LabelledScene:
     return _numbered(source.open(), ids)
 
 
 def _facts(
-    source: SourceScene, scene: LabelledScene, written: WrittenScene, target: Target
+    source: sources.SourceScene, scene: LabelledScene, written: WrittenScene, target: Target
 ) -> SceneFacts:
-    trust, things = trust_in(source), 0
+    trust, things = sources.trust_in(source), 0
     grasps = scene.grasps() if target.holds_grasps else None
     sets = () if grasps is None else grasps.sets
     words = LABELS[scene.labels] if isinstance(scene, SessionScene) else OWN_LABELS

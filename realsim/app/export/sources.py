@@ -267,7 +267,7 @@ def _findings(store: SessionStore, labelled: set[int]) -> list[str]:
     if not store.has("registration/report.json"):
         return []
     missing: Any = store.read_json("registration/report.json").get("not_placed", ())
-    return registration_notes(store) + [
+    return [*registration_notes(store)] + [
         f"object {n['obj_id']} (instance {n['instance']}) is not placed and has no label, though "
         f"the images may show it: {n['reason']}"
         for n in missing

@@ -11,14 +11,8 @@ from realsim.errors import InputError
 from realsim.store import SessionStore, atomic
 from realsim.untrusted.own_json import read_object
 from realsim_sim_bridge.synthetic.write import write_session
+from realsim_sim_bridge.table_scenes import sample
 from realsim_sim_bridge.table_scenes.cameras import intrinsics_of, views
-from realsim_sim_bridge.table_scenes.sample import (
-    Layout,
-    generator,
-    layout_from_json,
-    layout_to_json,
-    sample_layout,
-)
 from realsim_sim_bridge.table_scenes.scene import build_scene, scene_name, write_models
 
 CACHE = "cache"
@@ -52,14 +46,14 @@ def finished_path(out: Path, number: int) -> Path:
     return out / LAYOUTS / f"{scene_name(number)}.finished.json"
 
 
-def load_layout(out: Path, number: int) -> Layout:
+def load_layout(out: Path, number: int) -> sample.Layout:
     """Return the layout of a scene.
 
     Raises:
         InputError: it is missing or damaged.
     """
     path = layout_path(out, number)
-    return layout_from_json(read_object(path), str(path))
+    return sample.layout_from_json(read_object(path), str(path))
 
 
 def is_finished(out: Path, number: int, request: GenerateRequest) -> bool:
@@ -96,18 +90,21 @@ def make_scene(out: Path, number: int, request: GenerateRequest, workers: int = 
     if layout_path(out, number).is_file():
         layout = load_layout(out, number)
     else:
-        layout = sample_layout(request.seed, number, request.pool, request.scene, cache)
+        layout = sample.sample_layout(request.seed, number, request.pool, request.scene, cache)
         with atomic.storing(out, f"the layout of {scene_name(number)}"):
-            atomic.write_json(layout_path(out, number), layout_to_json(layout))
+            atomic.write_json(layout_path(out, number), sample.layout_to_json(layout))
     built = build_scene(
         layout, request.pool, request.scene, own=request.looks,
         farthest_m=request.views.radius_m[1], cache=cache,
     )  # fmt: skip
     between = _cpu_s()
     Ts_table_cam = views(
-        built.hulls(), request.views, generator(request.seed, number, "cameras"), built.table.rims
+        built.hulls(),
+        request.views,
+        sample.generator(request.seed, number, "cameras"),
+        built.table.rims,
     )
-    noise = int(generator(request.seed, number, "noise").integers(2**31))
+    noise = int(sample.generator(request.seed, number, "noise").integers(2**31))
     with tempfile.TemporaryDirectory(prefix="realsim_models_") as models:
         with atomic.storing(Path(models), "the scene's models"):
             write_models(Path(models), built)

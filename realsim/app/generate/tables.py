@@ -1,6 +1,7 @@
 """What generated scenes are like: dataset.json, tables for people."""
 
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -139,20 +140,18 @@ SCENES_HEADER = ["scene", "table", "objects", "lost", "moves [mm]", "sunk [mm]",
                  "physics [s]", "views [s]"]  # fmt: skip
 
 
-def scene_rows(out: Path, dataset: dict[str, Any]) -> list[list[str]]:
+def scene_rows(out: Path, dataset: dict[str, Any]) -> Iterator[list[str]]:
     """Return a row per scene: what stayed on its table, how much is seen, and CPU seconds."""
-    rows: list[list[str]] = []
     for scene in dataset["scenes"]:
         costs = stored_costs(out, _number(scene))
         lost = [len(scene[k]) for k in ("fell", "overhung", "restless")]
         figures = scene["figures"]
-        rows.append(
-            [scene["name"], scene["table"], str(len(scene["objects"])),
-             "/".join(map(str, lost)), f"{figures['moved_mm']:.2f}",
-             f"{figures['penetration_mm']:.2f}", _percent(scene["mean_visibility"]),
-             f"{costs.get('physics_s', 0.0):.0f}", f"{costs.get('rendering_s', 0.0):.0f}"]
-        )  # fmt: skip
-    return rows
+        yield [
+            scene["name"], scene["table"], str(len(scene["objects"])),
+            "/".join(map(str, lost)), f"{figures['moved_mm']:.2f}",
+            f"{figures['penetration_mm']:.2f}", _percent(scene["mean_visibility"]),
+            f"{costs.get('physics_s', 0.0):.0f}", f"{costs.get('rendering_s', 0.0):.0f}",
+        ]  # fmt: skip
 
 
 def _number(scene: dict[str, Any]) -> int:
@@ -192,8 +191,8 @@ def cost_rows(out: Path, dataset: dict[str, Any]) -> list[list[str]]:
 def tables_of(out: Path, dataset: dict[str, Any]) -> list[FiguresTable]:
     """Return every table of a data set; empty ones are left out."""
     tables = [
-        FiguresTable(title="Generated scenes", header=SCENES_HEADER, rows=scene_rows(out, dataset),
-              text=LOST),
+        FiguresTable(title="Generated scenes", header=SCENES_HEADER,
+              rows=list(scene_rows(out, dataset)), text=LOST),
         FiguresTable(title="Visibility of objects in views", header=["visible", "labels", "share"],
               rows=visibility_rows(dataset)),
         FiguresTable(title="CPU time of a frame", header=["part", "s", "share"],

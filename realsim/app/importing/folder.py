@@ -14,16 +14,7 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.formats.folders import (
-    FolderChoice,
-    FolderSource,
-    FrameState,
-    ImageFolder,
-    find_cam_info,
-    list_folder,
-    open_folder,
-    read_cam_info,
-)
+from realsim.formats import folders
 from realsim.formats.folders.listing import shown
 from realsim.formats.folders.source import require_one_size
 from realsim.records import CameraIntrinsics
@@ -88,27 +79,27 @@ class ImportRequest:
     scale: float | None = None
     """Metres per unit of a COLMAP model or of a transforms.json."""
 
-    def folder_choice(self) -> FolderChoice:
+    def folder_choice(self) -> folders.FolderChoice:
         """Return what is asked of a folder's images."""
-        return FolderChoice(
+        return folders.FolderChoice(
             colour=self.images, depth=self.depths, use_depth=not self.no_depth,
             depth_unit_m=self.depth_unit, depth_coding=self.depth_coding,
         )  # fmt: skip
 
 
-def open_image_folder(request: ImportRequest) -> tuple[FolderSource, list[str]]:
+def open_image_folder(request: ImportRequest) -> tuple[folders.FolderSource, list[str]]:
     """Return a folder as a frame source, and what was decided on the way.
 
     Raises:
         InputError: as `open_folder`, or the camera or the poses cannot be read.
     """
     root, choice = request.source, request.folder_choice()
-    listing = list_folder(root, colour=choice.colour, depth=choice.depth)
+    listing = folders.list_folder(root, colour=choice.colour, depth=choice.depth)
     size = require_one_size(listing.colour, "colour images")
     notes: list[str] = []
-    states: list[Sequence[FrameState]] = []
-    info_path = find_cam_info(listing.root)
-    info = None if info_path is None else read_cam_info(info_path)
+    states: list[Sequence[folders.FrameState]] = []
+    info_path = folders.find_cam_info(listing.root)
+    info = None if info_path is None else folders.read_cam_info(info_path)
     if info is not None and info.states:
         states.append(info.states)
         notes.append(f"camera poses from {info.path.name}, in metres, camera to world.")
@@ -128,7 +119,7 @@ def open_image_folder(request: ImportRequest) -> tuple[FolderSource, list[str]]:
     notes += said
     if choice.depth_unit_m is None and unit_m is not None:
         choice = replace(choice, depth_unit_m=unit_m)
-    source = open_folder(root, camera, states, choice=choice, listing=listing)
+    source = folders.open_folder(root, camera, states, choice=choice, listing=listing)
     return source, notes
 
 
@@ -176,7 +167,7 @@ def _matrix_text(path: Path) -> Array | None:
     return np.array(numbers).reshape(3, 3) if len(numbers) == 9 else None
 
 
-def camera_files(listing: ImageFolder) -> list[Path]:
+def camera_files(listing: folders.ImageFolder) -> list[Path]:
     """Return the files of a folder whose names may mean a camera."""
     places = dict.fromkeys([listing.root, listing.colour[0].path.parent])
     return sorted(
@@ -191,7 +182,7 @@ def camera_files(listing: ImageFolder) -> list[Path]:
 
 
 def _camera_in(
-    listing: ImageFolder, size: tuple[int, int]
+    listing: folders.ImageFolder, size: tuple[int, int]
 ) -> tuple[CameraIntrinsics | None, list[str]]:
     """Return the one camera that the folder's files hold, None where there is none.
 
@@ -230,7 +221,9 @@ def _equal(a: CameraIntrinsics, b: CameraIntrinsics) -> bool:
     return bool(np.array_equal(a.K, b.K) and np.array_equal(a.distortion, b.distortion))
 
 
-def _stated_unit(listing: ImageFolder, request: ImportRequest) -> tuple[float | None, list[str]]:
+def _stated_unit(
+    listing: folders.ImageFolder, request: ImportRequest
+) -> tuple[float | None, list[str]]:
     """Return the depth unit [m] that a BOP camera.json beside the images states."""
     if request.depth_unit is not None or not listing.depth:
         return None, []
@@ -251,8 +244,8 @@ def _stated_unit(listing: ImageFolder, request: ImportRequest) -> tuple[float | 
 
 
 def _poses(
-    listing: ImageFolder, request: ImportRequest, *, has_states: bool
-) -> tuple[list[FrameState], list[str]]:
+    listing: folders.ImageFolder, request: ImportRequest, *, has_states: bool
+) -> tuple[list[folders.FrameState], list[str]]:
     """Return the poses that were given or found, and what was decided.
 
     Raises:
@@ -300,7 +293,7 @@ def _poses(
             )
     field = {"tool": "T_base_ee", "camera": "T_world_cam"}[request.poses_of]
     states = [
-        FrameState(
+        folders.FrameState(
             name=raw.labels[k] or raw.stems[k], where=raw.where[k],
             joints=None if joints is None else joints[k], **{field: Ts[k]},
         )
@@ -315,7 +308,7 @@ def _poses(
 def describe_folder(request: ImportRequest) -> list[tuple[str, str]]:
     """Return what a folder holds, for --list, without importing it."""
     root, choice = request.source, request.folder_choice()
-    listing = list_folder(root, colour=choice.colour, depth=choice.depth)
+    listing = folders.list_folder(root, colour=choice.colour, depth=choice.depth)
     rows: list[tuple[str, str]] = []
     for what, files in (("colour", listing.colour), ("depth", listing.depth)):
         sizes = sorted({f"{f.width}x{f.height}" for f in files})
@@ -331,10 +324,10 @@ def describe_folder(request: ImportRequest) -> list[tuple[str, str]]:
         except InputError as error:
             rows.append(("depth unit", str(error)))
     cameras = [p.name for p in camera_files(listing)]
-    info = find_cam_info(listing.root)
+    info = folders.find_cam_info(listing.root)
     rows.append(("camera files", shown(cameras) or "none"))
     if info is not None:
-        rows.append(("camera poses", f"{len(read_cam_info(info).states)} in {info.name}"))
+        rows.append(("camera poses", f"{len(folders.read_cam_info(info).states)} in {info.name}"))
     try:
         states, notes = _poses(listing, request, has_states=info is not None)
         rows.append(("poses", f"{len(states)}. {' '.join(notes)}"))

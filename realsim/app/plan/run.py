@@ -221,27 +221,22 @@ def _source_plan(
     source: str, place: Place, joints_unit: JointUnit | None, console: Console
 ) -> CapturePlan:
     """Return the plan that a file holds, or the one that a joint path makes."""
+    from realsim_capture_plans.plan_files import plan_json
     from realsim_capture_plans.plan_files.imported import plan_of_path
     from realsim_capture_plans.plan_files.joint_paths import read_path
-    from realsim_capture_plans.plan_files.plan_json import (
-        LARGEST_BYTES,
-        PREFIX,
-        SCHEMA,
-        resolve_plan,
-    )
 
     path = Path(source)
-    is_plan = source.startswith(PREFIX)
+    is_plan = source.startswith(plan_json.PREFIX)
     if path.suffix.lower() == ".json" and path.is_file():
-        data = read_json(path, most_bytes=LARGEST_BYTES)
-        is_plan = isinstance(data, dict) and data.get("schema") == SCHEMA
+        data = read_json(path, most_bytes=plan_json.LARGEST_BYTES)
+        is_plan = isinstance(data, dict) and data.get("schema") == plan_json.SCHEMA
     if is_plan or not path.exists():
         if is_plan and (replace(place, arm=None) != Place() or joints_unit):
             raise InputError(
                 f"{source} is a realsim plan: its robot, mount and scene are in it and cannot be "
                 "changed by options. Make it anew with `realsim plan`."
             )
-        return _of_arm(resolve_plan(source), place.arm)
+        return _of_arm(plan_json.resolve_plan(source), place.arm)
     chain = place.chain()
     found = read_path(path, chain, joints_unit)
     if found.reading is not None:
@@ -274,17 +269,13 @@ def _source_plan(
 
 def _writer(dest: Path) -> Callable[[CapturePlan, Path], list[Path]]:
     """Return what writes a file of this suffix."""
-    from realsim_capture_plans.plan_files.exported import (
-        export_csv,
-        export_graspnet,
-        export_urscript,
-    )
+    from realsim_capture_plans.plan_files import exported
     from realsim_capture_plans.plan_files.plan_json import save_plan
 
     writers: dict[str, Callable[[CapturePlan, Path], None]] = {
         ".json": save_plan,
-        ".csv": export_csv,
-        ".script": export_urscript,
+        ".csv": exported.export_csv,
+        ".script": exported.export_urscript,
     }
     suffix = dest.suffix.lower()
     if suffix in writers:
@@ -295,7 +286,7 @@ def _writer(dest: Path) -> Callable[[CapturePlan, Path], list[Path]]:
 
         return one
     if not suffix and not dest.is_file():
-        return export_graspnet
+        return exported.export_graspnet
     raise InputError(
         f"'{dest}' has no form that is written: .json (realsim plan), .csv (table), .script "
         "(URScript), or a folder without a suffix (GraspNet's camera_poses.npy)."

@@ -5,32 +5,19 @@ and where it started, so that a second run with nothing new computes nothing. Sc
 replaced stay in `registration/earlier/`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from realsim.app.register.results import (
-    STAGE_FILE,
-    VIEWS_FILE,
-    Registered,
-    load_cameras,
-    with_objects,
-)
+from realsim.app.register import results
 from realsim.app.reviewed import damage_words, review_of
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose, Scene
 from realsim.registration.search.records import Region, Wanted
-from realsim.review.corrections import (
-    DECIDED,
-    apart,
-    corrected_scene,
-    decision_on,
-    is_same_place,
-    pending,
-)
+from realsim.review import corrections
 from realsim.review.journal import Entry, ReviewState
 from realsim.store import SessionStore, load_scene
 from realsim.untrusted.own_json import to_json
@@ -101,7 +88,7 @@ def review_starts(store: SessionStore, models: Mapping[int, ObjectModel] | None)
             f"no decision of a review stands in session '{store.folder}': its journal is empty, or "
             f"all was taken back. Run `realsim review {store.folder}`, or leave --from-review away."
         )
-    lines = pending(scene, state)
+    lines = corrections.pending(scene, state)
     kept = store.read_json(REVIEW_FILE) if store.has(REVIEW_FILE) else None
     before = () if kept is None else tuple(kept["applied"])
     standing = {e.id for e in state.standing}
@@ -116,10 +103,10 @@ def review_starts(store: SessionStore, models: Mapping[int, ObjectModel] | None)
         for e in state.entries
         if e.id in before and e.id not in standing and e.action in ("reject", "move", "swap")
     ]
-    for placed in corrected_scene(scene, state).objects:
-        decision = decision_on(placed, state)
+    for placed in corrections.corrected_scene(scene, state).objects:
+        decision = corrections.decision_on(placed, state)
         name = f"instance {placed.instance} (object {placed.obj_id})"
-        if decision is not None and DECIDED[decision.action] == "rejected":
+        if decision is not None and corrections.DECIDED[decision.action] == "rejected":
             why = f": {decision.comment}" if decision.comment else ""
             words.append(f"{name} was rejected by {decision.reviewer}{why}. It is left out.")
             continue
@@ -167,23 +154,23 @@ def _wanted(row: Row, models: Mapping[int, ObjectModel]) -> Wanted:
 
 
 def stayed(
-    store: SessionStore, starts: ReviewStarts, result: Registered
-) -> tuple[Registered, list[str]]:
+    store: SessionStore, starts: ReviewStarts, result: results.Registered
+) -> tuple[results.Registered, list[str]]:
     """Return the registration with those objects where they stood that stay, and words on them.
 
     What a person accepted stays, and in an upgraded scene all that nobody moved: annotations that
     no fit bettered are among it. The table stays with them. Seen by other cameras than before, an
     object is where it is found.
     """
-    before, record, state = load_scene(store), load_cameras(store), review_of(store)
+    before, record, state = load_scene(store), results.load_cameras(store), review_of(store)
     cameras = store.session.Ts_world_cam if record is None else record.session
-    corrected = corrected_scene(before, state)
+    corrected = corrections.corrected_scene(before, state)
     fitted = {o.instance: o for o in result.scene.objects}
     words: list[str] = []
     stay = False
     for row in starts.rows:
         placed = corrected.object(row["instance"])
-        decision = decision_on(placed, state)
+        decision = corrections.decision_on(placed, state)
         is_accepted = decision is not None and decision.action == "accept"
         if not is_accepted and not (store.has(UPGRADE_FILE) and _is_as_before(placed, before)):
             continue
@@ -192,15 +179,15 @@ def stayed(
         if not steps or np.median(np.linalg.norm(steps, axis=1)) > SAME_CAMERAS_M:
             continue
         found, stay = fitted.get(placed.instance), True
-        if found is None or not is_same_place(found.T_world_obj, placed.T_world_obj):
+        if found is None or not corrections.is_same_place(found.T_world_obj, placed.T_world_obj):
             fit = "finds it nowhere"
             if found is not None:
-                mm, deg = apart(placed.T_world_obj, found.T_world_obj)
+                mm, deg = corrections.apart(placed.T_world_obj, found.T_world_obj)
                 fit = f"would put it {mm:.2g} mm and {deg:.2g} deg from there"
             who = "where it stood" if decision is None else f"where {decision.reviewer} accepted it"
             words.append(f"instance {placed.instance} stays {who}; the fit {fit}.")
         fitted[placed.instance] = placed
-    result = with_objects(result, [fitted[k] for k in sorted(fitted)])
+    result = results.with_objects(result, [fitted[k] for k in sorted(fitted)])
     if stay and before.plane is not None:  # grasps were tried at places on this table
         result = replace(result, scene=replace(result.scene, plane=before.plane))
     return result, words
@@ -209,14 +196,16 @@ def stayed(
 def _is_as_before(placed: ObjectPose, scene: Scene) -> bool:
     """Return whether an object is the one of a scene, and at its place there."""
     old = scene.object(placed.instance)
-    return old.obj_id == placed.obj_id and is_same_place(old.T_world_obj, placed.T_world_obj)
+    return old.obj_id == placed.obj_id and corrections.is_same_place(
+        old.T_world_obj, placed.T_world_obj
+    )
 
 
 def accepted_in(store: SessionStore) -> list[int]:
     """Return the instances that a person accepted where they stand."""
     state = review_of(store)
-    decided = [(o.instance, decision_on(o, state))
-               for o in corrected_scene(load_scene(store), state).objects]  # fmt: skip
+    decided = [(o.instance, corrections.decision_on(o, state))
+               for o in corrections.corrected_scene(load_scene(store), state).objects]  # fmt: skip
     return [k for k, e in decided if e is not None and e.action == "accept"]
 
 
@@ -226,7 +215,9 @@ def is_precious(store: SessionStore) -> bool:
     A registration can be made again.
     """
     # One that was ended after its scene was written has no stage yet.
-    return bool(review_of(store).standing) or not any(map(store.has, (STAGE_FILE, VIEWS_FILE)))
+    return bool(review_of(store).standing) or not any(
+        map(store.has, (results.STAGE_FILE, results.VIEWS_FILE))
+    )
 
 
 def keep_earlier(store: SessionStore) -> str | None:
@@ -251,13 +242,11 @@ def instances_ever(store: SessionStore) -> set[int]:
 
 def moved_since_accepted(
     objects: Sequence[ObjectPose], state: ReviewState
-) -> list[tuple[ObjectPose, Entry, float, float]]:
+) -> Iterator[tuple[ObjectPose, Entry, float, float]]:
     """Return the objects whose last acceptance was of another place, and how far [mm, deg]."""
-    found: list[tuple[ObjectPose, Entry, float, float]] = []
     for placed in objects:
-        last = [e for e in state.of(placed.instance) if e.action in DECIDED]
+        last = [e for e in state.of(placed.instance) if e.action in corrections.DECIDED]
         if not last or last[-1].action != "accept" or last[-1].pose is None:
             continue
-        if decision_on(placed, state) is None and last[-1].obj_id == placed.obj_id:
-            found.append((placed, last[-1], *apart(last[-1].pose, placed.T_world_obj)))
-    return found
+        if corrections.decision_on(placed, state) is None and last[-1].obj_id == placed.obj_id:
+            yield (placed, last[-1], *corrections.apart(last[-1].pose, placed.T_world_obj))

@@ -167,20 +167,18 @@ def colour_remark(store: SessionStore, views: Sequence[int]) -> Remark | None:
         store: the session.
         views: numbers of views with depth.
     """
-    from realsim.registration.depth_alignment import (
-        AlignmentFinding,
-        check_alignment,
-        pooled_alignment,
-    )
+    from realsim.registration import depth_alignment
 
-    findings: list[AlignmentFinding] = []
+    findings: list[depth_alignment.AlignmentFinding] = []
     for index in evenly(views, COLOUR_VIEWS):
         rgb = store.rgb(index)
         if rgb.min() < rgb.max():  # else no colour was recorded
-            findings.append(check_alignment(rgb, store.depth_m(index), store.session.intrinsics))
+            findings.append(
+                depth_alignment.check_alignment(rgb, store.depth_m(index), store.session.intrinsics)
+            )
     if not findings:
         return None
-    found = pooled_alignment(findings)
+    found = depth_alignment.pooled_alignment(findings)
     return None if found.kind in QUIET_KINDS else Remark(None, found.kind, found.words)
 
 

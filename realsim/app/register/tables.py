@@ -1,6 +1,6 @@
 """What a registration found, as rows of tables and as words: for the console and for the page."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +41,8 @@ def named(instance: int, obj_id: int, models: Mapping[int, ObjectModel]) -> str:
     return name if instance < 0 else f"{instance} {name}"
 
 
-def object_rows(result: Registered, models: Mapping[int, ObjectModel]) -> Rows:
+def object_rows(result: Registered, models: Mapping[int, ObjectModel]) -> Iterator[list[str]]:
     """Return the table of the objects, worst first; a dash is what is not known."""
-    rows: Rows = []
     common = shared_reasons(result)
     for o in worst_first(result):
         mm, deg = sigmas(o.covariance, models.get(o.obj_id))
@@ -52,19 +51,16 @@ def object_rows(result: Registered, models: Mapping[int, ObjectModel]) -> Rows:
         why = [r for r in o.reasons if r not in common]
         if len(why) < len(o.reasons):
             why.append("see below")
-        rows.append(
-            [
-                named(o.instance, o.obj_id, models),
-                o.verdict,
-                _figure(100 * o.checks.get("probability", float("nan")), 1),
-                _figure(o.checks.get("agree", float("nan")), 3),
-                _figure(mm, 2),
-                _figure(deg, 2),
-                _figure(float(np.median(px)) if px else float("nan"), 2),
-                "; ".join(why),
-            ]
-        )
-    return rows
+        yield [
+            named(o.instance, o.obj_id, models),
+            o.verdict,
+            _figure(100 * o.checks.get("probability", float("nan")), 1),
+            _figure(o.checks.get("agree", float("nan")), 3),
+            _figure(mm, 2),
+            _figure(deg, 2),
+            _figure(float(np.median(px)) if px else float("nan"), 2),
+            "; ".join(why),
+        ]
 
 
 def shared_reasons(result: Registered) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
 """How much the synthetic twins are like the real frames: masks, edges, depth noise, holes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -142,15 +142,14 @@ def _entries(store: SessionStore, view: int) -> Sequence[Mapping[str, int]]:
     return store.read_json(path)["objects"] if store.has(path) else ()
 
 
-def _ious(store: SessionStore, view: int, ids: Int32) -> list[float]:
+def _ious(store: SessionStore, view: int, ids: Int32) -> Iterator[float]:
     """Return the IoU of each object's annotated visible mask with what the twin's labels say."""
-    found: list[float] = []
     for k, row in enumerate(_entries(store, view)):
         path = mask_path(view, int(row.get("mask", k)), visible=True)
         if store.has(path):
             iou = mask_iou(store.read_image(path) > 0, ids == int(row["instance"]))
-            found += [iou] if np.isfinite(iou) else []
-    return found
+            if np.isfinite(iou):
+                yield iou
 
 
 def rim_distances_px(ids: Int32, rgb: UInt8) -> Array32:

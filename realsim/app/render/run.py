@@ -4,15 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from realsim.app.console import Console
-from realsim.app.render.compare import (
-    PAGE_FILE,
-    SHEET_FILE,
-    TwinFigures,
-    compare_twins,
-    layers,
-    pairs,
-    sheet,
-)
+from realsim.app.render import compare
 from realsim.app.render.request import RenderRequest, wanted_views
 from realsim.app.render.scene import TwinScene, require_shown, twin_scene
 from realsim.errors import InputError
@@ -39,7 +31,7 @@ class RenderOutcome:
     scene: Scene
     models: dict[int, ObjectModel]
     summary: SyntheticSummary
-    figures: TwinFigures | None
+    figures: compare.TwinFigures | None
     """Real against synthetic; None = new views."""
     look: TwinScene
     real: tuple[int, ...] | None
@@ -86,12 +78,15 @@ def run_render(session: Path, request: RenderRequest, console: Console) -> Rende
         figures = None
         if wanted.real is not None:
             with console.stage("compare", "real and synthetic"):
-                figures = compare_twins(store, twin, wanted.real, request.config(store).profile)
+                figures = compare.compare_twins(
+                    store, twin, wanted.real, request.config(store).profile
+                )
         twin.path("reports").mkdir(exist_ok=True)
-        save_png(twin.path(SHEET_FILE), sheet(twin, store, wanted.real))
+        save_png(twin.path(compare.SHEET_FILE), compare.sheet(twin, store, wanted.real))
         outcome = RenderOutcome(
             store=store, twin=twin, scene=scene, models=models, summary=summary, figures=figures,
-            look=look, real=wanted.real, sheet=twin.path(SHEET_FILE), page=twin.path(PAGE_FILE),
+            look=look, real=wanted.real, sheet=twin.path(compare.SHEET_FILE),
+            page=twin.path(compare.PAGE_FILE),
         )  # fmt: skip
         write_page(outcome)
     read = ("rgb/*", "registration/scene.json", "models/*", "review/journal.jsonl")
@@ -174,7 +169,7 @@ def scene_rows(outcome: RenderOutcome) -> list[list[str]]:
     ]
 
 
-def _figures_title(figures: TwinFigures) -> str:
+def _figures_title(figures: compare.TwinFigures) -> str:
     return f"Real frames and their twins ({figures.views} views)"
 
 
@@ -191,9 +186,9 @@ def write_page(outcome: RenderOutcome) -> None:
         page.text(note, "note")
     if outcome.real is not None:
         page.section("Real and synthetic")
-        page.sliders(pairs(outcome.store, outcome.twin, outcome.real))
+        page.sliders(compare.pairs(outcome.store, outcome.twin, outcome.real))
     page.section("Synthetic views")
-    page.layers(layers(outcome.twin))
+    page.layers(compare.layers(outcome.twin))
     if outcome.figures is not None:
         page.section(_figures_title(outcome.figures))
         page.table(FIGURES_HEADER, outcome.figures.rows())

@@ -1,36 +1,17 @@
 """The comparison of reports: a table for the console, a document for programs, a page."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from realsim.app.report import compare
 from realsim.app.report.catalogue import CATALOGUE
-from realsim.app.report.compare import (
-    OUTCOMES,
-    SIGMAS,
-    Difference,
-    ObjectDifference,
-    differences,
-    object_differences,
-)
 from realsim.app.report.figures import figures_to_json
 from realsim.app.report.sources import Source
 from realsim.app.report.summary import SCHEMA_VERSION, VERDICTS
-from realsim.pages import Cell, Page
-from realsim.pages.plots import (
-    BAR_PX,
-    INK,
-    MARKERS,
-    MUTED,
-    SERIES,
-    STYLES,
-    axes,
-    legend,
-    png,
-    whole_numbers,
-)
+from realsim.pages import Cell, Page, plots
 
 SCHEMA = "realsim report comparison"
 KINDS = {"better": "good", "worse": "bad", "same": "", "other": "", "unknown": "off"}
@@ -38,8 +19,8 @@ SIGNS = {"better": "▲ better", "worse": "▼ worse", "same": "same", "other": 
          "unknown": "?"}  # fmt: skip
 """Words as well as colours: both are read."""
 EXPLAINED = (
-    f"A difference counts where it is more than {SIGMAS:g} sigma of both together. Counts are "
-    "exact. Where a sigma is not known, a difference may be noise and is marked with '?'."
+    f"A difference counts where it is more than {compare.SIGMAS:g} sigma of both together. Counts "
+    "are exact. Where a sigma is not known, a difference may be noise and is marked with '?'."
 )
 WORLD_NOTE = (
     "Poses are compared in the robot's world: objects that were moved, or a robot that stands "
@@ -53,12 +34,12 @@ class Comparison:
     """The first of several sessions against each of the others."""
 
     sources: tuple[Source, ...]
-    figures: tuple[tuple[Difference, ...], ...]
+    figures: tuple[tuple[compare.Difference, ...], ...]
     """Figures of every other session."""
-    objects: tuple[tuple[ObjectDifference, ...], ...]
+    objects: tuple[tuple[compare.ObjectDifference, ...], ...]
 
     @property
-    def worse(self) -> list[tuple[Source, Difference]]:
+    def worse(self) -> list[tuple[Source, compare.Difference]]:
         """Return the figures that are worse by more than noise."""
         return [
             (other, d)
@@ -73,8 +54,8 @@ def comparison_of(sources: Sequence[Source]) -> Comparison:
     first, others = sources[0], sources[1:]
     return Comparison(
         sources=tuple(sources),
-        figures=tuple(tuple(differences(first, other)) for other in others),
-        objects=tuple(tuple(object_differences(first, other)) for other in others),
+        figures=tuple(tuple(compare.differences(first, other)) for other in others),
+        objects=tuple(tuple(compare.object_differences(first, other)) for other in others),
     )
 
 
@@ -87,14 +68,13 @@ def figure_header(c: Comparison) -> list[str]:
     return header
 
 
-def figure_rows(c: Comparison, *, all_figures: bool = True) -> list[list[object]]:
+def figure_rows(c: Comparison, *, all_figures: bool = True) -> Iterator[list[object]]:
     """Return the rows of the table of figures.
 
     Args:
         c: the comparison.
         all_figures: False leaves out those that are the same in all.
     """
-    rows: list[list[object]] = []
     by = [{d.name: d for d in found} for found in c.figures]
     for name, meaning in CATALOGUE.items():
         mine = [found[name] for found in by if name in found]
@@ -105,11 +85,10 @@ def figure_rows(c: Comparison, *, all_figures: bool = True) -> list[list[object]
             row.append(s.figures[name].shown if name in s.figures else "-")
         for found, other in zip(by, c.sources[1:], strict=True):
             row += _outcome(found.get(name), c.sources[0], other)
-        rows.append(row)
-    return rows
+        yield row
 
 
-def _outcome(d: Difference | None, first: Source, other: Source) -> list[object]:
+def _outcome(d: compare.Difference | None, first: Source, other: Source) -> list[object]:
     """Return difference and meaning of one figure."""
     if d is None:
         return ["-", "in neither"]
@@ -119,7 +98,7 @@ def _outcome(d: Difference | None, first: Source, other: Source) -> list[object]
     text = SIGNS[d.outcome]
     if d.outcome == "unknown" and d.tends:
         text = f"? ({d.tends})"
-    return [d.shown, Cell(text=text, kind=KINDS[d.outcome], hover=OUTCOMES[d.outcome])]
+    return [d.shown, Cell(text=text, kind=KINDS[d.outcome], hover=compare.OUTCOMES[d.outcome])]
 
 
 OBJECT_HEADER = [
@@ -128,24 +107,20 @@ OBJECT_HEADER = [
 ]  # fmt: skip
 
 
-def object_rows(found: Sequence[ObjectDifference]) -> list[list[object]]:
+def object_rows(found: Sequence[compare.ObjectDifference]) -> Iterator[list[object]]:
     """Return the rows of the table of objects."""
-    rows: list[list[object]] = []
     for o in found:
         moved = {None: "not known", True: "yes", False: "within noise"}[o.is_moved]
         moved = "no" if o.shift_mm == 0 and o.turn_deg == 0 else moved
-        noise = None if o.sigma_mm is None else SIGMAS * o.sigma_mm
-        rows.append(
-            [
-                o.name,
-                "-" if o.first is None else o.first["verdict"],
-                "-" if o.second is None else o.second["verdict"],
-                *[_number(v, 3) for v in (o.mssd_mm, o.shift_mm, o.turn_deg, noise)],
-                moved if o.shift_mm is not None else "-",
-                o.note,
-            ]
-        )
-    return rows
+        noise = None if o.sigma_mm is None else compare.SIGMAS * o.sigma_mm
+        yield [
+            o.name,
+            "-" if o.first is None else o.first["verdict"],
+            "-" if o.second is None else o.second["verdict"],
+            *[_number(v, 3) for v in (o.mssd_mm, o.shift_mm, o.turn_deg, noise)],
+            moved if o.shift_mm is not None else "-",
+            o.note,
+        ]
 
 
 def _number(value: float | None, digits: int) -> str:
@@ -195,7 +170,7 @@ def comparison_page(c: Comparison) -> Page:
     names = " and ".join(s.label for s in c.sources[:2]) + " ..." * (len(c.sources) > 2)
     page = Page(title=f"Comparison: {names}", document=as_json(c))
     _summary(page, c)
-    plots = overlaid([(s.label, s.series) for s in c.sources])
+    drawings = list(overlaid([(s.label, s.series) for s in c.sources]))
     for other, found in zip(c.sources[1:], c.objects, strict=True):
         labels = f"{c.sources[0].letter} and {other.letter}"
         page.section(f"Objects, {labels}", WORLD_NOTE)
@@ -208,8 +183,8 @@ def comparison_page(c: Comparison) -> Page:
         else:
             page.text("Neither has objects.")
     page.section("Plots")
-    if plots:
-        page.plots(plots)
+    if drawings:
+        page.plots(drawings)
     else:
         page.text("There is nothing that two of them have measured.")
     page.section("All figures", EXPLAINED)
@@ -248,7 +223,7 @@ def _summary(page: Page, c: Comparison) -> None:
     page.table(["session", "its report says", "objects", "figures"], rows)
 
 
-def _uncompared(only: Sequence[Difference], first: Source, other: Source) -> str:
+def _uncompared(only: Sequence[compare.Difference], first: Source, other: Source) -> str:
     """Return which stages one side alone has."""
     told: list[str] = []
     for letter, missing in ((first.letter, "second"), (other.letter, "first")):
@@ -279,35 +254,44 @@ SHARES = (
 """Series of values between 0 and 1."""
 
 
-def overlaid(sessions: Series) -> list[tuple[bytes, str]]:
+def overlaid(sessions: Series) -> Iterator[tuple[bytes, str]]:
     """Return every plot that two sessions at least have something for."""
-    drawn: list[tuple[bytes, str]] = []
     for name, title, x, y in BY_VIEW:
         mine = [(label, s[name], k) for k, (label, s) in enumerate(sessions) if _views(s, name)]
         if len(mine) > 1:
-            figure, ax = axes(title, x, y)
+            figure, ax = plots.axes(title, x, y)
             for label, values, k in mine:
-                style = {"color": SERIES[k % 6], "marker": MARKERS[k % 6], "ls": STYLES[k % 6]}
+                style = {
+                    "color": plots.SERIES[k % 6],
+                    "marker": plots.MARKERS[k % 6],
+                    "ls": plots.STYLES[k % 6],
+                }
                 # The first ones larger: equal values would hide them.
                 size = max(3, 7 - 2 * k)
                 ax.plot(values["view"], values["value"], ms=size, lw=1, label=label, **style)
             ax.set_ylim(0, 1.3 * max(ax.get_ylim()[1], 1e-9))
-            whole_numbers(ax.xaxis)
-            legend(ax, loc="upper left", ncols=2)
-            drawn.append((png(figure), f"{title}: {_labels(mine)}."))
+            plots.whole_numbers(ax.xaxis)
+            plots.legend(ax, loc="upper left", ncols=2)
+            yield (plots.png(figure), f"{title}: {_labels(mine)}.")
     for name, title, x, y in SHARES:
         mine = [(label, s[name], k) for k, (label, s) in enumerate(sessions) if s.get(name)]
         if len(mine) > 1:
-            figure, ax = axes(title, x, y)
+            figure, ax = plots.axes(title, x, y)
             edges = np.linspace(0, 1, 21)
             for label, values, k in mine:
                 counts, _ = np.histogram(values, edges)
                 share = 100 * counts / len(values)
-                ax.stairs(share, edges, color=SERIES[k % 6], ls=STYLES[k % 6], lw=2, label=label)
+                ax.stairs(
+                    share,
+                    edges,
+                    color=plots.SERIES[k % 6],
+                    ls=plots.STYLES[k % 6],
+                    lw=2,
+                    label=label,
+                )
             ax.set_ylim(0, 1.25 * max(ax.get_ylim()[1], 1e-9))
-            legend(ax, loc="upper left", ncols=2)
-            drawn.append((png(figure), f"{title}: {_labels(mine)}."))
-    return drawn
+            plots.legend(ax, loc="upper left", ncols=2)
+            yield (plots.png(figure), f"{title}: {_labels(mine)}.")
 
 
 def _views(series: Mapping[str, Any], name: str) -> bool:
@@ -318,21 +302,21 @@ def _labels(mine: Sequence[tuple[str, Any, int]]) -> str:
     return ", ".join(label for label, _, _ in mine)
 
 
-def moves(objects: Sequence[ObjectDifference], labels: str) -> bytes | None:
+def moves(objects: Sequence[compare.ObjectDifference], labels: str) -> bytes | None:
     """Plot how far the objects stand from one another, beside the noise; None where none do."""
     rows = [o for o in objects if o.shift_mm is not None]
     if not rows:
         return None
     title = f"How far the objects stand apart, {labels}"
-    height_px = 100 + BAR_PX * max(3, len(rows))
-    figure, ax = axes(title, "distance of the middle [mm]", height_px=height_px)
+    height_px = 100 + plots.BAR_PX * max(3, len(rows))
+    figure, ax = plots.axes(title, "distance of the middle [mm]", height_px=height_px)
     places = np.arange(len(rows))
-    ax.barh(places, [o.shift_mm or 0.0 for o in rows], 0.6, color=SERIES[0])
+    ax.barh(places, [o.shift_mm or 0.0 for o in rows], 0.6, color=plots.SERIES[0])
     noise = [2 * o.sigma_mm if o.sigma_mm is not None else np.nan for o in rows]
-    ax.plot(noise, places, "|", ms=16, mew=2, color=INK)
+    ax.plot(noise, places, "|", ms=16, mew=2, color=plots.INK)
     ax.set_yticks(places, [o.name for o in rows])
     ax.invert_yaxis()
     ax.margins(x=0.1)
-    ax.tick_params(axis="y", colors=INK)
-    ax.axvline(0, color=MUTED, lw=1)
-    return png(figure)
+    ax.tick_params(axis="y", colors=plots.INK)
+    ax.axvline(0, color=plots.MUTED, lw=1)
+    return plots.png(figure)

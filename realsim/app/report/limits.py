@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,8 +64,7 @@ def read_limits(path: Path) -> list[Limit]:
     return limits
 
 
-def _limits(told: Mapping[str, Any], before: str, path: Path) -> list[Limit]:
-    found: list[Limit] = []
+def _limits(told: Mapping[str, Any], before: str, path: Path) -> Iterator[Limit]:
     for key, value in told.items():
         name = f"{before}{key}"
         if not isinstance(value, dict):
@@ -83,12 +82,11 @@ def _limits(told: Mapping[str, Any], before: str, path: Path) -> list[Limit]:
             )
             if limit.least > limit.greatest:
                 raise InputError(f"--limits '{path}': {name} has min above max.")
-            found.append(limit)
+            yield limit
         elif rows:
-            found += _limits(rows, f"{name}.", path)
+            yield from _limits(rows, f"{name}.", path)
         else:
             raise InputError(f"--limits '{path}': {name} has neither min nor max.")
-    return found
 
 
 def _number(value: Any, what: str) -> float:
@@ -106,17 +104,15 @@ def _number(value: Any, what: str) -> float:
     return number
 
 
-def broken(limits: Sequence[Limit], figures: Mapping[str, Figure]) -> list[str]:
+def broken(limits: Sequence[Limit], figures: Mapping[str, Figure]) -> Iterator[str]:
     """Return in words which limits are not kept; one on a figure that is not there is not."""
-    told: list[str] = []
     for limit in limits:
         figure = figures.get(limit.name)
         if figure is None:
-            told.append(f"{limit.name} is not there: its stage has not been run, or says nothing.")
+            yield f"{limit.name} is not there: its stage has not been run, or says nothing."
             continue
         value = f"{limit.name} is {shown(figure.value, figure.sigma)} {figure.meaning.unit}".strip()
         if figure.value < limit.least:
-            told.append(f"{value}, at least {limit.least:g} is asked for.")
+            yield f"{value}, at least {limit.least:g} is asked for."
         if figure.value > limit.greatest:
-            told.append(f"{value}, at most {limit.greatest:g} is asked for.")
-    return told
+            yield f"{value}, at most {limit.greatest:g} is asked for."

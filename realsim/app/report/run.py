@@ -129,7 +129,7 @@ def _say_several(console: Console, c: compare_page.Comparison) -> None:
     """Print the tables."""
     for s in c.sources:
         console.say(f"{s.label}: {VERDICTS[s.verdict][0].lower()}")
-    rows = compare_page.figure_rows(c, all_figures=False)
+    rows = list(compare_page.figure_rows(c, all_figures=False))
     if rows:
         console.table("Figures that differ", compare_page.figure_header(c), rows)
     else:

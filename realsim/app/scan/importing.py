@@ -97,37 +97,29 @@ def _import_one(
     path: Path, request: ImportRequest, console: Console
 ) -> tuple[str, tuple[str, ...], dict[str, object]]:
     """Import one mesh, say what was found, and return its verdict, its row and its document."""
+    from realsim.models import library_prepare as prepare
     from realsim.models.library import ModelLibrary
-    from realsim.models.library_prepare import (
-        STEPS,
-        Matter,
-        PrepareConfig,
-        Step,
-        prepare_mesh,
-        prepare_unscaled,
-        source_of,
-    )
     from realsim.models.pictures import sheet_png
     from realsim.models.reading import read_scan
     from realsim.untrusted.own_json import to_json
 
     name = _name(path, request)
     _check_place(name, request)
-    config = PrepareConfig(most_faces=request.faces, with_parts=not request.no_parts)
-    steps = ("read", *STEPS, "picture")
+    config = prepare.PrepareConfig(most_faces=request.faces, with_parts=not request.no_parts)
+    steps = ("read", *prepare.STEPS, "picture")
     with console.stage("import", path.name) as tick:
 
-        def step(which: Step) -> None:
+        def step(which: prepare.Step) -> None:
             tick(steps.index(which), len(steps))
 
         tick(0, len(steps))
         scan = read_scan(path, request.unit, request.up)
-        source, metric = source_of(scan, path.name), scan.unit != "none"
+        source, metric = prepare.source_of(scan, path.name), scan.unit != "none"
         if metric:
-            matter = Matter(density=request.density, mass_kg=request.mass)
-            made = prepare_mesh(scan.mesh, config, matter, source=source, step=step)
+            matter = prepare.Matter(density=request.density, mass_kg=request.mass)
+            made = prepare.prepare_mesh(scan.mesh, config, matter, source=source, step=step)
         else:
-            made = prepare_unscaled(scan.mesh, config, source=source, step=step)
+            made = prepare.prepare_unscaled(scan.mesh, config, source=source, step=step)
         tick(len(steps) - 1, len(steps))
         picture = sheet_png(made.mesh, made.properties, made.parts, name)
         library = ModelLibrary.create(request.library)

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -137,9 +137,8 @@ def survivors(s: GraspSet, measure: str, levels_of: str) -> tuple[Array, Array]:
     return levels, np.array([100.0 * np.mean(least <= v) for v in levels])
 
 
-def level_tables(sets: Sequence[GraspSet], models: Names) -> list[tuple[str, list[str], Rows]]:
+def level_tables(sets: Sequence[GraspSet], models: Names) -> Iterator[tuple[str, list[str], Rows]]:
     """Return for each swept quantity its name, and a table of the share [%] that pass by level."""
-    tables: list[tuple[str, list[str], Rows]] = []
     for measure, levels_of, what in LEVELS:
         found = [(s, *survivors(s, measure, levels_of)) for s in sets]
         found = [(s, levels, share) for s, levels, share in found if len(levels)]
@@ -151,8 +150,7 @@ def level_tables(sets: Sequence[GraspSet], models: Names) -> list[tuple[str, lis
             at = dict(zip(levels.tolist(), share.tolist(), strict=True))
             cells = [f"{at[v]:.0f}" if v in at else "-" for v in every.tolist()]
             rows.append([named(s, models), *cells])
-        tables.append((what, ["object", *[f"{v:g}" for v in every]], rows))
-    return tables
+        yield (what, ["object", *[f"{v:g}" for v in every]], rows)
 
 
 def agreement_line(sets: Sequence[GraspSet]) -> str:
@@ -236,40 +234,36 @@ def why_no_grasp(grasps: GraspSet) -> str:
     )
 
 
-def not_tried(sets: Sequence[GraspSet], models: Names) -> list[str]:
+def not_tried(sets: Sequence[GraspSet], models: Names) -> Iterator[str]:
     """Return in words, of each object without tried grasps, why there are none."""
-    words: list[str] = []
     for s in sets:
         if len(s) == 0:
-            words.append(f"{named(s, models)}: {why_no_grasp(s)}")
+            yield f"{named(s, models)}: {why_no_grasp(s)}"
         elif s.parameters.get("not_tried"):
-            words.append(f"{named(s, models)}: not tried: {s.parameters['not_tried']}")
-    return words
+            yield f"{named(s, models)}: not tried: {s.parameters['not_tried']}"
 
 
 FAT, THIN = 1.10, 0.90
 """Convex parts of a larger or smaller share of the mesh's volume are named."""
 
 
-def doubts(sets: Sequence[GraspSet], models: Names) -> list[str]:
+def doubts(sets: Sequence[GraspSet], models: Names) -> Iterator[str]:
     """Return in words, of each object, what makes its labels doubtful: its shape, its volume."""
-    words: list[str] = []
     for s in sets:
         convex: dict[str, Any] = s.parameters.get("convex") or {}
         ratio = float(convex.get("volume_ratio", 1.0))
         if ratio > FAT:
-            words.append(
+            yield (
                 f"{named(s, models)}: its convex parts are {ratio:.2f} times as large as its mesh, "
                 "so hollows are smaller and walls thicker than they are"
             )
         elif ratio < THIN:
-            words.append(f"{named(s, models)}: its convex parts are only {ratio:.2f} of its mesh")
+            yield f"{named(s, models)}: its convex parts are only {ratio:.2f} of its mesh"
         if s.parameters.get("watertight") is False:
-            words.append(
+            yield (
                 f"{named(s, models)}: its mesh is not closed, so its mass is a guess: weigh it "
                 "(`--weighed`) or repair it (`realsim scan import`)"
             )
-    return words
 
 
 SUMMARY_HEADER = ["property", "here", "in the paper"]

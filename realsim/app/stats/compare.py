@@ -1,7 +1,7 @@
 """`realsim stats NEW --compare OLD`: what two releases of a data set differ in, scene by scene."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,13 +14,7 @@ from realsim.app.console import Console
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.sources import SourceScene, source_scenes
 from realsim.app.stages import open_session
-from realsim.app.stats.compare_files import (
-    is_same_file,
-    names_in,
-    other_files,
-    other_in_roots,
-    other_models,
-)
+from realsim.app.stats import compare_files
 from realsim.arrays import Array, Int64
 from realsim.formats.bop.labelled import BopLabelledScene
 from realsim.formats.graspnet.grasp_labels import read_grasp_labels
@@ -113,12 +107,12 @@ def compare_releases(new: Sequence[Path], old: Path, console: Console) -> dict[s
         with console.stage("compare", name):
             diffs.append(diff_scenes(name, before[name].open(), after[name].open()))
             places = (before[name].folder, after[name].folder)
-            diffs[-1].files_changed += other_files(*places)
+            diffs[-1].files_changed += compare_files.other_files(*places)
             lists = [p.parent / OBJECT_LIST for p in places]
-            if after[name].kind == "graspnet" and not is_same_file(*lists):
+            if after[name].kind == "graspnet" and not compare_files.is_same_file(*lists):
                 diffs[-1].files_changed.append(OBJECT_LIST)
             if before[name].kind == after[name].kind == "session":
-                diffs[-1].files_changed += other_models(places, [{}, {}])
+                diffs[-1].files_changed += compare_files.other_models(places, [{}, {}])
     console.table(
         f"{', '.join(p.name for p in new)} since {old.name}",
         ("scene", "state", "frames", "objects", "moved", "at most [mm]", "[deg]", "labels",
@@ -132,7 +126,7 @@ def compare_releases(new: Sequence[Path], old: Path, console: Console) -> dict[s
             "releases of one data set."
         )
     roots = _roots(before), _roots(after)
-    files = [f for a, b in zip(*roots, strict=False) for f in other_in_roots(a, b)]
+    files = [f for a, b in zip(*roots, strict=False) for f in compare_files.other_in_roots(a, b)]
     if files:
         console.warn(f"{len(files)} files beside the scenes differ: {', '.join(files[:8])}"
                      f"{' ...' if len(files) > 8 else ''}.")  # fmt: skip
@@ -226,9 +220,9 @@ def _counterparts(before: set[Thing], after: set[Thing]) -> dict[Thing, Thing]:
 def _names(scene: LabelledScene) -> dict[int, str]:
     """Return the names of the models by id; {} where they do not tell models apart."""
     if isinstance(scene, SessionScene):
-        return names_in(scene.store.folder / "models")
+        return compare_files.names_in(scene.store.folder / "models")
     folder = scene.models_folder if isinstance(scene, BopLabelledScene) else None
-    return {} if folder is None else names_in(folder)
+    return {} if folder is None else compare_files.names_in(folder)
 
 
 def _rows(frame: LabelledFrame, names: dict[int, str]) -> dict[Thing, int]:
@@ -299,7 +293,9 @@ def _label_files(found: SceneDiff, old: GraspnetLabelledScene, new: GraspnetLabe
         found.grasps_changed += changed
         found.grasps_kept += len(i) - changed
     name = f"collision_label/scene_{old.number:04d}"
-    found.files_changed += [f"{name}/{f}" for f in other_files(*(r / name for r in roots))]
+    found.files_changed += [
+        f"{name}/{f}" for f in compare_files.other_files(*(r / name for r in roots))
+    ]
 
 
 def _label_rows(file: Path) -> tuple[Int64, Array]:
@@ -323,7 +319,7 @@ def _grasps(found: SceneDiff, old: dict[Thing, GraspSet], new: dict[Thing, Grasp
     for thing in old.keys() | new.keys():
         before, after = old.get(thing), new.get(thing)
         a, b = (0 if s is None else len(s) for s in (before, after))
-        pairs = [] if before is None or after is None else _same(before, after)
+        pairs = [] if before is None or after is None else list(_same(before, after))
         found.grasps_lost += a - len(pairs)
         found.grasps_added += b - len(pairs)
         if before is not None and after is not None and pairs:
@@ -338,23 +334,21 @@ def _grasps(found: SceneDiff, old: dict[Thing, GraspSet], new: dict[Thing, Grasp
             found.grasps_kept += int((~changed).sum())
 
 
-def _same(before: GraspSet, after: GraspSet) -> list[tuple[int, int]]:
+def _same(before: GraspSet, after: GraspSet) -> Iterator[tuple[int, int]]:
     """Return the rows of grasps that are in both sets, each once."""
     if not len(before) or not len(after):
-        return []
+        return
     from scipy.spatial import KDTree
 
     tree = KDTree(after.Ts_obj_grasp[:, :3, 3])
-    pairs: list[tuple[int, int]] = []
     taken: set[int] = set()
     for i, T in enumerate(before.Ts_obj_grasp):
         for j in sorted(tree.query_ball_point(T[:3, 3], SAME_GRASP_M)):
             turn = se3.angle(T[:3, :3].T @ after.Ts_obj_grasp[j, :3, :3])
             if j not in taken and np.degrees(turn) <= SAME_GRASP_DEG:
                 taken.add(j)
-                pairs.append((i, j))
+                yield (i, j)
                 break
-    return pairs
 
 
 def _shown(d: SceneDiff) -> list[object]:

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -37,16 +37,15 @@ def other_files(old: Path, new: Path) -> list[str]:
     return [n for n in sorted(names) if not is_same_file(old / n, new / n)]
 
 
-def other_models(roots: Sequence[Path], names: Sequence[dict[int, str]]) -> list[str]:
+def other_models(roots: Sequence[Path], names: Sequence[dict[int, str]]) -> Iterator[str]:
     """Return the files of models that differ: of equal names, or of equal ids without names."""
-    found: list[str] = []
     for folder in sorted({p.name for r in roots for p in r.glob("models*") if p.is_dir()}):
         files = [
             {_called(p, r / folder, ids): p for p in (r / folder).rglob("*")
              if p.is_file() and p.name != INFO_FILE and not LEFT_OUT.search(p.name)}
             for r, ids in zip(roots, names, strict=True)
         ]  # fmt: skip
-        found += [
+        yield from [
             f"{folder}/{n}" for n in sorted(files[0].keys() | files[1].keys())
             if n not in files[0] or n not in files[1] or not is_same_file(files[0][n], files[1][n])
         ]  # fmt: skip
@@ -55,8 +54,7 @@ def other_models(roots: Sequence[Path], names: Sequence[dict[int, str]]) -> list
             for r, ids in zip(roots, names, strict=True)
         ]
         if rows[0] != rows[1]:
-            found.append(f"{folder}/{INFO_FILE}")
-    return found
+            yield f"{folder}/{INFO_FILE}"
 
 
 def other_in_roots(old: Path, new: Path) -> list[str]:
@@ -64,7 +62,7 @@ def other_in_roots(old: Path, new: Path) -> list[str]:
     names = [names_in(r / "models") for r in (old, new)]
     tables = {p.name for r in (old, new) for p in r.glob("*.json") if not LEFT_OUT.search(p.name)}
     other = [n for n in sorted(tables) if not is_same_file(old / n, new / n)]
-    return other + other_models((old, new), names)
+    return [*other, *other_models((old, new), names)]
 
 
 def is_same_file(old: Path, new: Path) -> bool:

@@ -1,6 +1,7 @@
 """The pictures of the statistics: what became of grasps, how visible and certain objects are."""
 
 from collections import Counter
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -26,21 +27,19 @@ Drawn = tuple[bytes, str]
 """A picture and its caption."""
 
 
-def figures(stats: Statistics) -> list[tuple[str, int, list[Drawn]]]:
+def figures(stats: Statistics) -> Iterator[tuple[str, int, list[Drawn]]]:
     """Return (title, width of a picture [px], pictures) of everything that there are figures for.
 
     Pictures stand side by side where the page is wide enough, and one below the other on a phone.
     """
-    drawn: list[tuple[str, int, list[Drawn]]] = []
     if stats.school.judged:
         both = [_outcomes(stats), _labels(stats)]
-        drawn.append(("What became of the candidates, beside the paper's", plots.WIDTH_PX, both))
-        drawn.append(("Force closure against p_hold or score", plots.WIDTH_PX, [_closure(stats)]))
+        yield ("What became of the candidates, beside the paper's", plots.WIDTH_PX, both)
+        yield ("Force closure against p_hold or score", plots.WIDTH_PX, [_closure(stats)])
     if len(stats.visibility) or stats.objects:
-        drawn.append(("How visible and how certain the objects are", THIRD_PX, _trust(stats)))
+        yield ("How visible and how certain the objects are", THIRD_PX, _trust(stats))
     if stats.objects and len(stats.sessions) > 1:  # of one, the table says it
-        drawn.append(("Objects, frames and verdicts of the scenes", THIRD_PX, _scenes(stats)))
-    return drawn
+        yield ("Objects, frames and verdicts of the scenes", THIRD_PX, _scenes(stats))
 
 
 def _outcomes(stats: Statistics) -> Drawn:

@@ -3,7 +3,7 @@
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -126,12 +126,12 @@ def document_of(stats: Statistics, left_out: Sequence[str] = ()) -> dict[str, An
     }
 
 
-def _records(header: Sequence[str], rows: Sequence[Sequence[Cell]]) -> list[dict[str, Any]]:
+def _records(header: Sequence[str], rows: Iterable[Sequence[Cell]]) -> list[dict[str, Any]]:
     """Return table rows as JSON objects, with null for what is not known."""
     return [json_value(dict(zip(header, row, strict=True))) for row in rows]
 
 
-def csv_bytes(header: Sequence[str], rows: Sequence[Sequence[Cell]]) -> bytes:
+def csv_bytes(header: Sequence[str], rows: Iterable[Sequence[Cell]]) -> bytes:
     """Return rows as CSV (RFC 4180, UTF-8); what is not known is an empty cell."""
     buffer = io.StringIO()
     writer = csv.writer(buffer)
@@ -145,7 +145,7 @@ def _write_all(
     out: Path, stats: Statistics, document: dict[str, Any], notes: list[str], console: Console
 ) -> None:
     out.mkdir(parents=True, exist_ok=True)
-    tables: tuple[tuple[Sequence[str], Sequence[Sequence[Cell]]], ...] = (
+    tables: tuple[tuple[Sequence[str], Iterable[Sequence[Cell]]], ...] = (
         (HEADER, statistics.all_rows(stats)),
         (statistics.SESSION_HEADER, statistics.session_table(stats)),
         (statistics.OBJECT_HEADER, statistics.object_table(stats)),
@@ -189,7 +189,7 @@ def _words(header: Sequence[str]) -> list[str]:
     return [name.replace("_", " ") for name in header]
 
 
-def _shown(rows: Sequence[Sequence[Cell]]) -> list[list[str]]:
+def _shown(rows: Iterable[Sequence[Cell]]) -> list[list[str]]:
     def cell(value: Cell) -> str:
         if isinstance(value, float):
             return statistics.NOTHING if math.isnan(value) else f"{value:.3f}"

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -150,39 +150,31 @@ OBJECT_HEADER = (
 Cell = str | int | float
 
 
-def session_table(stats: Statistics) -> list[list[Cell]]:
+def session_table(stats: Statistics) -> Iterator[list[Cell]]:
     """Return one row a session, as in SESSION_HEADER."""
-    rows: list[list[Cell]] = []
     for s in stats.sessions:
         verdicts = Counter(o.verdict for o in s.objects)
         sigma = np.array([o.sigma_mm for o in s.objects])
         seen = np.concatenate([np.zeros(0), *(o.visibility for o in s.objects)])
-        rows.append(
-            [
-                s.name, s.kind, s.frames, s.frames_annotated, len(s.objects),
-                *_school_cells(summarise(s.sets)), *(verdicts.get(v, 0) for v in VERDICTS),
-                _median(sigma), _average(seen), s.width, s.height,
-            ]
-        )  # fmt: skip
-    return rows
+        yield [
+            s.name, s.kind, s.frames, s.frames_annotated, len(s.objects),
+            *_school_cells(summarise(s.sets)), *(verdicts.get(v, 0) for v in VERDICTS),
+            _median(sigma), _average(seen), s.width, s.height,
+        ]  # fmt: skip
 
 
-def object_table(stats: Statistics) -> list[list[Cell]]:
+def object_table(stats: Statistics) -> Iterator[list[Cell]]:
     """Return one row a thing of every session, as in OBJECT_HEADER."""
-    rows: list[list[Cell]] = []
     for s in stats.sessions:
         sets = {g.instance: g for g in s.sets}
         for o in s.objects:
             tried = [sets[o.instance]] if o.instance in sets else []
             most = float(o.visibility.max()) if len(o.visibility) else math.nan
-            rows.append(
-                [
-                    s.name, o.instance, o.name, o.verdict, o.sigma_mm, o.sigma_deg,
-                    *_school_cells(summarise(tried)), len(o.visibility), _average(o.visibility),
-                    most, o.obj_id,
-                ]
-            )  # fmt: skip
-    return rows
+            yield [
+                s.name, o.instance, o.name, o.verdict, o.sigma_mm, o.sigma_deg,
+                *_school_cells(summarise(tried)), len(o.visibility), _average(o.visibility),
+                most, o.obj_id,
+            ]  # fmt: skip
 
 
 def _school_cells(summary: SchoolSummary) -> Sequence[Cell]:

@@ -1,6 +1,6 @@
 """What is to be upgraded: what the user asked for, the scenes of a data set, how they open."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -125,7 +125,7 @@ def scenes_of(dataset: Path, config: UpgradeConfig) -> list[SceneRef]:
         InputError: there are none, or not those asked for.
     """
     kind = _kind_of(dataset, config.kind)
-    refs = _graspnet(dataset, config) if kind == "graspnet" else _bop(dataset, config)
+    refs = list(_graspnet(dataset, config)) if kind == "graspnet" else _bop(dataset, config)
     missing = sorted(set(config.scenes) - {r.number for r in refs})
     if missing:
         there = ", ".join(map(str, sorted({r.number for r in refs})))
@@ -204,16 +204,15 @@ def _graspnet_cameras(dataset: Path) -> list[Path]:
     return [(home / camera).resolve() for home in homes for camera in cameras_of(home)]
 
 
-def _graspnet(dataset: Path, config: UpgradeConfig) -> list[SceneRef]:
+def _graspnet(dataset: Path, config: UpgradeConfig) -> Iterator[SceneRef]:
     """Return the scenes of a GraspNet tree; each camera's images are a scene of their own."""
     if is_graspnet_frame(dataset):
         models = config.models or dataset / "models"
-        return [
-            SceneRef(
-                kind="graspnet", root=dataset, folder=dataset, number=0, camera="",
-                place="train/000000", models=models,
-            )
-        ]  # fmt: skip
+        yield SceneRef(
+            kind="graspnet", root=dataset, folder=dataset, number=0, camera="",
+            place="train/000000", models=models,
+        )  # fmt: skip
+        return
     folders = _graspnet_cameras(dataset)
     if config.camera:
         folders = [f for f in folders if f.name == config.camera]
@@ -223,7 +222,6 @@ def _graspnet(dataset: Path, config: UpgradeConfig) -> list[SceneRef]:
             + (f" of the camera {config.camera}" if config.camera else "")
             + f": {GRASPNET}"
         )
-    refs: list[SceneRef] = []
     for folder in folders:
         scene = folder.parent
         digits = scene.name.removeprefix("scene_")
@@ -231,14 +229,11 @@ def _graspnet(dataset: Path, config: UpgradeConfig) -> list[SceneRef]:
             raise InputError(f"{scene} is not named scene_NUMBER, as GraspNet's scenes are.")
         root = scene.parent.parent
         split = "train" if int(digits) < FIRST_TEST_SCENE else "test"
-        refs.append(
-            SceneRef(
-                kind="graspnet", root=root, folder=folder, number=int(digits), camera=folder.name,
-                place=f"{split}_{folder.name}/{int(digits):06d}",
-                models=config.models or root / "models",
-            )
+        yield SceneRef(
+            kind="graspnet", root=root, folder=folder, number=int(digits), camera=folder.name,
+            place=f"{split}_{folder.name}/{int(digits):06d}",
+            models=config.models or root / "models",
         )  # fmt: skip
-    return refs
 
 
 def open_scene(ref: SceneRef) -> LabelledScene:

@@ -9,7 +9,7 @@ OUT/camera.json, OUT/SPLIT_targets_bop19.json
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,15 +61,13 @@ def finished_record(folder: Path, key: str) -> dict[str, Any] | None:
         return None  # a damaged note is no note: the stages are gone through again
 
 
-def all_records(out: Path) -> list[dict[str, Any]]:
+def all_records(out: Path) -> Iterator[dict[str, Any]]:
     """Return what came of every scene that has been upgraded into a folder."""
-    records: list[dict[str, Any]] = []
     for path in sorted(out.glob(f"*/*/{NOTE}")):
         try:
-            records.append(dict(read_object(path)["record"]))
+            yield dict(read_object(path)["record"])
         except (InputError, KeyError, TypeError, ValueError):
             continue
-    return records
 
 
 def labels_of(ref: SceneRef) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
 """The page of an upgrade: where every object was said to be, where it is, worst first."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,7 @@ def write_page(
     page = Page(title="Upgraded data set", about=tables.summary_line(summary))
     for line in notes_line(notes, len(failed)):
         page.text(line, "note")
-    frames = _frames(out, pictured)
+    frames = list(_frames(out, pictured))
     if frames:
         page.section(
             "Frames",
@@ -110,19 +110,15 @@ def notes_line(notes: Sequence[tuple[str, str]], left_out: int) -> list[str]:
     return [f"{lost}{counted(len(notes), 'note')} on {counted(scenes, 'scene')}: see below."]
 
 
-def _frames(out: Path, pictured: Sequence[tuple[Record, Mapping[str, Any]]]) -> list[View]:
+def _frames(out: Path, pictured: Sequence[tuple[Record, Mapping[str, Any]]]) -> Iterator[View]:
     """Return whole frames with the outlines of their objects, those of the worst objects first."""
     frames: dict[tuple[str, int], list[Mapping[str, Any]]] = {}
     for record, o in pictured:
         frames.setdefault((str(record["place"]), int(o["shown"]["image"])), []).append(o)
-    views: list[View] = []
     for (place, image), objects in list(frames.items())[:FRAMES]:
         before, after = (partial(_frame, out / place, image, objects, k) for k in (1, 2))
         names = ", ".join(str(o["name"]) for o in objects)
-        views.append(
-            View(f"{place} image {image}: {names}", {"as given": before, "as written": after})
-        )
-    return views
+        yield View(f"{place} image {image}: {names}", {"as given": before, "as written": after})
 
 
 def _frame(folder: Path, image: int, objects: Sequence[Mapping[str, Any]], poses: int) -> Image:

@@ -1,6 +1,6 @@
 """One scene of an upgrade: a session made of it, taken through every stage, and what came of it."""
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -71,7 +71,7 @@ class SceneConsole(Console):
         """Keep one line that the user must not miss."""
         self.told += texts
 
-    def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    def table(self, title: str, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
         """Leave the table out."""
 
 
@@ -165,39 +165,35 @@ def settled(
             for f in spread_frames(frames, middle, VIEWS)
         ]  # fmt: skip
         outcomes = decide(pictures, source.models, annotations, objects, result.scene.plane)
-    result = with_objects(result, _with_outcomes(objects, outcomes))
+    result = with_objects(result, tuple(_with_outcomes(objects, outcomes)))
     report = dict(result.report) | {"upgrade": {str(o.instance): o.as_json() for o in outcomes}}
     return replace(result, report=report)
 
 
 def _with_outcomes(
     scene_objects: Sequence[ObjectPose], outcomes: Sequence[Outcome]
-) -> tuple[ObjectPose, ...]:
+) -> Iterator[ObjectPose]:
     """Return the registered objects with the annotations that were kept in their places.
 
     A kept annotation within `RIGHT_M` of the new pose has that one's verdict; another one is
     unchecked, or doubtful where it looks wrong.
     """
     by = {o.instance: o for o in outcomes}
-    out: list[ObjectPose] = []
     for p in scene_objects:
         o = by.get(p.instance)
         if o is None:
-            out.append(p)
+            yield p
             continue
         near = o.evidence is not None and o.evidence.moved_m <= RIGHT_M
         if o.kind == "improved" or (near and not o.looks_wrong and p.verdict != "rejected"):
-            out.append(replace(p, T_world_obj=o.T_world_obj))
+            yield replace(p, T_world_obj=o.T_world_obj)
             continue
         agree = {} if o.evidence is None else {"agree": o.evidence.agree[0]}
-        out.append(
-            replace(
-                p, T_world_obj=o.T_world_obj, covariance=None, checks=agree,
-                verdict="doubtful" if o.looks_wrong else "unchecked",
-                reasons=(f"annotation kept: {o.words}",),
-            )
+        yield replace(
+            p, T_world_obj=o.T_world_obj, covariance=None, checks=agree,
+            verdict="doubtful" if o.looks_wrong else "unchecked",
+            reasons=(f"annotation kept: {o.words}",),
         )  # fmt: skip
-    return tuple(out)
 
 
 def _session_of(job: SceneJob, source: SceneSource) -> SessionStore:
@@ -324,21 +320,20 @@ def _visible_fractions(store: SessionStore, pose: ObjectPose) -> dict[int, float
     return out
 
 
-def registration_notes(store: SessionStore) -> list[str]:
+def registration_notes(store: SessionStore) -> Iterator[str]:
     """Return what the registration found out about the scene as a whole."""
     report: dict[str, Any] = store.read_json("registration/report.json")
-    notes: list[str] = []
     offset = report.get("common_offset_mm")  # only of objects that all had starts
     if offset is not None and offset["consistent"]:
         x, y, z = offset["offset_mm"]
-        notes.append(
+        yield (
             f"all objects moved together by ({x:.1f}, {y:.1f}, {z:.1f}) mm from their start poses, "
             f"agreeing within {offset['spread_mm']:.1f} mm: the given poses are off as a whole, as "
             "those of a neighbouring frame, of a moved camera, or with a common depth error."
         )
     sinking = report.get("common_sinking")
     if sinking is not None and sinking["consistent"]:
-        notes.append(
+        yield (
             f"the objects sink into the table by {-100 * sinking['share_of_height']:.1f} % of "
             "their height, all alike: the depth reads short, or the models are too large."
         )
@@ -350,8 +345,7 @@ def registration_notes(store: SessionStore) -> list[str]:
         if not axis["declared"] and abs(axis.get("fit_deg", 0.0)) >= 1.0
     ]
     if kept:
-        notes.append(
+        yield (
             f"the depth cannot see how these are turned about their own axis: {', '.join(kept)}; "
             "the start's turn was kept (in brackets: what the fit alone would have turned)."
         )
-    return notes
