@@ -74,6 +74,12 @@ def box_mesh(low: ArrayLike, high: ArrayLike) -> Mesh:
     return Mesh(vertices=np.array(list(product(*ends.T))), faces=BOX_FACES)
 
 
+def slab_mesh(edge_m: float, thickness_m: float) -> Mesh:
+    """Return a square table as a closed box under the plane z = 0, about the origin."""
+    half = edge_m / 2
+    return box_mesh((-half, -half, -thickness_m), (half, half, 0.0))
+
+
 def transformed(mesh: Mesh, T: ArrayLike) -> Mesh:
     """Return the mesh with its vertices mapped by a rigid T (4, 4)."""
     T = se3.check_rigid(T, "the transform of the mesh")

@@ -9,8 +9,8 @@ from realsim.app.render.light import ObservedLook, matched_look, neutral_environ
 from realsim.app.render.request import RenderRequest
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.mesh import box_mesh
-from realsim.records import Mesh, ObjectModel, Scene
+from realsim.geometry.mesh import slab_mesh
+from realsim.records import ObjectModel, Scene
 from realsim.rendering.appearance import Material
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.store import SessionStore
@@ -74,7 +74,8 @@ def twin_scene(
         T_world_top = scene.plane.T_world_table @ se3.from_translation([0.0, 0.0, top_m])
         scene = replace(scene, plane=replace(scene.plane, T_world_table=T_world_top))
         material = given or Material(roughness=0.6, name="as photographed")
-        surroundings = (PlacedMesh(BACKGROUND, table_slab(), T_world_top, material),)
+        slab = slab_mesh(TABLE_M, TABLE_THICKNESS_M)
+        surroundings = (PlacedMesh(BACKGROUND, slab, T_world_top, material),)
     environment = neutral_environment()
     if request.hdri is not None:
         from realsim.rendering.procedural.hdri import read_environment
@@ -134,12 +135,6 @@ def table_top_m(scene: Scene, models: dict[int, ObjectModel]) -> float:
         for o in shown
     ]
     return float(np.clip(min(lowest), -LOWEST_TABLE_M, 0.0))
-
-
-def table_slab() -> Mesh:
-    """Return the table: a closed box under the plane z = 0 of its frame [m]."""
-    h, t = TABLE_M / 2, TABLE_THICKNESS_M
-    return box_mesh((-h, -h, -t), (h, h, 0.0))
 
 
 def table_material(request: RenderRequest) -> Material | None:

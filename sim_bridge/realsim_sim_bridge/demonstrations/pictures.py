@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 
 from realsim.arrays import Array, Int32
 from realsim.geometry import se3
-from realsim.geometry.mesh import BOX_FACES, box_mesh
+from realsim.geometry.mesh import BOX_FACES, slab_mesh
 from realsim.geometry.mesh_files import load_mesh
 from realsim.models.simplify import colors_at, simplified
 from realsim.records import Mesh
@@ -197,7 +197,7 @@ class ScenePictures:
         if self._known is None:
             table = np.eye(4)
             table[:2, 3] = self.middle_xy
-            placed = [PlacedMesh(BACKGROUND, table_slab(), table)]
+            placed = [PlacedMesh(BACKGROUND, slab_mesh(TABLE_M, TABLE_THICKNESS_M), table)]
             numbers = {i: 1 + k for k, i in enumerate(sorted(self._objects))}
             placed += [PlacedMesh(i, *self._objects[i]) for i in numbers]
             zero = np.zeros((1, len(self._arm.arm.joint_names)))
@@ -275,9 +275,3 @@ def drawn_mesh(mesh: Mesh) -> Mesh:
     size = [max(1, round(scale * edge)) for edge in mesh.texture.shape[1::-1]]
     texture = cv2.resize(mesh.texture, size, interpolation=cv2.INTER_AREA)
     return replace(mesh, texture=np.asarray(texture, np.uint8))
-
-
-def table_slab() -> Mesh:
-    """Return the table: a closed box under the plane z = 0 [m]."""
-    h, t = TABLE_M / 2, TABLE_THICKNESS_M
-    return box_mesh((-h, -h, -t), (h, h, 0.0))
