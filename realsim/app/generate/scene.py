@@ -1,11 +1,11 @@
 """One generated scene: laid out once, rendered and labelled, and kept when it is finished."""
 
 import tempfile
-import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from realsim.app.console import cpu_seconds
 from realsim.app.generate.request import LAYOUTS, GenerateRequest
 from realsim.errors import InputError
 from realsim.store import SessionStore, atomic
@@ -85,7 +85,7 @@ def make_scene(out: Path, number: int, request: GenerateRequest, workers: int = 
         InputError: the pool or the cameras cannot be used.
         StorageError: the disk is full, or refuses.
     """
-    began = _cpu_s()
+    began = cpu_seconds()
     cache = out / CACHE
     if layout_path(out, number).is_file():
         layout = load_layout(out, number)
@@ -97,7 +97,7 @@ def make_scene(out: Path, number: int, request: GenerateRequest, workers: int = 
         layout, request.pool, request.scene, own=request.looks,
         farthest_m=request.views.radius_m[1], cache=cache,
     )  # fmt: skip
-    between = _cpu_s()
+    between = cpu_seconds()
     Ts_table_cam = views(
         built.hulls(),
         request.views,
@@ -114,7 +114,7 @@ def make_scene(out: Path, number: int, request: GenerateRequest, workers: int = 
             request.rendering, noise, workers=workers, models_from=Path(models),
         )  # fmt: skip
     costs = SceneCosts(
-        number=number, physics_s=between - began, rendering_s=_cpu_s() - between,
+        number=number, physics_s=between - began, rendering_s=cpu_seconds() - between,
         rendered=summary.rendered, parts=summary.cpu_s,
         notes=summary.notes,
     )  # fmt: skip
@@ -144,10 +144,3 @@ def stored_costs(out: Path, number: int) -> dict[str, Any]:
     path = finished_path(out, number)
     value: Any = read_object(path).get("costs", {}) if path.is_file() else {}
     return dict(value)
-
-
-def _cpu_s() -> float:
-    import os
-
-    t = os.times()
-    return time.process_time() + t.children_user + t.children_system
