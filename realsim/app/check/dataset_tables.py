@@ -77,8 +77,7 @@ def show_agreement(folder: Path, scenes: Sequence[SceneAgreement], console: Cons
     lines = [f"{s.place}: {f}" for s in scenes for f in s.findings]
     lines += [f"{s.place} object {o.obj_id} {o.name}: {f}" for s, o in rows for f in o.faults]
     console.say(*shortened([f"disagrees: {line}" for line in lines], MOST_FINDINGS, MORE))
-    for note in dict.fromkeys(f"{s.place}: {n}" for s in scenes for n in s.notes):
-        console.say(f"note: {note}")
+    console.say(*dict.fromkeys(f"note: {s.place}: {n}" for s in scenes for n in s.notes))
     good = sum(s.agrees for s in scenes)
     rough = sum(s.approximate for s in scenes)
     console.say(

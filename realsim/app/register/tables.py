@@ -1,5 +1,6 @@
 """What a registration found, as rows of tables and as words: for the console and for the page."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -66,10 +67,7 @@ def object_rows(result: Registered, models: Mapping[int, ObjectModel]) -> Iterat
 def shared_reasons(result: Registered) -> tuple[str, ...]:
     """Return reasons of several objects that are told once, as findings of the scene."""
     told = {r.words for r in result.remarks}
-    counts: dict[str, int] = {}
-    for o in result.scene.objects:
-        for reason in o.reasons:
-            counts[reason] = counts.get(reason, 0) + 1
+    counts = Counter(reason for o in result.scene.objects for reason in o.reasons)
     return tuple(reason for reason, n in counts.items() if n > 1 and reason in told)
 
 
@@ -245,26 +243,25 @@ def show_registered(
 
 def as_json(result: Registered, models: Mapping[int, ObjectModel]) -> dict[str, Any]:
     """Return what a program wants to know, as plain JSON values."""
-    objects: list[dict[str, Any]] = []
-    for o in worst_first(result):
+
+    def of_object(o: ObjectPose) -> dict[str, Any]:
         mm, deg = sigmas(o.covariance, models.get(o.obj_id))
-        objects.append(
-            {
-                "instance": o.instance,
-                "obj_id": o.obj_id,
-                "name": models[o.obj_id].name if o.obj_id in models else "",
-                "verdict": o.verdict,
-                "reasons": list(o.reasons),
-                "probability": o.checks.get("probability"),
-                "agree": o.checks.get("agree"),
-                "sigma_mm": mm if np.isfinite(mm) else None,
-                "sigma_deg": deg if np.isfinite(deg) else None,
-                "T_world_obj": o.T_world_obj.tolist(),
-            }
-        )
+        return {
+            "instance": o.instance,
+            "obj_id": o.obj_id,
+            "name": models[o.obj_id].name if o.obj_id in models else "",
+            "verdict": o.verdict,
+            "reasons": list(o.reasons),
+            "probability": o.checks.get("probability"),
+            "agree": o.checks.get("agree"),
+            "sigma_mm": mm if np.isfinite(mm) else None,
+            "sigma_deg": deg if np.isfinite(deg) else None,
+            "T_world_obj": o.T_world_obj.tolist(),
+        }
+
     return {
         "usable": result.is_usable,
-        "objects": objects,
+        "objects": [of_object(o) for o in worst_first(result)],
         "not_placed": [
             {"instance": n.instance, "obj_id": n.obj_id, "reason": n.reason}
             for n in result.not_placed

@@ -129,30 +129,28 @@ def _number(value: float | None, digits: int) -> str:
 
 def as_json(c: Comparison) -> dict[str, Any]:
     """Return the comparison as plain JSON values."""
-    others: list[dict[str, Any]] = []
-    for other, figures, objects in zip(c.sources[1:], c.figures, c.objects, strict=True):
-        others.append(
-            {
-                "with": other.label,
-                "figures": {
-                    d.name: {
-                        "difference": d.value, "sigma": d.sigma, "outcome": d.outcome,
-                        "better": CATALOGUE[d.name].better, "unit": CATALOGUE[d.name].unit,
-                    }
-                    for d in figures
-                },
-                "objects": [
-                    {
-                        "name": o.name, "note": o.note, "mssd_mm": o.mssd_mm,
-                        "shift_mm": o.shift_mm, "turn_deg": o.turn_deg, "sigma_mm": o.sigma_mm,
-                        "moved": o.is_moved,
-                        "verdicts": [None if s is None else s["verdict"]
-                                     for s in (o.first, o.second)],
-                    }
-                    for o in objects
-                ],
-            }
-        )  # fmt: skip
+    others = [
+        {
+            "with": other.label,
+            "figures": {
+                d.name: {
+                    "difference": d.value, "sigma": d.sigma, "outcome": d.outcome,
+                    "better": CATALOGUE[d.name].better, "unit": CATALOGUE[d.name].unit,
+                }
+                for d in figures
+            },
+            "objects": [
+                {
+                    "name": o.name, "note": o.note, "mssd_mm": o.mssd_mm,
+                    "shift_mm": o.shift_mm, "turn_deg": o.turn_deg, "sigma_mm": o.sigma_mm,
+                    "moved": o.is_moved,
+                    "verdicts": [None if s is None else s["verdict"] for s in (o.first, o.second)],
+                }
+                for o in objects
+            ],
+        }
+        for other, figures, objects in zip(c.sources[1:], c.figures, c.objects, strict=True)
+    ]  # fmt: skip
     return {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,

@@ -1,6 +1,6 @@
 """The section on the labels: what is visible, what hides it, and frames to look at."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -85,32 +85,32 @@ def _depth_figures(objects: Sequence[Any]) -> tuple[float | None, float | None]:
 
 def _object_table(section: Section, frames: Mapping[int, Any]) -> None:
     """Add one row an object: frames, visibility, agreement, what hides it."""
-    by: dict[int, list[Any]] = {}
-    for frame in frames.values():
-        for o in frame["objects"]:
-            by.setdefault(int(o["instance"]), []).append(o)
-    rows: list[list[object]] = []
-    for instance, mine in sorted(by.items()):
-        seen = [o for o in mine if o["px_count_visib"] > 0]
-        (agree, _), (_, hidden) = _depth_figures(seen), _depth_figures(mine)
-        names = {o["unknown_occluder"]["finding"] for o in mine} - {"none"}
-        rows.append(
-            [
-                f"{instance} {mine[0]['name']}",
-                f"{len(seen)} of {len(mine)}",
-                f"{100 * np.mean([o['visib_fract'] for o in seen]):.0f}" if seen else "-",
-                "-" if agree is None else f"{100 * agree:.1f}",
-                "-" if hidden is None else f"{100 * hidden:.2f}",
-                "; ".join(sorted(names)) or "-",
-            ]
-        )
     header = [
         "object", "frames seen", "visible, mean [%]",
         Cell(text="depth agrees, median [%]", hover=AGREE, note="b"),
         "hidden by unknown [%]", "occluders found",
     ]  # fmt: skip
-    section.page.table(header, rows)
+    section.page.table(header, _object_rows(frames))
     section.page.text(f"b: {AGREE}", "foot")
+
+
+def _object_rows(frames: Mapping[int, Any]) -> Iterator[list[object]]:
+    by: dict[int, list[Any]] = {}
+    for frame in frames.values():
+        for o in frame["objects"]:
+            by.setdefault(int(o["instance"]), []).append(o)
+    for instance, mine in sorted(by.items()):
+        seen = [o for o in mine if o["px_count_visib"] > 0]
+        (agree, _), (_, hidden) = _depth_figures(seen), _depth_figures(mine)
+        names = {o["unknown_occluder"]["finding"] for o in mine} - {"none"}
+        yield [
+            f"{instance} {mine[0]['name']}",
+            f"{len(seen)} of {len(mine)}",
+            f"{100 * np.mean([o['visib_fract'] for o in seen]):.0f}" if seen else "-",
+            "-" if agree is None else f"{100 * agree:.1f}",
+            "-" if hidden is None else f"{100 * hidden:.2f}",
+            "; ".join(sorted(names)) or "-",
+        ]
 
 
 def _named_frames(section: Section, rows: list[tuple[int, Any]]) -> None:
@@ -131,24 +131,23 @@ def _named_frames(section: Section, rows: list[tuple[int, Any]]) -> None:
     if not told:
         section.page.text("None: in no frame does the depth contradict a label.")
         return
-    body: list[list[object]] = []
-    for view, o in told[:NAMED]:
-        unknown = o["unknown_occluder"]
-        gap = unknown["gap_m"]
-        body.append(
-            [
-                view,
-                f"{o['instance']} {o['name']}",
-                FOUND.get(unknown["finding"], unknown["finding"]),
-                f"{100 * unknown['share']:.1f}",
-                "-" if gap is None else f"{1e3 * gap:.0f}",
-                "yes" if unknown["is_removed"] else "no",
-            ]
-        )
     header = ["frame", "object", "found", "hides [%]", "in front by [mm]", "taken out of the mask"]
-    section.page.table(header, body)
+    section.page.table(header, [_named_row(*r) for r in told[:NAMED]])
     if len(told) > NAMED:
         section.page.text(f"... and {len(told) - NAMED} more.")
+
+
+def _named_row(view: int, o: Any) -> list[object]:
+    unknown = o["unknown_occluder"]
+    gap = unknown["gap_m"]
+    return [
+        view,
+        f"{o['instance']} {o['name']}",
+        FOUND.get(unknown["finding"], unknown["finding"]),
+        f"{100 * unknown['share']:.1f}",
+        "-" if gap is None else f"{1e3 * gap:.0f}",
+        "yes" if unknown["is_removed"] else "no",
+    ]
 
 
 def _photographs(section: Section, store: SessionStore) -> None:

@@ -1,6 +1,6 @@
 """The section on registration: every object's verdict, probability and sigma; cameras; views."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -204,30 +204,30 @@ def _object_table(section: Section) -> None:
         Cell(text="1 sigma [mm]", hover=SIGMA), Cell(text="[deg]", hover=SIGMA),
         Cell(text="depth agrees [%]", hover=AGREE, note="a"), "in views [px]", "views", "why",
     ]  # fmt: skip
-    rows: list[list[object]] = []
-    for r in section.objects:
-        note = "b" if r["decided_by"] and r["verdict"] == "accepted" else ""
-        verdict = r["verdict"] + (f" by {r['decided_by']}" if r["decided_by"] else "")
-        rows.append(
-            [
-                f"{r['instance']} {r['name']}",
-                Cell(text=verdict, kind=VERDICT_KIND[r["verdict"]]),
-                Cell(text=_number(r["probability"], 100, 1), note=note),
-                _number(r["sigma_mm"], 1, 2),
-                _number(r["sigma_deg"], 1, 3),
-                _number(r["agree"], 100, 1),
-                _number(r["sigma_px"], 1, 2),
-                _number(r["views"], 1, 0),
-                "; ".join(r["reasons"]),
-            ]
-        )
-    section.page.table(header, rows)
+    section.page.table(header, _object_rows(section.objects))
     section.page.text(
         f"a: {AGREE} The section on labels has a share of the same name of every frame by itself.",
         "foot",
     )
     if any(r["decided_by"] and r["verdict"] == "accepted" for r in section.objects):
         section.page.text(PERSON_NOTE, "foot")
+
+
+def _object_rows(objects: Sequence[Any]) -> Iterator[list[object]]:
+    for r in objects:
+        note = "b" if r["decided_by"] and r["verdict"] == "accepted" else ""
+        verdict = r["verdict"] + (f" by {r['decided_by']}" if r["decided_by"] else "")
+        yield [
+            f"{r['instance']} {r['name']}",
+            Cell(text=verdict, kind=VERDICT_KIND[r["verdict"]]),
+            Cell(text=_number(r["probability"], 100, 1), note=note),
+            _number(r["sigma_mm"], 1, 2),
+            _number(r["sigma_deg"], 1, 3),
+            _number(r["agree"], 100, 1),
+            _number(r["sigma_px"], 1, 2),
+            _number(r["views"], 1, 0),
+            "; ".join(r["reasons"]),
+        ]
 
 
 def _number(value: float | None, factor: float, digits: int) -> str:

@@ -145,8 +145,7 @@ def show_model(folder: Path, name: str, console: Console) -> None:
     console.result(
         {"name": model.name, "obj_id": model.obj_id, "notes": found.notes, "properties": known}
     )
-    for note in found.notes:
-        console.say(f"note: {note}")
+    console.say(*[f"note: {note}" for note in found.notes])
     if found.properties is None:
         size = " x ".join(f"{1e3 * x:.1f}" for x in model.mesh.extent)
         console.say(

@@ -286,29 +286,28 @@ def as_json(sets: Sequence[GraspSet], models: Names) -> dict[str, Any]:
     from realsim_sim_bridge.school.measure_statistics import p_hold_spread
 
     spread = p_hold_spread(sets)
-    objects: list[dict[str, Any]] = []
-    for s in sets:
+
+    def of_set(s: GraspSet) -> dict[str, Any]:
         margins = s.measures.get("margin", np.zeros(0))
         scores = s.scores[~np.isnan(s.scores)]
-        objects.append(
-            {
-                "instance": s.instance,
-                "obj_id": s.obj_id,
-                "name": named(s, models).partition(" ")[2],
-                **grasp_counts(s),
-                "mean_score": float(scores.mean()) if len(scores) else None,
-                "mean_margin": float(np.nanmean(margins)) if np.isfinite(margins).any() else None,
-                "not_tried": s.parameters.get("not_tried"),
-                "filters": s.parameters.get("counts"),
-            }
-        )
+        return {
+            "instance": s.instance,
+            "obj_id": s.obj_id,
+            "name": named(s, models).partition(" ")[2],
+            **grasp_counts(s),
+            "mean_score": float(scores.mean()) if len(scores) else None,
+            "mean_margin": float(np.nanmean(margins)) if np.isfinite(margins).any() else None,
+            "not_tried": s.parameters.get("not_tried"),
+            "filters": s.parameters.get("counts"),
+        }
+
     found = agreement_of(sets)
     low, high = found.interval
     agree = {"count": found.count, "agree": found.agree, "share": found.share,
              "interval": [low, high]}  # fmt: skip
     return json_value(
         {
-            "objects": objects,
+            "objects": [of_set(s) for s in sets],
             "reasons": reasons(sets),
             "agreement": agree if found.count else None,
             "p_hold": None if spread is None else asdict(spread),

@@ -73,23 +73,19 @@ def session_facts(folder: Path) -> SessionFacts:
     store = open_session(folder)
     session = store.session
     infos, instances = _visibility_rows(store)
-    scene_objects: tuple[ObjectPose, ...] = ()
-    if store.has("registration/scene.json"):
-        scene_objects = judged_scene(store).objects
+    placed = judged_scene(store).objects if store.has("registration/scene.json") else ()
     known = _infos(store)
-    objects: list[ObjectFacts] = []
-    for o in scene_objects:
+
+    def facts(o: ObjectPose) -> ObjectFacts:
         info = known.get(o.obj_id, {})
         axes = [s["axis"] for s in info.get("symmetries_continuous", ())]
         mm, deg = largest(o.covariance, axes)
-        objects.append(
-            ObjectFacts(
-                instance=o.instance, obj_id=o.obj_id,
-                name=str(info.get("name", f"object {o.obj_id}")),
-                identity=_identity(store, o.obj_id), verdict=o.verdict, sigma_mm=mm, sigma_deg=deg,
-                visibility=_visibility(infos, instances.get(o.instance)),
-            )
+        return ObjectFacts(
+            instance=o.instance, obj_id=o.obj_id, name=str(info.get("name", f"object {o.obj_id}")),
+            identity=_identity(store, o.obj_id), verdict=o.verdict, sigma_mm=mm, sigma_deg=deg,
+            visibility=_visibility(infos, instances.get(o.instance)),
         )  # fmt: skip
+
     return SessionFacts(
         name=folder.resolve().name,
         folder=folder,
@@ -99,7 +95,7 @@ def session_facts(folder: Path) -> SessionFacts:
         frames=len(session.views),
         frames_annotated=len(infos),
         content=_content(store),
-        objects=tuple(objects),
+        objects=tuple(facts(o) for o in placed),
         sets=tuple(_without_poses(s) for s in load_grasps(store)),
         has=_present(store),
     )

@@ -131,17 +131,16 @@ def agreement_of(sets: Sequence[GraspSet]) -> dict[str, Any] | None:
     friction = np.concatenate([s.measures["closure_friction"] for s in sets])
     scores = np.concatenate([s.scores for s in sets])
     was_tried = np.concatenate([executed(s) for s in sets])
-    levels: list[dict[str, Any]] = []
-    for level in np.unique(friction):
+
+    def at(level: float) -> dict[str, Any]:
         here = was_tried & (friction == level)
         n = int(here.sum())
-        levels.append(
-            {
-                "friction": round(float(level), 3), "grasps": int(np.sum(friction == level)),
-                "tried": n, "good": int(np.sum(scores[here] >= 0.5)),
-                "mean_score": round(float(scores[here].mean()), 4) if n else None,
-            }
-        )  # fmt: skip
+        return {
+            "friction": round(float(level), 3), "grasps": int(np.sum(friction == level)),
+            "tried": n, "good": int(np.sum(scores[here] >= 0.5)),
+            "mean_score": round(float(scores[here].mean()), 4) if n else None,
+        }  # fmt: skip
+
     pairs = rank_correlations(sets, np.random.default_rng(0))
     pair = next((p for p in pairs if (p.first, p.second) == ("score", "closure_friction")), None)
     rho = None
@@ -149,7 +148,8 @@ def agreement_of(sets: Sequence[GraspSet]) -> dict[str, Any] | None:
         rho = {k: round(float(getattr(pair, k)), 4) for k in ("rho", "low", "high")}
     return {
         "grasps": len(scores), "tried": int(was_tried.sum()),
-        "good": int(np.sum(scores[was_tried] >= 0.5)), "levels": levels,
+        "good": int(np.sum(scores[was_tried] >= 0.5)),
+        "levels": [at(level) for level in np.unique(friction)],
         "score_vs_friction": rho,
     }  # fmt: skip
 

@@ -115,9 +115,7 @@ def upgrade_scene(job: SceneJob, source: SceneSource, shown: Console | None) -> 
             restart="finished",
         )  # fmt: skip
         grasps = run_in_session(store, asked, console).sets
-        analytic: list[GraspSet] = []
-        if job.config.analytic:
-            analytic = try_analytic(store, job, console)
+        analytic = try_analytic(store, job, console) if job.config.analytic else []
         annotate_session(store, console)
         notes = [*source.notes, *registration_notes(store), *console.told]
         with console.stage("report"):
@@ -233,22 +231,21 @@ def _record(
     """Return what came of a scene."""
     sets = {s.instance: s for s in grasps}
     became: Record = store.read_json("registration/report.json").get("upgrade", {})
-    objects: list[Record] = []
-    for o in scene.objects:
+
+    def of_object(o: ObjectPose) -> Record:
         moved_mm, moved_deg = moved_from_start(o, starts, source.models)
         found = sets.get(o.instance)
         decided: Record = {**UNDECIDED, **became.get(str(o.instance), {})}
         T_proposed = decided.pop("T_world_obj_proposed")
-        objects.append(
-            {
-                "instance": o.instance, "obj_id": o.obj_id, "name": source.models[o.obj_id].name,
-                "verdict": o.verdict, "reasons": list(o.reasons), **decided,
-                "agree": _number(o.checks.get("agree")),
-                "probability": _number(o.checks.get("probability")),
-                "moved_mm": round(moved_mm, 3), "moved_deg": round(moved_deg, 3),
-                "grasps": _grasp_counts(found), "shown": _shown(source, store, o, T_proposed),
-            }
-        )  # fmt: skip
+        return {
+            "instance": o.instance, "obj_id": o.obj_id, "name": source.models[o.obj_id].name,
+            "verdict": o.verdict, "reasons": list(o.reasons), **decided,
+            "agree": _number(o.checks.get("agree")),
+            "probability": _number(o.checks.get("probability")),
+            "moved_mm": round(moved_mm, 3), "moved_deg": round(moved_deg, 3),
+            "grasps": _grasp_counts(found), "shown": _shown(source, store, o, T_proposed),
+        }  # fmt: skip
+
     plane = scene.plane
     return {
         "place": job.ref.place, "version": __version__, "frames": len(source.indices),
@@ -256,7 +253,7 @@ def _record(
         "plane": None if plane is None else {
             "rms_mm": round(1e3 * plane.rms_m, 3), "points": plane.inliers,
         },
-        "objects": objects, "notes": list(notes),
+        "objects": [of_object(o) for o in scene.objects], "notes": list(notes),
         "pictures": sorted(
             p.relative_to(job.out).as_posix() for p in (store.folder / "reports").glob("*.png")
         ),

@@ -74,8 +74,7 @@ def run_scale(request: ScaleRequest, console: Console) -> bool:
         write_result(place, record, named, store)
     fit, box_mm = record.fit, 1e3 * record.fit.scale * smallest_box(named.mesh)
     show_fit(named.name, fit, record.measured, box_mm, console)
-    for note in named.notes:
-        console.say(f"note: {note}")
+    console.say(*[f"note: {note}" for note in named.notes])
     _say_of_model(named, fit, console)
     if known is not None:
         console.say(f"nothing has changed since {place.folder / FILE} was written; --overwrite "
@@ -206,8 +205,7 @@ def _by_measurement(request: ScaleRequest, console: Console) -> bool:
     size_mm = [1e3 * scale * float(e) for e in named.mesh.extent]
     box_mm = [float(side) for side in 1e3 * scale * smallest_box(named.mesh)]
     show_measured(named.name, (scale, sigma), each, (box_mm, size_mm), console)
-    for note in named.notes:
-        console.say(f"note: {note}")
+    console.say(*[f"note: {note}" for note in named.notes])
     reason = "the scale rests on a length measured by hand; no session has checked it."
     values: dict[str, Any] = {
         "format": MEASURED_FORMAT, "format_version": 1, "verdict": "unchecked",

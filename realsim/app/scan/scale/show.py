@@ -123,8 +123,7 @@ def show_fit(
                 console.say(f"  {check.text}")
     if fit.views:
         console.table("Views, worst first", VIEW_HEADER, view_rows(fit))
-    for note in fit.notes:
-        console.say(f"note: {note}")
+    console.say(*[f"note: {note}" for note in fit.notes])
 
 
 def model_lines(
