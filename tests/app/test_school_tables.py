@@ -20,6 +20,9 @@ def test_rows_add_up_and_levels_only_rise() -> None:
         :9
     ] and not tables.p_hold_line(plain)
     assert tables.p_hold_line(sets).startswith("p_hold of ")
+    assert "estimate" not in tables.p_hold_line(sets)  # they are of Franka's hand
+    own = [replace(s, parameters={"config": {"hand": {"name": "wide"}}}) for s in sets]
+    assert "for wide it is an estimate" in tables.p_hold_line(own)
     for column in range(1, 8):
         assert int(rows[-1][column]) == sum(int(r[column]) for r in rows[:-1])
     assert [r[0] for r in rows] == ["0 cube", "1 cube", "2 cube", "all"]

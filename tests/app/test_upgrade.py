@@ -143,7 +143,7 @@ def test_other_images_are_not_mixed_into_an_upgrade(upgraded, tmp_path) -> None:
 @pytest.mark.slow
 def test_another_data_set_is_not_mixed_into_an_upgrade(upgraded, tmp_path) -> None:
     dataset, out, _ = upgraded
-    before = content_and_times(out)
+    before = datasets.content_and_times(out)
     shutil.copytree(dataset, moved := tmp_path / "moved")
     gt = moved / "test/000001/scene_gt.json"
     told = json.loads(gt.read_text())
@@ -153,7 +153,7 @@ def test_another_data_set_is_not_mixed_into_an_upgrade(upgraded, tmp_path) -> No
     shutil.move(moved / "test/000001", moved / "test/000077")
     shutil.rmtree(moved / "test/000002")
     assert "upgrade of another data set" in failed_with(moved, out)
-    assert content_and_times(out) == before
+    assert datasets.content_and_times(out) == before
 
 
 @pytest.mark.slow

@@ -206,6 +206,21 @@ def test_files_that_do_not_belong_together_are_named(tmp_path):
     refused("has no image 2; it has 1, 5, 9", scene.frame, 2)
 
 
+def test_labels_without_an_image_and_a_principal_point_beside_it_are_told(tmp_path):
+    def shift(cameras):
+        for row in cameras.values():
+            row["cam_K"][2] += WIDTH
+
+    folder = write_boxes(tmp_path)
+    edit(folder / "scene_gt.json", lambda data: data.update({"99": data["5"]}))
+    notes = open_labelled_bop(tmp_path).notes
+    assert any("images that are not there; they are left out: 99." in note for note in notes)
+    (folder / "scene_gt.json").unlink()  # or its boxes would speak first
+    edit(folder / "scene_camera.json", shift)
+    notes = open_labelled_bop(tmp_path).notes
+    assert any("principal point outside of image 1, 5, 9" in note for note in notes)
+
+
 def test_models_that_are_missing_are_named(tmp_path):
     write_boxes(tmp_path)
     (tmp_path / "models/obj_000007.ply").unlink()
@@ -218,12 +233,14 @@ def test_models_that_are_missing_are_named(tmp_path):
     refused("nowhere does not exist; obj", open_labelled_bop, tmp_path, models=tmp_path / "nowhere")
 
 
-@pytest.mark.parametrize("scale", [0.5, 1 / 640])
-def test_a_camera_of_another_image_size_is_named(tmp_path, scale):
+@pytest.mark.parametrize(
+    ("scale", "said"), [(0.5, "not seen where cam_K"), (1 / 640, "of another image size")]
+)
+def test_a_camera_of_another_image_size_is_named(tmp_path, scale, said):
     def shrink(cameras):
         for row in cameras.values():
             row["cam_K"] = [x * scale if k < 6 else x for k, x in enumerate(row["cam_K"])]
 
     folder = write_boxes(tmp_path)
     edit(folder / "scene_camera.json", shrink)
-    refused("not seen where cam_K", open_labelled_bop, tmp_path)
+    refused(said, open_labelled_bop, tmp_path)

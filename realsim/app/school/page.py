@@ -74,6 +74,10 @@ MEANING = (
     "one mass. How likely a real hand holds is p_hold, the label to use where there is one. Of "
     "grasps that all pass, the margin tells which would with less force or friction."
 )
+SUMMARY = (
+    "As in the paper's table, by its limits. Counts of good grasps differ from those above, which "
+    "the rows of the nominal score have."
+)
 CAPTIONS: dict[str, tuple[str, str]] = {
     SHEET: (
         "The grasps",
@@ -126,6 +130,6 @@ def page_bytes(
     page.table(tables.REASON_HEADER, tables.reason_rows(sets))
     page.section("What the filters took", "Candidates before the arm and physics had their say.")
     page.table(tables.FILTER_HEADER, tables.filter_rows(sets, models))
-    page.section("Summary", "As in the paper's table: by its limits, but for 'nominal' rows.")
+    page.section("Summary", SUMMARY)
     page.table(tables.SUMMARY_HEADER, summarise(sets).to_rows())
     return page.encode()

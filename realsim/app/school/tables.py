@@ -12,6 +12,7 @@ from realsim.app.console import Console
 from realsim.arrays import Array
 from realsim.json_values import json_value
 from realsim.records import STAGES, GraspSet, ObjectModel
+from realsim.robots.hand import FRANKA
 
 Rows = list[list[str]]
 Names = Mapping[int, ObjectModel]
@@ -169,11 +170,21 @@ def agreement_line(sets: Sequence[GraspSet]) -> str:
 
 
 def p_hold_line(sets: Sequence[GraspSet]) -> str:
-    """Return in one line how p_hold is distributed; empty where no set has one."""
+    """Return in one line how p_hold is distributed; empty where no set has one.
+
+    The shipped calibration is of real trials of Franka's hand: of other hands the line says so.
+    """
     from realsim_sim_bridge.school.measure_statistics import p_hold_spread
 
     spread = p_hold_spread(sets)
-    return "" if spread is None else spread.in_words
+    if spread is None:
+        return ""
+    shipped = [s for s in sets if not (s.parameters.get("config") or {}).get("calibration")]
+    others = sorted({s.hand[0] for s in shipped} - {FRANKA})
+    return spread.in_words + (
+        f" It was calibrated on real trials of Franka's hand alone: for {', '.join(others)} it is "
+        "an estimate, good for an order rather than as a share."
+    ) * bool(others)
 
 
 def setting_lines(sets: Sequence[GraspSet]) -> list[str]:
@@ -258,7 +269,10 @@ def doubts(sets: Sequence[GraspSet], models: Names) -> Iterator[str]:
                 "so hollows are smaller and walls thicker than they are"
             )
         elif ratio < THIN:
-            yield f"{named(s, models)}: its convex parts are only {ratio:.2f} of its mesh"
+            yield (
+                f"{named(s, models)}: its convex parts are only {ratio:.2f} of its mesh: look for "
+                "holes and inner walls, and repair it (`realsim scan import`)"
+            )
         if s.parameters.get("watertight") is False:
             yield (
                 f"{named(s, models)}: its mesh is not closed, so its mass is a guess: weigh it "
