@@ -265,7 +265,8 @@ def _proven(
             return usual
         raise InputError(
             f"how the poses are to be read is not clear from the file, and the images do not "
-            f"decide: {proof.sentence} Give --reading, such as --reading rotvec,m."
+            f"decide: {proof.sentence} Do images and poses belong together, and are all images "
+            f"the right way up? If so, say how the poses are written: --reading {proof.best}."
         )
     best = reading_from_text(proof.best)
     if proof.best_mode != request.mode:
