@@ -18,7 +18,7 @@ import tempfile
 import weakref
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,9 +34,11 @@ from realsim_sim_bridge.slip.bullet_shapes import (
     shape_in,
     wavefront,
 )
-from realsim_sim_bridge.slip.engines import BulletSettings
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import SlipBody, SlipPhysics
+
+if TYPE_CHECKING:
+    from realsim_sim_bridge.slip.engines import BulletSettings
 
 FINGERS = ("left_slide", "right_slide")
 """Joints of the two fingers; the first is at +y."""
@@ -66,7 +68,7 @@ class BulletPair:
         body: SlipBody,
         physics: SlipPhysics,
         geometry: Hand,
-        settings: BulletSettings,
+        settings: "BulletSettings",
         stand: Stand | None = None,
     ) -> None:
         """Build the pair, and what the object stands on while the fingers close.

@@ -1,12 +1,13 @@
 """PyBullet as an engine of the slip test: K grasps, one after the other in one pair."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from realsim.arrays import Array, Mask
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.bullet_pair import BulletPair
-from realsim_sim_bridge.slip.engines import BulletSettings
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import (
     Closing,
@@ -19,6 +20,9 @@ from realsim_sim_bridge.slip.world import (
     SlipPhysics,
 )
 
+if TYPE_CHECKING:
+    from realsim_sim_bridge.slip.engines import BulletSettings
+
 _PLACE, _AXES = np.s_[:3, 3], np.s_[:3, :3]
 
 
@@ -27,7 +31,7 @@ class BulletEngine(Engine):
 
     name = "pybullet"
 
-    def __init__(self, settings: BulletSettings) -> None:
+    def __init__(self, settings: "BulletSettings") -> None:
         """Keep the settings."""
         self.settings = settings
         self._kept: tuple[SlipBody, SlipPhysics, Hand, BulletPair] | None = None

@@ -16,7 +16,7 @@ What makes its friction right (each was measured to be wrong without it):
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,11 +24,13 @@ from realsim.arrays import Array, Int64
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
-from realsim_sim_bridge.slip.engines import MujocoSettings
 from realsim_sim_bridge.slip.mujoco_approach import surface_triangles
 from realsim_sim_bridge.slip.mujoco_pads import PAD_PRIORITY, set_pads
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import PadModel, SlipBody, SlipPhysics
+
+if TYPE_CHECKING:
+    from realsim_sim_bridge.slip.engines import MujocoSettings
 
 FINGER_NAMES = ("left", "right")
 LIFT_NAMES = ("left_lift", "right_lift")
@@ -90,7 +92,7 @@ def compile_pair(
     body: SlipBody,
     physics: SlipPhysics,
     geometry: Hand,
-    settings: MujocoSettings,
+    settings: "MujocoSettings",
     stand: Stand | None = None,
 ) -> PairModel:
     """Compile the model.
@@ -164,7 +166,7 @@ def lift_joints(model: Any) -> list[Any]:
     return [model.joint(name) for name in LIFT_NAMES if name in names]
 
 
-def lock_lifts(model: Any, locked: bool, settings: MujocoSettings) -> None:
+def lock_lifts(model: Any, locked: bool, settings: "MujocoSettings") -> None:
     """Hold the fingers' height, or let it follow the arc."""
     for joint in lift_joints(model):
         at = int(joint.dofadr[0])
@@ -194,7 +196,7 @@ def _keep_tolerance(model: Any, lifts: list[int]) -> None:
     model.opt.tolerance *= np.delete(model.dof_M0[:-1], lifts).mean() / model.stat.meaninertia
 
 
-def _set_options(spec: Any, physics: SlipPhysics, settings: MujocoSettings) -> None:
+def _set_options(spec: Any, physics: SlipPhysics, settings: "MujocoSettings") -> None:
     """Set integrator, solver and cone."""
     mujoco = load_mujoco()
 
@@ -215,7 +217,7 @@ def _set_options(spec: Any, physics: SlipPhysics, settings: MujocoSettings) -> N
 
 
 def _add_finger(
-    spec: Any, finger: int, geometry: Hand, physics: SlipPhysics, settings: MujocoSettings
+    spec: Any, finger: int, geometry: Hand, physics: SlipPhysics, settings: "MujocoSettings"
 ) -> None:
     """Add a finger that slides along y; its joint's position is its face's distance from y = 0."""
     mujoco = load_mujoco()
@@ -265,7 +267,7 @@ def _add_finger(
     )
 
 
-def _add_drive(spec: Any, physics: SlipPhysics, settings: MujocoSettings) -> None:
+def _add_drive(spec: Any, physics: SlipPhysics, settings: "MujocoSettings") -> None:
     """Add the carriage that takes the fingers along until they resist with more than their force.
 
     Each finger is held to the carriage by dry friction of the hand's force; the carriage is too
@@ -289,7 +291,7 @@ def _add_drive(spec: Any, physics: SlipPhysics, settings: MujocoSettings) -> Non
 
 
 def _couple(
-    spec: Any, led: str, leading: str, law: "Array | list[float]", settings: MujocoSettings
+    spec: Any, led: str, leading: str, law: "Array | list[float]", settings: "MujocoSettings"
 ) -> None:
     """Keep one joint's position where a polynomial of another's has it, as a linkage does."""
     mujoco = load_mujoco()
@@ -311,7 +313,7 @@ def _add_object(
     mass_kg: float,
     moments: Array,
     physics: SlipPhysics,
-    settings: MujocoSettings,
+    settings: "MujocoSettings",
 ) -> None:
     """Add the object; its body frame is the principal one, its parts are in that frame."""
     factor = max(1.0, physics.mass_floor_kg / mass_kg)
@@ -341,7 +343,7 @@ def _add_hull(spec: Any, body: Any, name: str, points: Array) -> Any:
 # of an object, so the hull of all parts stands on it: four contacts in place of dozens.
 
 
-def _add_stand(spec: Any, stand: Stand, corners: Array, settings: MujocoSettings) -> None:
+def _add_stand(spec: Any, stand: Stand, corners: Array, settings: "MujocoSettings") -> None:
     """Add the table, its neighbours, and the hull of the object's corners (V, 3) that stands."""
     mujoco = load_mujoco()
 
@@ -370,7 +372,7 @@ def _add_box(body: Any, low: Array, high: Array, side: float) -> Any:
     )
 
 
-def _set_contact(geom: Any, side: int, physics: SlipPhysics, settings: MujocoSettings) -> None:
+def _set_contact(geom: Any, side: int, physics: SlipPhysics, settings: "MujocoSettings") -> None:
     """Set friction, stiffness and what the geom meets."""
     geom.contype, geom.conaffinity = side, HAND_SIDE + OBJECT_SIDE - side
     geom.condim = 3

@@ -9,14 +9,16 @@ f = K r with K = k / R: every K > 0 has its d = K A / (K A + k), while k and b, 
 that is reached, follow from the step alone. Friction creeps at R / (impratio b) per newton.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from realsim.arrays import Int64
 from realsim.errors import InputError
-from realsim_sim_bridge.slip.engines import MujocoSettings
 from realsim_sim_bridge.slip.world import PadModel
+
+if TYPE_CHECKING:
+    from realsim_sim_bridge.slip.engines import MujocoSettings
 
 PAD_PRIORITY = 1
 """Priority of the spheres' geoms: the higher one decides a contact's friction and stiffness
@@ -31,7 +33,7 @@ TAKEN = 1e-6
 """Greatest relative error of a stiffness read back."""
 
 
-def set_pads(model: Any, held: int, pads: PadModel, settings: MujocoSettings) -> None:
+def set_pads(model: Any, held: int, pads: PadModel, settings: "MujocoSettings") -> None:
     """Give the pads' contacts their stiffness, and their friction its creep.
 
     Args:

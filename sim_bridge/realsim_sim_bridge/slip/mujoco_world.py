@@ -8,7 +8,7 @@ import copy
 import hashlib
 from collections import OrderedDict
 from dataclasses import fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip import mujoco_state
-from realsim_sim_bridge.slip.engines import MujocoSettings
 from realsim_sim_bridge.slip.mujoco_approach import advanced_fingers
 from realsim_sim_bridge.slip.mujoco_model import (
     OBJECT,
@@ -39,6 +38,9 @@ from realsim_sim_bridge.slip.world import (
     SlipPhysics,
 )
 
+if TYPE_CHECKING:
+    from realsim_sim_bridge.slip.engines import MujocoSettings
+
 MODELS_KEPT = 4
 """Compiled models that an engine keeps; a scene's objects are tested one after the other."""
 PIECE_STEPS = 100
@@ -55,7 +57,7 @@ class MujocoEngine(Engine):
 
     name = "mujoco"
 
-    def __init__(self, settings: MujocoSettings) -> None:
+    def __init__(self, settings: "MujocoSettings") -> None:
         """Take the settings; nothing is compiled yet."""
         self.settings = settings
         self._models: OrderedDict[str, PairModel] = OrderedDict()
@@ -93,7 +95,7 @@ class MujocoWorld(HandWorld):
     """K pairs, each a row of state; see `mujoco_state`."""
 
     def __init__(
-        self, pair: PairModel, grips: Grips, physics: SlipPhysics, settings: MujocoSettings
+        self, pair: PairModel, grips: Grips, physics: SlipPhysics, settings: "MujocoSettings"
     ) -> None:
         """Place the hands open and the objects where the grips say."""
         mujoco = load_mujoco()
