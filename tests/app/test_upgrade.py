@@ -11,6 +11,7 @@ import pytest
 from click.testing import Result
 
 import upgradable_datasets as datasets
+from plain_meshes import square
 from realsim.app.console import Console
 from realsim.app.upgrade.analytic import FOLDER, agreement_of
 from realsim.app.upgrade.dataset import scenes_of
@@ -238,7 +239,7 @@ def judged(
     things = [*placed]
     if hidden:  # a board between the camera and the parts
         board = se3.from_translation([0.0, -0.2, 0.2]) @ se3.exp([0.8, 0, 0, 0, 0, 0])
-        things.append(PlacedMesh(-1, datasets.slab(), board))
+        things.append(PlacedMesh(-1, square(0.5), board))
     (labels,) = datasets.looks(things, 1)
     depth_m = np.where(labels.depth_m > 0, labels.depth_m + far_m, 0).astype(np.float32)
     picture = Picture(

@@ -245,10 +245,8 @@ def test_another_mesh_pose_or_object_is_refused(finished):
 def test_another_version_is_refused(finished, monkeypatch):
     from realsim.store import provenance
 
-    real = provenance.version
-    monkeypatch.setattr(
-        provenance, "version", lambda name: "9.9" if name == "pybullet" else real(name)
-    )
+    real = provenance.versions_of
+    monkeypatch.setattr(provenance, "versions_of", lambda names: real(names) | {"pybullet": "9.9"})
     refused(r"versions.pybullet: \"[\d.]+\" -> \"9.9\"", run, finished)
 
 
