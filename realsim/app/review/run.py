@@ -68,6 +68,8 @@ def run_review(request: ReviewRequest, console: Console) -> None:
     console.say(f"decisions in this run: {words_of(decisions)}")
     console.say(f"judged by people: {judged} of {objects} objects in {len(stores)} session(s)")
     changed = sorted({str(s.store.folder) for s in server.sessions if s.has_pending})
+    if changed:
+        console.say("decisions count in every later command; to fit the other poses to them, too:")
     for folder in changed:
         console.say(f"next      realsim register {folder} --from-review")
     console.result(

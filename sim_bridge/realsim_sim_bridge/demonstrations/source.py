@@ -250,8 +250,10 @@ class DemonstrationSource(Sequence[Demonstration]):
             return self.attempts.index(name)
         for other in self.not_attempted:
             if (other.instance, other.grasp) == (instance, grasp):
+                tried = [str(a.grasp) for a in self.attempts if a.instance == instance]
                 raise InputError(
-                    f"grasp {grasp} of instance {instance} has no attempt: {other.why}."
+                    f"grasp {grasp} of instance {instance} has no attempt: {other.why}. Attempts "
+                    f"there are at its grasps {', '.join(tried[:20]) or '(none)'}."
                 )
         there = ", ".join(f"{i} ({len(s)} grasps)" for i, s in self._sets.items())
         raise InputError(f"there is no grasp {grasp} of instance {instance}; there are: {there}.")

@@ -127,7 +127,9 @@ def test_a_step_is_seen_the_same_each_time_and_steps_are_seen_differently(good):
 
 def test_a_grasp_without_an_attempt_is_refused_with_its_reason(source):
     none = source.not_attempted[0]
-    refused(r"collides|kinematics", source.number_of, none.instance, none.grasp)
+    said = refused(r"collides|kinematics", source.number_of, none.instance, none.grasp)
+    there = [a.grasp for a in source.attempts if a.instance == none.instance]
+    assert f"Attempts there are at its grasps {there[0] if there else '(none)'}" in said
     refused("no grasp 99", source.number_of, 0, 99)
     for k, name in enumerate(source.attempts):
         assert source.number_of(name.instance, name.grasp) == k
