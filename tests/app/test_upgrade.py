@@ -14,11 +14,11 @@ import upgradable_datasets as datasets
 from plain_meshes import square
 from realsim.app.console import Console
 from realsim.app.upgrade.analytic import FOLDER, agreement_of
-from realsim.app.upgrade.dataset import scenes_of
+from realsim.app.upgrade.dataset import open_scene, scenes_of
 from realsim.app.upgrade.files import NOTE
 from realsim.app.upgrade.outcome import Outcome, decide
 from realsim.app.upgrade.run import UpgradeConfig, run_upgrade
-from realsim.app.upgrade.source import told_apart, world_starts
+from realsim.app.upgrade.source import prepare, told_apart, world_starts
 from realsim.app.upgrade.tables import notes_of
 from realsim.errors import InputError, RealsimError
 from realsim.formats.graspnet.grasp_labels import read_grasp_labels
@@ -199,6 +199,16 @@ def test_a_camera_and_a_number_of_images_can_be_asked_for(tmp_path) -> None:
 
 
 # --- which annotations are one thing ----------------------------------------------------------
+
+
+def test_one_picture_with_two_camera_poses_is_told(tmp_path) -> None:
+    dataset = datasets.bop_dataset(tmp_path / "dataset", views=2)
+    (ref,) = scenes_of(dataset, config := UpgradeConfig())
+    assert not any("same picture" in n for n in prepare(open_scene(ref), ref, config).notes)
+    for what in ("rgb", "depth"):
+        first, second = sorted((ref.folder / what).glob("*.png"))
+        shutil.copy(first, second)
+    assert any("same picture" in n for n in prepare(open_scene(ref), ref, config).notes)
 
 
 def test_two_things_of_one_model_stay_two_in_every_order() -> None:

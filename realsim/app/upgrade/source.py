@@ -86,6 +86,12 @@ def prepare(scene: LabelledScene, ref: SceneRef, config: UpgradeConfig) -> Scene
     for index in indices:
         depths = [float(T[2, 3]) for _, _, T in poses[index]]
         digests[index] = _checked_images(scene, frames[index], depths)
+        first = next(k for k in digests if digests[k] == digests[index])
+        if first != index and not np.allclose(Ts_world_cam[first], Ts_world_cam[index]):
+            notes.append(
+                f"images {first} and {index} are the same picture with two camera poses: one of "
+                "them is wrong."
+            )
     return SceneSource(
         scene=scene, indices=indices, intrinsics=intrinsics, depth_unit_m=depth_unit_m,
         digests=digests, seen=seen, Ts_world_cam=Ts_world_cam,
