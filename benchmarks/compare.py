@@ -106,14 +106,15 @@ def page_of(documents: dict[str, Document]) -> str:
     lines = [
         "# Measured", "",
         "Written by `benchmarks/compare.py --page` from `benchmarks/measured/`; do not edit it.",
-        "Goals are those of full runs. Quick runs take fewer samples, some of them one. A value "
-        "behind +- is the spread over several runs. The folder holds further figures.", "",
+        "Runs are full and have 2 cores unless it is said. Goals are those of full runs; quick "
+        "ones take fewer samples. A value behind +- is the spread over runs.", "",
     ]  # fmt: skip
     for name, document in documents.items():
         machine, goals = document.get("machine") or {}, document.get("goals") or {}
         seeds = ", ".join(map(str, document.get("seeds") or [document.get("seed")]))
-        kind = "quick" if document.get("quick") else "full"
-        lines += [f"## {name}", "", f"{kind}, seeds {seeds}, {machine.get('cores', '?')} cores", ""]
+        unusual = ", quick" * bool(document.get("quick"))
+        unusual += f", {machine.get('cores', '?')} cores" * (machine.get("cores") != 2)
+        lines += [f"## {name}", "", f"seeds {seeds}{unusual}", ""]
         figures, noise = document["figures"].items(), document.get("noise", {}).items()
         said = {k: "not measured" if v is None else f"{v:.4g}" for k, v in figures}
         said |= {k: f"{said[k]} +- {v:.2g}" for k, v in noise}
