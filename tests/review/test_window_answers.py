@@ -201,7 +201,7 @@ def test_a_scene_that_cannot_be_read_is_told_until_it_can(page: Page) -> None:
     assert "scene.json" in window.list._remarks.content
     path.write_bytes(whole)
     page.wait_message("can be read again", "realsim-message ok")
-    assert "scene.json" not in window.list._remarks.content
+    page.wait(lambda: "scene.json" not in window.list._remarks.content)
 
 
 def test_a_page_with_a_swap_to_a_missing_model_stays_usable(page: Page) -> None:

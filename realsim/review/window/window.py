@@ -317,12 +317,13 @@ class Window:
             trouble = trouble or error
         before, self.trouble = self.trouble, trouble
         # It is looked at once a second; a bug is logged once.
-        if repr(trouble) != repr(before):
-            with contextlib.suppress(Exception):
-                self.refresh(force=True)
+        if is_new := repr(trouble) != repr(before):
             self.say("The session can be read again.") if trouble is None else self.fail(trouble)
         elif isinstance(trouble, SessionGone):
             self.alarm(str(trouble))
+        if is_new:
+            with contextlib.suppress(Exception):
+                self.refresh(force=True)
 
     def _looked(self) -> None:
         """The browser's camera was moved: the address follows, and frustums make way."""
