@@ -155,6 +155,11 @@ def test_another_data_set_is_not_mixed_into_an_upgrade(upgraded, tmp_path) -> No
     shutil.rmtree(moved / "test/000002")
     assert "upgrade of another data set" in failed_with(moved, out)
     assert datasets.content_and_times(out) == before
+    # Where it is not known whose scene it is, its annotations tell.
+    shutil.copytree(out, unknown := tmp_path / "unknown")
+    (unknown / "test/000001/imported/source.json").write_text("{}")
+    assert upgrade(dataset, unknown, "--only-scenes", "1").exit_code == 0
+    assert "of another folder" in failed_with(moved, unknown)
 
 
 @pytest.mark.slow
@@ -174,7 +179,7 @@ def test_what_is_done_anew_is_told_where_it_was_reviewed_and_where_its_models_ch
     info.write_text(json.dumps(models))
     told = upgrade(dataset, again, "--only-scenes", "1", "--views", "1").output
     assert "test/000001 was reviewed" in told
-    assert "object 1 of test/000003 is another model" in told
+    assert "object 1 of test/000003: another model" in told
 
 
 @pytest.mark.slow

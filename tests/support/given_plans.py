@@ -18,7 +18,7 @@ from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 HOME, CENTER = np.array([0.1, -1.6, 1.7, -1.7, -1.5, 0.3]), np.array([0.37, 0.02, 0.05])
 MOUNT = d405_mount(se3.exp([0.02, -0.1, 0.3, 0.0, -0.065, 0.035]))
-"""Of `a_plan`."""
+"""The mount of `a_plan`."""
 UR5_HOME = find_arm("ur5").home
 TURNED_HOME = UR5_HOME + np.pi * np.eye(6)[0]
 """On the side where the table is."""

@@ -8,6 +8,7 @@ OUT/camera.json, OUT/SPLIT_targets_bop19.json
 
 import hashlib
 import json
+import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -128,14 +129,15 @@ def require_one_data_set(out: Path, refs: Sequence[SceneRef]) -> None:
         InputError: the folder holds scenes of another one.
     """
     there = {str(p.parents[1].relative_to(out)): p for p in out.glob(f"*/*/{IMPORTED}/source.json")}
-    roots = {place: str(read_object(path)["dataset"]) for place, path in sorted(there.items())}
+    told = {k: str(read_object(p).get("dataset", "another folder")) for k, p in there.items()}
     root = refs[0].root.resolve()
-    others = {place: told for place, told in roots.items() if Path(told).resolve() != root}
+    known = {str(root), os.path.abspath(refs[0].root)}
+    others = {k: of for k, of in sorted(told.items()) if os.path.abspath(of) not in known}
     here = [ref for ref in refs if ref.place in others]
     if others and not (here and all(_is_imported(ref, there[ref.place].parent) for ref in here)):
-        place, told = next(iter(others.items()))
+        place, of = next(iter(others.items()))
         raise InputError(
-            f"'{out}' holds an upgrade of another data set: {place} is of {told}. Its labels, "
+            f"'{out}' holds an upgrade of another data set: {place} is of {of}. Its labels, "
             f"models and review would be mixed up with those of {root}. Give another --out."
         )
 
@@ -144,17 +146,17 @@ def _is_imported(ref: SceneRef, imported: Path) -> bool:
     """Return whether a scene's annotations are those that were imported, byte by byte."""
     files = [p for pattern in DOCUMENTS[ref.kind] for p in ref.folder.glob(pattern)]
     copies = [(p, imported / p.relative_to(ref.folder)) for p in files]
-    return all(c.is_file() and c.read_bytes() == p.read_bytes() for p, c in copies)
+    return bool(copies) and all(c.is_file() and c.read_bytes() == p.read_bytes() for p, c in copies)
 
 
 def gather_models(out: Path, places: Sequence[str]) -> list[str]:
     """Copy the models of all scenes into one models folder, as BOP has it.
 
     Returns:
-        Which models of a scene are not those of an earlier one, in words.
+        The models that are not those of an earlier scene, which are kept: "object 4 of PLACE".
     """
     info: dict[str, Any] = {}
-    words: list[str] = []
+    differing: list[str] = []
     home = out / "models"
     for place in places:
         models = out / place / "models"
@@ -163,9 +165,7 @@ def gather_models(out: Path, places: Sequence[str]) -> list[str]:
         for obj_id, entry in read_object(models / "models_info.json").items():
             if obj_id in info:
                 if entry != info[obj_id]:
-                    words.append(f"object {obj_id} of {place} is another model than that of an "
-                                 "earlier scene, which stays in OUT/models: upgrade all scenes "
-                                 "again, or each data set into a folder of its own.")  # fmt: skip
+                    differing.append(f"object {obj_id} of {place}")
                 continue
             info[obj_id] = entry
             for path in sorted(models.glob(f"obj_{int(obj_id):06d}.*")):
@@ -174,7 +174,7 @@ def gather_models(out: Path, places: Sequence[str]) -> list[str]:
                     atomic.write_bytes(home / path.name, data)
     ordered = {k: info[k] for k in sorted(info, key=int)}
     atomic.write_json(home / "models_info.json", ordered)
-    return words
+    return differing
 
 
 def write_root_files(out: Path, places: Sequence[str]) -> None:

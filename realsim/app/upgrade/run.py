@@ -124,7 +124,11 @@ def _write_together(out: Path, failed: dict[str, str], console: Console) -> Reco
     records = list(files.all_records(out))
     places = [str(r["place"]) for r in records]
     with console.stage("together", f"{len(records)} scenes"):
-        console.warn(*files.gather_models(out, places))
+        if differing := files.gather_models(out, places):
+            console.warn(
+                f"{', '.join(differing[:4])}{' ...' if len(differing) > 4 else ''}: another model "
+                f"than in an earlier scene, which stays in {out}/models. Upgrade all scenes again."
+            )
         files.write_root_files(out, places)
         analytic = agreement_of(all_sets(out, places))
         write_tables(out, records, failed, analytic)

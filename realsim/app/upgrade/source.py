@@ -83,10 +83,11 @@ def prepare(scene: LabelledScene, ref: SceneRef, config: UpgradeConfig) -> Scene
     Ts_world_cam = camera_poses(frames, poses, scene.name)
     seen, notes = told_apart(poses, Ts_world_cam, models)
     digests: dict[int, str] = {}
+    first_of: dict[str, int] = {}
     for index in indices:
         depths = [float(T[2, 3]) for _, _, T in poses[index]]
         digests[index] = _checked_images(scene, frames[index], depths)
-        first = next(k for k in digests if digests[k] == digests[index])
+        first = first_of.setdefault(digests[index], index)
         if first != index and not np.allclose(Ts_world_cam[first], Ts_world_cam[index]):
             notes.append(
                 f"images {first} and {index} are the same picture with two camera poses: one of "

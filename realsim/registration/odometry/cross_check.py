@@ -252,7 +252,7 @@ class _Found:
     unmatched: tuple[int, ...]
     poseless: tuple[int, ...]
     twists: list[list[tuple[Array, float]]]
-    """Of every view what its pairs say about its pose (6,), and their overlaps."""
+    """What the pairs of each view say about its pose (6,), and their overlaps."""
     noise_mm: float
     noise_deg: float
     pairs: int
