@@ -13,6 +13,7 @@ from realsim.geometry.camera import project
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Check, Chessboard, Target
 from realsim_calibration.checks import FOCAL_SHARE, own_lens_check
+from realsim_calibration.fit.closed_forms import pose_stacks
 from realsim_calibration.fit.joint_solve import JointConfig
 from realsim_calibration.hand_eye import HandEyeConfig, calibrate_hand_eye_report
 from realsim_calibration.lens.fit import IntrinsicsConfig
@@ -249,14 +250,8 @@ def calibrate_from_poses(
         InputError: the stacks differ in length, or a pose puts the grid behind the camera.
         DegenerateError: the poses do not determine the hand-eye.
     """
-    A = np.asarray(Ts_base_ee, dtype=np.float64).reshape(-1, 4, 4)
-    C = np.asarray(Ts_cam_board, dtype=np.float64).reshape(-1, 4, 4)
+    A, C = pose_stacks(Ts_base_ee, Ts_cam_board, "hand-eye", others="camera poses")
     C = measured_poses(C, [f"T_cam_board of view {k}" for k in range(len(C))])
-    if len(A) != len(C):
-        raise InputError(
-            f"hand-eye: {len(A)} hand poses and {len(C)} camera poses were given; every view needs "
-            "one of each."
-        )
     towards = np.einsum("ni,ni->n", C[:, :3, 2], C[:, :3, 3]) < 0
     grid = replace(grid or VirtualGrid(), z_to_camera=bool(2 * towards.sum() > len(C)))
     pinhole = grid.camera if camera is None else replace(camera, distortion=np.zeros(8))

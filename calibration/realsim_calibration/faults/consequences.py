@@ -8,9 +8,9 @@ from realsim.records import Check, Target
 from realsim_calibration.detect.drawings import DRAWN
 from realsim_calibration.faults.diagnose import diagnose
 from realsim_calibration.faults.diagnosis import Diagnosis
-from realsim_calibration.faults.frame_fit import MIN_VIEWS
 from realsim_calibration.faults.half_turns import HalfTurns, synchronise_half_turns
 from realsim_calibration.faults.motion_check import check_motion
+from realsim_calibration.fit.closed_forms import MIN_VIEWS
 from realsim_calibration.results import Mode
 from realsim_calibration.views import TargetDetection
 

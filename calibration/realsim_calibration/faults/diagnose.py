@@ -37,13 +37,7 @@ from realsim_calibration.faults.diagnosis import (
     ReadingFit,
     ReadingProof,
 )
-from realsim_calibration.faults.frame_fit import (
-    MIN_VIEWS,
-    FrameFit,
-    fit_frames,
-    hand_side,
-    mismatch,
-)
+from realsim_calibration.faults.frame_fit import FrameFit, fit_frames, hand_side, mismatch
 from realsim_calibration.faults.hypotheses import (
     Hypothesis,
     Poses,
@@ -60,7 +54,7 @@ from realsim_calibration.faults.hypotheses import (
 )
 from realsim_calibration.faults.mirrored import mirrored
 from realsim_calibration.faults.tool_offset import tool_offset
-from realsim_calibration.fit.closed_forms import motions, principal_turns
+from realsim_calibration.fit.closed_forms import MIN_VIEWS, motions, pose_stacks, principal_turns
 from realsim_calibration.results import Mode
 
 UNITS = (("millimetres", 1000.0), ("centimetres", 100.0), ("inches", 39.3701))
@@ -94,13 +88,9 @@ def diagnose(
         InputError: stacks of different lengths, or fewer than four views.
         NotRigidError: a pose is not rigid.
     """
-    T = se3.check_rigid(Ts_base_ee, "Ts_base_ee").reshape(-1, 4, 4)
-    C = se3.check_rigid(Ts_cam_board, "Ts_cam_board").reshape(-1, 4, 4)
-    if len(T) != len(C) or len(T) < MIN_VIEWS + 1:
-        raise InputError(
-            f"diagnosis: {len(T)} hand poses and {len(C)} board poses; at least {MIN_VIEWS + 1} "
-            "views with one of each are needed."
-        )
+    T = se3.check_rigid(Ts_base_ee, "Ts_base_ee")
+    C = se3.check_rigid(Ts_cam_board, "Ts_cam_board")
+    T, C = pose_stacks(T, C, "diagnosis", least=MIN_VIEWS + 1)
     names = tuple(str(k) for k in (labels if labels is not None else range(len(T))))
     if len(names) != len(T):
         raise InputError(f"diagnosis: {len(names)} labels for {len(T)} views.")

@@ -22,9 +22,13 @@ from numpy.typing import ArrayLike
 
 from realsim.arrays import Array, Int64
 from realsim.compiled import njit
-from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_calibration.fit.closed_forms import clear_of_half_turns, motions
+from realsim_calibration.fit.closed_forms import (
+    MIN_VIEWS,
+    clear_of_half_turns,
+    motions,
+    pose_stacks,
+)
 
 RIDGE = 1e-9
 """Share of the mean curvature that decides what the views do not determine."""
@@ -32,8 +36,6 @@ SETTLED = 1e-9
 """A step shorter than this, in units of the distance and radians, ends the fit."""
 COLLAPSED = 0.02
 """A ratio that makes the camera's motion this part of the hand's is a collapse, not a fit."""
-MIN_VIEWS = 3
-"""Two frames and a ratio are 13 unknowns, a view gives 6 equations."""
 UNIT_DEG = 0.5
 """A rotation error of this size counts 1 [deg]: twice that of a good robot and board."""
 UNIT_PART = 0.01
@@ -118,12 +120,7 @@ def fit_frames(
     Raises:
         InputError: fewer than three views, or stacks of different lengths.
     """
-    A, C = np.asarray(A, dtype=np.float64), np.asarray(C, dtype=np.float64)
-    if len(A) != len(C) or len(A) < MIN_VIEWS:
-        raise InputError(
-            f"hand-eye: {len(A)} hand poses and {len(C)} board poses; at least {MIN_VIEWS} views "
-            "with one of each are needed."
-        )
+    A, C = pose_stacks(A, C, "hand-eye", least=MIN_VIEWS)
     m = np.asarray(middle, dtype=np.float64)
     q = C[:, :3, :3] @ m + C[:, :3, 3]
     rng = np.random.default_rng(SEED)

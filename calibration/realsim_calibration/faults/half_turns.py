@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from realsim.arrays import Array, Mask
-from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim_calibration.fit.closed_forms import MIN_VIEWS, pose_stacks
 
 SOFT_DEG = 0.5
 """Differences of angle below this say nothing [deg]: the angle error of a planar pose."""
@@ -66,12 +66,7 @@ def synchronise_half_turns(
     Raises:
         InputError: stacks of different lengths, or fewer than three views.
     """
-    A, C = np.asarray(Ts_base_ee, dtype=np.float64), np.asarray(Ts_cam_board, dtype=np.float64)
-    if len(A) != len(C) or len(A) < 3:
-        raise InputError(
-            f"half turns: {len(A)} hand poses and {len(C)} board poses; three or more views with "
-            "one of each are needed."
-        )
+    A, C = pose_stacks(Ts_base_ee, Ts_cam_board, "half turns", least=MIN_VIEWS)
     off = _differences(A, C)
     flips = _polish(off, _synchronise(off, np.radians(SOFT_DEG)), SWEEPS)
     if 2 * flips.sum() > len(flips):

@@ -12,16 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from realsim.arrays import Array
-from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_calibration.faults.frame_fit import (
-    MIN_VIEWS,
-    FrameFit,
-    fit_frames,
-    hand_side,
-    linearise,
-)
-from realsim_calibration.fit.closed_forms import principal_turns, relative
+from realsim_calibration.faults.frame_fit import FrameFit, fit_frames, hand_side, linearise
+from realsim_calibration.fit.closed_forms import MIN_VIEWS, pose_stacks, principal_turns, relative
 
 UNSEEN = 1e-8
 """Information below this, in 1 / degree^2 or 1 / mm^2, is none: 1-sigma 10 m."""
@@ -82,12 +75,7 @@ def check_motion(
     Raises:
         InputError: fewer than three views, or stacks of different lengths.
     """
-    T, C = np.asarray(Ts_base_ee, dtype=np.float64), np.asarray(Ts_cam_board, dtype=np.float64)
-    if len(T) != len(C) or len(T) < MIN_VIEWS:
-        raise InputError(
-            f"motion: {len(T)} hand poses and {len(C)} board poses; at least {MIN_VIEWS} views "
-            "with one of each are needed."
-        )
+    T, C = pose_stacks(Ts_base_ee, Ts_cam_board, "motion", least=MIN_VIEWS)
     m = np.asarray(middle, dtype=np.float64)
     rms, axes = principal_turns(relative(se3.invert(C)).turns)
     turns, axes = np.degrees(rms), axes.T

@@ -19,12 +19,12 @@ from realsim.geometry import se3
 from realsim_calibration.faults.frame_fit import (
     AGREE,
     CAP,
-    MIN_VIEWS,
     FrameFit,
     fit_frames,
     mean_transform,
     mismatch,
 )
+from realsim_calibration.fit.closed_forms import MIN_VIEWS
 
 MovedFrame = Literal["X", "Z"]
 MOVED_FRAMES: tuple[MovedFrame, ...] = ("X", "Z")

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from realsim.arrays import Array, Int64
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_calibration.faults.frame_fit import fit_frames, mean_transform
+from realsim_calibration.fit.closed_forms import MIN_VIEWS, pose_stacks
 
 LEAST_MM = 5.0
 """Offsets below this are the nominal kinematics' own error [mm]: real arms show 1 to 3."""
@@ -58,12 +58,7 @@ def tool_offset(Ts_base_ee: ArrayLike, nominal: ArrayLike) -> ToolOffset:
     Raises:
         InputError: stacks of different lengths, or fewer than three views.
     """
-    A, N = np.asarray(Ts_base_ee, dtype=np.float64), np.asarray(nominal, dtype=np.float64)
-    if len(A) != len(N) or len(A) < 3:
-        raise InputError(
-            f"tool offset: {len(A)} hand poses and {len(N)} nominal ones; three or more with one "
-            "of each are needed."
-        )
+    A, N = pose_stacks(Ts_base_ee, nominal, "tool offset", least=MIN_VIEWS, others="nominal poses")
     L, offsets, groups, error = _simplest(A, N)
     mm, deg = _rms(error)
     known = mm <= MAX_ERROR_MM

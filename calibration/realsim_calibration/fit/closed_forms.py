@@ -24,7 +24,8 @@ from realsim.geometry import se3
 HALF_TURN = np.radians(175.0)
 """Pairs that turn further are left out: near 180 deg the sign of the axis is decided by noise."""
 MIN_VIEWS = 3
-"""Two motions about different axes need three poses."""
+"""Two motions about different axes need three poses; two frames and a ratio of lengths, 13
+unknowns, too: a view gives 6 equations."""
 MIN_TURN_DEG = 2.0
 """Least RMS rotation of the view pairs about the second-best axis [deg]: ten times the angle
 error of a planar pose seen from half a metre."""
@@ -67,14 +68,34 @@ def motions(Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike) -> tuple[Relative, R
     Raises:
         InputError: the two stacks do not have the same number of poses.
     """
-    A = np.asarray(Ts_base_ee, dtype=np.float64).reshape(-1, 4, 4)
-    C = np.asarray(Ts_cam_board, dtype=np.float64).reshape(-1, 4, 4)
-    if len(A) != len(C):
-        raise InputError(
-            f"hand-eye: {len(A)} hand poses and {len(C)} board poses were given; every view needs "
-            "one of each."
-        )
+    A, C = pose_stacks(Ts_base_ee, Ts_cam_board, "hand-eye")
     return relative(A), relative(se3.invert(C))
+
+
+def pose_stacks(
+    Ts_base_ee: ArrayLike, Ts: ArrayLike, what: str, *, least: int = 0, others: str = "board poses"
+) -> tuple[Array, Array]:
+    """Return two stacks (n, 4, 4) of poses that belong together.
+
+    Args:
+        Ts_base_ee: hand poses.
+        Ts: what was measured beside each.
+        what: is done with them, for the message.
+        least: how many are needed.
+        others: what the second stack holds, for the message.
+
+    Raises:
+        InputError: stacks of different lengths, or fewer than `least`.
+    """
+    A = np.asarray(Ts_base_ee, dtype=np.float64).reshape(-1, 4, 4)
+    C = np.asarray(Ts, dtype=np.float64).reshape(-1, 4, 4)
+    if len(A) != len(C) or len(A) < least:
+        needed = f"at least {least} views with one of each are needed"
+        raise InputError(
+            f"{what}: {len(A)} hand poses and {len(C)} {others} were given; "
+            f"{needed if least else 'every view needs one of each'}."
+        )
+    return A, C
 
 
 def principal_turns(turns: Array) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim_calibration.faults.frame_fit import FrameFit, fit_frames, hand_side
-from realsim_calibration.fit.closed_forms import MIN_VIEWS, check_observable
+from realsim_calibration.fit.closed_forms import MIN_VIEWS, check_observable, pose_stacks
 from realsim_calibration.fit.robot_error import arm_basis
 from realsim_calibration.pairs.noise import (
     KINDS,
@@ -146,13 +146,7 @@ def checked_pairs(Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike) -> tuple[Array
     Raises:
         InputError: they differ in length, or hold values that are not finite.
     """
-    A = np.asarray(Ts_base_ee, dtype=np.float64).reshape(-1, 4, 4)
-    C = np.asarray(Ts_cam_board, dtype=np.float64).reshape(-1, 4, 4)
-    if len(A) != len(C):
-        raise InputError(
-            f"hand-eye: {len(A)} hand poses and {len(C)} camera poses were given; every pair needs "
-            "one of each."
-        )
+    A, C = pose_stacks(Ts_base_ee, Ts_cam_board, "hand-eye", others="camera poses")
     bad = np.flatnonzero(~(np.isfinite(A) & np.isfinite(C)).all(axis=(1, 2)))
     if len(bad):
         raise InputError(
