@@ -91,12 +91,14 @@ def test_the_quality_is_the_hull_s_by_qhull():
         assert 10 < np.count_nonzero(expected) < 110
 
 
-def test_a_centred_grasp_of_a_cube_has_the_quality_of_the_formula():
+@pytest.mark.parametrize("friction", [1.0, 0.5])
+def test_a_centred_grasp_of_a_cube_has_the_quality_of_the_formula(friction):
     """Torsion (gamma) and the friction of both fingers at their arm (r) share the normal force."""
-    closure = force_closure(box(CUBE), np.eye(4)[None], np.array([0.06]))
+    config = ClosureConfig(friction=friction)
+    closure = force_closure(box(CUBE), np.eye(4)[None], np.array([0.06]), config)
     length = np.sqrt(3) * 0.025
-    gamma = closure.contacts.levers_m[0, 0] / length
-    r = np.cos(np.pi / 8) * 0.025 / length
+    gamma = friction * closure.contacts.levers_m[0, 0] / length
+    r = friction * np.cos(np.pi / 8) * 0.025 / length
     assert closure.ferrari_canny[0] == pytest.approx(1 / np.hypot(1 / gamma, 1 / r), rel=1e-4)
 
 
