@@ -140,12 +140,15 @@ class LinearModel:
         """Return step, sigma, H, residual sum and prior quadratic; sigma re-estimated in rounds."""
         gram, prior, offset = self._normal(basis, ratio)
         G, g, c = gram[:-1, :-1], gram[:-1, -1], float(gram[-1, -1])
+        # Without noise the views outweigh the prior by more than the digits of a double: what only
+        # the prior determines would be lost in the rounding of G, and H be singular.
+        G_held = G + np.diag(len(G) * np.finfo(np.float64).eps * np.diag(G))
         step, rest = np.zeros(len(G)), c
         for _ in range(rounds):
-            step = np.linalg.solve(G / sigma**2 + prior, -g / sigma**2 - prior @ offset)
+            step = np.linalg.solve(G_held / sigma**2 + prior, -g / sigma**2 - prior @ offset)
             rest = max(float(step @ G @ step + 2 * step @ g + c), 1e-12)
             sigma = float(np.sqrt(rest / self.freedom))
-        H = G / sigma**2 + prior
+        H = G_held / sigma**2 + prior
         step = np.asarray(np.linalg.solve(H, -g / sigma**2 - prior @ offset), np.float64)
         moved = offset + step
         return step, sigma, H, rest, float(moved @ prior @ moved)
