@@ -6,15 +6,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectPose
 from realsim.records.depth_bias import DepthBias
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.fixed_cameras import FixedCamera, FixedFrames, noise_of, still_depth
-from realsim.registration.register import register_scene
-from realsim.rendering.labels import LabelRenderer, PlacedMesh
-from table_scenes import QUICK
+from realsim.rendering.labels import LabelRenderer
+from refusals import refused
+from table_scenes import named_scene, register, starts_off_by, things_of
 
 CAMERA = CameraIntrinsics(width=400, height=300, fx=310.0, fy=312.0, cx=203.0, cy=147.0)
 """Another camera than the one in the hand."""
@@ -27,37 +26,27 @@ EYES = ([0.28, -0.36, 0.42], [-0.35, -0.30, 0.45], [0.02, -0.5, 0.4])
 
 
 @pytest.fixture(scope="module")
-def one_sided(make_scene):
+def one_sided():
     """Objects of which the camera in the hand sees the far side (+y) only."""
-    scene = make_scene((("wedge", (-0.05, 0.02), 1.1, (0.0, 0.0, 0.0)),
-                        ("box", (0.05, -0.01), 0.4, (0.0, 0.0, 0.0))), 1, 3)  # fmt: skip
-    renderer = LabelRenderer(things(scene))
+    scene = named_scene(3, ("wedge", "box"), 1)
+    renderer = LabelRenderer(things_of(scene))
     rng = np.random.default_rng(8)
     frames = []
-    for k, azimuth in enumerate(np.linspace(60, 120, 8)):
+    for k, a in enumerate(np.radians(np.linspace(60, 120, 8))):
         flat, up = 0.36 * np.cos(np.radians(28)), 0.36 * np.sin(np.radians(28))
-        a = np.radians(azimuth)
         T = se3.look_at([flat * np.cos(a), flat * np.sin(a), up], [0.0, 0.0, 0.02])
         z = renderer.render(scene.intrinsics, T).depth_m.astype(np.float64)
         z = np.where(z > 0, z + rng.normal(size=z.shape) * NOISE_PER_M * z**2, 0)
         error = se3.exp(rng.normal(size=6) * np.repeat([np.radians(0.03), 2e-4], 3))
         frames.append(DepthFrame(index=k, depth_m=z.astype(np.float32), T_world_cam=T @ error))
-    return replace(scene, frames=frames)
-
-
-def things(scene) -> list[PlacedMesh]:
-    from tests.registration.conftest import table_mesh
-
-    return [PlacedMesh(-1, table_mesh(), np.eye(4))] + [
-        PlacedMesh(p.instance, scene.models[p.obj_id].mesh, p.T_world_obj) for p in scene.truth
-    ]
+    return replace(scene, frames=tuple(frames))
 
 
 def fixed_camera(scene, eye, seed: int) -> tuple[FixedFrames, np.ndarray]:
     """A fixed camera with errors of its own, an arm before it in some images; where it stands."""
     rng = np.random.default_rng(seed)
     T = se3.look_at(eye, [0.0, 0.0, 0.02])
-    exact = LabelRenderer(things(scene)).render(CAMERA, T).depth_m.astype(np.float64)
+    exact = LabelRenderer(things_of(scene)).render(CAMERA, T).depth_m.astype(np.float64)
     images = []
     for k in range(IMAGES):
         z = exact.copy()
@@ -77,15 +66,9 @@ def fixed_camera(scene, eye, seed: int) -> tuple[FixedFrames, np.ndarray]:
 @pytest.fixture(scope="module")
 def registered(one_sided):
     """Registrations with none to three fixed cameras."""
-    starts = one_sided.starts(np.random.default_rng(2), 4, 4)
+    starts = starts_off_by(one_sided, 4, 4, seed=2)
     cameras = [fixed_camera(one_sided, eye, seed) for seed, eye in enumerate(EYES)]
-    found = [
-        register_scene(
-            "one side", one_sided.intrinsics, one_sided.frames, one_sided.models, starts, QUICK,
-            fixed=[c for c, _ in cameras[:n]],
-        )
-        for n in (0, 1, 3)
-    ]  # fmt: skip
+    found = [register(one_sided, starts, fixed=[c for c, _ in cameras[:n]]) for n in (0, 1, 3)]
     return found, cameras
 
 
@@ -137,10 +120,8 @@ def test_a_fixed_camera_is_one_unknown_and_moves_to_where_it_stands(registered):
 
 def test_too_few_views_for_a_joint_fit_leave_fixed_cameras_out_and_say_so(one_sided):
     frames, _ = fixed_camera(one_sided, EYES[0], 0)
-    found = register_scene(
-        "two views", one_sided.intrinsics, one_sided.frames[:2], one_sided.models,
-        one_sided.starts(np.random.default_rng(2), 2, 2), QUICK, fixed=[frames],
-    )  # fmt: skip
+    starts = starts_off_by(one_sided, 2, 2, seed=2)
+    found = register(one_sided, starts, frames=one_sided.frames[:2], fixed=[frames])
     assert found.fixed_cameras == {}
     said = [f.words for f in found.findings if f.kind == "fixed_cameras"]
     assert len(said) == 1
@@ -150,11 +131,8 @@ def test_too_few_views_for_a_joint_fit_leave_fixed_cameras_out_and_say_so(one_si
 def test_images_of_another_size_than_the_camera_are_named(one_sided):
     frames, _ = fixed_camera(one_sided, EYES[0], 0)
     wrong = replace(frames, read=lambda: [np.ones((10, 20), np.float32)])
-    with pytest.raises(InputError, match=r"camera 'fixed0': .*\(10, 20\)"):
-        register_scene(
-            "wrong", one_sided.intrinsics, one_sided.frames, one_sided.models,
-            one_sided.starts(np.random.default_rng(2), 2, 2), fixed=[wrong],
-        )  # fmt: skip
+    starts = starts_off_by(one_sided, 2, 2, seed=2)
+    refused(r"camera 'fixed0': .*\(10, 20\)", register, one_sided, starts, fixed=[wrong])
 
 
 def test_the_still_depth_is_that_of_the_scene_behind_a_passing_arm():
@@ -175,5 +153,4 @@ def test_the_still_depth_is_that_of_the_scene_behind_a_passing_arm():
 def test_a_pixel_on_which_images_do_not_agree_has_no_depth():
     images = [np.full((2, 3), z, np.float32) for z in (0.5, 0.6, 0.7, 0.8)]
     assert not np.any(still_depth(images))
-    with pytest.raises(InputError, match="sizes"):
-        still_depth([*images, np.ones((3, 3), np.float32)])
+    refused("sizes", still_depth, [*images, np.ones((3, 3), np.float32)])
