@@ -9,10 +9,9 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.registration.odometry.hand_held import hand_held_poses
 from realsim.registration.simulated import DEPTH_UNIT_M, render_depth
-from realsim.registration.simulated_lab import table_square
 from realsim.registration.views import SampleConfig
-from realsim.rendering.rays import BACKGROUND, PlacedMesh
-from table_scenes import small_scene
+from refusals import refused
+from table_scenes import small_scene, things_of
 
 SAMPLE = SampleConfig(stride=1)
 VIEWS = 12
@@ -28,10 +27,7 @@ def led_by_hand():
         azimuth, height = np.radians(5.0 * k + rng.normal(scale=0.4)), 0.25 + 0.02 * np.sin(k / 3)
         eye = [0.22 * np.cos(azimuth), 0.22 * np.sin(azimuth), height]
         poses.append(se3.look_at(eye, [*rng.normal(scale=0.003, size=2), 0.03], 0.1 * np.sin(k)))
-    things = [PlacedMesh(k, scene.models[p.obj_id].mesh, p.T_world_obj)
-              for k, p in enumerate(scene.truth)]  # fmt: skip
-    things.append(PlacedMesh(BACKGROUND, table_square((0.0, 0.0)), np.eye(4)))
-    images = render_depth(things, scene.intrinsics, np.stack(poses), scene.sensor, 5)
+    images = render_depth(things_of(scene), scene.intrinsics, np.stack(poses), scene.sensor, 5)
     depths = [d.astype(np.float32) * np.float32(DEPTH_UNIT_M) for d in images]
     return scene.intrinsics, depths, np.stack(poses)
 
@@ -75,8 +71,7 @@ def test_sigmas_grow_with_the_way():
 def test_a_missing_piece_of_the_way_is_named():
     intrinsics, depths, _ = led_by_hand()
     turned = [*depths[:4], depths[4][::-1, ::-1].copy()]
-    with pytest.raises(InputError, match="view 4 cannot be placed"):
-        hand_held_poses(intrinsics, turned, SAMPLE)
+    refused("view 4 cannot be placed", hand_held_poses, intrinsics, turned, SAMPLE)
 
 
 def test_without_a_table_there_is_no_ground():

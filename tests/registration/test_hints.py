@@ -1,6 +1,7 @@
 """Hints lead to regions that hold the object; what cannot be meant is an error with its row."""
 
 import json
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from begun_sessions import begun
 from realsim.errors import InputError, NotRigidError, UnitError
 from realsim.geometry import se3
-from realsim.records import SupportPlane, View
+from realsim.records import View
 from realsim.registration.hint_regions import SLACK_M
 from realsim.registration.hints import (
     Box,
@@ -24,10 +25,8 @@ from realsim.registration.hints import (
     region_of,
 )
 from refusals import refused
-from table_faults import seen_instances
-from table_scenes import part_models, small_scene
-
-TABLE = SupportPlane(T_world_table=np.eye(4))
+from table_faults import seen_instances, without_any_depth
+from table_scenes import TABLE, part_models, small_scene
 
 
 @lru_cache(maxsize=1)
@@ -103,17 +102,13 @@ def test_boxes_and_masks_lead_to_the_object():
 
 def test_without_depth_the_table_tells():
     scene_, scene, _ = setting()
-    frames = {
-        k: type(f)(index=k, depth_m=np.zeros_like(f.depth_m), T_world_cam=f.T_world_cam)
-        for k, f in scene.frames.items()
-    }
-    blind = HintScene(intrinsics=scene.intrinsics, frames=frames, plane=TABLE)
+    frames = {k: without_any_depth(f) for k, f in scene.frames.items()}
+    blind = replace(scene, frames=frames)
     for view, pose, model, rows, columns in seen_well():
         click = Click(view=view, pixel=(float(np.median(columns)), float(np.median(rows))))
         hint = Hint(obj_id=pose.obj_id, instance=0, where=click)
         check_region(hint, model, blind, pose)
-        with pytest.raises(InputError, match="no depth is measured"):
-            region_of(hint, model, HintScene(intrinsics=scene.intrinsics, frames=frames))
+        refused("no depth is measured", region_of, hint, model, replace(blind, plane=None))
     assert len(scene_.truth) == 6
 
 
@@ -130,10 +125,8 @@ def test_without_depth_the_table_tells():
 def test_places_that_cannot_be_meant_are_errors(where, words):
     scene, hints, _ = setting()
     pose = scene.truth[0]
-    with pytest.raises(InputError, match=words):
-        region_of(
-            Hint(obj_id=pose.obj_id, instance=0, where=where), scene.models[pose.obj_id], hints,
-        )  # fmt: skip
+    hint = Hint(obj_id=pose.obj_id, instance=0, where=where)
+    refused(words, region_of, hint, scene.models[pose.obj_id], hints)
 
 
 # --- typed ------------------------------------------------------------------------------------

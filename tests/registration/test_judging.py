@@ -7,10 +7,10 @@ import pytest
 
 from realsim.errors import UnitError
 from realsim.geometry import se3
-from realsim.records import ObjectPose, SupportPlane
-from realsim.registration.body import make_body
+from realsim.records import SupportPlane
+from realsim.registration.body import moved_body
 from realsim.registration.compare import make_comparer
-from realsim.registration.evidence import DepthNoise, average_cloud
+from realsim.registration.evidence import average_cloud
 from realsim.registration.judging.held_out import box_shift_m, held_out, owned_points
 from realsim.registration.judging.scene_checks import scene_findings
 from realsim.registration.judging.surface_residuals import (
@@ -23,25 +23,20 @@ from realsim.registration.judging.surface_residuals import (
 )
 from realsim.registration.judging.unit_checks import unit_errors
 from realsim.registration.table_planes import support_checks
-from realsim.registration.views import SampleConfig, sample_views, world_cloud
-from table_scenes import named_scene
-
-PLANE = SupportPlane(T_world_table=np.eye(4))
-NOISE = DepthNoise(per_m=0.0069, floor_m=0.0002)
-NAMES = ("gear", "box", "mug", "t_profile")
+from realsim.registration.views import world_cloud
+from table_scenes import NOISE, TABLE, bodies_of, named_scene, true_cameras, true_poses, views_of
 
 
 @pytest.fixture(scope="module")
 def watched():
     """(scene, bodies, true poses, a function poses -> residuals) with true cameras."""
-    scene = named_scene(3, NAMES, 16)
-    bodies = [make_body(p, scene.models[p.obj_id], 64, 300) for p in scene.truth]
-    views = sample_views(scene.intrinsics, scene.frames, NOISE, SampleConfig(stride=1))
+    scene = named_scene(3, ("gear", "box", "mug", "t_profile"), 16)
+    bodies, views = bodies_of(scene, 64, 300), views_of(scene)
 
-    def residuals(poses, Ts=scene.Ts_world_cam, plane=PLANE):
+    def residuals(poses, Ts=scene.Ts_world_cam, plane=TABLE):
         return surface_residuals(bodies, poses, scene.intrinsics, views, Ts, NOISE, plane)
 
-    return scene, bodies, [p.T_world_obj for p in scene.truth], residuals
+    return scene, bodies, true_poses(scene), residuals
 
 
 def turned(body, T, angle, axis=(0.0, 0.0, 1.0)):
@@ -126,15 +121,14 @@ def test_errors_that_all_objects_share_raise_the_bound_but_not_without_end(watch
 def halved():
     """(bodies, true poses, a function poses -> HeldOut of each)."""
     scene = named_scene(5, ("wedge", "box", "mug"), 12)
-    bodies = [make_body(p, scene.models[p.obj_id], 64, 300) for p in scene.truth]
-    views = sample_views(scene.intrinsics, scene.frames, NOISE, SampleConfig(stride=1))
+    bodies, views = bodies_of(scene, 64, 300), views_of(scene)
 
     def judge(poses):
         seen = (scene.intrinsics, views, scene.Ts_world_cam)
-        owned = owned_points(bodies, poses, *seen, NOISE, PLANE)
+        owned = owned_points(bodies, poses, *seen, NOISE, TABLE)
         return held_out(bodies, poses, owned, len(views))
 
-    return bodies, [p.T_world_obj for p in scene.truth], judge
+    return bodies, true_poses(scene), judge
 
 
 def test_both_halves_find_a_right_pose(halved):
@@ -154,81 +148,69 @@ def test_a_wrong_place_shows_on_unused_views(halved):
 
 
 # --- What is wrong with a whole scene: shifted, sunk, swapped, absent, in other units.
-STANDING = ("box", "wedge", "mug", "u_channel")
 
 
 @pytest.fixture(scope="module")
 def table():
-    """(scene, bodies at the truth, comparer, the cloud above the table)."""
-    scene = named_scene(7, STANDING, 8)
-    frames = [
-        replace(f, T_world_cam=T) for f, T in zip(scene.frames, scene.Ts_world_cam, strict=True)
-    ]
-    bodies = [make_body(p, scene.models[p.obj_id], 48, 300) for p in scene.truth]
-    comparer = make_comparer(scene.intrinsics, frames, NOISE, PLANE)
-    views = sample_views(scene.intrinsics, frames, NOISE, SampleConfig(stride=2))
-    cloud = average_cloud(world_cloud(views, NOISE), np.eye(4), 0.003)
-    return scene, bodies, comparer, cloud.select(cloud.points[:, 2] > 0.003)
+    """(scene, bodies at the truth, true poses, a function of bodies and poses -> findings)."""
+    scene = true_cameras(named_scene(7, ("box", "wedge", "mug", "u_channel"), 8))
+    comparer = make_comparer(scene.intrinsics, scene.frames, NOISE, TABLE)
+    cloud = average_cloud(world_cloud(views_of(scene, stride=2), NOISE), np.eye(4), 0.003)
+    cloud = cloud.select(cloud.points[:, 2] > 0.003)
 
+    def findings(bodies, poses, probabilities=(0.99,) * 4, with_starts=True):
+        return scene_findings(bodies, poses, probabilities, cloud, comparer, with_starts)
 
-def findings(table, bodies, poses, probabilities, with_starts=True):
-    _, _, comparer, cloud = table
-    return scene_findings(bodies, poses, probabilities, cloud, comparer, with_starts)
+    return scene, bodies_of(scene, 48, 300), true_poses(scene), findings
 
 
 def test_a_right_scene_has_no_findings(table):
-    _, bodies, _, _ = table
-    assert findings(table, bodies, [b.T_start for b in bodies], [0.99] * 4) == []
+    _, bodies, poses, findings = table
+    assert findings(bodies, poses) == []
 
 
 def test_a_common_shift_of_the_starts_is_named(table):
-    _, bodies, _, _ = table
+    _, bodies, poses, findings = table
     shift = se3.from_translation([0.02, -0.01, 0.0])
-    moved = [replace(b, start=replace(b.start, T_world_obj=shift @ b.T_start)) for b in bodies]
-    poses = [b.T_start for b in bodies]
-    (found,) = findings(table, moved, poses, [0.99] * 4)
+    moved = [moved_body(b, shift @ b.T_start) for b in bodies]
+    (found,) = findings(moved, poses)
     assert found.kind == "common shift"
     assert "22.4 mm" in found.words
     assert found.instances == tuple(b.start.instance for b in bodies)
-    assert findings(table, moved, poses, [0.99] * 4, with_starts=False) == []
+    assert findings(moved, poses, with_starts=False) == []
 
 
 def test_sinking_alike_is_named(table):
-    _, bodies, _, _ = table
+    _, bodies, _, findings = table
     sunk = []
     for b in bodies:
         height = np.ptp(se3.transform(b.T_start, b.model.mesh.vertices)[:, 2])
         sunk.append(se3.from_translation([0, 0, -0.05 * height]) @ b.T_start)
-    (found,) = findings(table, bodies, sunk, [0.99] * 4, with_starts=False)
+    (found,) = findings(bodies, sunk, with_starts=False)
     assert found.kind == "common sinking"
     assert "5.0 %" in found.words
     assert "too large" in found.words
 
 
 def test_swapped_ids_are_named(table):
-    _, bodies, _, _ = table
+    _, bodies, true, findings = table
     names = [b.model.name for b in bodies]
     a, b = names.index("wedge"), names.index("u_channel")
     # Where the other one is, in whatever turn: as a registration of swapped ids ends.
-    poses = [body.T_start for body in bodies]
+    poses = [*true]
     for here, there in ((a, b), (b, a)):
-        away = bodies[there].center(bodies[there].T_start) - bodies[here].center(poses[here])
-        poses[here] = se3.from_translation(away) @ bodies[here].T_start
-    found = [
-        f
-        for f in findings(table, bodies, poses, [0.01 if k in (a, b) else 0.99 for k in range(4)])
-        if f.kind == "swapped ids"
-    ]
-    assert len(found) == 1
-    assert set(found[0].instances) == {bodies[a].start.instance, bodies[b].start.instance}
-    assert names[a] in found[0].words
+        away = bodies[there].center(true[there]) - bodies[here].center(true[here])
+        poses[here] = se3.from_translation(away) @ true[here]
+    told = findings(bodies, poses, [0.01 if k in (a, b) else 0.99 for k in range(4)])
+    (found,) = (f for f in told if f.kind == "swapped ids")
+    assert set(found.instances) == {bodies[a].start.instance, bodies[b].start.instance}
+    assert names[a] in found.words
 
 
 def test_a_model_that_is_not_there_is_named(table):
-    _, bodies, _, _ = table
-    poses = [b.T_start for b in bodies]
-    poses[2] = se3.from_translation([0.3, 0.0, 0.0]) @ poses[2]
-    (found,) = findings(table, bodies, poses, [0.99, 0.99, 0.001, 0.99])
+    _, bodies, (a, b, c, d), findings = table
+    away = se3.from_translation([0.3, 0.0, 0.0]) @ c
+    (found,) = findings(bodies, [a, b, away, d], [0.99, 0.99, 0.001, 0.99])
     assert found.kind == "not in the scene"
     assert "mug" in found.words
 
@@ -254,7 +236,7 @@ def test_a_start_in_millimetres_is_an_error_and_right_ones_are_none(table):
     assert unit_errors(scene.models, scene.truth, cameras, 0.35) == {}
     T = bodies[1].T_start.copy()
     T[:3, 3] = [120.0, -80.0, 30.0]
-    start = ObjectPose(obj_id=bodies[1].start.obj_id, instance=9, T_world_obj=T)
+    start = replace(bodies[1].start, instance=9, T_world_obj=T)
     errors = unit_errors(scene.models, [*scene.truth, start], cameras, 0.35)
     assert set(errors) == {9}
     assert "120" in str(errors[9])
@@ -262,17 +244,16 @@ def test_a_start_in_millimetres_is_an_error_and_right_ones_are_none(table):
 
 
 def test_floating_and_sinking_are_lengths_and_a_stack_does_not_float(table):
-    _, bodies, _, _ = table
-    poses = [b.T_start for b in bodies]
-    checks = support_checks(bodies, poses, PLANE)
+    _, bodies, poses, _ = table
+    checks = support_checks(bodies, poses, TABLE)
     assert all(c["sunk_mm"] < 1e-6 and c["floating_mm"] < 1e-6 for c in checks)
     lifted = [se3.from_translation([0, 0, 0.005]) @ poses[0], *poses[1:]]
-    assert support_checks(bodies, lifted, PLANE)[0]["floating_mm"] == pytest.approx(5.0, abs=2.0)
+    assert support_checks(bodies, lifted, TABLE)[0]["floating_mm"] == pytest.approx(5.0, abs=2.0)
     sunk = [se3.from_translation([0, 0, -0.004]) @ poses[0], *poses[1:]]
-    assert support_checks(bodies, sunk, PLANE)[0]["sunk_mm"] == pytest.approx(4.0, abs=1e-6)
+    assert support_checks(bodies, sunk, TABLE)[0]["sunk_mm"] == pytest.approx(4.0, abs=1e-6)
     top = se3.transform(poses[0], bodies[0].model.mesh.vertices)[:, 2].max()
     shift = bodies[0].center(poses[0]) - bodies[1].center(poses[1])
     stacked = se3.from_translation([shift[0], shift[1], top]) @ poses[1]
-    piled = support_checks(bodies, [poses[0], stacked, *poses[2:]], PLANE)[1]
+    piled = support_checks(bodies, [poses[0], stacked, *poses[2:]], TABLE)[1]
     assert piled["floating_mm"] < 6.0 < 1e3 * top
     assert support_checks(bodies, poses, None) == [{}] * 4

@@ -14,17 +14,16 @@ from realsim.geometry.mesh import sample_surface, symmetry_transforms
 from realsim.geometry.parts import part
 from realsim.interop import import_open3d
 from realsim.records import Mesh, ObjectModel, SupportPlane
-from realsim.registration.evidence import Cloud, DepthNoise
+from realsim.registration.evidence import Cloud
 from realsim.registration.search.height_grid import HeightGrid, height_grid
 from realsim.registration.search.matching import MOST, MOST_IN_REGION, match_templates
 from realsim.registration.search.near_symmetry import NearSymmetryConfig, near_symmetries
 from realsim.registration.search.records import Region
 from realsim.registration.search.templates import TemplateConfig, model_templates
-from realsim.registration.views import SampleConfig, sample_views, world_cloud
+from realsim.registration.views import world_cloud
 from realsim.rendering.rays import PlacedMesh, RayScene
-from table_scenes import named_scene
+from table_scenes import NOISE, TABLE, named_scene, views_of
 
-PLANE = SupportPlane(T_world_table=np.eye(4))
 NAMES = ("mug", "box", "wedge", "gear", "elbow")
 
 
@@ -37,9 +36,7 @@ def templates_of(name):
 def measured(seed=3):
     """A simulated table with 5 parts, and the heights that 12 noisy views show."""
     scene = named_scene(seed, NAMES)
-    noise = DepthNoise(per_m=0.0069, floor_m=2e-4)
-    views = sample_views(scene.intrinsics, scene.frames, noise, SampleConfig(stride=1))
-    return scene, height_grid(world_cloud(views, noise), PLANE)
+    return scene, height_grid(world_cloud(views_of(scene), NOISE), TABLE)
 
 
 def exact_grid(model, T_world_obj, cells=140):
@@ -83,7 +80,7 @@ def test_alone_it_is_found_first_in_every_resting_pose(name):
     model, t = part(name), templates_of(name)
     for pose in range(len(t.rotations)):
         truth = resting(name, pose, 141.0, (0.031, -0.047))
-        found = match_templates(exact_grid(model, truth), t, plane=PLANE)
+        found = match_templates(exact_grid(model, truth), t, plane=TABLE)
         near = [h for h in found if is_near(model, h.T_world_obj, truth)]
         assert near and near[0].score > 0.7
         assert near[0].score > found[0].score - 0.1
@@ -94,7 +91,7 @@ def test_every_part_of_a_noisy_clutter_is_among_the_hypotheses():
     scene, grid = measured()
     for p in scene.truth:
         model = scene.models[p.obj_id]
-        found = match_templates(grid, templates_of(model.name), plane=PLANE)
+        found = match_templates(grid, templates_of(model.name), plane=TABLE)
         assert len(found) <= MOST
         assert all(a.score >= b.score for a, b in pairwise(found))
         assert any(is_near(model, h.T_world_obj, p.T_world_obj) for h in found[:8])
@@ -105,7 +102,7 @@ def test_hypotheses_stand_on_the_table_and_move_with_it():
     T = se3.random_transform(np.random.default_rng(1))
     model = scene.models[scene.truth[0].obj_id]
     t = templates_of(model.name)
-    here = match_templates(grid, t, plane=PLANE)
+    here = match_templates(grid, t, plane=TABLE)
     there = match_templates(grid, t, plane=SupportPlane(T_world_table=T))
     assert len(here) == len(there) > 0
     for a, b in zip(here, there, strict=True):
@@ -127,7 +124,7 @@ def test_a_region_bounds_place_and_turn():
             R_world_obj=p.T_world_obj[:3, :3] @ turn,
             turn_deg=38.0,
         )
-        found = match_templates(grid, templates_of(model.name), plane=PLANE, region=region)
+        found = match_templates(grid, templates_of(model.name), plane=TABLE, region=region)
         assert 0 < len(found) <= MOST_IN_REGION
         assert any(is_near(model, h.T_world_obj, p.T_world_obj) for h in found)
         start = se3.from_rt(region.R_world_obj, np.zeros(3))
@@ -149,7 +146,7 @@ def test_a_flat_plate_is_found():
     heights = (grid.heights + noise).astype(np.float32)
     noisy = HeightGrid(heights=heights, origin=grid.origin, cell_m=grid.cell_m)
     t = model_templates(plate, TemplateConfig(), None)
-    found = match_templates(noisy, t, plane=PLANE)
+    found = match_templates(noisy, t, plane=TABLE)
     assert any(is_near(plate, h.T_world_obj, truth) for h in found[:8])
 
 
@@ -175,7 +172,7 @@ def table_and_block(rng, n=60_000):
 
 
 def test_the_table_is_zero_and_the_block_has_its_height(rng):
-    grid = height_grid(cloud_of(table_and_block(rng)), PLANE)
+    grid = height_grid(cloud_of(table_and_block(rng)), TABLE)
     xy = grid.centers()
     inside = np.all(np.abs(xy - [0.05, 0.02]) < [0.027, 0.017], axis=-1)
     outside = np.any(np.abs(xy - [0.05, 0.02]) > [0.033, 0.023], axis=-1)

@@ -7,35 +7,30 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.records import SupportPlane
-from realsim.registration.evidence import DepthNoise
-from realsim.registration.odometry.cross_check import check_kinematics
+from realsim.registration.odometry.cross_check import KinematicsCheck, check_kinematics
 from realsim.registration.odometry.kiss import FitConfig, LocalMap, thin_points
-from realsim.registration.views import SampleConfig, ViewPoints, sample_views
-from table_scenes import small_scene
+from realsim.registration.views import ViewPoints
+from refusals import refused
+from table_scenes import TABLE, small_scene, views_of
 
-PLANE = SupportPlane(T_world_table=np.eye(4))
-NOISE = DepthNoise(per_m=0.0069, floor_m=2e-4)
 VIEWS = 32
 
 
-@lru_cache(maxsize=4)
-def views_of(seed: int) -> tuple[ViewPoints, ...]:
-    scene = small_scene(seed, objects=6, views=VIEWS)
-    return sample_views(scene.intrinsics, scene.frames, NOISE, SampleConfig(stride=1))
+@lru_cache(maxsize=1)
+def views() -> tuple[ViewPoints, ...]:
+    return views_of(small_scene(1, objects=6, views=VIEWS))
 
 
-def posed(views, Ts) -> list[ViewPoints]:
-    """Return the views in a new order of capture, at these poses."""
-    return [
-        replace(v, T_world_cam=T, index=k) for k, (v, T) in enumerate(zip(views, Ts, strict=False))
-    ]
+def checked(order, Ts) -> KinematicsCheck:
+    """Return the check of these views in a new order of capture, at these poses."""
+    return check_kinematics(
+        [replace(views()[v], T_world_cam=Ts[k], index=k) for k, v in enumerate(order)], TABLE
+    )
 
 
-def poses_of(views) -> np.ndarray:
-    return np.stack([v.T_world_cam for v in views])
+def claimed() -> np.ndarray:
+    return np.stack([v.T_world_cam for v in views()])
 
 
 def off(mm: float, deg: float, seed: int = 0) -> np.ndarray:
@@ -67,7 +62,7 @@ def test_known_motion_is_found():
 
 
 def test_a_clean_capture_raises_no_alarm():
-    check = check_kinematics(views_of(1), PLANE)
+    check = check_kinematics(views(), TABLE)
     assert check.good, check.words()
     assert check.noise_mm < 1.6 and check.noise_deg < 0.25
     assert [v.index for v in check.views] == list(range(VIEWS))
@@ -75,10 +70,9 @@ def test_a_clean_capture_raises_no_alarm():
 
 
 def test_one_wrong_view_is_named():
-    views = views_of(1)
-    Ts = poses_of(views)
+    Ts = claimed()
     Ts[17] = Ts[17] @ off(6, 1.2)
-    check = check_kinematics(posed(views, Ts), PLANE)
+    check = checked(range(VIEWS), Ts)
     assert [(f.kind, f.view) for f in check.faults] == [("view", 17)]
     assert check.faults[0].mm == pytest.approx(6, abs=2)
     assert check.faults[0].deg == pytest.approx(1.2, abs=0.4)
@@ -86,33 +80,28 @@ def test_one_wrong_view_is_named():
 
 
 def test_a_slipped_mount_is_named():
-    views = views_of(1)
-    Ts = poses_of(views)
+    Ts = claimed()
     Ts[18:] = Ts[18:] @ off(5, 1.0, 3)
-    check = check_kinematics(posed(views, Ts), PLANE)
+    check = checked(range(VIEWS), Ts)
     assert [(f.kind, f.view) for f in check.faults] == [("mount", 18)]
     assert check.faults[0].mm == pytest.approx(5, abs=2)
 
 
 @pytest.mark.slow
 def test_swapped_images_are_named():
-    views = views_of(1)
     order = np.arange(VIEWS)
     order[[9, 20]] = order[[20, 9]]
-    check = check_kinematics(posed([views[k] for k in order], poses_of(views)), PLANE)
+    check = checked(order, claimed())
     assert [(f.kind, f.view, f.other) for f in check.faults] == [("swapped", 9, 20)]
 
 
 @pytest.mark.slow
 def test_a_skipped_image_is_named():
-    views = views_of(1)
-    kept = np.delete(np.arange(VIEWS), 11)
-    check = check_kinematics(posed([views[k] for k in kept], poses_of(views)), PLANE)
+    check = checked(np.delete(np.arange(VIEWS), 11), claimed())
     assert [(f.kind, f.view, f.other) for f in check.faults] == [("shifted", 11, 1)]
     assert "from view 11 on" in check.words()[1]
 
 
 def test_an_empty_table_is_an_error():
-    views = [replace(v, points=v.points[:0], pixels=v.pixels[:0]) for v in views_of(1)[:3]]
-    with pytest.raises(InputError, match="0 of 3 views"):
-        check_kinematics(views, PLANE)
+    empty = [replace(v, points=v.points[:0], pixels=v.pixels[:0]) for v in views()[:3]]
+    refused("0 of 3 views", check_kinematics, empty, TABLE)

@@ -9,19 +9,17 @@ import pytest
 
 from fault_sessions import ROOT, load_benchmark
 from realsim.geometry import se3
-from realsim.geometry.metrics import aligned_pose, mssd_symmetric
-from realsim.records import ObjectPose, SupportPlane
-from realsim.registration.body import make_body, moved_about_center
+from realsim.geometry.metrics import aligned_pose
+from realsim.registration.body import moved_about_center
 from realsim.registration.evidence import Cloud
 from realsim.registration.few_views import ALIKE, register_few, with_photograph
 from realsim.registration.intake import take_in
 from realsim.registration.judging.verdict import EXPLAINED
 from realsim.registration.refinement.flat import LEAN_DEG, laid_down
-from realsim.registration.register import register_scene
 from realsim.registration.rivals_around import FLAT_M, _moved_alike
 from realsim.registration.search.flat_search import explained_at, table_map
 from realsim.registration.solver import FINE, solve_pose
-from table_scenes import QUICK
+from table_scenes import QUICK, bodies_of, body_at, errors_mm, register, starts_off_by
 
 shapes = load_benchmark("outside_shapes")
 lab = load_benchmark("outside_lab")
@@ -31,18 +29,8 @@ OFFSET_PX = 0.1
 """By which the disparity of the one view is too large: 1.5 to 2.5 mm."""
 
 
-def off_by(pose: ObjectPose, mm: float, deg: float, rng: np.random.Generator) -> ObjectPose:
-    axis, way = rng.normal(size=(2, 3))
-    xi = np.concatenate([
-        np.radians(deg) * axis / np.linalg.norm(axis), 1e-3 * mm * way / np.linalg.norm(way)
-    ])  # fmt: skip
-    return replace(pose, T_world_obj=pose.T_world_obj @ se3.exp(xi))  # origins are in the middle
-
-
 def body_of(name: str, T: np.ndarray):
-    model = shapes.objects()[IDS[name]][0]
-    start = ObjectPose(obj_id=model.obj_id, instance=0, T_world_obj=T)
-    return make_body(start, model, 64, 200)
+    return body_at(shapes.objects()[IDS[name]][0], 64, 200, T)
 
 
 def dummy_fit(body, T: np.ndarray):
@@ -146,18 +134,7 @@ def one_view():
 
 
 def registered(scene, frame):
-    rng = np.random.default_rng(0)
-    starts = [off_by(t, 8, 8, rng) for t in scene.truth]
-    return register_scene("x", scene.intrinsics, [frame], scene.models, starts, QUICK)
-
-
-def errors(scene, found):
-    by = {t.instance: t.T_world_obj for t in scene.truth}
-    return {
-        scene.models[o.obj_id].name: 1e3
-        * mssd_symmetric(by[o.instance], o.T_world_obj, scene.models[o.obj_id])
-        for o in found.scene.objects
-    }
+    return register(scene, starts_off_by(scene, 8, 8), frames=[frame])
 
 
 @pytest.fixture(scope="module")
@@ -177,10 +154,10 @@ def test_an_accepted_pose_is_right_and_its_covariance_holds_the_error(one_view, 
     by = {t.instance: t.T_world_obj for t in one_view.truth}
     accepted = [o for o in with_photo.scene.objects if o.verdict == "accepted"]
     assert len(accepted) >= 3
-    squares = []
+    squares, errors = [], errors_mm(one_view, accepted)
     for o in accepted:
         model = one_view.models[o.obj_id]
-        assert errors(one_view, with_photo)[model.name] < 3.0
+        assert errors[o.instance] < 3.0
         T = aligned_pose(by[o.instance], o.T_world_obj, model)
         xi = se3.log(se3.invert(T) @ by[o.instance])
         squares.append(xi @ np.linalg.solve(o.covariance, xi))
@@ -197,7 +174,7 @@ def something_else(one_view):
 def few(one_view):
     """What was taken in, the bodies at the truth, and what depth alone makes of them."""
     intake = take_in(one_view.intrinsics, one_view.frames, QUICK)
-    bodies = [make_body(t, one_view.models[t.obj_id], 64, 200) for t in one_view.truth]
+    bodies = bodies_of(one_view)
     return intake, bodies, register_few(intake, bodies, QUICK, None, lambda: None)
 
 
@@ -215,7 +192,9 @@ def test_a_photograph_makes_poses_better_and_another_one_moves_nothing(
     bare = registered(one_view, replace(one_view.frames[0], read_rgb=None))
     other = registered(one_view, something_else)
     assert "photograph" not in bare.report and not other.report["photograph"]["taken"]
-    left, had = (np.median([*errors(one_view, r).values()]) for r in (with_photo, bare))
+    left, had = (
+        np.median([*errors_mm(one_view, r.scene.objects).values()]) for r in (with_photo, bare)
+    )
     assert left < 0.8 * had
     for a, b in zip(other.scene.objects, bare.scene.objects, strict=True):
         np.testing.assert_allclose(a.T_world_obj, b.T_world_obj, atol=1e-9)
@@ -260,8 +239,7 @@ def test_the_turn_of_a_mug_is_doubted_where_its_handle_is_hidden(hidden):
     z = np.where(z < 1.5, z * (1 + 0.002 * np.random.default_rng(0).normal(size=z.shape)), 0.0)
     frame = replace(frame, depth_m=z.astype(np.float32), T_world_cam=T_world_cam)
     start = replace(true, T_world_obj=T @ se3.exp([0, 0, np.radians(8), 0, 0, 0]))
-    fine = replace(QUICK, field_cells=96)
-    found = register_scene("x", scene.intrinsics, [frame], scene.models, [start], fine)
+    found = register(scene, [start], replace(QUICK, field_cells=96), frames=[frame])
     (mug,) = found.scene.objects
     if hidden:
         assert mug.verdict == "doubtful"
@@ -270,7 +248,8 @@ def test_the_turn_of_a_mug_is_doubted_where_its_handle_is_hidden(hidden):
         assert np.degrees(np.sqrt(mug.covariance[2, 2])) > 3.0
     else:
         assert mug.verdict == "accepted", mug.reasons
-        assert errors(replace(scene, truth=(replace(true, T_world_obj=T),)), found)["mug"] < 3.0
+        standing = replace(scene, truth=(replace(true, T_world_obj=T),))
+        assert errors_mm(standing, [mug])[mug.instance] < 3.0
 
 
 # --- plates ---------------------------------------------------------------------------------------
@@ -280,10 +259,9 @@ def test_a_slid_plate_does_not_explain_the_heights_around_it():
     flat = lab.Lab(views=12, **TRUE_CAMERAS)
     scene = lab.make_scene(3, flat, ids=[IDS["plate_2"], IDS["plate_5"]])
     intake = take_in(scene.intrinsics, scene.frames, QUICK)
-    plane = SupportPlane(T_world_table=np.eye(4))
     assert intake.plane is not None
     map_ = table_map(intake.views, intake.plane, intake.noise, np.zeros(3), 12.5)
-    up = intake.plane.T_world_table @ se3.invert(plane.T_world_table)
+    up = intake.plane.T_world_table
     for true in scene.truth:
         name = scene.models[true.obj_id].name
         body = body_of(name, true.T_world_obj)

@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import merged, sample_surface, transformed
 from realsim.geometry.parts import part
-from realsim.records import Mesh, ObjectModel, ObjectPose, SupportPlane
-from realsim.registration.body import make_body
-from realsim.registration.evidence import Cloud, DepthNoise, join_clouds
+from realsim.records import Mesh, ObjectModel, ObjectPose
+from realsim.registration.evidence import Cloud, join_clouds
 from realsim.registration.find_table import find_table
 from realsim.registration.search.candidates import Candidate, Sought, fuse
 from realsim.registration.search.find import FindConfig, find_objects
@@ -24,12 +22,10 @@ from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import Render, Score, ScoreConfig, make_canvas
 from realsim.registration.search.templates import TemplateConfig
 from realsim.registration.simulated import TableScene, resized, table_scene
-from realsim.registration.views import SampleConfig, ViewPoints, sample_views
 from refusals import refused
-from table_scenes import SMALL_LAB, named_scene
+from table_scenes import NOISE, SMALL_LAB, TABLE, body_at, named_scene, views_of
 
 NAMES = ("l_bracket", "wedge", "stepped_shaft", "wedge")
-NOISE = DepthNoise(per_m=0.08 / (648 * 0.018), floor_m=2e-4)
 CONFIG = FindConfig(
     field_cells=48, templates=TemplateConfig(rays=1500), score=ScoreConfig(columns=80, frames=8)
 )
@@ -40,15 +36,17 @@ def scene() -> TableScene:
 
 
 @lru_cache(maxsize=1)
-def views() -> tuple[ViewPoints, ...]:
-    return sample_views(scene().intrinsics, scene().frames, NOISE, SampleConfig(stride=1))
+def evidence() -> tuple[Any, ...]:
+    """Return what `find_objects` looks at."""
+    views = views_of(scene())
+    plane = find_table(views, NOISE).plane
+    assert plane is not None
+    return scene().intrinsics, scene().frames, views, plane, NOISE
 
 
 def find(wanted: list[Wanted] | None, folder: Path, told: list[str] | None = None) -> SearchResult:
-    plane = find_table(views(), NOISE).plane
-    assert plane is not None
     return find_objects(
-        scene().intrinsics, scene().frames, views(), plane, NOISE, scene().models, wanted, CONFIG,
+        *evidence(), scene().models, wanted, CONFIG,
         field_folder=folder, told=None if told is None else told.append,
     )  # fmt: skip
 
@@ -109,18 +107,14 @@ def test_one_too_many_is_not_placed_and_says_why(folder: Path):
 
 
 def test_bad_questions_are_refused():
-    plane = find_table(views(), NOISE).plane
-    assert plane is not None
-    twice = [Wanted(obj_id=1, instance=0), Wanted(obj_id=1, instance=0)]
-    rest = (scene().intrinsics, scene().frames, views(), plane, NOISE)
-    refused("same instance", find_objects, *rest, scene().models, twice, CONFIG)
-    refused("no models", find_objects, *rest, {}, None, CONFIG)
-    with pytest.raises(InputError, match="needs both"):
-        find_objects(scene().intrinsics, [], [], plane, NOISE, scene().models, None, CONFIG)
+    twice = [Wanted(obj_id=1, instance=0)] * 2
+    refused("same instance", find_objects, *evidence(), scene().models, twice, CONFIG)
+    refused("no models", find_objects, *evidence(), {}, None, CONFIG)
+    camera, _, _, *rest = evidence()
+    refused("needs both", find_objects, camera, [], [], *rest, scene().models, None, CONFIG)
 
 
 # --- Near-symmetric poses told apart: a shape with one small feature, turned the wrong way.
-PLANE = SupportPlane(T_world_table=np.eye(4), rms_m=1e-3, inliers=1000)
 LATTICE = ScoreConfig(columns=160, frames=10)
 HALF_TURN = se3.from_rt(se3.exp_so3([0.0, 0.0, np.pi]), np.zeros(3))
 QUARTER = se3.from_rt(se3.exp_so3([0.0, 0.0, np.pi / 2]), np.zeros(3))
@@ -145,27 +139,27 @@ def marked_scene(knob_m: float) -> tuple[TableScene, Sought]:
     )  # fmt: skip
     lab = resized(replace(SMALL_LAB, views=10), 320)
     made = table_scene({1: model}, [pose], lab, np.random.default_rng(4))
-    body = make_body(replace(pose, T_world_obj=np.eye(4)), model, 64, 100)
-    return made, Sought(body=body, sameness=make_sameness(model))
+    return made, sought_of(model, 64)
+
+
+def sought_of(model: ObjectModel, cells: int) -> Sought:
+    return Sought(body=body_at(model, cells, 100), sameness=make_sameness(model))
 
 
 def decide(knob_m: float, start: np.ndarray, near: np.ndarray) -> Decision:
     made, sought = marked_scene(knob_m)
-    views = sample_views(made.intrinsics, made.frames, NOISE, SampleConfig(stride=1))
-    cloud = fuse(views, NOISE, PLANE).fine
-    canvas = make_canvas(made.intrinsics, made.frames, NOISE, PLANE, LATTICE)
+    cloud = fuse(views_of(made), NOISE, TABLE).fine
+    canvas = make_canvas(made.intrinsics, made.frames, NOISE, TABLE, LATTICE)
     T = made.truth[0].T_world_obj @ start
     return decide_rivals(sought, T, canvas.table, (canvas, cloud, near))
 
 
 def test_a_single_rival_that_is_right_replaces_a_wrong_pose():
-    knob_m = 0.012
-    made, sought = marked_scene(knob_m)
-    got = decide(knob_m, HALF_TURN, HALF_TURN[None])
+    made, sought = marked_scene(0.012)
+    got = decide(0.012, HALF_TURN, HALF_TURN[None])
     assert got.changed
     assert sought.sameness.distance(made.truth[0].T_world_obj, got.T_world_obj) < 0.003
-    assert got.contrast is not None
-    assert got.contrast > 0.1
+    assert got.contrast is not None and got.contrast > 0.1
     assert got.T_rival is not None
 
 
@@ -174,8 +168,7 @@ def test_the_right_pose_stays_and_its_rival_is_named():
     got = decide(0.012, np.eye(4), np.stack([HALF_TURN, QUARTER]))
     assert not got.changed
     assert sought.sameness.distance(made.truth[0].T_world_obj, got.T_world_obj) < 0.003
-    assert got.contrast is not None
-    assert got.contrast > 0.1
+    assert got.contrast is not None and got.contrast > 0.1
     assert got.T_rival is not None
     assert sought.sameness.distance(made.truth[0].T_world_obj, got.T_rival) > 0.01
 
@@ -183,8 +176,7 @@ def test_the_right_pose_stays_and_its_rival_is_named():
 def test_what_cannot_be_seen_is_undecided():
     """The knob is 0.3 mm: both ways round explain the images alike."""
     got = decide(0.0003, np.eye(4), HALF_TURN[None])
-    assert got.contrast is not None
-    assert got.contrast < 0.1
+    assert got.contrast is not None and got.contrast < 0.1
 
 
 def test_a_fit_of_the_same_pose_that_ended_a_little_apart_is_no_rival():
@@ -196,13 +188,6 @@ def test_a_fit_of_the_same_pose_that_ended_a_little_apart_is_no_rival():
 
 
 # --- What is left over: clusters of it, starts in it, and objects it makes suspect.
-
-
-def sought(name: str) -> Sought:
-    start = ObjectPose(obj_id=part(name).obj_id, instance=0, T_world_obj=np.eye(4))
-    return Sought(
-        body=make_body(start, part(name), 48, 100), sameness=make_sameness(part(name))
-    )  # fmt: skip
 
 
 def surface(name: str, T: np.ndarray, count: int, rng: np.random.Generator) -> Cloud:
@@ -223,7 +208,7 @@ def at(s: Sought, T: np.ndarray) -> tuple[Sought, Candidate]:
 
 def test_an_object_in_the_wrong_turn_is_suspect_and_its_neighbour_is_not():
     rng = np.random.default_rng(0)
-    shaft, mug = sought("stepped_shaft"), sought("mug")
+    shaft, mug = (sought_of(part(name), 48) for name in ("stepped_shaft", "mug"))
     T_shaft = se3.from_rt(se3.exp_so3([np.pi / 2, 0, 0]), [0.0, 0.0, 0.1])
     T_mug = se3.from_translation([0.25, 0.0, 0.05])
     parts = (("stepped_shaft", T_shaft), ("mug", T_mug))

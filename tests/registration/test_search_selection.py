@@ -9,9 +9,7 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import symmetry_transforms
 from realsim.geometry.metrics import mssd
 from realsim.geometry.parts import part
-from realsim.records import ObjectPose, SupportPlane
-from realsim.registration.body import Body, footprint, make_body
-from realsim.registration.evidence import DepthNoise
+from realsim.registration.body import Body, footprint
 from realsim.registration.search.candidates import Candidate, Sought, candidate
 from realsim.registration.search.sameness import distinct, make_sameness
 from realsim.registration.search.scoring import (
@@ -30,28 +28,22 @@ from realsim.registration.search.selection import (
     select_any,
     select_pair,
 )
-from table_scenes import named_scene, part_models, small_scene
+from table_scenes import NOISE, TABLE, body_at, named_scene, part_models, small_scene
 
 SEED = 3
-NOISE = DepthNoise(per_m=0.08 / (648 * 0.018), floor_m=2e-4)
-PLANE = SupportPlane(T_world_table=np.eye(4), rms_m=1e-3, inliers=1000)
 CONFIG = ScoreConfig(columns=80, frames=6)
 
 
 @lru_cache(maxsize=1)
 def canvas() -> Canvas:
     scene = small_scene(SEED)
-    return make_canvas(scene.intrinsics, scene.frames[:6], NOISE, PLANE, CONFIG)
+    return make_canvas(scene.intrinsics, scene.frames[:6], NOISE, TABLE, CONFIG)
 
 
 @lru_cache(maxsize=1)
 def bodies() -> list[tuple[Body, np.ndarray]]:
     scene = small_scene(SEED)
-    return [
-        (make_body(ObjectPose(obj_id=p.obj_id, instance=0, T_world_obj=np.eye(4)),
-                   scene.models[p.obj_id], 24, 50), p.T_world_obj)
-        for p in scene.truth
-    ]  # fmt: skip
+    return [(body_at(scene.models[p.obj_id], 24, 50), p.T_world_obj) for p in scene.truth]
 
 
 def test_a_render_is_the_footprint_of_every_frame():
@@ -108,15 +100,13 @@ def material() -> tuple[Canvas, list[Candidate], list[int]]:
     scene = named_scene(1, CHOSEN)
     rng = np.random.default_rng(0)
     canvas = make_canvas(
-        scene.intrinsics, scene.frames[:8], NOISE, PLANE, ScoreConfig(columns=80, frames=8)
+        scene.intrinsics, scene.frames[:8], NOISE, TABLE, ScoreConfig(columns=80, frames=8)
     )
     right: list[Candidate] = []
     wrong: list[Candidate] = []
     for p in scene.truth:
-        start = ObjectPose(obj_id=p.obj_id, instance=0, T_world_obj=np.eye(4))
         model = scene.models[p.obj_id]
-        body = make_body(start, model, 24, 50)
-        sought = Sought(body=body, sameness=make_sameness(model))
+        sought = Sought(body=body_at(model, 24, 50), sameness=make_sameness(model))
         right.append(candidate(sought, canvas, p.T_world_obj, "right", True))
         for q in scene.truth:  # everywhere else, turned at random
             shift = q.T_world_obj[:3, 3] - p.T_world_obj[:3, 3]
@@ -138,18 +128,14 @@ def slots() -> list[Slot]:
 def test_the_right_poses_are_chosen():
     canvas, pool, _ = material()
     got = select(canvas, pool, slots())
-    assert {c for c in got.chosen} == {0, 1, 2, 3}
-    assert got.chosen[0] == 0
-    assert got.chosen[2] == 2
-    for s in got.scores:
-        assert s is not None
-        assert s.agree > 0.9
+    assert set(got.chosen) == {0, 1, 2, 3}
+    assert got.chosen[0] == 0 and got.chosen[2] == 2
+    assert all(s is not None and s.agree > 0.9 for s in got.scores)
 
 
 def test_two_of_one_model_never_share_a_pose():
     canvas, pool, _ = material()
-    only = [frozenset([1]), frozenset([1])]
-    got = select(canvas, pool, only)
+    got = select(canvas, pool, [frozenset([1])] * 2)
     assert sorted(map(str, got.chosen)) == ["1", "None"]
 
 
@@ -165,8 +151,7 @@ def test_wrong_poses_alone_are_refused():
     got = select_any(canvas, pool[4:])
     assert all(s is not None and s.per_cell >= LEAST_PER_CELL_UNKNOWN for s in got.scores)
     empty = select(canvas, pool, [frozenset()])
-    assert empty.chosen == (None,)
-    assert empty.scores == (None,)
+    assert empty.chosen == empty.scores == (None,)
 
 
 def test_two_that_stand_in_each_others_places_change_them():

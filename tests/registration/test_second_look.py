@@ -7,11 +7,9 @@ import pytest
 
 from fault_sessions import load_benchmark
 from realsim.geometry import se3
-from realsim.geometry.metrics import mssd_symmetric
 from realsim.records import Mesh, ObjectPose
-from realsim.registration.register import register_scene
 from realsim.registration.second_look import far_moved
-from table_scenes import QUICK, named_scene
+from table_scenes import QUICK, errors_mm, named_scene, register
 
 NAMES = ("gear", "box", "mug")
 shapes = load_benchmark("outside_shapes")
@@ -23,34 +21,36 @@ def scene():
     return named_scene(3, NAMES, 9)
 
 
-def registered(scene, frames, models=None, starts=()):
+def registered(scene, *starts, **other):
     near = [
         replace(t, T_world_obj=t.T_world_obj @ se3.exp([0.02, 0, 0.03, 0.003, -0.002, 0.002]))
         for t in scene.truth
     ]
-    return register_scene(
-        "x", scene.intrinsics, frames, models or scene.models, [*near, *starts], QUICK
-    )
+    return register(scene, [*near, *starts], **other)
 
 
 def worst_mm(scene, found):
-    by = {o.instance: o.T_world_obj for o in found.scene.objects}
-    return 1e3 * max(
-        mssd_symmetric(t.T_world_obj, by[t.instance], scene.models[t.obj_id]) for t in scene.truth
-    )
+    errors = errors_mm(scene, found.scene.objects)
+    return max(errors[t.instance] for t in scene.truth)
+
+
+def with_a_larger(scene, obj_id, factor, about):
+    """Return the models, one of them that many times as large."""
+    model = scene.models[obj_id]
+    larger = Mesh(vertices=(model.mesh.vertices - about) * factor + about, faces=model.mesh.faces)
+    return {**scene.models, obj_id: replace(model, mesh=larger)}
 
 
 @pytest.fixture(scope="module")
 def plain(scene):
-    return registered(scene, scene.frames)
+    return registered(scene)
 
 
 @pytest.mark.slow
 def test_a_view_whose_depth_lies_beside_its_image_is_named_and_left_out(scene, plain):
-    aside = np.roll(scene.frames[5].depth_m, 9, axis=1)
     frames = [*scene.frames]
-    frames[5] = replace(frames[5], depth_m=aside)
-    found = registered(scene, frames)
+    frames[5] = replace(frames[5], depth_m=np.roll(frames[5].depth_m, 9, axis=1))
+    found = registered(scene, frames=frames)
     number = scene.frames[5].index
     said = [f.words for f in found.findings if getattr(f, "index", None) == number]
     assert any("left out" in words for words in said) and number not in found.cameras
@@ -60,9 +60,8 @@ def test_a_view_whose_depth_lies_beside_its_image_is_named_and_left_out(scene, p
 def test_an_object_that_is_not_there_does_not_pull_the_cameras(scene, plain):
     far = scene.truth[0].T_world_obj @ se3.from_translation([0.02, 0.02, 0.0])
     double = ObjectPose(obj_id=scene.truth[0].obj_id, instance=99, T_world_obj=far)
-    found = registered(scene, scene.frames, starts=[double])
-    others = [o for o in found.scene.objects if o.instance != 99]
-    assert len(others) == len(NAMES)
+    found = registered(scene, double)
+    assert len([o for o in found.scene.objects if o.instance != 99]) == len(NAMES)
     assert worst_mm(scene, found) < worst_mm(scene, plain) + 0.2
     for o in found.scene.objects:
         if o.instance == 99:
@@ -72,12 +71,7 @@ def test_an_object_that_is_not_there_does_not_pull_the_cameras(scene, plain):
 @pytest.mark.slow
 def test_a_model_of_the_wrong_size_is_told_so(scene):
     big = scene.truth[1].obj_id
-    models = dict(scene.models)
-    mesh = models[big].mesh
-    models[big] = replace(
-        models[big], mesh=Mesh(vertices=mesh.vertices * 1.09, faces=mesh.faces)
-    )  # fmt: skip
-    found = registered(scene, scene.frames, models)
+    found = registered(scene, models=with_a_larger(scene, big, 1.09, np.zeros(3)))
     of = {o.obj_id: o for o in found.scene.objects}
     assert of[big].verdict != "accepted"
     assert any("smaller than its model's" in r for r in of[big].reasons), of[big].reasons
@@ -86,15 +80,10 @@ def test_a_model_of_the_wrong_size_is_told_so(scene):
 def test_cameras_that_follow_a_model_of_the_wrong_size_leave_no_pose_accepted():
     pair = named_scene(3, ("tube", "knob"), 8)
     tube, knob = pair.truth
-    models = dict(pair.models)
-    mesh = models[tube.obj_id].mesh
-    middle = mesh.vertices.mean(axis=0)
-    large = Mesh(vertices=(mesh.vertices - middle) * 1.07 + middle, faces=mesh.faces)
-    models[tube.obj_id] = replace(models[tube.obj_id], mesh=large)
-    found = registered(pair, pair.frames, models)
+    middle = pair.models[tube.obj_id].mesh.vertices.mean(axis=0)
+    found = registered(pair, models=with_a_larger(pair, tube.obj_id, 1.07, middle))
     by = {o.instance: o for o in found.scene.objects}
-    placed = by[knob.instance].T_world_obj
-    off_mm = 1e3 * mssd_symmetric(knob.T_world_obj, placed, pair.models[knob.obj_id])
+    off_mm = errors_mm(pair, found.scene.objects)[knob.instance]
     assert off_mm < 3.0 or {o.verdict for o in by.values()} <= {"doubtful", "rejected"}
     assert by[tube.instance].verdict != "accepted"
 
@@ -120,7 +109,7 @@ def test_a_plane_on_objects_alone_is_no_table():
         replace(t, T_world_obj=t.T_world_obj @ se3.exp(near * rng.normal(size=6)))
         for t in bare.truth
     ]
-    found = register_scene("x", bare.intrinsics, bare.frames, bare.models, starts, QUICK)
+    found = register(bare, starts)
     assert found.scene.plane is None
     assert not [f for f in found.findings if "sink" in f.words or "float" in f.words]
     assert len(found.scene.objects) == len(picked)

@@ -1,37 +1,33 @@
 """Faults of views are named, and only those: every fault is done on purpose to simulated views."""
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.registration import view_checks
-from realsim.registration.body import make_body
 from realsim.registration.evidence import DepthNoise
 from realsim.registration.find_table import find_table
 from realsim.registration.simulated import table_scene
 from realsim.registration.view_checks import check_views
-from realsim.registration.views import SampleConfig, ViewPoints, sample_views
-from table_scenes import SMALL_LAB, part_models, small_scene
+from realsim.registration.views import ViewPoints
+from refusals import refused
+from table_scenes import SMALL_LAB, bodies_of, part_models, small_scene, true_poses, views_of
 
 NOISE = DepthNoise(per_m=0.008, floor_m=2e-4)
 VIEWS = 16
+sampled = partial(views_of, noise=NOISE, stride=2, edge_reach_px=1)
 
 
 @lru_cache(maxsize=4)
-def views_of(seed: int):
-    scene = small_scene(seed, 6, VIEWS)
-    return sample_views(
-        scene.intrinsics, scene.frames, NOISE, SampleConfig(stride=2, edge_reach_px=1)
-    )
+def views_at(seed: int):
+    return sampled(small_scene(seed, 6, VIEWS))
 
 
-def findings(views, noise=NOISE, **more):
-    plane = find_table(views, noise).plane
-    return check_views(views, plane, noise, **more)
+def findings(views, noise=NOISE):
+    return check_views(views, find_table(views, noise).plane, noise)
 
 
 def with_pose(view, T):
@@ -49,27 +45,21 @@ def kinds(found):
 
 @pytest.mark.parametrize(("seed", "views"), [(1, VIEWS), (1, 1), (1, 2)])
 def test_sound_views_are_left_alone(seed, views):
-    assert findings(views_of(seed)[:views]) == ()
+    assert findings(views_at(seed)[:views]) == ()
 
 
 def test_a_bad_hand_eye_is_no_fault_of_the_views():
     scene = small_scene(1, 6, VIEWS)
     config = replace(SMALL_LAB, views=VIEWS, hand_eye_mm=1.5, hand_eye_deg=0.4)
     bad = table_scene(part_models(), scene.truth, config, np.random.default_rng(4))
-    views = sample_views(bad.intrinsics, bad.frames, NOISE, SampleConfig(stride=2, edge_reach_px=1))
-    assert findings(views) == ()
+    assert findings(sampled(bad)) == ()
 
 
 def test_views_without_depth_are_named():
-    views = list(views_of(1))
-    none = replace(views[2], points=views[2].points[:0], pixels=views[2].pixels[:0])
-    views[2] = replace(none, measured_share=0.0)
-    views[5] = replace(
-        views[5], points=views[5].points[:300], pixels=views[5].pixels[:300], measured_share=0.03
-    )
-    views[7] = replace(
-        views[7], points=views[7].points[:20], pixels=views[7].pixels[:20], measured_share=0.01
-    )
+    views = list(views_at(1))
+    for k, left, share in ((2, 0, 0.0), (5, 300, 0.03), (7, 20, 0.01)):
+        few = replace(views[k], points=views[k].points[:left], pixels=views[k].pixels[:left])
+        views[k] = replace(few, measured_share=share)
     found = findings(views)
     assert kinds(found) == {2: "no_depth", 5: "little_depth", 7: "little_depth"}
     assert [f.exclude for f in found] == [True, False, True]
@@ -77,7 +67,7 @@ def test_views_without_depth_are_named():
 
 
 def test_a_view_with_a_displaced_camera_is_named():
-    views = list(views_of(1))
+    views = list(views_at(1))
     views[7] = off_by(views[7], 15, 3)
     found = findings(views)
     assert kinds(found) == {7: "table_off"} and found[0].exclude
@@ -85,7 +75,7 @@ def test_a_view_with_a_displaced_camera_is_named():
 
 
 def test_swapped_poses_are_named_with_their_partner():
-    views = list(views_of(1))
+    views = list(views_at(1))
     a, b = views[6], views[12]
     views[6], views[12] = with_pose(a, b.T_world_cam), with_pose(b, a.T_world_cam)
     found = findings(views)
@@ -96,20 +86,20 @@ def test_swapped_poses_are_named_with_their_partner():
 def test_views_of_another_session_are_named():
     # The other session stood on the same table, its cameras where they are said to be.
     wrong = range(10, 16)
-    views = [views_of(2)[k] if k in wrong else v for k, v in enumerate(views_of(1))]
+    views = [views_at(2)[k] if k in wrong else v for k, v in enumerate(views_at(1))]
     found = findings(views)
     assert kinds(found) == dict.fromkeys(wrong, "foreign")
     assert all(f.exclude for f in found)
 
 
 def test_two_views_that_disagree_are_not_told_apart():
-    found = findings([views_of(1)[0], views_of(2)[1]])
+    found = findings([views_at(1)[0], views_at(2)[1]])
     assert kinds(found) == {None: "all_disagree"} and not found[0].exclude
     assert "depth's unit" in found[0].words and "aligned to the colour" in found[0].words
 
 
 def test_a_slipped_mount_is_named_with_the_view_it_begins_at():
-    views = [off_by(v, 10, 3) if k >= 11 else v for k, v in enumerate(views_of(1))]
+    views = [off_by(v, 10, 3) if k >= 11 else v for k, v in enumerate(views_at(1))]
     found = findings(views)
     assert kinds(found) == dict.fromkeys(range(11, VIEWS), "slipped")
     assert "before view 11" in found[0].words
@@ -132,46 +122,39 @@ def in_mm(Ts):
     ],
 )
 def test_a_mistake_of_all_poses_is_named(mistake, words):
-    wrong = mistake(np.stack([v.T_world_cam for v in views_of(1)]))
-    found = findings([with_pose(v, T) for v, T in zip(views_of(1), wrong, strict=True)])
+    wrong = mistake(np.stack([v.T_world_cam for v in views_at(1)]))
+    found = findings([with_pose(v, T) for v, T in zip(views_at(1), wrong, strict=True)])
     assert kinds(found) == {None: "all_disagree"}
     assert words in found[0].words
 
 
 def test_a_wrong_depth_unit_is_named():
     noise = DepthNoise(per_m=NOISE.per_m / 10, floor_m=NOISE.floor_m * 10)
-    views = [replace(v, points=v.points * np.float32(10)) for v in views_of(1)]
+    views = [replace(v, points=v.points * np.float32(10)) for v in views_at(1)]
     found = findings(views, noise)
     assert kinds(found) == {None: "all_disagree"} and "ten times too large" in found[0].words
 
 
 def test_after_registration_views_that_fit_no_object_are_named(monkeypatch):
     scene = small_scene(1, 6, VIEWS)
-    bodies = [make_body(p, scene.models[p.obj_id], 48, 200) for p in scene.truth]
-    Ts = [p.T_world_obj for p in scene.truth]
-    plane = find_table(views_of(1), NOISE).plane
-    sound = check_views(views_of(1), plane, NOISE, bodies=bodies, Ts_world_obj=Ts)
-    assert sound == ()
+    plane = find_table(views_at(1), NOISE).plane
+    objects = {"bodies": bodies_of(scene, 48), "Ts_world_obj": true_poses(scene)}
+    assert check_views(views_at(1), plane, NOISE, **objects) == ()
     # With the check against other views switched off, the objects alone tell.
     monkeypatch.setattr(view_checks, "PARTLY_SHARE", 2.0)
     monkeypatch.setattr(view_checks, "FOREIGN_SHARE", 2.0)
-    views = [*views_of(1)[:3], replace(views_of(2)[6], index=9)]
-    found = check_views(views, plane, NOISE, bodies=bodies, Ts_world_obj=Ts)
+    views = [*views_at(1)[:3], replace(views_at(2)[6], index=9)]
+    found = check_views(views, plane, NOISE, **objects)
     assert kinds(found) == {9: "objects_off"} and found[0].exclude
 
 
 def test_senseless_calls_are_errors():
-    with pytest.raises(InputError, match="no views"):
-        check_views([], None, NOISE)
-    with pytest.raises(InputError, match="0 objects have 1 poses"):
-        check_views(views_of(1), None, NOISE, Ts_world_obj=[np.eye(4)])
+    refused("no views", check_views, [], None, NOISE)
+    poses = [np.eye(4)]
+    refused("0 objects have 1 poses", check_views, views_at(1), None, NOISE, Ts_world_obj=poses)
 
 
 # --- The table is found without any object's pose, and moves with the world.
-
-
-def moved(views, T):
-    return [replace(v, T_world_cam=T @ v.T_world_cam) for v in views]
 
 
 def sheet(plane_z: float, half: float, n: int, rng, middle=(0.0, 0.0)):
@@ -191,7 +174,7 @@ def view_of_points(index: int, eye, points_world) -> ViewPoints:
 
 
 def test_the_true_table_is_found():
-    found = find_table(views_of(1), NOISE)
+    found = find_table(views_at(1), NOISE)
     assert found.plane is not None and found.reason == ""
     T = found.plane.T_world_table
     # The hand-eye is off by 0.5 mm and 0.1 deg, the arm by a little more.
@@ -205,10 +188,10 @@ def test_the_true_table_is_found():
 
 
 def test_the_table_moves_with_the_world():
-    views = views_of(1)
     rng = np.random.default_rng(3)
     T = se3.from_rt(se3.exp_so3([0.3, -0.4, 1.1]), rng.normal(size=3))
-    a, b = (find_table(v, NOISE).plane for v in (views, moved(views, T)))
+    moved = [with_pose(v, T @ v.T_world_cam) for v in views_at(1)]
+    a, b = (find_table(v, NOISE).plane for v in (views_at(1), moved))
     assert a is not None and b is not None
     normal = T[:3, :3] @ a.T_world_table[:3, 2]
     assert np.degrees(np.arccos(np.clip(normal @ b.T_world_table[:3, 2], -1, 1))) < 0.05
@@ -248,7 +231,7 @@ def test_reasons_are_given_where_there_is_no_table():
     found = find_table([view_of_points(0, (0.0, 0.1, 0.6), cloud)], NOISE)
     assert found.plane is None and "largest plane" in found.reason
     empty = replace(
-        views_of(1)[0], points=np.zeros((0, 3), np.float32), pixels=np.zeros((0, 2), np.int32)
+        views_at(1)[0], points=np.zeros((0, 3), np.float32), pixels=np.zeros((0, 2), np.int32)
     )
     found = find_table([empty], NOISE)
     assert found.plane is None and "0 trusted points" in found.reason

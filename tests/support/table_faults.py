@@ -12,8 +12,8 @@ from realsim.arrays import Array32, Int32
 from realsim.geometry.camera import ray_table
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.simulated import TableScene
-from realsim.registration.simulated_lab import table_square
-from realsim.rendering.rays import BACKGROUND, PlacedMesh, RayScene, rotated
+from realsim.rendering.rays import BACKGROUND, RayScene, rotated
+from table_scenes import things_of
 
 MARGIN_PX = 1
 """Pixels around an object whose match also fails: a matching window is wider than one pixel."""
@@ -21,10 +21,7 @@ MARGIN_PX = 1
 
 def seen_instances(scene: TableScene, views: Sequence[int]) -> Int32:
     """Return which instance each pixel really shows (V, H, W); -1 = the table or nothing."""
-    placed = [
-        PlacedMesh(p.instance, scene.models[p.obj_id].mesh, p.T_world_obj) for p in scene.truth
-    ]
-    things = [*placed, PlacedMesh(BACKGROUND, table_square((0.0, 0.0)), np.eye(4))]
+    things = things_of(scene)
     world = RayScene(things)
     # The last entry answers -1, nothing.
     instances = np.array([*(p.instance for p in things), BACKGROUND], np.int32)
