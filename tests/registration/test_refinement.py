@@ -1,7 +1,7 @@
 """Laws and known answers of the joint refinement of objects, cameras, table and depth bias."""
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -11,9 +11,8 @@ from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
-from realsim.geometry.metrics import mssd_symmetric
 from realsim.geometry.parts import part
-from realsim.registration.body import Body, make_body
+from realsim.registration.body import Body
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.intake import Intake, take_in
 from realsim.registration.refinement.config import CameraPrior, PointConfig, RefineConfig
@@ -25,11 +24,11 @@ from realsim.registration.refinement.uncertainty import (
     object_covariance,
     seen_poses,
 )
-from realsim.registration.simulated import TableLabConfig, TableScene, scatter_objects, table_scene
+from realsim.registration.simulated import TableLabConfig, TableScene
 from realsim.rendering.depth_sensors.model import DepthSensorModel
-from table_scenes import SMALL_LAB, named_scene, part_models, small_scene
+from refusals import refused
+from table_scenes import SMALL_LAB, bodies_of, errors_mm, named_scene, scene_of, small_scene
 
-NAMES = ("box", "wedge", "l_bracket", "elbow", "flange")
 DISPARITY_PER_M = 648 * 0.018
 """Focal length [px] times baseline [m]: pixels of disparity per inverse depth."""
 ALL_POINTS = RefineConfig(
@@ -59,10 +58,9 @@ class Case:
         )  # fmt: skip
 
     def object_errors_mm(self, refined: Refined) -> Array:
-        return np.array([
-            1e3 * mssd_symmetric(p.T_world_obj, T, self.scene.models[p.obj_id])
-            for p, T in zip(self.scene.truth, refined.poses, strict=True)
-        ])  # fmt: skip
+        found = zip(self.scene.truth, refined.poses, strict=True)
+        placed = [replace(p, T_world_obj=T) for p, T in found]
+        return np.array([*errors_mm(self.scene, placed).values()])
 
     def camera_errors(self, cameras: Array) -> tuple[float, float]:
         """Median error of the cameras [mm, deg]."""
@@ -77,16 +75,12 @@ class Case:
 
 def case_of(scene: TableScene) -> Case:
     intake = take_in(scene.intrinsics, scene.frames, RegistrationConfig())
-    bodies = [make_body(p, scene.models[p.obj_id], 96, 400) for p in scene.truth]
-    return Case(scene, intake, bodies)
+    return Case(scene, intake, bodies_of(scene, 96, 400))
 
 
-def made(seed: int, config: TableLabConfig, names: tuple[str, ...] = NAMES) -> Case:
-    rng = np.random.default_rng(seed)
-    models = {part(n).obj_id: part_models()[part(n).obj_id] for n in names}
-    meshes = {i: m.mesh for i, m in models.items()}
-    placed = scatter_objects(meshes, list(models), config, rng)
-    return case_of(table_scene(models, placed.objects, config, rng))
+def made(config: TableLabConfig) -> Case:
+    ids = [part(name).obj_id for name in ("box", "wedge", "l_bracket", "elbow", "flange")]
+    return case_of(scene_of(ids, config, np.random.default_rng(0)))
 
 
 def starts_off(case: Case) -> list[Array]:
@@ -105,7 +99,7 @@ def noisy() -> tuple[Case, Refined]:
 @lru_cache(maxsize=1)
 def exact() -> Case:
     """No noise, no error of the arm; the hand-eye is off by 0.5 mm and 0.1 deg."""
-    return made(0, NO_NOISE)
+    return made(NO_NOISE)
 
 
 def seen_alike(a: Refined, b: Refined, mm: float, deg: float) -> None:
@@ -169,11 +163,10 @@ def test_without_noise_the_hand_eye_is_found():
 def test_objects_elsewhere_are_refused():
     case, _ = noisy()
     far = [b.T_start @ se3.from_translation([0, 0, 5.0]) for b in case.bodies]
-    with pytest.raises(DegenerateError, match="nothing to refine cameras with"):
-        case.refined(poses=far, plane=None)
+    no_cameras = "nothing to refine cameras with"
+    refused(no_cameras, case.refined, poses=far, plane=None, error=DegenerateError)
     # The table is used around objects only, so without any there is nothing at all.
-    with pytest.raises(DegenerateError, match="0 of the table"):
-        case.refined(bodies=[], poses=[])
+    refused("0 of the table", case.refined, bodies=[], poses=[], error=DegenerateError)
 
 
 # --- known answers -------------------------------------------------------------------------------
@@ -205,7 +198,7 @@ def test_sigma_of_the_views_is_the_arms():
 
 @pytest.mark.slow
 def test_a_disparity_bias_is_found():
-    case = made(0, replace(SMALL_LAB, bias_px=0.1))
+    case = made(replace(SMALL_LAB, bias_px=0.1))
     refined = case.refined()
     true = -0.1 / DISPARITY_PER_M
     sigma = np.sqrt(np.diag(refined.covariance.shared[BIAS, BIAS]))
@@ -221,32 +214,24 @@ def test_a_disparity_bias_is_found():
 
 ALL_SEEN = ("wedge", "l_bracket", "elbow", "t_profile")
 """Parts without a symmetry about an axis: every turn is seen."""
-SEEDS = range(3)
 
 
-@lru_cache(maxsize=8)
-def refined_scene(seed: int) -> tuple[TableScene, list[Body], Refined]:
+@cache
+def refined_case(seed: int) -> tuple[Case, Refined, list[list[SeenPose]]]:
+    """Return a case, what it is refined to, and its objects as the views see them."""
     case = case_of(named_scene(seed, ALL_SEEN))
-    return case.scene, case.bodies, case.refined()
-
-
-@lru_cache(maxsize=8)
-def seen(seed: int) -> list[list[SeenPose]]:
-    scene, bodies, refined = refined_scene(seed)
-    return seen_poses(refined, bodies, scene.intrinsics)
+    refined = case.refined()
+    return case, refined, seen_poses(refined, case.bodies, case.scene.intrinsics)
 
 
 def normalised(xi: Array, C: Array) -> float:
     return float(xi @ np.linalg.solve(C, xi)) / len(xi)
 
 
-# --- laws ----------------------------------------------------------------------------------------
-
-
 def test_covariances_are_symmetric_and_positive():
-    _, bodies, refined = refined_scene(0)
-    matrices = [object_covariance(refined, b, k) for k, b in enumerate(bodies)]
-    matrices += [s.covariance for of in seen(0) for s in of] + list(refined.covariance.views)
+    case, refined, seen = refined_case(0)
+    matrices = [object_covariance(refined, b, k) for k, b in enumerate(case.bodies)]
+    matrices += [s.covariance for of in seen for s in of] + list(refined.covariance.views)
     matrices.append(refined.covariance.shared)
     for C in matrices:
         np.testing.assert_allclose(C, C.T, atol=1e-9 * np.abs(C).max())
@@ -255,10 +240,10 @@ def test_covariances_are_symmetric_and_positive():
 
 def test_covariance_in_a_view_is_that_of_samples_of_everything():
     """Drawn together with their correlations: object, hand-eye and view."""
-    scene, bodies, refined = refined_scene(0)
+    case, refined, seen = refined_case(0)
     rng = np.random.default_rng(1)
-    k, v, body = 2, 5, bodies[2]
-    C = refined.covariance
+    k, v, body = 2, 5, case.bodies[2]
+    told, C = seen[k][v], refined.covariance
     at = np.r_[
         np.arange(OBJECTS + 6 * k, OBJECTS + 6 * k + 6), np.arange(HAND_EYE.start, HAND_EYE.stop)
     ]
@@ -270,33 +255,26 @@ def test_covariance_in_a_view_is_that_of_samples_of_everything():
     c = se3.from_translation(body.center_obj)
     object_ = refined.poses[k] @ c @ se3.exp(x[:, :6]) @ se3.invert(c)
     camera = refined.cameras[v] @ se3.exp(x[:, 6:12] + x[:, 12:])
-    T = seen(0)[k][v].T_cam_obj
-    xi = se3.log(se3.invert(T) @ se3.invert(camera) @ object_)
-    expected = seen(0)[k][v].covariance
-    scale = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(
-        np.cov(xi.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.04
-    )
+    xi = se3.log(se3.invert(told.T_cam_obj) @ se3.invert(camera) @ object_)
+    scale = np.sqrt(np.outer(*2 * [np.diag(told.covariance)]))
+    np.testing.assert_allclose(np.cov(xi.T) / scale, told.covariance / scale, atol=0.04)
     # And in pixels.
-    every = max(1, len(body.samples) // 40)
-    points = body.samples[::every]
+    points = body.samples[:: max(1, len(body.samples) // 40)]
     uv = np.stack([
-        project(scene.intrinsics, se3.transform(se3.invert(cam) @ obj, points))
+        project(case.scene.intrinsics, se3.transform(se3.invert(cam) @ obj, points))
         for cam, obj in zip(camera[:1500], object_[:1500], strict=True)
     ])  # fmt: skip
-    spread = np.sqrt(uv.var(0).sum(-1).mean())
-    assert seen(0)[k][v].sigma_px == pytest.approx(spread, rel=0.05)
+    assert told.sigma_px == pytest.approx(np.sqrt(uv.var(0).sum(-1).mean()), rel=0.05)
 
 
 def test_a_move_of_everything_is_common_and_what_is_left_is_own():
-    _, bodies, refined = refined_scene(0)
-    moves = moves_of_all(bodies, refined.state)
+    case, refined, _ = refined_case(0)
+    moves = moves_of_all(case.bodies, refined.state)
     S = np.diag(np.square([1e-3, 2e-3, 1e-3, 1e-4, 2e-4, 3e-4]))
 
     def told(C: Array) -> tuple[Array, Array]:
-        return common_and_own(
-            replace(refined, covariance=replace(refined.covariance, shared=C)), bodies
-        )
+        of_everything = replace(refined.covariance, shared=C)
+        return common_and_own(replace(refined, covariance=of_everything), case.bodies)
 
     common, own = told(moves @ S @ moves.T)
     np.testing.assert_allclose(common, S, rtol=1e-3, atol=1e-13)
@@ -315,19 +293,17 @@ def test_a_move_of_everything_is_common_and_what_is_left_is_own():
 @pytest.mark.slow
 def test_errors_are_as_large_as_the_covariance_says():
     """The normalised square of six errors is 1 on average."""
-    in_world: list[float] = []
-    in_views: list[float] = []
-    hands: list[float] = []
-    for seed in SEEDS:
-        scene, bodies, refined = refined_scene(seed)
-        off = refined.state.hand_eye - se3.log(se3.invert(scene.T_ee_cam) @ scene.T_ee_cam_true)
+    in_world, in_views, hands = [], [], []
+    for seed in range(3):
+        case, refined, seen = refined_case(seed)
+        off = refined.state.hand_eye - case.hand_eye_true
         hands.append(normalised(off, refined.covariance.shared[HAND_EYE, HAND_EYE]))
-        Ts_cam_world = se3.invert(scene.Ts_world_cam)
-        for k, (p, body) in enumerate(zip(scene.truth, bodies, strict=True)):
-            xi = se3.log(se3.invert(refined.poses[k]) @ p.T_world_obj)
+        Ts_cam_world = se3.invert(case.scene.Ts_world_cam)
+        for k, body in enumerate(case.bodies):
+            xi = se3.log(se3.invert(refined.poses[k]) @ body.T_start)
             in_world.append(normalised(xi, object_covariance(refined, body, k)))
-            for s, T in zip(seen(seed)[k], Ts_cam_world, strict=True):
-                xi = se3.log(se3.invert(s.T_cam_obj) @ T @ p.T_world_obj)
+            for s, T in zip(seen[k], Ts_cam_world, strict=True):
+                xi = se3.log(se3.invert(s.T_cam_obj) @ T @ body.T_start)
                 in_views.append(normalised(xi, s.covariance))
     assert 0.3 < np.mean(in_world) < 3 and 0.3 < np.median(in_world) < 3
     assert 0.3 < np.mean(in_views) < 3

@@ -11,8 +11,7 @@ from realsim.geometry import se3
 from realsim.geometry.normal_equations import System, covariances, solve
 from realsim.geometry.parts import part
 from realsim.geometry.seen_surface import seen_distances
-from realsim.records import ObjectPose
-from realsim.registration.body import Body, make_body
+from realsim.registration.body import Body
 from realsim.registration.refinement.equations import (
     BIAS,
     BLOCK,
@@ -31,6 +30,7 @@ from realsim.registration.refinement.equations import (
 )
 from realsim.registration.refinement.points import exact_residuals, thin_share
 from realsim.registration.refinement.priors import OF_FIXED, OF_VIEW
+from table_scenes import body_at
 
 TINY_M = 1e-9
 """A residual so small that the ray meets the surface at the point itself."""
@@ -39,8 +39,7 @@ STEP = 1e-5
 
 @pytest.fixture(scope="module")
 def box() -> Body:
-    pose = ObjectPose(obj_id=1, instance=0, T_world_obj=np.eye(4))
-    return make_body(pose, part("box"), 64, 200)
+    return body_at(part("box"), 64, 200)
 
 
 # --- derivatives ---------------------------------------------------------------------------------
@@ -190,6 +189,15 @@ def test_noise_of_a_point_is_not_in_its_derivative(box: Body):
 # --- residuals -----------------------------------------------------------------------------------
 
 
+def residuals(exact: bool, body: Body, points_cam: Array, T_obj_cam: Array) -> tuple[Array, ...]:
+    """Return places, distances and normals by the triangles, or by the field."""
+    views, Ms, eyes = np.zeros(len(points_cam), np.int32), T_obj_cam[None], T_obj_cam[None, :3, 3]
+    eyes = np.ascontiguousarray(eyes)
+    if exact:
+        return exact_residuals(body, points_cam, views, Ms, eyes)
+    return seen_distances(body.field.lattice, 1.0, points_cam, views, (Ms, eyes), False)
+
+
 @pytest.mark.parametrize("exact", [False, True])
 def test_residual_is_the_distance_along_the_normal(box: Body, exact: bool):
     rng = np.random.default_rng(1)
@@ -201,14 +209,7 @@ def test_residual_is_the_distance_along_the_normal(box: Body, exact: bool):
     beyond = rng.uniform(-2e-3, 2e-3, seen.sum())
     points_obj = box.samples[seen] + beyond[:, None] * box.normals[seen]
     points_cam = se3.transform(se3.invert(T_obj_cam), points_obj)
-    views = np.zeros(len(points_cam), np.int32)
-    Ms, eyes = T_obj_cam[None], np.ascontiguousarray(T_obj_cam[None, :3, 3])
-    if exact:
-        places, distances, normals = exact_residuals(box, points_cam, views, Ms, eyes)
-    else:
-        places, distances, normals = seen_distances(
-            box.field.lattice, 1.0, points_cam, views, (Ms, eyes), False
-        )
+    places, distances, normals = residuals(exact, box, points_cam, T_obj_cam)
     np.testing.assert_allclose(places, points_obj, atol=1e-12)
     np.testing.assert_allclose(distances, beyond, atol=2e-5 if not exact else 1e-6)
     np.testing.assert_allclose(normals, box.normals[seen], atol=0.02 if not exact else 1e-5)
@@ -216,8 +217,7 @@ def test_residual_is_the_distance_along_the_normal(box: Body, exact: bool):
 
 @pytest.mark.parametrize("exact", [False, True])
 def test_point_behind_a_thin_wall_belongs_to_the_side_that_was_seen(exact: bool):
-    pose = ObjectPose(obj_id=part("mug").obj_id, instance=0, T_world_obj=np.eye(4))
-    mug = make_body(pose, part("mug"), 64, 4000)
+    mug = body_at(part("mug"), 64, 4000)
     assert thin_share(mug, 3.0) > 0.2 > thin_share(mug, 0.5)
     # Outer wall, seen from outside; the points lie a little more than the wall behind it.
     radial = mug.samples[:, :2] / np.linalg.norm(mug.samples[:, :2], axis=1, keepdims=True)
@@ -233,14 +233,7 @@ def test_point_behind_a_thin_wall_belongs_to_the_side_that_was_seen(exact: bool)
     depth = 0.0025
     points = mug.samples[some] - depth * mug.normals[some]
     points_cam = se3.transform(se3.invert(T_obj_cam), points)
-    views = np.zeros(len(some), np.int32)
-    Ms, eyes = T_obj_cam[None], eye[None]
-    if exact:
-        _, distances, normals = exact_residuals(mug, points_cam, views, Ms, eyes)
-    else:
-        _, distances, normals = seen_distances(
-            mug.field.lattice, 1.0, points_cam, views, (Ms, eyes), False
-        )
+    _, distances, normals = residuals(exact, mug, points_cam, T_obj_cam)
     cosine = np.sum(normals * mug.normals[some], axis=1)
     assert np.median(cosine) > 0.98
     assert np.median(distances) == pytest.approx(-depth, abs=4e-4 if not exact else 1e-4)
@@ -270,12 +263,17 @@ def random_system(seed: int, objects: int, views: int, each: int = 15) -> System
     return system
 
 
+def of_views(system: System) -> list[slice]:
+    """Return where the unknowns of each view are."""
+    S = len(system.A)
+    return [slice(S + 6 * v, S + 6 * v + 6) for v in range(len(system.D))]
+
+
 def dense(system: System) -> tuple[Array, Array]:
-    S, V = len(system.A), len(system.D)
-    N, n = np.zeros((S + 6 * V, S + 6 * V)), np.zeros(S + 6 * V)
+    S, size = len(system.A), len(system.A) + 6 * len(system.D)
+    N, n = np.zeros((size, size)), np.zeros(size)
     N[:S, :S], n[:S] = system.A, system.a
-    for v in range(V):
-        at = slice(S + 6 * v, S + 6 * v + 6)
+    for v, at in enumerate(of_views(system)):
         N[:S, at], N[at, :S] = system.B[v], system.B[v].T
         N[at, at], n[at] = system.D[v], system.d[v]
     return N, n
@@ -291,8 +289,7 @@ def test_elimination_of_views_is_the_dense_solution():
     np.testing.assert_allclose(np.concatenate([shared, views.ravel()]), x, rtol=1e-8, atol=1e-10)
     C, found = np.linalg.inv(N), covariances(system)
     np.testing.assert_allclose(found.shared, C[:S, :S], rtol=1e-8, atol=1e-10)
-    for v in range(len(system.D)):
-        at = slice(S + 6 * v, S + 6 * v + 6)
+    for v, at in enumerate(of_views(system)):
         np.testing.assert_allclose(found.cross[v], C[:S, at], rtol=1e-8, atol=1e-10)
         np.testing.assert_allclose(found.views[v], C[at, at], rtol=1e-8, atol=1e-10)
 
@@ -311,11 +308,8 @@ def test_an_object_turns_about_its_centre_and_cameras_about_themselves(box: Body
     shared[OBJECTS : OBJECTS + 3] = [0.1, -0.2, 0.05]
     after = step_state(state, [box], shared, np.zeros((2, 6)))
     np.testing.assert_allclose(box.center(after.poses[0]), box.center(T), atol=1e-12)
-    np.testing.assert_allclose(
-        centre_pose(box, after.poses[0]),
-        centre_pose(box, T) @ se3.exp(shared[OBJECTS:]),
-        atol=1e-12,
-    )
+    turned = centre_pose(box, T) @ se3.exp(shared[OBJECTS:])
+    np.testing.assert_allclose(centre_pose(box, after.poses[0]), turned, atol=1e-12)
     xi = rng.normal(size=6)
     claimed = se3.random_transform(rng, 2)
     held = step_state(state, [box], np.r_[xi, np.zeros(OBJECTS)], np.stack([-xi, np.zeros(6)]))
