@@ -21,12 +21,14 @@ from realsim_sim_bridge.slip.engines import (
     make_engine,
     settings_of,
 )
+from realsim_sim_bridge.slip.mujoco_approach import CLEARANCE_M, advanced_fingers, surface_triangles
 from realsim_sim_bridge.slip.mujoco_model import lift_law
 from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import Closing, Grips, PadModel, Replay, SlipBody, SlipPhysics
 from realsim_sim_bridge.validation.specimens import cube_trial
 from refusals import refused
+from trimesh_solids import box
 
 
 def ellipsoid():
@@ -259,3 +261,49 @@ def test_a_neighbour_blocks_and_its_overlap_throws_nothing(engine):
     assert np.abs(seen[:, :3, 3] - start[:3, 3]).max() < 1e-3
     start, seen, forces = standing(engine, cube, table(), off_m=-0.015)
     assert start[1, 3] - seen[-1, 1, 3] > 0.01 and forces[-1].min() > 50.0
+
+
+# --- Fingers are moved together in free air only.
+
+HAND = find_hand()
+
+
+def advanced(parts, Ts, opening=0.08):
+    return advanced_fingers(surface_triangles(parts), Ts, np.full(len(Ts), opening), HAND)
+
+
+def scattered(n, seed=0):
+    rng = np.random.default_rng(seed)
+    return se3.from_rt(se3.random_rotation(rng, n), rng.uniform(-0.03, 0.03, (n, 3)))
+
+
+def test_no_point_of_the_surface_is_nearer_than_the_clearance_and_one_is_as_near():
+    rng = np.random.default_rng(1)
+    parts = (rng.uniform(-0.03, 0.03, (20, 3)), box([0.06, 0.01, 0.02], [0.02, 0.0, 0.0]).vertices)
+    triangles, Ts = surface_triangles(parts), scattered(40)
+    weights = rng.dirichlet(np.ones(3), size=(len(triangles), 3000))
+    points = np.einsum("tnc,tcd->tnd", weights, triangles).reshape(-1, 3)
+    _, _, (low, high) = HAND.boxes(0.0)[0]
+    found, exact = advanced(parts, Ts), 0
+    for T, y in zip(Ts, found, strict=True):
+        p = se3.transform(se3.invert(T), points)
+        across = p[:, [0, 2]]
+        within = np.all((low[[0, 2]] < across) & (across < high[[0, 2]]), axis=1)
+        between = np.abs(p[within & (np.abs(p[:, 1]) < 0.04), 1])
+        if len(between) and between.max() + CLEARANCE_M < 0.04:
+            assert between.max() <= y - CLEARANCE_M + 1e-12
+            exact += y - CLEARANCE_M - between.max() < 0.5e-3
+    assert exact > 10
+
+
+def test_the_fingers_never_open_and_stay_where_nothing_is_between_them():
+    small = (box([0.02, 0.02, 0.02]).vertices,)
+    Ts = scattered(40, 3)
+    assert (advanced(small, Ts, 0.03) <= 0.015).all()
+    away = se3.from_translation([0.0, 0.0, -0.2])[None]
+    assert advanced(small, away) == 0.04
+
+
+def test_a_face_that_passes_through_the_sweep_counts_although_no_corner_is_inside():
+    beam = (box([0.3, 0.03, 0.3]).vertices,)
+    assert np.allclose(advanced(beam, np.eye(4)[None]), 0.015 + CLEARANCE_M)

@@ -3,9 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from realsim.errors import InputError
 from realsim.formats.graspnet.grasp_labels import write_grasp_labels
 from realsim.formats.grasps.scene_grasps import executed
 from realsim.geometry.parts import part
@@ -13,6 +11,7 @@ from realsim_sim_bridge.grasping.analytic import AnalyticConfig, analytic_labels
 from realsim_sim_bridge.school import SchoolConfig
 from realsim_sim_bridge.school.school import run_school
 from realsim_sim_bridge.slip.engines import MujocoSettings
+from refusals import refused
 from school_sessions import NAMES, scene
 
 LABELS = AnalyticConfig(points=40, view_step=2)
@@ -47,5 +46,4 @@ def test_labels_of_a_file_are_taken_instead_and_told_apart(tmp_path):
     for s in sets:
         assert s.parameters["analytic"]["from"] == files[s.obj_id].name
         assert executed(s).any()
-    with pytest.raises(InputError, match="labels"):
-        run_school(scene(), MODELS, config_of(), workers=1, cache=cache)
+    refused("labels", run_school, scene(), MODELS, config_of(), workers=1, cache=cache)

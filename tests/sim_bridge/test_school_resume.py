@@ -2,8 +2,10 @@
 
 import dataclasses
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import Future
 from pathlib import Path
@@ -13,7 +15,7 @@ import pytest
 
 from file_trees import bytes_of
 from realsim.errors import InputError
-from realsim.many import WorkerDiedError, open_pool
+from realsim.many import PoolConfig, WorkerDiedError, open_pool
 from realsim_sim_bridge.school import recompute_scores, run_school, run_school_results
 from realsim_sim_bridge.school.object_slips import in_words
 from realsim_sim_bridge.school.run_record import RUN_FILE, folder_of_run
@@ -272,3 +274,44 @@ def test_only_a_finished_run_gives_way_to_another(tmp_path, whole):
     assert written == [(tmp_path / name).stat().st_mtime_ns for name in grasps]
     (tmp_path / "finished").unlink()
     refused("seed: ", run, tmp_path, other, restart="finished")
+
+
+# --- Robot School on a Ray cluster that loses a worker: it finds what one process finds.
+
+
+def ray_workers_below(pid):
+    """Return the processes that Ray calls workers, below a process."""
+    listed = subprocess.run(
+        ["ps", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    rows = [line.split(None, 2) for line in listed]
+    below = {pid}
+    for _ in range(6):
+        below |= {int(row[0]) for row in rows if int(row[1]) in below}
+    return [int(r[0]) for r in rows if int(r[0]) in below and r[2].startswith("ray::on_node")]
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_finds_what_one_process_finds():
+    pytest.importorskip("ray")
+    objects = scene(at(0, 0), at(0.2, 0.1, instance=1))
+    killed = []
+
+    def kill_one(done, of):
+        def kill():
+            for pid in ray_workers_below(os.getpid())[:1]:
+                os.kill(pid, signal.SIGKILL)
+                killed.append(pid)
+
+        if not killed and 4 <= done < of:
+            threading.Timer(0.05, kill).start()
+
+    where = PoolConfig(workers=2, address="local")
+    settings = {"shard_grasps": 2}
+    found = run_school_results(
+        objects, {1: model()}, small_worlds(), workers=where, progress=kill_one, **settings
+    )
+    alone = run_school_results(objects, {1: model()}, small_worlds(), workers=1, **settings)
+    assert killed, "a worker was killed in the middle"
+    for a, b in zip(found, alone, strict=True):
+        assert not a.unfinished and same_result(a, b)

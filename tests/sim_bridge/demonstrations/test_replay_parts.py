@@ -17,6 +17,7 @@ from realsim_sim_bridge.school import run_school_results
 from realsim_sim_bridge.school.object_slips import stand_of
 from realsim_sim_bridge.school.sweep import SweepConfig
 from realsim_sim_bridge.slip.engines import make_engine, settings_of
+from refusals import refused
 from school_scenes import CONFIG, at, model, scene, small_worlds
 from tried_grasps import plain_grasps
 
@@ -57,8 +58,7 @@ def test_a_field_that_a_version_did_not_have_takes_its_default():
     # Franka's, before names.
     assert school_config_of(plain_grasps(0, parameters={"config": stored})) == CONFIG
     stored["hand"]["mount_z_m"] = -0.15
-    with pytest.raises(InputError, match="without a name"):
-        school_config_of(plain_grasps(0, parameters={"config": stored}))
+    refused("without a name", school_config_of, plain_grasps(0, parameters={"config": stored}))
 
 
 def test_a_box_that_is_dropped_lands_on_its_face():

@@ -1,10 +1,22 @@
 """Cameras of synthetic views: where they stand, where they look, how evenly they are spread."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from realsim import InputError
+from realsim import InputError, Mesh
+from realsim.geometry import se3
+from realsim.rendering.appearance import Material
+from realsim.rendering.depth_camera import DepthCamera
+from realsim.rendering.depth_sensors.loss import look_of
+from realsim.rendering.depth_sensors.model import DepthSensorModel
+from realsim.rendering.labels import LabelRenderer
+from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim_sim_bridge.synthetic.cameras import hemisphere_cameras
+from realsim_sim_bridge.synthetic.config import SyntheticConfig
+from refusals import refused
+from synthetic_scenes import INTRINSICS, cameras, synthetic_scene, table
 
 CENTER = np.array([0.4, -0.2, 0.1])
 
@@ -60,3 +72,87 @@ def test_what_cannot_be_is_refused():
     ):  # fmt: skip
         with pytest.raises(InputError, match="accepted"):
             hemisphere_cameras(CENTER, radius, count, np.random.default_rng(0), elevation)
+
+
+# --- The simulated depth camera of synthetic views: exact shadows, lossy materials, fitted figures.
+
+FAULTLESS = DepthSensorModel.noiseless()
+WITH_SHADOWS = replace(FAULTLESS, occlusion=True, border=False, baseline_m=0.05)
+BLACK = Material(base_color=(0.002, 0.002, 0.002), name="black")
+WHITE = Material(base_color=(0.9, 0.9, 0.9), name="white")
+MIRROR = Material(base_color=(0.9, 0.9, 0.9), metallic=1.0, roughness=0.05, name="mirror")
+T = cameras(1)[0]
+
+
+def exact(scene):
+    return LabelRenderer(scene.placed()).render(INTRINSICS, T)
+
+
+def measured(scene, model, seed=0, material_loss=True):
+    camera = DepthCamera(scene.placed(), model, exact_shadows=True, material_loss=material_loss)
+    return camera.measure(INTRINSICS, T, np.random.default_rng(seed), exact(scene))
+
+
+def test_the_shadows_are_what_the_second_eye_cannot_see():
+    scene = synthetic_scene()
+    labels = exact(scene)
+    lost = (
+        (measured(scene, WITH_SHADOWS, material_loss=False) == 0)
+        & (labels.depth_m > 0)
+        & (labels.depth_m < WITH_SHADOWS.max_z_m)
+    )
+    T_world_right = T @ se3.from_translation([WITH_SHADOWS.baseline_m, 0, 0])
+    right = LabelRenderer(scene.placed()).render(INTRINSICS, T_world_right)
+    rows, columns = np.nonzero(labels.depth_m > 0)
+    # By the second eye's own picture: a point is hidden where that picture shows something nearer.
+    from realsim.geometry.camera import project, ray_table
+
+    points = ray_table(INTRINSICS)[rows, columns] * labels.depth_m[rows, columns, None]
+    uv = project(INTRINSICS, points - [WITH_SHADOWS.baseline_m, 0, 0])
+    at = np.round(uv).astype(int)
+    inside = np.all((at >= 1) & (at < [INTRINSICS.width - 1, INTRINSICS.height - 1]), axis=1)
+    around = [right.depth_m[at[inside, 1] + j, at[inside, 0] + i] for i in (-1, 0, 1)
+              for j in (-1, 0, 1)]  # fmt: skip
+    z, hidden = points[inside, 2], lost[rows[inside], columns[inside]]
+    margin = 0.01
+    assert not np.any(hidden & (z < np.min(around, axis=0) + 1e-4))
+    clearly = np.max(around, axis=0) < z - margin
+    assert clearly.sum() > 20 and np.all(hidden[clearly])
+
+
+@pytest.mark.parametrize(("material", "least", "most"), [
+    (WHITE, 0.0, 0.0), (BLACK, 0.9, 1.0), (MIRROR, 0.4, 0.65),
+])  # fmt: skip
+def test_dark_and_mirroring_surfaces_lose_pixels(material, least, most):
+    scene = synthetic_scene(
+        materials={0: material, 3: WHITE}, surroundings=(replace_look(table(), WHITE),)
+    )
+    labels = exact(scene)
+    found = np.mean([
+        measured(scene, FAULTLESS, seed)[labels.ids == 0] == 0 for seed in range(4)
+    ])  # fmt: skip
+    assert least <= found <= most
+    assert np.all(measured(scene, FAULTLESS)[labels.ids == 3] > 0)
+    assert np.all(measured(scene, FAULTLESS, material_loss=False)[labels.ids == 0] > 0)
+
+
+def replace_look(placed, material):
+    return PlacedMesh(placed.instance, placed.mesh, placed.T_world_obj, material)
+
+
+def test_the_mean_look_of_a_mesh_is_its_own():
+    v, f = np.eye(4)[:, :3], np.array([[0, 1, 2]], np.int32)
+    grey = np.full((4, 3), 188, np.uint8)  # sRGB 188 is half of the light
+    colored = PlacedMesh(0, Mesh(vertices=v, faces=f, colors=grey), np.eye(4))
+    assert look_of(colored).base_color == pytest.approx((0.5, 0.5, 0.5), abs=0.01)
+    image = np.stack([np.zeros((8, 3), np.uint8), np.full((8, 3), 255, np.uint8)])
+    own = Material(base_color=(0.5, 1.0, 1.0), base_color_image=image, metallic=1.0, roughness=0.2)
+    seen = look_of(PlacedMesh(BACKGROUND, Mesh(vertices=v, faces=f), np.eye(4), own))
+    assert seen.base_color == pytest.approx((0.25, 0.5, 0.5), abs=0.01)
+    assert (seen.metallic, seen.roughness, seen.base_color_image) == (1.0, 0.2, None)
+    plain = look_of(PlacedMesh(0, Mesh(vertices=v, faces=f), np.eye(4)))
+    assert plain.base_color == Material().base_color
+
+
+def test_a_fitted_model_with_another_kind_of_depth_is_refused():
+    refused("'disparity'", SyntheticConfig, depth="stereo", depth_model=FAULTLESS)
