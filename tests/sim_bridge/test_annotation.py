@@ -2,14 +2,14 @@
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
 
 from begun_sessions import begun
 from file_trees import annotation_of
-from plain_meshes import box
-from realsim import CameraIntrinsics, GraspSet, ObjectModel, ObjectPose, Scene, SupportPlane, View
+from realsim import CameraIntrinsics, GraspSet, Scene, View
 from realsim.formats.bop import scene as bop
 from realsim.geometry import se3
 from realsim.records.grasps import joined_measure
@@ -18,31 +18,15 @@ from realsim.store import SessionStore
 from realsim_sim_bridge.annotation.annotate import AnnotationConfig, annotate
 from realsim_sim_bridge.annotation.inputs import table_slab
 from refusals import refused
+from synthetic_scenes import MODELS, TABLE, rejected, two_boxes
 from tried_grasps import plain_grasps
 
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
-TABLE = se3.from_translation([0.5, 0.0, 0.1])
-
-
-MODELS = {
-    1: ObjectModel(obj_id=1, name="tall", mesh=box((0.04, 0.04, 0.12))),
-    7: ObjectModel(obj_id=7, name="flat", mesh=box((0.08, 0.06, 0.03))),
-}
+TALL, FLAT = two_boxes().objects
 # The tall box stands between the first camera and the flat one.
-SCENE = Scene(
-    name="two boxes",
-    objects=(
-        ObjectPose(
-            obj_id=1, instance=0, verdict="accepted",
-            T_world_obj=TABLE @ se3.from_translation([-0.04, 0.0, 0.06]),
-        ),
-        ObjectPose(
-            obj_id=7, instance=3, verdict="doubtful", reasons=("one view only",),
-            T_world_obj=TABLE @ se3.from_translation([0.04, 0.01, 0.015]),
-        ),
-    ),
-    plane=SupportPlane(T_world_table=TABLE),
-)  # fmt: skip
+SCENE = replace(
+    two_boxes(), objects=(TALL, replace(FLAT, verdict="doubtful", reasons=("one view only",)))
+)
 CAMERAS = {
     0: se3.look_at([0.1, 0.0, 0.35], [0.5, 0.0, 0.12]),
     2: se3.look_at([0.5, 0.05, 0.6], [0.5, 0.0, 0.12]),
@@ -114,8 +98,7 @@ def test_grasps_of_a_view_are_the_objects_grasps_in_its_camera(annotated: Sessio
         np.testing.assert_array_equal(got["scores"], np.concatenate([g.scores for g in GRASPS]))
         for name in ("p_hold", "safety"):
             np.testing.assert_array_equal(got[name], joined_measure(GRASPS, name))
-        reachable = np.concatenate([g.reachable for g in GRASPS])
-        np.testing.assert_array_equal(got["reachable"], reachable)
+        np.testing.assert_array_equal(got["reachable"], [r for g in GRASPS for r in g.reachable])
         np.testing.assert_array_equal(got["visibility"], got["contact_seen"].sum(1))
         seen += got["visibility"].tolist()
     assert {0, 2} <= set(seen)
@@ -123,16 +106,10 @@ def test_grasps_of_a_view_are_the_objects_grasps_in_its_camera(annotated: Sessio
 
 def test_again_is_skipped_and_changes_nothing(annotated: SessionStore) -> None:
     before = annotation_of(annotated.folder)
-    calls: list[tuple[int, int]] = []
-    again = annotate(
-        annotated, SCENE, MODELS, GRASPS, progress=lambda done, total: calls.append((done, total))
-    )
-    assert again.skipped == 3 and calls == [(3, 3)]
+    progress = Mock()
+    assert annotate(annotated, SCENE, MODELS, GRASPS, progress=progress).skipped == 3
+    assert progress.mock_calls == [call(3, 3)]
     assert annotation_of(annotated.folder) == before
-
-
-class Killed(Exception):
-    """Stands for a SIGKILL."""
 
 
 def moved(scene: Scene) -> Scene:
@@ -162,12 +139,12 @@ def test_going_back_after_a_kill_leaves_no_foreign_masks(
 
     def killed(self: SessionStore, path: str, data: bytes) -> None:
         if path == "annotations/000000.json":
-            raise Killed
+            raise KeyboardInterrupt
         write_bytes(self, path, data)
 
     with monkeypatch.context() as patch:
         patch.setattr(SessionStore, "write_bytes", killed)
-        with pytest.raises(Killed):
+        with pytest.raises(KeyboardInterrupt):
             annotate(store, moved(SCENE), MODELS, GRASPS)
     assert annotation_of(store.folder) != before
     assert annotate(store, SCENE, MODELS, GRASPS).skipped == 2
@@ -177,7 +154,7 @@ def test_going_back_after_a_kill_leaves_no_foreign_masks(
 def test_a_rejected_object_leaves_and_takes_its_masks_along(tmp_path: Path) -> None:
     store = make_session(tmp_path / "s")
     annotate(store, SCENE, MODELS, GRASPS)
-    only = replace(SCENE, objects=(SCENE.objects[0], replace(SCENE.objects[1], verdict="rejected")))
+    only = rejected(SCENE, 3)
     summary = annotate(store, only, MODELS, GRASPS)
     assert summary.left_out == (3,) and summary.grasps == 6
     names = sorted(p.name for p in (store.folder / "mask").iterdir())

@@ -1,6 +1,5 @@
 """What an annotated session holds: maps, clouds, boxes, BOP files; the same from any process."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -93,8 +92,8 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> SessionStore:
 
 
 def deep_rgb(store: SessionStore, name: str, view: int) -> UInt16:
-    data = np.frombuffer(store.path(f"labels/{name}/{view:06d}.png").read_bytes(), np.uint8)
-    return np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED)[..., ::-1])
+    path = store.path(f"labels/{name}/{view:06d}.png")
+    return np.ascontiguousarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., ::-1])
 
 
 def part(store: SessionStore, view: int) -> dict[str, Any]:
@@ -211,6 +210,6 @@ def test_a_camera_inside_an_object_and_pixels_without_a_ray_are_told(tmp_path: P
     summary = annotate(store, scene, {2: big}, [])
     assert summary.flagged_views == (7,)
     assert "view 7: the camera stands inside crate" in summary.notes[0]
-    said = json.loads(store.path("annotations/000007.json").read_text())
+    said = part(store, 7)
     assert said["camera_inside"] == [0] and said["px_without_ray"] > 0
     assert any("cannot be inverted" in note for note in summary.notes)

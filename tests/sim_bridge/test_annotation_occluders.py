@@ -1,10 +1,11 @@
 """Things that are not in the scene: found in the measured depth, and nothing else taken for one."""
 
+import cv2
 import numpy as np
 import pytest
 
 from plain_meshes import box
-from realsim import CameraIntrinsics, GraspSet, ObjectModel, ObjectPose, Scene, SupportPlane
+from realsim import CameraIntrinsics, GraspSet, ObjectModel, ObjectPose
 from realsim.arrays import Array, Array32
 from realsim.geometry import se3
 from realsim.rendering.depth_sensors.model import DepthSensorModel
@@ -16,21 +17,14 @@ from realsim_sim_bridge.annotation.inputs import FrameInputs, FrameView, table_s
 from tried_grasps import plain_grasps
 
 CAMERA = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
-Depth = Array32
-
-
 MODELS = {
     1: ObjectModel(obj_id=1, name="mug", mesh=box((0.08, 0.08, 0.10))),
     2: ObjectModel(obj_id=2, name="book", mesh=box((0.16, 0.11, 0.03))),
 }
 PLACES = {1: [-0.07, 0.0, 0.05], 2: [0.09, 0.02, 0.015]}
-SCENE = Scene(
-    name="desk",
-    objects=tuple(
-        ObjectPose(obj_id=i, instance=i, verdict="accepted", T_world_obj=se3.from_translation(t))
-        for i, t in PLACES.items()
-    ),
-    plane=SupportPlane(T_world_table=np.eye(4)),
+OBJECTS = tuple(
+    ObjectPose(obj_id=i, instance=i, verdict="accepted", T_world_obj=se3.from_translation(t))
+    for i, t in PLACES.items()
 )
 
 
@@ -42,16 +36,12 @@ def grasps_of_the_book() -> GraspSet:
     )
 
 
-def inputs_of() -> FrameInputs:
-    config = AnnotationConfig(plane_clearance_m=0.0, maps=("instance",))
-    return FrameInputs(
-        config=config, intrinsics=CAMERA, depth_unit_m=1e-4, objects=SCENE.objects, models=MODELS,
-        grasp_sets=(grasps_of_the_book(),), digest="",
-        surroundings=(PlacedMesh(BACKGROUND, table_slab(config), np.eye(4)),),
-    )  # fmt: skip
-
-
-INPUTS = inputs_of()
+CONFIG = AnnotationConfig(plane_clearance_m=0.0, maps=("instance",))
+INPUTS = FrameInputs(
+    config=CONFIG, intrinsics=CAMERA, depth_unit_m=1e-4, objects=OBJECTS, models=MODELS,
+    grasp_sets=(grasps_of_the_book(),), digest="",
+    surroundings=(PlacedMesh(BACKGROUND, table_slab(CONFIG), np.eye(4)),),
+)  # fmt: skip
 
 
 def camera_at(distance_m: float, azimuth: float = 0.7, up: float = 1.2) -> Array:
@@ -63,21 +53,16 @@ def rendered(T: Array, *things: PlacedMesh) -> Labels:
     return LabelRenderer([*INPUTS.placed(), *things]).render(CAMERA, T)
 
 
-def annotated(T: Array, depth_m: Depth):
+def annotated(T: Array, depth_m: Array32):
     """Return the objects' entries by name, and the visible masks by name."""
-    view = FrameView(index=0, T_world_cam=T, digest="")
-    frame = frame_files(INPUTS, view, depth_m)
+    frame = frame_files(INPUTS, FrameView(index=0, T_world_cam=T, digest=""), depth_m)
     entries = {e["name"]: e for e in frame.part["objects"]}
-    import cv2
 
-    masks = {
-        name: cv2.imdecode(
-            np.frombuffer(frame.files[f"mask_visib/000000_{e['mask']:06d}.png"], np.uint8),
-            cv2.IMREAD_UNCHANGED,
-        ) > 0
-        for name, e in entries.items()
-    }  # fmt: skip
-    return entries, masks
+    def mask(number: int) -> Array:
+        stored = np.frombuffer(frame.files[f"mask_visib/000000_{number:06d}.png"], np.uint8)
+        return cv2.imdecode(stored, cv2.IMREAD_UNCHANGED) > 0
+
+    return entries, {name: mask(e["mask"]) for name, e in entries.items()}
 
 
 def hand(T: Array, over: list[float], size: tuple[float, float], before: float):
@@ -123,8 +108,8 @@ def test_noise_is_not_taken_for_a_thing() -> None:
     for seed, azimuth in enumerate([0.0, 2.5]):
         T = camera_at(1.0, azimuth)
         labels = rendered(T)
-        sensor = DepthSensorModel()
-        measured = sensor.measure(labels.depth_m, CAMERA, np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        measured = DepthSensorModel().measure(labels.depth_m, CAMERA, rng)
         entries, _ = annotated(T, measured)
         removed += sum(e["px_hidden_by_unknown"] for e in entries.values())
         seen += sum(labels.px_count_visib.values())
@@ -140,22 +125,17 @@ def test_speckle_and_fattened_edges_stay() -> None:
     measured[100:104, 60:260] *= 0.7  # a strip of 4 pixels
     entries, _ = annotated(T, measured)
     assert all(e["px_hidden_by_unknown"] == 0 for e in entries.values())
-    import cv2
-
     fat = np.where(labels.depth_m > 0, labels.depth_m, np.float32(np.inf))
     fat = np.asarray(cv2.erode(fat, np.ones((7, 7), np.uint8)), np.float32)
     entries, _ = annotated(T, np.where(np.isfinite(fat), fat, 0).astype(np.float32))
     assert all(e["px_hidden_by_unknown"] == 0 for e in entries.values())
 
 
-def nearer_by(labels: Labels, instance: int, metres: float) -> Depth:
-    return np.where(labels.ids == instance, labels.depth_m - np.float32(metres), labels.depth_m)
-
-
 def test_a_wrong_pose_is_not_silently_taken_for_a_thing() -> None:
     T = camera_at(0.5)
     labels = rendered(T)
-    entries, masks = annotated(T, nearer_by(labels, 1, 0.03))
+    nearer = np.where(labels.ids == 1, labels.depth_m - np.float32(0.03), labels.depth_m)
+    entries, masks = annotated(T, nearer)
     mug = entries["mug"]
     assert mug["unknown_occluder"]["finding"] == "pose or occluder"
     assert not mug["unknown_occluder"]["is_removed"] and mug["px_hidden_by_unknown"] == 0

@@ -1,14 +1,13 @@
 """Robot School interrupted, killed, and started again with something else."""
 
-import dataclasses
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from concurrent.futures import Future
-from pathlib import Path
+from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,14 +15,16 @@ import pytest
 from file_trees import bytes_of
 from realsim.errors import InputError
 from realsim.many import PoolConfig, WorkerDiedError, open_pool
-from realsim_sim_bridge.school import recompute_scores, run_school, run_school_results
+from realsim_sim_bridge.school import recompute_scores, run_school, run_school_results, school
 from realsim_sim_bridge.school.object_slips import in_words
 from realsim_sim_bridge.school.run_record import RUN_FILE, folder_of_run
 from refusals import refused
 from school_scenes import at, model, same_result, scene, small_worlds
+from started_scripts import started
 
 CONFIG = small_worlds()
 SHARD = 2
+TWO = scene(at(0, 0), at(0.2, 0.1, instance=1))
 
 
 def run(cache=None, config=CONFIG, objects=None, models=None, **kwargs):
@@ -84,6 +85,7 @@ def test_a_damaged_piece_is_made_again(tmp_path, whole):
 SCRIPT = """
 import sys
 from pathlib import Path
+from started_scripts import started
 from school_scenes import at, model, scene, small_worlds
 from realsim_sim_bridge.school import run_school
 
@@ -96,23 +98,12 @@ if __name__ == "__main__":
 """
 
 
-def start(tmp_path):
-    (tmp_path / "script.py").write_text(SCRIPT)
-    support = Path(__file__).parents[1] / "support"
-    return subprocess.Popen(
-        [sys.executable, tmp_path / "script.py", tmp_path / "cache"],
-        env=os.environ | {"PYTHONPATH": str(support)},
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-
-
 @pytest.mark.slow
 def test_a_run_killed_at_random_moments_ends_as_if_it_had_not_been(tmp_path):
     rng = np.random.default_rng(2)
     judged = 0
     for _ in range(2):
-        process = start(tmp_path)
+        process = started(tmp_path, SCRIPT, tmp_path / "cache")
         lines = [process.stdout.readline() for _ in range(rng.integers(1, 4))]
         if lines[0]:  # what was judged before a kill needs no second test
             assert int(lines[0].split()[0]) >= judged
@@ -121,13 +112,12 @@ def test_a_run_killed_at_random_moments_ends_as_if_it_had_not_been(tmp_path):
         lines += process.stdout.read().split("\n")
         judged = max([judged, *(int(line.split()[0]) for line in lines if line)])
         process.wait()
-    process = start(tmp_path)
+    process = started(tmp_path, SCRIPT, tmp_path / "cache")
     lines = process.communicate(timeout=120)[0].splitlines()
     assert process.returncode == 0 and lines[-1] == "12 12"
     assert int(lines[0].split()[0]) >= judged > 0
-    objects = scene(at(0, 0), at(0.2, 0.1, instance=1))
-    kept = run(tmp_path / "cache", objects=objects)
-    for a, b in zip(kept, run(objects=objects), strict=True):
+    kept = run(tmp_path / "cache", objects=TWO)
+    for a, b in zip(kept, run(objects=TWO), strict=True):
         assert same_result(a, b)
     assert not list((tmp_path / "cache").glob(".*"))
 
@@ -159,10 +149,6 @@ class Deadly:
 @pytest.fixture
 def deadly(monkeypatch, whole):
     """Workers that die of the object's second shard."""
-    from contextlib import contextmanager
-
-    from realsim_sim_bridge.school import school
-
     shard = np.flatnonzero(whole.grasp_set.reachable)[SHARD : 2 * SHARD]
     made = []
 
@@ -216,14 +202,11 @@ def finished(tmp_path_factory):
 
 
 def test_another_config_is_refused_field_by_field(finished):
-    physics = dataclasses.replace(CONFIG.slip.physics, friction=0.5, force_n=20.0)
-    other = dataclasses.replace(
-        CONFIG, seed=4, slip=dataclasses.replace(CONFIG.slip, physics=physics)
-    )
+    physics = replace(CONFIG.slip.physics, friction=0.5, force_n=20.0)
+    other = replace(CONFIG, seed=4, slip=replace(CONFIG.slip, physics=physics))
     before = bytes_of(finished, "*")
     said = refused(".", run, finished, other)
-    lines = said.splitlines()[1:-1]
-    assert [line.strip() for line in lines] == [
+    assert [line.strip() for line in said.splitlines()[1:-1]] == [
         "config.seed: 0 -> 4",
         "config.slip.physics.force_n: 70.0 -> 20.0",
         "config.slip.physics.friction: 1.0 -> 0.5",
@@ -240,8 +223,7 @@ def test_another_mesh_pose_or_object_is_refused(finished):
         ({"objects": scene(at(0, 0), at(0.2, 0, 1))}, "objects.instance_000001: (nothing) ->"),
         ({"shard_grasps": 4}, "shard_grasps: 2 -> 4"),
     ):
-        said = refused("started with something else", run, finished, **change)
-        assert field in said
+        assert field in refused("started with something else", run, finished, **change)
 
 
 def test_another_version_is_refused(finished, monkeypatch):
@@ -265,7 +247,7 @@ def test_two_runs_at_once_in_one_folder_are_refused(tmp_path):
 
 
 def test_only_a_finished_run_gives_way_to_another(tmp_path, whole):
-    other = dataclasses.replace(CONFIG, seed=7)
+    other = replace(CONFIG, seed=7)
     run(tmp_path, other)
     assert same_result(run(tmp_path, restart="finished")[0], whole)
     grasps = names(tmp_path, "grasps")
@@ -281,10 +263,8 @@ def test_only_a_finished_run_gives_way_to_another(tmp_path, whole):
 
 def ray_workers_below(pid):
     """Return the processes that Ray calls workers, below a process."""
-    listed = subprocess.run(
-        ["ps", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True
-    ).stdout.splitlines()
-    rows = [line.split(None, 2) for line in listed]
+    listed = subprocess.check_output(["ps", "-eo", "pid=,ppid=,args="], text=True)
+    rows = [line.split(None, 2) for line in listed.splitlines()]
     below = {pid}
     for _ in range(6):
         below |= {int(row[0]) for row in rows if int(row[1]) in below}
@@ -294,7 +274,6 @@ def ray_workers_below(pid):
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_finds_what_one_process_finds():
     pytest.importorskip("ray")
-    objects = scene(at(0, 0), at(0.2, 0.1, instance=1))
     killed = []
 
     def kill_one(done, of):
@@ -307,11 +286,7 @@ def test_a_cluster_that_loses_a_worker_finds_what_one_process_finds():
             threading.Timer(0.05, kill).start()
 
     where = PoolConfig(workers=2, address="local")
-    settings = {"shard_grasps": 2}
-    found = run_school_results(
-        objects, {1: model()}, small_worlds(), workers=where, progress=kill_one, **settings
-    )
-    alone = run_school_results(objects, {1: model()}, small_worlds(), workers=1, **settings)
+    found = run(objects=TWO, workers=where, progress=kill_one)
     assert killed, "a worker was killed in the middle"
-    for a, b in zip(found, alone, strict=True):
+    for a, b in zip(found, run(objects=TWO), strict=True):
         assert not a.unfinished and same_result(a, b)

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from realsim import InputError, Mesh
+from realsim import Mesh
 from realsim.geometry import se3
+from realsim.geometry.camera import project, ray_table
 from realsim.rendering.appearance import Material
 from realsim.rendering.depth_camera import DepthCamera
 from realsim.rendering.depth_sensors.loss import look_of
@@ -70,8 +71,8 @@ def test_what_cannot_be_is_refused():
         ((0.5, 0.4), 5, (15, 85)), ((0, 1), 5, (15, 85)), ((0.4, 0.5), 0, (15, 85)),
         ((0.4, 0.5), 5, (50, 20)),
     ):  # fmt: skip
-        with pytest.raises(InputError, match="accepted"):
-            hemisphere_cameras(CENTER, radius, count, np.random.default_rng(0), elevation)
+        rng = np.random.default_rng(0)
+        refused("accepted", hemisphere_cameras, CENTER, radius, count, rng, elevation)
 
 
 # --- The simulated depth camera of synthetic views: exact shadows, lossy materials, fitted figures.
@@ -105,8 +106,6 @@ def test_the_shadows_are_what_the_second_eye_cannot_see():
     right = LabelRenderer(scene.placed()).render(INTRINSICS, T_world_right)
     rows, columns = np.nonzero(labels.depth_m > 0)
     # By the second eye's own picture: a point is hidden where that picture shows something nearer.
-    from realsim.geometry.camera import project, ray_table
-
     points = ray_table(INTRINSICS)[rows, columns] * labels.depth_m[rows, columns, None]
     uv = project(INTRINSICS, points - [WITH_SHADOWS.baseline_m, 0, 0])
     at = np.round(uv).astype(int)
@@ -114,9 +113,8 @@ def test_the_shadows_are_what_the_second_eye_cannot_see():
     around = [right.depth_m[at[inside, 1] + j, at[inside, 0] + i] for i in (-1, 0, 1)
               for j in (-1, 0, 1)]  # fmt: skip
     z, hidden = points[inside, 2], lost[rows[inside], columns[inside]]
-    margin = 0.01
     assert not np.any(hidden & (z < np.min(around, axis=0) + 1e-4))
-    clearly = np.max(around, axis=0) < z - margin
+    clearly = np.max(around, axis=0) < z - 0.01
     assert clearly.sum() > 20 and np.all(hidden[clearly])
 
 
@@ -124,9 +122,8 @@ def test_the_shadows_are_what_the_second_eye_cannot_see():
     (WHITE, 0.0, 0.0), (BLACK, 0.9, 1.0), (MIRROR, 0.4, 0.65),
 ])  # fmt: skip
 def test_dark_and_mirroring_surfaces_lose_pixels(material, least, most):
-    scene = synthetic_scene(
-        materials={0: material, 3: WHITE}, surroundings=(replace_look(table(), WHITE),)
-    )
+    looks, white_table = {0: material, 3: WHITE}, replace(table(), material=WHITE)
+    scene = synthetic_scene(materials=looks, surroundings=(white_table,))
     labels = exact(scene)
     found = np.mean([
         measured(scene, FAULTLESS, seed)[labels.ids == 0] == 0 for seed in range(4)
@@ -134,10 +131,6 @@ def test_dark_and_mirroring_surfaces_lose_pixels(material, least, most):
     assert least <= found <= most
     assert np.all(measured(scene, FAULTLESS)[labels.ids == 3] > 0)
     assert np.all(measured(scene, FAULTLESS, material_loss=False)[labels.ids == 0] > 0)
-
-
-def replace_look(placed, material):
-    return PlacedMesh(placed.instance, placed.mesh, placed.T_world_obj, material)
 
 
 def test_the_mean_look_of_a_mesh_is_its_own():

@@ -1,11 +1,7 @@
 """Synthetic views as a session: labels against a fresh render, exact poses, what is refused."""
 
 import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +9,7 @@ import pytest
 from realsim import Mesh
 from realsim.app.console import Console
 from realsim.app.school.inputs import SchoolRequest, session_inputs
+from realsim.formats.bop.models import load_models
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer
 from realsim.store import SessionStore, load_scene
@@ -20,6 +17,7 @@ from realsim_sim_bridge.synthetic.config import SyntheticConfig
 from realsim_sim_bridge.synthetic.write import cameras_inside, write_session
 from refusals import refused
 from shared_sessions import copy_of
+from started_scripts import started
 from synthetic_scenes import (
     INTRINSICS,
     MODELS,
@@ -49,14 +47,9 @@ def written(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fresh(written):
-    renderer = LabelRenderer(synthetic_scene(models=stored_models(written[1])).placed())
+    models = load_models(written[1].folder / "models")
+    renderer = LabelRenderer(synthetic_scene(models=models).placed())
     return [renderer.render(INTRINSICS, T) for T in cameras(3)]
-
-
-def stored_models(store):
-    from realsim.formats.bop.models import load_models
-
-    return load_models(store.folder / "models")
 
 
 def test_the_written_instances_are_those_of_a_fresh_label_render(written, fresh):
@@ -90,8 +83,8 @@ def test_a_clean_depth_camera_reports_the_clean_depth(tmp_path, written):
     counts = store.read_image("depth/000000.png").astype(int)
     clean = store.read_image("labels/depth/000000.png").astype(int)
     # Another depth camera leaves the photograph as it is.
-    photograph = "rgb/000000.png"
-    assert content(store.folder)[photograph] == content(written[1].folder)[photograph]
+    photograph, there = (content(s.folder)["rgb/000000.png"] for s in (store, written[1]))
+    assert photograph == there
     # Photograph and labels cast their rays by two libraries: a rim pixel may fall to either side.
     assert np.mean(np.abs(counts - clean) > 1) < 1e-3
 
@@ -162,8 +155,7 @@ def test_the_seed_is_of_the_noise_and_not_of_the_labels(tmp_path, written):
 def test_two_scenes_are_never_mixed_in_one_folder(written, changed, named):
     folder = written[1].folder
     before = content(folder)
-    said = refused(named, write, folder, **{"count": 3} | changed)
-    assert "other inputs" in said
+    assert "other inputs" in refused(named, write, folder, **{"count": 3} | changed)
     assert content(folder) == before
 
 
@@ -237,13 +229,8 @@ if __name__ == "__main__":
 @pytest.mark.slow
 def test_a_killed_run_of_two_processes_ends_with_the_bytes_of_one_that_was_not(tmp_path):
     write(tmp_path / "whole", 3, SyntheticConfig())
-    (tmp_path / "script.py").write_text(SCRIPT)
-    support = Path(__file__).parents[2] / "support"
     for steps in (2, 4):
-        process = subprocess.Popen(
-            [sys.executable, tmp_path / "script.py", tmp_path / "s"],
-            env=os.environ | {"PYTHONPATH": str(support)}, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
+        process = started(tmp_path, SCRIPT, tmp_path / "s")
         assert process.stdout is not None
         for _ in range(steps):
             process.stdout.readline()
