@@ -1,18 +1,19 @@
 """A scene under physics: what rests must rest, and what cannot stand must be named."""
 
 from dataclasses import replace
+from functools import partial
 from unittest.mock import patch
 
+import cv2
 import numpy as np
 import pytest
+from pybullet_utils.bullet_client import BulletClient
 
 from bop_scenes import mm, png
-from realsim.errors import InputError, RealsimError
+from realsim.errors import RealsimError
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
-from realsim.models.library_records import KnownSolid
-from realsim.models.model_records import ConvexParts
 from realsim.models.properties import physical_properties
 from realsim.records import CameraIntrinsics, Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.store.atomic import write_json
@@ -109,9 +110,8 @@ def test_friction_is_of_the_contact_not_its_square():
 
 def test_a_heavy_end_shifts_the_centre_of_mass():
     """The matter given decides, not the shape: with the mass at its far end the rod falls."""
-    support = Support(
-        name="step", T_world_support=np.eye(4), mesh=box((0.2, 0.2, 0.2), (0, 0, 0.1))
-    )
+    mesh = box((0.2, 0.2, 0.2), (0, 0, 0.1))
+    support = Support(name="step", T_world_support=np.eye(4), mesh=mesh)
     rod = ObjectModel(obj_id=1, name="rod", mesh=box((0.1, 0.02, 0.02)))
     scene = school_scene(place(0.08, 0, 0.21), models={1: rod}, supports=(support,))
     solid = scene.solids[1]
@@ -135,12 +135,8 @@ def test_an_object_in_the_air_floats_and_the_gap_is_named():
 
 
 def test_objects_inside_one_another_are_named_in_pairs():
-    scene = school_scene(
-        place(0, 0, SIDE / 2),
-        place(SIDE - 0.01, 0.002, SIDE / 2 + 1e-4, 1),
-        place(0.3, 0, SIDE / 2, 2),
-    )
-    report = run(scene)
+    beside = place(SIDE - 0.01, 0.002, SIDE / 2 + 1e-4, 1)
+    report = run(school_scene(place(0, 0, SIDE / 2), beside, place(0.3, 0, SIDE / 2, 2)))
     assert verdicts(report) == ["inside another", "inside another", "stands"]
     ((a, b, depth),) = report.inside
     assert {a, b} == {"cube1 #0", "cube1 #1"} and depth == pytest.approx(0.01, abs=1e-4)
@@ -151,12 +147,9 @@ def test_every_parameter_is_read_back_and_a_lost_one_is_an_error(monkeypatch):
     monkeypatch.setattr(table_world, "FRICTION", 0.6)
     with TableWorld(scene) as world:
         settings = world.settings()
-        assert settings["contact_friction"] == pytest.approx(0.6)
-        assert settings["iterations"] == 300
-        assert settings["collision_margin_m"] == pytest.approx(0.0005)
-
-    from pybullet_utils.bullet_client import BulletClient
-
+    assert settings["contact_friction"] == pytest.approx(0.6)
+    assert settings["iterations"] == 300
+    assert settings["collision_margin_m"] == pytest.approx(0.0005)
     whole = BulletClient.__getattr__
 
     def forgetful(self, name):
@@ -174,31 +167,25 @@ def test_every_parameter_is_read_back_and_a_lost_one_is_an_error(monkeypatch):
 def test_blown_up_parts_and_meshes_without_volume_are_named():
     scene = school_scene(place(0, 0, SIDE / 2))
     solid = scene.solids[1]
-    fat = KnownSolid(
-        parts=ConvexParts(parts=solid.parts.parts, volume_ratio=1.4, method="hull"),
-        matter=solid.matter,
-    )
+    fat = replace(solid, parts=replace(solid.parts, volume_ratio=1.4))
     (note,) = run(replace(scene, solids={1: fat})).notes
     assert "cube1" in note and "1.40" in note
     opened = Mesh(vertices=box(CUBE).vertices, faces=box(CUBE).faces[2:])
-    matter = physical_properties(opened)
-    lidless = replace(scene, solids={1: KnownSolid(parts=solid.parts, matter=matter)})
-    (note,) = run(lidless).notes
+    lidless = replace(solid, matter=physical_properties(opened))
+    (note,) = run(replace(scene, solids={1: lidless})).notes
     assert "cube1" in note and "no volume" in note
     sheet = Mesh(vertices=box(CUBE).vertices * [1, 1, 0], faces=box(CUBE).faces)
-    flat = ObjectModel(obj_id=1, name="sheet", mesh=sheet)
-    refused(r"sheet.*flat", known_solids, {1: flat})
+    refused(r"sheet.*flat", known_solids, {1: ObjectModel(obj_id=1, name="sheet", mesh=sheet)})
 
 
 def test_bad_input_is_named(tmp_path):
-    with pytest.raises(InputError, match="does not exist"):
-        Support(name="shelf", T_world_support=np.eye(4), urdf=tmp_path / "shelf.urdf")
-    refused("neither a mesh nor", Support, name="shelf", T_world_support=np.eye(4))
+    shelf = partial(Support, name="shelf", T_world_support=np.eye(4))
+    refused("does not exist", shelf, urdf=tmp_path / "shelf.urdf")
+    refused("neither a mesh nor", shelf)
     broken = tmp_path / "broken.urdf"
     broken.write_text("<robot name='x'><link")
-    shelf = Support(name="shelf", T_world_support=np.eye(4), urdf=broken)
-    with pytest.raises(InputError, match=r"'shelf'.*broken\.urdf"):
-        TableWorld(school_scene(place(0, 0, SIDE / 2), supports=(shelf,)))
+    scene = school_scene(place(0, 0, SIDE / 2), supports=(shelf(urdf=broken),))
+    refused(r"'shelf'.*broken\.urdf", TableWorld, scene)
     refused("mass is given for object 7", known_solids, {1: cube()}, Matter(masses_kg={7: 0.1}))
     scene = Scene(name="bare", objects=(place(0, 0, 0),))
     refused("no supporting plane", SchoolScene, scene=scene, models={1: cube()}, solids={})
@@ -220,16 +207,13 @@ def test_an_object_stands_on_a_support_from_a_urdf(tmp_path):
 
 
 def test_rows_and_picture_say_what_happened():
-    import cv2
-
     scene = school_scene(place(0, 0, SIDE / 2), place(0.2, 0, SIDE / 2 + 0.02, 1))
     report = run(scene)
     rows = stand_rows(report)
     assert all(len(row) == len(HEADERS) for row in rows)
     assert rows[0][1] == "stands" and rows[1][1] == "floats" and rows[1][2] == "20.0"
     png = stand_picture(scene, report)
-    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
-    rgb = image[..., ::-1].astype(int)
+    rgb = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
     teal = np.abs(rgb - [0x2A, 0x9D, 0x8F]).max(-1) < 12
     assert teal.sum() > 200  # the floating one's outline and arrow
     assert png == stand_picture(scene, report)
@@ -282,8 +266,8 @@ def test_a_bop_scene_stands_on_the_table_that_its_depth_shows(tmp_path, cameras,
 
 
 def test_bop_scenes_that_lack_something_are_refused(tmp_path):
-    with pytest.raises(InputError, match="no image with annotated objects and depth"):
-        from_bop(write_bop(tmp_path / "a", depth=False))
+    dark = write_bop(tmp_path / "a", depth=False)
+    refused("no image with annotated objects and depth", from_bop, dark)
     refused("image 7", from_bop, write_bop(tmp_path / "b"), image=7)
     refused("no scene 9", load_scene_source, tmp_path / "b", scene_id=9)
 

@@ -85,7 +85,6 @@ def test_a_damaged_piece_is_made_again(tmp_path, whole):
 SCRIPT = """
 import sys
 from pathlib import Path
-from started_scripts import started
 from school_scenes import at, model, scene, small_worlds
 from realsim_sim_bridge.school import run_school
 

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from realsim.geometry import se3
-from realsim.records import Mesh
+from realsim.geometry.mesh import merged
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.grasping.antipodal import CandidateConfig, RaySurface, antipodal_pairs
 from realsim_sim_bridge.grasping.candidates import IN_OBJECT, HandPoses, Stand
@@ -42,10 +42,8 @@ def test_pairs_turn_with_the_mesh():
     mesh, T = cup(), se3.exp([0.4, -1.0, 0.7, 0.1, 0.2, -0.3])
     # Only the rays along the normal: the random ones start from axes of the frame.
     first = replace(CONFIG, rays_per_point=1)
-    a, b = (
-        pairs_of(m, first)[0]
-        for m in (mesh, Mesh(vertices=se3.transform(T, mesh.vertices), faces=mesh.faces))
-    )
+    turned = replace(mesh, vertices=se3.transform(T, mesh.vertices))
+    a, b = (pairs_of(m, first)[0] for m in (mesh, turned))
     # Rays have single precision: of pairs at the edge of a triangle a few may differ.
     assert abs(len(a) - len(b)) <= 0.02 * len(a)
     moved = se3.transform(T, a.points.reshape(-1, 3)).reshape(-1, 6)
@@ -55,7 +53,7 @@ def test_pairs_turn_with_the_mesh():
 
 def test_a_mesh_whose_triangles_all_face_inwards_has_the_same_pairs():
     mesh = cup()
-    inside_out = Mesh(vertices=mesh.vertices, faces=mesh.faces[:, ::-1])
+    inside_out = replace(mesh, faces=mesh.faces[:, ::-1])
     (a, _), (b, counts) = pairs_of(mesh), pairs_of(inside_out)
     assert abs(len(b) - len(a)) < 0.05 * len(a)
     assert counts["antipodal_points"] > 400
@@ -68,23 +66,17 @@ def test_an_open_mesh_with_triangles_of_either_orientation_keeps_its_pairs():
     faces = mesh.faces[rng.random(len(mesh.faces)) > 0.03].copy()
     turned = rng.random(len(faces)) < 0.4
     faces[turned] = faces[turned][:, ::-1]
-    scan = Mesh(vertices=mesh.vertices, faces=faces)
+    scan = replace(mesh, faces=faces)
     assert not RaySurface(scan).is_closed
     found, _ = pairs_of(scan)
     assert len(found) > 0.9 * len(whole)
-    out = np.sum(found.normals * found.points, axis=-1) > 0
-    assert np.mean(out) > 0.97
-
-
-def noisy(mesh, sigma, seed=0):
-    rng = np.random.default_rng(seed)
-    return Mesh(
-        vertices=mesh.vertices + rng.normal(scale=sigma, size=mesh.vertices.shape), faces=mesh.faces
-    )
+    assert np.mean(np.sum(found.normals * found.points, axis=-1) > 0) > 0.97
 
 
 def test_averaged_normals_are_nearer_to_the_truth_on_a_noisy_scan():
-    scan = noisy(sphere(), 1e-4)
+    ball, rng = sphere(), np.random.default_rng(0)
+    noise = rng.normal(scale=1e-4, size=ball.vertices.shape)
+    scan = replace(ball, vertices=ball.vertices + noise)
     errors = {}
     for radius in (0.0, CONFIG.normal_radius_m):
         pairs, _ = pairs_of(scan, replace(CONFIG, normal_radius_m=radius))
@@ -95,11 +87,8 @@ def test_averaged_normals_are_nearer_to_the_truth_on_a_noisy_scan():
 
 
 def test_a_double_surface_gives_no_pair_across_its_layers_and_one_exit_per_wall():
-    outer = trimesh.creation.box((0.05, 0.05, 0.05))
-    inner = trimesh.creation.box((0.0494, 0.0494, 0.0494))
-    scan = solid(trimesh.util.concatenate([outer, inner]))
-    first = replace(CONFIG, rays_per_point=1)
-    pairs, counts = pairs_of(scan, first)
+    scan = merged([box((side, side, side)) for side in (0.05, 0.0494)])
+    pairs, counts = pairs_of(scan, replace(CONFIG, rays_per_point=1))
     assert np.all(pairs.widths_m > 0.049)
     assert counts["exits"] == CONFIG.surface_points
 
@@ -115,8 +104,7 @@ def test_a_wedge_closes_only_where_friction_exceeds_the_tangent_of_its_half_angl
     # Rays along the normals only: from one slope to the other they are 40 deg off there.
     config = replace(CONFIG, friction=friction, rays_per_point=4)
     pairs, _ = pairs_of(solid(prism), config)
-    slopes = np.abs(pairs.normals[:, :, 1]) > 0.5
-    slope_pairs = np.sum(slopes.all(axis=1))
+    slope_pairs = np.sum((np.abs(pairs.normals[:, :, 1]) > 0.5).all(axis=1))
     assert slope_pairs == 0 if friction < np.tan(a) else slope_pairs > 50
 
 
@@ -153,12 +141,10 @@ def free_by_coal(boxes, Ts, triangles):
 
 
 def test_the_verdict_is_that_of_a_collision_library():
-    clearance = 0.002
+    clearance, mesh = 0.002, cup(48)
     boxes, Ts = hands(400, 0)
-    mesh = cup(48)
     triangles = mesh.vertices[mesh.faces]
-    grown = boxes + np.array([[-clearance], [clearance]])
-    expected = free_by_coal(grown, Ts, triangles)
+    expected = free_by_coal(boxes + np.array([[-clearance], [clearance]]), Ts, triangles)
     assert 100 < expected.sum() < 300
     assert np.array_equal(hands_free(boxes, Ts, surface_tree(triangles), clearance), expected)
 
@@ -189,9 +175,8 @@ def test_the_open_hand_is_free_in_all_grasps_of_acronym_s_mug():
         scale = float(np.array(file["object/scale"]))
     shape = trimesh.load(next(folder.glob("*.obj")), force="mesh")
     tree = surface_tree(scale * np.array(shape.triangles))
-    T_hand_grasp = np.eye(4)
-    T_hand_grasp[:3, :3] = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]
-    T_hand_grasp[2, 3] = -HAND.mount_z_m
+    quarter = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]
+    T_hand_grasp = se3.from_rt(quarter, [0.0, 0.0, -HAND.mount_z_m])
     boxes = HAND.boxes(np.full(len(Ts), HAND.max_opening_m))
     assert len(Ts) == 2000
     assert hands_free(boxes, Ts @ T_hand_grasp, tree, 0.0).mean() > 0.99
