@@ -14,15 +14,12 @@ from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
 from realsim_sim_bridge.slip.world import SlipPhysics
 
 
-def trial(off_m, mass=0.3):
-    return held_from_above(held_box(mass, length=0.14), off_m)
-
-
-def checked(t, physics, second):
-    config = SlipConfig(physics=physics)
-    slips = run_slip_test(t, config)
-    engine = make_engine(settings_of(second))
-    return slips, cross_check(t, slips, config, ScoreLimits(), find_hand(), engine)
+def checked(off_m, **physics):
+    """Return what MuJoCo says of Bullet's verdicts on grasps beside the middle of a bar."""
+    trial = held_from_above(held_box(0.3, length=0.14), off_m)
+    config = SlipConfig(physics=SlipPhysics(**physics))
+    slips, engine = run_slip_test(trial, config), make_engine(settings_of("mujoco"))
+    return cross_check(trial, slips, config, ScoreLimits(), find_hand(), engine)
 
 
 # --- the interval ---------------------------------------------------------------------------
@@ -61,9 +58,8 @@ def test_labels_are_counted_and_what_one_did_not_judge_is_left_out():
     first = np.array([1.0, 1.0, 0.25, 0.0, np.nan, 1.0, 2 / 3])
     second = np.array([1.0, 0.5, 0.25, 1.0, 1.0, np.nan, 7 / 12])
     found = agreement(first, second)
-    assert (found.count, found.both_held, found.only_first, found.only_second, found.both_lost) == (
-        5, 1, 1, 1, 2,
-    )  # fmt: skip
+    alone = found.both_held, found.only_first, found.only_second, found.both_lost
+    assert found.count == 5 and alone == (1, 1, 1, 2)
     assert found.share == 0.6 and found.interval == wilson_interval(3, 5)
     assert found.same_score == 2
     assert found.mean_confidence == pytest.approx(np.mean([1, 0.5, 1, 0, 1 - 1 / 12]))
@@ -73,11 +69,10 @@ def test_labels_are_counted_and_what_one_did_not_judge_is_left_out():
 
 
 def test_two_engines_agree_on_a_box_that_coulomb_s_law_decides():
-    mujoco = pytest.importorskip("mujoco")
-    assert mujoco
+    pytest.importorskip("mujoco")
     # 2 mu F against 2.9 N of weight: 28 N hold; with 0.4 N, and with all weight 6 cm beside the
     # pads, the box falls or turns.
-    strong = checked(trial([0.0, 0.02]), SlipPhysics(force_n=70.0, friction=0.2), "mujoco")[1]
-    weak = checked(trial([0.0, 0.055]), SlipPhysics(force_n=1.0, friction=0.2), "mujoco")[1]
+    strong = checked([0.0, 0.02], force_n=70.0, friction=0.2)
+    weak = checked([0.0, 0.055], force_n=1.0, friction=0.2)
     assert np.all(strong["second_score"] == 1.0) and np.all(strong["confidence"] == 1.0)
     assert np.all(weak["second_score"] < 0.5) and np.all(weak["confidence"] > 0.8)

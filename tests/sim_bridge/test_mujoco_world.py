@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from held_boxes import held_box
+from held_boxes import DOWN, SIDE, held_box
 from realsim.geometry import se3
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.slip.engines import MujocoSettings
@@ -16,20 +16,14 @@ from refusals import refused
 
 pytest.importorskip("mujoco")
 
-DOWN = np.diag([1.0, -1.0, -1.0])
-SIDE = 0.05
+CENTRED = np.eye(4)[None]
+CUBE = held_box(0.125)
 GRAVITY = np.array([0.0, 0.0, -9.81])
 ENGINE = MujocoEngine(MujocoSettings())
 
 
-def cube(mass=0.125):
-    return held_box(mass)
-
-
-def grips(Ts_obj_grasp=None, R=DOWN, opening=SIDE + 0.008):
+def grips(Ts_obj_grasp=CENTRED, R=DOWN, opening=SIDE + 0.008):
     """Grips by hands of rotation R; the cube is seen turned so that its faces meet the fingers."""
-    if Ts_obj_grasp is None:
-        Ts_obj_grasp = np.eye(4)[None]
     n = len(Ts_obj_grasp)
     Ts = se3.from_rt(np.broadcast_to(R, (n, 3, 3)), np.zeros((n, 3)))
     return Grips(Ts_table_grasp=Ts, Ts_obj_grasp=Ts_obj_grasp, openings_m=np.full(n, opening))
@@ -43,7 +37,9 @@ def scattered(n, seed=0):
 
 
 def world(body=None, given=None, physics=None, engine=ENGINE):
-    return engine.world(body or cube(), given or grips(), physics or SlipPhysics(), find_hand())
+    return engine.world(
+        body or held_box(0.125), given or grips(), physics or SlipPhysics(), find_hand()
+    )
 
 
 def constant(force, steps, n=1):
@@ -114,7 +110,7 @@ def test_a_free_object_moves_as_its_twist_and_its_wrench_say():
     aside = se3.from_translation([0.0, 0.0, 0.3])[None]  # no finger touches the object
     twist = np.array([1.0, -2.0, 3.0, 0.2, 0.5, -0.4])
     wrench = np.array([2e-4, 1e-4, -3e-4, 0.3, -0.6, 0.9])
-    with world(cube(mass), grips(aside, R)) as hands:
+    with world(held_box(mass), grips(aside, R)) as hands:
         start = hands.states()
         moving = replace(start, twists=twist[None])
         hands.put(moving)
@@ -123,9 +119,7 @@ def test_a_free_object_moves_as_its_twist_and_its_wrench_say():
         end = hands.states()
     t = steps * hands.dt
     inertia = mass * SIDE**2 / 6  # a cube's is the same about all axes
-    speeds = np.concatenate(
-        [twist[:3] + wrench[:3] / inertia * t, twist[3:] + wrench[3:] / mass * t]
-    )
+    speeds = twist + wrench / np.repeat([inertia, mass], 3) * t
     assert np.allclose(end.twists[0], speeds, rtol=0, atol=1e-9)
     way = end.Ts_world_body[0, :3, 3] - start.Ts_world_body[0, :3, 3]
     assert np.allclose(way, 0.5 * (twist[3:] + speeds[3:]) * t, rtol=0, atol=1e-4)
@@ -169,7 +163,7 @@ def test_each_finger_presses_with_the_hand_s_force_and_carries_the_load_across(f
 ])  # fmt: skip
 def test_coulomb_s_limit_is_met_within_three_percent(force_n, friction, direction):
     capacity = 2 * friction * force_n
-    with world(cube(0.3), physics=SlipPhysics(force_n=force_n, friction=friction)) as hands:
+    with world(held_box(0.3), physics=SlipPhysics(force_n=force_n, friction=friction)) as hands:
         hands.close(Closing())
         closed = hands.states()
         below = slip_mm(hands, constant(0.97 * capacity * np.array(direction), 250))
@@ -184,7 +178,7 @@ def test_coulomb_s_limit_is_met_within_three_percent(force_n, friction, directio
 ])  # fmt: skip
 def test_a_box_sticks_through_lift_and_oscillation(mass, settings):
     motion, engine = SlipMotion(), MujocoEngine(settings)
-    with world(cube(mass), engine=engine) as hands:
+    with world(held_box(mass), engine=engine) as hands:
         hands.close(Closing())
         for a in (lift_acceleration(motion, hands.dt), oscillation_acceleration(motion, hands.dt)):
             wrenches = np.zeros((1, len(a), 6))
@@ -198,11 +192,11 @@ def test_a_box_sticks_through_lift_and_oscillation(mass, settings):
 def test_a_load_beyond_the_capacity_is_lost_although_light_objects_are_simulated_heavier():
     mass, force_n = 0.013, 1.0
     weight = constant(mass * GRAVITY, 600)
-    with world(cube(mass), physics=SlipPhysics(force_n=force_n, friction=0.05)) as hands:
+    with world(held_box(mass), physics=SlipPhysics(force_n=force_n, friction=0.05)) as hands:
         assert hands.settings()["object_mass_kg"] == pytest.approx(0.2)
         hands.close(Closing())
         assert not slip_mm(hands, weight)[0, -1] < 10.0
-    with world(cube(mass), physics=SlipPhysics(force_n=4 * force_n, friction=0.05)) as hands:
+    with world(held_box(mass), physics=SlipPhysics(force_n=4 * force_n, friction=0.05)) as hands:
         hands.close(Closing())
         assert slip_mm(hands, weight).max() < 0.05
 
@@ -212,7 +206,7 @@ def test_a_load_beyond_the_capacity_is_lost_although_light_objects_are_simulated
 
 def test_a_lost_pair_stops_and_a_removed_one_is_nan_and_neither_disturbs_the_others():
     n = 3
-    with world(given=grips(np.repeat(np.eye(4)[None], n, axis=0))) as hands:
+    with world(given=grips(np.repeat(CENTRED, n, axis=0))) as hands:
         hands.close(Closing())
         hands.remove(np.array([False, True, False]))
         loads = constant([0.0, 0.0, -1.0], 600, n=n)
@@ -232,7 +226,9 @@ def test_a_lost_pair_stops_and_a_removed_one_is_nan_and_neither_disturbs_the_oth
 
 
 def test_bad_input_is_refused_in_words():
-    flat = replace(cube(), parts=(np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]),))
+    flat = replace(
+        held_box(0.125), parts=(np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]),)
+    )
     refused("plane", world, flat)
     with world() as hands:
         refused(r"0\.001 m/s", hands.close, Closing(speed=0.001))

@@ -31,12 +31,14 @@ def trial(n=1, mass=0.125):
     return held_from_above(held_box(mass), [0.0] * n)
 
 
+def simulated(physics=None, engine=None):
+    """Return a config of which all stages are simulated: the engine is judged, not what is sure."""
+    engine = engine or BulletSettings()
+    return SlipConfig(physics=physics or SlipPhysics(), engine=engine, sure=None)
+
+
 def run(physics=None, engine=None, **kwargs):
-    """Simulate all stages: the engine is judged, not what is sure."""
-    config = SlipConfig(
-        physics=physics or SlipPhysics(), engine=engine or BulletSettings(), sure=None
-    )
-    return run_slip_test(trial(**kwargs), config)
+    return run_slip_test(trial(**kwargs), simulated(physics, engine))
 
 
 def score(slips):
@@ -52,9 +54,7 @@ def test_the_box_is_held_through_all_stages_without_slip():
 def test_a_bare_default_world_drops_the_same_box():
     default = SlipPhysics(pads=None, mass_floor_kg=0.0)
     patient = ScoreLimits(slip_m=0.04, slip_deg=360.0)
-    config = SlipConfig(
-        physics=default, engine=BulletSettings(iterations=50, replay=Replay()), sure=None
-    )
+    config = simulated(default, BulletSettings(iterations=50, replay=Replay()))
     assert score(run_slip_test(trial(), config))[0] < 0.5
     # Even if turning and slipping are let pass, the box falls out before the end.
     slips = run_slip_test(trial(), config, patient)
@@ -109,21 +109,19 @@ def test_light_objects_are_held_and_carry_their_true_weight():
 
 def turned_trial(n, mass=0.125):
     """Return grasps of the cube that differ: off its middle, and about its closing axis."""
-    t = trial(n, mass)
-    Ts = t.Ts_obj_grasp.copy()
-    for k in range(n):
-        Ts[k] = se3.from_rt(DOWN @ se3.exp_so3([0, 0.3 * k, 0]), [0.004 * k, 0.0, 0.002 * k])
-    return replace(t, Ts_obj_grasp=Ts, Ts_table_grasp=Ts)
+    k = np.arange(n)[:, None]
+    Ts = se3.from_rt(DOWN @ se3.exp_so3(k * [0, 0.3, 0]), k * [0.004, 0.0, 0.002])
+    return replace(trial(n, mass), Ts_obj_grasp=Ts, Ts_table_grasp=Ts)
 
 
 def test_results_are_repeatable_to_the_bit():
-    a, b = (run_slip_test(turned_trial(2), SlipConfig(sure=None)) for _ in range(2))
+    a, b = (run_slip_test(turned_trial(2), simulated()) for _ in range(2))
     assert np.array_equal(a.slip_m, b.slip_m) and np.array_equal(a.slip_rad, b.slip_rad)
 
 
 @pytest.mark.slow
 def test_no_grasp_depends_on_the_others_it_is_tried_with():
-    every = SlipConfig(sure=None)  # a stage that is not simulated depends on nothing anyhow
+    every = simulated()  # a stage that is not simulated depends on nothing anyhow
     together = run_slip_test(turned_trial(4), every)
     backwards = run_slip_test(turned_trial(4).part(np.array([3, 2, 1, 0])), every)
     alone = run_slip_test(turned_trial(4).part(slice(2, 3)), every)
@@ -173,9 +171,8 @@ def test_states_put_back_go_on_alike():
 
 
 def test_a_hand_that_closes_on_nothing_fails_in_the_first_stage():
-    beside = trial()
-    beside = replace(beside, Ts_obj_grasp=se3.from_rt(DOWN, [0.0, 0.0, 0.2])[None])
-    slips = run_slip_test(beside)
+    beside = se3.from_rt(DOWN, [0.0, 0.0, 0.2])[None]
+    slips = run_slip_test(replace(trial(), Ts_obj_grasp=beside))
     assert slips.failures[0] == "close: the fingers did not both touch the object"
     assert np.isinf(slips.slip_m[0, 0]) and np.isnan(slips.slip_m[0, 1:]).all()
 
@@ -204,10 +201,9 @@ def test_inertial_forces_are_those_of_newton_in_the_world():
     axis /= np.linalg.norm(axis)
     arm, mass = rng.normal(size=3), 0.7
     angle = pendulum_angle(motion, dt, -1.0, 1.0)
-    wrench = pendulum_wrenches(
-        angle[None], axis[None], arm[None], np.eye(3)[None] * 1e-3, mass, 9.81
-    )
-    torque, force = wrench[0, :, :3], wrench[0, :, 3:]
+    inertia = np.eye(3)[None] * 1e-3
+    (wrench,) = pendulum_wrenches(angle[None], axis[None], arm[None], inertia, mass, 9.81)
+    torque, force = wrench[:, :3], wrench[:, 3:]
     R = se3.exp_so3(angle[0][:, None] * axis)
     path = R @ arm
     acceleration = np.gradient(np.gradient(path, dt, axis=0), dt, axis=0)
@@ -220,21 +216,18 @@ def test_inertial_forces_are_those_of_newton_in_the_world():
 
 
 def test_the_safety_factor_is_coulomb_s_and_what_it_makes_sure_is_what_the_engine_says():
-    physics = replace(SlipPhysics(), force_n=10.0, friction=0.3)
-    simulated = SlipConfig(physics=physics, engine=MujocoSettings(), sure=None)
-    skipped = 0
+    config, skipped = simulated(SlipPhysics(force_n=10.0, friction=0.3), MujocoSettings()), 0
     for mass in (0.02, 0.1, 0.125, 0.25, 0.5, 3.0):
         cubes = turned_trial(2, mass)
-        sure = run_slip_test(cubes, replace(simulated, sure=3.0))
-        every = run_slip_test(cubes, simulated)
+        sure = run_slip_test(cubes, replace(config, sure=3.0))
+        every = run_slip_test(cubes, config)
         # Two fingers carry 2 mu F; a cone of eight edges is at most 5 % off.
         assert sure.safety[0, 0] == pytest.approx(2 * 0.3 * 10.0 / (9.81 * mass), rel=0.06)
         np.testing.assert_array_equal(sure.safety, every.safety)
         np.testing.assert_array_equal(sure.passed, every.passed)
         is_sure = sure.safety[:, 1:] >= 3.0
-        assert np.all(sure.slip_m[:, 1:][is_sure] == 0) and np.all(
-            every.slip_m[:, 1:][is_sure] < 1e-3
-        )
+        assert np.all(sure.slip_m[:, 1:][is_sure] == 0)
+        assert np.all(every.slip_m[:, 1:][is_sure] < 1e-3)
         skipped += int(is_sure.sum())
     assert skipped >= 18
     refused(r"0.5 makes nothing sure.*more than 1", SlipConfig, sure=0.5)
@@ -254,7 +247,6 @@ def test_a_sliver_between_parts_has_a_core_too():
 
 # --- Margins: how little friction and force a grasp survives.
 
-GRAVITY = 9.81
 PEAK = 11.6
 """Greatest acceleration that any of the stages asks the pads to carry on a centred box [m/s^2]."""
 LEVELS = (1.0, 0.7, 0.5, 0.35, 0.2, 0.1, 0.05)
@@ -279,7 +271,7 @@ class Law:
 
     def __call__(self, level, rows):
         self.tries[rows] += 1
-        return np.where(level >= self.thresholds[rows], 1.0, 0.25)
+        return self.known(level)[rows]
 
     def known(self, own):
         return np.where(own >= self.thresholds, 1.0, 0.25)
@@ -297,10 +289,8 @@ def test_all_searches_find_the_same_least_level(own):
         above = np.where(ladder >= thresholds[:, None], ladder, np.inf)
         assert np.array_equal(found[search].least, above.min(axis=1))
         assert not found[search].exceptions.any()
-        most = {"descent": len(LEVELS), "bisect": 3, "every": len(LEVELS)}[search]
-        assert law.tries.max() <= most
-    passed = [f.passed for f in found.values()]
-    assert all(np.array_equal(p, passed[0]) for p in passed)
+        assert law.tries.max() <= (3 if search == "bisect" else len(LEVELS))
+        assert np.array_equal(found[search].passed, found["descent"].passed)
 
 
 def test_the_own_level_is_not_tried_again_and_counts_in_the_share_only_if_listed():
@@ -338,7 +328,7 @@ def test_the_least_friction_and_force_are_coulomb_s(engine, mass):
     # Two pads carry 2 mu F. Below the weight the box falls, above the peak load it stays; between
     # it slides for a moment, which may stay below 2 cm.
     force_n, friction = 20.0, 0.25
-    weight, peak = mass * GRAVITY, mass * PEAK
+    weight, peak = mass * 9.81, mass * PEAK
     frictions = (peak * 4, peak * 1.05, weight * 0.9, weight * 0.5)
     sweep = SweepConfig(
         frictions=tuple(load / (2 * force_n) for load in frictions),
@@ -346,7 +336,7 @@ def test_the_least_friction_and_force_are_coulomb_s(engine, mass):
         search="every",
     )
     physics = SlipPhysics(force_n=force_n, friction=friction)
-    found = measured(held_from_above(held_box(mass)), sweep, physics, engine)
+    found = measured(trial(mass=mass), sweep, physics, engine)
     assert found.friction.least == pytest.approx([peak * 1.05 / (2 * force_n)])
     assert found.force.least == pytest.approx([peak * 1.05 / (2 * friction)])
     assert found.measures()["margin"] == pytest.approx([0.5])
@@ -360,9 +350,9 @@ def test_pads_that_cannot_be_and_forces_that_press_them_through_are_left_out():
     pytest.importorskip("mujoco")
     own = SlipPhysics(force_n=20.0).with_pads(3e4)
     sweep = SweepConfig(frictions=(1.0,), forces_n=(70.0, 20.0), stiffness_factors=(50.0, 1.0, 0.3))
-    found = measured(held_from_above(held_box(0.2)), sweep, own, "mujoco")
+    found = measured(trial(mass=0.2), sweep, own, "mujoco")
     assert found.stiffness.levels.tolist() == [3e4] and found.force.levels.tolist() == [20.0]
-    bare = measured(held_from_above(held_box(0.2)), sweep, SlipPhysics(pads=None), "mujoco")
+    bare = measured(trial(mass=0.2), sweep, SlipPhysics(pads=None), "mujoco")
     assert bare.stiffness.scores.shape == (1, 1) and not np.isnan(bare.stiffness.scores).any()
 
 
