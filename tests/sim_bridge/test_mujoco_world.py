@@ -36,10 +36,8 @@ def scattered(n, seed=0):
     return se3.from_rt(se3.exp_so3(turns), rng.uniform(-0.01, 0.01, (n, 3)) * [1, 0.2, 1])
 
 
-def world(body=None, given=None, physics=None, engine=ENGINE):
-    return engine.world(
-        body or held_box(0.125), given or grips(), physics or SlipPhysics(), find_hand()
-    )
+def world(body=CUBE, given=None, physics=None, engine=ENGINE):
+    return engine.world(body, given or grips(), physics or SlipPhysics(), find_hand())
 
 
 def constant(force, steps, n=1):
@@ -226,9 +224,7 @@ def test_a_lost_pair_stops_and_a_removed_one_is_nan_and_neither_disturbs_the_oth
 
 
 def test_bad_input_is_refused_in_words():
-    flat = replace(
-        held_box(0.125), parts=(np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]),)
-    )
+    flat = replace(CUBE, parts=(np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]),))
     refused("plane", world, flat)
     with world() as hands:
         refused(r"0\.001 m/s", hands.close, Closing(speed=0.001))

@@ -63,9 +63,8 @@ def test_every_candidate_is_in_exactly_one_row(seed):
     assert sum(out.values()) == found.candidates == sum(len(s) for s in sets)
     assert found.good == sum(int(s.good.sum()) for s in sets)
     assert found.good + found.bad + out["not_tried"] == found.candidates
-    assert found.bad == (
-        out["no_trajectory"] + out["fail_close"] + out["fail_lift"] + out["penalized"]
-    )
+    wrong = ("no_trajectory", "fail_close", "fail_lift", "penalized")
+    assert found.bad == sum(out[name] for name in wrong)
     assert found.with_trajectory + out["no_trajectory"] == found.judged
     paper = found.by_paper
     assert sum(paper.outcomes.values()) == found.candidates and paper.outcomes["penalized"] == 0
@@ -82,13 +81,10 @@ def test_every_candidate_is_in_exactly_one_row(seed):
 
 def by_hand(rows):
     """Return a set of (reachable, base, score, executed stages)."""
-    n = len(rows)
-    slip = np.full((n, 4), np.nan)
-    for row, (_, _, _, stages) in zip(slip, rows, strict=True):
-        row[:stages] = 0.001
-    reachable, base, scores, _ = (np.array(column) for column in zip(*rows, strict=True))
+    reachable, base, scores, stages = (np.array(column) for column in zip(*rows, strict=True))
+    slip = np.where(np.arange(4) < stages[:, None], 0.001, np.nan)
     return plain_grasps(
-        n, scores=scores, base_scores=base, slip_m=slip, slip_rad=slip, reachable=reachable
+        len(rows), scores=scores, base_scores=base, slip_m=slip, slip_rad=slip, reachable=reachable
     )
 
 
@@ -167,14 +163,10 @@ def test_only_tried_grasps_are_compared_with_force_closure():
     tried = ~np.isnan(s.slip_m[:, 0])
     closed = (rng.random(n) < 0.7).astype(float)
     closed[:10] = np.nan
-    s = replace(
-        s,
-        measures={
-            "margin": np.where(tried, np.nan_to_num(s.scores) ** 2, np.nan),
-            "dexnet_closure": closed,
-            "closure_friction": np.where(rng.random(n) < 0.5, np.inf, 0.4),
-        },
-    )
+    margin = np.where(tried, np.nan_to_num(s.scores) ** 2, np.nan)
+    friction = np.where(rng.random(n) < 0.5, np.inf, 0.4)
+    measures = {"margin": margin, "dexnet_closure": closed, "closure_friction": friction}
+    s = replace(s, measures=measures)
     found = summarise([s])
     pair = next(c for c in found.correlations if (c.first, c.second) == ("score", "margin"))
     assert pair.rho == pytest.approx(1.0) and pair.grasps == int(tried.sum())
@@ -183,9 +175,8 @@ def test_only_tried_grasps_are_compared_with_force_closure():
     assert c.closure == "dexnet_closure" and c.grasps == int(known.sum())
     assert c.closed_good == int(np.sum(known & (closed == 1) & s.good))
     assert c.agree == pytest.approx(np.mean(s.good[known] == (closed[known] == 1)))
-    assert found.closures[1].closed_good + found.closures[1].closed_bad == int(
-        np.sum(tried & np.isfinite(s.measures["closure_friction"]))
-    )
+    closed_good, closed_bad = found.closures[1].closed_good, found.closures[1].closed_bad
+    assert closed_good + closed_bad == int(np.sum(tried & np.isfinite(friction)))
     assert [c.friction for c in found.closures] == [None, 0.4]
     names = [name for name, _, _ in found.to_rows()]
     assert "dexnet_closure: closed: good, bad" in names
@@ -219,11 +210,11 @@ def test_the_entropy_of_p_hold_is_that_of_ten_equal_bins():
 
 def test_objects_of_one_number_and_other_meshes_are_different_objects():
     rng = np.random.default_rng(0)
-    sets = [
-        replace(scored_set(rng, 5, obj_id=1), parameters={"inputs": {"mesh": mesh}})
-        for mesh in ("one", "other", "one")
-    ]
-    assert summarise({"a": sets[:1], "b": sets[1:2], "c": sets[2:]}).objects == 2
+    scenes = {
+        name: [replace(scored_set(rng, 5, obj_id=1), parameters={"inputs": {"mesh": mesh}})]
+        for name, mesh in zip("abc", ("one", "other", "one"), strict=True)
+    }
+    assert summarise(scenes).objects == 2
 
 
 def test_hands_are_compared_on_the_objects_that_all_of_them_tried():
@@ -251,14 +242,10 @@ NAN, INF = np.nan, np.inf
 TEN = np.radians(10.0)
 
 
-def one(slip_m, slip_rad=(0.0, 0.0, 0.0, 0.0), tried=True):
-    base, score = score_stages(
-        np.array([slip_m], dtype=float),
-        np.array([slip_rad], dtype=float),
-        np.array([tried]),
-        ScoreLimits(),
-    )
-    return float(base[0]), float(score[0])
+def one(slip_m, slip_rad, tried=True):
+    slips = np.array([[slip_m], [slip_rad]], dtype=float)
+    (base,), (score,) = score_stages(*slips, np.array([tried]), ScoreLimits())
+    return base, score
 
 
 @pytest.mark.parametrize(
@@ -320,18 +307,7 @@ def test_scores_lie_in_the_unit_interval_and_never_rise_with_slip():
     assert np.all(worse <= score) and np.any(worse < score)
 
 
-def stored(slip_m, reachable, scores):
-    return plain_grasps(
-        len(slip_m),
-        scores=scores,
-        base_scores=scores,
-        slip_m=slip_m,
-        slip_rad=np.where(np.isnan(slip_m), NAN, 0.0),
-        reachable=reachable,
-        parameters={"config": {"score": asdict(ScoreLimits())}},
-    )
-
-
 def test_a_set_from_elsewhere_is_refused():
-    grasp_set = replace(stored([[0, 0, 0, 0]], [True], [1.0]), parameters={})
-    refused(r"config\.score", recompute_scores, grasp_set)
+    still, held = np.zeros((1, 4)), np.ones(1)
+    own = plain_grasps(1, scores=held, base_scores=held, slip_m=still, slip_rad=still)
+    refused(r"config\.score", recompute_scores, own)

@@ -3,11 +3,13 @@
 import json
 import math
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pybullet_utils.bullet_client import BulletClient
 from scipy.optimize import linprog
 
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings, make_engine, settings_of
@@ -58,25 +60,6 @@ def failed(report):
     return {c.name for c in report.checks if not c.passed}
 
 
-@pytest.fixture
-def told_otherwise(monkeypatch):
-    """Make PyBullet take engine parameters besides those it is given."""
-    from pybullet_utils.bullet_client import BulletClient
-
-    def tell(**more):
-        original = BulletClient.__getattr__
-
-        def attribute(self, name):
-            found = original(self, name)
-            if name == "setPhysicsEngineParameter":
-                return lambda **asked: found(**(asked | more))
-            return found
-
-        monkeypatch.setattr(BulletClient, "__getattr__", attribute)
-
-    return tell
-
-
 class StrongerEngine:
     """PyBullet whose fingers press half as hard again as they are told to."""
 
@@ -103,14 +86,11 @@ def test_the_shipped_settings_pass_a_small_suite():
 @pytest.mark.slow
 def test_the_quick_suite_passes():
     pytest.importorskip("mujoco")
-    told = []
-    report = validate(
-        settings_of("mujoco"), ValidationConfig().quick(), lambda *progress: told.append(progress)
-    )
+    told = Mock()
+    report = validate(settings_of("mujoco"), ValidationConfig().quick(), told)
     assert failed(report) == set(), report.to_rows()
-    assert [t[0] for t in told] == list(CHECKS)
-    groups = {c.group for c in report.checks}
-    assert groups >= set(CHECKS) - {"replay"}
+    assert [made.args[0] for made in told.mock_calls] == list(CHECKS)
+    assert {c.group for c in report.checks} >= set(CHECKS) - {"replay"}
     assert picture(report)[:8] == b"\x89PNG\r\n\x1a\n"
 
 
@@ -132,8 +112,16 @@ def test_too_much_contact_damping_fails():
     assert failed(run("coulomb", settings=replace(PLAIN, damping=1000.0)))
 
 
-def test_a_friction_pyramid_fails_between_the_axes_alone(told_otherwise):
-    told_otherwise(enableConeFriction=0)
+def test_a_friction_pyramid_fails_between_the_axes_alone(monkeypatch):
+    original = BulletClient.__getattr__
+
+    def pyramid(self, name):
+        found = original(self, name)
+        if name == "setPhysicsEngineParameter":
+            return lambda **asked: found(**(asked | {"enableConeFriction": 0}))
+        return found
+
+    monkeypatch.setattr(BulletClient, "__getattr__", pyramid)
     assert failed(run("coulomb")) == {"coulomb limit, 45 deg"}
 
 
