@@ -1,12 +1,12 @@
 """Analytic labels: what closes, what the gripper hits, and how few of many are chosen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-import trimesh
 
 from realsim.formats.graspnet import gripper_frame as frame
 from realsim.geometry import se3
-from realsim.records import Mesh
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.grasping.analytic import AnalyticConfig, analytic_labels, gripper_boxes
 from realsim_sim_bridge.grasping.analytic_given import given_candidates, standing_labels
@@ -14,14 +14,11 @@ from realsim_sim_bridge.grasping.analytic_select import select_rows
 from realsim_sim_bridge.grasping.candidates import CandidateConfig, Surroundings
 from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
 from tried_grasps import assert_same
-from trimesh_solids import solid, wedge
+from trimesh_solids import ball, box, wedge
 
 HAND = find_hand()
 FEW = AnalyticConfig(points=12)
-
-
-def box(*size):
-    return solid(trimesh.creation.box(size or (0.04, 0.06, 0.1)))
+BOX = box((0.04, 0.06, 0.1))
 
 
 def labels_of(mesh, config=FEW, seed=0):
@@ -30,7 +27,7 @@ def labels_of(mesh, config=FEW, seed=0):
 
 @pytest.fixture(scope="module")
 def of_box():
-    return box(), labels_of(box())
+    return BOX, labels_of(BOX)
 
 
 # --- laws -------------------------------------------------------------------------------------
@@ -41,19 +38,13 @@ def test_the_same_seed_gives_the_same_labels(of_box):
     assert_same(labels_of(mesh), labels)
 
 
-def inside_out(mesh):
-    return Mesh(vertices=mesh.vertices, faces=mesh.faces[:, ::-1])
-
-
-@pytest.mark.parametrize("mesh", [inside_out(box()), solid(trimesh.creation.icosphere(3, 0.03))])
+@pytest.mark.parametrize("mesh", [replace(BOX, faces=BOX.faces[:, ::-1]), ball(0.03, 3)])
 def test_the_friction_is_that_of_the_measure_closure_friction(mesh):
     """Two ways to the same number: rays of 14,400 lines a point, and the hand's closing axis."""
     labels = labels_of(mesh)
     some = labels.rows(np.arange(0, len(labels), max(1, len(labels) // 300)))
-    config = ClosureConfig(levels=AnalyticConfig().levels)
-    closure = force_closure(
-        mesh, some.Ts_obj_grasp(), some.openings_m.astype(np.float64), config, HAND
-    )
+    config, openings = ClosureConfig(levels=AnalyticConfig().levels), some.openings_m.astype(float)
+    closure = force_closure(mesh, some.Ts_obj_grasp(), openings, config, HAND)
     same = np.abs(closure.closure_friction - some.friction) < 1e-6
     # Lines along an edge meet the one or the other face.
     assert len(some) > 50 and same.mean() > 0.97
@@ -84,7 +75,7 @@ def test_what_closes_on_a_wedge_needs_the_friction_of_its_slopes():
 
 
 def test_a_box_that_nothing_can_hold_has_no_label():
-    labels = labels_of(box(0.3, 0.3, 0.3))
+    labels = labels_of(box((0.3, 0.3, 0.3)))
     assert len(labels) == 0 and len(labels.points) == 12
     assert len(select_rows(labels, 10, np.random.default_rng(0))) == 0
 
@@ -99,7 +90,7 @@ def test_graspnets_gripper_has_the_boxes_of_its_collision_check():
 def test_a_palm_in_the_object_collides_with_it():
     """Wherever one of a dozen points of the gripper is in the box, the label says so."""
     half = np.array([0.03, 0.1, 0.1])
-    labels = labels_of(box(*(2 * half)))
+    labels = labels_of(box(2 * half))
     Ts = frame.graspnet_poses(labels.Ts_obj_grasp(), labels.depths_m)
     boxes = gripper_boxes(labels.depths_m.astype(float), labels.openings_m.astype(float))
     at = np.array([[a, b, c] for a in (0.1, 0.5, 0.9) for b in (0.1, 0.9) for c in (0.2, 0.8)])
@@ -114,10 +105,9 @@ def test_a_palm_in_the_object_collides_with_it():
 
 def test_the_choice_is_free_spread_and_of_every_level(of_box):
     labels = of_box[1]
-    rng = np.random.default_rng(1)
-    few = labels.rows(select_rows(labels, 60, rng))
-    assert len(few) == 60
     rows = select_rows(labels, 60, np.random.default_rng(1))
+    few = labels.rows(select_rows(labels, 60, np.random.default_rng(1)))
+    assert len(few) == 60
     np.testing.assert_array_equal(few.index, labels.index[rows])
     np.testing.assert_array_equal(few.friction, labels.friction[rows])
     assert not labels.collision[rows].any()
@@ -145,9 +135,8 @@ def test_given_grasps_keep_their_contacts_and_their_friction(of_box):
     mesh, labels = of_box
     given = labels.rows(select_rows(labels, 80, np.random.default_rng(0)))
     Ts = given.Ts_obj_grasp()
-    found, rows = given_candidates(
-        mesh, standing(mesh), Surroundings(), Ts, CandidateConfig(), HAND
-    )
+    alone, config = Surroundings(), CandidateConfig()
+    found, rows = given_candidates(mesh, standing(mesh), alone, Ts, config, HAND)
     counts = found.counts
     taken = ("without_contacts", "too_near", "too_wide", "hand_in_table", "hand_in_object",
              "hand_in_neighbour", "free")  # fmt: skip

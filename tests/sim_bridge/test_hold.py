@@ -1,6 +1,6 @@
 """p_hold: laws of the draws and of the loads that they are asked for."""
 
-from dataclasses import fields, replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -75,8 +75,7 @@ def drawn(bar, trial):
 
 
 def shares(drawn):
-    names = ("blocked", "missed", "skewed", "overloaded")
-    return np.stack([getattr(drawn, name) for name in names])
+    return np.stack([drawn.blocked, drawn.missed, drawn.skewed, drawn.overloaded])
 
 
 # --- draws ----------------------------------------------------------------------------------------
@@ -101,9 +100,7 @@ def test_more_spread_is_less_share_of_a_tight_grasp(bar):
     tight = bar_trial(np.array([0.0, 0.01]))
     found = []
     for times in (0.0, 1.0, 2.0, 4.0):
-        spread = PoseSpread(
-            **{f.name: times * getattr(PoseSpread(), f.name) for f in fields(PoseSpread)}
-        )
+        spread = PoseSpread(**{name: times * x for name, x in asdict(PoseSpread()).items()})
         found.append(draws_of(bar, tight, HoldConfig(draws=32, spread=spread)).share)
     assert np.all(np.diff(found, axis=0) < 0) and np.all(found[0] > 0.98)
 
@@ -142,9 +139,8 @@ def test_a_draw_without_spread_says_what_the_nominal_safety_says(bar):
 
 def test_point_contacts_on_a_ball_are_overloaded_by_a_torque_not_skewed():
     ball = GraspedObject.of(solid(trimesh.creation.icosphere(3, 0.025)))
-    rigid = replace(CERTAIN, conformity_m=0.0)
     trial = bar_trial(np.array([0.0, 0.004]), z=0.0)
-    found = draws_of(ball, trial, rigid, np.inf)
+    found = draws_of(ball, trial, replace(CERTAIN, conformity_m=0.0), np.inf)
     assert found.skewed.sum() == 0 and found.overloaded[1] == 1.0
 
 
@@ -246,27 +242,33 @@ def test_hands_on_an_arc_and_open_meshes_work(bar, trial):
 # --- loads ----------------------------------------------------------------------------------------
 
 
+def turned_by(R, wrenches):
+    """Return torques and forces as rows times R."""
+    return np.concatenate([wrenches[..., :3] @ R, wrenches[..., 3:] @ R], axis=-1)
+
+
+def start_of(trial):
+    """Return where the bodies' principal frames are, the hands' middles being the origin."""
+    start = np.tile(np.eye(4), (len(trial), 1, 1))
+    T_grasp_body = se3.invert(trial.Ts_obj_grasp) @ trial.body.principal_frame()[0]
+    start[:, :3] = trial.Ts_table_grasp[:, :3, :3] @ T_grasp_body[:, :3]
+    return start
+
+
 def test_loads_are_those_of_the_slip_test_in_the_hands_frame(trial):
     tilts = se3.random_transform(np.random.default_rng(2), len(trial))
     trial = replace(trial, Ts_table_grasp=tilts)
     motion, R = SlipMotion(), tilts[:, :3, :3]
     loads = stage_loads(trial, motion)
-    turned = np.concatenate(
-        [loads.wrenches[..., :3] @ np.swapaxes(R, 1, 2),
-         loads.wrenches[..., 3:] @ np.swapaxes(R, 1, 2)], axis=-1,
-    )  # fmt: skip
+    turned = turned_by(np.swapaxes(R, 1, 2), loads.wrenches)
     weight = [0, 0, 0, 0, 0, -MASS * motion.gravity]
     np.testing.assert_allclose(turned[:, loads.stage == 0], [[weight]] * len(trial), atol=1e-12)
     centers = se3.transform(se3.invert(trial.Ts_obj_grasp), np.zeros((1, 3)))[:, 0]
     rest = loads.about_grasp(centers, np.zeros((len(trial), 1), dtype=np.int64))[:, 0]
     down = -MASS * motion.gravity * R[:, 2]  # the weight in the hand's axes, where the middle is
     np.testing.assert_allclose(rest, np.hstack([np.cross(centers, down), down]), atol=1e-12)
-    start = np.broadcast_to(np.eye(4), trial.Ts_obj_grasp.shape).copy()
-    T_grasp_obj = se3.invert(trial.Ts_obj_grasp)
-    T_obj_body = trial.body.principal_frame()[0]
-    start[:, :3] = R @ (T_grasp_obj @ T_obj_body)[:, :3]
     for k in range(1, len(STAGES)):
-        exact = stage_wrenches(k, trial, start, motion, 1 / 240)
+        exact = stage_wrenches(k, trial, start_of(trial), motion, 1 / 240)
         mine = turned[:, loads.stage == k]
         for part in (slice(0, 3), slice(3, 6)):  # every load is one of the stage's ...
             apart = np.linalg.norm(mine[:, :, None, part] - exact[:, None, :, part], axis=-1)
@@ -282,13 +284,10 @@ def test_the_few_loads_are_the_worst_of_all(bar):
     trial = replace(trial, Ts_table_grasp=se3.from_rt(turn, np.zeros(3)) @ trial.Ts_table_grasp)
     few = stage_loads(trial, motion)
     R = trial.Ts_table_grasp[:, :3, :3]
-    start = np.broadcast_to(np.eye(4), (*R.shape[:1], 4, 4)).copy()
-    start[:, :3] = R @ se3.invert(trial.Ts_obj_grasp)[:, :3] @ trial.body.principal_frame()[0]
     told = nominal_factors(bar, trial, few, HAND, 0.5, FORCE, 0.0015)
     for k in range(1, len(STAGES)):
-        fine = stage_wrenches(k, trial, start, motion, 1 / 96)
-        turned = np.concatenate([fine[..., :3] @ R, fine[..., 3:] @ R], axis=-1)
-        every = replace(few, wrenches=turned, stage=np.full(turned.shape[1], k))
+        fine = stage_wrenches(k, trial, start_of(trial), motion, 1 / 96)
+        every = replace(few, wrenches=turned_by(R, fine), stage=np.full(fine.shape[1], k))
         factors = nominal_factors(bar, trial, every, HAND, 0.5, FORCE, 0.0015)
         np.testing.assert_allclose(
             told[:, few.stage == k].min(axis=1), factors.min(axis=1), rtol=0.02

@@ -1,6 +1,7 @@
 """p_hold: laws of its calibration, and of how it is judged by real trials."""
 
 from dataclasses import replace
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
@@ -81,17 +82,16 @@ def test_trials_that_cannot_calibrate_are_named():
 # --- judged by trials -----------------------------------------------------------------------------
 
 
-def judged(held, evidence, kinds=2, digest="none", **columns):
+def judged(held, evidence, kinds=2, **columns):
     n = len(held)
     return Judged(
-        held=np.asarray(held, dtype=bool),
-        objects=np.array([f"object {k % kinds}" for k in range(n)]),
-        evidence=np.asarray(evidence, dtype=float),
-        columns={"score_old": np.asarray(evidence, dtype=float), **columns},
-        shares={},
-        digest=digest,
-        engine="made up",
-    )
+        held=held, objects=np.array([f"object {k % kinds}" for k in range(n)]), evidence=evidence,
+        columns={"score_old": evidence, **columns}, shares={}, digest="none", engine="made up",
+    )  # fmt: skip
+
+
+def row_of(found, name):
+    return next(row for row in found.rows if row.name == name)
 
 
 def slow_auc(values, held):
@@ -118,17 +118,16 @@ def test_auc_and_average_precision_are_those_of_slow_formulas_with_ties(seed):
     shuffle = rng.permutation(60)
     for order in (np.arange(60), shuffle, np.argsort(held), np.roll(shuffle, 7)):
         found = reality_of(judged(held[order], np.full(60, 0.5), some=values[order]))
-        row = next(row for row in found.rows if row.name == "some")
+        row = row_of(found, "some")
         assert row.auc == pytest.approx(slow_auc(values, held))
         assert row.average_precision == pytest.approx(slow_precision(values, held))
     halves = [np.flatnonzero(np.arange(60) % 2 == k) for k in (0, 1)]  # the last order's objects
     v, h = values[order], held[order]
     weights = [h[rows].sum() * (~h[rows]).sum() for rows in halves]
-    told = [
-        slow_auc(v[rows], h[rows]) if w else 0.0 for rows, w in zip(halves, weights, strict=True)
-    ]
+    pairs = zip(halves, weights, strict=True)
+    told = [slow_auc(v[rows], h[rows]) if weight else 0.0 for rows, weight in pairs]
     assert row.within == pytest.approx(np.average(told, weights=weights))
-    always = next(row for row in found.rows if row.name == "always holds")
+    always = row_of(found, "always holds")
     assert always.auc == 0.5 and always.average_precision == pytest.approx(held.mean())
     assert np.isnan(always.within)
 
@@ -137,7 +136,7 @@ def test_the_identity_predictor_knows_an_objects_other_trials_alone():
     """Object 0 held in 3 of 4 trials, object 1 in 1 of 4: each trial is told by the other three."""
     held = np.array([1, 0, 1, 0, 1, 1, 0, 0], dtype=bool)  # objects by turns
     found = reality_of(judged(held, np.full(8, 0.5)))
-    row = next(row for row in found.rows if row.name == "object")
+    row = row_of(found, "object")
     told = np.array([2, 1, 2, 1, 2, 0, 3, 1]) / 3
     assert row.auc == pytest.approx(slow_auc(told, held))
 
@@ -166,19 +165,17 @@ def test_intervals_are_by_object_and_need_three():
     np.testing.assert_allclose([row.auc_low, row.auc_high], np.percentile(aucs, (2.5, 97.5)))
     assert (many.gain, many.gain_low, many.gain_high) == (0.0, 0.0, 0.0)  # the same predictor
     own = replace(shipped(), digest="none")
-    inside = reality_of(judged(held, evidence, kinds=6), own)
-    assert inside.in_sample and not many.in_sample
     data = judged(held, evidence, kinds=6)
+    inside = reality_of(data, own)
+    assert inside.in_sample and not many.in_sample
     np.testing.assert_array_equal(inside.p_hold, left_out(evidence, held, data.objects))
 
 
 def test_good_and_bad_grasps_of_a_box_are_told_apart(tmp_path):
     write_graspa(tmp_path, "wooden_box", *box_grasps())
-    objects, done = read_graspa(tmp_path), []
-    found = judge_trials(
-        objects, RealityConfig(hold=HoldConfig(draws=4)), progress=lambda k, n: done.append((k, n))
-    )
-    assert done == [(8, 8)] and found.engine == "pybullet"
+    objects, progress = read_graspa(tmp_path), Mock()
+    found = judge_trials(objects, RealityConfig(hold=HoldConfig(draws=4)), progress=progress)
+    assert progress.mock_calls == [call(8, 8)] and found.engine == "pybullet"
     reality = reality_of(found)
     auc = {row.name: row.auc for row in reality.rows}
     assert {row.within for row in reality.rows if row.name == "score"} == {1.0}

@@ -32,16 +32,6 @@ def pixels(png):
     return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
 
 
-def with_score(s, score):
-    """Return the set as if every grasp had been tried and had this score."""
-    n = len(s)
-    slip = np.full((n, 4), 0.001)
-    return replace(
-        s, scores=np.full(n, score), base_scores=np.full(n, score), slip_m=slip, slip_rad=slip,
-        reachable=np.ones(n, bool), measures={},
-    )  # fmt: skip
-
-
 # --- what is counted --------------------------------------------------------------------------
 
 
@@ -97,13 +87,16 @@ def test_no_two_words_overlap_and_all_are_on_the_sheet(measures):
 
 def test_the_hands_are_green_where_all_hold_and_red_where_none_does():
     def counted(score):
-        s = with_score(some_sets(1, 20)[0], score)
+        """Return the green and the red pixels as if all grasps had been tried and had the score."""
+        alike, slip = np.full(20, score), np.full((20, 4), 0.001)
+        s = replace(
+            some_sets(1, 20)[0], scores=alike, base_scores=alike, slip_m=slip, slip_rad=slip,
+            reachable=np.ones(20, bool), measures={},
+        )  # fmt: skip
         rgb = pixels(school_sheet([s], {1: model()}))[390:600]  # the object alone
         saturated = np.ptp(rgb, axis=-1) > 90
-        return (
-            int(np.sum(saturated & (rgb[..., 1] > rgb[..., 0]))),
-            int(np.sum(saturated & (rgb[..., 0] > rgb[..., 1]))),
-        )
+        red, green = rgb[saturated][:, :2].T
+        return int(np.sum(green > red)), int(np.sum(red > green))
 
     green, red = counted(1.0)
     assert green > 500 and red == 0
@@ -112,9 +105,8 @@ def test_the_hands_are_green_where_all_hold_and_red_where_none_does():
 
 
 def test_a_set_that_is_empty_or_untried_has_its_panel_too():
-    empty = tried_set(np.random.default_rng(0), 0, obj_id=1, instance=0, measures=())
-    Ts = tried_set(np.random.default_rng(0), 5).Ts_obj_grasp
-    untried = untried_set(Ts, obj_id=2, instance=1)
+    (empty,), (some,) = some_sets(1, 0, measures=()), some_sets(1, 5)
+    untried = untried_set(some.Ts_obj_grasp, obj_id=2, instance=1)
     models = {1: model(), 2: model(2, "ünknown $x_1$")}
     figure = sheet_figure([empty, untried], models, "t", {})
     said = [t.get_text() for t in figure.texts]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from realsim.geometry import se3
+from realsim.geometry.camera import project
 from realsim.records.trajectories import PHASES
 from realsim_sim_bridge.demonstrations.front_view import (
     BORDER,
@@ -20,13 +21,6 @@ from realsim_sim_bridge.demonstrations.front_view import (
 
 CAMERA = view_intrinsics(40.0)
 TOWARDS = np.array([1.0, 0.4, 0.6])
-
-
-def pixels(T_table_cam, points):
-    """Return (N, 2) and depths (N,)."""
-    p = se3.transform(se3.invert(T_table_cam), points)
-    uv = p[:, :2] / p[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
-    return uv, p[:, 2]
 
 
 def some(seed, n=40):
@@ -45,13 +39,13 @@ def a_grasp(arms, away=(1.0, 0.0)):
 def test_the_nearest_camera_sees_all_and_no_nearer_one_does():
     points = some(0)
     T = nearest_camera(points, TOWARDS, CAMERA)
-    uv, depth = pixels(T, points)
+    p = se3.transform(se3.invert(T), points)
+    uv = project(CAMERA, p)
     edge = BORDER * np.array([CAMERA.width, CAMERA.height])
     low, high = edge - 0.5, np.array([CAMERA.width, CAMERA.height]) - edge - 0.5
-    assert depth.min() > 0 and (uv > low - 1e-6).all() and (uv < high + 1e-6).all()
+    assert p[:, 2].min() > 0 and (uv > low - 1e-6).all() and (uv < high + 1e-6).all()
     # It touches two opposite borders, so that no camera nearer along its axis has room for all.
-    touched = np.isclose(uv.min(axis=0), low) & np.isclose(uv.max(axis=0), high)
-    assert touched.any()
+    assert np.any(np.isclose(uv.min(axis=0), low) & np.isclose(uv.max(axis=0), high))
 
 
 def test_a_scene_that_is_elsewhere_is_seen_alike():
@@ -63,8 +57,7 @@ def test_a_scene_that_is_elsewhere_is_seen_alike():
 
 def test_an_arm_between_camera_and_grasp_hides_it_and_one_behind_does_not():
     eye = np.array([1.0, 0.0, 0.5])
-    between = a_grasp([[0.5, 0.02, 0.275]])
-    behind = a_grasp([[-0.5, 0.0, -0.2]])
+    between, behind = a_grasp([[0.5, 0.02, 0.275]]), a_grasp([[-0.5, 0.0, -0.2]])
     assert hidden(between, eye).tolist() == [True]
     assert hidden(behind, eye).tolist() == [False]
     assert hidden(between, np.array([0.0, 1.0, 0.5])).tolist() == [False]
@@ -97,7 +90,6 @@ def test_fingers_and_objects_are_in_the_picture_from_pre_grasp_to_lift(source):
                     d.scenery.models.items(), d.scenery.Ts_table_obj.values(), strict=True
                 )
             ]
-            p = se3.transform(T_cam_table, np.concatenate(points))
-            u, v = p[:, 0] / p[:, 2] * i.fx + i.cx, p[:, 1] / p[:, 2] * i.fy + i.cy
+            u, v = project(i, se3.transform(T_cam_table, np.concatenate(points))).T
             assert u.min() >= -0.5 and u.max() <= i.width - 0.5, (d.name, k)
             assert v.min() >= -0.5 and v.max() <= i.height - 0.5, (d.name, k)

@@ -1,5 +1,6 @@
 """Goals in words: met where the words say so, and nowhere else."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -89,7 +90,7 @@ def test_phrasings_are_taken_in_turn_and_name_both_things() -> None:
 
 def test_things_of_one_name_are_no_reference_to_each_other() -> None:
     there = standing()
-    same = Standing(corners=there.corners, names={MUG: "mug", BOWL: "mug"}, ahead=there.ahead)
+    same = replace(there, names={MUG: "mug", BOWL: "mug"})
     assert [g.relation for g in goals_of(same, MUG, 0)] == [FREE]
     apart = standing(gap=0.1)
     assert FREE not in [g.relation for g in goals_of(apart, MUG, 0)]  # nothing is near it

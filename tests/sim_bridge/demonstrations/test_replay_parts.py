@@ -1,13 +1,12 @@
 """What a replay is made of: the configuration read back, the watched engine, the fall."""
 
-import dataclasses
 import json
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
 from held_boxes import held_box
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 from realsim_sim_bridge.demonstrations.falling import fall
@@ -20,45 +19,44 @@ from realsim_sim_bridge.slip.engines import make_engine, settings_of
 from refusals import refused
 from school_scenes import CONFIG, at, model, scene, small_worlds
 from tried_grasps import plain_grasps
-
-CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.025
+from trimesh_solids import box
 
 
 def test_a_configuration_comes_back_from_the_parameters():
-    base = dataclasses.replace(
-        CONFIG,
-        slip=dataclasses.replace(CONFIG.slip, engine=settings_of("pybullet")),
-        second_engine=settings_of("mujoco"),
-        sweep=SweepConfig(),
-    )
-    stored = json.loads(json.dumps(dataclasses.asdict(base)))
-    assert school_config_of(plain_grasps(0, parameters={"config": stored})) == base
+    slip = replace(CONFIG.slip, engine=settings_of("pybullet"))
+    base = replace(CONFIG, slip=slip, second_engine=settings_of("mujoco"), sweep=SweepConfig())
+    assert school_config_of(tried_with(stored_config(base))) == base
 
 
-@pytest.mark.parametrize("change", ["gone", "new", "type"])
-def test_a_configuration_of_another_version_is_refused(change):
-    stored = json.loads(json.dumps(dataclasses.asdict(CONFIG)))
-    if change == "gone":
-        del stored["slip"]
-    elif change == "new":
-        stored["slip"]["physics"]["glue"] = 1.0
-    else:
-        stored["slip"]["physics"]["friction"] = "much"
-    with pytest.raises(InputError, match=r"slip is not there|glue|friction is str"):
-        school_config_of(plain_grasps(0, parameters={"config": stored}))
+def stored_config(config):
+    return json.loads(json.dumps(asdict(config)))
+
+
+def tried_with(stored):
+    return plain_grasps(0, parameters={"config": stored})
+
+
+def test_a_configuration_of_another_version_is_refused():
+    gone, new, other_type = (stored_config(CONFIG) for _ in range(3))
+    del gone["slip"]
+    new["slip"]["physics"]["glue"] = 1.0
+    other_type["slip"]["physics"]["friction"] = "much"
+    refused("slip is not there", school_config_of, tried_with(gone))
+    refused("glue", school_config_of, tried_with(new))
+    refused("friction is str", school_config_of, tried_with(other_type))
 
 
 def test_a_field_that_a_version_did_not_have_takes_its_default():
-    stored = json.loads(json.dumps(dataclasses.asdict(CONFIG)))
+    stored = stored_config(CONFIG)
     del stored["slip"]["headroom_m"], stored["sweep"]
     sizes = "max_opening_m finger_length_m tip_beyond_tcp_m finger_width_m finger_thickness_m"
     stored["hand"] = {n: stored["hand"][n] for n in [*sizes.split(), "mount_z_m"]}
     del stored["reach"]["arm"]  # the Panda's, before arms had names
     stored["reach"]["joint7_samples"] = stored["reach"].pop("held_values")
     # Franka's, before names.
-    assert school_config_of(plain_grasps(0, parameters={"config": stored})) == CONFIG
+    assert school_config_of(tried_with(stored)) == CONFIG
     stored["hand"]["mount_z_m"] = -0.15
-    refused("without a name", school_config_of, plain_grasps(0, parameters={"config": stored}))
+    refused("without a name", school_config_of, tried_with(stored))
 
 
 def test_a_box_that_is_dropped_lands_on_its_face():
@@ -72,19 +70,18 @@ def test_a_box_that_is_dropped_lands_on_its_face():
 
 def test_a_thrown_box_flies_on_and_lands_on_what_stands_there():
     twist = np.array([0, 0, 0, 0.5, 0, 0.0])
-    block = CORNERS * [4, 4, 1] + [0.07, 0, 0.025]
-    Ts = fall(
-        held_box(0.1), se3.from_translation([0.0, 0, 0.2]), twist, [block], np.array([0.1, 1.0]),
-        )  # fmt: skip
+    block = box((0.2, 0.2, 0.05), (0.07, 0, 0.025)).vertices
+    T = se3.from_translation([0.0, 0, 0.2])
+    Ts = fall(held_box(0.1), T, twist, [block], np.array([0.1, 1.0]))
     assert Ts[0, 0, 3] == pytest.approx(0.05, abs=2e-3)
     assert Ts[1, 2, 3] == pytest.approx(0.075, abs=2e-3)
 
 
 @pytest.mark.slow
 def test_a_replay_in_bullet_ends_as_the_school_did():
-    config = small_worlds(dataclasses.replace(CONFIG, max_candidates=4))
-    physics = dataclasses.replace(config.slip.physics, friction=0.3, force_n=6.0)
-    config = dataclasses.replace(config, slip=dataclasses.replace(config.slip, physics=physics))
+    config = small_worlds(replace(CONFIG, max_candidates=4))
+    physics = replace(config.slip.physics, friction=0.3, force_n=6.0)
+    config = replace(config, slip=replace(config.slip, physics=physics))
     (result,) = run_school_results(scene(at(0.0, 0.0)), {1: model()}, config, workers=1)
     s, attempts = result.grasp_set, result.trajectories
     assert attempts is not None
@@ -98,8 +95,7 @@ def test_a_replay_in_bullet_ends_as_the_school_did():
         replay = replay_grasp(s, row, lifted, T_table_obj, body, config, engine, stand)
         assert replay.agrees, replay.disagreement
         assert replay.base_score == s.base_scores[row]
-        executed = int((~np.isnan(s.slip_m[row])).sum())
-        assert len(replay.stages) == executed
+        assert len(replay.stages) == int((~np.isnan(s.slip_m[row])).sum())
         for stage in replay.stages:
             assert np.all(np.diff(stage.times_s) > 0)
             np.testing.assert_allclose(np.linalg.det(stage.Ts_grasp_obj[:, :3, :3]), 1.0, atol=1e-6)
