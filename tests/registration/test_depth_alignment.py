@@ -36,10 +36,10 @@ def painted():
     shown = seen_instances(scene, range(4))
     pairs = []
     for labels, frame in zip(shown, scene.frames[:4], strict=True):
-        rgb = paint[labels] + rng.normal(0, 4, (*labels.shape, 3))
-        big = (640, 360)
-        rgb = cv2.resize(np.clip(rgb, 0, 255).astype(np.uint8), big, interpolation=cv2.INTER_LINEAR)
-        pairs.append((rgb, cv2.resize(frame.depth_m, big, interpolation=cv2.INTER_NEAREST)))
+        rgb = np.clip(paint[labels] + rng.normal(0, 4, (*labels.shape, 3)), 0, 255)
+        rgb = cv2.resize(rgb.astype(np.uint8), (640, 360), interpolation=cv2.INTER_LINEAR)
+        depth = cv2.resize(frame.depth_m, (640, 360), interpolation=cv2.INTER_NEAREST)
+        pairs.append((rgb, depth))
     camera = CameraIntrinsics(width=640, height=360, fx=324, fy=324, cx=319.5, cy=179.5)
     return camera, pairs
 

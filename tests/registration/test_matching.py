@@ -10,10 +10,10 @@ import pytest
 
 from realsim.geometry import se3
 from realsim.geometry.distance_field import raycasting_scene
-from realsim.geometry.mesh import sample_surface, symmetry_transforms
+from realsim.geometry.mesh import box_mesh, sample_surface, symmetry_transforms
 from realsim.geometry.parts import part
 from realsim.interop import import_open3d
-from realsim.records import Mesh, ObjectModel, SupportPlane
+from realsim.records import ObjectModel, SupportPlane
 from realsim.registration.evidence import Cloud
 from realsim.registration.search.height_grid import HeightGrid, height_grid
 from realsim.registration.search.matching import MOST, MOST_IN_REGION, match_templates
@@ -120,10 +120,8 @@ def test_a_region_bounds_place_and_turn():
         turn = se3.exp_so3(math.radians(20) * axis / np.linalg.norm(axis))
         region = Region(
             center_world=se3.transform(p.T_world_obj, c)[0] + 0.03 * shift / np.linalg.norm(shift),
-            radius_m=0.045,
-            R_world_obj=p.T_world_obj[:3, :3] @ turn,
-            turn_deg=38.0,
-        )
+            radius_m=0.045, R_world_obj=p.T_world_obj[:3, :3] @ turn, turn_deg=38.0,
+        )  # fmt: skip
         found = match_templates(grid, templates_of(model.name), plane=TABLE, region=region)
         assert 0 < len(found) <= MOST_IN_REGION
         assert any(is_near(model, h.T_world_obj, p.T_world_obj) for h in found)
@@ -136,17 +134,12 @@ def test_a_region_bounds_place_and_turn():
 
 
 def test_a_flat_plate_is_found():
-    box = part("box").mesh
-    low, high = box.bounds
-    scaled = (box.vertices - low) / (high - low) * [0.08, 0.05, 0.003]
-    plate = replace(part("box"), mesh=replace(box, vertices=scaled))
+    plate = replace(part("box"), mesh=box_mesh(np.zeros(3), np.array([0.08, 0.05, 0.003])))
     truth = se3.from_rt(se3.exp_so3([0, 0, 0.6]), [0.03, -0.04, 0.0])
     grid = exact_grid(plate, truth)
     noise = np.random.default_rng(0).normal(scale=3e-4, size=grid.heights.shape)
-    heights = (grid.heights + noise).astype(np.float32)
-    noisy = HeightGrid(heights=heights, origin=grid.origin, cell_m=grid.cell_m)
-    t = model_templates(plate, TemplateConfig(), None)
-    found = match_templates(noisy, t, plane=TABLE)
+    noisy = replace(grid, heights=(grid.heights + noise).astype(np.float32))
+    found = match_templates(noisy, model_templates(plate, TemplateConfig(), None), plane=TABLE)
     assert any(is_near(plate, h.T_world_obj, truth) for h in found[:8])
 
 
@@ -159,20 +152,15 @@ def rng():
     return np.random.default_rng(0)
 
 
-def cloud_of(points):
-    towards = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    return Cloud(points=points, towards=towards, sigmas=np.full(len(points), 1e-3))
-
-
-def table_and_block(rng, n=60_000):
+def test_the_table_is_zero_and_the_block_has_its_height(rng):
     """A table of 30 cm with a block of 6 x 4 cm, 5 cm high, about (0.05, 0.02)."""
+    n = 60_000
     xy = rng.uniform(-0.15, 0.15, (n, 2))
     on = np.all(np.abs(xy - [0.05, 0.02]) < [0.03, 0.02], axis=1)
-    return np.c_[xy, np.where(on, 0.05, 0.0) + rng.normal(0, 3e-4, n)]
-
-
-def test_the_table_is_zero_and_the_block_has_its_height(rng):
-    grid = height_grid(cloud_of(table_and_block(rng)), TABLE)
+    points = np.c_[xy, np.where(on, 0.05, 0.0) + rng.normal(0, 3e-4, n)]
+    towards = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
+    cloud = Cloud(points=points, towards=towards, sigmas=np.full(n, 1e-3))
+    grid = height_grid(cloud, TABLE)
     xy = grid.centers()
     inside = np.all(np.abs(xy - [0.05, 0.02]) < [0.027, 0.017], axis=-1)
     outside = np.any(np.abs(xy - [0.05, 0.02]) > [0.033, 0.023], axis=-1)
@@ -202,18 +190,12 @@ def test_template_heights_are_those_of_the_placed_mesh(name):
 
 def test_a_box_rests_on_three_sides_and_looks_the_same_after_half_a_turn():
     size = np.array([0.04, 0.06, 0.10])
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * size
-    import trimesh
-
-    hull = trimesh.Trimesh(corners).convex_hull
-    mesh = Mesh(vertices=np.array(hull.vertices), faces=np.array(hull.faces, np.int32))
-    center = size / 2
+    plain = ObjectModel(obj_id=1, name="b", mesh=box_mesh(np.zeros(3), size))
     half = np.stack([np.diag(d) for d in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])])
-    S = se3.from_rt(half.astype(float), center - half @ center)
-    known = model_templates(ObjectModel(obj_id=1, name="b", mesh=mesh, symmetries=S), FEW, None)
-    unknown = model_templates(ObjectModel(obj_id=1, name="b", mesh=mesh), FEW, None)
-    assert len(known.rotations) == 3
-    assert len(unknown.rotations) == 6
+    S = se3.from_rt(half.astype(float), (size - half @ size) / 2)
+    known = model_templates(replace(plain, symmetries=S), FEW, None)
+    unknown = model_templates(plain, FEW, None)
+    assert (len(known.rotations), len(unknown.rotations)) == (3, 6)
     assert set(known.yaw_counts) == {12} and set(unknown.yaw_counts) == {24}
     assert np.isclose(known.probabilities.sum(), unknown.probabilities.sum())
     heights = sorted(float(p[:, 2].mean()) for p in known.points)
@@ -243,8 +225,7 @@ NEAR = NearSymmetryConfig()
 
 def gap(model, T, Ts):
     """Least over the motions and all symmetries of the greatest shift of a corner of the box."""
-    low, high = model.mesh.bounds
-    box = low + np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low)
+    box = box_mesh(*model.mesh.bounds).vertices
     S = symmetry_transforms(model, np.radians(1))
     images = se3.transform((Ts[:, None] @ S[None]).reshape(-1, 4, 4), box)
     shifts = np.linalg.norm(images - se3.transform(T, box), axis=2)

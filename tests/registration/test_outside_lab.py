@@ -9,6 +9,7 @@ import pytest
 
 from fault_sessions import ROOT, load_benchmark
 from realsim.geometry import se3
+from realsim.geometry.camera import ray_table
 from realsim.geometry.metrics import aligned_pose
 from realsim.registration.body import moved_about_center
 from realsim.registration.evidence import Cloud
@@ -112,9 +113,7 @@ def test_a_sensor_without_faults_measures_the_rays():
     body = body_of("carton", scene.truth[0].T_world_obj)
     v, u = np.argwhere(frame.depth_m > 0)[::997].T
     z = frame.depth_m[v, u].astype(float)
-    rays = np.stack([(u - scene.intrinsics.cx) / 440, (v - scene.intrinsics.cy) / 440,
-                     np.ones_like(z)], axis=1)  # fmt: skip
-    world = se3.transform(frame.T_world_cam, rays * z[:, None])
+    world = se3.transform(frame.T_world_cam, ray_table(scene.intrinsics)[v, u] * z[:, None])
     surface = np.abs(body.field.distance(world, se3.invert(scene.truth[0].T_world_obj)))
     assert np.quantile(np.minimum(np.abs(world[:, 2]), surface), 0.98) < 5e-4
 
@@ -218,20 +217,17 @@ def test_an_object_that_depth_and_photograph_place_apart_is_told_of(one_view, fe
 
 @pytest.mark.parametrize("hidden", [True, False])
 def test_the_turn_of_a_mug_is_doubted_where_its_handle_is_hidden(hidden):
-    scene = lab.make_scene(
-        1, lab.Lab(views=1, bias_px=0.0, highest_deg=25.0, **TRUE_CAMERAS), ids=[IDS["mug"]]
-    )
+    low = lab.Lab(views=1, bias_px=0.0, highest_deg=25.0, **TRUE_CAMERAS)
+    scene = lab.make_scene(1, low, ids=[IDS["mug"]])
     (true,), (frame,) = scene.truth, scene.frames
     # The mug stands; the camera is put before it, its handle behind it or at its side.
-    T = se3.from_translation([0.0, 0.0, true.T_world_obj[2, 3]])
-    T[2, 3] = -float(scene.models[true.obj_id].mesh.bounds[0, 2])
+    T = se3.from_translation([0.0, 0.0, -scene.models[true.obj_id].mesh.bounds[0, 2]])
     eye = [-0.36, 0.0, 0.16] if hidden else [0.0, -0.36, 0.16]
     T_world_cam = se3.look_at(eye, [0.0, 0.0, 0.04])
     world = lab.o3d.t.geometry.RaycastingScene()
     body = shapes.objects()[IDS["mug"]][1].copy().apply_transform(T)
-    world.add_triangles(shapes.mesh_of(body))
-    table = lab._table(lab.Lab())
-    world.add_triangles(shapes.mesh_of(table))
+    for thing in (body, lab._table(lab.Lab())):
+        world.add_triangles(shapes.mesh_of(thing))
     directions = lab._rays(lab.Lab(lens_px=0.0)) @ T_world_cam[:3, :3].T
     origins = np.broadcast_to(T_world_cam[:3, 3], directions.shape)
     rays = np.concatenate([origins, directions], -1).astype(np.float32)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull, KDTree
 
 from realsim.geometry import se3
 from realsim.geometry.depth import points_from_depth
@@ -17,7 +18,6 @@ from realsim.records import Mesh, ObjectPose
 from realsim.registration.simulated import (
     Scattered,
     TableLabConfig,
-    TableScene,
     resized,
     scatter_objects,
     table_scene,
@@ -26,24 +26,11 @@ from realsim.registration.simulated_lab import camera_of, sensor_of
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from refusals import refused
 from table_faults import seen_instances
-from table_scenes import part_models
+from table_scenes import part_models, scene_of
 
 NO_ERRORS = {"hand_eye_mm": 0.0, "hand_eye_deg": 0.0, "arm_mm": 0.0, "arm_deg": 0.0}
 TINY = resized(TableLabConfig(sensor=DepthSensorModel.noiseless()), 64)
 """Images that cost nothing: poses do not depend on them."""
-
-
-def mug_alone(config: TableLabConfig, seed: int) -> TableScene:
-    rng = np.random.default_rng(seed)
-    model = part("mug")
-    placed = scatter_objects({model.obj_id: model.mesh}, [model.obj_id], config, rng)
-    return table_scene({model.obj_id: model}, placed.objects, config, rng)
-
-
-def distances(surface: Any, points: np.ndarray) -> np.ndarray:
-    """Return the distances (N,) of points to the surface of a ray-casting scene."""
-    core: Any = import_open3d().core
-    return surface.compute_distance(core.Tensor(points.astype(np.float32)), 1).numpy()
 
 
 # --- layout --------------------------------------------------------------------------------------
@@ -64,8 +51,6 @@ def test_objects_stand_on_the_table_in_the_disc_and_do_not_touch():
     assert len(result.objects) + len(result.left_out) == len(wanted)
     assert len(result.objects) >= 13
     placed = [se3.transform(o.T_world_obj, meshes[o.obj_id].vertices) for o in result.objects]
-    from scipy.spatial import ConvexHull, KDTree
-
     for v in placed:
         assert abs(v[:, 2].min()) < 1e-9
         assert np.linalg.norm((v.min(0) + v.max(0))[:2] / 2) <= config.disc_m + 1e-9
@@ -83,8 +68,6 @@ def test_objects_stand_on_the_table_in_the_disc_and_do_not_touch():
 
 def test_resting_objects_are_stable():
     """The centre of mass is over the support polygon: it would not tip."""
-    from scipy.spatial import ConvexHull
-
     meshes, _, _, result = scattered(6)
     for o in result.objects:
         v = se3.transform(o.T_world_obj, meshes[o.obj_id].vertices)
@@ -111,7 +94,7 @@ def test_a_seed_gives_a_layout_and_what_finds_no_room_is_named():
 
 
 def test_the_errors_are_those_asked_for_and_stored_consistently():
-    scene = mug_alone(replace(TINY, views=600), 3)
+    scene = scene_of([part("mug").obj_id], replace(TINY, views=600), np.random.default_rng(3))
     np.testing.assert_allclose(
         np.stack([f.T_world_cam for f in scene.frames]), scene.Ts_base_ee @ scene.T_ee_cam
     )
@@ -131,22 +114,20 @@ def test_the_errors_are_those_asked_for_and_stored_consistently():
 
 def test_exact_depth_lies_on_the_true_surfaces():
     config = replace(resized(TINY, 320), views=3, **NO_ERRORS)
-    rng = np.random.default_rng(2)
     ids = [part(n).obj_id for n in ("mug", "l_bracket", "capsule")]
-    models = {i: part_models()[i] for i in ids}
-    placed = scatter_objects({i: m.mesh for i, m in models.items()}, ids, config, rng).objects
-    scene = table_scene(models, placed, config, rng)
+    scene = scene_of(ids, config, np.random.default_rng(2))
     seen = seen_instances(scene, range(3))
     for k, frame in enumerate(scene.frames):
         points, pixels = points_from_depth(frame.depth_m, scene.intrinsics, 1)
         world = se3.transform(frame.T_world_cam, points)
         which = seen[k][frame.depth_m > 0]
         assert len(points) == len(which), pixels
-        for p in placed:
+        for p in scene.truth:
             q = se3.transform(se3.invert(p.T_world_obj), world[which == p.instance])
             assert len(q) > 100
-            surface = raycasting_scene(models[p.obj_id].mesh)
-            assert distances(surface, q).max() < 1e-4  # rounded to 0.1 mm along the ray
+            surface: Any = raycasting_scene(scene.models[p.obj_id].mesh)
+            apart = surface.compute_distance(import_open3d().core.Tensor(np.float32(q)), 1)
+            assert apart.numpy().max() < 1e-4  # rounded to 0.1 mm along the ray
         assert np.abs(world[which < 0, 2]).max() < 1e-4
 
 
@@ -158,9 +139,8 @@ def test_a_small_image_has_the_noise_and_the_information_of_a_large_one():
     sensor = replace(sensor, blobs_per_megapixel=0.0, occlusion=False, grazing_from_deg=90.0)
     rng = np.random.default_rng(0)
     flat = np.full((camera.height, camera.width), 0.4, np.float32)
-    dz = np.concatenate([
-        (sensor.measure(flat, camera, rng) - 0.4)[: camera.height // 12 * 12] for _ in range(3)
-    ])  # fmt: skip
+    rows = camera.height // 12 * 12
+    dz = np.concatenate([sensor.measure(flat, camera, rng)[:rows] - 0.4 for _ in range(3)])
     sigma = 0.4**2 * 0.08 / (648 * 0.018)
     assert dz.std() == pytest.approx(sigma, rel=0.03)
     n = width // 32  # 40 px of the full image, 20 sigma of the correlation
@@ -173,12 +153,11 @@ def test_a_small_image_has_the_noise_and_the_information_of_a_large_one():
 
 def test_a_seed_gives_the_same_bytes_whether_images_are_kept_or_made(tmp_path: Path):
     config = replace(resized(TableLabConfig(), 160), views=3)
-    model = part("mug")
     pose = ObjectPose(obj_id=10, instance=4, T_world_obj=np.eye(4))
 
     def made(seed: int, keep: Path | None = None, lab: TableLabConfig = config):
         rng = np.random.default_rng(seed)
-        return table_scene({10: model}, [pose], lab, rng, keep), rng.random()
+        return table_scene({10: part("mug")}, [pose], lab, rng, keep), rng.random()
 
     (a, x), (b, y), (c, z) = made(1), made(1, tmp_path), made(1, tmp_path)
     assert x == y == z and len(list(tmp_path.iterdir())) == 1

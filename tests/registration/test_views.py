@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from realsim.arrays import Array, Array32
 from realsim.geometry import se3
-from realsim.geometry.camera import project
+from realsim.geometry.camera import project, ray_table
 from realsim.records import CameraIntrinsics
 from realsim.registration.evidence import DepthFrame, DepthNoise
 from realsim.registration.views import SampleConfig, sample_view, sample_views, world_cloud
@@ -26,11 +26,7 @@ def frame(depth: NDArray, T: Array | None = None, index: int = 0) -> DepthFrame:
 
 def plane_depth(camera: CameraIntrinsics, T_world_cam: Array) -> Array32:
     """Exact depth of the plane z = 0 of the world (no lens distortion)."""
-    v, u = np.mgrid[: camera.height, : camera.width]
-    rays = np.stack(
-        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1
-    )
-    down = rays @ T_world_cam[2, :3]
+    down = ray_table(camera) @ T_world_cam[2, :3]
     return np.where(down < 0, -T_world_cam[2, 3] / down, 0).astype(np.float32)
 
 
@@ -44,10 +40,7 @@ def trusted_by_definition(depth: NDArray, config: SampleConfig) -> list[tuple[in
         for j in range(0, depth.shape[1], config.stride):
             if not known[i, j]:
                 continue
-            window = (
-                slice(max(0, i - reach), i + reach + 1),
-                slice(max(0, j - reach), j + reach + 1),
-            )
+            window = tuple(slice(max(0, k - reach), k + reach + 1) for k in (i, j))
             near = depth[window][known[window]]
             z = float(depth[i, j])
             allowed = config.edge_jump_m + pitch * z + config.edge_sigmas * NOISE.sigma(np.array(z))
@@ -61,10 +54,8 @@ def test_trusted_pixels_are_those_of_the_definition(stride: int, reach: int):
     rng = np.random.default_rng(stride)
     steps = np.kron(rng.uniform(0.3, 0.45, (6, 8)), np.ones((15, 20)))
     depth = (steps + rng.normal(0, 1e-3, steps.shape)).astype(np.float32)
-    depth[rng.random(depth.shape) < 0.2] = 0
-    depth[rng.random(depth.shape) < 0.01] = np.nan
-    depth[rng.random(depth.shape) < 0.01] = np.inf
-    depth[rng.random(depth.shape) < 0.01] = -0.3
+    for wrong, share in ((0, 0.2), (np.nan, 0.01), (np.inf, 0.01), (-0.3, 0.01)):
+        depth[rng.random(depth.shape) < share] = wrong
     config = SampleConfig(stride=stride, edge_reach_px=reach)
     view = sample_view(CAMERA, frame(depth), NOISE, config)
     expected = trusted_by_definition(depth, config)
@@ -88,19 +79,15 @@ def test_a_point_is_seen_where_its_pixel_is():
 
 def test_cloud_looks_back_at_the_cameras_with_their_noise():
     Ts = [se3.look_at([0.2, 0, 0.4], [0, 0, 0]), se3.look_at([0, -0.3, 0.9], [0, 0, 0])]
-    views = sample_views(
-        CAMERA, [frame(plane_depth(CAMERA, T), T, k) for k, T in enumerate(Ts)], NOISE,
-        SampleConfig(stride=5),
-    )  # fmt: skip
+    frames = [frame(plane_depth(CAMERA, T), T, k) for k, T in enumerate(Ts)]
+    views = sample_views(CAMERA, frames, NOISE, SampleConfig(stride=5))
     cloud = world_cloud(views, NOISE)
     n = len(views[0].points)
     assert len(cloud.points) == n + len(views[1].points)
     np.testing.assert_allclose(np.linalg.norm(cloud.towards, axis=1), 1)
     for part, T, view in ((slice(0, n), Ts[0], views[0]), (slice(n, None), Ts[1], views[1])):
         far = np.linalg.norm(T[:3, 3] - cloud.points[part], axis=1, keepdims=True)
-        np.testing.assert_allclose(
-            cloud.points[part] + far * cloud.towards[part], np.tile(T[:3, 3], (len(far), 1)),
-            atol=1e-9,
-        )  # fmt: skip
+        back = cloud.points[part] + far * cloud.towards[part]
+        np.testing.assert_allclose(back, np.tile(T[:3, 3], (len(far), 1)), atol=1e-9)
         z = view.points[:, 2].astype(np.float64)
         np.testing.assert_allclose(cloud.sigmas[part], np.maximum(2e-4, 0.007 * z**2), rtol=1e-6)
