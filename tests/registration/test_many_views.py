@@ -7,7 +7,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.records.depth_bias import DepthBias
 from realsim.registration.body import Body, moved_body
@@ -29,7 +28,6 @@ from table_scenes import SMALL_LAB, bodies_of, errors_mm, named_scene, small_sce
 CONFIG = RegistrationConfig(field_cells=64)
 NAMES = ("cylinder_can", "wedge", "elbow")
 """The first is round: nothing shows how it is turned about its axis."""
-CLAIMED_TURN_DEG = 40.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,21 +39,17 @@ class Case:
     many: ManyViews
 
 
-def turned_about_axis(body: Body, deg: float) -> Array:
-    (axis, point), *_ = body.model.symmetry_axes
-    P = se3.from_translation(point)
-    R = se3.from_rt(se3.exp_so3(np.radians(deg) * np.asarray(axis)), np.zeros(3))
-    return body.T_start @ P @ R @ se3.invert(P)
-
-
 @lru_cache(maxsize=1)
 def case() -> Case:
     """Somebody claimed the can turned by 40 deg and the wedge a little off; not the elbow."""
     scene = named_scene(6, NAMES, 8)
     intake = take_in(scene.intrinsics, scene.frames, CONFIG)
     bodies = bodies_of(scene, 64, 400)
+    (axis, point), *_ = bodies[0].model.symmetry_axes
+    P, turn = se3.from_translation(point), np.radians(40.0) * np.asarray(axis)
+    turned = bodies[0].T_start @ P @ se3.exp(np.r_[turn, np.zeros(3)]) @ se3.invert(P)
     claimed: list[Body | None] = [
-        moved_body(bodies[0], turned_about_axis(bodies[0], CLAIMED_TURN_DEG)),
+        moved_body(bodies[0], turned),
         moved_body(bodies[1], bodies[1].T_start @ se3.exp(np.array([0.05, 0, 0, 0, 0.004, 0]))),
         None,
     ]

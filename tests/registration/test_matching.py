@@ -69,17 +69,12 @@ def is_near(model, T, truth):
     return mm < 10 and deg < 15
 
 
-def resting(name, pose, yaw_deg, xy):
-    t = templates_of(name)
-    turn = se3.from_rt(se3.exp_so3([0, 0, math.radians(yaw_deg)]), [*xy, 0.0])
-    return turn @ se3.from_rt(t.rotations[pose], t.offsets[pose])
-
-
 @pytest.mark.parametrize("name", ["mug", "wedge"])
 def test_alone_it_is_found_first_in_every_resting_pose(name):
     model, t = part(name), templates_of(name)
-    for pose in range(len(t.rotations)):
-        truth = resting(name, pose, 141.0, (0.031, -0.047))
+    put = se3.from_rt(se3.exp_so3([0, 0, math.radians(141.0)]), [0.031, -0.047, 0.0])
+    for resting in se3.from_rt(t.rotations, t.offsets):
+        truth = put @ resting
         found = match_templates(exact_grid(model, truth), t, plane=TABLE)
         near = [h for h in found if is_near(model, h.T_world_obj, truth)]
         assert near and near[0].score > 0.7
@@ -168,21 +163,15 @@ def test_the_table_is_zero_and_the_block_has_its_height(rng):
     assert np.nanmax(np.abs(grid.heights[outside])) < 1e-3
 
 
-def rebuilt(mesh, templates, d):
-    """The template's points as the mesh, put down by the same pose, shows them from above."""
-    T = se3.from_rt(templates.rotations[d], templates.offsets[d])
-    p = templates.points[d].astype(float)
-    return p[:, 2], seen_from_above(mesh, T, p[:, :2])
-
-
 @pytest.mark.parametrize("name", ["mug", "wedge"])
 def test_template_heights_are_those_of_the_placed_mesh(name):
     model = part(name)
     templates = model_templates(model, FEW, None)
-    for d in range(len(templates.rotations)):
-        said, seen = rebuilt(model.mesh, templates, d)
-        assert np.median(np.abs(said - seen)) < 1e-5
-        placed = model.mesh.vertices @ templates.rotations[d].T + templates.offsets[d]
+    poses = se3.from_rt(templates.rotations, templates.offsets)
+    for T, points in zip(poses, templates.points, strict=True):
+        seen = seen_from_above(model.mesh, T, points[:, :2].astype(float))
+        assert np.median(np.abs(points[:, 2] - seen)) < 1e-5
+        placed = se3.transform(T, model.mesh.vertices)
         assert abs(placed[:, 2].min()) < 1e-9  # stands on the table
         # the reference point is the middle of the footprint's box
         assert np.allclose(placed.min(0)[:2], -placed.max(0)[:2], atol=1e-9)

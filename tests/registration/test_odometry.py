@@ -42,16 +42,11 @@ def off(mm: float, deg: float, seed: int = 0) -> np.ndarray:
     return se3.from_rt(se3.exp_so3(np.radians(deg) * a[0]), 1e-3 * mm * a[1])
 
 
-def bumpy(rng: np.random.Generator) -> np.ndarray:
-    """Points (N, 3) on a surface with relief in all directions, 35 cm before a camera."""
-    xy = rng.uniform(-0.1, 0.1, (6000, 2))
-    z = 0.35 + 0.02 * np.sin(60 * xy[:, 0]) * np.cos(45 * xy[:, 1]) + 0.3 * xy[:, 0] * xy[:, 1]
-    return np.column_stack([xy, z])
-
-
 def test_known_motion_is_found():
-    rng = np.random.default_rng(1)
-    points = bumpy(rng)
+    # A surface with relief in all directions, 35 cm before a camera.
+    x, y = np.random.default_rng(1).uniform(-0.1, 0.1, (6000, 2)).T
+    z = 0.35 + 0.02 * np.sin(60 * x) * np.cos(45 * y) + 0.3 * x * y
+    points = np.column_stack([x, y, z])
     step = se3.exp([0.01, -0.02, 0.015, 0.003, -0.002, 0.001])
     kept = LocalMap(thin_points(points, 0.004), 0.004, 2)
     for k in range(3):

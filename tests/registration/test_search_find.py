@@ -22,7 +22,7 @@ from realsim.registration.search.records import SearchResult, Wanted
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import Render, Score, ScoreConfig, make_canvas
 from realsim.registration.search.templates import TemplateConfig
-from realsim.registration.simulated import TableScene, resized, table_scene
+from realsim.registration.simulated import TableScene, table_scene
 from refusals import refused
 from table_scenes import NOISE, SMALL_LAB, TABLE, body_at, named_scene, views_of
 
@@ -117,8 +117,7 @@ def test_bad_questions_are_refused():
 
 # --- Near-symmetric poses told apart: a shape with one small feature, turned the wrong way.
 LATTICE = ScoreConfig(columns=160, frames=10)
-HALF_TURN = se3.from_rt(se3.exp_so3([0.0, 0.0, np.pi]), np.zeros(3))
-QUARTER = se3.from_rt(se3.exp_so3([0.0, 0.0, np.pi / 2]), np.zeros(3))
+HALF_TURN, QUARTER = (se3.exp([0, 0, angle, 0, 0, 0]) for angle in (np.pi, np.pi / 2))
 
 
 def marked_box(knob_m: float) -> Mesh:
@@ -134,12 +133,10 @@ def marked_box(knob_m: float) -> Mesh:
 @lru_cache(maxsize=4)
 def marked_scene(knob_m: float) -> tuple[TableScene, Sought]:
     model = ObjectModel(obj_id=1, name="marked box", mesh=marked_box(knob_m))
-    pose = ObjectPose(
-        obj_id=1, instance=0,
-        T_world_obj=se3.from_rt(se3.exp_so3([0, 0, 0.4]), [0.01, -0.02, 0.015]),
-    )  # fmt: skip
-    lab = resized(replace(SMALL_LAB, views=10), 320)
-    made = table_scene({1: model}, [pose], lab, np.random.default_rng(4))
+    T = se3.from_rt(se3.exp_so3([0, 0, 0.4]), [0.01, -0.02, 0.015])
+    pose = ObjectPose(obj_id=1, instance=0, T_world_obj=T)
+    lab, rng = replace(SMALL_LAB, views=10), np.random.default_rng(4)
+    made = table_scene({1: model}, [pose], lab, rng)
     return made, sought_of(model, 64)
 
 
@@ -191,12 +188,10 @@ def test_a_fit_of_the_same_pose_that_ended_a_little_apart_is_no_rival():
 # --- What is left over: clusters of it, starts in it, and objects it makes suspect.
 
 
-def surface(name: str, T: np.ndarray, count: int, rng: np.random.Generator) -> Cloud:
-    points, normals = sample_surface(part(name).mesh, count, rng)
-    return Cloud(
-        points=se3.transform(T, points), towards=normals @ T[:3, :3].T,
-        sigmas=np.full(count, 5e-4),
-    )  # fmt: skip
+def surface(name: str, T: np.ndarray, rng: np.random.Generator) -> Cloud:
+    points, normals = sample_surface(part(name).mesh, 900, rng)
+    towards, sigmas = normals @ T[:3, :3].T, np.full(900, 5e-4)
+    return Cloud(points=se3.transform(T, points), towards=towards, sigmas=sigmas)
 
 
 def at(s: Sought, T: np.ndarray) -> tuple[Sought, Candidate]:
@@ -213,7 +208,7 @@ def test_an_object_in_the_wrong_turn_is_suspect_and_its_neighbour_is_not():
     T_shaft = se3.from_rt(se3.exp_so3([np.pi / 2, 0, 0]), [0.0, 0.0, 0.1])
     T_mug = se3.from_translation([0.25, 0.0, 0.05])
     parts = (("stepped_shaft", T_shaft), ("mug", T_mug))
-    cloud = join_clouds([surface(name, T, 900, rng) for name, T in parts])
+    cloud = join_clouds([surface(name, T, rng) for name, T in parts])
     center = shaft.body.center(T_shaft)
     R = se3.exp_so3([0, 0, np.pi / 2])
     wrong = se3.from_rt(R, center - R @ center) @ T_shaft
