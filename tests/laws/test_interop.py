@@ -35,8 +35,7 @@ def test_gtsam():
     # The same order of the tangent, and the same perturbation on the right.
     np.testing.assert_allclose(gtsam.Pose3.Logmap(pose), se3.log(T), atol=1e-12)
     xi = np.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6])
-    moved = interop.T_from_pose3(pose.retract(xi))
-    np.testing.assert_allclose(moved, T @ se3.exp(xi), atol=1e-12)
+    np.testing.assert_allclose(interop.T_from_pose3(pose.retract(xi)), T @ se3.exp(xi), atol=1e-12)
     np.testing.assert_allclose(pose.AdjointMap(), se3.adjoint(T), atol=1e-12)
 
 
@@ -55,8 +54,7 @@ def test_viser():
     from viser import transforms
 
     wxyz, position = interop.viser_wxyz_position(T)
-    theirs = transforms.SE3.from_matrix(T)
-    np.testing.assert_allclose(wxyz, theirs.rotation().wxyz, atol=1e-12)
+    np.testing.assert_allclose(wxyz, transforms.SE3.from_matrix(T).rotation().wxyz, atol=1e-12)
     np.testing.assert_allclose(position, [1, 2, 3])
     assert interop.viser_wxyz_position(np.stack([T, T]))[0].shape == (2, 4)
 
@@ -89,14 +87,13 @@ def test_opengl_cameras_look_along_minus_z():
 
 
 def run(code):
-    env = os.environ | {"OMP_NUM_THREADS": "1"}
     return subprocess.run(
         [sys.executable, "-c", code],
         check=False,
         capture_output=True,
         text=True,
         timeout=60,
-        env=env,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
     )
 
 

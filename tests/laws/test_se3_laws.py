@@ -44,8 +44,7 @@ def test_transform_is_the_matrix_product(seed):
 def test_log_undoes_exp_near_zero_and_near_half_a_turn(seed, angle):
     xi = twist(seed, angle)
     # Near pi the logarithm divides by what is left of 1 + cos: digits are lost there, no more.
-    tolerance = 1e-12 if angle < 3.0 else 1e-8
-    np.testing.assert_allclose(se3.log(se3.exp(xi)), xi, atol=tolerance)
+    np.testing.assert_allclose(se3.log(se3.exp(xi)), xi, atol=1e-12 if angle < 3.0 else 1e-8)
 
 
 @few

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from plain_meshes import square
-from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, TagBoard
 from realsim.rendering.board import board_mesh
 from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.photo import Lighting, PhotoRenderer, PlacedMesh
+from refusals import refused
 
 BOARD = TagBoard(rows=3, columns=4, tag_size_m=0.03, gap_m=0.0087)
 T_WORLD_BOARD = se3.from_rt(se3.exp_so3([np.pi, 0, 0]), [0.3, 0.06, 0.0])
@@ -28,8 +28,7 @@ def photo_of_board(
     placed = [PlacedMesh(-1, board_mesh(BOARD), T_WORLD_BOARD)]
     rgb = PhotoRenderer(placed).render(intrinsics, T).rgb
     T_cam_board = se3.invert(T) @ T_WORLD_BOARD
-    corners = camera.project(CAMERA, se3.transform(T_cam_board, BOARD.corners_board))
-    return rgb, corners, T_cam_board
+    return rgb, camera.project(CAMERA, se3.transform(T_cam_board, BOARD.corners_board)), T_cam_board
 
 
 def edge_offsets(rgb: np.ndarray, T_cam_board: np.ndarray) -> np.ndarray:
@@ -76,8 +75,7 @@ def test_printed_edges_lie_where_they_are_projected(eye: list[float]) -> None:
 def test_the_measurement_would_see_half_a_pixel() -> None:
     moved = replace(CAMERA, cx=CAMERA.cx + 0.5)
     rgb, _, T_cam_board = photo_of_board([0.37, -0.12, 0.28], intrinsics=moved)
-    shift = common_shift(edge_offsets(rgb, T_cam_board))
-    assert np.allclose(shift, [0.5, 0.0], atol=0.03)
+    assert np.allclose(common_shift(edge_offsets(rgb, T_cam_board)), [0.5, 0.0], atol=0.03)
 
 
 def test_a_detector_reads_the_tags_upright() -> None:
@@ -111,8 +109,7 @@ def test_board_mesh_faces_its_viewer_and_carries_its_corners() -> None:
         assert np.allclose(texel, np.round(texel), atol=1e-9)
     # The first tag begins with its black border, and the margin is white.
     assert mesh.texture[0, 0].tolist() == [255, 255, 255]
-    with pytest.raises(InputError, match="margin"):
-        board_mesh(BOARD, margin_m=0.0)
+    refused("margin", board_mesh, BOARD, margin_m=0.0)
 
 
 def scene() -> list[PlacedMesh]:

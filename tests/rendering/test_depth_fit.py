@@ -40,8 +40,7 @@ def frames_of(model: DepthSensorModel, exact: Sequence[np.ndarray] = WALLS) -> l
 
 @lru_cache
 def fitted(model: DepthSensorModel, kind: str = "d405") -> FittedDepthModel:
-    frames = frames_of(model)
-    return fit_depth_model(frames, CAMERA, kind)
+    return fit_depth_model(frames_of(model), CAMERA, kind)
 
 
 def test_parameters_are_recovered_within_their_uncertainty() -> None:
@@ -152,8 +151,7 @@ def test_a_fit_is_written_drawn_and_loaded(tmp_path: Path) -> None:
     path = tmp_path / "sensor.json"
     path.write_text(json.dumps(fit.document(), allow_nan=False))
     assert DepthSensorModel.load(path) == fit.model
-    picture = fit_picture(fit)
-    assert picture.startswith(b"\x89PNG")
+    assert fit_picture(fit).startswith(b"\x89PNG")
 
 
 def test_the_step_is_found_down_to_what_the_files_can_show() -> None:

@@ -106,8 +106,7 @@ def test_a_kind_that_was_not_seen_gets_the_mean_of_all() -> None:
                      LossFitConfig(edge_width_px=(2,), edge_dropout=(0.5,)))  # fmt: skip
     low, high = sorted(fit.reflectance.values())
     assert low < fit.mean_reflectance < high
-    seen = view(PLAIN, {}, 1)
-    unknown = replace(seen, kinds={0: "cup"})
+    unknown = replace(view(PLAIN, {}, 1), kinds={0: "cup"})
     rho = fit.reflectance_of(unknown)
     assert np.allclose(rho[unknown.ids == 0], fit.mean_reflectance)
     assert np.all(rho[unknown.ids != 0] == 1)

@@ -53,8 +53,7 @@ def test_bias_law() -> None:
 
 def test_without_faults_depth_is_the_identity_up_to_the_quantum() -> None:
     depth = np.random.default_rng(0).uniform(0.1, 1.2, (240, 320)).astype(np.float32)
-    exact = EXACT.measure(depth, CAMERA, np.random.default_rng(0))
-    assert np.allclose(exact, depth, rtol=1e-6)
+    assert np.allclose(EXACT.measure(depth, CAMERA, np.random.default_rng(0)), depth, rtol=1e-6)
     coarse = DepthSensorModel.noiseless(1 / 32).measure(depth, CAMERA, np.random.default_rng(0))
     d, q = 320 * 0.018 / depth, 320 * 0.018 / coarse
     assert np.abs(q - d).max() <= 1 / 64 + 1e-4
@@ -79,8 +78,7 @@ def test_nothing_stays_nothing_and_the_range_ends() -> None:
 
 def test_the_shadow_lies_to_the_left_and_is_as_wide_as_the_step_in_disparity() -> None:
     model = replace(EXACT, occlusion=True)
-    measured = model.measure(with_a_box(), CAMERA, np.random.default_rng(0))
-    lost = measured == 0
+    lost = model.measure(with_a_box(), CAMERA, np.random.default_rng(0)) == 0
     d_near, d_far = 320 * 0.018 / 0.3, 320 * 0.018 / 0.6
     row = np.flatnonzero(lost[120])
     shadow = row[row > 50]

@@ -28,8 +28,7 @@ def placed(behind: bool = False) -> list[PlacedMesh]:
         PlacedMesh(1, box((0.1, 0.06, 0.08)), se3.from_rt(turned, [0.12, -0.03, 0.42])),
         PlacedMesh(-1, wall, se3.from_translation([0, 0, 0.8])),
     ]
-    back = PlacedMesh(-1, wall, se3.from_translation([0, 0, -0.3]))
-    return [*things, back] if behind else things
+    return [*things, PlacedMesh(-1, wall, se3.from_translation([0, 0, -0.3]))] if behind else things
 
 
 def brute_force_hidden(points: np.ndarray, eye: np.ndarray, things: list[PlacedMesh]) -> np.ndarray:

@@ -113,8 +113,7 @@ def test_moving_world_and_camera_together_changes_nothing() -> None:
     same = before.ids == after.ids
     assert np.count_nonzero(~same) <= 3
     both = same & (before.depth_m > 0) & (after.depth_m > 0)
-    away = np.abs(before.depth_m - after.depth_m)[both]
-    assert np.quantile(away, 0.999) < 5e-6
+    assert np.quantile(np.abs(before.depth_m - after.depth_m)[both], 0.999) < 5e-6
 
 
 def test_what_is_behind_the_camera_or_aside_is_counted_as_nothing() -> None:

@@ -24,8 +24,7 @@ def test_every_instance_has_the_colour_of_its_outline() -> None:
 
 
 def test_a_photograph_stays_where_no_instance_is() -> None:
-    rgb = np.full((2, 3, 3), 200, np.uint8)
-    picture = instance_picture(IDS, rgb, strength=1.0)
+    picture = instance_picture(IDS, np.full((2, 3, 3), 200, np.uint8), strength=1.0)
     assert tuple(picture[0, 0]) == (200, 200, 200)
     assert tuple(picture[0, 2]) == instance_color(3)
     with pytest.raises(InputError, match=r"photograph is 3x4 and the instances are 3x2"):
@@ -46,8 +45,7 @@ def test_coordinates_run_over_the_box_of_the_model() -> None:
     picture = coordinates_picture(at, ids, {5: box})
     np.testing.assert_array_equal(picture[0, :3], [[0] * 3, [255] * 3, [128] * 3])
     assert tuple(picture[0, 3]) == NOTHING
-    own = coordinates_picture(at, ids)
-    np.testing.assert_array_equal(own[0, :2], picture[0, :2])
+    np.testing.assert_array_equal(coordinates_picture(at, ids)[0, :2], picture[0, :2])
     refused(r"instance 5 has no box", coordinates_picture, at, ids, {4: box})
 
 

@@ -71,8 +71,7 @@ def test_a_half_white_sky_lights_by_the_tilt(tilt_deg: float) -> None:
     panorama = np.zeros((64, 128, 3), np.float32)
     panorama[:32] = 1.0
     T_world_obj = se3.from_rt(se3.exp_so3([np.radians(tilt_deg), 0, 0]), [0, 0, 0])
-    normal = T_world_obj[:3, 2]
-    T = se3.look_at(normal + np.array([1e-3, 0, 0]), [0, 0, 0])
+    T = se3.look_at(T_world_obj[:3, 2] + np.array([1e-3, 0, 0]), [0, 0, 0])
     placed = [PlacedMesh(0, square(2.0), T_world_obj, WHITE)]
     light = light_of(placed, Environment(panorama=panorama), T)
     expected = 0.5 + 0.5 * np.cos(np.radians(tilt_deg))
@@ -164,10 +163,9 @@ def test_a_lamp_leaves_no_pattern_in_its_shadow() -> None:
 
 def test_a_deep_corner_is_darker_than_the_open_table() -> None:
     wall = se3.from_rt(se3.exp_so3([np.pi / 2, 0, 0]), [0, 0.2, 0.5])
-    black = Material(base_color=(0.0, 0.0, 0.0), roughness=1.0)
     placed = [
         PlacedMesh(-1, square(0.8), np.eye(4), WHITE),
-        PlacedMesh(0, square(0.5), wall, black),
+        PlacedMesh(0, square(0.5), wall, Material(base_color=(0.0, 0.0, 0.0), roughness=1.0)),
     ]
     T = se3.look_at([0, -0.3, 1.2], [0, 0, 0])
     light = light_of(placed, even_sky(), T, ambient_rays=4)

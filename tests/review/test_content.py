@@ -20,7 +20,7 @@ from realsim.review.drawing.grasp_drawing import GraspFilter, passing
 from realsim.review.window.panel_grasps import legend_html
 from realsim.store import SessionStore
 from refusals import refused
-from tests.support.reviewed_boxes import CAMERAS, boxes_session, grasp_set
+from reviewed_boxes import CAMERAS, boxes_session, grasp_set
 
 CONFIG = SceneConfig(voxel_m=0.004, coarse_points=200, piece_points=700, thumbnail_px=40)
 
@@ -68,8 +68,7 @@ def test_levels_nest_and_grow(shown: SceneContent) -> None:
     cloud = shown.cloud
     assert list(cloud.ends) == sorted(set(cloud.ends)) and cloud.ends[-1] == len(cloud)
     assert 100 <= cloud.ends[0] <= CONFIG.coarse_points
-    levels = [cloud.points[:end] for end in cloud.ends]
-    for coarse, fine in pairwise(levels):
+    for coarse, fine in pairwise([cloud.points[:end] for end in cloud.ends]):
         np.testing.assert_array_equal(fine[: len(coarse)], coarse)
     assert len(np.unique(cloud.points, axis=0)) == len(cloud)
 
@@ -102,8 +101,7 @@ def test_points_are_grouped_by_voxels_and_those_seen_most_often_stay(voxel_m: fl
 
 
 def test_without_objects_the_region_is_where_the_cameras_look() -> None:
-    views = [View(index=i, T_world_cam=T) for i, T in enumerate(CAMERAS)]
-    region = region_of([], views, 0.2)
+    region = region_of([], [View(index=i, T_world_cam=T) for i, T in enumerate(CAMERAS)], 0.2)
     np.testing.assert_allclose(region.center, [0.5, 0.0, 0.03], atol=1e-9)
 
 
@@ -171,8 +169,7 @@ def with_p_hold(grasps: GraspSet) -> GraspSet:
 
 def test_what_passes_is_what_was_asked_for() -> None:
     grasps = grasp_set(1, 0)
-    every = passing(grasps, GraspFilter())
-    np.testing.assert_array_equal(every, np.arange(40))
+    np.testing.assert_array_equal(passing(grasps, GraspFilter()), np.arange(40))
     rows = passing(grasps, GraspFilter(stage=3, min_label=0.4, reachable_only=True))
     expected = [
         r for r in range(40)
@@ -246,19 +243,16 @@ class LabelledPoints:
 
 
 def test_a_moved_object_takes_its_grasps_out_of_sight(shown: SceneContent) -> None:
-    away = se3.from_translation([0.5, 0.0, -1.0])
-    seen = grasp_drawing.visible_grasps(shown, 0, {0: away})
+    seen = grasp_drawing.visible_grasps(shown, 0, {0: se3.from_translation([0.5, 0.0, -1.0])})
     assert len(seen[0]) == 0 and len(seen[3]) > 0
 
 
 def test_the_gripper_is_as_wide_as_the_grasp() -> None:
     vertices, faces = grasp_drawing.gripper_mesh()
     assert len(faces) <= 24 and faces.max() < len(vertices)
-    rng = np.random.default_rng(1)
-    for width in rng.uniform(0.01, 0.1, 5):
+    for width in np.random.default_rng(1).uniform(0.01, 0.1, 5):
         scaled = vertices * grasp_drawing.gripper_scales([width])[0]
-        tips = scaled[np.isclose(scaled[:, 2], 0.0)]
-        inner = np.abs(tips[:, 1]).min()
+        inner = np.abs(scaled[np.isclose(scaled[:, 2], 0.0)][:, 1]).min()
         assert inner == pytest.approx(width / 2, rel=1e-5)
         assert scaled[:, 2].max() == pytest.approx(0.0, abs=1e-9)
         assert scaled[:, 2].min() == pytest.approx(-0.065, abs=1e-6)

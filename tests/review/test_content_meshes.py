@@ -56,14 +56,12 @@ def test_a_decimated_mesh_keeps_its_outline_and_its_colours() -> None:
         a, b = outline(mesh, T), outline(few, T)
         assert np.sum(a & b) / np.sum(a | b) > 0.995
     assert few.colors is not None
-    expected = np.clip(255 * (few.vertices / 0.12 + 0.5), 0, 255)
-    assert np.abs(few.colors - expected).max() < 8
+    assert np.abs(few.colors - np.clip(255 * (few.vertices / 0.12 + 0.5), 0, 255)).max() < 8
 
 
 def test_a_mesh_is_not_touched_below_its_budget_and_textures_have_a_larger_one() -> None:
     square = textured_square()
-    config = SceneConfig(most_triangles=1, most_textured_triangles=2)
-    assert within_budget(square, config) is square
+    assert within_budget(square, SceneConfig(most_triangles=1, most_textured_triangles=2)) is square
     plain = box((0.1, 0.1, 0.1), (180, 60, 40))
     assert within_budget(plain, SceneConfig(most_triangles=12)) is plain
 
@@ -81,8 +79,7 @@ def test_vertex_colours_are_linear_light_as_gltf_has_them() -> None:
     glb = glb_of(box((0.1, 0.1, 0.1), (0, 128, 255)), 1024)
     length = int.from_bytes(glb[12:16], "little")
     tree = json.loads(glb[20 : 20 + length])
-    at = tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]
-    accessor = tree["accessors"][at]
+    accessor = tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
     view = tree["bufferViews"][accessor["bufferView"]]
     start = 20 + length + 8 + view["byteOffset"]
     values = np.frombuffer(glb[start : start + view["byteLength"]], "<u2").reshape(-1, 4)

@@ -13,7 +13,7 @@ from realsim import InputError, images
 from realsim.review.content import quick_png
 from realsim.review.content.thumbnails import FOLDER, Thumbnails, thumbnail
 from realsim.store import SessionStore
-from tests.support.reviewed_boxes import boxes_session
+from reviewed_boxes import boxes_session
 
 INDICES = (0, 1, 2, 3)
 FILTERS = (0, 1, 2, 3, 4)
@@ -76,8 +76,7 @@ def test_one_of_another_photograph_size_or_quality_is_made_anew(store: SessionSt
 
 def test_progress_comes_to_its_end_and_a_missing_photograph_is_named(store: SessionStore) -> None:
     steps: list[tuple[int, int]] = []
-    thumbnails = opened(store)
-    thumbnails.of(INDICES, {}, lambda done, of: steps.append((done, of)))
+    opened(store).of(INDICES, {}, lambda done, of: steps.append((done, of)))
     assert steps == [(k, 4) for k in (1, 2, 3, 4)]
     (store.folder / "rgb/000002.png").write_bytes(b"\x89PNG\r\n\x1a\n damaged")
     (store.folder / FOLDER / "000002.jpg").unlink()
@@ -123,8 +122,7 @@ def test_all_row_filters_are_undone_as_opencv_does(tmp_path: Path, row_filter: i
 def test_other_files_come_out_as_the_ordinary_reader_has_them(tmp_path: Path, kind: str) -> None:
     from PIL import Image
 
-    rng = np.random.default_rng(0)
-    rgb = rng.integers(0, 256, (20, 30, 3), dtype=np.uint8)
+    rgb = np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8)
     path = tmp_path / "image.png"
     if kind == "depth":
         path.write_bytes(images.png_bytes(rgb[..., 0].astype(np.uint16)))

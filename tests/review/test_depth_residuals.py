@@ -50,8 +50,7 @@ def test_residuals_do_not_depend_on_where_the_world_is() -> None:
 
 def test_points_far_from_all_have_none() -> None:
     points = np.concatenate([surface()[:10], [[0.5, 0.1, 0.5], [0.0, 0.0, 0.0]]])
-    r = residuals(points, T_WEDGE[None], [WEDGE])
-    assert list(np.isnan(r)) == [False] * 10 + [True] * 2
+    assert list(np.isnan(residuals(points, T_WEDGE[None], [WEDGE]))) == [False] * 10 + [True] * 2
     assert np.all(np.isnan(residuals(points, np.zeros((0, 4, 4)), [])))
 
 
@@ -95,14 +94,12 @@ def test_what_is_no_cloud_is_refused() -> None:
 
 
 def test_noise_looks_like_noise_and_an_error_does_not() -> None:
-    rng = np.random.default_rng(0)
-    noise = rng.normal(scale=0.0007, size=4000)
+    noise = np.random.default_rng(0).normal(scale=0.0007, size=4000)
     sigma = noise_of(np.append(noise, np.nan))
     assert sigma == pytest.approx(0.0007, rel=0.05)
     on = residual_rgb([0.0])[0]
     assert np.mean((residual_rgb(noise, noise_m=sigma) == on).all(1)) > 0.93
-    off = residual_rgb(noise + 0.003, noise_m=sigma)
-    assert np.mean((off == on).all(1)) < 0.02
+    assert np.mean((residual_rgb(noise + 0.003, noise_m=sigma) == on).all(1)) < 0.02
     # A scene in which most stands wrong must not pass for a noisy one.
     assert noise_of(noise + 0.006) <= 0.001
 

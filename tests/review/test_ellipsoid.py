@@ -7,11 +7,11 @@ import pytest
 import trimesh
 
 from realsim.arrays import Array
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import ObjectPose
 from realsim.review.placing.ellipsoid import ellipsoid_of, middle_of, pose_sigmas, unit_sphere
+from refusals import refused
 
 MUG = part("mug")
 TUBE = replace(part("tube"), symmetry_axes=(((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)),))
@@ -49,14 +49,12 @@ def test_the_ellipsoid_is_the_spread_of_the_middle_of_sampled_poses() -> None:
 
 def test_it_does_not_depend_on_where_the_object_s_frame_lies() -> None:
     """T exp(xi) = T D D^-1 exp(xi): the same uncertainty, told in the frame of a moved mesh."""
-    rng = np.random.default_rng(4)
-    T, D = se3.random_transform(rng, 2)
+    T, D = se3.random_transform(np.random.default_rng(4), 2)
     C = covariance(4)
     shift = se3.from_translation(D[:3, 3])
     Ad = se3.adjoint(se3.invert(shift))
     mesh = replace(MUG.mesh, vertices=se3.transform(se3.invert(shift), MUG.mesh.vertices))
-    other = replace(MUG, mesh=mesh)
-    moved = ellipsoid_of(at(T @ shift, Ad @ C @ Ad.T), model=other)
+    moved = ellipsoid_of(at(T @ shift, Ad @ C @ Ad.T), model=replace(MUG, mesh=mesh))
     found = ellipsoid_of(at(T, C), model=MUG)
     assert found is not None and moved is not None
     np.testing.assert_allclose(moved.radii_m, found.radii_m, rtol=1e-9)
@@ -88,8 +86,7 @@ def test_without_a_covariance_there_is_none() -> None:
     placed = at(np.eye(4), None)
     assert ellipsoid_of(placed) is None
     assert pose_sigmas(placed, MUG) is None
-    with pytest.raises(InputError, match="positive"):
-        ellipsoid_of(at(np.eye(4), covariance(8)), sigmas=0.0)
+    refused("positive", ellipsoid_of, at(np.eye(4), covariance(8)), sigmas=0.0)
 
 
 @pytest.mark.parametrize("divisions", [0, 2])
@@ -98,5 +95,4 @@ def test_the_sphere_is_closed_and_turned_outwards(divisions: int) -> None:
     assert len(sphere.faces) == 20 * 4**divisions
     np.testing.assert_allclose(np.linalg.norm(sphere.vertices, axis=1), 1.0)
     assert trimesh.Trimesh(sphere.vertices, sphere.faces, process=False).is_volume
-    with pytest.raises(InputError, match="0 to 5"):
-        unit_sphere(9)
+    refused("0 to 5", unit_sphere, 9)

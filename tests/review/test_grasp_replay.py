@@ -12,16 +12,8 @@ from realsim import InputError, Mesh
 from realsim.geometry import se3
 from realsim.records import STAGES
 from realsim.records.trajectories import PHASES
+from realsim.review.replaying import grasp_words as words
 from realsim.review.replaying.grasp_replay import GraspMotion, Motions, ReplayPlayer, hand_approach
-from realsim.review.replaying.grasp_words import (
-    LOST,
-    NOT_TRIED,
-    escaped,
-    grasp_words,
-    slip_table,
-    slip_words,
-    why_words,
-)
 from realsim.robots.hand import find_hand
 from reviewed_boxes import grasp_set
 from tried_grasps import tried_set
@@ -214,23 +206,24 @@ def test_the_arm_can_be_hidden_and_the_hand_stays(server: viser.ViserServer) -> 
 
 
 def test_slips_are_read_as_numbers_lost_or_not_tried() -> None:
-    assert [slip_words(v) for v in (np.nan, np.inf, 1.234)] == [NOT_TRIED, LOST, "1.23"]
+    said = [words.slip_words(v) for v in (np.nan, np.inf, 1.234)]
+    assert said == [words.NOT_TRIED, words.LOST, "1.23"]
 
 
 def test_the_words_of_every_grasp_say_stage_by_stage_what_is_stored() -> None:
     grasps = tried_set(np.random.default_rng(0))
     for row in range(len(grasps)):
-        table = slip_table(grasps, row)
+        table = words.slip_table(grasps, row)
         assert [line.split("|")[1].strip() for line in table[2:]] == list(STAGES)
         for line, slip in zip(table[2:], grasps.slip_m[row], strict=True):
             cell = line.split("|")[2].strip()
             if np.isfinite(slip):
                 assert float(cell) == pytest.approx(1e3 * slip, abs=0.006)
             else:
-                assert cell == (LOST if np.isinf(slip) else NOT_TRIED)
-        text = grasp_words(grasps, row, "mug")
+                assert cell == (words.LOST if np.isinf(slip) else words.NOT_TRIED)
+        text = words.grasp_words(grasps, row, "mug")
         assert f"Grasp {row}" in text and "mug" in text
-        assert escaped(grasps.failures[row]) in text and why_words(grasps, row) in text
+        assert words.escaped(grasps.failures[row]) in text and words.why_words(grasps, row) in text
         assert ("does not reach" in text) is not bool(grasps.reachable[row])
         assert "nan" not in text and "inf" not in text.replace("instance", "")
 
@@ -251,7 +244,7 @@ def test_one_sentence_says_why_a_grasp_failed() -> None:
         grasps, failures=failures, measures=measures, base_scores=np.ones(7),
         scores=np.array([0.2, 0, np.nan, 1, 0, 1, 1]), reachable=np.arange(7) != 1,
     )  # fmt: skip
-    assert [why_words(grasps, row) for row in range(7)] == [
+    assert [words.why_words(grasps, row) for row in range(7)] == [
         "It failed during the lift: the object slipped 7.5 mm.",
         "The arm does not reach it: collides with the table.",
         "It was not tried: too few \\*pads\\*.",
@@ -262,11 +255,11 @@ def test_one_sentence_says_why_a_grasp_failed() -> None:
         "It held in all four stages.",
     ]
     unknown = replace(grasps, failures=("",) * 7, base_scores=np.zeros(7))
-    assert why_words(unknown, 4) == "It failed: no reason is stored."
+    assert words.why_words(unknown, 4) == "It failed: no reason is stored."
     with pytest.raises(IndexError):
-        grasp_words(grasps, 7)
+        words.grasp_words(grasps, 7)
 
 
 def test_names_of_people_are_neither_html_nor_markdown() -> None:
-    assert escaped("a\r\nb\x00\u2029c") == "a b c"
-    assert escaped("<b>*a*|`x`</b>") == "&lt;b&gt;\\*a\\*\\|\\`x\\`&lt;/b&gt;"
+    assert words.escaped("a\r\nb\x00\u2029c") == "a b c"
+    assert words.escaped("<b>*a*|`x`</b>") == "&lt;b&gt;\\*a\\*\\|\\`x\\`&lt;/b&gt;"

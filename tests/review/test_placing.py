@@ -59,8 +59,7 @@ def test_a_step_commutes_with_a_change_of_world(
 @pytest.mark.parametrize("frame", FRAMES)
 def test_a_turn_leaves_the_middle_where_it_is(frame: placing.Frame) -> None:
     T, table, cam = random_poses(4)
-    turned = step(T, ("turn", frame, "y"), np.radians(5.0), table, cam)
-    found = placing.moved(T, turned, MUG)
+    found = placing.moved(T, step(T, ("turn", frame, "y"), np.radians(5.0), table, cam), MUG)
     assert found.mm < 1e-10
     assert found.deg == pytest.approx(5.0)
 
@@ -140,9 +139,7 @@ def test_what_is_put_on_the_table_touches_it() -> None:
     T, table, _ = random_poses(10)
     plane = SupportPlane(T_world_table=table)
     down = placing.on_table(T, MUG, plane)
-    z = se3.transform(se3.invert(table) @ down, MUG.vertices)[:, 2]
-    assert abs(z.min()) < 1e-12
+    assert abs(se3.transform(se3.invert(table) @ down, MUG.vertices)[:, 2].min()) < 1e-12
     np.testing.assert_array_equal(down[:3, :3], T[:3, :3])
-    across = table[:3, :2].T @ (down[:3, 3] - T[:3, 3])
-    np.testing.assert_allclose(across, 0, atol=1e-12)
+    np.testing.assert_allclose(table[:3, :2].T @ (down[:3, 3] - T[:3, 3]), 0, atol=1e-12)
     np.testing.assert_allclose(placing.on_table(down, MUG, plane), down, atol=1e-14)

@@ -21,8 +21,8 @@ from realsim.local_pages import Door
 from realsim.review import ReviewServer
 from realsim.store import SessionStore
 from refusals import refused
-from tests.support.review_browser import CAMERA, SOCKET, serving
-from tests.support.reviewed_boxes import boxes_session
+from review_browser import CAMERA, SOCKET, serving
+from reviewed_boxes import boxes_session
 
 TOKEN = "a-secret-of-more-than-16"
 
@@ -286,8 +286,7 @@ def test_the_token_comes_once_in_the_address_and_stays_as_a_cookie(locked: Revie
 
 
 def test_an_open_server_answers_to_its_addresses_and_names_only(locked: ReviewServer) -> None:
-    headers = asked(locked, f"/?token={TOKEN}", Host="192.0.2.7:8080")[1]
-    cookie = headers["Set-Cookie"].split(";")[0]
+    cookie = asked(locked, f"/?token={TOKEN}", Host="192.0.2.7:8080")[1]["Set-Cookie"].split(";")[0]
     assert cookie.startswith("realsim_8080=")
     for host in ("192.0.2.7:8080", f"{socket.gethostname()}:8080"):
         assert asked(locked, Host=host, Cookie=cookie)[0] == 200

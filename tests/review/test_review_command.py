@@ -14,7 +14,7 @@ from realsim.app.review.run import ReviewRequest, open_all, write_page
 from realsim.review.reviewed_session import ReviewedSession
 from realsim.review.server import counted
 from realsim.store import SessionStore
-from tests.support.reviewed_boxes import boxes_session
+from reviewed_boxes import boxes_session
 from typed_commands import refused
 
 MAIN = "from realsim.app.cli import main; main()"
@@ -22,8 +22,7 @@ MAIN = "from realsim.app.cli import main; main()"
 
 def test_sessions_that_cannot_be_reviewed_are_told_and_the_others_opened(tmp_path: Path) -> None:
     boxes_session(tmp_path / "root/a").close()
-    raw = boxes_session(tmp_path / "root/b")
-    raw.remove("registration/scene.json")
+    boxes_session(tmp_path / "root/b").remove("registration/scene.json")
     cut = boxes_session(tmp_path / "root/c").path("registration/scene.json")
     cut.write_text(cut.read_text()[:99])
     stores, remarks = open_all((tmp_path / "root",))

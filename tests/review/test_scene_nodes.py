@@ -17,7 +17,7 @@ from realsim.review.content.content import SceneContent
 from realsim.review.drawing.scene_nodes import GraspFilter, SceneNodes
 from realsim.review.placing.ellipsoid import ellipsoid_of
 from refusals import refused
-from tests.support.reviewed_boxes import CAMERAS, SCENE, boxes_session
+from reviewed_boxes import CAMERAS, SCENE, boxes_session
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 
@@ -95,8 +95,7 @@ def test_place_and_place_back_leaves_every_node_as_it_was(
     moved = se3.random_transform(np.random.default_rng(0))
     nodes.place(0, moved)
     during = states(server)
-    changed = {name for name in before if during[name] != before[name]}
-    assert changed == {"/objects/0"}
+    assert {name for name in before if during[name] != before[name]} == {"/objects/0"}
     np.testing.assert_allclose(during["/objects/0"][4:7], moved[:3, 3], atol=1e-9)
     nodes.place(0, SCENE.object(0).T_world_obj)
     after = states(server)
@@ -137,8 +136,7 @@ def test_switches_show_one_look_at_a_time_and_colours_follow_the_verdict(
 def test_colours_of_the_cloud_are_set_in_its_order_and_taken_back(
     server: viser.ViserServer, nodes: SceneNodes, shown: SceneContent
 ) -> None:
-    rng = np.random.default_rng(0)
-    colors = rng.integers(0, 256, shown.cloud.points.shape, dtype=np.uint8)
+    colors = np.random.default_rng(0).integers(0, 256, shown.cloud.points.shape, dtype=np.uint8)
 
     def sent() -> np.ndarray:
         handles = server.scene._handle_from_node_name  # type: ignore[reportPrivateUsage]
@@ -165,8 +163,7 @@ def test_grasps_are_one_node_at_their_poses_and_a_click_tells_the_row(
     done = threading.Event()
     nodes.grasps.on_click(lambda instance, row: (clicked.append((instance, row)), done.set()))
     moved = se3.random_transform(np.random.default_rng(2))
-    chosen = GraspFilter(stage=4)
-    drawn = nodes.draw_grasps(chosen, {3: moved})
+    drawn = nodes.draw_grasps(GraspFilter(stage=4), {3: moved})
     expected = [
         (g.instance, int(r)) for g in shown.grasp_sets for r in np.flatnonzero(g.base_scores == 1)
     ]

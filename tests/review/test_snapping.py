@@ -21,13 +21,7 @@ from realsim.review.placing.measured_views import depth_bias_of, usable_views
 from realsim.review.placing.placing import middle_of
 from realsim.review.placing.snapping import Snapped, Snapper
 from realsim.store import SessionStore
-from tests.support.registered_sessions import (
-    CAMERA,
-    models_of,
-    table_session,
-    true_cameras,
-    true_poses,
-)
+from registered_sessions import CAMERA, models_of, table_session, true_cameras, true_poses
 
 MODELS = models_of()
 TUBE = part("tube")
@@ -51,8 +45,7 @@ def snapper(store: SessionStore) -> Iterator[Snapper]:
 
 def pushed(placed: ObjectPose, mm: float, deg: float, seed: int = 0) -> Array:
     """Return a pose that is off by so much, turned about the object's middle."""
-    rng = np.random.default_rng(seed)
-    turn, shift = rng.normal(size=(2, 3))
+    turn, shift = np.random.default_rng(seed).normal(size=(2, 3))
     turn, shift = turn / np.linalg.norm(turn), shift / np.linalg.norm(shift)
     C = se3.from_translation(middle_of((MODELS | {TUBE.obj_id: TUBE})[placed.obj_id].mesh))
     xi = np.concatenate([np.radians(deg) * turn, 1e-3 * mm * shift])

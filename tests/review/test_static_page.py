@@ -19,8 +19,8 @@ from realsim.review.static.page_nodes import LABEL_EDGES, drawn_grasps, label_cl
 from realsim.review.static.static_page import PageWords, StaticSummary, write_static
 from realsim.store import save_grasps, save_scene
 from registered_sessions import registered_by_hand, table_session, true_poses
-from tests.support.review_browser import CHROMIUM, WAIT_S, review_browser
-from tests.support.reviewed_boxes import grasp_set
+from review_browser import CHROMIUM, WAIT_S, review_browser
+from reviewed_boxes import grasp_set
 
 NASTY = "</script><script>document.title='taken'</script> & \"quoted\" <img src=http://e.example/x>"
 MADE = datetime(2026, 1, 2, 3, 4, tzinfo=UTC)

@@ -30,8 +30,8 @@ from realsim.review.window.place import Place
 from realsim.review.window.window import Window
 from realsim.store import SessionStore, save_grasps, save_scene
 from realsim.store.session_store import rgb_path
-from tests.support.review_browser import CAMERA, SOCKET, serving
-from tests.support.reviewed_boxes import MODELS, SCENE, boxes_session, grasp_set
+from review_browser import CAMERA, SOCKET, serving
+from reviewed_boxes import MODELS, SCENE, boxes_session, grasp_set
 
 RED, ORANGE = "realsim-message alarm", "realsim-message refused"
 

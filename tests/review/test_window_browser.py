@@ -16,7 +16,7 @@ from realsim.review.drawing.grasp_drawing import FINGER_M
 from realsim.review.journal import Entry
 from realsim.review.static.static_page import write_static
 from realsim.store import SessionStore, load_scene, save_scene
-from tests.support.review_browser import (
+from review_browser import (
     CHROMIUM,
     ReviewBrowser,
     ReviewPage,
@@ -24,7 +24,7 @@ from tests.support.review_browser import (
     review_browser,
     serving,
 )
-from tests.support.reviewed_boxes import boxes_session
+from reviewed_boxes import boxes_session
 
 TABLE_RGB, BOX_RGB = (100, 100, 100), (210, 210, 210)
 """Colours of the photographs, with noise of 10."""
@@ -63,8 +63,7 @@ def rows(page: ReviewPage) -> list[str]:
 
 def share_of(image: Any, rgb: tuple[int, int, int]) -> float:
     """Return the share of pixels of about this colour."""
-    off = np.abs(image.astype(int) - np.array(rgb)).max(-1)
-    return float(np.mean(off < 30))
+    return float(np.mean(np.abs(image.astype(int) - np.array(rgb)).max(-1) < 30))
 
 
 def test_a_scene_of_any_up_is_framed_at_once_and_a_link_shows_the_same(

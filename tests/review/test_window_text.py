@@ -11,7 +11,7 @@ from realsim.geometry import se3
 from realsim.review import journal
 from realsim.review.window import window_text
 from realsim.review.window.keys import KEYS, STEPS
-from tests.support.reviewed_boxes import MODELS, SCENE
+from reviewed_boxes import MODELS, SCENE
 
 TALL = 1
 PLACED = SCENE.objects[1]
@@ -97,8 +97,7 @@ def test_undo_names_whose_line_it_takes_back() -> None:
 def test_a_line_in_the_history_has_time_name_and_how() -> None:
     T = se3.from_translation([0.5, 0.0, 0.015])
     moved = journal.new_entry("move", PLACED, "bob", pose=T, how="steps+icp")
-    text = window_text.history_text([entry("it floats"), moved])
-    first, second = text.split("\n")
+    first, second = window_text.history_text([entry("it floats"), moved]).split("\n")
     assert "**bob** moved it (steps+icp)" in first and "**ada** rejected: it floats" in second
     assert re.search(r"\d{4}-\d\d-\d\d \d\d:\d\d UTC", first)
 

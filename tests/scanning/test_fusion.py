@@ -127,8 +127,7 @@ def test_the_mesh_moves_with_the_world() -> None:
     radii = np.linalg.norm(back[fused.measured] - [0, 0, RADIUS], axis=1)
     assert np.median(radii) == pytest.approx(RADIUS, abs=1e-4)
     assert np.percentile(np.abs(radii - RADIUS), 95) < 4e-4
-    up = T[:3, :3] @ [0, 0, 1]
-    assert fused.plane.T_world_table[:3, 2] == pytest.approx(up, abs=1e-4)
+    assert fused.plane.T_world_table[:3, 2] == pytest.approx(T[:3, :3] @ [0, 0, 1], abs=1e-4)
 
 
 def test_the_order_of_the_frames_does_not_matter_and_twice_is_the_same() -> None:
@@ -174,8 +173,7 @@ def test_a_view_with_a_wrong_pose_is_left_out_by_name() -> None:
 def test_the_picture_shows_the_mesh() -> None:
     import cv2
 
-    data = fusion_picture(fused_ball())
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    image = cv2.imdecode(np.frombuffer(fusion_picture(fused_ball()), np.uint8), cv2.IMREAD_COLOR)
     assert image is not None and image.shape[1] > 1000
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 500
 
@@ -227,8 +225,7 @@ def test_frames_of_another_size_are_named_by_number() -> None:
 
 
 def test_identical_frames_are_named() -> None:
-    same = [replace(good()[0], index=k) for k in range(5)]
-    refused("identical", fuse, same)
+    refused("identical", fuse, [replace(good()[0], index=k) for k in range(5)])
     pose = good()[0].T_world_cam
     refused("same place", fuse, [replace(f, T_world_cam=pose) for f in good()])
     refused("unique", fuse, [good()[0], *good()])
@@ -242,8 +239,7 @@ def test_several_objects_are_named_and_one_can_be_chosen() -> None:
     frames = frames_of((block(-0.06, 0, (0.05, 0.05, 0.05)), block(0.07, 0.02, (0.04, 0.06, 0.03))))
     refused(r"2 things .* mm at \(.*at_m", fuse, frames)
     fused = fuse(frames, replace(CONFIG, at_m=(0.07, 0.02)))
-    middle = fused.mesh.bounds.mean(0)
-    assert middle == pytest.approx([0.07, 0.02, 0.015], abs=0.003)
+    assert fused.mesh.bounds.mean(0) == pytest.approx([0.07, 0.02, 0.015], abs=0.003)
     assert any("also on the table" in note for note in fused.notes)
     refused("nothing stands at", fuse, frames, replace(CONFIG, at_m=(0.0, 0.15)))
 

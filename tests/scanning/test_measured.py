@@ -44,8 +44,7 @@ def known():
 
 @pytest.fixture(scope="module")
 def fit(known):
-    rng = np.random.default_rng(0)
-    residual = 0.2 * rng.standard_normal(len(known.scan.vertices))
+    residual = 0.2 * np.random.default_rng(0).standard_normal(len(known.scan.vertices))
     return fit_of(known, 1.0, reasons=(), verdict="accepted", residual_mm=residual)
 
 
@@ -115,8 +114,7 @@ def test_lengths_of_a_brick_are_known():
 def test_longest_and_diameter_do_not_depend_on_the_axes(kind):
     mesh = part("mug").mesh
     m = Measurement(kind=kind, value_m=0.1, sigma_m=1e-3)
-    length = length_of(mesh, m)
-    assert length_of(turned(mesh, 0)[0], m) == pytest.approx(length, rel=2e-3)
+    assert length_of(turned(mesh, 0)[0], m) == pytest.approx(length_of(mesh, m), rel=2e-3)
 
 
 # --- several ----------------------------------------------------------------------------------

@@ -10,14 +10,8 @@ from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.normal_equations import System, symmetric
 from realsim.registration.refinement.equations import OBJECTS, TABLE_AT, Blocks, Offsets, assemble
+from realsim.scanning.scale import equations
 from realsim.scanning.scale.config import ScaleConfig
-from realsim.scanning.scale.equations import (
-    Round,
-    add_contact,
-    object_distances,
-    surface_blocks,
-    table_blocks,
-)
 from realsim.scanning.scale.outlines import COLUMNS, Rims, add_outline
 from realsim.scanning.scale.shape import ScanShape
 from realsim.scanning.scale.state import OBJECT, PATCHES, RIM, SIZE, ScaleState, moved_state
@@ -77,12 +71,12 @@ def row_of(system: System, at: int = PATCHES, sign: float = 1.0) -> tuple[float,
 def surface_row(shape: ScanShape, state: ScaleState, T: Array, point: Array) -> tuple[float, Array]:
     """Return the row of one measured point (3,) of the object, in camera axes."""
     views = np.zeros(1, np.int32)
-    held = Round(
+    held = equations.Round(
         points=point[None], views=views, variance=np.full(1, 1e-8), crowding=np.ones(1),
         ids=np.zeros(1, np.int64), rims=Rims(points=[], ids=[], factors=[]),
     )  # fmt: skip
-    seen, Ms = object_distances(shape, state, state.cameras(T[None]), point[None], views)
-    blocks, kernels = surface_blocks(seen, Ms, held, (np.zeros(1), 1e6, 0.0))
+    seen, Ms = equations.object_distances(shape, state, state.cameras(T[None]), point[None], views)
+    blocks, kernels = equations.surface_blocks(seen, Ms, held, (np.zeros(1), 1e6, 0.0))
     if kernels[0] == 0.0:
         return np.nan, np.full(SHARED + 6, np.nan)
     r, J = row_of(assemble([blocks], SHARED), PATCHES, -1.0)
@@ -145,9 +139,8 @@ def test_table_derivatives_are_the_differences_of_the_height():
     evidence, config = evidence_of("block", "exact"), ScaleConfig()
 
     def row(state: ScaleState, T: Array, point: Array) -> tuple[float, Array]:
-        view = replace(evidence.views[0], table=point[None])
-        one = replace(evidence, views=(view,))
-        blocks = table_blocks(one, state, state.cameras(T[None]), config)
+        one = replace(evidence, views=(replace(evidence.views[0], table=point[None]),))
+        blocks = equations.table_blocks(one, state, state.cameras(T[None]), config)
         return row_of(assemble([blocks], SHARED), TABLE_AT[2], -1.0)
 
     for seed in range(3):
@@ -229,7 +222,7 @@ def test_contact_derivatives_are_the_differences_of_the_lowest_points_height():
         n = PATCHES + len(offsets)
         system = System(A=np.zeros((n, n)), a=np.zeros(n), B=np.zeros((1, n, 6)),
                         D=np.zeros((1, 6, 6)), d=np.zeros((1, 6)))  # fmt: skip
-        add_contact(shape, state, offsets, (0.0, config), system)
+        equations.add_contact(shape, state, offsets, (0.0, config), system)
         J = np.sqrt(np.diag(system.A)) * np.sign(system.A[SIZE]) * np.sign(system.A[SIZE, SIZE])
         w = 1.0 / config.prior.contact_m**2
         T = se3.invert(state.T_world_table) @ state.poses[0]

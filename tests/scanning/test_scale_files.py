@@ -9,15 +9,7 @@ import pytest
 
 from realsim.errors import NotRigidError
 from realsim.records import Mesh
-from realsim.scanning.scale.files import (
-    ScaleRecord,
-    installed_versions,
-    json_lines,
-    load_record,
-    load_start,
-    record_from_json,
-    record_to_json,
-)
+from realsim.scanning.scale import files
 from realsim.scanning.scale.measured import parse_measurement
 from realsim.scanning.scale.measured_check import with_measurements
 from realsim.scanning.scale.picture_overlays import Photograph, overlays_png
@@ -39,20 +31,20 @@ def record(known):
     fit, checks = with_measurements(fit_of(known), known.scan, lengths)
     inputs = {"key": "abc", "mesh": {"name": "wedge"}, "at": [0.1, 0.2]}
     poses = ({"index": 0, "T_world_cam": np.eye(4).tolist()},)
-    return ScaleRecord(
+    return files.ScaleRecord(
         fit=fit, inputs=inputs, config={"field_cells": 96}, measured=checks, poses=poses,
-        versions=installed_versions(),
+        versions=files.installed_versions(),
     )  # fmt: skip
 
 
 def test_a_record_comes_back_and_is_written_the_same_again(record, tmp_path):
     path = tmp_path / "scale.json"
-    path.write_text(json_lines(record_to_json(record)))
-    loaded = load_record(path)
+    path.write_text(files.json_lines(files.record_to_json(record)))
+    loaded = files.load_record(path)
     assert_same(loaded, record)
-    assert json_lines(record_to_json(loaded)) == path.read_text()
+    assert files.json_lines(files.record_to_json(loaded)) == path.read_text()
     with pytest.raises(TypeError, match="JSON"):
-        json_lines(record_to_json(replace(record, inputs={"bad": object()})))
+        files.json_lines(files.record_to_json(replace(record, inputs={"bad": object()})))
 
 
 @pytest.mark.parametrize(
@@ -66,23 +58,23 @@ def test_a_record_comes_back_and_is_written_the_same_again(record, tmp_path):
     ],
 )
 def test_damage_is_named(record, change, said):
-    data = record_to_json(record)
+    data = files.record_to_json(record)
     change(data)
-    refused(said, record_from_json, data)
+    refused(said, files.record_from_json, data)
 
 
 def test_a_file_that_is_no_json_is_named(tmp_path):
     (tmp_path / "scale.json").write_text('{"format": "realsim sc')
-    refused("not valid JSON", load_record, tmp_path / "scale.json")
-    refused("does not exist", load_record, tmp_path / "none.json")
+    refused("not valid JSON", files.load_record, tmp_path / "scale.json")
+    refused("does not exist", files.load_record, tmp_path / "none.json")
 
 
 # --- starts -----------------------------------------------------------------------------------
 
 
 def test_a_result_is_a_start(record, tmp_path):
-    (tmp_path / "scale.json").write_text(json_lines(record_to_json(record)))
-    start = load_start(tmp_path / "scale.json")
+    (tmp_path / "scale.json").write_text(files.json_lines(files.record_to_json(record)))
+    start = files.load_start(tmp_path / "scale.json")
     assert start.scale == record.fit.scale
     np.testing.assert_array_equal(start.T_world_obj, record.fit.T_world_obj)
 
@@ -94,18 +86,19 @@ def written(tmp_path, **values):
 
 
 def test_a_start_is_two_values(tmp_path):
-    start = load_start(written(tmp_path, scale=0.1, T_world_obj=np.eye(4).tolist()))
+    start = files.load_start(written(tmp_path, scale=0.1, T_world_obj=np.eye(4).tolist()))
     assert start.scale == 0.1 and start.source == "given"
 
 
 def test_a_start_that_is_none_is_named(tmp_path):
     scaled = np.diag([2.0, 2, 2, 1]).tolist()
     with pytest.raises(NotRigidError, match="never inside"):
-        load_start(written(tmp_path, scale=2.0, T_world_obj=scaled))
+        files.load_start(written(tmp_path, scale=2.0, T_world_obj=scaled))
+    pose = np.eye(4).tolist()
     for scale in (-1, 0, "big", None, True):
-        refused("scale", load_start, written(tmp_path, scale=scale, T_world_obj=np.eye(4).tolist()))
-    refused("shape", load_start, written(tmp_path, scale=1.0, T_world_obj=[1, 2, 3]))
-    refused("lacks T_world_obj", load_start, written(tmp_path, scale=1.0))
+        refused("scale", files.load_start, written(tmp_path, scale=scale, T_world_obj=pose))
+    refused("shape", files.load_start, written(tmp_path, scale=1.0, T_world_obj=[1, 2, 3]))
+    refused("lacks T_world_obj", files.load_start, written(tmp_path, scale=1.0))
 
 
 # --- Pictures of a scale fit: colours mean what they say, and every case can be drawn.

@@ -74,13 +74,11 @@ def _case(name: str, seed: int, amplitude: float = 0.02) -> Case:
     mesh = part(name).mesh
     resting = resting_orientations(mesh)
     chance = np.array([r.probability for r in resting])
-    R = resting[rng.choice(len(resting), p=chance / chance.sum())].R
-    T = standing(mesh, R, rng)
+    T = standing(mesh, resting[rng.choice(len(resting), p=chance / chance.sum())].R, rng)
     cloud = _cloud(mesh, T, rng)
     shape = distorted(mesh, amplitude, rng) if amplitude else mesh
     turned = shape.vertices @ se3.random_rotation(rng).T / FACTOR + rng.uniform(-1, 1, 3)
-    given = make_shape(Mesh(vertices=turned, faces=shape.faces), ScaleConfig())
-    return Case(mesh, T, cloud, given)
+    return Case(mesh, T, cloud, make_shape(Mesh(vertices=turned, faces=shape.faces), ScaleConfig()))
 
 
 def _placed(start: Similarity, shape: ScanShape) -> np.ndarray:
@@ -132,8 +130,7 @@ def test_starts_are_few_and_sorted_and_each_stands_on_the_table(
     assert scores == sorted(scores, reverse=True)
     assert len({(s.scale, s.T_world_obj.tobytes()) for s in mug_starts}) == len(mug_starts)
     for s in mug_starts:
-        lowest = se3.transform(s.T_world_obj, s.scale * mug.given.hull)[:, 2].min()
-        assert abs(lowest) < 0.002
+        assert abs(se3.transform(s.T_world_obj, s.scale * mug.given.hull)[:, 2].min()) < 0.002
 
 
 def test_starts_move_with_the_world(mug: Case, mug_starts: list[Similarity]) -> None:
@@ -169,8 +166,7 @@ FEW_PIXELS = replace(LAB, views=6, width=320, height=180, focal_px=162.0)
 
 def placed(mesh: Mesh, x: float, y: float = 0.0) -> Mesh:
     """Return the mesh moved on the table, its lowest point at z = 0."""
-    low = mesh.vertices[:, 2].min()
-    return shifted(mesh, x, y, -float(low))
+    return shifted(mesh, x, y, -float(mesh.vertices[:, 2].min()))
 
 
 @lru_cache(maxsize=1)
@@ -196,8 +192,7 @@ def object_of(
 ) -> Footprint:
     frames = frames or known.frames
     noise = measure_noise(frames, EvidenceConfig())
-    plane = table_of(known, frames)
-    return find_object(known.views.intrinsics, frames, plane, noise, CONFIG, at)
+    return find_object(known.views.intrinsics, frames, table_of(known, frames), noise, CONFIG, at)
 
 
 def test_the_plane_is_found_whatever_the_world_is():

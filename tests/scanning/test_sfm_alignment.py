@@ -22,8 +22,7 @@ def cameras(rng: np.random.Generator, views: int = VIEWS) -> np.ndarray:
 
 def in_other_world(Ts: np.ndarray, scale: float, rng: np.random.Generator) -> np.ndarray:
     """Return cameras in a world whose unit is `scale` metres, turned and shifted."""
-    G = se3.random_transform(rng)
-    moved = G @ Ts
+    moved = se3.random_transform(rng) @ Ts
     moved[:, :3, 3] /= scale
     return moved
 
@@ -38,8 +37,7 @@ def test_exact_poses_give_the_exact_scale() -> None:
     found = in_other_world(T, 240.0, rng)
     a = align_to_robot(names(VIEWS), found, T, AlignmentConfig(), rng)
     assert a.scale == pytest.approx(240.0, rel=1e-6)
-    centres = a.scale * found[:, :3, 3] @ a.R.T + a.t
-    assert np.allclose(centres, T[:, :3, 3], atol=1e-7)
+    assert np.allclose(a.scale * found[:, :3, 3] @ a.R.T + a.t, T[:, :3, 3], atol=1e-7)
     assert max(v.offset_mm for v in a.views) < 1e-3
     assert not any(v.outlier for v in a.views)
 
@@ -68,10 +66,8 @@ def test_the_interval_covers_with_arm_and_hand_eye_errors() -> None:
         errors = se3.exp(s * rng.standard_normal((views, 6)))
         robot = T @ se3.exp(h * rng.standard_normal(6)) @ errors
         # The arm's own metre is part of the sigma, so it errs here, too.
-        metre = 1 + noise.arm_scale_percent / 100 * rng.standard_normal()
-        robot[:, :3, 3] *= metre
-        found = in_other_world(T, 0.1, rng)
-        a = align_to_robot(names(views), found, robot, AlignmentConfig(), rng)
+        robot[:, :3, 3] *= 1 + noise.arm_scale_percent / 100 * rng.standard_normal()
+        a = align_to_robot(names(views), in_other_world(T, 0.1, rng), robot, AlignmentConfig(), rng)
         hits += abs(a.scale / 0.1 - 1) <= 1.96 * a.sigma / a.scale
     assert 0.87 <= hits / runs <= 1.0
 

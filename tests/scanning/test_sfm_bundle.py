@@ -87,8 +87,7 @@ def test_point_sigmas_are_those_of_repeated_noise() -> None:
 
 
 def test_measured_depth_gives_the_ratio() -> None:
-    rng = np.random.default_rng(4)
-    true = scene(rng)
+    true = scene(np.random.default_rng(4))
     flat = replace(true, points=true.points * [1.0, 1.0, 0.0])
     local = se3.transform(se3.invert(flat.Ts_world_cam), flat.points)
     flat = replace(flat, uv_px=project(CAMERA, local.reshape(-1, 3)))

@@ -31,15 +31,13 @@ def scanned(config: ScanLabConfig, seed: int) -> ScanViews:
 
 def pose_errors(views: ScanViews) -> Array:
     """Return inv(true) @ reported (F, 4, 4)."""
-    reported = np.stack([f.T_world_cam for f in views.frames])
-    return se3.invert(views.Ts_world_cam) @ reported
+    return se3.invert(views.Ts_world_cam) @ np.stack([f.T_world_cam for f in views.frames])
 
 
 def test_the_hand_eye_error_is_one_constant_motion_of_the_size_asked_for():
     directions = []
     for seed in range(24):
-        views = scanned(replace(SMALL, views=3, arm_mm=0.0, arm_deg=0.0), seed)
-        E = pose_errors(views)
+        E = pose_errors(scanned(replace(SMALL, views=3, arm_mm=0.0, arm_deg=0.0), seed))
         np.testing.assert_allclose(E, np.broadcast_to(E[0], E.shape), atol=1e-12)
         assert np.linalg.norm(E[0, :3, 3]) == pytest.approx(0.5e-3, rel=1e-9)
         assert np.degrees(se3.angle(E[0, :3, :3])) == pytest.approx(0.1, rel=1e-6)
@@ -52,8 +50,7 @@ def test_the_arm_error_is_white_at_the_flange_with_the_sigmas_asked_for():
     views = scanned(replace(SMALL, views=600, hand_eye_mm=0.0, hand_eye_deg=0.0), seed=3)
     # reported = true @ inv(X) @ exp(xi) @ X with the camera X on the hand.
     xi = se3.log(T_EE_CAM @ pose_errors(views) @ se3.invert(T_EE_CAM))
-    n = xi[:, :3].size
-    spread = 4 / np.sqrt(2 * n)  # of a standard deviation, four sigma
+    spread = 4 / np.sqrt(2 * xi[:, :3].size)  # of a standard deviation, four sigma
     assert np.degrees(xi[:, :3].std()) == pytest.approx(0.03, rel=spread)
     assert 1e3 * xi[:, 3:].std() == pytest.approx(0.2, rel=spread)
     unit = xi / xi.std(0)
@@ -82,8 +79,7 @@ def slab_depth(views: ScanViews, T_world_cam: Array) -> tuple[Array, Array]:
 
 
 def test_without_noise_depth_is_that_of_the_true_geometry_at_the_true_poses():
-    config = replace(SMALL, width=320, height=180, focal_px=162.0, views=6)
-    views = scanned(config, seed=5)
+    views = scanned(replace(SMALL, width=320, height=180, focal_px=162.0, views=6), seed=5)
     for frame, T in zip(views.frames, views.Ts_world_cam, strict=True):
         expected, block_seen = slab_depth(views, T)
         off = np.abs(frame.depth_m - expected)

@@ -50,6 +50,5 @@ def add_drawn(
     """Add exact depth from these poses, and what `photograph` makes of whose pixel is whose."""
     for index, T in enumerate(Ts_world_cam):
         labels = renderer.render(store.session.intrinsics, T)
-        view = View(index=index, T_world_cam=T)
-        store.add_view(view, photograph(labels.ids), labels.depth_m)
+        store.add_view(View(index=index, T_world_cam=T), photograph(labels.ids), labels.depth_m)
     return store

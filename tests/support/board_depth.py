@@ -84,8 +84,7 @@ def detected(
 ) -> TargetDetection:
     uv = project(CAMERA, se3.transform(T, BOARD.points_board if points is None else points))
     uv = uv + rng.normal(scale=corner_px, size=uv.shape) if corner_px else uv
-    inside = np.all((uv > 0) & (uv < [CAMERA.width - 1, CAMERA.height - 1]), axis=-1)
-    ids = np.flatnonzero(inside)
+    ids = np.flatnonzero(np.all((uv > 0) & (uv < [CAMERA.width - 1, CAMERA.height - 1]), axis=-1))
     return TargetDetection(point_ids=ids, uv=uv[ids], image_size=(CAMERA.width, CAMERA.height))
 
 

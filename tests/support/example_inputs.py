@@ -53,16 +53,14 @@ def make_inputs(root: Path, *, grasps: bool) -> None:
 def add_grasps(session: Path) -> None:
     """Try a few grasps and annotate the frames."""
     console = Console(quiet=True)
-    store = SessionStore.open(session)
-    run_in_session(store, SchoolRequest(grasps=GRASPS, where=1), console)
+    run_in_session(SessionStore.open(session), SchoolRequest(grasps=GRASPS, where=1), console)
     run_annotate(session, console, maps="instance,depth", workers=1, check_depth=True)
 
 
 def plan_file(path: Path) -> None:
     """Write a plan of a few views round the middle of the lab's table."""
     config, center = PlanConfig(), np.array([0.45, 0.0, 0.01])
-    plan = hemisphere_plan(4, center, d405_mount(), config, np.random.default_rng(0))
-    save_plan(plan, path)
+    save_plan(hemisphere_plan(4, center, d405_mount(), config, np.random.default_rng(0)), path)
 
 
 def camera_file(path: Path, camera: CameraIntrinsics) -> None:

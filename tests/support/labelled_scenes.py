@@ -38,8 +38,7 @@ def poses_in_world(places=PLACES):
     found = []
     for obj_id, x, y, turn in places:
         height = float(MODELS[obj_id].mesh.extent[2]) / 2
-        T = se3.from_rt(se3.exp_so3([0.0, 0.0, turn]), [x, y, height])
-        found.append((obj_id, TABLE @ T))
+        found.append((obj_id, TABLE @ se3.from_rt(se3.exp_so3([0.0, 0.0, turn]), [x, y, height])))
     return found
 
 

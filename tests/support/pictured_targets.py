@@ -65,8 +65,7 @@ def pose(target, tilt_deg, azimuth_deg=30.0, roll_deg=20.0, distance=0.4, aim=(0
     middle = (points.min(0) + points.max(0)) / 2 + np.array([*aim, 0.0])
     tilt, azimuth = np.radians([tilt_deg, azimuth_deg])
     away = [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)]
-    T = se3.look_at(middle + distance * np.array(away), middle, np.radians(roll_deg))
-    return se3.invert(T)
+    return se3.invert(se3.look_at(middle + distance * np.array(away), middle, np.radians(roll_deg)))
 
 
 def truth(target, T, intrinsics=CAMERA):

@@ -27,8 +27,7 @@ def square(half: float = 0.5) -> Mesh:
 def ball(radius: float, rings: int = 16) -> Mesh:
     """A ball round the origin, open at its poles."""
     polar = np.linspace(0.02, np.pi - 0.02, rings)
-    around = np.arange(2 * rings) * np.pi / rings
-    p, a = np.meshgrid(polar, around, indexing="ij")
+    p, a = np.meshgrid(polar, np.arange(2 * rings) * np.pi / rings, indexing="ij")
     xyz = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], -1).reshape(-1, 3)
     m = 2 * rings
     i, j = np.divmod(np.arange((rings - 1) * m), m)

@@ -69,8 +69,7 @@ def text_by_number(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
 
 def text_by_name(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
     """Every line begins with the image's name."""
-    names = save_images(d, shots)
-    return d, _lines(d / "poses.txt", rows_of(ROTVEC, Ts), names=names), "rotvec,m"
+    return d, _lines(d / "poses.txt", rows_of(ROTVEC, Ts), names=save_images(d, shots)), "rotvec,m"
 
 
 def csv_with_names(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
@@ -105,10 +104,9 @@ def json_by_image(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
 
 def json_frames(d: Path, Ts: Array, shots: list[UInt8]) -> Written:
     """NeRF's transforms.json: frames with a file_path and a transform_matrix."""
-    names = save_images(d / "images", shots)
     frames = [
         {"file_path": f"images/{n}", "transform_matrix": T.tolist()}
-        for n, T in zip(names, Ts, strict=True)
+        for n, T in zip(save_images(d / "images", shots), Ts, strict=True)
     ]
     (d / "transforms.json").write_text(json.dumps({"frames": frames}))
     return d, d, ""

@@ -56,8 +56,7 @@ def _serve():
     other = cluster.add_node(**ONE_NODE)
     print(cluster.address, flush=True)
     for line in sys.stdin:
-        lost = other if line == "node\n" else cluster.head_node
-        cluster.remove_node(lost, allow_graceful=False)
+        cluster.remove_node(other if line == "node\n" else cluster.head_node, allow_graceful=False)
         print("lost", flush=True)
 
 

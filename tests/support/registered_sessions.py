@@ -80,8 +80,7 @@ def table_session(
     store = begun(folder, CAMERA, {"gravity_up_world": [0, 0, 1]})
     for k, T in enumerate(true_cameras(views, posed=posed)):
         labels = renderer.render(CAMERA, T)
-        twist = rng.normal(size=6) * np.repeat(sigma, 3)
-        claimed = T @ se3.exp(twist) if posed else None
+        claimed = T @ se3.exp(rng.normal(size=6) * np.repeat(sigma, 3)) if posed else None
         store.add_view(View(index=k, T_world_cam=claimed), light_things(labels.ids), labels.depth_m)
     save_models(store.folder / "models", models_of())
     return store

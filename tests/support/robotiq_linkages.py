@@ -47,8 +47,7 @@ def four_bar(name, angles):
 def arc_error_mm(name):
     """Return how far the arc is from the four-bar linkage, over the whole stroke [mm]."""
     hand = find_hand(name)
-    angles = np.linspace(-0.1, 0.85, 300)
-    faces = four_bar(name, angles)
+    faces = four_bar(name, np.linspace(-0.1, 0.85, 300))
     width = faces[:, 0, 1] - faces[:, 1, 1]
     stroke = (width >= -1e-4) & (width <= hand.max_opening_m + 1e-3)
     assert width[stroke].max() >= hand.max_opening_m and width[stroke].min() < 1e-3

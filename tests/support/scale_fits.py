@@ -55,11 +55,9 @@ def known_scan(name: str = "mug", seed: int = 0, config: ScanLabConfig = SMALL) 
 def fit_of(known: KnownScan, factor: float = 1.0, **changes: Any) -> ScaleFit:
     """Return the fit that has the scale `factor` times the true one, honestly judged."""
     scale = known.scale * factor
-    centre = known.scan.bounds.mean(0)
-    T = known.T_world_scan @ se3.from_translation((known.scale - scale) * centre)
+    T = known.T_world_scan @ se3.from_translation((known.scale - scale) * known.scan.bounds.mean(0))
     vertices = se3.transform(T, scale * known.scan.vertices)
-    normals = vertex_normals(known.scan) @ T[:3, :3].T
-    residual = residuals_mm(known.views, vertices, normals)
+    residual = residuals_mm(known.views, vertices, vertex_normals(known.scan) @ T[:3, :3].T)
     views = agreements(known, scale, T)
     good = float(np.mean([v.agree for v in views])) > 0.8
     covariance = np.diag([1e-3, 1e-3, 1e-3, 2e-4, 2e-4, 2e-4, 2e-3]) ** 2

@@ -105,10 +105,9 @@ class Software:
         self._send(self.stereo, self.depth_profile, self.depth(number), number, FRAME_MS * number)
 
     def send_color(self, number: int) -> None:
-        moment = FRAME_MS * number + self.color_delay_ms
         self._send(
             self.color_sensor, self.color_profile, color_of(number), number + self.color_count,
-            moment,
+            FRAME_MS * number + self.color_delay_ms,
         )  # fmt: skip
 
     def send(self, number: int) -> None:

@@ -35,8 +35,7 @@ def add(store: SessionStore, index: int, take: int = 0) -> None:
 
 
 def make_whole(folder: Path) -> None:
-    extra = {"plan_hash": "p" * 64, "camera": "D405 17"}
-    store = begun(folder, CAMERA, extra, name="whole")
+    store = begun(folder, CAMERA, {"plan_hash": "p" * 64, "camera": "D405 17"}, name="whole")
     store.write_json("plan.json", {"sha256": "p" * 64, "content": {"joints": [[0] * 6] * 8}})
     for index in range(VIEWS):
         add(store, index)

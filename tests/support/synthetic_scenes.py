@@ -66,8 +66,7 @@ def synthetic_scene(**changed):
 
 
 def cameras(count=3, seed=0):
-    rng = np.random.default_rng(seed)
-    return hemisphere_cameras([0.5, 0.0, 0.13], (0.35, 0.5), count, rng)
+    return hemisphere_cameras([0.5, 0.0, 0.13], (0.35, 0.5), count, np.random.default_rng(seed))
 
 
 def captured_session(folder, count=3, scene=None):

@@ -69,8 +69,7 @@ def named_scene(seed: int, names: tuple[str, ...], views: int = 12) -> TableScen
 def scene_of(ids: Sequence[int], config: TableLabConfig, rng: np.random.Generator) -> TableScene:
     """Return the parts of these ids put down at random."""
     models = {i: part_models()[i] for i in ids}
-    meshes = {i: m.mesh for i, m in models.items()}
-    placed = scatter_objects(meshes, ids, config, rng)
+    placed = scatter_objects({i: m.mesh for i, m in models.items()}, ids, config, rng)
     assert not placed.left_out, f"objects {[o.obj_id for o in placed.left_out]} found no room"
     return table_scene(models, placed.objects, config, rng)
 

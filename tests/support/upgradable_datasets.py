@@ -117,8 +117,7 @@ def graspnet_dataset(root: Path, number: int = 100) -> Path:
                 f"<ori_in_world>{words[1]}</ori_in_world></obj>"
             )
         cv2.imwrite(str(folder / f"label/{k:04d}.png"), label)
-        text = f"<scene>{''.join(nodes)}</scene>"
-        (folder / f"annotations/{k:04d}.xml").write_text(text)
+        (folder / f"annotations/{k:04d}.xml").write_text(f"<scene>{''.join(nodes)}</scene>")
     np.save(folder / "camK.npy", CAMERA.K)
     np.save(folder / "cam0_wrt_table.npy", Ts[0])
     np.save(folder / "camera_poses.npy", np.stack([se3.invert(Ts[0]) @ T for T in Ts]))

@@ -172,7 +172,6 @@ def refused(
     path: Path, choice: BagChoice | None = None, kind: type[RealsimError] = InputError
 ) -> str:
     with pytest.raises(kind) as caught:
-        source = open_bag(path, choice)
-        list(source.frames())
+        list(open_bag(path, choice).frames())
     assert "\n" not in str(caught.value).strip()
     return str(caught.value)

@@ -8,8 +8,7 @@ from realsim.records import Mesh
 
 def colorful_texture(n=32, seed=0):
     """Blocks of 4 x 4 texels, so that a texel's neighbour is rarely of another colour."""
-    rng = np.random.default_rng(seed)
-    blocks = rng.integers(0, 256, (n // 4, n // 4, 3), dtype=np.uint8)
+    blocks = np.random.default_rng(seed).integers(0, 256, (n // 4, n // 4, 3), dtype=np.uint8)
     return blocks.repeat(4, axis=0).repeat(4, axis=1)
 
 

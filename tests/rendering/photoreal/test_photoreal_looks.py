@@ -48,10 +48,8 @@ def test_a_texture_s_first_row_is_at_the_top_of_v() -> None:
     image = np.repeat(np.repeat(COLORS, 16, 0), 16, 1)
     own = PlacedMesh(0, replace(square(), texture=image), np.eye(4))
     material = Material(base_color=(1, 1, 1), base_color_image=image, projection="uv")
-    given = PlacedMesh(0, square(), np.eye(4), material)
-    for placed in (own, given):
-        seen = quadrants(picture(placed))
-        assert np.abs(hues(seen) - hues(COLORS)).max() < HUE
+    for placed in (own, PlacedMesh(0, square(), np.eye(4), material)):
+        assert np.abs(hues(quadrants(picture(placed))) - hues(COLORS)).max() < HUE
 
 
 def test_box_projection_repeats_the_image_every_period_along_the_face() -> None:
@@ -72,8 +70,7 @@ def test_vertex_colours_and_paints_are_seen_as_they_are() -> None:
     seen = picture(PlacedMesh(0, mesh, np.eye(4)))[8:24, 8:24].mean((0, 1))
     assert np.abs(hues(seen) - hues(color)).max() < HUE
     seen = picture(PlacedMesh(13, square(), np.eye(4)))[8:24, 8:24].mean((0, 1))
-    paint = np.array(PLAIN_COLORS[13 % len(PLAIN_COLORS)])
-    assert np.abs(hues(seen) - hues(paint)).max() < HUE
+    assert np.abs(hues(seen) - hues(np.array(PLAIN_COLORS[13 % len(PLAIN_COLORS)]))).max() < HUE
 
 
 def tilted(x: float, y: float) -> np.ndarray:
@@ -170,8 +167,7 @@ def test_both_variants_make_the_same_picture() -> None:
 def test_the_denoiser_keeps_even_light_even_up_to_the_corners() -> None:
     even = np.full((45, 60, 3), 0.4, np.float32)
     noisy = even * np.random.default_rng(0).uniform(0.9, 1.1, even.shape).astype(np.float32)
-    normal = np.broadcast_to(np.array([0, 0, 1], np.float32), even.shape)
-    clean = denoised(noisy, even, normal)
+    clean = denoised(noisy, even, np.broadcast_to(np.array([0, 0, 1], np.float32), even.shape))
     assert clean.shape == even.shape
     assert np.abs(clean / even - 1).max() < 0.06
 
@@ -215,8 +211,7 @@ def test_libraries_that_cannot_work_are_named_with_the_reason(
     assert "no such file" in search.rejected[0]
     assert "trial picture ended with" in search.rejected[1]
     assert "too old" in search.rejected[2]
-    kept = json.loads(verdicts.read_text())
-    assert len(kept) == 1  # only the one that had to be tried
+    assert len(json.loads(verdicts.read_text())) == 1  # only the one that had to be tried
 
 
 def test_a_verdict_is_kept_until_the_library_changes(

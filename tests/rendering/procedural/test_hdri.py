@@ -21,8 +21,7 @@ def write_hdr(path: Path, rgb: np.ndarray) -> Path:
 def sky_with_sun(height: int = 256, radius_deg: float = 0.8, peak: float = 4e4) -> np.ndarray:
     e = sunny_sky(np.random.default_rng(3), 40.0, 3.0, 0.0)
     panorama = cv2.resize(e.panorama, (2 * height, height), interpolation=cv2.INTER_AREA)
-    toward = np.array(e.sun_direction)
-    near = directions(height) @ toward > np.cos(np.radians(radius_deg))
+    near = directions(height) @ np.array(e.sun_direction) > np.cos(np.radians(radius_deg))
     panorama[near] = peak * np.array([1.0, 0.9, 0.7])
     return panorama
 

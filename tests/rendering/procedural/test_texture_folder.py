@@ -121,6 +121,5 @@ def test_an_exr_normal_map_without_a_reader_is_left_out_with_a_note(
     write(tmp_path / "a_diff.png", (1, 1, 1))
     (tmp_path / "a_nor_gl.exr").write_bytes(b"\x76\x2f\x31\x01" + bytes(100))
     notes: list[str] = []
-    m = material_from_images(tmp_path, 0.1, notes=notes)
-    assert m.normal_image is None
+    assert material_from_images(tmp_path, 0.1, notes=notes).normal_image is None
     assert any("realsim[photo]" in n and "flat" in n for n in notes)

@@ -40,8 +40,7 @@ def stripes_fit() -> FittedStereo:
 
 @pytest.mark.slow
 def test_a_known_sensors_statistics_are_recovered() -> None:
-    frames = [frame(DIM, "d405", z, k) for k, z in enumerate((0.2, 0.3))]
-    fit = fit_stereo(frames, CAMERA, "d405")
+    fit = fit_stereo([frame(DIM, "d405", z, k) for k, z in enumerate((0.2, 0.3))], CAMERA, "d405")
     assert fit.config.full_well == pytest.approx(DIM.full_well, rel=0.2)
     assert fit.config.least_texture_snr == pytest.approx(DIM.least_texture_snr, rel=0.1)
     for f in fit.frames:
@@ -158,8 +157,7 @@ def test_noise_falls_with_light_and_window_and_texture() -> None:
     assert sigma(full_well=40000.0) / usual == pytest.approx(0.5, abs=0.1)
     assert sigma(window_px=11) < 0.8 * usual
     assert sigma(texture_contrast=0.3) / usual == pytest.approx(0.5, abs=0.12)
-    floor = sigma(noise_floor_px=0.2)
-    assert floor == pytest.approx(np.hypot(0.2, usual), rel=0.1)
+    assert sigma(noise_floor_px=0.2) == pytest.approx(np.hypot(0.2, usual), rel=0.1)
 
 
 def test_the_range_ends_and_is_nearer_for_fewer_pixels() -> None:
