@@ -82,9 +82,8 @@ PLAIN = replace(
 def test_the_reflectance_of_each_kind_and_what_edges_lose_are_found_again() -> None:
     true = {0: 0.12, 1: 0.8}
     views = [view(PLAIN, true, seed) for seed in (0, 1)]
-    start = replace(PLAIN, edge_width_px=1, edge_dropout=0.2)
     tried = LossFitConfig(edge_width_px=(1, 2, 3), edge_dropout=(0.2, 0.5, 0.8))
-    fit = fit_losses(start, views, tried)
+    fit = fit_losses(replace(PLAIN, edge_width_px=1, edge_dropout=0.2), views, tried)
     assert fit.reflectance["rubber"] == pytest.approx(0.12, rel=0.15)
     assert fit.share_by_kind["rubber"] > 0.5 and fit.share_by_kind["paper"] < 0.05
     # Narrow edges that lose nearly all and wider ones that lose half leave as many holes.

@@ -23,12 +23,11 @@ def clutter(seed: int = 0, n: int = 6) -> list[PlacedMesh]:
     rng = np.random.default_rng(seed)
     placed = [table()]
     for i in range(n):
-        mesh = ball(0.04) if i % 2 else box((0.06, 0.04, 0.08))
         T = se3.from_rt(
             se3.exp_so3([0, 0, rng.uniform(0, 6)]),
             [0.4 + rng.uniform(-0.12, 0.12), rng.uniform(-0.12, 0.12), 0.04],
         )
-        placed.append(PlacedMesh(3 * i, mesh, T))
+        placed.append(PlacedMesh(3 * i, ball(0.04) if i % 2 else box((0.06, 0.04, 0.08)), T))
     return placed
 
 
@@ -63,12 +62,11 @@ def test_box_over_a_plane_covers_the_pixels_of_its_projection() -> None:
     # A camera straight down at 1 m over a face of 0.2 x 0.1 m at depth 0.9: at f = 90 px the face
     # spans [-10, 10] x [-5, 5] px about the principal point, which lies between pixel centres.
     i = CameraIntrinsics(width=64, height=48, fx=90, fy=90, cx=30.5, cy=20.5)
-    T = se3.look_at([0, 0, 1.0], [0, 0, 0])
     placed = [
         PlacedMesh(-1, box((3, 3, 0.2)), se3.from_translation([0, 0, -0.1])),
         PlacedMesh(5, box((0.2, 0.1, 0.1)), se3.from_translation([0, 0, 0.05])),
     ]
-    labels = LabelRenderer(placed).render(i, T)
+    labels = LabelRenderer(placed).render(i, se3.look_at([0, 0, 1.0], [0, 0, 0]))
     assert labels.px_count_visib == {5: 200}
     assert labels.px_count_all == {5: 200}
     assert labels.visible_fraction == {5: 1.0}
@@ -117,13 +115,12 @@ def test_moving_world_and_camera_together_changes_nothing() -> None:
 
 
 def test_what_is_behind_the_camera_or_aside_is_counted_as_nothing() -> None:
-    T = se3.look_at([0, 0, 0], [1, 0, 0])
     placed = [
         PlacedMesh(0, ball(0.05), se3.from_translation([-0.5, 0, 0])),
         PlacedMesh(1, ball(0.05), se3.from_translation([0.1, 0.0, 3.0])),
         PlacedMesh(2, ball(0.05), se3.from_translation([0.5, 0, 0])),
     ]
-    labels = LabelRenderer(placed).render(CAMERA, T)
+    labels = LabelRenderer(placed).render(CAMERA, se3.look_at([0, 0, 0], [1, 0, 0]))
     assert labels.px_count_all[0] == 0 and labels.px_count_all[1] == 0
     assert labels.visible_fraction[0] == 0.0
     assert set(np.unique(labels.ids)) == {-1, 2}

@@ -179,9 +179,8 @@ def test_colour_bleeds_off_a_sunlit_neighbour() -> None:
     wall = se3.from_rt(se3.exp_so3([np.pi / 2, 0, 0]), [0, 0.1, 0.3])
     red = Material(base_color=(0.9, 0.05, 0.05), roughness=1.0)
     placed = [PlacedMesh(-1, square(0.8), np.eye(4), WHITE), PlacedMesh(0, square(0.3), wall, red)]
-    sky = even_sky(0.3, sun=(1, 1, 1), sun_direction=(0, -1, 0.4))
     T = se3.look_at([0, -0.5, 0.8], [0, 0, 0])
-    light = light_of(placed, sky, T)
+    light = light_of(placed, even_sky(0.3, sun=(1, 1, 1), sun_direction=(0, -1, 0.4)), T)
     ratio = []
     for y in (0.07, -0.3):
         v, u = pixel_of(0, y, T)

@@ -14,13 +14,9 @@ from realsim.store import SessionStore
 
 
 def begun(
-    folder: Path,
-    camera: CameraIntrinsics,
-    extra: dict[str, Any] | None = None,
-    *,
-    name: str = "test",
-    unit_m: float = 1e-4,
-) -> SessionStore:
+    folder: Path, camera: CameraIntrinsics, extra: dict[str, Any] | None = None, *,
+    name: str = "test", unit_m: float = 1e-4,
+) -> SessionStore:  # fmt: skip
     """Return a new session that has no views yet."""
     session = CaptureSession(name=name, intrinsics=camera, depth_unit_m=unit_m)
     return SessionStore.create(folder, session, extra)
@@ -42,11 +38,9 @@ def light_things(ids: Array) -> UInt8:
 
 
 def add_drawn(
-    store: SessionStore,
-    renderer: LabelRenderer,
-    Ts_world_cam: Iterable[Array],
+    store: SessionStore, renderer: LabelRenderer, Ts_world_cam: Iterable[Array],
     photograph: Callable[[Array], UInt8] = light_things,
-) -> SessionStore:
+) -> SessionStore:  # fmt: skip
     """Add exact depth from these poses, and what `photograph` makes of whose pixel is whose."""
     for index, T in enumerate(Ts_world_cam):
         labels = renderer.render(store.session.intrinsics, T)

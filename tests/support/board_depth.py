@@ -65,9 +65,8 @@ def sensed(
     """Return what a stereo camera with this bias reports: correlated noise, holes, fliers."""
     from scipy.ndimage import gaussian_filter
 
-    fB = CAMERA.fx * BASELINE
     jitter = gaussian_filter(rng.normal(size=depth.shape), 2.0)
-    jitter *= noise_px / jitter.std() / fB
+    jitter *= noise_px / jitter.std() / (CAMERA.fx * BASELINE)
     inverse = np.where(depth > 0, 1 / truth.measured(np.where(depth > 0, depth, 1.0)), 0.0) + jitter
     if noise_px > 0:
         flying = rng.random(depth.shape) < 0.05
@@ -89,14 +88,9 @@ def detected(
 
 
 def views_of(
-    truth: DepthBias,
-    seed: int = 0,
-    *,
-    distances: Array = FAR,
-    noise_px: float = 0.08,
-    corner_px: float = 0.1,
-    pose_sd: tuple[float, float] = (0.0, 0.0),
-) -> list[DepthBoardView]:
+    truth: DepthBias, seed: int = 0, *, distances: Array = FAR, noise_px: float = 0.08,
+    corner_px: float = 0.1, pose_sd: tuple[float, float] = (0.0, 0.0),
+) -> list[DepthBoardView]:  # fmt: skip
     """Return views; `pose_sd` shakes the depth camera per view: an error common to a view."""
     bias = (truth.scale, truth.offset_per_m)
     return list(drawn_views(bias, seed, tuple(distances), noise_px, corner_px, pose_sd))

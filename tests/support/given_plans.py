@@ -27,14 +27,9 @@ QUICK = CaptureConfig(still=SettleConfig(window_s=0.0))
 
 
 def plan_through(
-    joints: Array,
-    home: Array,
-    center: ArrayLike,
-    kind: Any = "hemisphere",
-    obstacles: tuple[tuple[str, Box], ...] = (),
-    config: PlanConfig | None = None,
-    **more: Any,
-) -> CapturePlan:
+    joints: Array, home: Array, center: ArrayLike, kind: Any = "hemisphere",
+    obstacles: tuple[tuple[str, Box], ...] = (), config: PlanConfig | None = None, **more: Any,
+) -> CapturePlan:  # fmt: skip
     """A UR5's plan with a D405, in the config's cell; `more` are other fields of it."""
     config = config or PlanConfig()
     given = {
@@ -62,12 +57,9 @@ def calibrated(chain: DhChain, seed: int) -> DhChain:
     """A chain as a factory calibration leaves it: about 0.5 mm and 1 mrad off in every number."""
     rng = np.random.default_rng(seed)
     return replace(
-        chain,
-        delta_a=rng.normal(0, 5e-4, 6),
-        delta_d=rng.normal(0, 5e-4, 6),
-        delta_alpha=rng.normal(0, 1e-3, 6),
-        delta_theta=rng.normal(0, 1e-3, 6),
-    )
+        chain, delta_a=rng.normal(0, 5e-4, 6), delta_d=rng.normal(0, 5e-4, 6),
+        delta_alpha=rng.normal(0, 1e-3, 6), delta_theta=rng.normal(0, 1e-3, 6),
+    )  # fmt: skip
 
 
 def driven_clear(plan: CapturePlan, path: Iterable[Array]) -> bool:

@@ -14,12 +14,9 @@ MARGIN = 0.05
 
 
 def plane_noise(
-    config: StereoConfig,
-    profile: DepthProfile,
-    intrinsics: CameraIntrinsics,
-    distance_m: float,
+    config: StereoConfig, profile: DepthProfile, intrinsics: CameraIntrinsics, distance_m: float,
     rng: np.random.Generator,
-) -> float:
+) -> float:  # fmt: skip
     """Return the standard deviation of a plane's disparity about its own fitted plane [px]."""
     camera = StereoCamera([grey_plane(intrinsics, distance_m)], profile, config)
     measured = camera.measure(intrinsics, np.eye(4), rng).disparity_px

@@ -119,11 +119,9 @@ def held_out(hands: Array, residuals: Array, H: Array, mode: str) -> float:
 
 
 def report_of(
-    hands: Array,
-    seen: Sequence[Array] | None = None,
-    mode: Any = "eye_in_hand",
+    hands: Array, seen: Sequence[Array] | None = None, mode: Any = "eye_in_hand",
     checks: tuple[Check, ...] = (),
-) -> HandEyeReport:
+) -> HandEyeReport:  # fmt: skip
     """Return the calibration of views; without pixels, at the truth."""
     if seen is None:
         seen = [predict(np.zeros(18), A, np.zeros(6), mode) for A in hands]

@@ -37,11 +37,9 @@ def bracket():
         d = b.center_mass - com
         inertia += b.moment_inertia + b.volume * (d @ d * np.eye(3) - np.outer(d, d))
     matter = Matter(
-        mass_kg=1000 * volume,
-        center_of_mass=com,
-        inertia=1000 * inertia,
+        mass_kg=1000 * volume, center_of_mass=com, inertia=1000 * inertia,
         parts=[np.array(b.vertices) for b in bars],
-    )
+    )  # fmt: skip
     return ObjectModel(obj_id=1, name="bracket", mesh=solid(both, colors=colors)), matter
 
 

@@ -60,13 +60,9 @@ def table_renderer() -> LabelRenderer:
 
 
 def table_session(
-    folder: Path,
-    views: int = 8,
-    sigma: tuple[float, float] = (2e-3, 6e-4),
-    seed: int = 1,
-    *,
+    folder: Path, views: int = 8, sigma: tuple[float, float] = (2e-3, 6e-4), seed: int = 1, *,
     posed: bool = True,
-) -> SessionStore:
+) -> SessionStore:  # fmt: skip
     """Return a session with rendered depth whose claimed cameras are a little off.
 
     Args:

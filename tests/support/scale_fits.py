@@ -63,10 +63,7 @@ def fit_of(known: KnownScan, factor: float = 1.0, **changes: Any) -> ScaleFit:
     covariance = np.diag([1e-3, 1e-3, 1e-3, 2e-4, 2e-4, 2e-4, 2e-3]) ** 2
     covariance[3:6, 6] = covariance[6, 3:6] = [1e-7, -1e-7, 1.5e-7]
     fit = ScaleFit(
-        scale=scale,
-        sigma=2e-3 * scale,
-        T_world_obj=T,
-        covariance=covariance,
+        scale=scale, sigma=2e-3 * scale, T_world_obj=T, covariance=covariance,
         verdict="accepted" if good else "doubtful",
         reasons=() if good else ("less than 80 % of the depth agrees with the model.",),
         checks={"agree": float(np.mean([v.agree for v in views])), "noise": float("nan")},
@@ -74,8 +71,7 @@ def fit_of(known: KnownScan, factor: float = 1.0, **changes: Any) -> ScaleFit:
             Limit(name="hand-eye", percent=0.16, text="a hand-eye off by 0.5 mm moves it so far."),
             Limit(name="shape", percent=0.08, text="the mesh differs from the surface by 0.2 mm."),
         ),
-        views=views,
-        residual_mm=residual,
+        views=views, residual_mm=residual,
         plane=SupportPlane(T_world_table=np.eye(4), rms_m=4e-4, inliers=5000),
         extent_mm=1e3 * scale * known.scan.extent,
         candidates=tuple(
@@ -84,9 +80,8 @@ def fit_of(known: KnownScan, factor: float = 1.0, **changes: Any) -> ScaleFit:
             )
             for k, f in enumerate((1.0, 1.01, 0.82, 1.3, 0.55))
         ),
-        history=({"step": "fine", "rms_mm": 0.4},),
-        cpu_s=1.25,
-    )
+        history=({"step": "fine", "rms_mm": 0.4},), cpu_s=1.25,
+    )  # fmt: skip
     return replace(fit, **changes)
 
 

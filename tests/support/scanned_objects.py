@@ -131,9 +131,8 @@ def shape_of(name: str) -> ScanShape:
 
 def true_state(known: Scanned, shape: ScanShape, evidence: ScanEvidence) -> ScaleState:
     """Return the state at which scale and pose are true."""
-    T = known.T_world_obj
     s = UNIT_M / shape.unit
-    return first_state(evidence, s, T @ se3.from_translation(UNIT_M * shape.center))
+    return first_state(evidence, s, known.T_world_obj @ se3.from_translation(UNIT_M * shape.center))
 
 
 def scaled(mesh: Mesh, factor: float) -> Mesh:

@@ -15,14 +15,11 @@ CAMERA = CameraIntrinsics(
 def frame_of(k: int) -> SourceFrame:
     rng = np.random.default_rng(k)
     return SourceFrame(
-        name=f"f{k}",
-        time_s=1.7e9 + k / 30,
-        rgb=rng.integers(0, 256, (30, 40, 3), dtype=np.uint8),
+        name=f"f{k}", time_s=1.7e9 + k / 30, rgb=rng.integers(0, 256, (30, 40, 3), dtype=np.uint8),
         depth_counts=rng.integers(0, 2**16, (30, 40)).astype(np.uint16),
-        joints=rng.uniform(-3, 3, 6),
-        T_base_ee=se3.random_transform(rng, spread=0.3),
+        joints=rng.uniform(-3, 3, 6), T_base_ee=se3.random_transform(rng, spread=0.3),
         T_world_cam=se3.look_at(rng.uniform(0.2, 0.5, 3), [0, 0, 0]),
-    )
+    )  # fmt: skip
 
 
 class Recording:

@@ -22,9 +22,8 @@ def tried_set(rng, n=20, *, obj_id=7, instance=2, measures=tuple(MEASURES)):
     base = np.where(kind == 0, np.nan, np.clip(last, 0, 4) / 4)
     values = {}
     for name in measures:
-        shape = (n, 4) if MEASURES[name].by_stage else (n,)
         known = [np.nan, 0.25, -0.0, 1 / 3] + [np.inf] * (not MEASURES[name].is_share)
-        values[name] = rng.choice(known, shape)
+        values[name] = rng.choice(known, (n, 4) if MEASURES[name].by_stage else (n,))
     return GraspSet(
         obj_id=obj_id, instance=instance,
         Ts_obj_grasp=se3.random_transform(rng, n, 0.1) if n else np.zeros((0, 4, 4)),
@@ -64,13 +63,10 @@ def attempts_of(rng, grasps, joints=7):
     times = [np.sort(rng.random(c)) for c in counts]
     total = int(starts[-1])
     return GraspTrajectories(
-        rows=rows,
-        starts=starts,
-        time_s=np.concatenate(times),
-        joints_rad=rng.normal(size=(total, joints)),
-        opening_m=rng.uniform(0, 0.08, total),
+        rows=rows, starts=starts, time_s=np.concatenate(times),
+        joints_rad=rng.normal(size=(total, joints)), opening_m=rng.uniform(0, 0.08, total),
         phase=rng.integers(0, len(PHASES), total),
-    )
+    )  # fmt: skip
 
 
 def tried_scene(seed, *, with_poses=True, with_attempts=True):
@@ -85,13 +81,9 @@ def tried_scene(seed, *, with_poses=True, with_attempts=True):
     poses = {s.instance: se3.random_transform(rng) for s in sets[:3]} if with_poses else {}
     tried = {s.instance: attempts_of(rng, s) for s in (sets[0], sets[3])} if with_attempts else {}
     return SceneGrasps(
-        sets=sets,
-        name="Tisch 1",
-        names={9: "mug", 12: "box"},
-        trajectories=tried,
-        Ts_world_obj=poses,
-        T_world_table=se3.random_transform(rng) if with_poses else None,
-    )
+        sets=sets, name="Tisch 1", names={9: "mug", 12: "box"}, trajectories=tried,
+        Ts_world_obj=poses, T_world_table=se3.random_transform(rng) if with_poses else None,
+    )  # fmt: skip
 
 
 def assert_same(a, b, atol=0.0):
