@@ -23,9 +23,8 @@ SCENE = "registration/scene.json"
 def claimed(shape: tuple[int, ...]) -> bytes:
     """Return a .npy of a few bytes whose header claims an array of doubles."""
     buffer = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        buffer, {"descr": "<f8", "fortran_order": False, "shape": shape}
-    )
+    header = {"descr": "<f8", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(buffer, header)
     return buffer.getvalue() + bytes(128)
 
 
@@ -57,15 +56,12 @@ SCENES = {
     "a negative instance": (first_object(instance=-2), "the instance of object .* is -2"),
     "an object far away": (moved(1e9), r"1e\+09 m from the origin"),
 }
+FAR = [[1, 0, 0, 1e9], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 HEADERS = {
     "a wide camera": (lambda h: h["camera"].update(width=10**9), "1000000000x"),
     "no depth unit": (lambda h: h.update(depth_unit_m=0), "the depth unit is 0"),
-    "a far camera": (
-        lambda h: h["T_world_cam"].update({"0": [[1, 0, 0, 1e9], [0, 1, 0, 0], [0, 0, 1, 0],
-                                                 [0, 0, 0, 1]]}),
-        r"1e\+09 m from the origin",
-    ),
-}  # fmt: skip
+    "a far camera": (lambda h: h["T_world_cam"].update({"0": FAR}), r"1e\+09 m from the origin"),
+}
 
 
 @pytest.fixture()

@@ -171,8 +171,6 @@ def test_quiet_output_silences_c_code_and_gives_the_streams_back() -> None:
         "    ctypes.CDLL(None).puts(b'BUFFERED')\n"
         "print('after')"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
-    )
+    done = run(code)
+    assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.split() == ["before", "after"]
-    assert done.stderr == ""

@@ -71,9 +71,8 @@ def test_what_things_before_a_wall_show_is_recovered() -> None:
     for scene in scenes:
         for u in range(50, 400, 60):
             scene[40:260, u : u + 14] *= 0.8
-    found = edges_of(
-        frames_of(model, scenes), CAMERA, replace(model, edge_dropout=0.3, border_margin_px=0.0)
-    )
+    start = replace(model, edge_dropout=0.3, border_margin_px=0.0)
+    found = edges_of(frames_of(model, scenes), CAMERA, start)
     for name in ("edge_dropout", "border_margin_px"):
         off = abs(found[name].value - getattr(model, name))
         # Notches that edges tear make more edges: a sixth of the loss is not seen as such.

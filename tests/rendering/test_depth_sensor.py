@@ -14,7 +14,7 @@ from realsim.rendering.depth_sensors.model import DepthSensorModel
 from refusals import refused
 
 CAMERA = CameraIntrinsics(width=320, height=240, fx=320, fy=320, cx=159.5, cy=119.5)
-EXACT = DepthSensorModel.noiseless()
+EXACT, COARSE = DepthSensorModel.noiseless(), DepthSensorModel.noiseless(1 / 32)
 
 
 def flat(z: float) -> np.ndarray:
@@ -58,7 +58,7 @@ def test_bias_law() -> None:
 def test_without_faults_depth_is_the_identity_up_to_the_quantum() -> None:
     depth = np.random.default_rng(0).uniform(0.1, 1.2, (240, 320)).astype(np.float32)
     assert np.allclose(EXACT.measure(depth, CAMERA, np.random.default_rng(0)), depth, rtol=1e-6)
-    coarse = DepthSensorModel.noiseless(1 / 32).measure(depth, CAMERA, np.random.default_rng(0))
+    coarse = COARSE.measure(depth, CAMERA, np.random.default_rng(0))
     d, q = 320 * 0.018 / depth, 320 * 0.018 / coarse
     assert np.abs(q - d).max() <= 1 / 64 + 1e-4
     assert np.abs(q * 32 - np.round(q * 32)).max() < 1e-3
@@ -138,6 +138,9 @@ WHITE = DepthSensorModel(
 )
 
 
+HEAD = '{"format": "realsim depth sensor 1"'
+
+
 def tilted_with_a_box() -> np.ndarray:
     v, u = np.mgrid[:120, :160]
     depth = (0.6 / (1 + 0.002 * (v - 60) + 0.001 * (u - 80))).astype(np.float32)
@@ -151,10 +154,7 @@ def tilted_with_a_box() -> np.ndarray:
     ("model", "digest"),
     [
         (DepthSensorModel(), "5bec6a4e236b7a7add9dbfb135c129b3dc60615450d969a4f64c8b4e723e228b"),
-        (
-            DepthSensorModel.noiseless(1 / 32),
-            "4ff30763909fd153c564044751807868ba807c5d51c9676c1e85810bccf320f5",
-        ),
+        (COARSE, "4ff30763909fd153c564044751807868ba807c5d51c9676c1e85810bccf320f5"),
         (WHITE, "c1028aeebcf69e988d088e4cd2cbf6899a0229acc2b0ad3f7d040a5cf42928fe"),
     ],
 )
@@ -176,19 +176,13 @@ def test_a_profile_written_and_loaded_is_the_same(name: str, tmp_path: Path) -> 
     [
         ("{", "is not valid JSON"),
         ("[1]", "no depth sensor model"),
-        ('{"format": "realsim depth sensor 1", "model": {"colour": 1}}', "has no 'colour'"),
-        ('{"format": "realsim depth sensor 1", "model": {"baseline_m": "0.018"}}', "finite float"),
-        ('{"format": "realsim depth sensor 1", "model": {"baseline_m": 18}}', "millimetres"),
-        ('{"format": "realsim depth sensor 1", "model": {"border": 1}}', "finite bool"),
-        (
-            '{"format": "realsim depth sensor 1", "model": {"quantum_px": NaN}}',
-            "NaN at model.quantum_px",
-        ),
-        (
-            f'{{"format": "realsim depth sensor 1", "model": {{"quantum_px": {10**309}}}}}',
-            "finite float",
-        ),
-        ('{"format": "realsim depth sensor 1"}', "no object 'model'"),
+        (HEAD + ', "model": {"colour": 1}}', "has no 'colour'"),
+        (HEAD + ', "model": {"baseline_m": "0.018"}}', "finite float"),
+        (HEAD + ', "model": {"baseline_m": 18}}', "millimetres"),
+        (HEAD + ', "model": {"border": 1}}', "finite bool"),
+        (HEAD + ', "model": {"quantum_px": NaN}}', "NaN at model.quantum_px"),
+        (HEAD + f', "model": {{"quantum_px": {10**309}}}}}', "finite float"),
+        (HEAD + "}", "no object 'model'"),
     ],
 )
 def test_a_wrong_file_is_named(text: str, said: str, tmp_path: Path) -> None:

@@ -23,10 +23,8 @@ def clutter(seed: int = 0, n: int = 6) -> list[PlacedMesh]:
     rng = np.random.default_rng(seed)
     placed = [table()]
     for i in range(n):
-        T = se3.from_rt(
-            se3.exp_so3([0, 0, rng.uniform(0, 6)]),
-            [0.4 + rng.uniform(-0.12, 0.12), rng.uniform(-0.12, 0.12), 0.04],
-        )
+        R = se3.exp_so3([0, 0, rng.uniform(0, 6)])
+        T = se3.from_rt(R, [0.4 + rng.uniform(-0.12, 0.12), rng.uniform(-0.12, 0.12), 0.04])
         placed.append(PlacedMesh(3 * i, ball(0.04) if i % 2 else box((0.06, 0.04, 0.08)), T))
     return placed
 

@@ -167,9 +167,8 @@ def test_hatching_stays_in_its_mask_and_shows_what_is_under_it() -> None:
 
 
 def boxes_of_names(names: dict[int, str], ids: np.ndarray) -> np.ndarray:
-    out = write_names(
-        np.full((*ids.shape, 3), 200, np.uint8), ids, names, dict.fromkeys(names, (0, 255, 0))
-    )
+    grey = np.full((*ids.shape, 3), 200, np.uint8)
+    out = write_names(grey, ids, names, dict.fromkeys(names, (0, 255, 0)))
     return np.all(out == overlay.INK, axis=-1)
 
 
@@ -195,9 +194,8 @@ def test_the_legend_goes_where_it_hides_least(corner: int) -> None:
     columns = slice(0, 320) if corner % 2 == 0 else slice(320, 640)
     busy[rows, columns] = False
     rgb = np.zeros((480, 640, 3), np.uint8)
-    out = write_legend(
-        rgb, [("accepted", (0, 170, 130))], busy, ramp="p_hold", lines=["not visible: mug"]
-    )
+    entries = [("accepted", (0, 170, 130))]
+    out = write_legend(rgb, entries, busy, ramp="p_hold", lines=["not visible: mug"])
     changed = np.any(out != rgb, axis=-1)
     assert changed.any() and not np.any(changed & busy)
     assert changed.mean() < 0.05  # small

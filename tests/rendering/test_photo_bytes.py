@@ -61,9 +61,8 @@ def digests() -> list[str]:
     """Digests of the noisy picture in the even room and under an environment."""
     out = []
     for sky in (None, room()):
-        photo = PhotoRenderer(still_life(), None, sky).render(
-            VIEW, T_WORLD_CAM, np.random.default_rng(3)
-        )
+        renderer, rng = PhotoRenderer(still_life(), None, sky), np.random.default_rng(3)
+        photo = renderer.render(VIEW, T_WORLD_CAM, rng)
         out.append(hashlib.sha256(photo.rgb.tobytes() + photo.depth_m.tobytes()).hexdigest())
     return out
 

@@ -149,9 +149,8 @@ def test_seeking_puts_the_hand_where_the_motion_says(server: viser.ViserServer) 
         np.testing.assert_allclose(palm.position, T[:3, 3], atol=1e-6)
         apart = np.linalg.norm(np.array(left.position) - np.array(right.position))
         assert apart == pytest.approx(motion.opening_m[k], abs=1e-6)
-        np.testing.assert_allclose(
-            (np.array(left.position) + np.array(right.position)) / 2, T[:3, 3], atol=1e-6
-        )
+        middle = (np.array(left.position) + np.array(right.position)) / 2
+        np.testing.assert_allclose(middle, T[:3, 3], atol=1e-6)
     player.clear()
 
 

@@ -26,6 +26,11 @@ from realsim.review.symmetric import marked_models, symmetry_of
 from refusals import refused
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "journal.jsonl"
+
+
 def placed(instance: int = 0, x: float = 0.0) -> ObjectPose:
     return ObjectPose(obj_id=3, instance=instance, T_world_obj=se3.from_translation([x, 0, 0]))
 
@@ -85,8 +90,7 @@ def test_file_round_trip(tmp_path: Path) -> None:
     assert journal.read(path) == journal.JournalContent(entries=tuple(lines), damaged=())
 
 
-def test_a_torn_line_spoils_no_other(tmp_path: Path) -> None:
-    path = tmp_path / "journal.jsonl"
+def test_a_torn_line_spoils_no_other(path: Path) -> None:
     first, second = random_journal(np.random.default_rng(6), 2)
     journal.append(path, first)
     with path.open("ab") as file:
@@ -96,8 +100,8 @@ def test_a_torn_line_spoils_no_other(tmp_path: Path) -> None:
     assert journal.read(path) == journal.JournalContent(entries=(first, second), damaged=(2,))
 
 
-def test_reading_on_is_reading_whole_whatever_was_done_to_the_file(tmp_path: Path) -> None:
-    path, rng = tmp_path / "journal.jsonl", np.random.default_rng(8)
+def test_reading_on_is_reading_whole_whatever_was_done_to_the_file(path: Path) -> None:
+    rng = np.random.default_rng(8)
     followed = journal.Journal(path)
     for line in random_journal(rng, 200):
         journal.append(path, line)
@@ -111,8 +115,8 @@ def test_reading_on_is_reading_whole_whatever_was_done_to_the_file(tmp_path: Pat
             assert now == journal.read(path)
 
 
-def test_what_was_read_is_not_read_again_and_held_once(tmp_path: Path) -> None:
-    followed = journal.Journal(path := tmp_path / "journal.jsonl")
+def test_what_was_read_is_not_read_again_and_held_once(path: Path) -> None:
+    followed = journal.Journal(path)
     for _ in range(9):
         before, line = followed.read().entries, journal.new_entry("accept", placed(), "ada")
         journal.append(path, line, check=lambda _: None, journal=followed)
@@ -121,8 +125,7 @@ def test_what_was_read_is_not_read_again_and_held_once(tmp_path: Path) -> None:
         assert all(e.T_world_obj is last.T_world_obj and e.subject is last.subject for e in before)
 
 
-def test_foreign_lines_are_refused_with_their_number(tmp_path: Path) -> None:
-    path = tmp_path / "journal.jsonl"
+def test_foreign_lines_are_refused_with_their_number(path: Path) -> None:
     for line, words in (({"format": 99}, "line 1.*format 1"), ({"format": 1, "mood": 2}, "mood")):
         path.write_text(json.dumps(line) + "\n")
         refused(words, journal.read, path)
@@ -133,8 +136,7 @@ def _write_many(path: Path, reviewer: str, n: int) -> None:
         journal.append(path, journal.new_entry("comment", placed(k), reviewer, comment="x" * 300))
 
 
-def test_two_processes_lose_no_line(tmp_path: Path) -> None:
-    path = tmp_path / "journal.jsonl"
+def test_two_processes_lose_no_line(path: Path) -> None:
     context = multiprocessing.get_context("spawn")
     writers = [context.Process(target=_write_many, args=(path, w, 40)) for w in ("ada", "bob")]
     for w in writers:
@@ -245,25 +247,24 @@ def test_pending_names_rejections_views_and_marks_but_not_accepts() -> None:
     assert list(state.excluded_views()) == [4]
 
 
-def test_the_second_of_two_movers_is_told_and_nothing_is_written(tmp_path: Path) -> None:
-    start, path = scene(), tmp_path / "j.jsonl"
+def test_the_second_of_two_movers_is_told_and_nothing_is_written(path: Path) -> None:
+    start = scene()
     seen = start.objects[0]
     T = se3.from_translation([0.01, 0, 0])
-    journal.append(
-        path, journal.new_entry("move", seen, "ada", pose=T), check=check_is_current(start, seen)
-    )
+    move = journal.new_entry("move", seen, "ada", pose=T)
+    journal.append(path, move, check=check_is_current(start, seen))
     before = path.read_bytes()
     late = journal.new_entry("move", seen, "bob", pose=se3.from_translation([0, 0.01, 0]))
     refused("ada", journal.append, path, late, check=check_is_current(start, seen))
     assert path.read_bytes() == before
 
 
-def test_lines_of_the_first_format_are_read(tmp_path: Path) -> None:
+def test_lines_of_the_first_format_are_read(path: Path) -> None:
     entry = journal.new_entry("accept", placed(), "ada")
     keys = ("id", "time", "reviewer", "action", "instance", "subject", "comment", "undoes")
     old = {"format": 1} | {k: getattr(entry, k) for k in keys}
-    (tmp_path / "j.jsonl").write_text(json.dumps(old) + "\n")
-    state = journal.replay(journal.read(tmp_path / "j.jsonl").entries)
+    path.write_text(json.dumps(old) + "\n")
+    state = journal.replay(journal.read(path).entries)
     assert reviewed_scene(scene(), state).object(0).verdict == "accepted"
 
 
@@ -278,18 +279,15 @@ def test_lines_of_the_first_format_are_read(tmp_path: Path) -> None:
         {"action": "undo", "undoes": "1"}, {"surprise": 1},
     ],
 )  # fmt: skip
-def test_fields_of_another_kind_are_refused_with_the_line(
-    said: dict[str, Any], tmp_path: Path
-) -> None:
+def test_fields_of_another_kind_are_refused_with_the_line(said: dict[str, Any], path: Path) -> None:
     whole = {"format": 2, "id": "1", "time": "t", "reviewer": "ada", "action": "accept",
              "instance": 0, "subject": "s"}  # fmt: skip
-    (tmp_path / "j.jsonl").write_text(json.dumps(whole | said) + "\n")
-    refused(r"j\.jsonl, line 1", journal.read, tmp_path / "j.jsonl")
+    path.write_text(json.dumps(whole | said) + "\n")
+    refused(r"journal\.jsonl, line 1", journal.read, path)
 
 
 @pytest.mark.parametrize("line", [b"[" * 5000, b"1" * 6000, b"\x00\xff", b'{"a":'])
-def test_what_is_no_json_is_damage_and_spoils_no_other_line(line: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "j.jsonl"
+def test_what_is_no_json_is_damage_and_spoils_no_other_line(line: bytes, path: Path) -> None:
     journal.append(path, journal.new_entry("accept", placed(), "ada"))
     path.write_bytes(line + b"\n" + path.read_bytes())
     found = journal.read(path)
@@ -301,8 +299,7 @@ def test_one_id_with_two_meanings_is_refused() -> None:
     refused("say different things", journal.replay, [yes, replace(yes, action="reject")])
 
 
-def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path: Path) -> None:
-    path = tmp_path / "j.jsonl"
+def test_a_full_disk_leaves_the_journal_as_it_was(path: Path) -> None:
     journal.append(path, journal.new_entry("accept", placed(), "ada"))
     before = path.read_bytes()
     program = (

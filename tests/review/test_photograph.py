@@ -44,9 +44,7 @@ def shifted(o: ObjectPose, *by_mm: float) -> ObjectPose:
 
 
 def turned(o: ObjectPose, deg: float) -> ObjectPose:
-    return replace(
-        o, T_world_obj=o.T_world_obj @ se3.from_rt(se3.exp_so3([0, 0, np.radians(deg)]), [0, 0, 0])
-    )
+    return replace(o, T_world_obj=o.T_world_obj @ se3.exp([0, 0, np.radians(deg), 0, 0, 0]))
 
 
 def against(photographs: Photographs, *objects: ObjectPose, of: int = 3) -> list[float]:

@@ -183,9 +183,8 @@ def test_the_point_on_the_object_does_not_depend_on_where_the_world_is() -> None
     for o, d in zip(*rays_at(rng, 40), strict=True):
         o_world, d_world = se3.transform(T, o[None])[0], T[:3, :3] @ d
         at = ray_on_mesh(o_world, d_world, MUG.mesh, T)
-        moved = ray_on_mesh(
-            se3.transform(W, o_world[None])[0], 7.0 * W[:3, :3] @ d_world, MUG.mesh, W @ T
-        )
+        o_moved, d_moved = se3.transform(W, o_world[None])[0], 7.0 * W[:3, :3] @ d_world
+        moved = ray_on_mesh(o_moved, d_moved, MUG.mesh, W @ T)
         assert (at is None) == (moved is None)
         if at is not None and moved is not None:
             np.testing.assert_allclose(moved, at, atol=1e-12)

@@ -163,9 +163,8 @@ def test_unsigned_and_senseless_decisions_are_refused(session: ReviewedSession) 
 def test_the_journal_is_read_again_only_when_it_changed(session: ReviewedSession) -> None:
     first = session.standing
     assert session.standing is first
-    journal.append(
-        session.journal_path, journal.new_entry("accept", seen(session, 0), "somebody else")
-    )
+    line = journal.new_entry("accept", seen(session, 0), "somebody else")
+    journal.append(session.journal_path, line)
     assert session.standing is not first
     assert session.standing.state.entries[-1].reviewer == "somebody else"
 

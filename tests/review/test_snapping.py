@@ -28,11 +28,8 @@ from registered_sessions import CAMERA, models_of, table_session, true_cameras, 
 MODELS = models_of()
 TUBE = part("tube")
 TRUTH = {o.instance: o for o in true_poses()}
-SCENE = Scene(
-    name="two objects",
-    objects=tuple(replace(o, verdict="accepted") for o in TRUTH.values()),
-    plane=SupportPlane(T_world_table=np.eye(4)),
-)
+ACCEPTED = tuple(replace(o, verdict="accepted") for o in TRUTH.values())
+SCENE = Scene(name="two objects", objects=ACCEPTED, plane=SupportPlane(T_world_table=np.eye(4)))
 
 
 @pytest.fixture(scope="module")

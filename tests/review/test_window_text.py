@@ -62,10 +62,7 @@ def test_certainty_is_in_mm_and_deg_and_leaves_out_the_own_axis() -> None:
     C = np.diag([1.0, 4e-6, 4e-6, 1e-6, 1e-6, 9e-6])
     unknown = ObjectPose(obj_id=TALL, instance=0, T_world_obj=np.eye(4))
     placed = replace(unknown, covariance=C, checks={"probability": 0.987})
-    mesh = MODELS[TALL].mesh
-    round_ = ObjectModel(
-        obj_id=TALL, name="round", mesh=mesh, symmetry_axes=(((1.0, 0.0, 0.0), (0.0, 0.0, 0.0)),)
-    )
+    round_ = replace(MODELS[TALL], symmetry_axes=(((1.0, 0.0, 0.0), (0.0, 0.0, 0.0)),))
     text = window_text.certainty_text(placed, round_)
     assert "98.7 %" in text and "3 mm along its worst axis" in text
     assert "0.11 deg" in text and "left out" in text

@@ -145,10 +145,8 @@ def test_refined_poses_are_nearer_to_the_truth_than_the_robots() -> None:
 
     def off(Ts: Array) -> tuple[float, float]:
         gap = se3.log(se3.invert(true) @ Ts)
-        return (
-            float(np.mean(np.linalg.norm(gap[:, 3:], axis=1))),
-            float(np.mean(np.linalg.norm(gap[:, :3], axis=1))),
-        )
+        turn, shift = np.linalg.norm(gap.reshape(-1, 2, 3), axis=2).mean(0)
+        return float(shift), float(turn)
 
     before = off(np.stack([f.T_world_cam for f in frames]))
     after = off(np.stack([c.T_world_cam for c in fused.corrections]))
@@ -273,9 +271,8 @@ def exact_frames(
 
     The others look from 20 and 55 degrees in turn, so that every side is seen by two.
     """
-    scene = RayScene(
-        [PlacedMesh(BACKGROUND, m, np.eye(4)) for m in (*meshes, *([TABLE] if table else []))]
-    )
+    things = (*meshes, TABLE) if table else meshes
+    scene = RayScene([PlacedMesh(BACKGROUND, m, np.eye(4)) for m in things])
     rays = ray_table(camera)
     frames: list[FusionFrame] = []
     for k in range(count):

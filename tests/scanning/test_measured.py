@@ -103,9 +103,8 @@ def test_lengths_of_a_brick_are_known():
         m = Measurement(kind=kind, value_m=0.1, sigma_m=1e-3)
         assert length_of(mesh, m) == pytest.approx(length, rel=1e-9)
     R_up = se3.exp_so3([0, np.pi / 2, 0])  # x becomes -z
-    assert length_of(
-        mesh, Measurement(kind="height", value_m=0.1, sigma_m=1e-3), R_up
-    ) == pytest.approx(1)
+    m = Measurement(kind="height", value_m=0.1, sigma_m=1e-3)
+    assert length_of(mesh, m, R_up) == pytest.approx(1)
     m = Measurement(kind="between", value_m=0.1, sigma_m=1e-3, points=((0, 0, 0), (3, 4, 12)))
     assert length_of(mesh, m) == pytest.approx(13)
 
@@ -200,8 +199,7 @@ def test_the_pose_follows_the_scale_by_its_covariance(known, fit):
     centre = known.scan.bounds.mean(0)
     bare = replace(fit, covariance=np.diag([1e-6] * 3 + [4e-8] * 3 + [4e-6]))
     joined = conditioned(bare, known.scan, 1.003 * fit.scale, 1e-3 * fit.scale)
-    where = [se3.transform(f.T_world_obj, f.scale * centre) for f in (bare, joined)]
-    where = [w.reshape(3) for w in where]
+    where = [se3.transform(f.T_world_obj, f.scale * centre).reshape(3) for f in (bare, joined)]
     np.testing.assert_allclose(where[0], where[1], atol=1e-12)  # uncorrelated: it grows in place
     tied = conditioned(fit, known.scan, 1.003 * fit.scale, 1e-3 * fit.scale)
     moved = se3.transform(tied.T_world_obj, tied.scale * centre).reshape(3) - where[0]

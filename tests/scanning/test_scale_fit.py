@@ -172,9 +172,8 @@ def test_the_residual_map_shows_a_bump_with_sign_and_size():
     """The real block carries a plate on its top that the mesh does not know."""
     height_mm = 2.0
     # The knob tells top from bottom: with the plate hidden below, the depth would fit as well.
-    base = lab.joined(
-        lab.block((0.09, 0.06, 0.05)), lab.shifted(lab.block((0.02, 0.03, 0.02)), -0.05, 0, -0.015)
-    )
+    knob = lab.shifted(lab.block((0.02, 0.03, 0.02)), -0.05, 0, -0.015)
+    base = lab.joined(lab.block((0.09, 0.06, 0.05)), knob)
     plain = lab.subdivided(base, 5000)
     raised = plain.vertices.copy()
     plate = np.all(np.abs(raised[:, :2] - [0.02, 0.01]) < 0.015, axis=1) & (raised[:, 2] > 0.0249)
@@ -226,10 +225,8 @@ def as_scan(name: str) -> Mesh:
 
 
 def test_several_objects():
-    known = lab.scanned_mesh(
-        lab.joined(lab.shifted(lab.block(), -0.07, 0, 0), lab.shifted(lab.block(), 0.07, 0, 0)),
-        replace(lab.LAB, views=6),
-    )
+    two = lab.joined(lab.shifted(lab.block(), -0.07, 0, 0), lab.shifted(lab.block(), 0.07, 0, 0))
+    known = lab.scanned_mesh(two, replace(lab.LAB, views=6))
     with pytest.raises(InputError, match=r"2 objects .* x=.* mm tall.*--at x,y .*alone"):
         lab.fit_of(known, as_scan("block"), start=None)
 
@@ -310,9 +307,8 @@ def test_an_open_mesh_is_fitted_too():
 def test_poses_of_other_images_are_not_accepted():
     known = lab.scanned("bunny")
     poses = [f.T_world_cam for f in known.frames]
-    frames = tuple(
-        replace(f, T_world_cam=T) for f, T in zip(known.frames, poses[3:] + poses[:3], strict=True)
-    )
+    exchanged = zip(known.frames, poses[3:] + poses[:3], strict=True)
+    frames = tuple(replace(f, T_world_cam=T) for f, T in exchanged)
     try:
         fit = lab.fit_of(known, frames=frames)
     except RealsimError as error:

@@ -105,13 +105,10 @@ def write_boxes(
             R, t = mm(T)
             truth[i].append({"obj_id": obj_id, "cam_R_m2c": R, "cam_t_m2c": t, "score": 0.25})
             infos[i].append({
-                "bbox_obj": bbox(whole) if visible.any() else [-1] * 4,
-                "bbox_visib": bbox(visible),
-                "px_count_all": int(whole.sum()),
-                "px_count_valid": int((counts[whole] > 0).sum()),
-                "px_count_visib": int(visible.sum()),
+                "bbox_obj": bbox(whole) if visible.any() else [-1] * 4, "bbox_visib": bbox(visible),
+                "px_count_all": int(whole.sum()), "px_count_visib": int(visible.sum()),
+                "px_count_valid": int((counts[whole] > 0).sum()), "seen_by": "rays",
                 "visib_fract": float(visible.sum() / whole.sum()) if whole.any() else 0.0,
-                "seen_by": "rays",
             })  # fmt: skip
     for name, data in (("camera", cameras), ("gt", truth), ("gt_info", infos)):
         (folder / f"scene_{name}{s}.json").write_text(json.dumps(data))

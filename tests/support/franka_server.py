@@ -138,16 +138,12 @@ def _server(words: queue.Queue[list[str]]) -> type:
 
 def _recovery() -> type:
     """Return the command that ends a reflex, and no other stop."""
-    from franky_sim.franka_robot_protocol import (
-        AutomaticErrorRecoveryCommand,
-        AutomaticErrorRecoveryStatus,
-        RobotMode,
-    )
+    from franky_sim import franka_robot_protocol as protocol
 
-    class Recovery(AutomaticErrorRecoveryCommand):
+    class Recovery(protocol.AutomaticErrorRecoveryCommand):
         def handle(self, server: Any) -> None:
-            status = AutomaticErrorRecoveryStatus
-            if server.mode in (None, RobotMode.kReflex):
+            status = protocol.AutomaticErrorRecoveryStatus
+            if server.mode in (None, protocol.RobotMode.kReflex):
                 server.mode = server.error = None
                 self.reply(status.kSuccess)
             else:

@@ -34,11 +34,9 @@ def plan_through(
     config = config or PlanConfig()
     given = {
         "chain": UR5, "mount": d405_mount(), "cell": config.work_cell(center, kind, obstacles),
-        "vias": (), "reference_view": 0,
+        "vias": (), "reference_view": 0, "center_world": np.asarray(center),
     } | more  # fmt: skip
-    return CapturePlan(
-        kind=kind, home=home, joints=joints, center_world=np.asarray(center), config=config, **given
-    )
+    return CapturePlan(kind=kind, home=home, joints=joints, config=config, **given)
 
 
 def a_plan(chain: DhChain = UR5, n: int = 9, seed: int = 0) -> CapturePlan:

@@ -102,9 +102,7 @@ class GraspitHdf5:
             return file["a"][:, 0]
 
 
-FORMATS = [
-    Acronym, GraspGen, IsaacGrasp, GraspGroupNpy, GraspitHdf5,
-]  # fmt: skip
+FORMATS = [Acronym, GraspGen, IsaacGrasp, GraspGroupNpy, GraspitHdf5]
 
 
 def read_acronym(path):

@@ -57,9 +57,7 @@ def grey_plane(
     i = intrinsics
     half_x = 2 * distance_m * max(i.cx, i.width - i.cx) / i.fx
     half_y = 2 * distance_m * max(i.cy, i.height - i.cy) / i.fy
-    corners = np.array(
-        [[-half_x, -half_y, 0], [half_x, -half_y, 0], [half_x, half_y, 0], [-half_x, half_y, 0]]
-    )
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [half_x, half_y, 0]
     mesh = Mesh(vertices=corners, faces=np.array([[0, 2, 1], [0, 3, 2]], np.int32))
     a, b = np.radians(tilt_deg), np.radians(turn_deg)
     T = np.eye(4)

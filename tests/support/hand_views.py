@@ -73,20 +73,15 @@ def linear(hand: bytes, mode: str) -> tuple[Array, Array, Array]:
     """Return d uv / d theta (2p, 18) at theta 0, the weights (2p, 2p) and the information."""
     A, zero = np.frombuffer(hand).reshape(4, 4), np.zeros(6)
     units = np.array([1e-6] * 12 + [1e-3] * 4 + [1e-6] * 2)
-    J = np.stack(
-        [
-            (predict(s, A, zero, mode) - predict(-s, A, zero, mode)).ravel() / (2 * u)
-            for s, u in zip(np.diag(units), units, strict=True)
-        ],
-        -1,
-    )
-    E = np.stack(
-        [
-            (predict(np.zeros(18), A, s, mode) - predict(np.zeros(18), A, -s, mode)).ravel() / 2e-6
-            for s in np.eye(6) * 1e-6
-        ],
-        -1,
-    )
+    columns = [
+        (predict(s, A, zero, mode) - predict(-s, A, zero, mode)).ravel() / (2 * u)
+        for s, u in zip(np.diag(units), units, strict=True)
+    ]
+    errors = [
+        (predict(np.zeros(18), A, s, mode) - predict(np.zeros(18), A, -s, mode)).ravel() / 2e-6
+        for s in np.eye(6) * 1e-6
+    ]
+    J, E = np.stack(columns, -1), np.stack(errors, -1)
     W = np.linalg.inv(SIGMA**2 * np.eye(len(J)) + E @ np.diag(ROBOT_SD**2) @ E.T)
     return J, W, J.T @ W @ J
 
@@ -152,8 +147,7 @@ def report_of(
         robot_map=None, map_name="none", map_scores=(("none", held_out_px),), joint_offsets=None,
         sigma_px=SIGMA, robot_ratio=RATIO, views=views, seen_px=0.2, held_out_px=held_out_px,
         held_out_mm=0.2, held_out_deg=0.05, starts=(), mismatch_deg=0.1, screw_ratio=1.0,
-        roll_range_deg=180.0,
-        checks=checks, information=information,
+        roll_range_deg=180.0, checks=checks, information=information,
     )  # fmt: skip
 
 

@@ -46,9 +46,8 @@ def photograph(
         sheet, per_m, margin = printed_sheet(board)
         to_sheet = np.array([[per_m, 0, margin - 0.5], [0, per_m, margin - 0.5], [0, 0, 1.0]])
         H = finer @ camera.K @ T[:3, [0, 1, 3]] @ np.linalg.inv(to_sheet)
-        cv2.warpPerspective(
-            sheet, H, fine.shape[::-1], fine, cv2.INTER_LINEAR, cv2.BORDER_TRANSPARENT
-        )
+        size = fine.shape[::-1]
+        cv2.warpPerspective(sheet, H, size, fine, cv2.INTER_LINEAR, cv2.BORDER_TRANSPARENT)
     grey = cv2.resize(fine, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     noisy = np.clip(np.rint(grey + rng.normal(scale=1.5, size=grey.shape)), 0, 255)
     return np.repeat(noisy.astype(np.uint8)[..., None], 3, axis=2)

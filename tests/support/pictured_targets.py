@@ -49,9 +49,8 @@ def picture(
     for pose in (T, *also):
         H = intrinsics.K @ pose[:3, [0, 1, 3]] @ np.linalg.inv(to_page)
         big = np.array([[SUPER, 0, half], [0, SUPER, half], [0, 0, 1.0]]) @ H
-        cv2.warpPerspective(
-            page, big, fine.shape[::-1], fine, cv2.INTER_NEAREST, cv2.BORDER_TRANSPARENT
-        )
+        size = fine.shape[::-1]
+        cv2.warpPerspective(page, big, size, fine, cv2.INTER_NEAREST, cv2.BORDER_TRANSPARENT)
     image = cv2.resize(fine, (640, 480), interpolation=cv2.INTER_AREA).astype(np.float64)
     image = cv2.GaussianBlur(image, (0, 0), blur)
     image = image * (1 + shade * (np.arange(640) / 639 - 0.5))

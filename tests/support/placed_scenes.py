@@ -47,9 +47,8 @@ def textured_box():
     shape = trimesh.creation.box((0.05, 0.06, 0.1))
     rng = np.random.default_rng(1)
     texture = rng.integers(0, 255, (32, 16, 3)).astype(np.uint8)
-    return ObjectModel(
-        obj_id=2, name="2 box/é", mesh=solid(shape, uv=rng.random((8, 2)), texture=texture)
-    )
+    mesh = solid(shape, uv=rng.random((8, 2)), texture=texture)
+    return ObjectModel(obj_id=2, name="2 box/é", mesh=mesh)
 
 
 def standing(x, y, yaw, z=0.0):
@@ -65,16 +64,14 @@ def registered():
         ObjectPose(obj_id=2, instance=1, T_world_obj=standing(0.2, 0.1, 1.0, 0.05)),
         ObjectPose(obj_id=1, instance=2, T_world_obj=standing(-0.2, 0.1, 2.0)),
     )
-    scene = Scene(
-        name="three things", objects=objects, plane=SupportPlane(T_world_table=T_WORLD_TABLE)
-    )
+    table = SupportPlane(T_world_table=T_WORLD_TABLE)
+    scene = Scene(name="three things", objects=objects, plane=table)
     return scene, {1: one, 2: two}, {1: matter}
 
 
 def placed_scene():
-    view = SceneCamera(
-        name="view_0", intrinsics=CAMERA, T_world_cam=se3.look_at([0.5, -0.5, 1.2], [0.5, 0.1, 0.7])
-    )
+    T = se3.look_at([0.5, -0.5, 1.2], [0.5, 0.1, 0.7])
+    view = SceneCamera(name="view_0", intrinsics=CAMERA, T_world_cam=T)
     scene = place_scene(*registered(), cameras=[view])
     bodies = {i: replace(body, friction=FRICTION) for i, body in scene.bodies.items()}
     return replace(scene, bodies=bodies)
@@ -100,9 +97,8 @@ def same_bodies(scene, found, tolerance=0.0, shapes=0.0):
         assert np.allclose(corners(B), corners(A), rtol=0, atol=shapes)
     table, other = scene.table, found.table
     assert np.allclose(other.T_world_table, table.T_world_table, rtol=0, atol=1e-12)
-    assert np.allclose(other.size_m, table.size_m) and np.isclose(
-        other.thickness_m, table.thickness_m
-    )
+    assert np.allclose(other.size_m, table.size_m)
+    assert np.isclose(other.thickness_m, table.thickness_m)
 
 
 def turned_to(scene, seed=3):

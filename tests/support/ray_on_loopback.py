@@ -16,6 +16,7 @@ import time
 from contextlib import contextmanager
 from unittest import mock
 
+from file_trees import bytes_of
 from typed_commands import realsim
 
 SCENES = 4
@@ -109,13 +110,9 @@ def finished(out):
 
 def digests(out):
     """Return the hashes of what a scene is; its costs and dates differ from run to run."""
-    kinds = ("rgb/*.png", "depth/*.png", "mask/*.png", "mask_visib/*.png", "annotations/*.json",
-             "models/*.ply")  # fmt: skip
-    return {
-        p.relative_to(out).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
-        for kind in kinds
-        for p in sorted(out.glob(f"scene_*/{kind}"))
-    }
+    kinds = ("rgb/*.png", "depth/*.png", "mask*/*.png", "annotations/*.json", "models/*.ply")
+    found = bytes_of(out, *(f"scene_*/{kind}" for kind in kinds))
+    return {name: hashlib.sha256(data).hexdigest() for name, data in found.items()}
 
 
 if __name__ == "__main__":

@@ -35,9 +35,7 @@ def true_poses() -> list[ObjectPose]:
     poses: list[ObjectPose] = []
     for k, (name, (x, y, turn)) in enumerate(zip(NAMES, PLACES, strict=True)):
         model = part(name)
-        T = se3.from_translation([x, y, -model.mesh.bounds[0, 2]]) @ se3.exp(
-            np.array([0.0, 0.0, turn, 0.0, 0.0, 0.0])
-        )
+        T = se3.from_translation([x, y, -model.mesh.bounds[0, 2]]) @ se3.exp([0, 0, turn, 0, 0, 0])
         poses.append(ObjectPose(obj_id=model.obj_id, instance=k, T_world_obj=T))
     return poses
 
@@ -90,9 +88,8 @@ def registered_by_hand(store: SessionStore, *, left_out: int | None = None) -> R
         left_out: a view that took no part.
     """
     claimed = {v.index: v.T_world_cam for v in store.session.views if v.T_world_cam is not None}
-    cameras = {
-        k: T for k, T in enumerate(true_cameras(len(claimed))) if k in claimed and k != left_out
-    }
+    kept = claimed.keys() - {left_out}
+    cameras = {k: T for k, T in enumerate(true_cameras(len(claimed))) if k in kept}
     C = np.diag([3e-3, 2e-3, 1e-3, 3e-4, 2e-4, 1e-4]) ** 2
     objects = [
         ObjectPose(
@@ -102,22 +99,19 @@ def registered_by_hand(store: SessionStore, *, left_out: int | None = None) -> R
         )
         for k, (o, verdict) in enumerate(zip(true_poses(), ("accepted", "doubtful"), strict=True))
     ]  # fmt: skip
-    seen = {
-        k: {
-            o.instance: SeenPose(
-                T_cam_obj=se3.invert(T) @ o.T_world_obj, covariance=2 * C, sigma_px=0.1 * (k + 1)
-            )
-            for o in objects
-        }
-        for k, T in cameras.items()
-    }
+
+    def seen(k: int, o: ObjectPose) -> SeenPose:
+        T_cam_obj = se3.invert(cameras[k]) @ o.T_world_obj
+        return SeenPose(T_cam_obj=T_cam_obj, covariance=2 * C, sigma_px=0.1 * (k + 1))
+
     return Registered(
         scene=Scene(
             name="two objects", objects=tuple(objects),
             plane=SupportPlane(T_world_table=np.eye(4), rms_m=2e-4, inliers=900),
         ),
         single_view=Scene(name="two objects (single view)", objects=()),
-        cameras=CameraChange(claimed=claimed, refined=cameras), seen=seen,
+        cameras=CameraChange(claimed=claimed, refined=cameras),
+        seen={k: {o.instance: seen(k, o) for o in objects} for k in cameras},
         not_placed=(NotPlaced(obj_id=14, instance=7, reason="nothing there looks like it."),),
         remarks=(Remark(view=2, kind="little_depth", words="view 2 has hardly any depth."),),
         report={

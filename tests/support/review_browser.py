@@ -19,11 +19,11 @@ from realsim.review.content.config import SceneConfig
 from realsim.store import SessionStore
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-ARGS = (
+ARGS = [
     "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist", "--disable-background-networking", "--no-first-run",
     "--disable-dev-shm-usage",
-)  # fmt: skip
+]  # fmt: skip
 WAIT_S = 240.0
 """How long is waited for a page without a graphics card on a busy machine [s]."""
 HARMLESS = ("GPU stall due to ReadPixels", "GL Driver Message")
@@ -271,9 +271,7 @@ def review_browser() -> Generator[ReviewBrowser]:
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=CHROMIUM, args=list(ARGS), headless=True
-        )
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGS, headless=True)
         try:
             yield ReviewBrowser(browser)
         finally:

@@ -88,9 +88,8 @@ def rough_start(known: Scanned, seed: int = 0) -> Similarity:
     factor = 1.08 if rng.random() < 0.5 else 1 / 1.08
     c = known.real.bounds.mean(0)
     T = known.T_world_obj @ se3.from_translation(c) @ se3.from_rt(se3.exp_so3(w), v)
-    return Similarity(
-        scale=UNIT_M * factor, T_world_obj=T @ se3.from_translation(-factor * c), source="given"
-    )
+    T = T @ se3.from_translation(-factor * c)
+    return Similarity(scale=UNIT_M * factor, T_world_obj=T, source="given")
 
 
 def fit_of(known: Scanned, mesh: Mesh | None = None, **given: Any) -> ScaleFit:

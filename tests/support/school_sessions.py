@@ -36,21 +36,17 @@ def refused(*args: object) -> str:
 def scene() -> Scene:
     """Two convex things, apart on a table that is not the world's xy plane."""
     objects = tuple(
-        ObjectPose(
-            obj_id=part(name).obj_id,
-            instance=k,
-            T_world_obj=T_WORLD_TABLE @ standing(name, x, angle),
-        )
+        ObjectPose(obj_id=part(name).obj_id, instance=k, T_world_obj=standing(name, x, angle))
         for k, (name, x, angle) in enumerate(zip(NAMES, (-0.1, 0.1), (0.2, 1.1), strict=True))
     )
     return Scene(name="two", objects=objects, plane=SupportPlane(T_world_table=T_WORLD_TABLE))
 
 
 def standing(name: str, x: float, angle: float) -> np.ndarray:
-    """Return T_table_obj of a part on its lowest point."""
+    """Return T_world_obj of a part that stands on its lowest point."""
     T = se3.from_rt(se3.exp_so3(np.array([0.0, 0.0, angle])), [x, 0.0, 0.0])
     T[2, 3] = -part(name).mesh.bounds[0][2]
-    return T
+    return T_WORLD_TABLE @ T
 
 
 def registered(folder: Path) -> Path:

@@ -61,10 +61,9 @@ class Software:
         }  # fmt: skip
         for name, value in infos.items():
             self.device.register_info(getattr(rs.camera_info, name), value)
-        self.stereo = self.device.add_sensor("Stereo Module")
-        self.color_sensor = (
-            self.device.add_sensor("RGB Camera") if self.two_sensors else self.stereo
-        )
+        add = self.device.add_sensor
+        self.stereo = add("Stereo Module")
+        self.color_sensor = add("RGB Camera") if self.two_sensors else self.stereo
         self.depth_profile = self._stream(self.stereo, rs.stream.depth, 1, rs.format.z16, 2)
         self.color_profile = self._stream(self.color_sensor, rs.stream.color, 2, rs.format.rgb8, 3)
         self.stereo.add_read_only_option(rs.option.depth_units, 1e-4)

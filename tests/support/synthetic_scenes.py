@@ -32,12 +32,10 @@ MODELS = {
 }
 
 
-def placed(obj_id, instance, x, y, **more):
+def placed(obj_id, instance, x, y, verdict="accepted", **more):
     height = float(MODELS[obj_id].mesh.extent[2]) / 2
     T = TABLE @ se3.from_rt(se3.exp_so3([0, 0, 0.3 * instance]), [x, y, height])
-    return ObjectPose(
-        obj_id=obj_id, instance=instance, T_world_obj=T, **{"verdict": "accepted"} | more
-    )
+    return ObjectPose(obj_id=obj_id, instance=instance, T_world_obj=T, verdict=verdict, **more)
 
 
 def two_boxes(*more):
@@ -87,13 +85,11 @@ def captured_session(folder, count=3, scene=None):
 
 def rejected(scene, instance):
     """Return the scene with one object rejected."""
-    return replace(
-        scene,
-        objects=tuple(
-            replace(o, verdict="rejected", reasons=("wrong",)) if o.instance == instance else o
-            for o in scene.objects
-        ),
+    objects = (
+        replace(o, verdict="rejected", reasons=("wrong",)) if o.instance == instance else o
+        for o in scene.objects
     )
+    return replace(scene, objects=tuple(objects))
 
 
 VOLATILE = ("session.json", "session.begun.json", "manifest.jsonl")

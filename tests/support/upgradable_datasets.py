@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from file_trees import bytes_of
 from plain_meshes import square
 from realsim.arrays import Array, UInt8
 from realsim.formats.bop.models import save_models
@@ -130,8 +131,4 @@ def graspnet_dataset(root: Path, number: int = 100) -> Path:
 
 def content_and_times(root: Path) -> dict[str, tuple[bytes, int]]:
     """Return the bytes and the time of change of every file."""
-    return {
-        str(p.relative_to(root)): (p.read_bytes(), p.stat().st_mtime_ns)
-        for p in sorted(root.rglob("*"))
-        if p.is_file()
-    }
+    return {n: (data, (root / n).stat().st_mtime_ns) for n, data in bytes_of(root).items()}

@@ -64,22 +64,24 @@ class Bag:
         stamp = self.t["builtin_interfaces/msg/Time"](t // S, t % S)
         return self.t["std_msgs/msg/Header"](*((0,) if self.is_ros1 else ()), stamp, frame_id)
 
+    def _sensor(
+        self, kind: str, topic: str, t: int, frame_id: str, *values: Any, receive: int | None = None
+    ) -> None:
+        """Add a message of sensor_msgs, which came when it was made unless `receive` says."""
+        message = self.t[f"sensor_msgs/msg/{kind}"](self.header(t, frame_id), *values)
+        self.messages.append((t if receive is None else receive, topic, message))
+
     def image(
         self, topic: str, pixels: Any, encoding: str, t: int,
         receive: int | None = None, frame_id: str = FRAME,
     ) -> None:  # fmt: skip
         flat = np.ascontiguousarray(pixels).reshape(-1).view(np.uint8)
         h, w = pixels.shape[:2]
-        message = self.t["sensor_msgs/msg/Image"](
-            self.header(t, frame_id), h, w, encoding, 0, flat.size // h, flat
-        )
-        self.messages.append((t if receive is None else receive, topic, message))
+        values = (h, w, encoding, 0, flat.size // h, flat)
+        self._sensor("Image", topic, t, frame_id, *values, receive=receive)
 
     def packed(self, topic: str, data: bytes, form: str, t: int, frame_id: str = FRAME) -> None:
-        message = self.t["sensor_msgs/msg/CompressedImage"](
-            self.header(t, frame_id), form, np.frombuffer(data, np.uint8)
-        )
-        self.messages.append((t, topic, message))
+        self._sensor("CompressedImage", topic, t, frame_id, form, np.frombuffer(data, np.uint8))
 
     def info(
         self, topic: str, t: int = T0, *, model: str = "plumb_bob", d: Any = (0.0,) * 5,
@@ -87,11 +89,8 @@ class Bag:
     ) -> None:  # fmt: skip
         K = np.array([f, 0, 15.5, 0, f + 1, 11.5, 0, 0, 1])
         roi = self.t["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        message = self.t["sensor_msgs/msg/CameraInfo"](
-            self.header(t, frame_id), HEIGHT, WIDTH, model, np.array(d, float), K,
-            np.eye(3).ravel(), np.zeros(12), 0, 0, roi,
-        )  # fmt: skip
-        self.messages.append((t, topic, message))
+        lens = (model, np.array(d, float), K, np.eye(3).ravel(), np.zeros(12))
+        self._sensor("CameraInfo", topic, t, frame_id, HEIGHT, WIDTH, *lens, 0, 0, roi)
 
     def joints(
         self, q: Any, t: int, dq: Any = None, prefix: str = "", receive: int = 0,
@@ -100,10 +99,8 @@ class Bag:
         order = sorted(range(len(called)), key=lambda i: called[i])  # as drivers: by the alphabet
         names = [prefix + called[i] for i in order]
         velocity = np.zeros(0) if dq is None else np.asarray(dq, float)[order]
-        message = self.t["sensor_msgs/msg/JointState"](
-            self.header(t, ""), names, np.asarray(q, float)[order], velocity, np.zeros(0)
-        )
-        self.messages.append((receive or t, "/joint_states", message))
+        values = (names, np.asarray(q, float)[order], velocity, np.zeros(0))
+        self._sensor("JointState", "/joint_states", t, "", *values, receive=receive or t)
 
     def tf(self, parent: str, child: str, T: Any, t: int, static: bool = False) -> None:
         x, y, z, w = (float(v) for v in quaternion_xyzw_from_R(T[:3, :3]))

@@ -57,9 +57,8 @@ def test_the_path_tracer_meets_what_the_labels_say(
     placed = clutter(origin)
     T = se3.look_at(origin - np.array([0.25, 0.3, -0.3]), origin + np.array([0, 0, 0.03]))
     labels = LabelRenderer(placed).render(intrinsics, T)
-    traced = PhotorealRenderer(placed, grey_sky(), PhotorealConfig(variant=variant)).first_hits(
-        intrinsics, T
-    )
+    renderer = PhotorealRenderer(placed, grey_sky(), PhotorealConfig(variant=variant))
+    traced = renderer.first_hits(intrinsics, T)
     objects = (labels.ids >= 0) | (traced.instance >= 0)
     assert np.count_nonzero(labels.ids >= 0) > 1000
     different = np.count_nonzero((labels.ids != traced.instance)[objects])
@@ -203,9 +202,8 @@ def test_a_white_matte_object_in_a_white_room_is_hardly_seen() -> None:
     placed = [PlacedMesh(0, octahedron(0.1), np.eye(4), WHITE)]
     T = se3.look_at([0.2, 0.3, 0.25], [0, 0, 0])
     config = plain(32)
-    photo = PhotorealRenderer(placed, Environment(panorama=panorama(8, 0.5)), config).render(
-        CAMERA, T
-    )
+    room = Environment(panorama=panorama(8, 0.5))
+    photo = PhotorealRenderer(placed, room, config).render(CAMERA, T)
     inside = photo.rgb[photo.depth_m > 0].astype(float).mean()
     around = photo.rgb[photo.depth_m == 0].astype(float).mean()
     assert abs(inside - around) < 0.06 * around

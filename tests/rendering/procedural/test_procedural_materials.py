@@ -91,9 +91,8 @@ def test_reflectances_are_those_of_real_things(kind: str) -> None:
 
 
 def test_choices_draw_only_what_suits() -> None:
-    assert set(choose.TABLE_KINDS) | set(choose.OBJECT_KINDS) | set(choose.FLOOR_KINDS) <= set(
-        choose.KINDS
-    )
+    drawn = {*choose.TABLE_KINDS, *choose.OBJECT_KINDS, *choose.FLOOR_KINDS}
+    assert drawn <= set(choose.KINDS)
     assert len(set(choose.TABLE_KINDS)) >= 16
     for draw in (choose.table_material, choose.object_material):
         seen = {draw(np.random.default_rng(s)).name for s in range(3)}

@@ -103,9 +103,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not() -> None:
 
 
 def test_a_distorted_camera_reports_depth_on_its_raw_pixels() -> None:
-    raw = CameraIntrinsics(
-        width=360, height=240, fx=360, fy=360, cx=179.5, cy=119.5, distortion=[-0.15, 0.05]
-    )
+    raw = replace(CAMERA, distortion=[-0.15, 0.05])
     exact = LabelRenderer(CARD_BEFORE_WALL).render(raw, np.eye(4)).depth_m
     rng = np.random.default_rng(0)
     found = StereoCamera(CARD_BEFORE_WALL, WIDE, RICH).measure(raw, np.eye(4), rng)
