@@ -128,9 +128,10 @@ EXACT = DepthSensorModel.noiseless()
 BLACK = Material(base_color=(0.001, 0.001, 0.001))
 
 
-def card(instance: int, z: float, half: float, material: Material | None = None) -> PlacedMesh:
-    corners = half * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) + [0, 0, z]
-    mesh = Mesh(vertices=corners, faces=np.array([[0, 2, 1], [0, 3, 2]], np.int32))
+def card(
+    instance: int, z: float, half: float, material: Material | None = None, x: float = 0.0
+) -> PlacedMesh:
+    mesh = Mesh(vertices=square(half).vertices + np.array([x, 0, z]), faces=square().faces[:, ::-1])
     return PlacedMesh(instance, mesh, np.eye(4), material)
 
 
@@ -188,11 +189,6 @@ fit_losses = losses.fit_losses
 FULL = CameraIntrinsics(width=320, height=240, fx=320, fy=320, cx=159.5, cy=119.5)
 
 
-def facing(instance: int, z: float, half: float, x: float = 0.0) -> PlacedMesh:
-    mesh = Mesh(vertices=square(half).vertices + np.array([x, 0, z]), faces=square().faces[:, ::-1])
-    return PlacedMesh(instance, mesh, np.eye(4))
-
-
 def grey(value: float, metallic: float = 0.0, roughness: float = 0.8) -> float:
     return material_loss(Material(base_color=(value,) * 3, metallic=metallic, roughness=roughness))
 
@@ -223,7 +219,8 @@ def test_loss_depends_only_on_range_over_distance_and_on_reflectance_times_its_s
 
 def view(model: DepthSensorModel, reflectance: dict[int, float], seed: int) -> Any:
     """Return what a sensor sees of two squares before a wall, with the truth."""
-    placed = [facing(BACKGROUND, 0.9, 1.2), facing(0, 0.6, 0.09, -0.13), facing(1, 0.6, 0.09, 0.15)]
+    cards = [card(0, 0.6, 0.09, x=-0.13), card(1, 0.6, 0.09, x=0.15)]
+    placed = [card(BACKGROUND, 0.9, 1.2), *cards]
     labels = LabelRenderer(placed).render(FULL, np.eye(4))
     rho = np.ones(labels.ids.shape, np.float32)
     for instance, value in reflectance.items():
