@@ -15,6 +15,7 @@ from realsim.formats.evidence import (
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.rendering.rays import PlacedMesh, RayScene, rotated
+from refusals import refused
 from tests.support.synthetic_scenes import INTRINSICS, MODELS, cameras, table, two_boxes
 
 WRONG = ("inverted", "other axes", "inverted, other axes")
@@ -108,5 +109,4 @@ def test_depth_tells_the_unit_of_the_poses(scanned):
     Ts[:, :3, 3] /= factor
     evidence = scale_evidence(Ts, depth_of)
     assert evidence.decisive and evidence.best == pytest.approx(factor, rel=0.04)
-    with pytest.raises(InputError, match="--scale"):
-        require_scale(evidence, "x")
+    refused("--scale", require_scale, evidence, "x")

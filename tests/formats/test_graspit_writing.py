@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import placed_scenes
-from realsim.errors import InputError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspit.grasps import WorldGrasps, read_grasp_file
 from realsim.formats.graspit.scene import read_graspit_scene
 from realsim.formats.graspit.writing import paired_grasps, write_graspit
 from realsim.geometry import se3
+from refusals import refused
 from tried_grasps import plain_grasps
 
 
@@ -119,5 +119,4 @@ def test_the_same_scene_gives_the_same_bytes_and_several_go_into_one_export(tmp_
 def test_grasps_of_nothing_are_refused(tmp_path):
     stranger = dataclasses.replace(grasps()[0], instance=9)
     assert isinstance(stranger, WorldGrasps)
-    with pytest.raises(InputError, match="instance 9"):
-        write(placed_scenes.placed_scene(), [stranger], tmp_path / "s")
+    refused("instance 9", write, placed_scenes.placed_scene(), [stranger], tmp_path / "s")

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from realsim import images
-from realsim.errors import InputError
 from realsim.images import png
 from realsim.images.png import encode_window
+from refusals import refused
 
 WINDOWS = [
     (0, 0, 64, 48), (0, 0, 0, 0), (5, 7, 1, 1), (60, 40, 4, 8), (0, 10, 64, 3), (3, 0, 9, 48),
@@ -52,5 +52,4 @@ def test_a_mask_is_read_back_by_the_repositorys_own_reader(tmp_path):
     (np.ones((4, 4, 3), np.uint8), (0, 0), "can be written"),
 ])  # fmt: skip
 def test_what_cannot_be_written_is_named(window, origin, said):
-    with pytest.raises(InputError, match=said):
-        encode_window(window, origin, (64, 48))
+    refused(said, encode_window, window, origin, (64, 48))

@@ -11,8 +11,8 @@ import pytest
 
 from many_tasks import dies_first, doubled, odd_fails, sizes, waits_then
 from realsim import many
-from realsim.errors import InputError
 from realsim.store.atomic import StorageError
+from refusals import refused
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +53,7 @@ def test_a_failing_task_is_listed_with_its_reason_and_the_rest_go_on(two):
         "formatting",
     }
     assert len(outcomes) == 5 and str(summary) == "2 tasks are done, 3 failed"
-    with pytest.raises(InputError, match="1 is odd"):
-        next(o for o in outcomes if o.task.name == "task 1").found()
+    refused("1 is odd", next(o for o in outcomes if o.task.name == "task 1").found)
 
 
 def test_a_task_whose_worker_is_killed_is_begun_again(two, tmp_path):
