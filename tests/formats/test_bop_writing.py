@@ -1,18 +1,14 @@
 """BOP scenes written: the same numbers, the same pixels, the same bytes after a kill."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from file_trees import bytes_of
+from killed_children import killed_at
 from labelled_scenes import ChangedScene
 from realsim.errors import InputError
 from realsim.formats.bop.models import load_models
@@ -205,32 +201,6 @@ def test_targets_are_the_visible_objects(tmp_path):
 
 # --- interruption -------------------------------------------------------------------------------
 
-CHILD = """
-import os, signal, sys
-from realsim.formats.bop.opening import open_labelled_bop
-from realsim.formats.bop.root_files import write_bop_models, write_bop_root
-from realsim.formats.bop.writing import write_bop_scene
-from realsim.formats.export_folder import ExportFolder
-from realsim.store import atomic
-source, out, after = sys.argv[1], sys.argv[2], int(sys.argv[3])
-count = 0
-def counted(write):
-    def wrapper(*args, **more):
-        global count
-        count += 1
-        if count == after:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return write(*args, **more)
-    return wrapper
-os.replace = counted(os.replace)
-scene = open_labelled_bop(source)
-folder = ExportFolder.begin(out, {"what": "a test"})
-write_bop_scene(scene, folder)
-write_bop_models(scene.models(), folder, infos=scene.models_info())
-write_bop_root(folder, name="copy")
-folder.finish({})
-"""
-
 
 def test_colour_may_be_jpeg_and_masks_left_out(tmp_path):
     source = write_boxes(tmp_path / "a")
@@ -256,33 +226,16 @@ def test_colour_may_be_jpeg_and_masks_left_out(tmp_path):
     )
 
 
-def run_child(source, out, after):
-    done = subprocess.run(
-        [sys.executable, "-c", CHILD, str(source), str(out), str(after)],
-        capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2],
-        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
-    )  # fmt: skip
-    return done.returncode
-
-
 def test_a_killed_export_goes_on_and_ends_with_the_same_bytes(tmp_path):
     write_boxes(tmp_path / "a", count=3)
     scene = open_labelled_bop(tmp_path / "a")
     export(scene, tmp_path / "whole")
-    sums = (tmp_path / "whole/SHA256SUMS").read_text().splitlines()
-    # In the second frame's masks.
     out = tmp_path / "killed"
-    assert run_child(tmp_path / "a", out, 14) == -signal.SIGKILL
-    there = len((out / ".export/pieces.jsonl").read_text().splitlines()) if (
-        out / ".export/pieces.jsonl"
-    ).exists() else 0  # fmt: skip
-    folder = ExportFolder.begin(out, {"what": "a test"})
-    assert folder.resumed
-    written = write_bop_scene(scene, folder)
+    assert killed_at(13, lambda: export(scene, out))  # in the second frame's masks
+    pieces = out / ".export/pieces.jsonl"
+    there = len(pieces.read_text().splitlines()) if pieces.exists() else 0
+    assert ExportFolder.begin(out, {"what": "a test"}).resumed
+    written = export(scene, out)
     assert (written.frames, written.objects, written.counts["masks"]) == (3, 9, 18)
     assert written.frames_written == 3 - min(there, 3)
-    write_bop_models(scene.models(), folder, infos=scene.models_info())
-    write_bop_root(folder, name="copy")
-    folder.finish({})
-    assert (out / "SHA256SUMS").read_text().splitlines() == sums
     assert bytes_of(out) == bytes_of(tmp_path / "whole")

@@ -1,16 +1,16 @@
 """The model library: what goes in comes out, and nothing that happens on the way loses a model."""
 
 import json
-import os
 import shutil
-import signal
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from file_trees import bytes_of
+from killed_children import in_children, killed_at
 from plain_meshes import textured_wedge
 from realsim.errors import InputError
 from realsim.formats.bop.models import load_models, save_models
@@ -172,41 +172,20 @@ def test_other_folders_are_no_libraries(tmp_path: Path):
 # --- kills, other writers, damage -------------------------------------------------------------
 
 
-def killed_at(step: int, library: ModelLibrary, given: PreparedModel, name: str) -> bool:
-    """Add in a child that is killed before its `step`-th rename; return whether it was killed."""
-    child = os.fork()
-    if child == 0:
-        replaced, count = os.replace, 0
-
-        def dying(a: object, b: object) -> None:
-            nonlocal count
-            if count == step:
-                os.kill(os.getpid(), signal.SIGKILL)
-            count += 1
-            replaced(a, b)  # pyright: ignore[reportArgumentType]
-
-        os.replace = dying  # pyright: ignore[reportAttributeAccessIssue]
-        try:
-            library.add(given, name, overwrite=True, picture=b"new")
-            os._exit(0)
-        finally:
-            os._exit(1)
-    _, status = os.waitpid(child, 0)
-    assert os.WIFSIGNALED(status) or os.WEXITSTATUS(status) == 0
-    return os.WIFSIGNALED(status)
-
-
 @pytest.mark.parametrize("name", ["box", "another"])
 def test_a_kill_leaves_the_library_old_or_new(tmp_path: Path, name: str):
     ModelLibrary.create(tmp_path / "old").add(made("box"), "box", picture=b"old")
-    changed = ModelLibrary(shutil.copytree(tmp_path / "old", tmp_path / "new"))
-    new_id = changed.add(made("wedge"), name, overwrite=True, picture=b"new").model.obj_id
+    wedge = made("wedge")
+
+    def changing(library: ModelLibrary) -> int:
+        return library.add(wedge, name, overwrite=True, picture=b"new").model.obj_id
+
+    new_id = changing(ModelLibrary(shutil.copytree(tmp_path / "old", tmp_path / "new")))
     old, new = bytes_of(tmp_path / "old"), bytes_of(tmp_path / "new")
     outcomes: set[str] = set()
     for step in range(100):
         folder = shutil.copytree(tmp_path / "old", tmp_path / f"killed_{step}")
-        library = ModelLibrary(folder)
-        was_killed = killed_at(step, library, made("wedge"), name)
+        was_killed = killed_at(step, partial(changing, ModelLibrary(folder)))
         # A BOP reader that knows nothing of the change in flight reads it all the same.
         assert 1 in load_models(folder)
         library = ModelLibrary.open(folder)
@@ -215,7 +194,7 @@ def test_a_kill_leaves_the_library_old_or_new(tmp_path: Path, name: str):
         assert now in (old, new)
         outcomes.add("old" if now == old else "new")
         # The next writer goes on as if nothing had been.
-        library.add(made("wedge"), name, overwrite=True, picture=b"new")
+        changing(library)
         assert bytes_of(folder) == new
         if not was_killed:
             break
@@ -223,22 +202,15 @@ def test_a_kill_leaves_the_library_old_or_new(tmp_path: Path, name: str):
 
 
 def test_writers_wait_for_each_other(library: ModelLibrary):
-    names = [[f"a{k}" for k in range(4)], [f"b{k}" for k in range(4)]]
-    children: list[int] = []
     given = made("box")
-    for mine in names:
-        child = os.fork()
-        if child == 0:
-            try:
-                for name in mine:
-                    library.add(given, name)
-                os._exit(0)
-            finally:
-                os._exit(1)
-        children.append(child)
-    assert [os.waitstatus_to_exitcode(os.waitpid(c, 0)[1]) for c in children] == [0, 0]
+
+    def add(letter: str) -> None:
+        for k in range(4):
+            library.add(given, f"{letter}{k}")
+
+    assert in_children(partial(add, "a"), partial(add, "b"))
     entries = library.entries()
-    assert sorted(e.name for e in entries) == sorted(names[0] + names[1])
+    assert sorted(e.name for e in entries) == [f"{x}{k}" for x in "ab" for k in range(4)]
     assert [e.obj_id for e in entries] == list(range(1, 9))
     assert check_library(library) == []
 

@@ -1,16 +1,14 @@
 """A session comes back bit for bit, and no kill leaves half a view."""
 
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
 import time
+from functools import partial
 
 import numpy as np
 import pytest
 
+from killed_children import killed_growing
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession, View
@@ -239,50 +237,22 @@ def test_every_prefix_of_a_view_that_a_kill_can_leave_is_cleaned_up(tmp_path):
         assert not list(folder.rglob("*.part")), what
 
 
-def grow(path, lines):
-    """Wait until a file has that many more lines than now: a busy machine takes its time."""
-
-    def count():
-        return path.read_bytes().count(b"\n") if path.exists() else 0
-
-    goal, end = count() + lines, time.monotonic() + 30
-    while count() < goal:
-        assert time.monotonic() < end, f"{path} does not grow"
-        time.sleep(0.001)
-
-
-CAPTURE = """
-import sys
-sys.path[:0] = [{tests!r}, {tests!r} + '/../support']
-from test_session_store import SessionStore, make_view, make_images
-store = SessionStore.open({folder!r})
-print("ready", flush=True)
-for i in range(10_000):
-    if i not in store.completed:
-        store.add_view(make_view(i), *make_images(i))
-"""
-
-
-def kill_growing(code, path, lines, wait_s):
-    """Run a script, and kill it a little after a file of its has grown by so many lines."""
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert process.stdout.readline() == "ready\n"
-    grow(path, lines)
-    time.sleep(wait_s)
-    process.send_signal(signal.SIGKILL)
-    process.wait(timeout=20)
-    process.stdout.close()
+def capture(folder):
+    store = SessionStore.open(folder)
+    for i in range(10_000):
+        if i not in store.completed:
+            store.add_view(make_view(i), *make_images(i))
 
 
 def test_killed_captures_lose_at_most_the_view_in_flight(tmp_path):
     folder = tmp_path / "s"
     SessionStore.create(folder, empty_session())
-    code = CAPTURE.format(tests=os.path.dirname(__file__), folder=str(folder))
     rng = np.random.default_rng(0)
     before: set[int] = set()
     for _ in range(2):
-        kill_growing(code, folder / "robot.jsonl", 3, rng.uniform(0, 0.02))
-        lines = (folder / "robot.jsonl").read_bytes().count(b"\n")
+        robot = folder / "robot.jsonl"
+        killed_growing(partial(capture, folder), robot, 3, rng.uniform(0, 0.02))
+        lines = robot.read_bytes().count(b"\n")
         store = SessionStore.open(folder)
         assert before <= store.completed == set(range(lines))
         assert store.verify() == [] and not list(folder.rglob("*.part"))
@@ -295,24 +265,18 @@ def test_killed_captures_lose_at_most_the_view_in_flight(tmp_path):
         assert_same_view(store.session.view(i), make_view(i))
 
 
-SETTING = """
-import sys
-sys.path[:0] = [{tests!r}, {tests!r} + '/../support']
-from test_session_store import SessionStore, CAMERA
-from realsim.geometry import se3
-store = SessionStore.open({folder!r})
-print("ready", flush=True)
-for k in range(100_000):
-    store.set_cameras(CAMERA, {{i: se3.from_translation([k, i, 0]) for i in range(3)}})
-    store.write_json("reports/a.json", k)
-"""
+def calibrate(folder):
+    store = SessionStore.open(folder)
+    for k in range(100_000):
+        store.set_cameras(CAMERA, {i: se3.from_translation([k, i, 0]) for i in range(3)})
+        store.write_json("reports/a.json", k)
 
 
 def test_killed_calibrations_leave_one_set_of_cameras(tmp_path):
     folder = tmp_path / "s"
     filled(folder, 3)
-    code = SETTING.format(tests=os.path.dirname(__file__), folder=str(folder))
-    kill_growing(code, folder / "manifest.jsonl", 5, np.random.default_rng(1).uniform(0, 0.01))
+    wait_s = np.random.default_rng(1).uniform(0, 0.01)
+    killed_growing(partial(calibrate, folder), folder / "manifest.jsonl", 5, wait_s)
     store = SessionStore.open(folder)
     assert store.verify() == []
     k = {v.T_world_cam[0, 3] for v in store.session.views}
