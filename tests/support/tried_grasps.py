@@ -87,7 +87,10 @@ def tried_scene(seed, *, with_poses=True, with_attempts=True):
 
 
 def assert_same(a, b, atol=0.0):
-    """Every field is equal, arrays bit for bit or, where `atol` is given, to within it."""
+    """Every field is equal, arrays bit for bit or, where `atol` is given, to within it.
+
+    Where the arrays of the first cannot be changed, those of the second cannot either.
+    """
     assert type(a) is type(b)
     for name in a.__dataclass_fields__:
         same_value(getattr(a, name), getattr(b, name), name, atol)
@@ -101,6 +104,7 @@ def same_value(x, y, name, atol):
         assert isinstance(y, np.ndarray) and x.dtype == y.dtype and x.shape == y.shape, name
         close = atol and np.allclose(x, y, rtol=0, atol=atol, equal_nan=True)
         assert close or x.tobytes() == y.tobytes(), name
+        assert x.flags.writeable or not y.flags.writeable, name
     elif isinstance(x, dict):
         assert isinstance(y, dict) and sorted(x) == sorted(y), name
         for key in x:
