@@ -22,9 +22,8 @@ def test_a_scene_is_read_as_it_was_written(tmp_path):
     scene = open_labelled_bop(tmp_path)
     assert (scene.name, scene.number, scene.split, scene.camera) == ("test-000003", 3, "test", "")
     assert scene.indices == (1, 5, 9, 13, 17) and scene.T_world_table is None
-    cameras = json.loads((folder / "scene_camera.json").read_text())
-    truth = json.loads((folder / "scene_gt.json").read_text())
-    infos = json.loads((folder / "scene_gt_info.json").read_text())
+    documents = [folder / f"scene_{name}.json" for name in ("camera", "gt", "gt_info")]
+    cameras, truth, infos = (json.loads(path.read_text()) for path in documents)
     for k, i in enumerate(scene.indices):
         frame = scene.frame(i)
         # The principal point moves from image to image, as in T-LESS.
@@ -122,32 +121,32 @@ def rows_of(data):
 
 def inverted(data):
     for row in data.values():
-        T = se3.from_rt(np.reshape(row["cam_R_w2c"], (3, 3)), row["cam_t_w2c"])
-        T = se3.invert(T)
+        T = se3.invert(se3.from_rt(np.reshape(row["cam_R_w2c"], (3, 3)), row["cam_t_w2c"]))
         row.update(cam_R_w2c=T[:3, :3].ravel().tolist(), cam_t_w2c=T[:3, 3].tolist())
 
 
 def opengl(data):
-    for row in data.values():
-        G = np.diag([1.0, -1, -1])
-        row["cam_R_w2c"] = (G @ np.reshape(row["cam_R_w2c"], (3, 3))).ravel().tolist()
-        row["cam_t_w2c"] = (G @ row["cam_t_w2c"]).tolist()
+    G = np.diag([1.0, -1, -1])
+    each("cam_R_w2c", lambda R: (G @ R.reshape(3, 3)).ravel())(data)
+    each("cam_t_w2c", lambda t: G @ t)(data)
 
 
-def columns(key, of=lambda d: list(d.values())):
+def each(key, new, of=dict.values):
+    """Return a change of a key's value in every row."""
+
     def change(data):
         for row in of(data):
-            row[key] = np.reshape(row[key], (3, 3)).T.ravel().tolist()
+            row[key] = np.asarray(new(np.array(row[key]))).tolist()
 
     return change
 
 
-def scaled(key, factor, of=lambda d: list(d.values())):
-    def change(data):
-        for row in of(data):
-            row[key] = np.multiply(row[key], factor).tolist()
+def columns(key, of=dict.values):
+    return each(key, lambda R: R.reshape(3, 3).T.ravel(), of)
 
-    return change
+
+def scaled(key, factor, of=dict.values):
+    return each(key, lambda values: factor * values, of)
 
 
 TRAPS = {
@@ -163,31 +162,24 @@ TRAPS = {
     "depth of 10 um": ("camera", scaled("depth_scale", 0.1), UnitError, "with depth_scale 0.1 dep"),
     "a row of gt_info": ("gt_info", lambda d: d["5"].pop(), InputError, "has 2 objects in image 5"),
     "object 0": ("gt", lambda d: d["5"][0].update(obj_id=0), InputError, "obj_id of object 0"),
-    "a fisheye": (
-        "camera", lambda d: d["5"].pop("cam_K"), InputError, "no cam_K but a cam_model",
-    ),
+    "a fisheye": ("camera", lambda d: d["5"].pop("cam_K"), InputError, "no cam_K but a cam_model"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("trap", TRAPS)
-def test_traps_are_found(tmp_path, trap):
-    name, change, error, says = TRAPS[trap]
+@pytest.mark.parametrize(("name", "change", "error", "says"), TRAPS.values(), ids=TRAPS)
+def test_traps_are_found(tmp_path, name, change, error, says):
     folder = write_boxes(tmp_path)
     open_labelled_bop(tmp_path)
     edit(folder / f"scene_{name}.json", change)
-    said = refused(says, open_labelled_bop, tmp_path, error=error)
-    assert str(folder) in said
+    assert str(folder) in refused(says, open_labelled_bop, tmp_path, error=error)
 
 
 def test_moving_objects_are_told_not_refused(tmp_path):
     folder = write_boxes(tmp_path)
 
-    def move(data):
-        rng = np.random.default_rng(0)
-        for row in rows_of(data):
-            row["cam_t_m2c"] = (np.array(row["cam_t_m2c"]) + rng.uniform(-90, 90, 3)).tolist()
-
-    edit(folder / "scene_gt.json", move)
+    rng = np.random.default_rng(0)
+    moved = each("cam_t_m2c", lambda t: t + rng.uniform(-90, 90, 3), rows_of)
+    edit(folder / "scene_gt.json", moved)
     notes = open_labelled_bop(tmp_path).notes
     assert any("do not agree under any reading" in note for note in notes)
 
@@ -207,16 +199,12 @@ def test_files_that_do_not_belong_together_are_named(tmp_path):
 
 
 def test_labels_without_an_image_and_a_principal_point_beside_it_are_told(tmp_path):
-    def shift(cameras):
-        for row in cameras.values():
-            row["cam_K"][2] += WIDTH
-
     folder = write_boxes(tmp_path)
     edit(folder / "scene_gt.json", lambda data: data.update({"99": data["5"]}))
     notes = open_labelled_bop(tmp_path).notes
     assert any("images that are not there; they are left out: 99." in note for note in notes)
     (folder / "scene_gt.json").unlink()  # or its boxes would speak first
-    edit(folder / "scene_camera.json", shift)
+    edit(folder / "scene_camera.json", each("cam_K", lambda K: K + WIDTH * (np.arange(9) == 2)))
     notes = open_labelled_bop(tmp_path).notes
     assert any("principal point outside of image 1, 5, 9" in note for note in notes)
 
@@ -237,10 +225,7 @@ def test_models_that_are_missing_are_named(tmp_path):
     ("scale", "said"), [(0.5, "not seen where cam_K"), (1 / 640, "of another image size")]
 )
 def test_a_camera_of_another_image_size_is_named(tmp_path, scale, said):
-    def shrink(cameras):
-        for row in cameras.values():
-            row["cam_K"] = [x * scale if k < 6 else x for k, x in enumerate(row["cam_K"])]
-
     folder = write_boxes(tmp_path)
-    edit(folder / "scene_camera.json", shrink)
+    shrunk = each("cam_K", lambda K: np.where(np.arange(9) < 6, scale * K, K))
+    edit(folder / "scene_camera.json", shrunk)
     refused(said, open_labelled_bop, tmp_path)
