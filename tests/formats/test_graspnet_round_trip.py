@@ -12,7 +12,7 @@ from labelled_scenes import MODELS, TABLE, labelled_scene
 from labelled_scenes import graspnet_tree as written
 from labelled_scenes import opened_graspnet as opened
 from realsim import images
-from realsim.errors import NotRigidError, UnitError
+from realsim.errors import InputError, NotRigidError, UnitError
 from realsim.formats.bop.models import save_models
 from realsim.formats.bop.opening import open_labelled_bop
 from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
@@ -27,6 +27,7 @@ from refusals import refused
 
 SINGLE_M, SINGLE_RAD = 1e-7, 1e-6
 HOME = "scenes/scene_0003/realsense"
+MM = np.diag([1e3, 1e3, 1e3, 1.0])
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +40,14 @@ def tree(source, tmp_path_factory):
     out = tmp_path_factory.mktemp("tree") / "out"
     written(source, out)
     return out
+
+
+def same_poses(a, b, most_m=SINGLE_M, most_rad=SINGLE_RAD):
+    """Hold that two frames have the same objects, at the same poses."""
+    assert [o.obj_id for o in a.objects] == [o.obj_id for o in b.objects]
+    for x, y in zip(a.objects, b.objects, strict=True):
+        off = se3.invert(x.T_cam_obj) @ y.T_cam_obj
+        assert np.linalg.norm(off[:3, 3]) < most_m and se3.angle(off) < most_rad
 
 
 def tree_bytes(folder):
@@ -61,11 +70,8 @@ def test_poses_come_back_to_single_precision_and_cameras_exactly(source, tree):
         T_table_cam = se3.invert(TABLE) @ before.T_world_cam
         assert np.abs(T_table_cam - after.T_world_cam).max() < 1e-12
         assert np.abs(before.intrinsics.K - after.intrinsics.K).max() == 0
-        assert [o.obj_id for o in after.objects] == [o.obj_id for o in before.objects]
         assert [o.instance for o in after.objects] == [0, 1, 2]
-        for a, b in zip(before.objects, after.objects, strict=True):
-            off = se3.invert(a.T_cam_obj) @ b.T_cam_obj
-            assert np.linalg.norm(off[:3, 3]) < SINGLE_M and se3.angle(off) < SINGLE_RAD
+        same_poses(before, after)
 
 
 def test_without_meta_files_poses_come_back_from_the_text(source, tree, tmp_path):
@@ -74,14 +80,8 @@ def test_without_meta_files_poses_come_back_from_the_text(source, tree, tmp_path
     shutil.rmtree(bare / HOME / "meta")
     scene = opened(bare)
     assert any("no meta file" in n for n in scene.notes)
-    worst_mm = worst_deg = 0.0
     for index in source.indices:
-        pairs = zip(source.frame(index).objects, scene.frame(index).objects, strict=True)
-        for a, b in pairs:
-            off = se3.invert(a.T_cam_obj) @ b.T_cam_obj
-            worst_mm = max(worst_mm, 1e3 * np.linalg.norm(off[:3, 3]))
-            worst_deg = max(worst_deg, float(np.degrees(se3.angle(off))))
-    assert worst_mm < 1e-5 and worst_deg < 1e-5
+        same_poses(source.frame(index), scene.frame(index), 1e-8, np.radians(1e-5))
 
 
 def test_models_come_back_in_metres(tree):
@@ -138,15 +138,12 @@ def test_bop_to_graspnet_to_bop_gives_the_same_poses_ids_and_pixels(source, tmp_
     assert again.indices == bop.indices
     for index in bop.indices:
         a, b = bop.frame(index), again.frame(index)
-        assert [o.obj_id for o in a.objects] == [o.obj_id for o in b.objects]
         assert np.abs(a.T_world_cam - b.T_world_cam).max() < 1e-9
         assert np.abs(a.intrinsics.K - b.intrinsics.K).max() < 1e-9
-        for k, (x, y) in enumerate(zip(a.objects, b.objects, strict=True)):
-            off = se3.invert(x.T_cam_obj) @ y.T_cam_obj
-            assert np.linalg.norm(off[:3, 3]) < SINGLE_M and se3.angle(off) < SINGLE_RAD
-            assert np.array_equal(
-                bop.mask(index, k, visible=True), again.mask(index, k, visible=True)
-            )
+        same_poses(a, b)
+        for k in range(len(a.objects)):
+            masks = [scene.mask(index, k, visible=True) for scene in (bop, again)]
+            assert np.array_equal(*masks)
         for file in (bop.colour_file, bop.depth_file):
             other = getattr(again, file.__name__)(index)
             assert np.array_equal(images.read_image(file(index)), images.read_image(other))
@@ -172,44 +169,36 @@ def change_annotations(root, change):
         path.write_bytes(annotation_bytes(rows))
 
 
-def change_meta(root, **changed):
-    for path in sorted((home(root) / "meta").iterdir()):
-        m = read_meta(path)
-        values = {
-            "numbers": m.numbers, "poses": m.poses, "K": m.K, "factor_depth": m.factor_depth,
-        }  # fmt: skip
-        path.write_bytes(meta_bytes(**values | changed))
+def change_meta(path, **changed):
+    """Write a meta file again with some of its values changed."""
+    m = read_meta(path)
+    values = {"numbers": m.numbers, "poses": m.poses, "K": m.K, "factor_depth": m.factor_depth}
+    path.write_bytes(meta_bytes(**values | changed))
 
 
-def test_inverted_camera_poses_are_named_with_both_spreads(root):
-    path = home(root) / "camera_poses.npy"
-    np.save(path, se3.invert(np.load(path)))
-    refused(r"inverted poses.*wander by \d+\.\d mm.*by 0\.\d mm", opened, root)
+@pytest.mark.parametrize(
+    ("file", "change", "error", "says"),
+    [
+        ("camera_poses", se3.invert, InputError,
+         r"inverted poses.*wander by \d+\.\d mm.*by 0\.\d mm"),
+        ("cam0_wrt_table", np.linalg.inv, InputError,
+         "seems to be inverted: as the pose of camera 0"),
+        ("camera_poses", lambda Ts: np.roll(Ts, 1, axis=0), InputError,
+         "contradicts the annotations"),
+        ("camera_poses", lambda Ts: MM @ Ts @ np.linalg.inv(MM), UnitError, "millimetres"),
+        ("camera_poses", lambda Ts: Ts[:4], InputError,
+         "holds 4 poses, and there are 6 images"),
+    ],
+)  # fmt: skip
+def test_camera_poses_that_cannot_be_are_named(root, file, change, error, says):
+    path = home(root) / f"{file}.npy"
+    np.save(path, change(np.load(path)))
+    refused(says, opened, root, error=error)
 
 
-def test_a_table_that_is_upside_down_is_named(root):
-    path = home(root) / "cam0_wrt_table.npy"
-    np.save(path, np.linalg.inv(np.load(path)))
-    refused("seems to be inverted: as the pose of camera 0", opened, root)
-
-
-def test_camera_poses_of_another_recording_are_named(root):
-    path = home(root) / "camera_poses.npy"
-    np.save(path, np.roll(np.load(path), 1, axis=0))
-    refused("contradicts the annotations", opened, root)
-
-
-def test_millimetres_are_named_wherever_they_are(root):
-    path = home(root) / "camera_poses.npy"
-    metres = np.load(path)
-    mm = metres.copy()
-    mm[:, :3, 3] *= 1000
-    np.save(path, mm)
-    refused("millimetres", opened, root, error=UnitError)
-    np.save(path, metres)
-    poses = read_meta(home(root) / "meta/0000.mat").poses
-    poses[..., 3] *= 1000
-    (home(root) / "meta/0000.mat").write_bytes(meta_bytes((0, 6, 29), poses, np.eye(3), 1000.0))
+def test_millimetres_of_objects_are_named_wherever_they_are(root):
+    path = home(root) / "meta/0000.mat"
+    change_meta(path, poses=read_meta(path).poses * [1, 1, 1, 1000])
     refused("millimetres", opened, root, error=UnitError)
 
     def in_mm(fields):
@@ -235,7 +224,8 @@ def test_quaternions_in_another_order_are_named_by_the_views_and_by_the_meta_fil
 
 
 def test_depth_of_another_unit_is_named_with_the_factor_that_would_fit(root):
-    change_meta(root, factor_depth=10000.0)
+    for path in (home(root) / "meta").iterdir():
+        change_meta(path, factor_depth=10000.0)
     said = refused(r"counts per metre \(factor_depth", opened, root, error=UnitError)
     assert 900 < float(said.split("about ")[1].split()[0]) < 1050
 
@@ -245,22 +235,19 @@ def test_two_files_that_disagree_are_both_named(root):
     m = read_meta(path)
     poses = m.poses.copy()
     poses[1, 0, 3] += 0.0003
-    path.write_bytes(meta_bytes(m.numbers, poses, m.K, 1000.0))
+    change_meta(path, poses=poses)
     refused(r"0000\.xml and .*0000\.mat disagree about object 006", opened, root)
-    path.write_bytes(meta_bytes((0, 7, 29), m.poses, m.K, 1000.0))
+    change_meta(path, poses=m.poses, numbers=(0, 7, 29))
     refused(r"do not have the same objects: \[0, 6, 29\] and", opened, root)
-    path.write_bytes(meta_bytes(m.numbers[::-1], m.poses[::-1], m.K, 1000.0))
+    change_meta(path, numbers=m.numbers[::-1], poses=m.poses[::-1])
     assert [o.obj_id for o in opened(root).frame(0).objects] == [1, 7, 30]
-    path.write_bytes(meta_bytes(m.numbers, m.poses, m.K + np.diag([1.0, 0, 0]), 1000.0))
+    change_meta(path, K=m.K + np.diag([1.0, 0, 0]))
     refused(r"camK\.npy and intrinsic_matrix .* 1\.00 px", opened, root)
 
 
-def test_counts_that_differ_are_named(root):
+def test_a_pose_and_an_annotation_too_many_are_told(root):
     path = home(root) / "camera_poses.npy"
-    poses = np.load(path)
-    np.save(path, poses[:4])
-    refused("holds 4 poses, and there are 6 images", opened, root)
-    np.save(path, np.concatenate([poses, poses[:1]]))
+    np.save(path, np.concatenate([np.load(path), np.load(path)[:1]]))
     (home(root) / "rgb/0002.png").unlink()
     notes = " ".join(opened(root).notes)
     assert "1 annotation(s) without image: 2" in notes
@@ -278,17 +265,16 @@ def test_labels_elsewhere_are_refused_and_strange_values_counted(root):
     notes = " ".join(opened(root).notes)
     assert "of 3 of 3 images looked at have values without an object: 77" in notes
     assert "3 annotated objects have no labelled pixel" in notes
-    for path, label in labels.items():
-        path.write_bytes(images.png_bytes(np.roll(label, (60, 80), axis=(0, 1))))
-    refused(r"only 1 are where their poses .*number \+ 1\)", opened, root)
     values = np.zeros(256, np.uint8)
     values[[1, 7, 30]] = 0, 6, 29  # without the one that is added
-    for path, label in labels.items():
-        path.write_bytes(images.png_bytes(values[label]))
-    refused(r"only 0 are .* 6 if a value is the number itself", opened, root)
-    for path, label in labels.items():
-        path.write_bytes(images.png_bytes(label[::2].copy()))
-    refused("160x60 pixels", opened, root)
+    for change, says in (
+        (lambda a: np.roll(a, (60, 80), axis=(0, 1)), r"only 1 are where .*number \+ 1\)"),
+        (lambda a: values[a], r"only 0 are .* 6 if a value is the number itself"),
+        (lambda a: a[::2].copy(), "160x60 pixels"),
+    ):
+        for path, label in labels.items():
+            path.write_bytes(images.png_bytes(change(label)))
+        refused(says, opened, root)
 
 
 def test_equal_objects_are_told_apart_by_where_they_stand_and_have_no_masks(root):
@@ -338,10 +324,10 @@ def test_a_tree_is_found_from_its_root_its_scenes_a_scene_and_a_camera(root):
 
 
 def test_a_meta_file_with_a_mirrored_pose_is_refused(root):
-    m = read_meta(home(root) / "meta/0000.mat")
-    poses = m.poses.copy()
+    path = home(root) / "meta/0000.mat"
+    poses = read_meta(path).poses.copy()
     poses[0, :, :3] *= -1
-    (home(root) / "meta/0000.mat").write_bytes(meta_bytes(m.numbers, poses, m.K, 1000.0))
+    change_meta(path, poses=poses)
     refused("mirrored", opened, root, error=NotRigidError)
 
 
@@ -361,8 +347,7 @@ def test_one_frame_on_its_own_is_read_and_its_depth_is_checked(root, tmp_path):
     for a, b in zip(scene.frame(0).objects, tree.frame(0).objects, strict=True):
         assert np.array_equal(a.T_cam_obj, b.T_cam_obj)
     assert scene.models().keys() == {1, 7, 30} and scene.mask(0, 0, visible=True) is None
-    m = read_meta(folder / "meta.mat")
-    (folder / "meta.mat").write_bytes(meta_bytes(m.numbers, m.poses, m.K, 100.0))
+    change_meta(folder / "meta.mat", factor_depth=100.0)
     refused("counts per metre", open_graspnet_frame, folder, error=UnitError)
     (folder / "depth.png").unlink()
     refused(r"has no depth\.png", open_graspnet_frame, folder)
