@@ -4,7 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
-from realsim.errors import NotRigidError
+from realsim.errors import InputError, NotRigidError
 from realsim.formats.graspit.scene import read_graspit_scene
 from realsim.geometry import se3
 from refusals import refused
@@ -98,16 +98,19 @@ def test_an_order_that_the_content_does_not_prove_is_an_error_with_the_evidence(
 
 def test_grasps_of_a_wrong_shape_are_refused(tmp_path):
     folder = write_scene(tmp_path)
-    with h5py.File(folder / "grasps.hdf5", "a") as file:
-        del file["brick"]
-        file["brick"] = np.zeros((3, 4, 4))
-    refused(r"shape \(3, 4, 4\)", read_graspit_scene, folder)
-    with h5py.File(folder / "grasps.hdf5", "a") as file:
-        del file["brick"]
-        file["brick"] = np.ones((3, 2, 4, 4))
-    refused("brick", read_graspit_scene, folder, error=NotRigidError)
+    for Ts, says, error in (
+        (np.zeros((3, 4, 4)), r"shape \(3, 4, 4\)", InputError),
+        (np.ones((3, 2, 4, 4)), "brick", NotRigidError),
+    ):
+        with h5py.File(folder / "grasps.hdf5", "a") as file:
+            del file["brick"]
+            file["brick"] = Ts
+        refused(says, read_graspit_scene, folder, error=error)
     (folder / "grasps.hdf5").write_bytes(b"no hdf5")
     refused("no HDF5", read_graspit_scene, folder)
+
+
+AT = "name: a, position: [0, 0, 0]"
 
 
 @pytest.mark.parametrize(
@@ -116,25 +119,13 @@ def test_grasps_of_a_wrong_shape_are_refused(tmp_path):
         ("object1: {file_path: a.usd, name: a}", "orientation, position"),
         ("- 1\n- 2", "no named objects"),
         ("a: !!python/object/apply:os.system ['true']", "no objects of a program"),
-        (
-            "o: {file_path: brick.usd, name: a, orientation: [1, 0, 0, .nan], position: [0, 0, 0]}",
-            "has to be finite",
-        ),
-        (
-            "o: {file_path: brick.usd, name: a, orientation: [2, 0, 0, 0], position: [0, 0, 0]}",
-            "length 2",
-        ),
-        (
-            "o: {file_path: gone.usd, name: a, orientation: [1, 0, 0, 0], position: [0, 0, 0]}",
-            r"gone\.stl",
-        ),
-        (
-            "o: {file_path: brick.usd, name: a, orientation: [1, 0, 0, 0], position: [0, 0, 0], "
-            "scale: [1, -1, 1]}",
-            "scale",
-        ),
+        (f"o: {{file_path: brick.usd, orientation: [1, 0, 0, .nan], {AT}}}", "has to be finite"),
+        (f"o: {{file_path: brick.usd, orientation: [2, 0, 0, 0], {AT}}}", "length 2"),
+        (f"o: {{file_path: gone.usd, orientation: [1, 0, 0, 0], {AT}}}", r"gone\.stl"),
+        (f"o: {{file_path: brick.usd, orientation: [1, 0, 0, 0], {AT}, scale: [1, -1, 1]}}",
+         "scale"),
     ],
-)
+)  # fmt: skip
 def test_a_bad_file_is_named(tmp_path, text, what):
     write_stl(tmp_path, "brick", EXTENTS["brick"])
     (tmp_path / "scene.yaml").write_text(text)

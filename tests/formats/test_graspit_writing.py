@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import placed_scenes
+from file_trees import bytes_of
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspit.grasps import WorldGrasps, read_grasp_file
 from realsim.formats.graspit.scene import read_graspit_scene
@@ -18,10 +19,8 @@ from tried_grasps import plain_grasps
 
 def tried(instance, obj_id, middle, n=12):
     """Return grasps from above that close along the object's y about a point of it."""
-    z = np.array([0.0, 0.0, -1.0])
-    R = np.stack([np.cross([0.0, 1.0, 0.0], z), [0.0, 1.0, 0.0], z], axis=1)
     at = np.asarray(middle) + np.linspace(-0.005, 0.005, n)[:, None] * [0, 0, 1]
-    Ts = se3.from_rt(np.tile(R, (n, 1, 1)), at)
+    Ts = se3.from_rt(np.tile(np.diag([-1.0, 1.0, -1.0]), (n, 1, 1)), at)
     return plain_grasps(
         Ts, obj_id=obj_id, instance=instance, scores=np.ones(n), base_scores=np.ones(n),
         slip_m=np.zeros((n, 4)), slip_rad=np.zeros((n, 4)),
@@ -29,19 +28,16 @@ def tried(instance, obj_id, middle, n=12):
 
 
 def grasps():
-    sets = (
-        tried(0, 1, [0.06, 0.02, 0.01]),
-        tried(1, 2, [0.0, 0.0, 0.02]),
-        tried(2, 1, [0.05, 0.02, 0.01], n=7),
-    )
-    return [paired_grasps(s) for s in sets]
+    middles = [
+        (0, 1, [0.06, 0.02, 0.01], 12),
+        (1, 2, [0, 0, 0.02], 12),
+        (2, 1, [0.05, 0.02, 0.01], 7),
+    ]
+    return [paired_grasps(tried(*row)) for row in middles]
 
 
 def write(scene, sets, folder):
-    out = ExportFolder.begin(folder, {"scene": scene.name})
-    written = write_graspit(scene, sets, out)
-    out.finish({})
-    return written
+    return placed_scenes.written(lambda s, out: write_graspit(s, sets, out), scene, folder)
 
 
 def same(found, scene, sets):
@@ -103,10 +99,9 @@ def test_a_table_that_leans_in_world_becomes_level(tmp_path):
 
 def test_the_same_scene_gives_the_same_bytes_and_several_go_into_one_export(tmp_path):
     scene = placed_scenes.placed_scene()
-    write(scene, grasps(), tmp_path / "a")
-    write(scene, grasps(), tmp_path / "b")
-    sums = [(tmp_path / n / "SHA256SUMS").read_text() for n in "ab"]
-    assert sums[0] == sums[1]
+    for name in "ab":
+        write(scene, grasps(), tmp_path / name)
+    assert bytes_of(tmp_path / "a") == bytes_of(tmp_path / "b")
     out = ExportFolder.begin(tmp_path / "c", {})
     for k in range(2):
         write_graspit(scene, grasps(), out.below(f"scenes/scene_{k}"))

@@ -48,14 +48,11 @@ def some_labels(seed=0, points=20, n=150):
     flat = np.sort(rng.choice(int(np.prod(grid)), n, replace=False))
     index = np.stack(np.unravel_index(flat, grid), axis=1)
     return GraspLabels(
-        points=rng.uniform(-0.1, 0.1, (points, 3)).astype(np.float32),
-        index=index,
+        points=rng.uniform(-0.1, 0.1, (points, 3)).astype(np.float32), index=index,
         angles_rad=frame.angles_rad()[index[:, 2]],
-        depths_m=np.array(frame.DEPTHS_M)[index[:, 3]],
-        openings_m=rng.uniform(0.01, 0.1, n),
-        friction=rng.integers(1, 11, n) / 10,
-        collision=rng.random(n) < 0.4,
-    )
+        depths_m=np.array(frame.DEPTHS_M)[index[:, 3]], openings_m=rng.uniform(0.01, 0.1, n),
+        friction=rng.integers(1, 11, n) / 10, collision=rng.random(n) < 0.4,
+    )  # fmt: skip
 
 
 def matrix_as_documented(towards, angle):
@@ -64,10 +61,8 @@ def matrix_as_documented(towards, angle):
     y = np.array([-towards[1], towards[0], 0.0])
     y = y / np.sqrt(y @ y)
     z = np.array([x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]])
-    turn = np.array(
-        [[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]]
-    )
-    return np.array([x, y, z]).T @ turn
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([x, y, z]).T @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
 
 
 # --- laws -------------------------------------------------------------------------------------
@@ -85,9 +80,8 @@ def test_to_graspnets_gripper_and_back_is_the_same_grasp(seed):
     np.testing.assert_allclose(np.linalg.det(there[:, :3, :3]), 1.0)
     distance = np.linalg.norm(Ts[:, None, :3, 3] - Ts[None, :, :3, 3], axis=-1)
     tips = there[:, :3, 3] + depths[:, None] * there[:, :3, 0]
-    np.testing.assert_allclose(
-        np.linalg.norm(tips[:, None] - tips[None], axis=-1), distance, atol=1e-12
-    )
+    between_tips = np.linalg.norm(tips[:, None] - tips[None], axis=-1)
+    np.testing.assert_allclose(between_tips, distance, atol=1e-12)
 
 
 def test_sets_in_a_view_and_back_are_the_same_grasps(tmp_path):
@@ -108,17 +102,15 @@ def test_sets_in_a_view_and_back_are_the_same_grasps(tmp_path):
         assert 0 < rows.sum() < len(s)
         np.testing.assert_allclose(found.Ts_obj_grasp, s.Ts_obj_grasp[rows], rtol=0, atol=2e-6)
         np.testing.assert_allclose(found.parameters["openings_m"], s.widths_m[rows], rtol=SINGLE)
-        np.testing.assert_allclose(
-            found.parameters["source"]["scores"], s.labels[rows], rtol=SINGLE
-        )
+        scores = found.parameters["source"]["scores"]
+        np.testing.assert_allclose(scores, s.labels[rows], rtol=SINGLE)
         assert np.isnan(found.scores).all()  # another's score is not ours
         np.testing.assert_array_equal(found.widths_m, s.widths_m[rows])
         for name, values in s.measures.items():
             np.testing.assert_array_equal(found.measures[name], values[rows])
     with np.load(tmp_path / "g.labels.npz") as beside:
-        np.testing.assert_array_equal(
-            beside["score"], np.concatenate([s.scores[~np.isnan(s.labels)] for s in sets])
-        )
+        scores = np.concatenate([s.scores[~np.isnan(s.labels)] for s in sets])
+        np.testing.assert_array_equal(beside["score"], scores)
     write_grasp_group(tmp_path / "few.npy", grasp_group(sets[:1], Ts_cam_obj))
     (tmp_path / "few.npy").replace(tmp_path / "g.npy")
     refused("shape", read_grasp_group, tmp_path / "g.npy")
@@ -145,9 +137,9 @@ def test_which_views_were_looked_at_is_kept(tmp_path):
 
 
 def test_collisions_belong_to_the_labels_they_were_written_of(tmp_path):
-    objects = [(some_labels(k, points=10 + 20 * k), None) for k in range(3)]
     rng = np.random.default_rng(0)
-    objects = [(labels, rng.random(len(labels)) < 0.5) for labels, _ in objects]
+    known = [some_labels(k, points=10 + 20 * k) for k in range(3)]
+    objects = [(labels, rng.random(len(labels)) < 0.5) for labels in known]
     path = write_collision_labels(tmp_path / "collision_labels.npz", objects)
     with np.load(path) as file:
         for k, (labels, collides) in enumerate(objects):
@@ -241,12 +233,6 @@ def test_a_rectangle_has_the_grippers_opening_and_height_in_pixels():
 # --- files that are broken ----------------------------------------------------------------------
 
 
-def broken_group(change):
-    rows = np.zeros((3, 17), dtype=np.float32)
-    rows[:, 4:13] = np.eye(3).ravel()
-    return change(rows)
-
-
 def put(at, value):
     def change(rows):
         rows[at] = value
@@ -265,7 +251,9 @@ def put(at, value):
     (lambda rows: rows.astype(object), "never objects"),
 ])  # fmt: skip
 def test_a_broken_group_is_refused_with_the_reason(tmp_path, change, says):
-    np.save(tmp_path / "g.npy", broken_group(change), allow_pickle=True)
+    rows = np.zeros((3, 17), dtype=np.float32)
+    rows[:, 4:13] = np.eye(3).ravel()
+    np.save(tmp_path / "g.npy", change(rows), allow_pickle=True)
     refused(says, read_grasp_group, tmp_path / "g.npy")
 
 

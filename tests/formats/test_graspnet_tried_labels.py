@@ -1,7 +1,6 @@
 """Tried grasps as GraspNet's labels, read by a reader that shares no code with the writer."""
 
-import importlib.util
-import sys
+import importlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,16 +21,9 @@ TWO_TALL = (*PLACES, (1, 0.1, -0.1, 0.4))
 
 @pytest.fixture(scope="module")
 def load_grasp():
-    sys.path.insert(0, str(BENCHMARKS))
-    try:
-        spec = importlib.util.spec_from_file_location(
-            "campaign_graspnet", BENCHMARKS / "campaign_graspnet.py"
-        )
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-    finally:
-        sys.path.remove(str(BENCHMARKS))
-    return module.load_grasp
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(BENCHMARKS)
+        return importlib.import_module("campaign_graspnet").load_grasp
 
 
 class WithGrasps(SceneInMemory):
@@ -71,9 +63,8 @@ def tree(tmp_path_factory):
 
 def held_in(scene, index):
     poses = {o.instance: o.T_cam_obj for o in scene.frame(index).objects}
-    return np.concatenate(
-        [poses[s.instance] @ s.Ts_obj_pads[s.good & executed(s)] for s in scene.grasps().sets]
-    )
+    sets = scene.grasps().sets
+    return np.concatenate([poses[s.instance] @ s.Ts_obj_pads[s.good & executed(s)] for s in sets])
 
 
 def test_what_held_comes_back_in_its_own_scene_and_on_its_own_thing(tree, load_grasp):
@@ -99,9 +90,8 @@ def test_what_held_comes_back_in_its_own_scene_and_on_its_own_thing(tree, load_g
 def test_frictions_are_graspnets_and_an_object_without_grasps_has_empty_labels(tree):
     root, scenes, _, _ = tree
     labels = np.load(root / "grasp_label/000_labels.npz")
-    count = sum(
-        int((s.good & executed(s)).sum()) for x in scenes for s in x.grasps().sets if s.obj_id == 1
-    )
+    of_one = [s for x in scenes for s in x.grasps().sets if s.obj_id == 1]
+    count = sum(int((s.good & executed(s)).sum()) for s in of_one)
     scores = labels["scores"]
     assert scores.shape == (count, 300, 12, 4) and (scores > 0).sum() == count
     np.testing.assert_allclose(np.unique(scores), [-1.0, 0.2, 0.6, 1.0], atol=1e-6)
