@@ -1,6 +1,7 @@
 """BOP scenes written: the same numbers, the same pixels, the same bytes after a kill."""
 
 import json
+from collections import Counter
 from dataclasses import replace
 
 import cv2
@@ -28,8 +29,7 @@ DOCUMENTS = ("scene_camera", "scene_gt", "scene_gt_info")
 def export(scene, out, config=None):
     folder = ExportFolder.begin(out, {"what": "a test"})
     written = write_bop_scene(scene, folder, config)
-    infos = scene.models_info()
-    write_bop_models(scene.models(), folder, infos=infos)
+    write_bop_models(scene.models(), folder, infos=scene.models_info())
     write_bop_root(folder, name="copy")
     folder.finish({})
     return written
@@ -91,14 +91,11 @@ def test_a_camera_suffix_and_an_onboarding_folder_come_back(tmp_path):
         write_bop_scene(open_labelled_scene(ref), folder)
     write_bop_root(folder, name="two")
     folder.finish({})
-    assert [r.name for r in find_scenes(tmp_path / "b")] == [
-        r.name for r in find_scenes(tmp_path / "a")
-    ]
-    for ref, other in zip(find_scenes(tmp_path / "a"), find_scenes(tmp_path / "b"), strict=True):
+    for pair in zip(find_scenes(tmp_path / "a"), find_scenes(tmp_path / "b"), strict=True):
+        assert pair[0].name == pair[1].name
         for name in DOCUMENTS:
-            assert json.loads(ref.layout.document(name).read_text()) == json.loads(
-                other.layout.document(name).read_text()
-            )
+            before, after = (json.loads(r.layout.document(name).read_text()) for r in pair)
+            assert before == after
     assert (tmp_path / "b/test/000003/gray_cam1/000001.png").is_file()
     assert (tmp_path / "b/camera_cam1.json").is_file() and (tmp_path / "b/camera.json").is_file()
     # Another name for scene, split and camera.
@@ -123,9 +120,8 @@ def test_a_pose_that_changed_is_written_and_the_rest_of_its_row_kept(tmp_path):
     export(ChangedScene(scene, put_elsewhere), tmp_path / "b")
     again = open_labelled_bop(tmp_path / "b")
     for o, p in zip(scene.frame(5).objects, again.frame(5).objects, strict=True):
-        np.testing.assert_allclose(
-            (shift @ o.T_cam_obj)[:3, 3], p.T_cam_obj[:3, 3], rtol=3e-16, atol=0
-        )
+        t = (shift @ o.T_cam_obj)[:3, 3]
+        np.testing.assert_allclose(t, p.T_cam_obj[:3, 3], rtol=3e-16, atol=0)
         assert p.entry["score"] == 0.25 and p.entry["cam_t_m2c"] != o.entry["cam_t_m2c"]
 
 
@@ -144,9 +140,8 @@ def test_visibility_is_counted_as_bop_defines_it(tmp_path):
         depth = cv2.imread(str(copy / f"depth/{int(image):06d}.png"), -1)
         for k, row in enumerate(rows):
             name = f"{int(image):06d}_{k:06d}.png"
-            whole, visible = (
-                cv2.imread(str(copy / kind / name), -1) > 0 for kind in ("mask", "mask_visib")
-            )
+            masks = [cv2.imread(str(copy / kind / name), -1) for kind in ("mask", "mask_visib")]
+            whole, visible = (mask > 0 for mask in masks)
             assert row["px_count_all"] == whole.sum()
             assert row["px_count_valid"] == (depth[whole] > 0).sum()
             assert row["px_count_visib"] == visible.sum()
@@ -161,9 +156,8 @@ def test_coco_has_the_visible_masks_and_the_whole_boxes(tmp_path):
     export(scene, tmp_path / "b")
     coco = json.loads((tmp_path / "b/test/000003/scene_gt_coco.json").read_text())
     assert [c["name"] for c in coco["categories"]] == ["box1", "box7"]
-    assert [(i["id"], i["file_name"]) for i in coco["images"]] == [
-        (i, f"rgb/{i:06d}.png") for i in scene.indices
-    ]
+    files = {i["id"]: i["file_name"] for i in coco["images"]}
+    assert files == {i: f"rgb/{i:06d}.png" for i in scene.indices}
     assert [a["id"] for a in coco["annotations"]] == list(range(1, len(coco["annotations"]) + 1))
     rows = [(i, k, o) for i in scene.indices for k, o in enumerate(scene.frame(i).objects)]
     rows = [r for r in rows if scene.mask(*r[:2], visible=True).any()]
@@ -182,15 +176,13 @@ def test_targets_are_the_visible_objects(tmp_path):
     edit(source / "scene_gt_info.json", lambda data: data["5"][0].update(visib_fract=0.09))
     export(open_labelled_bop(tmp_path / "a"), tmp_path / "b")
     targets = json.loads((tmp_path / "b/test_targets_bop19.json").read_text())
-    by_image = {t["im_id"]: {} for t in targets}
-    for t in targets:
-        assert t["scene_id"] == 3
-        by_image[t["im_id"]][t["obj_id"]] = t["inst_count"]
+    found = {(t["scene_id"], t["im_id"], t["obj_id"]): t["inst_count"] for t in targets}
     scene = open_labelled_bop(tmp_path / "a")
-    for i in scene.indices:
-        seen = [o.obj_id for o in scene.frame(i).objects if o.visible_fraction >= 0.1]
-        assert by_image[i] == {k: seen.count(k) for k in set(seen)}
-    assert by_image[5][1] == 1
+    assert len(found) == len(targets) and found[3, 5, 1] == 1
+    assert found == Counter(
+        (3, i, o.obj_id)
+        for i in scene.indices for o in scene.frame(i).objects if o.visible_fraction >= 0.1
+    )  # fmt: skip
     detection = json.loads((tmp_path / "b/test_targets_bop24.json").read_text())
     assert [t["im_id"] for t in detection] == [1, 5, 9, 13, 17]
     camera = json.loads((tmp_path / "b/camera.json").read_text())
@@ -216,14 +208,12 @@ def test_colour_may_be_jpeg_and_masks_left_out(tmp_path):
     assert off.mean() < 3
     assert not (tmp_path / "b/test/000003/mask").exists()
     # JPEG is copied as it is, and PNG made of it has its pixels.
+    jpeg = copy.colour_file(1)
     export(copy, tmp_path / "c")
-    assert (tmp_path / "c/test/000003/rgb/000001.jpg").read_bytes() == copy.colour_file(
-        1
-    ).read_bytes()
+    assert (tmp_path / "c/test/000003/rgb/000001.jpg").read_bytes() == jpeg.read_bytes()
     export(copy, tmp_path / "d", BopWriteConfig(colour="png"))
-    assert np.array_equal(
-        read_rgb(tmp_path / "d/test/000003/rgb/000001.png"), read_rgb(copy.colour_file(1))
-    )
+    same = read_rgb(tmp_path / "d/test/000003/rgb/000001.png")
+    assert np.array_equal(same, read_rgb(jpeg))
 
 
 def test_a_killed_export_goes_on_and_ends_with_the_same_bytes(tmp_path):

@@ -42,15 +42,18 @@ def rgb_of(k: int) -> np.ndarray:
     return np.random.default_rng(k).integers(0, 256, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
 
 
+def pycolmap_camera(number: int, model: str) -> pycolmap.Camera:
+    width, height = SIZE
+    return pycolmap.Camera(
+        camera_id=number, model=model, width=width, height=height, params=PARAMS[model]
+    )
+
+
 def make(folder: Path, Ts, cameras=("OPENCV",), *, text: bool = False, place="sparse/0") -> Path:
     """Write a project: image k has the camera k modulo their number."""
     model = pycolmap.Reconstruction()
     for c, name in enumerate(cameras, start=1):
-        params = PARAMS[name]
-        camera = pycolmap.Camera(
-            camera_id=c, model=name, width=SIZE[0], height=SIZE[1], params=params
-        )
-        model.add_camera_with_trivial_rig(camera)
+        model.add_camera_with_trivial_rig(pycolmap_camera(c, name))
     for k, T in enumerate(Ts):
         name = f"shot_{k + 8}.png"  # natural order: 8, 9, 10
         image = pycolmap.Image(image_id=len(Ts) - k, camera_id=1 + k % len(cameras), name=name)
@@ -68,9 +71,7 @@ def test_every_camera_model_keeps_its_rays(tmp_path, name, text):
     """Law: our camera projects to COLMAP's pixel less half a pixel, for each model."""
     make(tmp_path, poses(3), (name,), text=text)
     camera = read_model(tmp_path / "sparse/0").cameras[1]
-    theirs = pycolmap.Camera(
-        camera_id=1, model=name, width=SIZE[0], height=SIZE[1], params=PARAMS[name]
-    )
+    theirs = pycolmap_camera(1, name)
     points = np.random.default_rng(0).uniform([-0.3, -0.3, 0.9], [0.3, 0.3, 1.5], (50, 3))
     ours, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, camera.distortion)
     expected = np.array([theirs.img_from_cam(p) for p in points])
@@ -89,23 +90,28 @@ def test_poses_and_images_come_back(tmp_path, text):
     assert source.depth_unit_m is None and any("scale unknown" in n for n in source.notes)
 
 
+def text_model(folder: Path, **changed: str) -> Path:
+    """Write a model by hand, after COLMAP's own description of its text files."""
+    files = {
+        "cameras": "# Camera list\n7 PINHOLE 40 30 35 36 20.5 15.25\n",
+        "images": "# Number of images: 1\n3 0.5 0.5 -0.5 0.5 0.1 -0.2 0.7 7 a.png\n\n",
+        "points3D": "1 0 0 1 9 9 9 -1\n",
+    } | changed
+    folder.mkdir(exist_ok=True)
+    for name, text in files.items():
+        (folder / f"{name}.txt").write_text(text)
+    cv2.imwrite(str(folder / "a.png"), np.zeros((30, 40, 3), np.uint8))
+    return folder
+
+
 def test_the_text_by_hand(tmp_path):
-    """Known answer: a model written by hand, after COLMAP's own description of its text files."""
-    q, t = [0.5, 0.5, -0.5, 0.5], [0.1, -0.2, 0.7]  # w x y z: a turn by 120 degrees
-    model = tmp_path / "sparse"
-    model.mkdir()
-    (model / "cameras.txt").write_text("# Camera list\n7 PINHOLE 40 30 35 36 20.5 15.25\n")
-    (model / "images.txt").write_text(
-        f"# Image list\n3 {' '.join(map(str, q))} {' '.join(map(str, t))} 7 a.png\n\n"
-    )
-    (model / "points3D.txt").write_text("# 3D point list\n")
-    (tmp_path / "images").mkdir()
-    cv2.imwrite(str(tmp_path / "images/a.png"), rgb_of(0)[..., ::-1])
-    source = open_colmap(tmp_path, metres_per_unit=2.0)
-    R = Rotation.from_quat([*q[1:], q[0]]).as_matrix()
+    """Known answer: a model written by hand is read as what it says, in metres."""
+    source = open_colmap(text_model(tmp_path), metres_per_unit=2.0)
+    # w x y z of the file are 0.5, 0.5, -0.5, 0.5: a turn by 120 degrees.
+    R = Rotation.from_quat([0.5, -0.5, 0.5, 0.5]).as_matrix()
     T = next(source.frames()).T_world_cam
     np.testing.assert_allclose(T[:3, :3], R.T, atol=1e-12)
-    np.testing.assert_allclose(T[:3, 3], 2.0 * (-R.T @ t), atol=1e-12)
+    np.testing.assert_allclose(T[:3, 3], 2.0 * (-R.T @ [0.1, -0.2, 0.7]), atol=1e-12)
     assert (source.intrinsics.cx, source.intrinsics.cy) == (20.0, 14.75)
     assert not any("scale unknown" in n for n in source.notes)
 
@@ -225,19 +231,6 @@ def test_what_cannot_be_written_is_said(store, tmp_path):
     poseless = ChangedScene(open_session_scene(store), lambda f: replace(f, T_world_cam=None))
     folder = ExportFolder.begin(tmp_path / "x", {})
     refused("none of the 3 images has a camera pose", write_colmap, poseless, folder)
-
-
-def text_model(folder: Path, **changed: str) -> Path:
-    files = {
-        "cameras": "7 PINHOLE 40 30 35 36 20.5 15.25\n",
-        "images": "# Number of images: 1\n3 0.5 0.5 -0.5 0.5 0.1 -0.2 0.7 7 a.png\n\n",
-        "points3D": "1 0 0 1 9 9 9 -1\n",
-    } | changed
-    folder.mkdir(exist_ok=True)
-    for name, text in files.items():
-        (folder / f"{name}.txt").write_text(text)
-    cv2.imwrite(str(folder / "a.png"), np.zeros((30, 40, 3), np.uint8))
-    return folder
 
 
 @pytest.mark.parametrize(

@@ -48,15 +48,9 @@ class Long:
     @lru_cache(maxsize=1)
     def frame(self, index):
         T_world_cam = se3.from_rt(se3.exp_so3([np.pi, 0, 1e-3 * np.sin(index)]), [0, 0, 0.7])
-        objects = [
-            LabelledObject(
-                obj_id=k + 1, instance=k,
-                T_cam_obj=se3.invert(T_world_cam) @ se3.from_translation([0.0, 0, 0]),
-            )
-            for k in range(1)
-        ]
+        thing = LabelledObject(obj_id=1, instance=0, T_cam_obj=se3.invert(T_world_cam))
         return LabelledFrame(index=index, intrinsics=CAMERA, depth_unit_m=1e-3,
-                             objects=tuple(objects), T_world_cam=T_world_cam)
+                             objects=(thing,), T_world_cam=T_world_cam)
 
     def colour_file(self, index):
         return self.home / "colour.png"

@@ -28,12 +28,8 @@ def tried(instance, obj_id, middle, n=12):
 
 
 def grasps():
-    middles = [
-        (0, 1, [0.06, 0.02, 0.01], 12),
-        (1, 2, [0, 0, 0.02], 12),
-        (2, 1, [0.05, 0.02, 0.01], 7),
-    ]
-    return [paired_grasps(tried(*row)) for row in middles]
+    first, box = tried(0, 1, [0.06, 0.02, 0.01]), tried(1, 2, [0.0, 0.0, 0.02])
+    return [paired_grasps(s) for s in (first, box, tried(2, 1, [0.05, 0.02, 0.01], n=7))]
 
 
 def write(scene, sets, folder):

@@ -101,6 +101,6 @@ def test_missing_and_broken_files_are_named(dataset, tmp_path):
     refused("annotation of image 0", read_graspnet_scene, root)
     (root / "annotations/0009.xml").rename(root / "annotations/0000.xml")
     np.save(root / "cam0_wrt_table.npy", np.diag([1.0, 1.0, -1.0, 1.0]))
-    refused("", read_graspnet_scene, scene_of(dataset), error=NotRigidError)
+    refused("mirrored", read_graspnet_scene, scene_of(dataset), error=NotRigidError)
     np.save(root / "cam0_wrt_table.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     refused("only numbers", read_graspnet_scene, scene_of(dataset))

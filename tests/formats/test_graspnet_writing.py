@@ -167,8 +167,7 @@ def test_a_textured_model_comes_back_with_its_texture(source, tmp_path):
     assert any("no mesh of object(s) 006, 029" in n for n in result.notes)
     found = load_mesh(tmp_path / "out/models/000/textured.obj", "m")
     assert np.array_equal(found.texture, mesh.texture)
-    corners = np.abs(found.vertices[found.faces] - mesh.vertices[mesh.faces]).max()
-    assert corners < 1e-8
+    assert np.abs(found.vertices[found.faces] - mesh.vertices[mesh.faces]).max() < 1e-8
     assert np.abs(found.uv[found.faces] - mesh.uv[mesh.faces]).max() < 1e-8
 
 
