@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from realsim.errors import InputError, UnitError
+from realsim.errors import UnitError
 from realsim.formats.folders import (
     FolderChoice,
     FrameState,
@@ -49,8 +49,8 @@ def make(folder: Path, numbers, colour="rgb_{:04d}.png", depth="depth_{:04d}.png
     return folder
 
 
-def opened(folder: Path):
-    return open_folder(folder, CAMERA, choice=MM)
+def opened(folder: Path, *poses: list[FrameState]):
+    return open_folder(folder, CAMERA, poses, choice=MM)
 
 
 def number_of(frame) -> int:
@@ -64,12 +64,8 @@ def number_of(frame) -> int:
 
 
 def states(numbers, name="{:04d}") -> list[FrameState]:
-    found = []
-    for k in numbers:
-        T = np.eye(4)
-        T[0, 3] = k / 100
-        found.append(FrameState(name=name.format(k) if name else "", where=f"row {k}", T_base_ee=T))
-    return found
+    Ts = {k: se3.from_translation([k / 100, 0, 0]) for k in numbers}
+    return [FrameState(name=name.format(k), where=f"row {k}", T_base_ee=T) for k, T in Ts.items()]
 
 
 @pytest.mark.parametrize(
@@ -85,7 +81,7 @@ def states(numbers, name="{:04d}") -> list[FrameState]:
 def test_every_frame_gets_its_own_parts(tmp_path, colour, depth):
     numbers = [0, 1, 2, 9, 10, 11]
     make(tmp_path, numbers, colour, depth)
-    source = open_folder(tmp_path, CAMERA, [states(numbers)], choice=MM)
+    source = opened(tmp_path, states(numbers))
     assert [number_of(f) for f in source.frames()] == numbers
     assert [f.time_s for f in source.frames(3)] == [3, 4, 5]
 
@@ -102,7 +98,7 @@ def test_gaps_and_order_do_not_change_what_belongs_together(tmp_path):
             write(tmp_path, f"depth_{k}.png", depth_of(k))
     rows = [s for s in states(numbers) if int(s.name) not in gone[2]]
     rng.shuffle(rows)
-    source = open_folder(tmp_path, CAMERA, [rows], choice=MM)
+    source = opened(tmp_path, rows)
     left = sorted(set(numbers) - set.union(*gone))
     assert [number_of(f) for f in source.frames()] == left
     said = " ".join(source.notes)
@@ -114,7 +110,7 @@ def test_incomplete_frames_are_named(tmp_path):
     make(tmp_path, range(5))
     (tmp_path / "depth_0002.png").unlink()
     (tmp_path / "rgb_0004.png").unlink()
-    source = open_folder(tmp_path, CAMERA, [states([0, 1, 2])], choice=MM)
+    source = opened(tmp_path, states([0, 1, 2]))
     assert [number_of(f) for f in source.frames()] == [0, 1]
     said = " ".join(source.notes)
     assert "rgb_0002.png (no depth image)" in said and "rgb_0003.png (no pose)" in said
@@ -128,8 +124,8 @@ def test_numbers_with_other_prefixes_are_never_shifted():
     assert join_names(left, gapped, "a", "b").pairs == {0: 1, 2: 2, 4: 0}
     refused(r"differ by -1", join_names, left, [f"kinect_{k + 1}" for k in range(5)], "a", "b")
     refused("no number is on both", join_names, left, ["kinect_17", "kinect_19"], "a", "b")
-    with pytest.raises(InputError, match="no single number"):
-        join_names(["12-30-05", "12-31-07"], ["12-30-06", "12-31-08"], "a", "b")
+    times = ["12-30-05", "12-31-07"], ["12-30-06", "12-31-08"]
+    refused("no single number", join_names, *times, "a", "b")
 
 
 # --- what is refused --------------------------------------------------------------------------
@@ -143,24 +139,25 @@ def test_rows_without_names_count_only_without_gaps():
     refused("names no image", join_states, keys, [*states([1]), *states([2], name="")])
 
 
-def test_two_images_of_one_name(tmp_path):
-    make(tmp_path, [1])
-    write(tmp_path, "rgb_0001.jpg", rgb_of(1))
-    refused(r"rgb_0001\.jpg and rgb_0001\.png are two images", opened, tmp_path)
-
-
-def test_several_sizes(tmp_path):
+@pytest.mark.parametrize(("name", "size", "says"), [
+    ("rgb_0001.jpg", (30, 40), r"rgb_0001\.jpg and rgb_0001\.png are two images"),
+    ("rgb_0001.png", (60, 80), r"rgb_0001\.png is 80x60"),
+    ("depth_0001.png", (30, 40), r"depth_0001\.png has 8 bits"),  # a picture of the depth
+])  # fmt: skip
+def test_an_image_that_does_not_fit_is_named(tmp_path, name, size, says):
     make(tmp_path, range(3))
-    write(tmp_path, "rgb_0001.png", rgb_of(1, (60, 80)))
-    refused(r"rgb_0001\.png is 80x60", opened, tmp_path)
+    write(tmp_path, name, rgb_of(1, size))
+    refused(says, opened, tmp_path)
 
 
 def test_no_camera_and_another_camera(tmp_path):
     make(tmp_path, range(2))
-    with pytest.raises(InputError, match=r"camera of the images \(40x30 px\) is not known"):
-        open_folder(tmp_path, None, choice=MM)
     other = CameraIntrinsics(width=80, height=60, fx=70, fy=70, cx=40, cy=30)
-    refused(r"80x60 px, the images are 40x30", open_folder, tmp_path, other, choice=MM)
+    for camera, says in (
+        (None, r"camera of the images \(40x30 px\) is not known"),
+        (other, "80x60 px, the images are 40x30"),
+    ):
+        refused(says, open_folder, tmp_path, camera, choice=MM)
 
 
 def test_empty_missing_file_and_below(tmp_path):
@@ -191,12 +188,6 @@ def test_an_image_marked_to_be_shown_turned_is_refused(tmp_path, ending):
     refused(rf"rgb_0001\.{ending} is marked to be shown turned", opened, tmp_path)
 
 
-def test_a_picture_of_the_depth_is_no_depth(tmp_path):
-    make(tmp_path, range(2))
-    write(tmp_path, "depth_0001.png", rgb_of(1))
-    refused(r"depth_0001\.png has 8 bits", opened, tmp_path)
-
-
 def test_depth_on_other_pixels_needs_a_decision(tmp_path):
     for k in range(3):
         write(tmp_path, f"{k}.jpg", rgb_of(k))
@@ -210,8 +201,9 @@ def test_depth_on_other_pixels_needs_a_decision(tmp_path):
 def test_the_depth_unit_is_asked_for_with_evidence(tmp_path):
     make(tmp_path, range(3))
     refused(r"0\.65\d? m with 0\.001.*0\.06\d+ m with 0\.0001", open_folder, tmp_path, CAMERA)
-    with pytest.raises(UnitError, match=r"median depth is 0\.0065"):
-        open_folder(tmp_path, CAMERA, choice=FolderChoice(depth_unit_m=1e-5))
+    tiny = FolderChoice(depth_unit_m=1e-5)
+    says = r"median depth is 0\.0065"
+    refused(says, open_folder, tmp_path, CAMERA, choice=tiny, error=UnitError)
 
 
 # --- depth whose bits were turned -------------------------------------------------------------

@@ -36,8 +36,7 @@ def test_the_file_has_graspgens_keys_and_axes(tmp_path):
     s = tried_set(np.random.default_rng(2), 25)
     data = json.loads(write_graspgen(tmp_path / "a.json", s, file="mug.obj").read_text())
     assert data["object"] == {"file": "mug.obj", "scale": 1.0}
-    T = np.asarray(data["grasps"]["transforms"])
-    mask = np.asarray(data["grasps"]["object_in_gripper"])
+    T, mask = (np.asarray(data["grasps"][name]) for name in ("transforms", "object_in_gripper"))
     assert mask.dtype == bool and mask.shape == T.shape[:1]
     rows = executed(s)
     # approach +z, closing along x, from the hand's base
