@@ -51,13 +51,13 @@ def test_depth_units() -> None:
     assert pixels.unit_of(depth, "t", "mono16", 5e-4, 2e-4)[0] == 5e-4
     refused("has no unit", pixels.unit_of, depth, "t", "mono16", None, None, error=UnitError)
     for counts in (30, 50000):
-        with pytest.raises(UnitError, match="depth_unit_m="):
-            pixels.unit_of([np.full((4, 4), counts, np.uint16)], "t", "16UC1", None, None)
+        image, how = np.full((4, 4), counts, np.uint16), ("t", "16UC1", None, None)
+        refused("depth_unit_m=", pixels.unit_of, [image], *how, error=UnitError)
     near, far = (np.full((4, 4), z, np.float32) for z in (0.5, 6.0))
     assert pixels.unit_of([near], "t", "32FC1", None, None)[0] == 1e-4
     assert pixels.unit_of([far], "t", "32FC1", None, None)[0] == 1e-3
-    with pytest.raises(UnitError):
-        pixels.unit_of([near * 1000], "t", "32FC1", None, None)
+    millimetres = [near * 1000]
+    refused("depth", pixels.unit_of, millimetres, "t", "32FC1", None, None, error=UnitError)
 
 
 # --- joints ---------------------------------------------------------------------------------------
@@ -80,8 +80,7 @@ def test_joints_are_joined_by_name_and_interpolated() -> None:
     a, b = rng.uniform(-3, 3, (2, 6))
     track = track_of([1.0, 1.1], [a, b], prefix="left_")
     found = track.at(round(1.025 * S), 0.25)
-    assert found is not None
-    assert np.allclose(found[0], 0.75 * a + 0.25 * b)
+    assert found is not None and np.allclose(found[0], 0.75 * a + 0.25 * b)
     assert found[1] == pytest.approx(np.abs(b - a).max() / 0.1)
     assert track.at(round(1.4 * S), 0.25) is None
     assert track_of([1.0, 2.0], [a, b]).at(round(1.5 * S), 0.25) is None
@@ -123,43 +122,33 @@ def test_chains_are_composed_and_edges_follow_their_twist() -> None:
     send(tree, "b", "c", se3.invert(T_cb) @ se3.exp(xi), 1.1, False)
     send(tree, "c", "d", se3.invert(T_dc), 0, True)
     tree.finish()
-    found = tree.lookup("a", "d", round(1.03 * S), 0.25)
     expected = T_ab @ se3.invert(T_cb) @ se3.exp(0.3 * xi) @ se3.invert(T_dc)
-    assert found is not None
-    assert np.allclose(found, expected, atol=1e-12)
-    back = tree.lookup("d", "a", round(1.03 * S), 0.25)
-    assert back is not None
-    assert np.allclose(back @ found, np.eye(4), atol=1e-12)
+    found, back = (tree.lookup(*way, round(1.03 * S), 0.25) for way in (("a", "d"), ("d", "a")))
+    assert found is not None and np.allclose(found, expected, atol=1e-12)
+    assert back is not None and np.allclose(back @ found, np.eye(4), atol=1e-12)
     assert tree.lookup("a", "d", 2 * S, 0.25) is None
     assert tree.lookup("a", "nowhere", S, 0.25) is None
     assert tree.times_ns("a", "d").tolist() == [S, round(1.1 * S)]
 
 
-def ur_tree(base: str, tool: str, T: Any) -> TfTree:
-    tree = TfTree()
-    send(tree, base, "wrist_3_link", T, 1.0, False)
-    send(tree, "wrist_3_link", tool, np.eye(4), 0.0, True)
-    tree.finish()
-    return tree
-
-
 def test_arm_frames_are_named_when_not_there_or_not_one() -> None:
-    tree = ur_tree("base", "tool0", np.eye(4))
+    tree = TfTree()
+    send(tree, "base", "wrist_3_link", np.eye(4), 1.0, False)
+    send(tree, "wrist_3_link", "tool0", np.eye(4), 0.0, True)
     send(tree, "elsewhere", "marker", np.eye(4), 0, True)
+    tree.finish()
     assert arm_frames(tree, None, None, False) is not None
     refused("no frame 'flange'", arm_frames, tree, None, "flange", False)
     send(tree, "tool0", "gripper_base", np.eye(4), 0, True)
     tree.finish()
     found = arm_frames(tree, None, None, False)
-    assert found is not None
-    assert found[:2] == ("base", "tool0")  # the gripper's base is not the arm's
+    assert found is not None and found[:2] == ("base", "tool0")  # not the gripper's base
     refused("does not join", arm_frames, tree, "elsewhere", None, False)
     send(tree, "right_base", "right_tool0", np.eye(4), 0, True)
     tree.finish()
     refused("several arms", arm_frames, tree, None, None, False)
     found = arm_frames(tree, None, "right_tool0", False)
-    assert found is not None
-    assert found[:2] == ("right_base", "right_tool0")
+    assert found is not None and found[:2] == ("right_base", "right_tool0")
     assert arm_frames(TfTree(), None, None, False) is None
 
 

@@ -30,21 +30,16 @@ def test_a_heap_in_which_the_library_would_go_round_for_ever_is_refused(tmp_path
 # --- recordings -----------------------------------------------------------------------------------
 
 
-def edited_metadata(tmp_path: Path, old: str, new: str) -> Path:
-    path = recorded(tmp_path, "mcap", 3).path
-    file = path / "metadata.yaml"
-    text = file.read_text()
-    assert old in text
-    file.write_text(text.replace(old, new))
-    return path
-
-
 @pytest.mark.parametrize(
     ("old", "new"),
     [("message_count: ", "message_count: x"), ("name: /camera", "name: [/camera] #")],
 )
 def test_a_damaged_table_of_contents_is_refused(tmp_path: Path, old: str, new: str) -> None:
-    refused("recording", open_bag, edited_metadata(tmp_path, old, new))
+    path = recorded(tmp_path, "mcap", 3).path
+    text = (path / "metadata.yaml").read_text()
+    assert old in text
+    (path / "metadata.yaml").write_text(text.replace(old, new))
+    refused("recording", open_bag, path)
 
 
 def test_lengths_of_gigabytes_in_recordings_are_refused_or_not_believed(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from refusals import refused
 LENGTHS = (3, 7, 4, 1, 5)
 FPS = 10
 SIZE = (32, 48)
+EPISODES = "meta/episodes/*/*.parquet"
 CAMERAS = {f"observation.images.{n}": LeRobotCamera(size=SIZE) for n in "ab"}
 FEATURES = {
     "observation.state": LeRobotFeature(dtype="float32", names=("x", "y")),
@@ -81,9 +82,9 @@ class Source:
         return replace(whole, **self.change)
 
 
-def write(folder, source=None, per_file=2):
+def write(folder, source=None, **how):
     export = ExportFolder.begin(folder, {"what": "test"})
-    written = write_lerobot(source or Source(), export, episodes_per_file=per_file)
+    written = write_lerobot(source or Source(), export, episodes_per_file=2, **how)
     export.finish({})
     return written
 
@@ -96,8 +97,6 @@ def folder(tmp_path_factory):
 
 
 def rows_of(folder, pattern):
-    import pyarrow.parquet as pq
-
     files = sorted(folder.glob(pattern))
     return [row for f in files for row in pq.read_table(f).to_pylist()]
 
@@ -117,23 +116,20 @@ def test_the_steps_are_those_that_were_given(folder):
     assert len(rows) == sum(LENGTHS)
     at = 0
     for k, n in enumerate(LENGTHS):
-        mine, given = rows[at : at + n], numbers(k)
-        for key in ("observation.state", "action"):
-            found = np.array([r[key] for r in mine], np.float32)
-            np.testing.assert_array_equal(found, given[key].astype(np.float32))
-        assert [r["phase"] for r in mine] == given["phase"].tolist()
-        assert [r["next.done"] for r in mine] == given["next.done"].tolist()
-        assert [r["index"] for r in mine] == list(range(at, at + n))
-        assert [r["frame_index"] for r in mine] == list(range(n))
-        assert {r["episode_index"] for r in mine} == {k}
-        assert {r["task_index"] for r in mine} == {k % 2}
-        np.testing.assert_array_equal([r["timestamp"] for r in mine],
-                                      (np.arange(n) / FPS).astype(np.float32))  # fmt: skip
+        steps = np.arange(n)
+        expected = numbers(k) | {
+            "index": at + steps, "frame_index": steps, "timestamp": steps / FPS,
+            "episode_index": np.full(n, k), "task_index": np.full(n, k % 2),
+        }  # fmt: skip
+        for key, given in expected.items():
+            found = np.array([r[key] for r in rows[at : at + n]])
+            single = np.float32 if given.dtype == np.float64 else given.dtype
+            np.testing.assert_array_equal(found, given.astype(single), err_msg=key)
         at += n
 
 
 def test_the_episodes_windows_tile_the_tables_and_the_videos(folder):
-    episodes = rows_of(folder, "meta/episodes/*/*.parquet")
+    episodes = rows_of(folder, EPISODES)
     assert [e["length"] for e in episodes] == list(LENGTHS)
     assert [e["data/file_index"] for e in episodes] == [0, 0, 1, 1, 2]
     edge = 0
@@ -145,18 +141,16 @@ def test_the_episodes_windows_tile_the_tables_and_the_videos(folder):
             mine = [e for e in episodes if e[f"videos/{camera}/file_index"] == number]
             edge = 0.0
             for e in mine:
-                assert e[f"videos/{camera}/from_timestamp"] == edge
-                edge = e[f"videos/{camera}/to_timestamp"]
-                assert edge - e[f"videos/{camera}/from_timestamp"] == pytest.approx(
-                    e["length"] / FPS, abs=1e-12
-                )
+                begin, end = (e[f"videos/{camera}/{x}_timestamp"] for x in ("from", "to"))
+                assert begin == edge and end - begin == pytest.approx(e["length"] / FPS, abs=1e-12)
+                edge = end
             path = layout.VIDEO_PATH.format(video_key=camera, chunk_index=0, file_index=number)
             times, _ = decoded(folder / path)
             np.testing.assert_allclose(times, np.arange(round(edge * FPS)) / FPS, atol=1e-9)
 
 
 def test_a_frame_at_its_episodes_time_is_its_picture(folder):
-    for e in rows_of(folder, "meta/episodes/*/*.parquet"):
+    for e in rows_of(folder, EPISODES):
         k = e["episode_index"]
         for camera in CAMERAS:
             place = {n: e[f"videos/{camera}/{n}"] for n in ("chunk_index", "file_index")}
@@ -172,22 +166,19 @@ def test_statistics_are_those_of_all_steps_and_pictures(folder):
     stats = json.loads((folder / layout.STATS).read_text())
     for key in ("observation.state", "action"):
         whole = np.concatenate([numbers(k)[key] for k in range(len(LENGTHS))]).astype(np.float32)
-        for name, of in (("min", np.min), ("max", np.max), ("mean", np.mean), ("std", np.std)):
-            np.testing.assert_allclose(
-                stats[key][name], of(whole.astype(np.float64), axis=0), atol=1e-12
-            )
+        for name in ("min", "max", "mean", "std"):
+            of = getattr(np, name)(whole.astype(np.float64), axis=0)
+            np.testing.assert_allclose(stats[key][name], of, atol=1e-12)
         assert stats[key]["count"] == [sum(LENGTHS)]
     for camera in CAMERAS:
         seen = np.stack([p[camera] for k, n in enumerate(LENGTHS) for p in pictures(k, n)]) / 255
-        for name, of in (("min", np.min), ("max", np.max), ("mean", np.mean), ("std", np.std)):
-            found = np.array(stats[camera][name])
+        for name in ("min", "max", "mean", "std"):
+            found, of = np.array(stats[camera][name]), getattr(np, name)(seen, axis=(0, 1, 2))
             assert found.shape == (3, 1, 1)
-            np.testing.assert_allclose(found[:, 0, 0], of(seen, axis=(0, 1, 2)), atol=1e-9)
+            np.testing.assert_allclose(found[:, 0, 0], of, atol=1e-9)
 
 
 def test_info_says_what_the_tables_hold(folder):
-    import pyarrow.parquet as pq
-
     info = json.loads((folder / layout.INFO).read_text())
     assert info["codebase_version"] == "v3.0"
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (5, 20, 2)
@@ -205,10 +196,9 @@ def test_info_says_what_the_tables_hold(folder):
 
 
 def test_a_killed_export_goes_on_at_the_next_episode(folder, tmp_path):
-    first = Source(dies_at=3)
+    first, second = Source(dies_at=3), Source()
     with pytest.raises(KeyboardInterrupt):
         write(tmp_path / "set", first)
-    second = Source()
     written = write(tmp_path / "set", second)
     assert first.asked + second.asked == list(range(len(LENGTHS)))
     assert written.frames == sum(LENGTHS)
@@ -277,8 +267,7 @@ def test_depth_comes_back_within_its_codes_and_says_how_they_are_read(tmp_path):
 def test_what_is_known_of_an_episode_is_a_column_of_meta_episodes(tmp_path):
     known = {"success": True, "p_hold": 0.75, "failure": ""}
     write(tmp_path / "set", Source(change={"metadata": known}))
-    rows = [r for f in sorted((tmp_path / "set/meta/episodes").rglob("*.parquet"))
-            for r in pq.read_table(f).to_pylist()]  # fmt: skip
+    rows = rows_of(tmp_path / "set", EPISODES)
     assert len(rows) == len(LENGTHS)
     assert all({k: r[k] for k in known} == known for r in rows)
 
@@ -286,12 +275,10 @@ def test_what_is_known_of_an_episode_is_a_column_of_meta_episodes(tmp_path):
 def test_encoding_elsewhere_gives_the_same_bytes(folder, tmp_path):
     """Episodes may come from other processes, as long as they come in order."""
     source = Source()
-    export = ExportFolder.begin(tmp_path / "set", {"what": "test"})
 
     def elsewhere(numbers, take):
         for k, episode in [(k, spool.encoded(source, k)) for k in numbers]:
             take(k, pickle.loads(pickle.dumps(episode)))
 
-    write_lerobot(source, export, episodes_per_file=2, encode=elsewhere)
-    export.finish({})
+    write(tmp_path / "set", source, encode=elsewhere)
     assert bytes_of(tmp_path / "set") == bytes_of(folder)
