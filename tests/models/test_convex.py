@@ -7,34 +7,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
+from scipy.spatial import ConvexHull
 
 from realsim.errors import InputError
-from realsim.geometry.mesh import decimated, hull_vertices
+from realsim.geometry.mesh import decimated, hull_vertices, mass_properties
 from realsim.geometry.parts import part
-from realsim.models.convex import (
-    ConvexConfig,
-    collision_obj,
-    convex_parts,
-    parts_from_collision_obj,
-)
+from realsim.models import convex
+from realsim.models.convex import ConvexConfig, collision_obj, convex_parts
 from realsim.models.convex_hulls import fewest, hull_volume, outermost
 from realsim.records import Mesh
 from refusals import refused
 from trimesh_solids import box, solid
 
 QUICK = ConvexConfig(thresholds=(0.1, 0.05), mcts_iterations=10, mcts_depth=1)
-
-
-def annulus(sections=24):
-    import trimesh
-
-    return solid(trimesh.creation.annulus(0.02, 0.03, 0.03, sections=sections))
+RING = solid(trimesh.creation.annulus(0.02, 0.03, 0.03, sections=24))
 
 
 def inside(parts, points):
     """Whether each point lies in one of the parts."""
-    from scipy.spatial import ConvexHull
-
     within = np.zeros(len(points), dtype=bool)
     for p in parts:
         eq = ConvexHull(p).equations
@@ -53,7 +44,7 @@ def test_a_convex_mesh_is_its_hull():
 
 def test_a_ring_is_cut_kept_and_found_again_by_every_run_of_the_user(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
-    ring, folders = annulus(), (tmp_path / "one", tmp_path / "one", tmp_path / "other")
+    ring, folders = RING, (tmp_path / "one", tmp_path / "one", tmp_path / "other")
     cut, *others = (convex_parts(ring, QUICK, folder) for folder in folders)
     assert cut.method == "coacd" and len(cut.parts) > 3 and 0.9 <= cut.volume_ratio <= 1.1
     full = sum(hull_volume(p) for p in cut.parts)
@@ -67,18 +58,15 @@ def test_a_ring_is_cut_kept_and_found_again_by_every_run_of_the_user(tmp_path, m
 
 
 def solid_volume(mesh):
-    from realsim.geometry.mesh import mass_properties
-
     return mass_properties(mesh, 1.0).volume_m3
 
 
 @pytest.mark.slow
 def test_an_open_mesh_is_cut_and_says_so_and_faces_that_look_inwards_make_no_difference():
-    ring = annulus()
-    cut = convex_parts(replace(ring, faces=ring.faces[1:]), QUICK)
+    cut = convex_parts(replace(RING, faces=RING.faces[1:]), QUICK)
     assert cut.method == "coacd" and "not closed" in cut.notes[0]
     assert not inside(cut.parts, np.zeros((1, 3)))[0]
-    flipped = convex_parts(replace(ring, faces=ring.faces[:, ::-1]), QUICK)
+    flipped = convex_parts(replace(RING, faces=RING.faces[:, ::-1]), QUICK)
     assert flipped.volume_ratio == pytest.approx(1.0, abs=0.1) and flipped.notes == ()
 
 
@@ -124,20 +112,19 @@ convex_parts(part("flange").mesh, ConvexConfig(thresholds=(0.02,), mcts_iteratio
 """
 
 
-def children_of(pid):
-    found = []
-    for line in subprocess.run(
-        ["ps", "-eo", "pid=,ppid=,stat="], capture_output=True, text=True, check=True
-    ).stdout.splitlines():
-        child, parent, state = line.split()
-        if int(parent) == pid and not state.startswith("Z"):
-            found.append(int(child))
-    return found
+def running():
+    """Return the processes that run, each with its parent's number."""
+    listed = subprocess.run(["ps", "-eo", "pid=,ppid=,stat="], capture_output=True, text=True)
+    rows = [line.split() for line in listed.stdout.splitlines()]
+    return {int(pid): int(parent) for pid, parent, state in rows if not state.startswith("Z")}
 
 
-def is_running(pid):
-    said = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True)
-    return said.stdout.strip() not in ("", "Z", "Z+")
+def waited_for(found, seconds):
+    """Return what `found()` finds, asked again until that is something or the time is over."""
+    end = time.monotonic() + seconds
+    while not (result := found()) and time.monotonic() < end:
+        time.sleep(0.1)
+    return result
 
 
 @pytest.mark.slow
@@ -149,18 +136,12 @@ def test_no_process_is_left_behind_by_a_kill(tmp_path):
         [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     )  # fmt: skip
     try:
-        workers, end = [], time.monotonic() + 120
-        while not workers and time.monotonic() < end and process.poll() is None:
-            time.sleep(0.1)
-            workers = children_of(process.pid)
+        workers = waited_for(lambda: {p for p, of in running().items() if of == process.pid}, 120)
         assert workers
         time.sleep(1.0)
         process.kill()
         process.wait(60)
-        end = time.monotonic() + 60
-        while any(map(is_running, workers)) and time.monotonic() < end:
-            time.sleep(0.1)
-        assert not any(map(is_running, workers))
+        assert waited_for(lambda: workers.isdisjoint(running()), 60)
     finally:
         process.kill()
         process.wait()
@@ -204,7 +185,7 @@ def some_parts():
 
 def test_the_obj_gives_the_same_corners_back_bit_for_bit():
     parts = some_parts()
-    back = parts_from_collision_obj(collision_obj(parts))
+    back = convex.parts_from_collision_obj(collision_obj(parts))
     assert len(back) == len(parts)
     for a, b in zip(parts, back, strict=True):
         assert np.array_equal(a[np.lexsort(a.T)], b[np.lexsort(b.T)])
@@ -215,4 +196,4 @@ def test_bad_parts_and_other_files_are_refused():
     refused("no convex parts", collision_obj, ())
     refused(r"part 1 of 2 .* is flat", collision_obj, (some_parts()[0], np.eye(3)))
     for text in (b"", b"o part_000\n", b"v 0 0 0\n", b"o part_000\nv 0 x 0\n", b"\xff\xfe"):
-        refused("collision OBJ", parts_from_collision_obj, text)
+        refused("collision OBJ", convex.parts_from_collision_obj, text)

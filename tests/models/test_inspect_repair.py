@@ -35,8 +35,9 @@ def without(mesh, rows):
     keep = np.ones(len(mesh.faces), dtype=bool)
     keep[rows] = False
     used, faces = np.unique(mesh.faces[keep], return_inverse=True)
-    rest = {k: getattr(mesh, k)[used] for k in ("colors", "uv") if getattr(mesh, k) is not None}
-    return replace(mesh, vertices=mesh.vertices[used], faces=faces.reshape(-1, 3), **rest)
+    known = [k for k in ("vertices", "colors", "uv") if getattr(mesh, k) is not None]
+    rest = {k: getattr(mesh, k)[used] for k in known}
+    return replace(mesh, faces=faces.reshape(-1, 3), **rest)
 
 
 def near(mesh, point, radius):
@@ -64,10 +65,8 @@ def plate():
 
 def soup(mesh):
     """Every corner its own vertex, as STL has it."""
-    return Mesh(
-        vertices=mesh.vertices[mesh.faces.ravel()],
-        faces=np.arange(3 * len(mesh.faces)).reshape(-1, 3),
-    )
+    rows = mesh.faces.ravel()
+    return Mesh(vertices=mesh.vertices[rows], faces=np.arange(len(rows)).reshape(-1, 3))
 
 
 def some_turned(mesh):
@@ -77,12 +76,17 @@ def some_turned(mesh):
     return replace(mesh, faces=faces)
 
 
+def extended(mesh, vertices, faces):
+    return Mesh(
+        vertices=np.concatenate([mesh.vertices, vertices]),
+        faces=np.concatenate([mesh.faces, faces]),
+    )
+
+
 def with_bad_rows(mesh):
     n = len(mesh.vertices)
-    return Mesh(
-        vertices=np.concatenate([mesh.vertices, [[1.0, 1.0, 1.0], mesh.vertices[0]]]),
-        faces=np.concatenate([mesh.faces, mesh.faces[:3], [[0, n + 1, 1], [2, 2, 5]]]),
-    )
+    more = [[1.0, 1.0, 1.0], mesh.vertices[0]]
+    return extended(mesh, more, [*mesh.faces[:3], [0, n + 1, 1], [2, 2, 5]])
 
 
 def with_fold(mesh):
@@ -90,10 +94,7 @@ def with_fold(mesh):
     a, b, _ = mesh.faces[0]
     n = len(mesh.vertices)
     tip = mesh.vertices[[a, b]].mean(axis=0) * 1.02
-    return Mesh(
-        vertices=np.concatenate([mesh.vertices, [tip]]),
-        faces=np.concatenate([mesh.faces, [[a, b, n], [a, n, b]]]),
-    )
+    return extended(mesh, [tip], [[a, b, n], [a, n, b]])
 
 
 def volume(mesh):
@@ -101,6 +102,7 @@ def volume(mesh):
     return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6.0
 
 
+OPEN = {"open", "non-manifold", "inconsistent winding", "duplicate faces", "folded faces"}
 BROKEN = {
     "sound": (lambda: solid(), set()),
     "soup": (lambda: soup(solid()), set()),
@@ -142,17 +144,13 @@ def kinds(report):
     return {p.kind for p in report.problems}
 
 
-@pytest.mark.parametrize("name", list(BROKEN))
-def test_every_problem_is_found_and_no_other(name):
-    make, expected = BROKEN[name]
+@pytest.mark.parametrize(("make", "expected"), BROKEN.values(), ids=BROKEN)
+def test_every_problem_is_found_and_no_other(make, expected):
     mesh = make()
     report = inspect_mesh(mesh)
     assert kinds(report) == expected
     assert report.is_outward == (not expected & {"inside-out", "inconsistent winding"})
-    assert report.is_watertight == (
-        not expected
-        & {"open", "non-manifold", "inconsistent winding", "duplicate faces", "folded faces"}
-    )
+    assert report.is_watertight == (not expected & OPEN)
     assert (report.boundary_edges > 0) == ("open" in expected)
     assert report.vertices == len(np.unique(mesh.vertices[mesh.faces.ravel()], axis=0))
     assert report.faces == len(mesh.faces)
@@ -242,13 +240,12 @@ def test_rims_that_meet_within_rounding_are_one():
 @pytest.mark.parametrize("textured", [False, True])
 def test_small_holes_are_closed_with_the_colours_of_their_rims(textured):
     whole = ball(subdivisions=5)
-    rng = np.random.default_rng(0)
-    colors = np.tile(np.array([200, 30, 60], np.uint8), (len(whole.vertices), 1))
+    n, red = len(whole.vertices), np.array([200, 30, 60], np.uint8)
     if textured:
-        texture = np.tile(np.array([200, 30, 60], np.uint8), (16, 16, 1))
-        whole = replace(whole, uv=rng.random((len(whole.vertices), 2)), texture=texture)
+        uv = np.random.default_rng(0).random((n, 2))
+        whole = replace(whole, uv=uv, texture=np.tile(red, (16, 16, 1)))
     else:
-        whole = replace(whole, colors=colors)
+        whole = replace(whole, colors=np.tile(red, (n, 1)))
     holes = [near(whole, 0.05 * np.array(p), 0.0015) for p in ([0, 0, 1], [0, 1, 0], [1, 0, 0])]
     torn = without(whole, np.concatenate(holes))
     before = inspect_mesh(torn)
@@ -258,9 +255,7 @@ def test_small_holes_are_closed_with_the_colours_of_their_rims(textured):
     assert volume(repair.mesh) == pytest.approx(volume(whole), rel=1e-3)
     assert deviation(repair.mesh, whole) < 2e-4
     middle = repair.mesh.vertices[repair.mesh.faces].mean(axis=1)
-    np.testing.assert_array_equal(
-        colors_at(repair.mesh, middle), np.tile([200, 30, 60], (len(middle), 1))
-    )
+    np.testing.assert_array_equal(colors_at(repair.mesh, middle), np.tile(red, (len(middle), 1)))
     kept = repaired(torn, RepairConfig(fill_size_share=0.0))
     assert kept.after.boundary_edges == before.boundary_edges
 
@@ -275,8 +270,8 @@ def test_specks_are_dropped_and_named_but_a_mesh_of_small_pieces_is_not():
 
 
 def test_what_cannot_be_an_object_is_refused():
-    refused("flat", repaired, plate(), error=DegenerateError)
-    refused("flat", repaired, two_sided(plate()), error=DegenerateError)
+    for flat in (plate(), two_sided(plate())):
+        refused("flat", repaired, flat, error=DegenerateError)
     line = Mesh(vertices=np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]), faces=[[0, 1, 2]])
     refused("no area", repaired, line, error=DegenerateError)
     assert "flat" in kinds(inspect_mesh(plate()))
@@ -286,16 +281,16 @@ def test_what_cannot_be_an_object_is_refused():
 
 def test_a_moebius_band_is_named_and_left():
     t = np.linspace(0, 2 * np.pi, 60, endpoint=False)
-    strip = []
-    for w in (-0.02, 0.02):
-        r = 0.1 + w * np.cos(t / 2)
-        strip.append(np.stack([r * np.cos(t), r * np.sin(t), w * np.sin(t / 2)], -1))
+    w = np.repeat([-0.02, 0.02], 60)
+    t = np.tile(t, 2)
+    r = 0.1 + w * np.cos(t / 2)
+    strip = np.stack([r * np.cos(t), r * np.sin(t), w * np.sin(t / 2)], -1)
     i = np.arange(60)
     a, b, c, d = i, 60 + i, np.append(i[1:], 60), np.append(61 + i[:-1], 0)
     faces = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)])
-    mesh = Mesh(vertices=np.concatenate(strip), faces=faces)
-    assert "one-sided" in kinds(inspect_mesh(mesh))
-    assert "one-sided" in kinds(repaired(mesh).after)
+    repair = repaired(Mesh(vertices=strip, faces=faces))
+    for report in (repair.before, repair.after):
+        assert "one-sided" in kinds(report)
 
 
 def test_a_folded_sheet_has_no_volume():
