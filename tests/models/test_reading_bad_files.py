@@ -10,7 +10,7 @@ from realsim.errors import MissingLibraryError
 from realsim.geometry.mesh import ply_bytes
 from realsim.models.reading import read_scan
 from refusals import refused
-from written_meshes import as_trimesh, textured_box, write_textured_obj, write_usd
+from written_meshes import as_trimesh, textured_box, write_gltf, write_textured_obj, write_usd
 
 
 def broken_files(folder):
@@ -43,8 +43,7 @@ def broken_files(folder):
 
 
 def test_bad_files_are_named(tmp_path):
-    names = broken_files(tmp_path)
-    for name in names:
+    for name in broken_files(tmp_path):
         refused(name, read_scan, tmp_path / name, "m")
     said = {
         "empty.stl": "0 bytes",
@@ -64,9 +63,8 @@ def test_bad_usd_files_are_named(tmp_path):
     (tmp_path / "noise.usda").write_text("#usda 1.0\n(nonsense")
     (tmp_path / "noise.usdz").write_bytes(bytes(range(256)))
     (tmp_path / "nothing.usda").write_text("#usda 1.0\n(metersPerUnit = 1)\n")
-    (tmp_path / "lost.usda").write_text(
-        '#usda 1.0\ndef Xform "a" (references = @./gone.usda@</a>) {}\n'
-    )
+    lost = 'def Xform "a" (references = @./gone.usda@</a>) {}'
+    (tmp_path / "lost.usda").write_text(f"#usda 1.0\n{lost}\n")
     for name in ("noise.usda", "noise.usdz", "nothing.usda", "lost.usda"):
         refused(name, read_scan, tmp_path / name, "m")
 
@@ -82,18 +80,12 @@ def test_without_the_extra_usd_says_what_to_install(tmp_path, monkeypatch):
 def test_a_missing_texture_is_a_note(tmp_path):
     box = textured_box()
     write_textured_obj(tmp_path / "a.obj", box, texture_name="gone.png")
-    scan = read_scan(tmp_path / "a.obj", "m")
-    assert scan.mesh.texture is None and any("gone.png" in n for n in scan.notes)
     write_usd(tmp_path / "a.usda", box, texture="gone.png")
-    scan = read_scan(tmp_path / "a.usda", None)
-    assert scan.mesh.texture is None and any("gone.png" in n for n in scan.notes)
-    gltf = as_trimesh(box).export(file_type="gltf")
-    for name, data in gltf.items():
-        if not name.endswith((".png", ".jpg", ".jpeg")):
-            (tmp_path / ("a.gltf" if name.endswith(".gltf") else name)).write_bytes(data)
+    write_gltf(tmp_path / "a.gltf", box, with_picture=False)
     edit(tmp_path / "a.gltf", lambda header: header.update(images=[{"uri": "gone.png"}]))
-    scan = read_scan(tmp_path / "a.gltf", "m")
-    assert scan.mesh.texture is None and any("gone.png" in n for n in scan.notes)
+    for name, unit in (("a.obj", "m"), ("a.usda", None), ("a.gltf", "m")):
+        scan = read_scan(tmp_path / name, unit)
+        assert scan.mesh.texture is None and any("gone.png" in n for n in scan.notes)
 
 
 @pytest.mark.parametrize("name", ["../skin.png", "/etc/hostname"])

@@ -69,8 +69,8 @@ def test_the_deviation_sees_what_one_surface_has_and_the_other_has_not():
     whole = ball(0.05, 4)
     half = replace(whole, faces=whole.faces[whole.vertices[whole.faces].mean(axis=1)[:, 2] < 0])
     expected = np.sqrt(2) * 0.05  # from the pole to the rim
-    assert deviation(whole, half) == pytest.approx(expected, rel=0.03)
-    assert deviation(half, whole) == pytest.approx(expected, rel=0.03)
+    for a, b in ((whole, half), (half, whole)):
+        assert deviation(a, b) == pytest.approx(expected, rel=0.03)
 
 
 def test_colours_are_carried_over():
@@ -109,9 +109,8 @@ def test_two_million_faces_are_read_and_repaired_within_the_memory(tmp_path):
     rgb = np.clip(255 * (mesh.vertices / 0.3 + 0.5), 0, 255).astype(np.uint8)
     (tmp_path / "a.ply").write_bytes(ply_bytes(replace(mesh, colors=rgb), "m"))
     # In a process of its own: its peak of memory is then not that of other tests.
-    alone = multiprocessing.get_context("spawn").Process(
-        target=measured, args=(tmp_path / "a.ply",)
-    )
+    spawned = multiprocessing.get_context("spawn")
+    alone = spawned.Process(target=measured, args=(tmp_path / "a.ply",))
     alone.start()
     alone.join()
     assert alone.exitcode == 0, "the job failed; its traceback is in the captured stderr"
@@ -206,8 +205,8 @@ def test_an_open_mesh_says_whose_volume_it_is_given():
 def test_two_answers_and_wrong_units_are_refused():
     mesh = part("cube").mesh
     refused("one follows from the other", physical_properties, mesh, density=1000, mass_kg=0.1)
-    with pytest.raises(UnitError, match=r"Were grams given\? 125 g would be 1000 kg/m\^3"):
-        physical_properties(mesh, mass_kg=125.0)
+    grams = r"Were grams given\? 125 g would be 1000 kg/m\^3"
+    refused(grams, physical_properties, mesh, error=UnitError, mass_kg=125.0)
     refused("mesh too large", physical_properties, mesh, error=UnitError, mass_kg=1e-4)
     refused(r"Were grams given", physical_properties, mesh, error=UnitError, mass_kg=1e9)
     for wrong in (0.0, -1.0, float("nan")):

@@ -18,7 +18,7 @@ from realsim.models.symmetry_search import closed, group, turn
 from realsim.records import Mesh, ObjectModel
 from realsim.scanning.simulated import distorted
 from refusals import refused
-from trimesh_solids import solid
+from trimesh_solids import ball, solid
 
 PHI = (1 + math.sqrt(5)) / 2
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
@@ -38,10 +38,6 @@ def ring(n, z, twist=0.0):
 def slowly(quick, *slow):
     """Return the names as parameters, all but the first marked slow."""
     return [quick, *(pytest.param(n, marks=pytest.mark.slow) for n in slow)]
-
-
-def scaled(mesh, factor):
-    return replace(mesh, vertices=factor * mesh.vertices)
 
 
 def subdivided(mesh, rng, times, noise_m):
@@ -117,12 +113,7 @@ def test_point_groups_are_found_wherever_the_shape_lies(name):
 
 @pytest.mark.slow
 def test_a_sphere_has_three_axes_as_bop_has_no_other_form():
-    import trimesh
-
-    ball = transformed(
-        solid(trimesh.creation.icosphere(3, 0.04)), se3.from_translation([0.3, 0, 0.1])
-    )
-    found = find_symmetries(ball)
+    found = find_symmetries(ball(0.04, 3, (0.3, 0, 0.1)))
     assert len(found.discrete) == 1 and len(found.axes) == 3
     directions = np.array([axis for axis, _ in found.axes])
     assert np.allclose(directions @ directions.T, np.eye(3), atol=1e-9)
@@ -153,16 +144,15 @@ def test_the_discrete_symmetries_are_a_group():
 def test_symmetries_move_with_the_mesh_and_grow_with_it(name):
     mesh = part(name).mesh
     T = se3.from_rt(se3.random_rotation(np.random.default_rng(5)), [4.0, -2.0, 1.0])
-    plain, moved = find_symmetries(mesh), find_symmetries(transformed(scaled(mesh, 3.0), T))
+    big = transformed(replace(mesh, vertices=3.0 * mesh.vertices), T)
+    plain, moved = find_symmetries(mesh), find_symmetries(big)
     assert len(moved.discrete) == len(plain.discrete)
     assert len(moved.axes) == len(plain.axes)
     assert moved.is_mirror_symmetric == plain.is_mirror_symmetric
     grown = plain.discrete.copy()
     grown[:, :3, 3] *= 3.0
     if not plain.axes:
-        expected = T @ grown @ se3.invert(T)
-        big = transformed(scaled(mesh, 3.0), T)
-        assert same_motions(expected, moved.discrete, big, 1e-3)
+        assert same_motions(T @ grown @ se3.invert(T), moved.discrete, big, 1e-3)
     for (a, p), (b, q) in zip(plain.axes, moved.axes, strict=True):
         direction, point = T[:3, :3] @ a, se3.transform(T, 3.0 * np.array([p]))[0]
         assert abs(direction @ b) > math.cos(math.radians(0.1))
@@ -292,7 +282,6 @@ def test_an_undeclared_symmetry_is_taken_where_nothing_tells_it(tmp_path, monkey
 
     # One end red: no flip, no symmetry for a photograph.
     colors = np.where(bar.vertices[:, 2:] > 0, [255, 0, 0], [0, 0, 0]).astype(np.uint8)
-    painted, words = with_found_symmetries(
-        replace(model, mesh=replace(bar, colors=colors)), None
-    )  # fmt: skip
+    red_end = replace(model, mesh=replace(bar, colors=colors))
+    painted, words = with_found_symmetries(red_end, None)
     assert len(painted.symmetries) == 1 and "photograph" in words

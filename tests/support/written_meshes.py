@@ -53,6 +53,13 @@ def as_trimesh(mesh):
     return solid
 
 
+def write_gltf(path, mesh, *, with_picture=True):
+    """Write a mesh as glTF in several files, or without the picture that it names."""
+    for name, data in as_trimesh(mesh).export(file_type="gltf").items():
+        if with_picture or not name.endswith((".png", ".jpg", ".jpeg")):
+            (path if name.endswith(".gltf") else path.parent / name).write_bytes(data)
+
+
 def write_textured_obj(path, mesh, texture_name="skin.png"):
     from PIL import Image
 
