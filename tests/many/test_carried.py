@@ -4,7 +4,6 @@ import errno
 
 import pytest
 
-from realsim.errors import InputError
 from realsim.many import Sent, Worked
 from realsim.many.carried import Incoming, Piece, digest_of, packed
 from realsim.store import atomic
@@ -38,20 +37,20 @@ def test_a_full_disk_here_is_told_and_nothing_is_changed(tmp_path, monkeypatch):
     (tmp_path / "a").write_bytes(b"old")
     incoming = Incoming(tmp_path)
 
-    def full(path, data):
+    def full(handle):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("os.fsync", lambda handle: full(None, None))
-    with pytest.raises(StorageError, match=r"no room for 'a'.*goes on from here"):
-        incoming.take(Piece("a", b"new", is_first=True, is_last=True))
+    monkeypatch.setattr("os.fsync", full)
+    piece = Piece("a", b"new", is_first=True, is_last=True)
+    refused(r"no room for 'a'.*goes on from here", incoming.take, piece, error=StorageError)
     incoming.drop()
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == {"a": b"old"}
 
 
 @pytest.mark.parametrize("name", ["../a", "/etc/a", "b/../../a"])
 def test_a_path_that_leads_out_is_refused(name, tmp_path):
-    with pytest.raises(InputError, match="leads out of its folder"):
-        Incoming(tmp_path).take(Piece(name, b"1", is_first=True, is_last=True))
+    piece = Piece(name, b"1", is_first=True, is_last=True)
+    refused("leads out of its folder", Incoming(tmp_path).take, piece)
     refused("leads out of its folder", Incoming(tmp_path).commit, (name,))
 
 
@@ -73,5 +72,4 @@ def test_files_are_named_by_their_bytes_and_leftovers_stay_behind(tmp_path):
 
 def test_what_is_not_there_and_two_changed_folders_are_refused(tmp_path):
     refused("is not there, and a job needs it", packed, (Sent(tmp_path / "none"),), tmp_path)
-    with pytest.raises(InputError, match="one folder at most; it names 2"):
-        packed((Worked(tmp_path), Worked(tmp_path)), tmp_path)
+    refused("one folder at most; it names 2", packed, (Worked(tmp_path),) * 2, tmp_path)

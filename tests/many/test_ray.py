@@ -16,42 +16,36 @@ from realsim.many.ray_driver import on_node
 from realsim.many.ray_node import work
 from realsim.many.ray_pool import _ending
 from realsim.store.lock import only_run_in
+from refusals import refused
 
 # --- without Ray ----------------------------------------------------------------------------------
 
 
+def opened(address):
+    """Open a cluster, and leave it at once."""
+    with many.open_pool(many.PoolConfig(address=address)):
+        pass
+
+
 def test_what_is_no_address_is_named():
     for address in ("10.0.0.1", "ray://10.0.0.1:10001", ":6379", "head:port"):
-        with (
-            pytest.raises(InputError, match="no address of a Ray cluster"),
-            many.open_pool(many.PoolConfig(address=address)),
-        ):
-            pass
-    with (
-        pytest.raises(InputError, match=r"no machine of the name 'nowhere\.invalid' is known"),
-        many.open_pool(many.PoolConfig(address="nowhere.invalid:6379")),
-    ):
-        pass
+        refused("no address of a Ray cluster", opened, address)
+    refused(r"no machine of the name 'nowhere\.invalid' is known", opened, "nowhere.invalid:6379")
 
 
 def test_a_cluster_is_not_joined_without_a_token(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     for name in ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH", "RAY_AUTH_MODE"):
         monkeypatch.delenv(name, raising=False)
-    config = many.PoolConfig(address="192.0.2.77:6379")
-    with pytest.raises(InputError, match="no token for the Ray cluster"), many.open_pool(config):
-        pass
+    refused("no token for the Ray cluster", opened, "192.0.2.77:6379")
     monkeypatch.setenv("RAY_AUTH_TOKEN", "t" * 64)
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
-    with pytest.raises(InputError, match="RAY_AUTH_MODE=token"), many.open_pool(config):
-        pass
+    refused("RAY_AUTH_MODE=token", opened, "192.0.2.77:6379")
 
 
 def test_without_ray_it_is_said_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    config = many.PoolConfig(address="local")
-    with pytest.raises(InputError, match=r"realsim\[cluster\]"), many.open_pool(config):
-        pass
+    refused(r"realsim\[cluster\]", opened, "local")
 
 
 def test_a_machine_with_another_version_does_nothing_and_is_named():
@@ -138,10 +132,8 @@ def test_files_travel_and_changes_come_back_or_nothing_does(cluster, tmp_path):
     assert (folder / "below/large.bin").stat().st_size == 20_000_000
     assert (folder / "same.txt").stat().st_mtime_ns == untouched
     with only_run_in(folder):  # nobody else may work in it meanwhile
-        assert (
-            "another run is working"
-            in ran(cluster, (many_tasks.sizes, many.Worked(folder)))[1][0].why
-        )
+        _, (found,) = ran(cluster, (many_tasks.sizes, many.Worked(folder)))
+        assert "another run is working" in found.why
 
 
 # --- several machines, and commands ---------------------------------------------------------------
