@@ -20,6 +20,19 @@ def model(folder):
     return mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
 
 
+@pytest.fixture
+def data(model):
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def turned_by(quaternion):
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, quaternion)
+    return R.reshape(3, 3)
+
+
 def test_mujoco_finds_meshes_parts_and_textures(scene, model):
     """MuJoCo keeps meshes as float32, in their own principal frame."""
     for o in scene.objects:
@@ -28,9 +41,7 @@ def test_mujoco_finds_meshes_parts_and_textures(scene, model):
         mesh = model.mesh(int(geom.dataid[0]))
         first = int(mesh.vertadr[0])
         points = model.mesh_vert[first : first + int(mesh.vertnum[0])]
-        R = np.zeros(9)
-        mujoco.mju_quat2Mat(R, geom.quat)
-        at = points @ R.reshape(3, 3).T + geom.pos
+        at = points @ turned_by(geom.quat).T + geom.pos
         known = body.model.mesh.vertices
         far = np.linalg.norm(at[:, None] - known[None], axis=2)
         assert far.min(axis=0).max() < 1e-8 and far.min(axis=1).max() < 1e-8
@@ -41,14 +52,11 @@ def test_mujoco_finds_meshes_parts_and_textures(scene, model):
         assert (int(texture.height[0]), int(texture.width[0])) == look.shape[:2]
 
 
-def test_mujoco_finds_masses_inertias_and_poses(scene, model):
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
+def test_mujoco_finds_masses_inertias_and_poses(scene, model, data):
     for o in scene.objects:
         body, known = model.body(o.name), scene.body(o)
-        R = np.zeros(9)
-        mujoco.mju_quat2Mat(R, body.iquat)
-        inertia = R.reshape(3, 3) @ np.diag(body.inertia) @ R.reshape(3, 3).T
+        R = turned_by(body.iquat)
+        inertia = R @ np.diag(body.inertia) @ R.T
         assert np.isclose(body.mass[0], known.mass_kg, rtol=1e-9)
         assert np.allclose(inertia, known.inertia, rtol=0, atol=1e-9 * known.inertia.max())
         assert np.allclose(body.ipos, known.center_of_mass, rtol=0, atol=1e-12)
@@ -56,9 +64,7 @@ def test_mujoco_finds_masses_inertias_and_poses(scene, model):
         assert np.allclose(data.xmat[body.id], o.T_world_obj[:3, :3].ravel(), rtol=0, atol=1e-12)
 
 
-def test_the_objects_rest_where_they_were_registered_with_their_own_friction(scene, model):
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
+def test_the_objects_rest_where_they_were_registered_with_their_own_friction(scene, model, data):
     before = data.xpos.copy()
     for _ in range(250):
         mujoco.mj_step(model, data)
@@ -70,9 +76,7 @@ def test_the_objects_rest_where_they_were_registered_with_their_own_friction(sce
     assert "table" in touching and not any("visual" in name for name in touching)
 
 
-def test_the_cameras_frustum_is_that_of_its_intrinsics(scene, model):
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
+def test_the_cameras_frustum_is_that_of_its_intrinsics(scene, model, data):
     view, camera = mujoco.MjvScene(model, 100), mujoco.MjvCamera()
     camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
     mujoco.mjv_updateScene(

@@ -1,6 +1,5 @@
 """Scenes as USD: Pixar's library finds everything that Isaac Sim needs."""
 
-import builtins
 import importlib
 
 import numpy as np
@@ -12,6 +11,7 @@ from realsim.errors import MissingLibraryError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.robot_scenes.mesh_obj import collision_parts
 from realsim.formats.robot_scenes.usd_scene import write_usd_scene
+from refusals import refused
 
 
 def write(scene, folder):
@@ -50,14 +50,14 @@ def test_objects_stand_at_their_poses_with_their_matter(scene, stage):
         assert prim.HasAPI(UsdPhysics.RigidBodyAPI)
         mass = UsdPhysics.MassAPI(prim)
         assert np.isclose(mass.GetMassAttr().Get(), body.mass_kg, rtol=1e-6)
-        com = mass.GetCenterOfMassAttr().Get()
-        assert np.allclose(com, body.center_of_mass, rtol=0, atol=1e-8)
+        assert np.allclose(mass.GetCenterOfMassAttr().Get(), body.center_of_mass, rtol=0, atol=1e-8)
         axes = Gf.Matrix3d(Gf.Rotation(Gf.Quatd(mass.GetPrincipalAxesAttr().Get())))
         R, moments = np.array(axes).T, np.array(mass.GetDiagonalInertiaAttr().Get())
         found = R @ np.diag(moments) @ R.T
         assert np.allclose(found, body.inertia, rtol=0, atol=1e-6 * body.inertia.max())
-        labels = UsdSemantics.LabelsAPI(prim, "class").GetLabelsAttr().Get()
-        assert list(labels) == [body.model.name]
+        assert list(UsdSemantics.LabelsAPI(prim, "class").GetLabelsAttr().Get()) == [
+            body.model.name
+        ]
 
 
 def test_what_is_seen_has_its_triangles_and_what_collides_its_convex_parts(scene, stage):
@@ -75,8 +75,7 @@ def test_what_is_seen_has_its_triangles_and_what_collides_its_convex_parts(scene
         assert len(parts) == len(known)
         for part, mesh in zip(parts, known, strict=True):
             assert part.HasAPI(UsdPhysics.CollisionAPI)
-            shape = UsdPhysics.MeshCollisionAPI(part).GetApproximationAttr().Get()
-            assert shape == "convexHull"
+            assert UsdPhysics.MeshCollisionAPI(part).GetApproximationAttr().Get() == "convexHull"
             assert UsdGeom.Imageable(part).ComputePurpose() == "guide"
             assert len(UsdGeom.Mesh(part).GetFaceVertexCountsAttr().Get()) == len(mesh.faces)
 
@@ -97,8 +96,7 @@ def test_the_table_stands_still_and_its_top_is_the_plane(scene, stage):
     prim = stage.GetPrimAtPath("/World/table")
     assert prim.HasAPI(UsdPhysics.CollisionAPI) and not prim.HasAPI(UsdPhysics.RigidBodyAPI)
     box, table = pose(prim), scene.table
-    top = box @ [0, 0, 0.5, 1]
-    assert np.allclose(top, table.T_world_table[:, 3])
+    assert np.allclose(box @ [0, 0, 0.5, 1], table.T_world_table[:, 3])
     sides = np.linalg.norm(box[:3, :3], axis=0)
     assert np.allclose(sides, [*table.size_m, table.thickness_m])
 
@@ -125,6 +123,6 @@ def test_without_the_extra_the_error_says_how_to_install_it(scene, tmp_path, mon
         return real(name, package)
 
     monkeypatch.setattr(importlib, "import_module", without)
-    with pytest.raises(MissingLibraryError, match=r"realsim\[usd\]"):
-        write_usd_scene(scene, ExportFolder.begin(tmp_path / "s", {}))
-    assert builtins.list((tmp_path / "s").iterdir()) == [tmp_path / "s/.export"]
+    out = ExportFolder.begin(tmp_path / "s", {})
+    refused(r"realsim\[usd\]", write_usd_scene, scene, out, error=MissingLibraryError)
+    assert list((tmp_path / "s").iterdir()) == [tmp_path / "s/.export"]
