@@ -76,8 +76,7 @@ def test_tried_grasps_are_written_with_all_that_is_known(tmp_path_factory, seed)
 
 def test_our_physics_does_not_pass_for_flex(tmp_path):
     s = tried_set(np.random.default_rng(1), 40)
-    path = write_acronym(tmp_path / "mug.h5", s, OBJECT)
-    with h5py.File(path) as file:
+    with h5py.File(write_acronym(tmp_path / "mug.h5", s, OBJECT)) as file:
         flex = file["grasps/qualities/flex"]
         assert list(flex) == ["object_in_gripper"]  # no score, no motion of ours under that name
         assert "not FleX" in flex.attrs["simulator"]
@@ -91,10 +90,10 @@ def test_our_physics_does_not_pass_for_flex(tmp_path):
 
 def fingers_and_gap(Ts, points):
     """Return (N,) whether the open fingers are free of points, and whether some lie between."""
-    x, y, z = np.moveaxis(np.abs(se3.transform(se3.invert(Ts), points)), -1, 0)
-    depth = se3.transform(se3.invert(Ts), points)[..., 2]
+    x, y, depth = np.moveaxis(se3.transform(se3.invert(Ts), points), -1, 0)
+    x, y = np.abs(x), np.abs(y)
     in_finger = (x < 0.008) & (y > 0.0405) & (y < 0.05) & (depth > -0.04) & (depth < 0.0088)
-    between = (x < 0.008) & (y < 0.04) & (z < 0.0088)
+    between = (x < 0.008) & (y < 0.04) & (np.abs(depth) < 0.0088)
     return ~in_finger.any(axis=1), between.any(axis=1)
 
 

@@ -58,9 +58,7 @@ def test_a_real_d435s_depth_lies_on_its_colour_image() -> None:
         assert np.sum(steps & whole) > 50
         return float(np.minimum(far[steps & whole], 8).mean())
 
-    turned, shifted = T.copy(), T.copy()
-    turned[:3, :3] = T[:3, :3].T
-    shifted[:3, 3] = -T[:3, 3]
+    turned, shifted = se3.from_rt(T[:3, :3].T, T[:3, 3]), se3.from_rt(T[:3, :3], -T[:3, 3])
     right = distance_px(T)
     assert right < 4
     for wrong in (se3.invert(T), np.eye(4), turned, shifted):
@@ -109,10 +107,8 @@ def record(rs: Any, path: Path, model: Any = None, coefficients: Any = (0.0,) * 
         sensor.open(profile)
         sensor.start(queue)
     for k in range(FRAMES):
-        for sensor, profile, image, size in (
-            (stereo, depth, wall(k), 2),
-            (rgb, colour, picture(k), 3),
-        ):
+        shots = (stereo, depth, wall(k), 2), (rgb, colour, picture(k), 3)
+        for sensor, profile, image, size in shots:
             frame = rs.software_video_frame()
             frame.pixels, frame.bpp, frame.stride = image, size, WIDTH * size
             frame.timestamp, frame.frame_number = 1000.0 + 33.0 * k, k + 1

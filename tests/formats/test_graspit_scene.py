@@ -23,30 +23,24 @@ def standing_poses():
     """Return T_world_obj by name: each on the table, turned about the vertical, one lying."""
     poses = {}
     for k, (name, extents) in enumerate(EXTENTS.items()):
-        R = se3.exp_so3(np.array([0.0, 0.0, 0.4 + k]))
-        half = extents[2] / 2
-        if name == "post":
-            R = R @ se3.exp_so3(np.array([np.pi / 2, 0.0, 0.0]))
-            half = extents[1] / 2
+        lying = name == "post"
+        R = se3.exp_so3([0.0, 0.0, 0.4 + k]) @ se3.exp_so3([lying * np.pi / 2, 0.0, 0.0])
+        half = extents[1 if lying else 2] / 2
         poses[name] = se3.from_rt(R, [0.2 * k, -0.1 * k, HEIGHT + half])
     return poses
 
 
-def grasps_of(T, axes="y"):
+def grasps_of(T):
     """Return 20 grasps (N, 2, 4, 4) from above across the object's own x, beside its middle."""
     z = np.array([0.0, 0.0, -1.0])
     y = T[:3, 0] if abs(T[2, 0]) < 0.1 else T[:3, 1]
     R = np.stack([np.cross(y, z), y, z], axis=1)
-    if axes == "x":
-        R = R @ se3.exp_so3(np.array([0.0, 0.0, np.pi / 2]))
-    if axes == "up":
-        R = R @ se3.exp_so3(np.array([0.0, np.pi, 0.0]))
     along = np.linspace(-0.005, 0.005, 20)[:, None] * z + 0.012 * np.cross(y, z)
     Ts = se3.from_rt(np.tile(R, (20, 1, 1)), T[:3, 3] + along)
     return np.stack([Ts, Ts @ np.diag([-1.0, -1.0, 1.0, 1.0])], axis=1)
 
 
-def write_scene(folder, order="wxyz", poses=None, grasps=True, scale=1.0, axes="y"):
+def write_scene(folder, order="wxyz", poses=None, grasps=True, scale=1.0):
     poses = poses or standing_poses()
     lines = ["grasp_path: scenes/scene_0/grasps.hdf5"]
     for k, (name, T) in enumerate(poses.items()):
@@ -67,7 +61,7 @@ def write_scene(folder, order="wxyz", poses=None, grasps=True, scale=1.0, axes="
     if grasps:
         with h5py.File(folder / "grasps.hdf5", "w") as file:
             for name, T in poses.items():
-                file[name] = grasps_of(T, axes)
+                file[name] = grasps_of(T)
     return folder
 
 

@@ -55,9 +55,8 @@ def test_objects_stand_at_their_poses_with_their_matter(scene, stage):
         R, moments = np.array(axes).T, np.array(mass.GetDiagonalInertiaAttr().Get())
         found = R @ np.diag(moments) @ R.T
         assert np.allclose(found, body.inertia, rtol=0, atol=1e-6 * body.inertia.max())
-        assert list(UsdSemantics.LabelsAPI(prim, "class").GetLabelsAttr().Get()) == [
-            body.model.name
-        ]
+        labels = UsdSemantics.LabelsAPI(prim, "class").GetLabelsAttr().Get()
+        assert list(labels) == [body.model.name]
 
 
 def test_what_is_seen_has_its_triangles_and_what_collides_its_convex_parts(scene, stage):

@@ -27,11 +27,6 @@ def noisy(seed: int, width: int = 640) -> np.ndarray:
     return np.asarray(cv2.resize(rough, (width, 360), interpolation=cv2.INTER_CUBIC))
 
 
-def pair(k: int = 0) -> View:
-    pictures = {"CAD start": flat(200, 30, 30), "registered": flat(30, 30, 200)}
-    return View(f"view {k}", pictures)
-
-
 def everything() -> Page:
     """A page with every part that there is."""
     page = Page(title="A & B", about="<b>two</b> views", hidden={"/data/s": "SESSION"})
@@ -53,7 +48,8 @@ def everything() -> Page:
     page.plots([(plots.png(figure), "a line")])
     page.videos([("v.mp4#t=0,1", flat(1, 1, 1))])
     page.section("Sliders")
-    page.sliders([pair(0), pair(1)])
+    pair = {"CAD start": flat(200, 30, 30), "registered": flat(30, 30, 200)}
+    page.sliders([View(f"view {k}", pair) for k in range(2)])
     page.section("Layers")
     page.layers([View("view 0", {"RGB": flat(1, 2, 3), "depth": flat(9, 9, 9)[..., 0]})])
     page.section("Sheet")
@@ -93,9 +89,8 @@ def test_nothing_on_a_page_is_markup() -> None:
     page.verdict("bad", hostile, hostile, [[hostile]])
     page.section(hostile, hostile, key=hostile)
     page.heading(hostile)
-    page.table(
-        [hostile], [[Cell(hostile, kind="bad", hover=hostile, note=hostile)]], folded=hostile
-    )
+    cell = Cell(hostile, kind="bad", hover=hostile, note=hostile)
+    page.table([hostile], [[cell]], folded=hostile)
     page.picture(b"\x89PNG", hostile)
     page.sliders([View(hostile, {hostile: flat(1, 1, 1), "b": flat(1, 1, 1)})])
     text = page.encode().decode()

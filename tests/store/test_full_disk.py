@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from file_trees import bytes_of
 from realsim.errors import RealsimError
 from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.store import SessionStore, StorageError, atomic
@@ -35,20 +36,15 @@ def disk(tmp_path: Path) -> Iterator[Path]:
     folder.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", f"size={DISK_PAGES * PAGE}", "tmpfs", str(folder)]
     try:
-        done = subprocess.run(mount, check=False, capture_output=True, text=True)
-    except OSError as error:
-        pytest.skip(f"no mount: {error}")
-    if done.returncode != 0:
-        pytest.skip(f"a small file system cannot be mounted here: {done.stderr.strip()}")
+        subprocess.run(mount, check=True, capture_output=True, text=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        pytest.skip(f"a small file system cannot be mounted here: {error}")
     yield folder
     subprocess.run(["umount", str(folder)], check=True)
 
 
 def sealed_bytes(folder: Path) -> dict[str, bytes]:
-    return {
-        p.relative_to(folder).as_posix(): p.read_bytes()
-        for p in folder.rglob("*.png") if not p.name.startswith(".")
-    }  # fmt: skip
+    return bytes_of(folder, "*/[!.]*.png")
 
 
 def test_wherever_the_disk_fills_up_nothing_sealed_is_lost(disk: Path) -> None:
@@ -98,8 +94,8 @@ def test_other_files_and_the_header_stay_as_they_were(disk: Path) -> None:
     store.write_json("reports/a.json", [1])
     ballast = disk / "ballast"
     ballast.write_bytes(b"\0" * shutil.disk_usage(disk).free)
-    with pytest.raises(StorageError, match=r"no room for reports/a\.json .* MB free"):
-        store.write_json("reports/a.json", list(range(2000)))
+    told, numbers = r"no room for reports/a\.json .* MB free", list(range(2000))
+    refused(told, store.write_json, "reports/a.json", numbers, error=StorageError)
     refused("no room", SessionStore.create, disk / "t", SESSION, error=StorageError)
     ballast.unlink()
     assert store.read_json("reports/a.json") == [1] and store.verify() == []
@@ -134,8 +130,8 @@ def test_a_line_that_does_not_fit_leaves_no_half_line(
     assert (100 in store.completed) == (name == "manifest.jsonl")
     add(store, 101)
     assert store.verify() == [] and check_session(tmp_path).sound
-    listed = {p for p in ("rgb/000100.png",) if p in (tmp_path / "manifest.jsonl").read_text()}
-    assert bool(listed) == (name == "manifest.jsonl")
+    is_listed = "rgb/000100.png" in (tmp_path / "manifest.jsonl").read_text()
+    assert is_listed == (name == "manifest.jsonl")
 
 
 def test_the_file_that_found_no_room_is_named(disk: Path) -> None:

@@ -137,7 +137,8 @@ class Note(OwnFile, kw_only=True):
     pad: PadFile | None = None
 
 
-POSE = {"obj_id": 1, "instance": 0, "T_world_obj": np.eye(4).tolist()}
+def in_scene(**pose):
+    return {"unit_m": 0.01, "scene": {"name": "s", "objects": [pose]}}
 
 
 @pytest.mark.parametrize(
@@ -148,10 +149,9 @@ POSE = {"obj_id": 1, "instance": 0, "T_world_obj": np.eye(4).tolist()}
         ({"unit_m": 0.01, "unitt": 1}, "unknown field `unitt`; accepted: format, unit_m, "),
         ({"unit_m": 0.01, "format": "note 2"}, "'note 2' - at `format`"),
         ({"unit_m": 0.01, "sigma": "much"}, "at `sigma`"),
-        ({"unit_m": 0.01, "scene": {"name": "s", "objects": [POSE | {"obj_id": "one"}]}},
+        (in_scene(obj_id="one", instance=0, T_world_obj=np.eye(4).tolist()),
          "expected `int`, got `str` - at `scene.objects[0].obj_id`"),
-        ({"unit_m": 0.01, "scene": {"name": "s", "objects": [{"obj_id": 1}]}},
-         "missing required field `instance` - at `scene.objects[0]`"),
+        (in_scene(obj_id=1), "missing required field `instance` - at `scene.objects[0]`"),
         ({"pad": {"widht_m": 1}}, "field `widht_m` - at `pad`; accepted: width_m, length_m"),
         ({"unit_m": 0.01, "map": {"kind": "guess"}}, "'guess' is not known; pose map, arm are"),
         ([], "expected `object`, got `array`"),
@@ -160,8 +160,7 @@ POSE = {"obj_id": 1, "instance": 0, "T_world_obj": np.eye(4).tolist()}
 def test_what_is_wrong_is_named_with_its_place(tmp_path, values, words):
     path = tmp_path / "note.json"
     path.write_text(json.dumps(values))
-    said = refused(re.escape(words), read_own, path, Note)
-    assert said.startswith(str(path))
+    assert refused(re.escape(words), read_own, path, Note).startswith(str(path))
 
 
 @pytest.mark.parametrize("text", ['{"unit_m": 0.01, "unit_m": 0.02}', '{"unit_m": NaN}', "[" * 200])

@@ -33,8 +33,7 @@ def test_whole_numbers_may_be_written_as_floats_but_not_round_ones() -> None:
 
 
 def test_ranges_hold_their_ends() -> None:
-    assert values.number(1, "x", 1, 2) == 1.0
-    assert values.whole(2, "x", 1, 2) == 2
+    assert values.number(1, "x", 1, 2) == 1.0 and values.whole(2, "x", 1, 2) == 2
     for wrong in (0.999, 2.001):
         refused("1 to 2", values.number, wrong, "x", 1, 2)
     refused("more than 40 digits; 2 or less", values.whole, 10**500, "x", high=2)
