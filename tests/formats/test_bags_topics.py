@@ -55,6 +55,7 @@ def test_raw_is_preferred_to_compressed_and_compressed_is_read(tmp_path: Path) -
     assert source.depth_unit_m == 1e-3
     same_pictures(source, range(3))
     both = recorded(tmp_path, "mcap", write=False).bag
+    png = cv2.imencode(".png", pictures(0)[0])[1].tobytes()
     both.packed(COLOUR + "/compressed", png, "png", stamp(0))
     assert open_bag(both.write()).extra["topics"]["colour"] == COLOUR
 

@@ -1,11 +1,11 @@
 """BOP scenes as frame sources: cameras, counts and poses exactly as the scene has them."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 
 from begun_sessions import begun, random_views
+from bop_scenes import edit
 from realsim.formats.bop.source import open_bop
 from realsim.records import CameraIntrinsics
 from realsim.store import SessionStore
@@ -57,10 +57,8 @@ def test_several_scenes_are_listed(tmp_path):
 
 def test_missing_poses_are_said(tmp_path):
     make_scene(tmp_path / "1")
-    path = tmp_path / "1/scene_camera.json"
-    entries = json.loads(path.read_text())
-    del entries["3"]["cam_R_w2c"], entries["3"]["cam_t_w2c"]
-    path.write_text(json.dumps(entries))
+    for key in ("cam_R_w2c", "cam_t_w2c"):
+        edit(tmp_path / "1/scene_camera.json", lambda entries, k=key: entries["3"].pop(k))
     source = open_bop(tmp_path / "1")
     assert any("1 of 4 images have no camera pose" in n for n in source.notes)
     assert [f.T_world_cam is None for f in source.frames()] == [False, True, False, False]

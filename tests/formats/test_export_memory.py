@@ -102,10 +102,8 @@ print(json.dumps([level, with_few, memory_kb("VmHWM")]))
 @pytest.mark.slow
 def test_a_frame_more_needs_no_more_memory(tmp_path):
     frames = 1000
-    done = subprocess.run(
-        [sys.executable, "-c", WORKER, str(frames), str(FEW), str(tmp_path)],
-        capture_output=True, text=True,
-    )  # fmt: skip
+    command = [sys.executable, "-c", WORKER, str(frames), str(FEW), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     level, with_few, peak = json.loads(done.stdout.splitlines()[-1])
     assert (peak - with_few) / (frames - FEW) < MOST_KB

@@ -65,11 +65,10 @@ def test_the_pose_in_the_file_is_that_of_a_rigid_hand(form, tmp_path):
 
 def test_a_hand_straight_down_has_its_fingertips_where_they_are_drawn(form, tmp_path):
     """The hand hangs over the point (0.1, 0.02, 0.05) and closes along the object's x."""
-    down = np.array([[0.0, 1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 0.02], [0.0, 0.0, -1.0, 0.05],
-                     [0.0, 0.0, 0.0, 1.0]])  # fmt: skip
-    s = tried(3)
-    path, Ts = written(form, tmp_path / "grasps",
-                       replace(s, Ts_obj_grasp=np.tile(down, (len(s), 1, 1))))  # fmt: skip
+    R = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    s, down = tried(3), se3.from_rt(R, [0.1, 0.02, 0.05])
+    hanging = replace(s, Ts_obj_grasp=np.tile(down, (len(s), 1, 1)))
+    path, Ts = written(form, tmp_path / "grasps", hanging)
     atol = form.rounding + 1e-12
     for T in form.raw(path):
         np.testing.assert_allclose(T[:3, form.approach], [0, 0, -1], atol=atol)
@@ -92,9 +91,8 @@ def test_another_hand_s_frame_and_joint_are_its_description_s(tmp_path):
     """The flange of the 2F-85, and its joint, which closes from 85.4 mm on by 0.81 rad."""
     s, hand = of_hand("robotiq_2f85"), find_hand("robotiq_2f85")
     tried = executed(s)
-    T = np.array(json.loads(write_graspgen(tmp_path / "a.json", s, file="a.obj").read_text())[
-        "grasps"]["transforms"])  # fmt: skip
-    grasps = s.Ts_obj_grasp[tried]
+    data = json.loads(write_graspgen(tmp_path / "a.json", s, file="a.obj").read_text())
+    T, grasps = np.array(data["grasps"]["transforms"]), s.Ts_obj_grasp[tried]
     np.testing.assert_allclose(T[:, :3, 3], grasps[:, :3, 3] - 0.155046 * grasps[:, :3, 2])
     np.testing.assert_allclose(grasp_poses(T, "acronym", hand), grasps, rtol=0, atol=1e-15)
 

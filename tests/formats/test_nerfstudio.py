@@ -156,8 +156,7 @@ def ngp(folder: Path, frames=None, **top):
         cv2.imwrite(str(folder / f"r_{k}.png"), np.full((30, 40, 3), k, np.uint8))
         T = se3.look_at([0.4 + 0.1 * k, 0, 0.5], [0, 0, 0]) @ GL
         rows.append({"file_path": f"./r_{k}", "transform_matrix": T.tolist()})
-    rows = frames(rows) if callable(frames) else rows if frames is None else frames
-    top = {"frames": rows} | top
+    top = {"frames": rows if frames is None else frames(rows)} | top
     (folder / "transforms.json").write_text(json.dumps(top))
     return folder
 
@@ -178,14 +177,7 @@ def test_instant_ngp_and_nerf_by_hand(tmp_path):
     assert degrees.intrinsics.fx == pytest.approx(40)
 
 
-def scaled(rows):
-    rows[1]["transform_matrix"] = (np.array(rows[1]["transform_matrix"]) * [1.01, 1, 1, 1]).tolist()
-    return rows
-
-
-def escaping(rows):
-    rows[1]["file_path"] = "../r_1.png"
-    return rows
+STRETCHED = np.diag([1.01, 1, 1, 1]).tolist()
 
 
 @pytest.mark.parametrize(
@@ -198,7 +190,6 @@ def escaping(rows):
         ({"fl_x": 40, "w": 80, "h": 60}, "80x60"),
         ({"fl_x": 40, "camera_angle_x": 0.2}, "Remove the wrong one"),
         ({"fl_x": 40, "applied_transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}, "rigid"),
-        ({"fl_x": 40, "frames": [3]}, "frame 1"),
     ],
 )
 def test_a_file_that_cannot_be_is_refused(tmp_path, top, said):
@@ -208,8 +199,9 @@ def test_a_file_that_cannot_be_is_refused(tmp_path, top, said):
 @pytest.mark.parametrize(
     ("frames", "said"),
     [
-        (scaled, "not rigid"),
-        (escaping, "leads out"),
+        (lambda rows: [rows[0], rows[1] | {"transform_matrix": STRETCHED}], "not rigid"),
+        (lambda rows: [rows[0], rows[1] | {"file_path": "../r_1.png"}], "leads out"),
+        (lambda rows: [3], "frame 1"),
         (lambda rows: [*rows, rows[0]], "two frames of the image"),
         (lambda rows: [r | {"fl_x": 41.0 + k} for k, r in enumerate(rows)], "takes the first"),
         (lambda rows: [r | {"file_path": f"x{k}"} for k, r in enumerate(rows)], "--images"),
@@ -226,10 +218,10 @@ def test_a_name_that_no_file_has_is_refused(tmp_path, images):
 
 
 def test_images_found_by_their_base_names_belong_to_one_pose_each(tmp_path):
-    folder = ngp(
-        tmp_path / "x", lambda rows: [r | {"file_path": f"cam{k}/r_1"} for k, r in enumerate(rows)],
-        fl_x=40,
-    )  # fmt: skip
+    def alike(rows):
+        return [r | {"file_path": f"cam{k}/r_1"} for k, r in enumerate(rows)]
+
+    folder = ngp(tmp_path / "x", alike, fl_x=40)
     refused("two frames of the image .*r_1", open_nerfstudio, folder, images_folder=folder)
 
 
