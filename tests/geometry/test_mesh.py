@@ -62,8 +62,7 @@ def test_mass_moves_and_turns_with_the_mesh():
 def test_two_boxes_weigh_the_sum_and_inside_out_changes_nothing():
     both = meshes.merged([box(), meshes.transformed(box(), se3.from_translation([0.3, 0, 0]))])
     m = meshes.mass_properties(both, 1000.0)
-    one = meshes.mass_properties(box(), 1000.0)
-    assert m.mass_kg == pytest.approx(2 * one.mass_kg)
+    assert m.mass_kg == pytest.approx(2 * meshes.mass_properties(box(), 1000.0).mass_kg)
     assert m.hull_volume_fraction < 0.6
     flipped = dataclasses.replace(both, faces=both.faces[:, ::-1])
     np.testing.assert_allclose(
@@ -164,8 +163,7 @@ def test_mssd_is_the_definition_and_the_hull_is_enough():
 
 
 def test_mssd_does_not_depend_on_the_frame_and_knows_symmetries():
-    rng = np.random.default_rng(2)
-    A, B, C = se3.random_transform(rng, 3)
+    A, B, C = se3.random_transform(np.random.default_rng(2), 3)
     v = box().vertices
     S = np.stack([np.eye(4), np.diag([-1.0, -1, 1, 1])])
     assert metrics.mssd(C @ A, C @ B, v, S) == pytest.approx(metrics.mssd(A, B, v, S), rel=1e-9)
@@ -198,8 +196,7 @@ def test_overlap_of_masks():
 @pytest.mark.parametrize("ascii", [False, True])
 @pytest.mark.parametrize("unit", ["m", "mm"])
 def test_a_ply_comes_back_the_same(tmp_path, ascii, unit):
-    colors = np.random.default_rng(0).integers(0, 256, (8, 3))
-    mesh = dataclasses.replace(box(), colors=colors)
+    mesh = dataclasses.replace(box(), colors=np.random.default_rng(0).integers(0, 256, (8, 3)))
     meshes.save_ply(tmp_path / "box.ply", mesh, unit, ascii=ascii)
     back = meshes.load_mesh(tmp_path / "box.ply", unit)
     np.testing.assert_allclose(back.vertices, mesh.vertices, atol=1e-8)

@@ -24,16 +24,14 @@ def raycasting(mesh):
     from realsim.geometry.mesh import tensor_mesh
     from realsim.interop import import_open3d
 
-    o3d = import_open3d()
-    scene = o3d.t.geometry.RaycastingScene()
+    scene = import_open3d().t.geometry.RaycastingScene()
     scene.add_triangles(tensor_mesh(mesh))
     return scene
 
 
 def distances(mesh, points):
     """Distance of points (N, 3) to the surface in double precision, by brute force."""
-    corners = mesh.vertices[mesh.faces]
-    a, b, c = np.moveaxis(corners, 1, 0)
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
     nearest = np.empty(len(points))
@@ -111,13 +109,11 @@ def test_groups_close():
         S = part(name).symmetries
         assert len(S) == order
         for a in S:
-            gaps = np.abs((a @ S)[:, None] - S[None]).max((2, 3)).min(1)
-            assert gaps.max() < 1e-9
+            assert np.abs((a @ S)[:, None] - S[None]).max((2, 3)).min(1).max() < 1e-9
 
 
 def test_ids_are_stable_and_unique():
-    ids = [part(n).obj_id for n in NAMES]
-    assert ids == list(range(1, len(NAMES) + 1))
+    assert [part(n).obj_id for n in NAMES] == list(range(1, len(NAMES) + 1))
     assert len(NAMES) >= 14
     assert part("mug") is part("mug")
     refused("hex_nut", part, "spanner")

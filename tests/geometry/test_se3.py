@@ -77,8 +77,7 @@ def test_float32_rotations_become_exactly_orthonormal():
 
 
 def test_angle_is_the_length_of_the_logarithm():
-    rng = np.random.default_rng(0)
-    axes = rng.normal(size=(200, 3))
+    axes = np.random.default_rng(0).normal(size=(200, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     angles = np.concatenate([np.geomspace(1e-9, 0.1, 100), np.pi - np.geomspace(1e-9, 0.1, 100)])
     R = se3.exp_so3(axes * angles[:, None])

@@ -32,8 +32,7 @@ def test_every_chain_of_turning_joints_has_dh_numbers(joints: int, seed: int) ->
     """Axes at any angle, parallel, intersecting or the same: the flange stays where it was."""
     rng = np.random.default_rng(seed)
     turns = rng.choice([0.0, np.pi / 2, -np.pi / 2, np.pi, 0.7], (joints + 1, 3))
-    shifts = rng.choice([0.0, 0.0, 0.1, -0.3], (joints + 1, 3))
-    steps = se3.from_rt(se3.exp_so3(turns), shifts)
+    steps = se3.from_rt(se3.exp_so3(turns), rng.choice([0.0, 0.0, 0.1, -0.3], (joints + 1, 3)))
     arm = dh_of_chain("any", steps)
     for q in rng.uniform(-3, 3, (3, joints)):
         np.testing.assert_allclose(arm.forward(q), forward(steps, q), atol=1e-8)
@@ -200,8 +199,7 @@ def test_what_is_wrong_with_an_arm_is_named(
     tmp_path: Path, file: str, old: str, new: str, said: str
 ) -> None:
     folder = six_joints(tmp_path / f"a{abs(hash((old, new)))}")
-    text = (folder / file).read_text()
-    (folder / file).write_text(text.replace(old, new, 1))
+    (folder / file).write_text((folder / file).read_text().replace(old, new, 1))
     with pytest.raises(RealsimError, match=said):
         find_arm(str(folder)).shapes  # noqa: B018 - meshes are read here
 

@@ -26,8 +26,7 @@ def test_the_arc_is_the_linkage_s_own(name):
 @pytest.fixture
 def own_2f85(tmp_path):
     """A folder of the 2F-85 with airo-models' URDF, which has a prefix that XML does not allow."""
-    airo = pytest.importorskip("airo_models")
-    text = Path(airo.get_urdf_path("robotiq_2f_85")).read_text()
+    text = Path(pytest.importorskip("airo_models").get_urdf_path("robotiq_2f_85")).read_text()
     text = "\n".join(line for line in text.splitlines() if "drake:" not in line)
     (tmp_path / "hand.urdf").write_text(text)
     told = (names_of("hand")["robotiq_2f85"] / "robot.toml").read_text()
@@ -40,8 +39,7 @@ def own_2f85(tmp_path):
 def test_the_arc_is_the_urdf_s_through_its_mimic_joints(own_2f85):
     hand, findings = check_hand(str(own_2f85))
     assert all(f.is_right for f in findings), findings
-    pads = ("right_inner_finger_pad", "left_inner_finger_pad")
-    Ts = pad_frames(own_2f85 / "hand.urdf", pads)
+    Ts = pad_frames(own_2f85 / "hand.urdf", ("right_inner_finger_pad", "left_inner_finger_pad"))
     faces = Ts[..., :3, 3] - 0.0034797 * Ts[..., :3, 1]
     assert path_error(hand, faces)[1] < 0.2e-3
     assert path_error(replace(hand, arc_radius_m=0.08), faces)[1] > 1e-3
