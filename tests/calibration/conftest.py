@@ -32,8 +32,7 @@ def camera_at(
     middle = np.array([w / 2, h / 2, 0.0])
     # The board's z points into the paper, so the camera stands on its negative side.
     away = [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)]
-    T_board_cam = se3.look_at(middle + distance * np.array(away), middle, roll)
-    return se3.invert(T_board_cam)
+    return se3.invert(se3.look_at(middle + distance * np.array(away), middle, roll))
 
 
 class Simulation:

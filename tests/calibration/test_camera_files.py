@@ -160,8 +160,7 @@ BAD = {
 @pytest.mark.parametrize("name", sorted(BAD))
 def test_what_is_not_a_camera_is_refused_with_the_reason(tmp_path, name):
     content, reason = BAD[name]
-    path = given_file(tmp_path, "some_camera", content)
-    said = refused("some_camera", read_camera, path)
+    said = refused("some_camera", read_camera, given_file(tmp_path, "some_camera", content))
     assert reason in said
 
 

@@ -130,8 +130,7 @@ def misfit(report: CamerasReport, name: str) -> float:
 
 
 def place_mm(report: CamerasReport, name: str) -> float:
-    off = report.camera(name).X[:3, 3] - PLACES[name][:3, 3]
-    return 1e3 * float(np.linalg.norm(off))
+    return 1e3 * float(np.linalg.norm(report.camera(name).X[:3, 3] - PLACES[name][:3, 3]))
 
 
 # --- the fit --------------------------------------------------------------------------------------
@@ -179,8 +178,7 @@ def test_the_step_is_that_of_all_unknowns_solved_at_once() -> None:
     noise = np.repeat(ratio, 3) * model.unit_sd
     n, S = len(rig.instants), problem.size
     for i, views in enumerate(problem.at):
-        blocks = problem.view_blocks(state, sigmas, problem.ones(), views)
-        F, M = problem.instant_rows(i, blocks)
+        F, M = problem.instant_rows(i, problem.view_blocks(state, sigmas, problem.ones(), views))
         full = np.zeros((len(M), S + 12 * n + 1))
         full[:, :S], full[:, -1] = M[:, :S], M[:, -1]
         full[:, S + 12 * i : S + 12 * i + 6] = M[:, S : S + 6] * noise
@@ -294,8 +292,7 @@ def boards_at(*places: Place) -> Callable[[Rig], Rig]:
 
 
 def same_boards(rig: Rig) -> Rig:
-    boards = (rig.boards[0], replace(rig.boards[1], target=TABLE))
-    return replace(rig, boards=boards)
+    return replace(rig, boards=(rig.boards[0], replace(rig.boards[1], target=TABLE)))
 
 
 def lone_camera(rig: Rig) -> Rig:
@@ -308,8 +305,7 @@ def lone_camera(rig: Rig) -> Rig:
 
 def other_size(rig: Rig) -> Rig:
     small = CameraIntrinsics(width=640, height=480, fx=520.0, fy=520.0, cx=319.5, cy=239.5)
-    cameras = (*rig.cameras[:2], replace(rig.cameras[2], intrinsics0=small))
-    return replace(rig, cameras=cameras)
+    return replace(rig, cameras=(*rig.cameras[:2], replace(rig.cameras[2], intrinsics0=small)))
 
 
 @pytest.mark.parametrize(
@@ -378,8 +374,7 @@ def test_a_camera_that_nothing_ties_is_named() -> None:
     rig = lab(("wrist", "left"))
     # The left camera sees a chessboard on the table that no other camera sees.
     extra = Chessboard(rows=6, columns=8, square_m=0.03)
-    T = se3.invert(PLACES["left"]) @ Z_TABLE
-    uv = project(LENS, se3.transform(T, extra.points_board))
+    uv = project(LENS, se3.transform(se3.invert(PLACES["left"]) @ Z_TABLE, extra.points_board))
     seen = TargetDetection(point_ids=np.arange(len(uv)), uv=uv, image_size=(1280, 960))
     boards = (rig.boards[0], RigBoard(name="lone", target=extra))
     kept = [s for s in rig.sightings if s.camera == 0 and s.board == 0]

@@ -44,8 +44,7 @@ def test_none_changes_nothing_and_holes_stay_holes() -> None:
     same = DepthBias.none().corrected(depth)
     assert same.dtype == np.float32
     np.testing.assert_array_equal(same, depth)
-    bias = DepthBias(scale=1.01, offset_per_m=-0.9)
-    out = bias.corrected(np.array([0.0, np.nan, 0.3, 5.0]))
+    out = DepthBias(scale=1.01, offset_per_m=-0.9).corrected(np.array([0.0, np.nan, 0.3, 5.0]))
     assert out[0] == 0 and np.isnan(out[1]) and out[2] > 0 and out[3] == 0
     assert DepthBias.unmeasured().sigma_m(0.4) > 0 == DepthBias.none().sigma_m(0.4)
 
@@ -70,8 +69,7 @@ def test_exact_data_give_the_exact_bias() -> None:
     assert report.bias.offset_per_m == pytest.approx(truth.offset_per_m, abs=1e-3)
     assert report.held_out_m < 5e-5 < report.uncorrected_m
     assert report.bias.separable
-    focal = CAMERA.fx
-    assert report.disparity_px == pytest.approx(0.015 / 1.012 * focal * BASELINE, abs=3e-3)
+    assert report.disparity_px == pytest.approx(0.015 / 1.012 * CAMERA.fx * BASELINE, abs=3e-3)
 
 
 def test_correcting_the_input_leaves_no_bias_and_order_does_not_matter() -> None:
@@ -86,8 +84,7 @@ def test_correcting_the_input_leaves_no_bias_and_order_does_not_matter() -> None
 
 
 def test_a_focal_length_error_is_within_its_sigma() -> None:
-    truth = DepthBias(scale=1.0, offset_per_m=0.0)
-    views = views_of(truth, noise_px=0.0, corner_px=0.0)
+    views = views_of(DepthBias(scale=1.0, offset_per_m=0.0), noise_px=0.0, corner_px=0.0)
     wrong = replace(CAMERA, fx=CAMERA.fx * 1.003, fy=CAMERA.fy * 1.003)
     C = np.zeros((12, 12))
     C[:2, :2] = np.outer([CAMERA.fx, CAMERA.fy], [CAMERA.fx, CAMERA.fy]) * 0.003**2
@@ -162,8 +159,7 @@ def test_noise_is_measured_and_grows_with_the_square_of_distance() -> None:
 
 
 def test_a_bad_view_does_not_bend_the_result() -> None:
-    truth = DepthBias(scale=1.01, offset_per_m=-0.01)
-    views = views_of(truth, 2)
+    views = views_of(DepthBias(scale=1.01, offset_per_m=-0.01), 2)
     clean = run(views)
     spoiled = replace(views[4], depth_m=views[4].depth_m * np.float32(1.05))
     report = run([*views[:4], spoiled, *views[5:]])
@@ -244,8 +240,7 @@ def test_range_images_are_recognised() -> None:
     length = np.linalg.norm(np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], -1), axis=-1)
     views = views_of(DepthBias.none(), 11)
     ranges = [replace(v, depth_m=v.depth_m * length) for v in views]
-    kind = {c.name: c.verdict for c in run(views).checks}["depth kind"]
-    assert kind == "good"
+    assert {c.name: c.verdict for c in run(views).checks}["depth kind"] == "good"
     assert {c.name: c.verdict for c in run(ranges).checks}["depth kind"] == "bad"
 
 

@@ -50,8 +50,7 @@ def transforms(draw: st.DrawFn) -> Array:
     R = se3.exp_so3(w / np.linalg.norm(w) * draw(angles))
     if draw(st.booleans()):
         R = se3.from_rt([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.zeros(3))[:3, :3] @ R
-    t = [draw(st.floats(-2, 2)) for _ in range(3)]
-    return se3.from_rt(R, t)
+    return se3.from_rt(R, [draw(st.floats(-2, 2)) for _ in range(3)])
 
 
 def rigid_of(xyz: Any, xyzw: Any) -> Array:
@@ -99,8 +98,7 @@ def test_easy_handeye_reads_the_same_transform(full_record: Maker, X: Array, mod
     t, q = two["transform"]["translation"], two["transform"]["rotation"]
     assert all(type(v) is float for v in (*t.values(), *q.values()))
     assert same(rigid_of([t[k] for k in "xyz"], [q[k] for k in "xyzw"]), X)
-    one = yaml11(ros.easy_handeye_text(report, FRAMES))
-    T = one["transformation"]
+    T = yaml11(ros.easy_handeye_text(report, FRAMES))["transformation"]
     assert all(type(v) is float for v in T.values())
     assert same(rigid_of([T[k] for k in "xyz"], [T[k] for k in ("qx", "qy", "qz", "qw")]), X)
 
@@ -253,8 +251,7 @@ def test_write_exports_writes_readable_files(full_record: Maker, tmp_path: Path)
     [{"hand": "/tool0"}, {"hand": "tool 0"}, {"target": "base"}, {"name": "../x"}, {"target": ""}],
 )
 def test_frame_names_that_tf_refuses(wrong: dict[str, Any]) -> None:
-    with pytest.raises(InputError):
-        FrameNames(**wrong)
+    refused(".", FrameNames, **wrong)
 
 
 def test_the_base_is_no_hand_that_carries_a_camera(full_record: Maker, tmp_path: Path) -> None:
@@ -334,8 +331,7 @@ def test_a_damaged_entry_is_named(
 ) -> None:
     path = tmp_path / "calibration.json"
     path.write_text(damaged(full_record(np.eye(4)), key, value))
-    said = refused(r"calibration\.json", read_calibration, path)
-    assert says in said
+    assert says in refused(r"calibration\.json", read_calibration, path)
 
 
 @pytest.mark.parametrize(("text", "says"), [("{", "not valid JSON"), ("[1, 2]", "list")])

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,6 +12,8 @@ from realsim.geometry import camera
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import TAG_CELLS, Chessboard, CircleGrid
 from realsim_calibration.detect import tags
+from realsim_calibration.detect.blur import edge_blur_px
+from realsim_calibration.detect.drawings import COVERED, DRAWN, drawing_reason
 from realsim_calibration.detect.find import find_target
 from realsim_calibration.detect.homography import apply_homography, fit_homography, seen_from_front
 from realsim_calibration.detect.tags import detect_tags
@@ -76,8 +79,6 @@ def test_targets_with_two_ends_are_numbered_clockwise_along_the_image():
 
 @pytest.mark.slow
 def test_a_strong_lens_is_undone_where_it_is_known():
-    import cv2
-
     lens = CameraIntrinsics.from_K(CAMERA.K, 640, 480, [-0.35, 0.1])
     xy, _ = camera.undistort(lens, camera.pixel_grid(640, 480))
     where = (xy * 600.0 + [319.5, 239.5]).astype(np.float32)
@@ -98,8 +99,7 @@ def test_light_that_falls_off_does_not_pull_the_points():
     for name in ("charuco", "chessboard", "circles"):
         target = TARGETS[name]
         T = pose(target, 15.0)
-        image = picture(target, T, noise=0.0, shade=0.5)
-        d = find_target(image, target)
+        d = find_target(picture(target, T, noise=0.0, shade=0.5), target)
         assert np.abs((d.uv - truth(target, T)[d.point_ids]).mean(0)).max() < 0.02
 
 
@@ -126,8 +126,6 @@ def test_a_cut_chessboard_or_grid_is_refused_with_what_was_seen(name):
 
 
 def test_a_glint_costs_the_chessboard_one_corner():
-    import cv2
-
     target = TARGETS["chessboard"]
     T = pose(target, 15.0)
     image = picture(target, T)
@@ -143,8 +141,7 @@ def test_two_equal_boards_are_refused(name):
     target = TARGETS[name]
     aims = ((-0.12, -0.01), (0.12, 0.01))
     poses = [pose(target, 10.0, 0.0, 0.0, distance=0.55, aim=a) for a in aims]
-    one = find_target(picture(target, poses[0]), target)
-    assert len(one) >= 0.9 * len(target.points_board)
+    assert len(find_target(picture(target, poses[0]), target)) >= 0.9 * len(target.points_board)
     d = find_target(picture(target, poses[0], also=poses[1:]), target)
     assert len(d) == 0
     assert any("two equal" in r or "more than once" in r for r in d.rejected)
@@ -231,8 +228,7 @@ def test_a_picture_out_of_focus_has_no_points_or_good_ones():
 def test_what_is_no_8_bit_image_is_refused(image):
     for target in (TARGETS["tags"], TARGETS["chessboard"]):
         refused(r"8-bit RGB|at least 32 px", find_target, image, target)
-    with pytest.raises(InputError):
-        what_is_visible(image)
+    refused(".", what_is_visible, image)
 
 
 def test_intrinsics_of_another_size_and_unknown_dictionaries_are_refused():
@@ -276,8 +272,6 @@ def test_bad_tags_are_rejected_with_a_reason(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_speck_on_an_edge_does_not_move_the_corners_and_a_blot_drops_the_tag():
-    import cv2
-
     board = TARGETS["tags"]
     T = pose(board, 10.0, distance=0.3)
     image, uv = picture(board, T, noise=1.0), truth(board, T).reshape(-1, 4, 2)
@@ -286,3 +280,95 @@ def test_a_speck_on_an_edge_does_not_move_the_corners_and_a_blot_drops_the_tag()
     assert 0 in speck.ids and np.abs(speck.corners_px[0] - uv[0]).max() < 0.1
     blot = detect_tags(cv2.circle(image.copy(), (x, y), 14, 215, -1), board)
     assert 0 not in blot.ids and len(blot) == len(board.ids) - 1
+
+
+# --- Pictures that are dark, blurred or drawn on: found, or named for what they are.
+
+
+@pytest.mark.parametrize("tilt", [10.0, 45.0])
+def test_a_dark_chessboard_in_a_bright_room_is_found(tilt):
+    board, (page, origin) = TARGETS["chessboard"], page_of(TARGETS["chessboard"])
+    T, rng = pose(board, tilt), np.random.default_rng(1)
+    dark = np.where(page > 127, 50, 10).astype(np.uint8)
+    image = picture(board, T, noise=0.0, page=(dark, origin))
+    sheet = picture(board, T, blur=0.1, noise=0.0, page=(np.full_like(page, 255), origin)) > 200
+    image = np.where(sheet, image, 230) + rng.normal(scale=2.0, size=image.shape)
+    found = find_target(np.clip(np.rint(image), 0, 255).astype(np.uint8), board)
+    assert len(found) == len(board.points_board)
+    assert np.abs(found.uv - truth(board, T)[found.point_ids]).max() < 0.3
+
+
+@pytest.mark.parametrize("name", ["tags", "charuco", "chessboard", "circles"])
+def test_a_blurred_picture_is_named_as_blurred(name):
+    board = TARGETS[name]
+    T, rng = pose(board, 30.0), np.random.default_rng(0)
+    for blur in (0.8, 2.0, 4.0):
+        measured = edge_blur_px(picture(board, T, rng, blur=blur))
+        assert 0.7 * blur < measured < 1.5 * max(blur, 0.8), blur
+    found = find_target(picture(board, T, rng, blur=9.0), board)
+    assert len(found) == 0
+    assert found.rejected[0].startswith("the picture is blurred: its edges spread over")
+    assert "rest" in found.rejected[0]
+
+
+def test_a_sharp_picture_without_the_board_is_not_called_blurred():
+    found = find_target(
+        picture(TARGETS["circles"], pose(TARGETS["circles"], 20.0)), TARGETS["tags"]
+    )
+    assert len(found) == 0 and not any("blurred" in r for r in found.rejected)
+    assert np.isnan(edge_blur_px(np.full((100, 100), 90, np.uint8)))
+
+
+@pytest.mark.parametrize(("seed", "view"), [(0, 0), (0, 3), (1, 2)])
+def test_a_line_made_up_in_the_margin_does_not_shift_the_numbers(seed, view):
+    # OpenCV's newer search misses a line of these boards, or makes one up.
+    board, rng = TARGETS["chessboard"], np.random.default_rng(seed)
+    for k in range(view + 1):
+        T = pose(board, rng.uniform(8, 40), 36.0 * k, rng.uniform(-80, 80), rng.uniform(0.3, 0.4))
+        image = picture(board, T, rng, noise=2.0)
+    found = find_target(image, board)
+    assert len(found) == len(board.points_board)
+    assert np.abs(found.uv - truth(board, T)[found.point_ids]).max() < 0.3
+
+
+def test_blue_fringes_and_a_tint_are_no_drawings():
+    # A camera whose blue spreads from the light into the dots, and which tints the dark.
+    board, rng = TARGETS["circles"], np.random.default_rng(3)
+    gray = picture(board, pose(board, 25.0), rng, blur=1.0, noise=0.0).astype(float)
+    blue = cv2.dilate(gray, np.ones((3, 3)))
+    image = np.stack([1.2 * gray - 30, 1.2 * gray - 20, 1.2 * blue + 10], axis=-1)
+    image = np.clip(image + rng.normal(scale=3.0, size=image.shape), 0, 255).astype(np.uint8)
+    found = find_target(image, board)
+    assert len(found) == len(board.points_board)
+    assert drawing_reason(image, found.uv) == ""
+    cv2.drawChessboardCorners(
+        image, (board.columns, board.rows), found.uv.astype(np.float32)[:, None], True
+    )
+    assert drawing_reason(image, found.uv).startswith(DRAWN)
+
+
+@pytest.mark.parametrize("quality", [90, 100])
+def test_drawn_corners_are_told_after_jpeg(quality):
+    board = TARGETS["chessboard"]
+    T = pose(board, 25.0)
+    image = cv2.cvtColor(picture(board, T, noise=2.0), cv2.COLOR_GRAY2BGR)
+    uv = truth(board, T).astype(np.float32)
+    cv2.drawChessboardCorners(image, (board.columns, board.rows), uv[:, None], True)
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    rgb = cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    assert drawing_reason(rgb, uv).startswith(DRAWN)
+
+
+@pytest.mark.parametrize("color", [(255, 0, 0), (0, 255, 0), (0, 0, 255)])
+def test_a_target_whose_points_are_all_drawn_over_is_named(color):
+    """Discs over every point: nothing is found, and the colours say why."""
+    board = TARGETS["chessboard"]
+    T = pose(board, 20.0)
+    image = np.repeat(picture(board, T)[..., None], 3, -1)
+    assert drawing_reason(image, np.zeros((0, 2))) == ""
+    for u, v in truth(board, T):
+        cv2.circle(image, (round(u), round(v)), 14, color, -1)
+    found = find_target(image, board)
+    assert len(found) < 4
+    said = [r for r in found.rejected if r.startswith(COVERED)]
+    assert said and "drawn over the target?" in said[0]

@@ -5,6 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -34,8 +35,6 @@ SETS = {
 
 
 def load(name, every=1):
-    import cv2
-
     pattern, target = SETS[name]
     files = sorted((DATA / name).glob(pattern), key=lambda p: int(p.stem.split("-")[-1]))
     assert files, f"no pictures in {DATA / name}"
@@ -44,8 +43,6 @@ def load(name, every=1):
 
 def opencv_points(image, target):
     """Return (n, 2) with NaN for missing points, in our numbering for the circles."""
-    import cv2
-
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     uv = np.full((len(target.points_board), 2), np.nan)
     shape = (target.columns, target.rows)
@@ -61,8 +58,6 @@ def opencv_points(image, target):
 
 
 def camera_rms(uvs, target, size):
-    import cv2
-
     points = target.points_board.astype(np.float32)
     seen = [(u, np.isfinite(u[:, 0])) for u in uvs]
     seen = [(u, m) for u, m in seen if m.sum() >= 6]

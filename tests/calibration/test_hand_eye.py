@@ -6,7 +6,7 @@ import pytest
 from realsim.errors import DegenerateError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
-from realsim_calibration import JointConfig
+from realsim_calibration import CLOSED_FORMS, JointConfig, check_observable, park
 from realsim_calibration.checks import own_lens_check
 from realsim_calibration.detect.drawings import DRAWN
 from realsim_calibration.fit.board_pose import estimate_board_pose
@@ -132,8 +132,7 @@ def test_a_pair_swapped_between_parallel_poses_is_dropped_by_its_pixels(simulate
         other = sim.truth_ee[5] @ se3.from_translation([-side, 0, 0])
         seen = sim.see(other @ sim.T_ee_cam, rng, 0.1)
         views[k] = BoardView(index=k, T_base_ee=T, detection=seen)
-    h = calibrate(sim, views)
-    assert [k for k, _ in h.rejected] == [5, 11]
+    assert [k for k, _ in calibrate(sim, views).rejected] == [5, 11]
 
 
 def test_inverted_poses_are_told(simulate):
@@ -197,8 +196,7 @@ def test_a_view_without_tags_and_a_repeated_index_are_handled(simulate):
         sim.views[4],
         detection=sim.views[4].detection.__class__(point_ids=[], uv=[], image_size=(1280, 720)),
     )
-    views = [*sim.views[:4], blind, *sim.views[5:]]
-    h = calibrate(sim, views)
+    h = calibrate(sim, [*sim.views[:4], blind, *sim.views[5:]])
     assert h.rejected[0][0] == 4
     advice = next(c.advice for c in h.checks if c.name == "views")
     assert "Images without it: 1; keep one board a folder." in advice
@@ -207,8 +205,7 @@ def test_a_view_without_tags_and_a_repeated_index_are_handled(simulate):
 
 def test_principal_points_apart_are_told(simulate):
     lens = simulate(0, views=4).intrinsics0
-    moved = replace(lens, cx=lens.cx + 9.0)
-    check = own_lens_check(lens, moved, 4.0 * np.eye(2))
+    check = own_lens_check(lens, replace(lens, cx=lens.cx + 9.0), 4.0 * np.eye(2))
     assert "9.0 px apart, 4.5 combined sigma" in check.sentence and check.verdict == "warn"
     assert own_lens_check(lens, lens, np.eye(2)).verdict == "good"
 
@@ -222,3 +219,63 @@ def test_board_pose_keeps_the_twin_apart(simulate):
         e = se3.log(se3.invert(truth) @ pose.T_cam_board)
         assert np.abs(e[:3]).max() < 2e-3 and np.abs(e[3:]).max() < 1e-3
         assert 0.03 < pose.rms_px < 0.12 and pose.twin_rms_px > pose.rms_px
+
+
+# --- The closed forms: exact on perfect data, and refused where the hand does not turn.
+
+ALL = sorted(CLOSED_FORMS)
+
+
+def problem(seed, n=10, rot=0.0, trans=0.0):
+    rng = np.random.default_rng(seed)
+    X, Z = se3.random_transform(rng, spread=0.1), se3.random_transform(rng, spread=0.5)
+    C = se3.from_rt(se3.exp_so3(rng.normal(scale=0.5, size=(n, 3))), rng.normal(size=(n, 3)))
+    C[:, 2, 3] += 1.0
+    A = Z @ se3.invert(C) @ se3.invert(X)
+    noise = np.concatenate(
+        [rng.normal(scale=rot, size=(n, 3)), rng.normal(scale=trans, size=(n, 3))], -1
+    )
+    return A @ se3.exp(noise), C, X, Z
+
+
+def close(a, b, tol=1e-9):
+    return np.abs(a - b).max() < tol
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_exact_on_perfect_data(name):
+    A, C, X, Z = problem(0)
+    x, z = CLOSED_FORMS[name](A, C)
+    assert close(x, X) and close(z, Z)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_frames_of_base_and_board_do_not_matter(name):
+    A, C, _, _ = problem(1, rot=0.01, trans=0.01)
+    rng = np.random.default_rng(9)
+    G, H = se3.random_transform(rng), se3.random_transform(rng)
+    x, z = CLOSED_FORMS[name](A, C)
+    x2, z2 = CLOSED_FORMS[name](G @ A, C)
+    assert close(x, x2, 1e-8) and close(G @ z, z2, 1e-8)
+    x3, _ = CLOSED_FORMS[name](A, C @ H)
+    # The board's origin is a lever arm for Shah's translation and the mean of the others' Z.
+    assert close(x[:3, :3], x3[:3, :3], 1e-8)
+    if name != "shah":
+        assert close(x, x3, 1e-8)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_one_axis_is_refused_and_named(name):
+    rng = np.random.default_rng(0)
+    turns = np.outer(np.linspace(-1, 1, 8), [0, 0, 1.0])
+    A = se3.from_rt(se3.exp_so3(turns), rng.normal(size=(8, 3)))
+    with pytest.raises(DegenerateError, match=r"one axis only, \[-?0.00, -?0.00, 1.00\]"):
+        CLOSED_FORMS[name](A, A)
+
+
+def test_what_cannot_be_solved_is_refused():
+    still = se3.from_translation(np.random.default_rng(0).normal(size=(8, 3)))
+    refused("does not turn", park, still, still, error=DegenerateError)
+    A, C, _, _ = problem(0)
+    refused("2 usable views", check_observable, A[:2], error=DegenerateError)
+    refused("10 hand poses and 9 board poses", park, A, C[1:])

@@ -164,13 +164,11 @@ def test_the_arm_is_told_by_joints_and_poses(name):
     arm = find_arm(name).chain
     joints = rng.uniform(arm.limits.lower, arm.limits.upper, (12, arm.joints)) / 3
     tool = se3.from_rt(se3.exp_so3([0.3, 0.1, -0.2]), [0.01, 0.02, 0.15])
-    bent = arm.corrected(rng.normal(size=4 * arm.joints) * 3e-4)
-    Ts = bent.forward(joints) @ tool
+    Ts = arm.corrected(rng.normal(size=4 * arm.joints) * 3e-4).forward(joints) @ tool
     # A Panda and an FR3 are one arm by their numbers; those of other joint counts are passed over.
     arms = [arm, *(c for c in known_chains().values() if c is not arm)]
     assert matching_arm(joints, Ts, arms) is arm
-    other = se3.random_transform(rng, 12)
-    assert matching_arm(joints, other, arms) is None
+    assert matching_arm(joints, se3.random_transform(rng, 12), arms) is None
     assert matching_arm(joints[:3], Ts[:3], arms) is None
 
 
@@ -311,8 +309,7 @@ def test_sigma_for_this_arm_is_what_halves_show_and_the_absolute_one_is_larger()
 @pytest.mark.parametrize("share", [0.5, 1.0, 3.0])
 def test_the_absolute_sigma_is_nowhere_the_smaller_one(share: float) -> None:
     """A covariance lifted to another's is no smaller than either, and lifted no further."""
-    rng = np.random.default_rng(6)
-    A, H = (M @ M.T for M in rng.normal(size=(2, 6, 6)))
+    A, H = (M @ M.T for M in np.random.default_rng(6).normal(size=(2, 6, 6)))
     whole = np.eye(9)
     whole[:6, :6] = A
     lifted = at_least(whole, share * A)

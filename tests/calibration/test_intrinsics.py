@@ -14,6 +14,7 @@ from realsim_calibration.lens.bundle import (
     _normal,  # pyright: ignore[reportPrivateUsage]
     shaped_points,
 )
+from realsim_calibration.lens.coverage import measure_coverage
 from realsim_calibration.lens.fit import IntrinsicsConfig
 from realsim_calibration.lens.intrinsics import calibrate_intrinsics
 from realsim_calibration.views import TargetDetection
@@ -57,8 +58,7 @@ def see(
     points = print_shape(board, shape)
     found = []
     while len(found) < views:
-        T = board_pose(rng, lens, tilt, spread, distances)
-        uv = project(lens, se3.transform(T, points))
+        uv = project(lens, se3.transform(board_pose(rng, lens, tilt, spread, distances), points))
         uv = uv + rng.normal(scale=noise, size=uv.shape) if noise else uv
         inside = np.all((uv > 0) & (uv < [lens.width - 1, lens.height - 1]), axis=-1)
         if inside.sum() >= 12:
@@ -242,11 +242,9 @@ def test_wrong_corners_and_views_are_named_and_left_out():
     uv[5] += [0, -9.0] if uv[5, 1] > 20 else [0, 9.0]
     spoilt = list(seen)
     spoilt[3] = detection(seen[3].point_ids, uv)
-    rng = np.random.default_rng(0)
-    mixed = rng.permutation(len(seen[7]))
+    mixed = np.random.default_rng(0).permutation(len(seen[7]))
     spoilt[7] = detection(seen[7].point_ids, seen[7].uv[mixed])
-    names = [f"{i}.png" for i in range(16)]
-    report = calibrate_intrinsics(spoilt, BOARD, names=names, config=FOUR)
+    report = calibrate_intrinsics(spoilt, BOARD, names=[f"{i}.png" for i in range(16)], config=FOUR)
     assert [v.name for v in report.views if not v.used] == ["7.png"]
     assert "wrongly found" in report.views[7].reason
     assert [p for p, _ in report.views[3].outliers] == [int(seen[3].point_ids[5])]
@@ -303,3 +301,26 @@ def test_predicted_sigmas_weigh_the_corners():
     weighed, same = (calibrate_intrinsics(s, BOARD, config=FOUR) for s in (blurred, blind))
     assert np.median(weighed.sd[:8] / same.sd[:8]) < 0.8
     assert np.all(np.abs(vector(weighed)[:8] - truth) < 4 * weighed.sd[:8])
+
+
+# --- Where the corners were: what the views cover, and what is missing.
+
+
+def test_coverage_names_what_is_missing():
+    poses = np.stack([se3.from_rt(se3.exp_so3([0.5 * s, 0.4, 0]), [0, 0, 0.5]) for s in (-1, 1)])
+    u, v = np.meshgrid(np.linspace(0, 639, 30), np.linspace(0, 479, 30))
+    everywhere = np.stack([u.ravel(), v.ravel()], -1)
+    full = measure_coverage(everywhere, (640, 480), poses)
+    assert full.share == 1 and full.reach > 0.9 and full.advice == ""
+    assert full.counts.sum() == len(everywhere)
+    missing = everywhere[(everywhere[:, 0] < 320) | (everywhere[:, 1] < 240)]
+    part = measure_coverage(missing, (640, 480), poses)
+    assert "no corners in the lower right quarter" in part.advice
+    straight = np.stack([se3.from_translation([0, 0, z]) for z in (0.4, 0.8)])
+    flat = measure_coverage(everywhere, (640, 480), straight)
+    assert "tilt it by 30 deg" in flat.advice
+    assert flat.distance_m.max() / flat.distance_m.min() == pytest.approx(2)
+
+
+def test_nothing_seen_is_refused():
+    refused("no corners", measure_coverage, np.zeros((0, 2)), (640, 480), np.eye(4)[None])

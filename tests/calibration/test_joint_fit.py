@@ -146,10 +146,8 @@ def whole_problem(problem, state, basis, sigma):
 
 @pytest.mark.parametrize("name", BASES)
 def test_the_linear_model_has_the_marginals_and_the_optimum_of_all_unknowns(simulate, name):
-    sim = simulate(5, views=10)
-    problem, state, basis = fitted(sim, BASES[name])
-    model = LinearModel(problem, state, problem.ones())
-    fit = model.fit(basis, RATIO, 0.3, rounds=0)
+    problem, state, basis = fitted(simulate(5, views=10), BASES[name])
+    fit = LinearModel(problem, state, problem.ones()).fit(basis, RATIO, 0.3, rounds=0)
     J, r = whole_problem(problem, state, basis, 0.3)
     shared = 29 + len(state.weights)
     ours, theirs = np.linalg.inv(fit.information), np.linalg.inv(J.T @ J)[:shared, :shared]
@@ -159,8 +157,7 @@ def test_the_linear_model_has_the_marginals_and_the_optimum_of_all_unknowns(simu
         np.abs(np.linalg.solve(J.T @ J, J.T @ r))[:29] < 1e-3 * np.sqrt(np.diag(ours))[:29]
     )
     # The fit is at its optimum, so the linear step from there is nothing but the map's weights.
-    sd = np.sqrt(np.diag(ours))
-    assert np.all(np.abs(fit.step[:29]) < 0.02 * sd[:29])
+    assert np.all(np.abs(fit.step[:29]) < 0.02 * np.sqrt(np.diag(ours))[:29])
     if basis is not None:
         assert np.allclose(fit.step[29:], state.weights, atol=0.02)
 
@@ -170,8 +167,7 @@ def test_the_likelihood_finds_the_robots_share(simulate):
 
     found = []
     for robot in (0.1e-3, 1e-3):
-        sim = simulate(3, views=30, robot=(robot, robot))
-        problem, state, _ = fitted(sim)
+        problem, state, _ = fitted(simulate(3, views=30, robot=(robot, robot)))
         model = LinearModel(problem, state, problem.ones())
         found.append(estimate_ratio(model, None, 0.1, 50.0, NoiseConfig()))
     # Truth: robot sd over the angle that a corner's 0.1 px subtends at f = 643 and 0.4 m.

@@ -154,8 +154,7 @@ def test_live_does_not_stop_while_the_error_on_unseen_views_moves() -> None:
 
 
 def test_live_stops_where_views_gain_nothing_and_says_so() -> None:
-    config = LiveConfig(sigma_mm=1e-6, sigma_deg=1e-6, min_views_to_stop=6, least_gain=0.9)
-    live = running(config)
+    live = running(LiveConfig(sigma_mm=1e-6, sigma_deg=1e-6, min_views_to_stop=6, least_gain=0.9))
     for k, A in enumerate(random_hands(np.random.default_rng(11), 6)):
         status = live.add(live_view(k, A))
     assert status.stop and "goal is not reached" in status.sentence

@@ -189,8 +189,7 @@ def test_units_in_names_extra_columns_and_joints():
 
 
 def test_degrees_under_names_that_state_radians_are_noted():
-    T = random_poses(6, 8)
-    numbers = rows_of(reading_from_text("rotvec,deg,m"), T)
+    numbers = rows_of(reading_from_text("rotvec,deg,m"), random_poses(6, 8))
     with folder() as place:
         head = "x_m,y_m,z_m,rx_rad,ry_rad,rz_rad"
         found = read_pose_file(write_lines(place / "a.csv", numbers, ",", head=head))
@@ -220,8 +219,7 @@ def test_time_stamps_from_1970_and_from_the_machines_start(start, stops, unit):
     times = start + np.cumsum(rng.uniform(4, 20, 40) if stops else np.full(40, 0.033))
     rows = [f"{int(t * unit)},0.{k:02d},0.1,0.2,0,0,0,1" for k, t in enumerate(times, 10)]
     with folder() as place:
-        text = "\n".join(["timestamp,x,y,z,qx,qy,qz,qw", *rows])
-        (place / "a.csv").write_text(text)
+        (place / "a.csv").write_text("\n".join(["timestamp,x,y,z,qx,qy,qz,qw", *rows]))
         found = read_pose_file(place / "a.csv")
     assert np.allclose(found.times, times, atol=2e-6)
 
@@ -242,9 +240,8 @@ def test_ros_poses_and_parts():
     q = rows_of(reading_from_text("quat_xyzw,m"), T)
 
     def ros(row):
-        position = dict(zip("xyz", row[:3].tolist(), strict=True))
         return {
-            "position": position,
+            "position": dict(zip("xyz", row[:3].tolist(), strict=True)),
             "orientation": dict(zip("xyzw", row[3:].tolist(), strict=True)),
         }
 

@@ -90,8 +90,7 @@ def test_a_capture_goes_on_with_the_cameras_it_was_begun_with(
     tmp_path: Path, arm: KinematicArm
 ) -> None:
     store, still = new_store(tmp_path / "s", plan().content_hash), StillCamera()
-    fixed = fixed_stores(store, {"left": still})
-    taken(arm, store, fixed, views=(0,))
+    taken(arm, store, fixed_stores(store, {"left": still}), views=(0,))
     refused(r"begun with the fixed cameras left, and .* names none", fixed_stores, store, {})
     refused("names left, right", fixed_stores, store, {"left": still, "right": StillCamera()})
     with pytest.raises(InputError, match=r"'left' of .* is still 1, .* connects still 2"):

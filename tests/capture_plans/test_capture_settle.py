@@ -1,13 +1,14 @@
 """The wait for a standing arm, and the checks' own numbers."""
 
+import cv2
 import numpy as np
 import pytest
 
-from given_plans import UR5_HOME
+from given_plans import UR5_HOME, stopped
 from realsim.robots.arm import UR5
 from realsim_capture_plans.capturing.checks import SHARPNESS_OF_MEDIAN, sharpness
 from realsim_capture_plans.capturing.look import SettleConfig, until_still
-from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError
+from realsim_capture_plans.devices.interfaces import ArmState
 from realsim_capture_plans.lab.devices import SimulatedArm
 
 
@@ -31,8 +32,7 @@ class RingingArm(SimulatedArm):
 def test_the_wait_ends_when_the_swing_is_below_the_tolerance(amplitude: float) -> None:
     arm, config = RingingArm(amplitude, 0.1), SettleConfig()
     state, waited = until_still(arm, config, clock=lambda: arm.now_s, sleep=arm.wait)
-    left = amplitude * np.exp(-arm.now_s / 0.1)
-    assert left <= config.tolerance_rad
+    assert amplitude * np.exp(-arm.now_s / 0.1) <= config.tolerance_rad
     assert np.abs(state.joints - UR5_HOME).max() <= config.tolerance_rad
     # Not much later than needed either: the tolerance plus two windows.
     needed = 0.1 * np.log(max(amplitude / (config.tolerance_rad / 2), 1.0))
@@ -41,15 +41,12 @@ def test_the_wait_ends_when_the_swing_is_below_the_tolerance(amplitude: float) -
 
 def test_an_arm_that_never_stands_is_named() -> None:
     arm = RingingArm(5e-3, 1e9)
-    with pytest.raises(ArmStoppedError, match="does not come to rest") as stopped:
-        until_still(arm, SettleConfig(), clock=lambda: arm.now_s, sleep=arm.wait)
-    assert stopped.value.stop == "not ready"
+    timed = {"clock": lambda: arm.now_s, "sleep": arm.wait}
+    stopped("not ready", "does not come to rest", until_still, arm, SettleConfig(), **timed)
 
 
 def scene(rng: np.random.Generator, contrast: float = 1.0) -> np.ndarray:
     """Discs of all sizes on a textured ground."""
-    import cv2
-
     image = np.full((360, 640, 3), 120, np.uint8)
     for _ in range(60):
         x, y, r = (int(rng.integers(0, n)) for n in (640, 360, 40))
@@ -59,8 +56,6 @@ def scene(rng: np.random.Generator, contrast: float = 1.0) -> np.ndarray:
 
 
 def test_sharpness_falls_with_every_blur_and_not_with_contrast() -> None:
-    import cv2
-
     rng = np.random.default_rng(0)
     image = scene(rng)
     values = [sharpness(image)]

@@ -66,8 +66,7 @@ class SlowCamera:
 def captured_by_a_person(folder: Path) -> None:
     store = begun(folder, CAMERA, {"plan_hash": plan().content_hash})
     with TerminalOperator("test") as operator:
-        job = CaptureJob(operator=operator)
-        capture(plan(), SimulatedArm(), SlowCamera(), store, job=job)
+        capture(plan(), SimulatedArm(), SlowCamera(), store, job=CaptureJob(operator=operator))
 
 
 class Terminal:

@@ -161,8 +161,7 @@ class Person(NoOperator):
         self.told.append(("! " if trouble else "") + text)
 
     def commands(self) -> list[Command]:
-        stored = self.statuses[-1].stored if self.statuses else 0
-        return self.keys.pop(stored, [])
+        return self.keys.pop(self.statuses[-1].stored if self.statuses else 0, [])
 
     def ask(self, text: str, choices: Sequence[Command]) -> Command | None:
         self.asked.append(text)
@@ -233,8 +232,7 @@ def test_a_stop_that_a_person_clears_costs_no_view(tmp_path: Path, reference: Se
     arm = StoppingArm({4: "protective stop", 7: "connection lost"}, patience=1)
     b = bench(tmp_path / "s", arm=arm)
     person = Person(answers=["go", "go", "go"])
-    summary = b.capture(operator=person)
-    assert summary.complete and arm.recovered == 2
+    assert b.capture(operator=person).complete and arm.recovered == 2
     assert len(person.asked) == 3  # one recovery was refused
     assert sum("release it at the pendant" in t for t in person.told) == 2
     assert driven_clear(plan(), arm.path)

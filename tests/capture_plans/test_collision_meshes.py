@@ -53,8 +53,7 @@ def test_every_triangle_lies_inside_our_shapes(frame: int) -> None:
     T = np.linalg.inv(UR5.link_frames(q)[frame])
     left = triangles @ T[:3, :3].T + T[:3, 3]
     assert len(left) > 400
-    deepest = np.min([outside(s, left) for s in shapes], axis=0)
-    assert deepest.max() <= 0.0  # every vertex
+    assert np.min([outside(s, left) for s in shapes], axis=0).max() <= 0.0  # every vertex
     for _ in range(SPLITS):
         is_out = np.min([outside(s, left).max(-1) for s in shapes], axis=0) > 0
         if not is_out.any():

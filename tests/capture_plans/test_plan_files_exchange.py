@@ -118,10 +118,9 @@ def test_urscript_drives_the_same_corners_and_nothing_else(tmp_path: Path) -> No
 
 def test_a_seven_joint_plan_goes_out_and_comes_back(tmp_path: Path) -> None:
     arm = find_arm("panda")
-    rng = np.random.default_rng(0)
     plan = replace(
         a_plan(), chain=arm.chain, home=arm.home, vias=(),
-        joints=arm.home + rng.normal(0, 0.1, (9, 7)),
+        joints=arm.home + np.random.default_rng(0).normal(0, 0.1, (9, 7)),
     )  # fmt: skip
     save_plan(plan, tmp_path / "p.json")
     assert load_plan(tmp_path / "p.json").content_hash == plan.content_hash
@@ -223,8 +222,7 @@ def test_tables_that_cannot_be_right_are_named(
     text: str, error: type[Exception], says: str, tmp_path: Path
 ) -> None:
     (tmp_path / "p.csv").write_text(text)
-    said = refused(says, imported, tmp_path / "p.csv", UR5, error=error)
-    assert "p.csv" in said
+    assert "p.csv" in refused(says, imported, tmp_path / "p.csv", UR5, error=error)
 
 
 @pytest.mark.parametrize(("mark", "form"), [(";", "Q{j} [deg]"), ("\t", "q{j}(degrees)")])

@@ -189,8 +189,7 @@ def test_an_unplugged_camera_is_named_and_goes_on_when_it_is_back(rs: Any, make:
         connected[0] = back = make()
         camera.recover()
         back.run()
-        after = camera.grab()
-        assert after.rgb.shape == before.rgb.shape
+        assert camera.grab().rgb.shape == before.rgb.shape
         camera.recover()  # no error while it is well
         camera.grab()
     finally:
@@ -221,8 +220,7 @@ SENT = 26
 
 def record(rs: Any, software: Software, path: Path, numbers: list[int]) -> None:
     """Record frames with the SDK's own recorder."""
-    recorder = rs.recorder(str(path), software.device)
-    sensors = recorder.query_sensors()
+    sensors = rs.recorder(str(path), software.device).query_sensors()
     came: list[int] = []
     for sensor in sensors:
         sensor.open(sensor.get_stream_profiles())

@@ -14,15 +14,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from given_plans import stopped
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.interop import T_from_rotation_vector_pose
 from realsim.robots.arm import UR5, UR5E, known_chains
-from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError
+from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError, Stop
 from realsim_capture_plans.devices.ur import UrArm
 from realsim_capture_plans.devices.ur_connection import UrConfig
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
+from realsim_capture_plans.devices.ur_loopback.robot import Motion
+from realsim_capture_plans.devices.ur_messages import detected_model, trouble
 from refusals import refused
 
 HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
@@ -132,13 +137,11 @@ def test_a_goal_or_a_speed_out_of_limits_is_refused_before_anything_moves(
     ],
 )
 def test_a_stop_in_mid_move_is_named_and_gone_after_recovery(
-    what: str, stop: str, said: str, arm: UrArm, controller: LoopbackController
+    what: str, stop: Stop, said: str, arm: UrArm, controller: LoopbackController
 ) -> None:
     goal = HOME + 0.8
     controller.inject(what, at_progress=0.5)
-    with pytest.raises(ArmStoppedError, match=said) as caught:
-        arm.move(goal)
-    assert caught.value.stop == stop
+    stopped(stop, said, arm.move, goal)
     time.sleep(0.1)  # it may still have been braking
     stands = np.array(controller.joints())
     assert 0.35 < (stands - HOME).max() < 0.75
@@ -155,8 +158,7 @@ def test_recovery_before_the_stop_is_cleared_says_what_to_do(
     arm: UrArm, controller: LoopbackController
 ) -> None:
     controller.inject("power_off")
-    with pytest.raises(ArmStoppedError):
-        arm.move(HOME + 0.1)
+    refused(".", arm.move, HOME + 0.1, error=ArmStoppedError)
     for _ in range(2):
         refused(r"What to do: .* pendant", arm.recover, error=ArmStoppedError)
     assert arm.state().joints == pytest.approx(HOME)  # it can still be read
@@ -191,9 +193,7 @@ def test_a_lost_connection_is_noticed_and_recovered(
 ) -> None:
     timer = threading.Timer(0.2, controller.inject, ["hang"])
     timer.start()
-    with pytest.raises(ArmStoppedError) as caught:
-        arm.move(HOME + 1.5, speed=0.05)
-    assert caught.value.stop == "connection lost"
+    stopped("connection lost", ".", arm.move, HOME + 1.5, speed=0.05)
     timer.join()
     refused(r"refuses|switch it off", arm.recover, error=ArmStoppedError)
     refused("connection lost", arm.state, error=ArmStoppedError)
@@ -242,9 +242,8 @@ def test_after_a_killed_capture_the_arm_stands_and_the_next_one_goes_on(
 def test_a_second_driver_is_refused_and_the_first_one_goes_on(
     arm: UrArm, controller: LoopbackController
 ) -> None:
-    with pytest.raises(ArmStoppedError, match="another program holds") as caught:
-        UrArm(controller.host, config=replace(CONFIG, release_s=0.2))
-    assert caught.value.stop == "not ready"
+    impatient = replace(CONFIG, release_s=0.2)
+    stopped("not ready", "another program holds", UrArm, controller.host, config=impatient)
     arm.move(HOME + 0.1, acceleration=4.0)
 
 
@@ -258,9 +257,7 @@ def test_a_program_of_somebody_else_is_not_stopped(controller: LoopbackControlle
 
 
 def test_wrong_addresses_are_told_apart(controller: LoopbackController) -> None:
-    with pytest.raises(ArmStoppedError, match=r"refuses.*port 30004") as caught:
-        UrArm("127.77.7.7")
-    assert caught.value.stop == "connection lost"
+    stopped("connection lost", r"refuses.*port 30004", UrArm, "127.77.7.7")
     refused("no host", UrArm, "no-such-robot.invalid", error=ArmStoppedError)
     controller.inject("hang")
     with pytest.raises(ArmStoppedError, match=r"says nothing|not as a UR"):
@@ -299,8 +296,7 @@ def test_software_that_cannot_tell_the_tool_offset_is_refused() -> None:
 
 
 def children(pid: int) -> list[int]:
-    text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
-    return [int(word) for word in text.split()]
+    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 def command_line(pid: int) -> bytes:
@@ -308,3 +304,96 @@ def command_line(pid: int) -> bytes:
         return Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
         return b""
+
+
+# --- The loopback controller itself: its motion, its processes, and what it says.
+
+STEP = 2e-3
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    reach=st.floats(1e-3, 3.0),
+    speed=st.floats(0.1, 3.0),
+    acceleration=st.floats(0.2, 5.0),
+)
+def test_a_motion_keeps_its_line_and_its_limits(
+    seed: int, reach: float, speed: float, acceleration: float
+) -> None:
+    way = np.random.default_rng(seed).uniform(-1, 1, 6)
+    way *= reach / np.abs(way).max()
+    motion = Motion(HOME, HOME + way, speed, acceleration)
+    cruise = reach >= speed**2 / acceleration
+    ideal = reach / speed + speed / acceleration if cruise else 2 * np.sqrt(reach / acceleration)
+    joints, speeds = [motion.joints], [motion.speeds]
+    while not motion.ended:
+        motion.advance(STEP)
+        joints.append(motion.joints)
+        speeds.append(motion.speeds)
+    q, v = np.stack(joints), np.stack(speeds)
+    np.testing.assert_allclose(q[-1], HOME + way, atol=1e-12)
+    assert (len(q) - 1) * STEP == pytest.approx(ideal, abs=2 * STEP)
+    assert np.abs(v).max() <= speed * (1 + 1e-9)
+    assert np.abs(np.diff(v, axis=0)).max() <= acceleration * STEP * (1 + 1e-6)
+    share = (q - HOME) @ way / (way @ way)
+    np.testing.assert_allclose(q, HOME + share[:, None] * way, atol=1e-12)
+    # The reported speed is the derivative of the reported place.
+    np.testing.assert_allclose(
+        np.diff(q, axis=0), 0.5 * STEP * (v[1:] + v[:-1]), atol=acceleration * STEP**2
+    )
+
+    # Both wait 0.5 s and more when they are closed: the controller's end is quicker.
+
+
+def test_ends_with_its_parent() -> None:
+    code = (
+        "import os\n"
+        "from realsim_capture_plans.devices.ur_loopback import LoopbackController\n"
+        "print(LoopbackController.start()._process.process.pid, flush=True)\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).stdout
+    pids = [int(word) for word in said.split()]
+    assert len(pids) == 1
+    end = time.monotonic() + 30.0
+    while any(_runs(pid) for pid in pids):
+        assert time.monotonic() < end, "a loopback controller outlives its parent"
+        time.sleep(0.02)
+
+
+def test_messages_of_modes() -> None:
+    assert trouble(7, 1, 1, 2) is None
+    assert trouble(7, 2, 2, None) is None
+    found = trouble(7, 1, 1 << 2, 2)
+    assert found is not None and found.stop == "protective stop"
+    found = trouble(3, 7, 1 << 7 | 1 << 6, 1)
+    assert found is not None and found.stop == "emergency stop"
+    for robot_mode, safety_mode in ((3, 1), (5, 1), (99, 1), (7, 5), (7, 8), (7, 9), (7, 42)):
+        found = trouble(robot_mode, safety_mode, 0, 2)
+        assert found is not None and found.stop == "not ready" and found.remedy
+
+
+@pytest.mark.parametrize(
+    ("says", "major", "model"),
+    [
+        ("UR5", 3, "UR5"),
+        ("UR5", 5, "UR5e"),
+        ("UR5e", 5, "UR5e"),
+        ("UR10", 5, "UR10e"),
+        ("UR20", 5, "UR20"),
+        ("could not understand: 'get robot model'", 3, None),
+        (None, 3, None),
+    ],
+)
+def test_the_dashboards_model_name_needs_the_series(
+    says: str | None, major: int, model: str | None
+) -> None:
+    assert detected_model(says, major) == model
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False

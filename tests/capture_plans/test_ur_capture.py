@@ -57,8 +57,7 @@ def test_a_capture_with_a_protective_stop_on_its_way_stores_every_view(tmp_path:
     with LoopbackController.start(robot="UR5", speedup=10, **words) as controller:
         with UrArm(controller.host, model="UR5") as arm:
             camera = SimulatedDepthCamera(lab.config, lab.truth, arm, lambda: lab._on_table)
-            extra = {"plan_hash": plan.content_hash}
-            store = begun(tmp_path / "session", camera.intrinsics, extra)
+            store = begun(tmp_path / "session", camera.intrinsics, {"plan_hash": plan.content_hash})
             controller.inject("protective_stop", at_progress=0.4)
             with pytest.raises(ArmStoppedError, match="protective stop"):
                 capture(plan, arm, camera, store)  # nobody can be asked

@@ -1,10 +1,11 @@
-"""Capture plans of joints that a test gives, and joints of a camera that looks down."""
+"""Capture plans of joints that a test gives, joints of a camera that looks down, and stops."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import ArrayLike
 
 from realsim.arrays import Array
@@ -14,6 +15,7 @@ from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box
 from realsim_capture_plans.capturing.look import CaptureConfig, SettleConfig
 from realsim_capture_plans.collision.mount import d405_mount
+from realsim_capture_plans.devices.interfaces import ArmStoppedError, Stop
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 HOME, CENTER = np.array([0.1, -1.6, 1.7, -1.7, -1.5, 0.3]), np.array([0.37, 0.02, 0.05])
@@ -77,3 +79,13 @@ def joints_looking_at(center: Array, eyes: Iterable[Array], home: Array) -> list
         q = UR5.inverse(T @ se3.invert(d405_mount().T_ee_cam))
         joints.append(q[np.argmin(np.abs(q - (joints[-1] if joints else home)).max(-1))])
     return joints
+
+
+def stopped(
+    stop: Stop, why: str, call: Callable[..., object], *args: object, **options: object
+) -> str:
+    """Hold that `call(*args, **options)` ends in this stop of the arm and says `why`; return it."""
+    with pytest.raises(ArmStoppedError, match=why) as caught:
+        call(*args, **options)
+    assert caught.value.stop == stop
+    return str(caught.value)
