@@ -1,7 +1,7 @@
-import dataclasses
 import math
 import os
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -167,7 +167,7 @@ def record(
         X=X_alone @ se3.exp(rng.normal(size=6) * 1e-3), X_covariance=covariance(6, 1e-4),
         Z=se3.random_transform(rng), X_alone=X_alone, X_alone_covariance=covariance(6, 1e-4),
         Z_alone=se3.random_transform(rng), intrinsics=lens,
-        intrinsics_alone=dataclasses.replace(lens, fx=645.7, cy=355.1),
+        intrinsics_alone=replace(lens, fx=645.7, cy=355.1),
         intrinsics_covariance=covariance(12, 1e-2),
         board=BoardShape(
             scale=0.996, aspect=-0.002, warp=rng.normal(size=3) * 1e-3, half_extent_m=0.115,

@@ -1,12 +1,12 @@
 """The calibration's page, made from a calibration of a simulated arm: what it says."""
 
 import base64
-import dataclasses
 import io
 import math
 import re
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -63,7 +63,7 @@ CHECKS = (
 def report(calibrated_arm: Maker) -> HandEyeReport:
     """Return a real calibration, with some checks of every verdict added to its own."""
     found = calibrated_arm()
-    return dataclasses.replace(found, checks=(*found.checks, *CHECKS))
+    return replace(found, checks=(*found.checks, *CHECKS))
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def paths(report: HandEyeReport, tmp_path_factory: pytest.TempPathFactory) -> li
     cv2.circle(photo, (320, 180), 100, (40, 90, 160), -1)
     folder = tmp_path_factory.mktemp("page") / "new" / "folder"
     return write_calibration_report(
-        dataclasses.replace(report, views=tuple(report.views[k] for k in (0, 3, 5, 7, 12, 15))),
+        replace(report, views=tuple(report.views[k] for k in (0, 3, 5, 7, 12, 15))),
         folder, images=lambda index: photo, title=f"Cell 4 {HOSTILE}",
     )  # fmt: skip
 
@@ -144,7 +144,7 @@ def test_the_verdict_is_that_of_the_worst_check(
 ) -> None:
     checks = tuple(Check(name=f"c{k}", verdict=v, sentence=f"S{k}.")  # type: ignore[arg-type]
                    for k, v in enumerate(verdicts))  # fmt: skip
-    changed = dataclasses.replace(report, checks=checks)
+    changed = replace(report, checks=checks)
     judged = verdict(changed)
     assert judged.verdict == expected and says in judged.headline + judged.sentence
     order = [row[0] for row in check_rows(changed)]
@@ -154,7 +154,7 @@ def test_the_verdict_is_that_of_the_worst_check(
 def test_verdict_and_table_count_the_checks_of_the_lens(report: HandEyeReport) -> None:
     good = Check(name="c", verdict="good", sentence="S.")
     lens = (good, Check(name="border", verdict="warn", sentence="90 px.", views=(0,)))
-    changed = dataclasses.replace(report, checks=(good,))
+    changed = replace(report, checks=(good,))
     judged = verdict(changed, lens)
     assert judged.verdict == "warn" and "1 of 3 checks gave a warning" in judged.sentence
     assert check_rows(changed, lens)[0][:4] == ["warn", "border", "", "90 px."]
@@ -175,11 +175,11 @@ def test_checks_name_views_by_their_files(report: HandEyeReport) -> None:
 def test_a_report_of_dropped_views_is_written(report: HandEyeReport, tmp_path: Path) -> None:
     nan, e = math.nan, np.zeros(6)
     dropped = tuple(
-        dataclasses.replace(v, used=False, reason="no", residuals=np.zeros((0, 2)), uv=v.uv[:0],
+        replace(v, used=False, reason="no", residuals=np.zeros((0, 2)), uv=v.uv[:0],
                             point_ids=v.point_ids[:0], label=ODD_NAME,
                             seen_px=nan, unseen_px=nan, robot_error=e) for v in report.views[:4]
     )  # fmt: skip
-    bare = dataclasses.replace(
+    bare = replace(
         report, seen_px=nan, held_out_px=nan, held_out_mm=nan, held_out_deg=nan, views=dropped
     )
     paths = write_calibration_report(bare, tmp_path, images=lambda index: None)
@@ -197,7 +197,7 @@ def test_a_camera_beside_the_robot_with_lens_and_depth(
     lens = calibrate_intrinsics(detections, report.target)
     warned = Check(name="depth", verdict="warn", sentence="3 of the views <lie>.")
     depth = board_depth.run(board_depth.views_of(DepthBias(scale=1.004, offset_per_m=0.01)))
-    depth = dataclasses.replace(depth, checks=(warned,))
+    depth = replace(depth, checks=(warned,))
     paths = write_calibration_report(report, tmp_path, intrinsics_report=lens,
                                      depth_report=depth)  # fmt: skip
     shown = " ".join(outline(paths[0]).words)
@@ -232,8 +232,8 @@ def test_viewpoint_of_a_known_camera(
     A = plain_report.Z @ T_board_cam @ se3.invert(plain_report.X)
     if mode == "eye_to_hand":
         A = plain_report.X @ se3.invert(T_board_cam) @ se3.invert(plain_report.Z)
-    changed = dataclasses.replace(plain_report, mode=mode, robot_map=None)
-    view = dataclasses.replace(plain_report.views[0], T_base_ee=A)
+    changed = replace(plain_report, mode=mode, robot_map=None)
+    view = replace(plain_report.views[0], T_base_ee=A)
     np.testing.assert_allclose(camera_in_board(changed, view), T_board_cam, atol=1e-9)
     p = viewpoint(changed, view)
     assert p.distance_m == pytest.approx(0.4, abs=1e-9)
@@ -254,7 +254,7 @@ def test_the_arms_map_explains_most_of_the_error(calibrated_arm: Maker) -> None:
     assert len(left) == len(whole)
     for part in (slice(0, 3), slice(3, 6)):
         assert np.linalg.norm(left[:, part]) < 0.4 * np.linalg.norm(whole[:, part])
-    unknown = dataclasses.replace(plain_report.used[0], joints=None)
+    unknown = replace(plain_report.used[0], joints=None)
     assert rest_of_map(plain_report, unknown) is None
     assert np.array_equal(corrected(plain_report, unknown), unknown.T_base_ee)
 
@@ -278,13 +278,13 @@ def test_names_that_the_font_lacks() -> None:
 
 def test_pictures_have_no_letters_that_the_font_lacks(plain_report: HandEyeReport) -> None:
     odd = tuple(
-        dataclasses.replace(v, label=f"图像_{v.index}.png", reason="没有" if v.reason else "")
+        replace(v, label=f"图像_{v.index}.png", reason="没有" if v.reason else "")
         for v in plain_report.views
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with style.paper_style():  # a letter that the font lacks would be a warning, here an error
-            figure = plot_views(dataclasses.replace(plain_report, views=odd))
+            figure = plot_views(replace(plain_report, views=odd))
             figure.savefig(out := io.BytesIO(), format="png")
     assert out.getvalue().startswith(b"\x89PNG")
     shown = "".join(text.get_text() for text in figure.findobj(Text))
@@ -295,12 +295,12 @@ def test_sigma_is_given_along_the_axes_of_the_carrier(plain_report: HandEyeRepor
     """A camera turned by 90 deg about z: its x is the tool's y, so is its uncertainty."""
     X = se3.from_rt(se3.exp_so3([0, 0, np.pi / 2]), [0.01, 0.02, 0.03])
     C = np.diag([1e-8, 1e-8, 1e-8, 9e-6, 1e-6, 4e-6])
-    row = pose_rows(dataclasses.replace(plain_report, X_here=X, X_here_covariance=C))[0]
+    row = pose_rows(replace(plain_report, X_here=X, X_here_covariance=C))[0]
     assert row[1] == "x 10.000 ± 1.000, y 20.000 ± 3.000, z 30.000 ± 2.000"
 
 
 def test_frustum_meets_the_corners_of_the_image() -> None:
-    ideal = dataclasses.replace(TRUE_LENS, distortion=np.zeros(8))
+    ideal = replace(TRUE_LENS, distortion=np.zeros(8))
     uv = camera.project(ideal, frustum(ideal, 0.3)[1:])
     np.testing.assert_allclose(uv, [[-0.5, -0.5], [1279.5, -0.5], [1279.5, 719.5], [-0.5, 719.5]])
 
@@ -310,5 +310,5 @@ def test_lens_field_undoes_the_lens() -> None:
     ideal = (uv - shift - [TRUE_LENS.cx, TRUE_LENS.cy]) / [TRUE_LENS.fx, TRUE_LENS.fy]
     rays = np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], -1)
     np.testing.assert_allclose(camera.project(TRUE_LENS, rays), uv, atol=1e-6)
-    _, none = lens_field(dataclasses.replace(TRUE_LENS, distortion=np.zeros(8)))
+    _, none = lens_field(replace(TRUE_LENS, distortion=np.zeros(8)))
     assert np.abs(none).max() < 1e-9

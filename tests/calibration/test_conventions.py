@@ -213,12 +213,10 @@ def test_bad_input_is_refused_in_words():
 
 
 def readings(s):
-    found = []
-    numbers = three_number_conventions()[0].encode(s.T[:, :3, :3])[:, 0]
-    for c in three_number_conventions():
-        found.append((c.name, se3.from_rt(c.decode(numbers), s.T[:, :3, 3])))
-    found.append(("millimetres", se3.from_rt(s.T[:, :3, :3], s.T[:, :3, 3] / 1000)))
-    return found
+    kinds, (R, t) = three_number_conventions(), (s.T[:, :3, :3], s.T[:, :3, 3])
+    numbers = kinds[0].encode(R)[:, 0]
+    found = [(c.name, se3.from_rt(c.decode(numbers), t)) for c in kinds]
+    return [*found, ("millimetres", se3.from_rt(R, t / 1000))]
 
 
 def test_the_reading_of_a_pose_file_is_proven():
@@ -269,9 +267,6 @@ def test_no_board_is_turned_in_clean_sessions():
         found = synchronise_half_turns(s.T, s.C, MIDDLE)
         assert not found.flips.any() and not found.decisive
         assert found.before_deg == found.after_deg
-
-
-# Tool offset
 
 
 # Gates and motion

@@ -10,12 +10,10 @@ from board_depth import (
     BOARD,
     CAMERA,
     EXACT,
-    FAR,
-    detected,
     exact_depth,
-    pose_at,
     run,
     sensed,
+    sensed_views,
     views_of,
 )
 from realsim.errors import DegenerateError, InputError, UnitError
@@ -104,13 +102,9 @@ def test_warp_is_taken_from_the_boards_shape() -> None:
     xy = (points[:, :2] - np.array(BOARD.size_m) / 2) / L
     points[:, 2] = L * (warp[0] * xy[:, 0] ** 2 + warp[1] * xy.prod(1) + warp[2] * xy[:, 1] ** 2)
     truth, rng = DepthBias(scale=1.01, offset_per_m=-0.01), np.random.default_rng(5)
-    views: list[DepthBoardView] = []
-    for k, distance in enumerate(FAR):
-        T = pose_at(rng, distance)
-        depth = sensed(exact_depth(T, CAMERA, warp), truth, rng, 0.0)
-        views.append(
-            DepthBoardView(index=k, depth_m=depth, detection=detected(T, rng, 0.0, points))
-        )
+    views = sensed_views(
+        rng, lambda T: sensed(exact_depth(T, CAMERA, warp), truth, rng, 0.0), points=points
+    )
     bent = estimate_depth_bias(views, BOARD, CAMERA, EXACT, shape=shape)
     flat = estimate_depth_bias(views, BOARD, CAMERA, EXACT)
     assert bent.bias.scale == pytest.approx(1.01, abs=5e-4)
@@ -123,11 +117,9 @@ def test_own_depth_camera_beside_the_colour_camera() -> None:
     truth, rng = DepthBias(scale=1.008, offset_per_m=-0.01), np.random.default_rng(8)
     depth_camera = CameraIntrinsics(width=240, height=180, fx=140.0, fy=140.0, cx=119.5, cy=92.0)
     beside = se3.from_rt(se3.exp_so3([0.01, -0.02, 0.005]), [0.015, 0.002, -0.001])
-    views: list[DepthBoardView] = []
-    for k, distance in enumerate(FAR):
-        T = pose_at(rng, distance)
-        depth = truth.measured(exact_depth(se3.invert(beside) @ T, depth_camera))
-        views.append(DepthBoardView(index=k, depth_m=depth, detection=detected(T, rng, 0.0)))
+    views = sensed_views(
+        rng, lambda T: truth.measured(exact_depth(se3.invert(beside) @ T, depth_camera))
+    )
     report = estimate_depth_bias(
         views, BOARD, CAMERA, EXACT, depth_intrinsics=depth_camera, T_color_depth=beside
     )
@@ -185,8 +177,8 @@ def test_one_distance_gives_only_the_sum() -> None:
 
 def test_a_wrong_unit_is_named() -> None:
     views = views_of(DepthBias.none())
-    with pytest.raises(UnitError, match=r"0\.001.*0\.0001"):
-        run([replace(v, depth_m=v.depth_m * np.float32(10.0)) for v in views])
+    tenfold = [replace(v, depth_m=v.depth_m * np.float32(10.0)) for v in views]
+    refused(r"0\.001.*0\.0001", run, tenfold, error=UnitError)
 
 
 def test_a_wrong_board_size_is_named() -> None:
@@ -207,12 +199,8 @@ def test_shifted_depth_is_refused() -> None:
 
 def test_another_focal_length_under_the_same_size_is_refused() -> None:
     """A depth image that was resized, not aligned: planes come out at other angles."""
-    rng, views = np.random.default_rng(9), []
-    other = replace(CAMERA, fx=CAMERA.fx * 1.5, fy=CAMERA.fy * 1.5)
-    for k, distance in enumerate(FAR):
-        T = pose_at(rng, distance)
-        depth = sensed(exact_depth(T, other), DepthBias.none(), rng)
-        views.append(DepthBoardView(index=k, depth_m=depth, detection=detected(T, rng, 0.05)))
+    rng, other = np.random.default_rng(9), replace(CAMERA, fx=CAMERA.fx * 1.5, fy=CAMERA.fy * 1.5)
+    views = sensed_views(rng, lambda T: sensed(exact_depth(T, other), DepthBias.none(), rng), 0.05)
     refused("turned by", run, views)
 
 

@@ -1,7 +1,7 @@
 """Calibration while views are captured: what it says, when it stops; a folder that fills."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -56,16 +56,18 @@ def running(config: LiveConfig | None = None, checks: tuple[Check, ...] = (), **
     )
 
 
+def fed(live: LiveCalibration, hands: Iterable[Array]) -> Any:
+    """Return the status once views at these hands, numbered from 0, are added."""
+    return [live.add(live_view(k, A)) for k, A in enumerate(hands)][-1]
+
+
 def test_live_names_what_is_missing_first() -> None:
-    live = running()
-    same = [board_at(3, 0, r, 0.9) for r in (0, 4, 8)]
-    status = [live.add(live_view(k, hand_at(T))) for k, T in enumerate(same)][-1]
+    status = fed(running(), [hand_at(board_at(3, 0, r, 0.9)) for r in (0, 4, 8)])
     assert status.state == "collecting" and "roll the hand by 60 deg" in status.sentence
     told = " | ".join(status.needs)
     assert "tilt the camera" in told and "move closer" in told and "part of the image" in told
-    rolled = running()
-    for k, (t, r) in enumerate(((0, 0), (30, 90), (-30, 200), (25, 45))):
-        status = rolled.add(live_view(k, hand_at(board_at(t, 0, r))))
+    rolled = ((0, 0), (30, 90), (-30, 200), (25, 45))
+    status = fed(running(), [hand_at(board_at(t, 0, r)) for t, r in rolled])
     assert "tilt about a second axis" in status.needs[0]
     assert "change the distance" in " | ".join(status.needs)
 
@@ -155,16 +157,14 @@ def test_live_does_not_stop_while_the_error_on_unseen_views_moves() -> None:
 
 def test_live_stops_where_views_gain_nothing_and_says_so() -> None:
     live = running(LiveConfig(sigma_mm=1e-6, sigma_deg=1e-6, min_views_to_stop=6, least_gain=0.9))
-    for k, A in enumerate(random_hands(np.random.default_rng(11), 6)):
-        status = live.add(live_view(k, A))
+    status = fed(live, random_hands(np.random.default_rng(11), 6))
     assert status.stop and "goal is not reached" in status.sentence
 
 
 def test_live_takes_the_plan_and_leaves_out_what_was_taken() -> None:
     hands = random_hands(np.random.default_rng(12), 8)
     live = running(plan=hands)
-    for k in range(7):
-        status = live.add(live_view(k, hands[k]))
+    status = fed(live, hands[:7])
     assert status.next_view is not None
     np.testing.assert_allclose(status.next_view.T_base_ee, hands[7])
     status = live.add(live_view(7, hands[7]))
@@ -175,8 +175,7 @@ def test_live_survives_a_failing_calibration() -> None:
     for error, state in ((DegenerateError("no second axis"), "collecting"),
                          (InputError("inverted poses"), "bad")):  # fmt: skip
         live = LiveCalibration(BOARD, CAMERA, solve=Mock(side_effect=error))
-        for k, A in enumerate(random_hands(np.random.default_rng(13), 6)):
-            status = live.add(live_view(k, A))
+        status = fed(live, random_hands(np.random.default_rng(13), 6))
         assert status.state == state and str(error) in status.sentence and not status.stop
 
 

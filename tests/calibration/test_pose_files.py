@@ -149,23 +149,22 @@ def test_every_reading_survives_every_layout(layout, seed, n, reading, wide):
         ("x,y,z," + ",".join(f"r{r}{c}" for r in range(3) for c in range(3)), "matrix"),
     ],
 )
-def test_header_names_say_what_columns_are(header, text):
+def test_header_names_say_what_columns_are(tmp_path, header, text):
     reading = reading_from_text(f"{text},mm")
     T = random_poses(5, 9)
     raw = rows_of(reading, T, width=12 if text == "matrix" else 16)
     separator = next(s for s in ";, " if s in header)
-    with folder() as place:
-        for k, start in enumerate(("", "# ")):
-            path = write_lines(place / f"{k}.txt", raw, separator, head=start + header)
-            found = read_pose_file(path)
-            # names say where the position is, so the reading's order does not matter
-            check(found, replace(reading, position_first=True), T)
-            assert np.abs(found.poses(reading) - T).max() < 1e-12
-            if "q" in header.lower() or text == "matrix":
-                assert found.stated == replace(reading, position_first=True)
+    for k, start in enumerate(("", "# ")):
+        path = write_lines(tmp_path / f"{k}.txt", raw, separator, head=start + header)
+        found = read_pose_file(path)
+        # names say where the position is, so the reading's order does not matter
+        check(found, replace(reading, position_first=True), T)
+        assert np.abs(found.poses(reading) - T).max() < 1e-12
+        if "q" in header.lower() or text == "matrix":
+            assert found.stated == replace(reading, position_first=True)
 
 
-def test_units_in_names_extra_columns_and_joints():
+def test_units_in_names_extra_columns_and_joints(tmp_path):
     T = random_poses(6, 8)
     reading = reading_from_text("euler_xyz,deg,mm")
     joints = np.random.default_rng(0).uniform(-170, 170, (8, 6))
@@ -173,8 +172,7 @@ def test_units_in_names_extra_columns_and_joints():
     head = ",".join(["image", *(f"q{k} [deg]" for k in range(6))])
     head += ",x (mm),y (mm),z (mm),roll_deg,pitch_deg,yaw_deg,force"
     names = [f"{k}.png" for k in range(8)]
-    with folder() as place:
-        found = read_pose_file(write_lines(place / "a.csv", table, ",", names, head=head))
+    found = read_pose_file(write_lines(tmp_path / "a.csv", table, ",", names, head=head))
     assert {str(p) for p in found.possible} == {
         f"euler_{o},deg,mm{i}" for o in ("xyz", "XYZ") for i in ("", ",inverted")
     }
@@ -188,24 +186,22 @@ def test_units_in_names_extra_columns_and_joints():
     refused("not rotation_vector", found.poses, reading_from_text("rotvec,deg,mm"))
 
 
-def test_degrees_under_names_that_state_radians_are_noted():
+def test_degrees_under_names_that_state_radians_are_noted(tmp_path):
     numbers = rows_of(reading_from_text("rotvec,deg,m"), random_poses(6, 8))
-    with folder() as place:
-        head = "x_m,y_m,z_m,rx_rad,ry_rad,rz_rad"
-        found = read_pose_file(write_lines(place / "a.csv", numbers, ",", head=head))
+    head = "x_m,y_m,z_m,rx_rad,ry_rad,rz_rad"
+    found = read_pose_file(write_lines(tmp_path / "a.csv", numbers, ",", head=head))
     assert any("beyond two turns" in n and "rotvec,deg" in n for n in found.notes)
 
 
-def test_time_and_index_columns_are_told_from_the_pose():
+def test_time_and_index_columns_are_told_from_the_pose(tmp_path):
     T = random_poses(7, 6)
     reading = reading_from_text("quat_xyzw,m")
     times = 1305031102.17 + np.cumsum(np.full(6, 0.03))
-    with folder() as place:
-        tum = write_lines(place / "a.txt", np.column_stack([times, rows_of(reading, T)]), " ")
-        check(read_pose_file(tum), reading, T)
-        vector = reading_from_text("rotvec,m")
-        rows = np.column_stack([np.arange(3, 9), rows_of(vector, T)])
-        counted = read_pose_file(write_lines(place / "b.txt", rows, " "))
+    tum = write_lines(tmp_path / "a.txt", np.column_stack([times, rows_of(reading, T)]), " ")
+    check(read_pose_file(tum), reading, T)
+    vector = reading_from_text("rotvec,m")
+    rows = np.column_stack([np.arange(3, 9), rows_of(vector, T)])
+    counted = read_pose_file(write_lines(tmp_path / "b.txt", rows, " "))
     check(counted, vector, T)
     assert counted.stems == tuple("345678")
 
@@ -213,29 +209,27 @@ def test_time_and_index_columns_are_told_from_the_pose():
 @pytest.mark.parametrize("start", [1305031102.17, 1700.0, 86400.0], ids="1970 28min day".split())
 @pytest.mark.parametrize("stops", [False, True], ids=["stream", "stops"])
 @pytest.mark.parametrize("unit", [1e9, 1e6])
-def test_time_stamps_from_1970_and_from_the_machines_start(start, stops, unit):
+def test_time_stamps_from_1970_and_from_the_machines_start(tmp_path, start, stops, unit):
     """28 minutes in ns have the size of ms since 1970: the steps tell them apart."""
     rng = np.random.default_rng(4)
     times = start + np.cumsum(rng.uniform(4, 20, 40) if stops else np.full(40, 0.033))
     rows = [f"{int(t * unit)},0.{k:02d},0.1,0.2,0,0,0,1" for k, t in enumerate(times, 10)]
-    with folder() as place:
-        (place / "a.csv").write_text("\n".join(["timestamp,x,y,z,qx,qy,qz,qw", *rows]))
-        found = read_pose_file(place / "a.csv")
+    (tmp_path / "a.csv").write_text("\n".join(["timestamp,x,y,z,qx,qy,qz,qw", *rows]))
+    found = read_pose_file(tmp_path / "a.csv")
     assert np.allclose(found.times, times, atol=2e-6)
 
 
-def test_text_of_spreadsheets_and_windows():
+def test_text_of_spreadsheets_and_windows(tmp_path):
     raw = rows_of(reading_from_text("rotvec,m"), random_poses(12, 4))
     text = "\r\n".join(" ".join(map(number, r)) for r in raw)
-    with folder() as place:
-        for k, data in enumerate(
-            (text.encode("utf-16"), text.encode("utf-8-sig"), text.replace(".", ",").encode())
-        ):
-            (place / f"{k}.txt").write_bytes(data)
-            assert np.array_equal(read_pose_file(place / f"{k}.txt").values, raw)
+    for k, data in enumerate(
+        (text.encode("utf-16"), text.encode("utf-8-sig"), text.replace(".", ",").encode())
+    ):
+        (tmp_path / f"{k}.txt").write_bytes(data)
+        assert np.array_equal(read_pose_file(tmp_path / f"{k}.txt").values, raw)
 
 
-def test_ros_poses_and_parts():
+def test_ros_poses_and_parts(tmp_path):
     T = random_poses(8, 5)
     q = rows_of(reading_from_text("quat_xyzw,m"), T)
 
@@ -246,68 +240,62 @@ def test_ros_poses_and_parts():
         }
 
     parts = [{"R": t[:3, :3].tolist(), "t": t[:3, 3:].tolist(), "id": k} for k, t in enumerate(T)]
-    with folder() as place:
-        stamped = [{"header": {"seq": k}, "pose": ros(r)} for k, r in enumerate(q)]
-        path = place / "a.yaml"
-        path.write_text("---\n".join(json.dumps(s) + "\n" for s in stamped))  # several documents
-        found = read_pose_file(path)
-        assert str(found.stated) == "quat_xyzw,m"
+    stamped = [{"header": {"seq": k}, "pose": ros(r)} for k, r in enumerate(q)]
+    path = tmp_path / "a.yaml"
+    path.write_text("---\n".join(json.dumps(s) + "\n" for s in stamped))  # several documents
+    vectors = [
+        {"rvec": r[3:].tolist(), "tvec_mm": r[:3].tolist()}
+        for r in rows_of(reading_from_text("rotvec,mm"), T)
+    ]
+    for file, stated in (
+        (path, "quat_xyzw,m"),
+        (as_json(tmp_path / "b.json", parts), "matrix,m"),
+        (as_json(tmp_path / "c.json", vectors), "rotvec,rad,mm"),
+    ):
+        found = read_pose_file(file)
+        assert str(found.stated) == stated
         check(found, found.stated, T)
-        found = read_pose_file(as_json(place / "b.json", parts))
-        assert str(found.stated) == "matrix,m"
-        check(found, found.stated, T)
-        tree = [
-            {"rvec": r[3:].tolist(), "tvec_mm": r[:3].tolist()}
-            for r in rows_of(reading_from_text("rotvec,mm"), T)
-        ]
-        found = read_pose_file(as_json(place / "c.json", tree))
-        assert str(found.stated) == "rotvec,rad,mm"
-        check(found, found.stated, T)
-        tree = [{"position": r[:3].tolist(), "quaternion": r[3:].tolist()} for r in q]
-        found = read_pose_file(as_json(place / "d.json", tree))
-        assert {p.rotation for p in found.possible} == {"quaternion_xyzw", "quaternion_wxyz"}
-        check(found, reading_from_text("quat_xyzw,m"), T)
+    tree = [{"position": r[:3].tolist(), "quaternion": r[3:].tolist()} for r in q]
+    found = read_pose_file(as_json(tmp_path / "d.json", tree))
+    assert {p.rotation for p in found.possible} == {"quaternion_xyzw", "quaternion_wxyz"}
+    check(found, reading_from_text("quat_xyzw,m"), T)
 
 
-def test_matrices_as_blocks_of_lines_and_of_few_decimals():
+def test_matrices_as_blocks_of_lines_and_of_few_decimals(tmp_path):
     T = random_poses(9, 5)
-    with folder() as place:
-        text = "\n\n".join("\n".join(" ".join(map(number, row)) for row in t) for t in T)
-        (place / "a.txt").write_text(text)
-        found = read_pose_file(place / "a.txt")
-        assert str(found.stated) == "matrix,m" and found.where[1] == "line 6"
-        check(found, found.stated, T)
-        (place / "b.txt").write_text("\n".join(" ".join(f"{x:.4f}" for x in t.ravel()) for t in T))
-        rounded = read_pose_file(place / "b.txt")
+    text = "\n\n".join("\n".join(" ".join(map(number, row)) for row in t) for t in T)
+    (tmp_path / "a.txt").write_text(text)
+    found = read_pose_file(tmp_path / "a.txt")
+    assert str(found.stated) == "matrix,m" and found.where[1] == "line 6"
+    check(found, found.stated, T)
+    (tmp_path / "b.txt").write_text("\n".join(" ".join(f"{x:.4f}" for x in t.ravel()) for t in T))
+    rounded = read_pose_file(tmp_path / "b.txt")
     assert any("few decimals" in n for n in rounded.notes)
     back = rounded.poses(rounded.stated)
     assert np.abs(back - T).max() < 1e-4 and se3.check_rigid(back, "rounded") is not None
 
 
-def test_numbers_leave_open_what_they_do_not_say():
+def test_numbers_leave_open_what_they_do_not_say(tmp_path):
     T = random_poses(10, 12)
-    with folder() as place:
-        six = read_pose_file(
-            write_lines(place / "a.txt", rows_of(reading_from_text("euler_ZYX,deg,mm"), T), " ")
-        )
-        assert {p.angle_unit for p in six.possible if p.position_first} == {"deg"}
-        assert {p.length_unit for p in six.possible if p.position_first} == {"mm"}
-        assert {p.rotation for p in six.possible} == {
-            r for r in ROTATIONS if r[:3] in ("eul", "rot")
-        }
-        assert six.stated is None
-        near = T.copy()
-        near[:, :3, 3] = 10.0 / 1000 * se3.random_rotation(np.random.default_rng(0), 12)[:, 0]
-        open_unit = read_pose_file(
-            write_lines(place / "b.txt", rows_of(reading_from_text("quat_wxyz,mm"), near), " ")
-        )
-        assert {p.length_unit for p in open_unit.possible} == {"m", "mm"}
-        assert {p.rotation for p in open_unit.possible if p.position_first} == {
-            "quaternion_xyzw",
-            "quaternion_wxyz",
-        }
-        still = np.tile(np.eye(4), (4, 1, 1))
-        both = read_pose_file(as_json(place / "c.json", still.tolist()))
+    six = read_pose_file(
+        write_lines(tmp_path / "a.txt", rows_of(reading_from_text("euler_ZYX,deg,mm"), T), " ")
+    )
+    assert {p.angle_unit for p in six.possible if p.position_first} == {"deg"}
+    assert {p.length_unit for p in six.possible if p.position_first} == {"mm"}
+    assert {p.rotation for p in six.possible} == {r for r in ROTATIONS if r[:3] in ("eul", "rot")}
+    assert six.stated is None
+    near = T.copy()
+    near[:, :3, 3] = 10.0 / 1000 * se3.random_rotation(np.random.default_rng(0), 12)[:, 0]
+    open_unit = read_pose_file(
+        write_lines(tmp_path / "b.txt", rows_of(reading_from_text("quat_wxyz,mm"), near), " ")
+    )
+    assert {p.length_unit for p in open_unit.possible} == {"m", "mm"}
+    assert {p.rotation for p in open_unit.possible if p.position_first} == {
+        "quaternion_xyzw",
+        "quaternion_wxyz",
+    }
+    still = np.tile(np.eye(4), (4, 1, 1))
+    both = read_pose_file(as_json(tmp_path / "c.json", still.tolist()))
     assert {p.rotation for p in both.possible} == {"matrix", "matrix_column_major"}
 
 
@@ -336,7 +324,7 @@ ROW = "0.5 -0.1 0.4 1.1 2.8 -0.1\n"
         ("a.xml", "<a/>", "not .xml"),
     ],
 )
-def test_malformed_files_are_refused_by_place(tmp_path, name, content, says):
+def test_malformed_files_are_refused_by_tmp_path(tmp_path, name, content, says):
     (tmp_path / name).write_text(content)
     refused(says, read_pose_file, tmp_path / name)
 

@@ -63,19 +63,15 @@ class Raster:
         return (np.asarray(uv, dtype=np.float64) + 0.5) * self.mm_per_px
 
 
-@pytest.fixture(scope="module")
-def printed(tmp_path_factory: pytest.TempPathFactory):
-    folder = tmp_path_factory.mktemp("sheets")
-    made: dict[str, tuple[Target, SheetReport, Raster]] = {}
+Printed = tuple[Target, SheetReport, Raster]
 
-    def get(line: str) -> tuple[Target, SheetReport, Raster]:
-        if line not in made:
-            target = parse_target(line)
-            report = write_sheet(target, folder / f"{len(made)}.pdf", paper=SHEETS[line])
-            made[line] = (target, report, Raster(report.pdf))
-        return made[line]
 
-    return get
+@pytest.fixture(scope="module", params=SHEETS)
+def printed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Printed:
+    target = parse_target(request.param)
+    path = tmp_path_factory.mktemp("sheets") / "sheet.pdf"
+    report = write_sheet(target, path, paper=SHEETS[request.param])
+    return target, report, Raster(report.pdf)
 
 
 # --- OpenCV's own detectors -------------------------------------------------------------------
@@ -136,9 +132,8 @@ def up_to_turns(target: Target, found: Array, expected: Array):
     return min(flat, key=lambda uv: float(np.nanmax(np.abs(uv - expected))))
 
 
-@pytest.mark.parametrize("line", SHEETS)
-def test_every_point_is_printed_at_its_place(line: str, printed) -> None:
-    target, report, raster = printed(line)
+def test_every_point_is_printed_at_its_place(printed: Printed) -> None:
+    target, report, raster = printed
     expected = np.array(report.layout.origin_mm) + 1000 * target.points_board[:, :2]
     found = up_to_turns(target, raster.to_mm(found_points(target, raster.gray)), expected)
     error = np.linalg.norm(found - expected, axis=-1)
@@ -146,11 +141,10 @@ def test_every_point_is_printed_at_its_place(line: str, printed) -> None:
     assert error.max() < WITHIN_MM
 
 
-@pytest.mark.parametrize("line", SHEETS)
-def test_rulers_and_page_have_their_length(line: str, printed) -> None:
-    _, report, raster = printed(line)
+def test_rulers_and_page_have_their_length(printed: Printed) -> None:
+    _, report, raster = printed
     assert raster.size_mm == pytest.approx(report.layout.page_mm, abs=1e-3)
-    assert sorted(report.layout.page_mm) == pytest.approx(sorted(PAPERS_MM[SHEETS[line]]))
+    assert sorted(report.layout.page_mm) == pytest.approx(sorted(PAPERS_MM[report.paper]))
     for ruler in report.layout.rulers:
         assert ruler.length_mm >= 100
         ticks = ruler_ticks_mm(ruler, raster)
@@ -178,9 +172,8 @@ def ruler_ticks_mm(ruler, raster: Raster) -> Array:
     return (np.array(centres) + low + 0.5) * pitch
 
 
-@pytest.mark.parametrize("line", SHEETS)
-def test_the_sheet_says_its_own_name(line: str, printed) -> None:
-    target, report, raster = printed(line)
+def test_the_sheet_says_its_own_name(printed: Printed) -> None:
+    target, report, raster = printed
     assert report.name in raster.text
     assert target_to_json(parse_target(report.name)) == target_to_json(target)
     assert "Print at 100 %" in raster.text
@@ -189,9 +182,8 @@ def test_the_sheet_says_its_own_name(line: str, printed) -> None:
     assert target_to_json(read_target(report.target_file)) == target_to_json(target)
 
 
-@pytest.mark.parametrize("line", SHEETS)
-def test_nothing_is_printed_in_the_quiet_zone(line: str, printed) -> None:
-    target, report, raster = printed(line)
+def test_nothing_is_printed_in_the_quiet_zone(printed: Printed) -> None:
+    target, report, raster = printed
     x0, y0, x1, y1 = (v * 1000 for v in artwork_of(target).bounds_m)
     inner = np.array([x0, y0, x1, y1]) + np.tile(report.layout.origin_mm, 2)
     quiet = np.array(report.layout.quiet_mm)
@@ -203,9 +195,8 @@ def test_nothing_is_printed_in_the_quiet_zone(line: str, printed) -> None:
     assert picture.min() == 255
 
 
-@pytest.mark.parametrize("line", SHEETS)
-def test_page_and_picture_show_the_same_without_seams(line: str, printed) -> None:
-    target, report, raster = printed(line)
+def test_page_and_picture_show_the_same_without_seams(printed: Printed) -> None:
+    target, report, raster = printed
     picture, origin = target_image(target, 1000 / float(raster.mm_per_px.mean()), 0.001)
     u, v = origin - (np.array(report.layout.origin_mm) / raster.mm_per_px - 0.5)
     move = np.array([[1, 0, u], [0, 1, v]])

@@ -100,26 +100,20 @@ def test_millimetres_are_scaled_as_decimal_numbers(tenths: int) -> None:
 
 
 def test_the_documented_lines() -> None:
-    charuco = parse_target("charuco:5x7,square=33mm,marker=20mm,dict=6X6_100")
-    assert fields_of(charuco) == fields_of(
-        CharucoBoard(rows=7, columns=5, square_m=0.033, marker_m=0.02, dictionary="DICT_6X6_100")
-    )
-    assert parse_target("ChArUco: 5 x 7 , square = 33 mm, marker=2cm, dict=dict_6x6_100, legacy")
-    assert fields_of(parse_target("chessboard:8x6,square=21.9mm")) == fields_of(
-        Chessboard(rows=6, columns=8, square_m=0.0219)
-    )
-    assert fields_of(parse_target("circles:10x10,pitch=1in,large-origin")) == fields_of(
-        CircleGrid(rows=10, columns=10, pitch_m=0.0254, large_origin=True)
-    )
-    assert fields_of(
-        parse_target("aprilgrid:6x4,tag=40mm,gap=10mm,family=25h9,first=3,from-bottom")
-    ) == fields_of(
+    documented = {
+        "charuco:5x7,square=33mm,marker=20mm,dict=6X6_100":
+        CharucoBoard(rows=7, columns=5, square_m=0.033, marker_m=0.02, dictionary="DICT_6X6_100"),
+        "chessboard:8x6,square=21.9mm": Chessboard(rows=6, columns=8, square_m=0.0219),
+        "circles:10x10,pitch=1in,large-origin":
+        CircleGrid(rows=10, columns=10, pitch_m=0.0254, large_origin=True),
+        "aprilgrid:6x4,tag=40mm,gap=10mm,family=25h9,first=3,from-bottom":
         TagBoard(rows=4, columns=6, tag_size_m=0.04, gap_m=0.01, family="tag25h9", first_id=3,
-                 ids_from="bottom")
-    )  # fmt: skip
-    assert fields_of(parse_target("tag:7,size=80mm")) == fields_of(
-        TagBoard(rows=1, columns=1, tag_size_m=0.08, gap_m=0.01, first_id=7)
-    )
+                 ids_from="bottom"),
+        "tag:7,size=80mm": TagBoard(rows=1, columns=1, tag_size_m=0.08, gap_m=0.01, first_id=7),
+    }  # fmt: skip
+    for line, target in documented.items():
+        assert fields_of(parse_target(line)) == fields_of(target)
+    assert parse_target("ChArUco: 5 x 7 , square = 33 mm, marker=2cm, dict=dict_6x6_100, legacy")
 
 
 def test_every_form_accepts_its_own_usage_line() -> None:
@@ -203,26 +197,21 @@ def write(folder: Path, name: str, text: str | bytes) -> Path:
 
 
 def test_kalibr_files(tmp_path: Path) -> None:
-    april = write(tmp_path, "april.yaml",
-                  "target_type: 'aprilgrid' #gridtype\ntagCols: 6\ntagRows: 5  # rows\n"
-                  "tagSize: 0.088  #edge to edge [m]\ntagSpacing: 0.3  #ratio\n")  # fmt: skip
-    grid = read_target(april)
-    assert isinstance(grid, TagBoard)
-    assert fields_of(grid) == fields_of(
-        TagBoard(rows=5, columns=6, tag_size_m=0.088, gap_m=0.0264, ids_from="bottom",
-                 corner_squares=True)
-    )  # fmt: skip
-    assert grid.ids[0] == 24 and grid.ids[-6] == 0
-    chess = write(tmp_path, "chess.yml",
-                  "target_type: 'checkerboard'\ntargetCols: 6\ntargetRows: 7\n"
-                  "rowSpacingMeters: 0.06\ncolSpacingMeters: 0.06\n")  # fmt: skip
-    assert fields_of(read_target(chess)) == fields_of(Chessboard(rows=7, columns=6, square_m=0.06))
-    circles = write(tmp_path, "circles.yaml",
-                    "target_type: circlegrid\ntargetCols: 4\ntargetRows: 11\n"
-                    "spacingMeters: 0.02\nasymmetricGrid: True\n")  # fmt: skip
-    assert fields_of(read_target(circles)) == fields_of(
-        CircleGrid(rows=11, columns=4, pitch_m=0.02, asymmetric=True)
-    )
+    april = TagBoard(rows=5, columns=6, tag_size_m=0.088, gap_m=0.0264, ids_from="bottom",
+                     corner_squares=True)  # fmt: skip
+    for name, target, text in (
+        ("april.yaml", april,
+         "target_type: 'aprilgrid' #gridtype\ntagCols: 6\ntagRows: 5  # rows\n"
+         "tagSize: 0.088  #edge to edge [m]\ntagSpacing: 0.3  #ratio\n"),
+        ("chess.yml", Chessboard(rows=7, columns=6, square_m=0.06),
+         "target_type: 'checkerboard'\ntargetCols: 6\ntargetRows: 7\n"
+         "rowSpacingMeters: 0.06\ncolSpacingMeters: 0.06\n"),
+        ("circles.yaml", CircleGrid(rows=11, columns=4, pitch_m=0.02, asymmetric=True),
+         "target_type: circlegrid\ntargetCols: 4\ntargetRows: 11\n"
+         "spacingMeters: 0.02\nasymmetricGrid: True\n"),
+    ):  # fmt: skip
+        assert fields_of(read_target(write(tmp_path, name, text))) == fields_of(target)
+    assert april.ids[0] == 24 and april.ids[-6] == 0
 
 
 @pytest.mark.parametrize(

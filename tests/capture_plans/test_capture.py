@@ -126,6 +126,11 @@ def new_store(folder: Path, plan_hash: str) -> SessionStore:
 
 
 @pytest.fixture
+def store(tmp_path: Path) -> SessionStore:
+    return new_store(tmp_path / "s", plan().content_hash)
+
+
+@pytest.fixture
 def arm() -> KinematicArm:
     return KinematicArm(joints=plan().home.copy())
 
@@ -173,10 +178,9 @@ def test_going_on_takes_only_what_is_missing_and_stays_clear(
         assert np.array_equal(part.rgb(k), full.rgb(k))
 
 
-def test_an_arm_below_the_table_is_not_moved(tmp_path: Path) -> None:
+def test_an_arm_below_the_table_is_not_moved(store: SessionStore) -> None:
     low = KinematicArm(joints=np.array([0.0, 0.6, 0.0, 0.0, 0.0, 0.0]))
     assert not plan().collision_model().free(low.joints[None])[0]
-    store = new_store(tmp_path / "s", plan().content_hash)
     refused("by hand", capture, plan(), low, TableCamera(low), store, error=DeviceError)
     assert low.path == []
 
@@ -203,15 +207,13 @@ def test_a_moving_arm_and_a_dark_frame_are_taken_again(tmp_path: Path, arm: Kine
     assert "black" in summary.rejected[0][1]
 
 
-def test_an_arm_that_was_stopped_short_is_noticed(tmp_path: Path, arm: KinematicArm) -> None:
-    store = new_store(tmp_path / "s", plan().content_hash)
+def test_an_arm_that_was_stopped_short_is_noticed(store: SessionStore, arm: KinematicArm) -> None:
     camera = TableCamera(arm, meanwhile=[lambda: arm.turn_wrist(0.02)])
     stopped("off goal", "off its goal", capture, plan(), arm, camera, store)
     assert store.completed == set()
 
 
-def test_another_arm_is_told_by_its_name_or_by_where_its_flange_is(tmp_path: Path) -> None:
-    store = new_store(tmp_path / "s", plan().content_hash)
+def test_another_arm_is_told_by_its_name_or_by_where_its_flange_is(store: SessionStore) -> None:
     named = KinematicArm(joints=plan().home.copy(), name="UR5e")
     refused("made for a UR5, this arm is a UR5e", capture, plan(), named, TableCamera(named), store)
 
@@ -225,7 +227,7 @@ def test_another_arm_is_told_by_its_name_or_by_where_its_flange_is(tmp_path: Pat
 
 
 def test_a_calibration_left_out_is_warned_of_once_and_the_controllers_pose_kept(
-    tmp_path: Path,
+    store: SessionStore,
 ) -> None:
     chain = replace(UR5, delta_d=np.array([1e-3, 0, 0, 2e-3, 0, 0]))
 
@@ -234,7 +236,6 @@ def test_a_calibration_left_out_is_warned_of_once_and_the_controllers_pose_kept(
             return replace(super().state(), T_base_ee=chain.forward(self.joints))
 
     arm = CalibratedArm(joints=plan().home.copy())
-    store = new_store(tmp_path / "s", plan().content_hash)
     summary = capture(plan(), arm, TableCamera(arm), store)
     assert len(summary.warnings) == 1 and "calibration.conf" in summary.warnings[0]
     for view in store.session.views:
@@ -257,8 +258,7 @@ def test_a_dry_run_goes_everywhere_slowly_and_keeps_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_views_asked_for_and_views_taken_again(tmp_path: Path, arm: KinematicArm) -> None:
-    store = new_store(tmp_path / "s", plan().content_hash)
+def test_views_asked_for_and_views_taken_again(store: SessionStore, arm: KinematicArm) -> None:
     camera = TableCamera(arm)
     first = capture(plan(), arm, camera, store, config=QUICK, job=CaptureJob(views=(2, 7)))
     assert store.completed == {2, 7} and first.complete
@@ -315,8 +315,7 @@ def test_a_kill_at_any_write_of_a_retake_loses_neither_view(
     pytest.fail("the retake never came to its end")
 
 
-def test_the_log_says_what_happened_and_is_listed(tmp_path: Path, arm: KinematicArm) -> None:
-    store = new_store(tmp_path / "s", plan().content_hash)
+def test_the_log_says_what_happened_and_is_listed(store: SessionStore, arm: KinematicArm) -> None:
     capture(plan(), arm, TableCamera(arm, dark=1), store)
     store = SessionStore.open(store.folder)
     entries = CaptureLog(store).entries

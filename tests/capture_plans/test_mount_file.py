@@ -90,19 +90,15 @@ def test_what_is_written_is_read_back(
     if any(not c.isprintable() for c in name):
         name = repr(name)
     rng = np.random.default_rng(seed)
+    kinds = {"box": 3, "capsule": 2, "cylinder": 2, "sphere": 1, "convex": 0}
     pieces = [
         Shape(
             part="bracket", frame=6, kind=kind, size_m=tuple(rng.uniform(0.01, 0.1, lengths)),
+            points=rng.normal(0, 0.02, (4, 3)) if kind == "convex" else None,
             T_frame_shape=se3.random_transform(rng, spread=0.05),
         )
-        for kind, lengths in {"box": 3, "capsule": 2, "cylinder": 2, "sphere": 1}.items()
+        for kind, lengths in kinds.items()
     ]  # fmt: skip
-    pieces.append(
-        Shape(
-            part="bracket", frame=6, kind="convex", size_m=(), points=rng.normal(0, 0.02, (4, 3)),
-            T_frame_shape=se3.random_transform(rng, spread=0.05),
-        )
-    )  # fmt: skip
     mount = Mount(
         name=name,
         camera=str(rng.choice(list(CAMERA_BODIES))),

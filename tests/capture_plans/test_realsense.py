@@ -4,6 +4,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -137,19 +138,14 @@ def exposure_of(rs: Any, sensor: Any) -> tuple[float, float]:
 
 
 def test_exposure_is_automatic_fixed_or_locked(rs: Any, make: Make, opened: Open) -> None:
-    def config(exposure: Any) -> RealSenseConfig:
-        return RealSenseConfig(
-            width=WIDTH, height=HEIGHT, exposure=exposure, settle_pairs=2, timeout_s=1.0
-        )
-
     software = make(**TWO)
-    opened(software, config(5000.0)).close()
+    opened(software, replace(FAST, exposure=5000.0)).close()
     # A colour sensor of its own counts 100 us.
     assert exposure_of(rs, software.stereo) == (0.0, 5000.0)
     assert exposure_of(rs, software.color_sensor) == (0.0, 50.0)
-    opened(software, config("auto")).close()
+    opened(software, replace(FAST, exposure="auto")).close()
     assert exposure_of(rs, software.stereo)[0] == 1.0
-    camera = opened(software, config("locked"))
+    camera = opened(software, replace(FAST, exposure="locked"))
     assert exposure_of(rs, software.stereo)[0] == 1.0
     software.run()
     camera.grab()
@@ -158,7 +154,7 @@ def test_exposure_is_automatic_fixed_or_locked(rs: Any, make: Make, opened: Open
     assert camera.last_metadata["depth"]["exposure_us"] == 8123.0
     assert camera.description["options"]["Stereo Module"]["exposure"] == 8123.0
     software.halt()
-    refused(r"takes 1 to 165000 us", opened, software, config(1e9))
+    refused(r"takes 1 to 165000 us", opened, software, replace(FAST, exposure=1e9))
 
 
 # --- trouble -------------------------------------------------------------------------------------

@@ -1,9 +1,10 @@
 """Meshes: analytic masses, files that come back the same, units that are found out."""
 
-import dataclasses
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -66,14 +67,14 @@ def test_two_boxes_weigh_the_sum_and_inside_out_changes_nothing():
     m = meshes.mass_properties(both, 1000.0)
     assert m.mass_kg == pytest.approx(2 * meshes.mass_properties(box(), 1000.0).mass_kg)
     assert m.hull_volume_fraction < 0.6
-    flipped = dataclasses.replace(both, faces=both.faces[:, ::-1])
+    flipped = replace(both, faces=both.faces[:, ::-1])
     np.testing.assert_allclose(
         meshes.mass_properties(flipped, 1000.0).inertia, m.inertia, atol=1e-15
     )
 
 
 def test_an_open_mesh_weighs_what_its_hull_weighs_and_says_so():
-    lidless = dataclasses.replace(box(), faces=box().faces[:-2])
+    lidless = replace(box(), faces=box().faces[:-2])
     m = meshes.mass_properties(lidless, 1000.0)
     assert not m.is_watertight and m.hull_volume_fraction == pytest.approx(1)
     assert m.volume_m3 == pytest.approx(0.1 * 0.06 * 0.04)
@@ -139,7 +140,7 @@ def test_symmetries_are_a_closed_set_that_keeps_the_object():
     np.testing.assert_allclose(
         se3.transform(turns, on_axis[None].repeat(13, 0))[:, 0], on_axis.repeat(13, 0), atol=1e-12
     )
-    plain = dataclasses.replace(model, symmetry_axes=())
+    plain = replace(model, symmetry_axes=())
     np.testing.assert_array_equal(meshes.symmetry_transforms(plain), plain.symmetries)
 
 
@@ -198,7 +199,7 @@ def test_overlap_of_masks():
 @pytest.mark.parametrize("ascii", [False, True])
 @pytest.mark.parametrize("unit", ["m", "mm"])
 def test_a_ply_comes_back_the_same(tmp_path, ascii, unit):
-    mesh = dataclasses.replace(box(), colors=np.random.default_rng(0).integers(0, 256, (8, 3)))
+    mesh = replace(box(), colors=np.random.default_rng(0).integers(0, 256, (8, 3)))
     meshes.save_ply(tmp_path / "box.ply", mesh, unit, ascii=ascii)
     back = meshes.load_mesh(tmp_path / "box.ply", unit)
     np.testing.assert_allclose(back.vertices, mesh.vertices, atol=1e-8)
@@ -208,7 +209,7 @@ def test_a_ply_comes_back_the_same(tmp_path, ascii, unit):
 
 @pytest.mark.parametrize("colors", [None, np.arange(24).reshape(8, 3), np.full((8, 3), 9)])
 def test_a_plain_ply_is_what_the_general_reader_makes_of_it(tmp_path, monkeypatch, colors):
-    data = meshes.ply_bytes(dataclasses.replace(box(), colors=colors), "mm")
+    data = meshes.ply_bytes(replace(box(), colors=colors), "mm")
     path = tmp_path / "box.ply"
     path.write_bytes(data)
     ours = meshes.load_mesh(path, "mm")
@@ -228,7 +229,7 @@ def test_a_textured_ply_comes_back_right_side_up(tmp_path):
     np.testing.assert_array_equal(back.texture, textured_square().texture)
     np.testing.assert_allclose(back.uv, textured_square().uv)
     # The corner at v = 0 is green, the one at v = 1 is red.
-    colors = meshes.vertex_colors(dataclasses.replace(back, uv=np.clip(back.uv, 0.1, 0.9)))
+    colors = meshes.vertex_colors(replace(back, uv=np.clip(back.uv, 0.1, 0.9)))
     assert colors.tolist() == [[0, 255, 0]] * 2 + [[255, 0, 0]] * 2
 
 
@@ -343,32 +344,23 @@ def test_a_whole_texture_is_kept_without_a_word(tmp_path: Path) -> None:
     assert notes == []
 
 
-def test_a_missing_texture_leaves_the_materials_colour(tmp_path: Path) -> None:
-    mesh, notes = loaded(obj(tmp_path, UV + WITH_UV, RED + "map_Kd gone.png\n"))
-    assert mesh.texture is None and mesh.colors is not None
-    assert tuple(mesh.colors[0]) == (204, 26, 26)
-    assert len(notes) == 1
-    assert "'gone.png'" in notes[0] and "sRGB 204 26 26" in notes[0]
-
-
-def test_a_broken_texture_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("body", "table", "words", "color"),
+    [
+        (UV + WITH_UV, "map_Kd gone.png\n", ("'gone.png'", "sRGB 204 26 26"), (204, 26, 26)),
+        (UV + WITH_UV, "map_Kd bad.png\n", ("'bad.png'", "cannot be decoded"), (204, 26, 26)),
+        (UV + WITH_UV, None, ("'m.mtl'", "procedural material"), None),
+        (WITHOUT_UV, "map_Kd t.png\n", ("'t.png'", "no texture coordinates"), (204, 26, 26)),
+    ],
+)
+def test_a_texture_that_is_lacking_is_named_and_leaves_the_materials_colour(
+    tmp_path: Path, body: str, table: str | None, words: tuple[str, ...], color: Any
+) -> None:
     (tmp_path / "bad.png").write_bytes(b"no picture")
-    mesh, notes = loaded(obj(tmp_path, UV + WITH_UV, RED + "map_Kd bad.png\n"))
-    assert mesh.texture is None
-    assert "'bad.png'" in notes[0] and "cannot be decoded" in notes[0]
-
-
-def test_a_missing_material_table_leaves_no_colour_instead_of_grey(tmp_path: Path) -> None:
-    mesh, notes = loaded(obj(tmp_path, UV + WITH_UV))
-    assert mesh.texture is None and mesh.colors is None
-    assert "'m.mtl'" in notes[0] and "procedural material" in notes[0]
-
-
-def test_a_texture_without_coordinates_is_named(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "t.png"), np.zeros((4, 4, 3), np.uint8))
-    mesh, notes = loaded(obj(tmp_path, WITHOUT_UV, RED + "map_Kd t.png\n"))
-    assert mesh.texture is None
-    assert "'t.png'" in notes[0] and "no texture coordinates" in notes[0]
+    mesh, (note,) = loaded(obj(tmp_path, body, table and RED + table))
+    assert mesh.texture is None and all(word in note for word in words)
+    assert (mesh.colors if color is None else tuple(mesh.colors[0])) == color
 
 
 def test_a_ply_without_its_texture_is_named_and_prints_no_traceback(

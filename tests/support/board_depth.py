@@ -1,5 +1,6 @@
 """Depth images of a board with a known bias, noise and warp."""
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -112,6 +113,21 @@ def drawn_views(
         depth.setflags(write=False)
         found.append(DepthBoardView(index=k, depth_m=depth, detection=detected(T, rng, corner_px)))
     return tuple(found)
+
+
+def sensed_views(
+    rng: np.random.Generator,
+    depth_at: Callable[[Array], Array | Array32],
+    corner_px: float = 0.0,
+    points: Array | None = None,
+) -> list[DepthBoardView]:
+    """Return views at the distances FAR, of whose board poses `depth_at` makes the depth."""
+    found: list[DepthBoardView] = []
+    for k, distance in enumerate(FAR):
+        T = pose_at(rng, distance)
+        depth, seen = depth_at(T), detected(T, rng, corner_px, points)
+        found.append(DepthBoardView(index=k, depth_m=depth, detection=seen))
+    return found
 
 
 def run(views: list[DepthBoardView], config: DepthBiasConfig | None = EXACT) -> DepthBiasReport:
