@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from stored_sessions import flip, make_whole
-from typed_commands import realsim
+from typed_commands import complained, realsim
 
 HEAVY = "numpy open3d pybullet gtsam cv2 viser trimesh scipy numba matplotlib".split()
 
@@ -32,10 +32,8 @@ def test_help_imports_nothing_heavy() -> None:
 
 def test_a_folder_that_is_no_session_is_named(tmp_path: Path) -> None:
     for command in ("calibrate", "register", "school", "annotate", "report"):
-        done = realsim(command, tmp_path)
-        assert done.returncode == 2
-        assert str(tmp_path) in done.stderr and "session.json" in done.stderr
-        assert "Traceback" not in done.stderr
+        said = complained(command, tmp_path)
+        assert str(tmp_path) in said and "session.json" in said
         assert list(tmp_path.iterdir()) == []
 
 
@@ -43,8 +41,7 @@ def test_a_folder_that_is_no_session_is_named(tmp_path: Path) -> None:
 
 
 def test_0_is_done(tmp_path: Path) -> None:
-    done = realsim("board", "tag:7,size=80mm", "--out", str(tmp_path / "b"))
-    assert done.returncode == 0
+    assert realsim("board", "tag:7,size=80mm", "--out", tmp_path / "b").returncode == 0
 
 
 def test_1_is_done_but_a_check_failed(tmp_path: Path) -> None:
@@ -112,18 +109,15 @@ def test_no_color_may_stand_anywhere(place: int, monkeypatch: pytest.MonkeyPatch
 
 def test_demo_takes_nobodys_folder(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
-    done = realsim("demo", "--out", str(tmp_path))
-    assert done.returncode == 2 and "not empty" in done.stderr
+    assert "not empty" in complained("demo", "--out", tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
 
 
 def test_unwritable_output_is_one_paragraph() -> None:
     # /proc refuses new folders for everybody, root included.
-    done = realsim("demo", "--out", "/proc/realsim-demo")
-    assert done.returncode == 2 and "Traceback" not in done.stderr and "/proc" in done.stderr
+    assert "/proc" in complained("demo", "--out", "/proc/realsim-demo")
 
 
 def test_upgrade_names_a_folder_without_scenes(tmp_path: Path) -> None:
-    done = realsim("upgrade", str(tmp_path), "--out", str(tmp_path / "out"))
-    assert done.returncode == 2 and "scene" in done.stderr and "Traceback" not in done.stderr
+    assert "scene" in complained("upgrade", tmp_path, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()

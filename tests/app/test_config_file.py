@@ -16,7 +16,7 @@ from realsim.app.config.template import template, toml_value
 from realsim.app.option_values import Numbers
 from realsim.app.outputs import OutputFile
 from refusals import refused
-from typed_commands import finished, realsim
+from typed_commands import complained, finished, realsim
 
 EVERY = walk(commands)
 
@@ -173,11 +173,9 @@ def test_the_first_file_that_is_there_is_read(monkeypatch: pytest.MonkeyPatch) -
         return in_force("register", "views", *before)[0]
 
     assert views() == "all"
-    written("[register]\nviews = 1\n", "home/realsim/config.toml")
-    assert views() == 1
-    written("[register]\nviews = 2\n", "realsim.toml")
-    assert views() == 2
-    written("[register]\nviews = 3\n", "variable.toml")
+    for k, path in enumerate(("home/realsim/config.toml", "realsim.toml", "variable.toml")):
+        written(f"[register]\nviews = {k + 1}\n", path)
+        assert views() == min(k + 1, 2)
     monkeypatch.setenv("REALSIM_CONFIG", "variable.toml")
     assert views() == 3
     written("[register]\nviews = 4\n", "named.toml")
@@ -202,9 +200,8 @@ def test_a_named_file_that_is_not_there_is_an_error(monkeypatch: pytest.MonkeyPa
     for name, args in (("--config", ["--config", "gone.toml"]), ("REALSIM_CONFIG", [])):
         if not args:
             monkeypatch.setenv(name, "gone.toml")
-        done = realsim(*args, "scan", "list")
-        assert done.returncode == 2 and "gone.toml" in done.stderr and name in done.stderr
-        assert "Traceback" not in done.stderr
+        said = complained(*args, "scan", "list")
+        assert "gone.toml" in said and name in said
 
 
 # --- what it refuses ----------------------------------------------------------------------------
@@ -237,21 +234,17 @@ def test_what_cannot_be_used_is_named_with_its_line_and_what_would_do(text: str)
 
 def test_a_wrong_file_stops_work_but_not_help_doctor_and_config_template() -> None:
     written("[registre]\n", "realsim.toml")
-    assert realsim("scan", "list").returncode == 2
-    assert realsim("config", "show").returncode == 2
+    for args in (["scan", "list"], ["config", "show"]):
+        complained(*args)
     for args in (["--help"], ["config", "template"], ["completion", "bash"]):
         assert realsim(*args).returncode == 0
 
 
 def test_bytes_that_are_no_text_are_named() -> None:
     Path("realsim.toml").write_bytes(b"\xff\xfe\x00")
-    done = realsim("config", "show")
-    assert done.returncode == 2 and "realsim.toml" in done.stderr
-    assert "Traceback" not in done.stderr
+    assert "realsim.toml" in complained("config", "show")
 
 
 def test_a_variable_that_cannot_be_used_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("REALSIM_DEMO_VIEWS", "many")
-    done = realsim("demo")
-    assert done.returncode == 2 and "REALSIM_DEMO_VIEWS" in done.stderr
-    assert "Traceback" not in done.stderr
+    assert "REALSIM_DEMO_VIEWS" in complained("demo")

@@ -2,6 +2,7 @@
 
 - `realsim`: the whole of `realsim.app.cli.main`, so that exit codes and messages are those of the
   program. Laws about the process itself (kills, terminals, what is imported) start one.
+- `complained`: what the program said of bad input, which has to be in words.
 - `invoked`, `finished`, `refused`: the command alone, which says what it raised.
 """
 
@@ -35,6 +36,13 @@ def realsim(*words: object) -> "subprocess.CompletedProcess[str]":
         finally:
             sys.argv = argv
     return subprocess.CompletedProcess(typed, code, said.getvalue(), complained.getvalue())
+
+
+def complained(*words: object) -> str:
+    """Return what `realsim WORDS...` said of bad input: it has to end with 2 and no traceback."""
+    done = realsim(*words)
+    assert done.returncode == 2 and "Traceback" not in done.stderr, (done.stdout, done.stderr)
+    return done.stderr
 
 
 def invoked(*words: object) -> Result:
