@@ -28,6 +28,11 @@ def run(*args: object) -> Result:
     return typed_commands.invoked("school", *args)
 
 
+def finished(*args: object) -> Result:
+    """Run the group, which has to end with 0."""
+    return typed_commands.finished("school", *args)
+
+
 def refused(*args: object) -> str:
     """Return what the group refuses the arguments with."""
     return typed_commands.refused("school", *args)
