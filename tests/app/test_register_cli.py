@@ -3,11 +3,13 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import Result
 
+from plain_meshes import square
 from realsim.app import stages
 from realsim.app.console import Console
 from realsim.app.register.config import RegisterRequest, config_of, load_depth_bias
@@ -18,7 +20,7 @@ from realsim.errors import InputError
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.parts import part
-from realsim.records import Mesh, ObjectModel, ObjectPose
+from realsim.records import ObjectModel
 from realsim.records.depth_bias import DepthBias
 from realsim.registration.odometry.hand_held import hand_held_poses
 from realsim.registration.views import SampleConfig
@@ -28,36 +30,31 @@ from shared_sessions import copy_of
 from typed_commands import finished, invoked, refused
 
 QUIET = Console(quiet=True)
+MUG = RegisterRequest(objects=("mug",))
 
 
 @pytest.fixture(scope="module")
 def registered(few_views: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
     """A session of four views registered from rough starts, and what the command said."""
     folder = copy_of(few_views, tmp_path_factory.mktemp("registered") / "s")
-    store = SessionStore.open(folder)
     off = se3.exp(np.array([0.1, -0.1, 0.15, 0.006, -0.004, 0.005]))
-    starts = [
-        ObjectPose(obj_id=o.obj_id, instance=o.instance, T_world_obj=o.T_world_obj @ off)
-        for o in true_poses()
-    ]
-    stages.save_starts(store, starts, "test")
-    return folder, invoked("register", folder, "--quiet")
+    starts = [replace(o, T_world_obj=o.T_world_obj @ off) for o in true_poses()]
+    stages.save_starts(SessionStore.open(folder), starts, "test")
+    return folder, finished("register", folder, "--quiet")
 
 
 @pytest.fixture
-def session(table_views: Path, tmp_path: Path) -> Path:
+def session(table_views: Path, tmp_path: Path) -> SessionStore:
     """A session of eight views for one test, with nothing said of its objects."""
-    return copy_of(table_views, tmp_path / "s")
+    return SessionStore.open(copy_of(table_views, tmp_path / "s"))
 
 
 def test_objects_are_found_and_everything_is_written(registered: tuple[Path, Result]) -> None:
     folder, result = registered
-    assert result.exit_code == 0, result.output
     store = SessionStore.open(folder)
     found = load_registered(store)
-    models = models_of()
     for o, true in zip(found.scene.objects, true_poses(), strict=True):
-        corners = models[o.obj_id].mesh.vertices
+        corners = models_of()[o.obj_id].mesh.vertices
         gap = se3.transform(o.T_world_obj, corners) - se3.transform(true.T_world_obj, corners)
         assert np.linalg.norm(gap, axis=1).max() < 2e-3
         assert o.covariance is not None and o.verdict != "rejected"
@@ -90,66 +87,65 @@ def test_a_second_run_computes_nothing_and_starts_from_the_claimed_cameras(
     assert all(np.allclose(now[k], refined[k], rtol=0, atol=1e-14) for k in refined)
 
 
-def test_nothing_said_names_the_three_ways(session: Path) -> None:
-    said = refused("register", session)
-    assert all(way in said for way in ("--object", "starts.json", "--find-all"))
-    assert not (session / "registration").exists()
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--find-all", "--object", "mug"], "one of both"),
-        (["--object", "teapot"], "teapot"),
-        (["--object", "mug", "--hand-held"], "--hand-held"),
-        (["--object", "mug", "--depth-bias", "nowhere.json"], "nowhere.json"),
+        ([], ["--object", "starts.json", "--find-all"]),
+        (["--find-all", "--object", "mug"], ["one of both"]),
+        (["--object", "teapot"], ["teapot"]),
+        (["--object", "mug", "--hand-held"], ["--hand-held"]),
+        (["--object", "mug", "--depth-bias", "nowhere.json"], ["nowhere.json"]),
     ],
 )
-def test_what_cannot_be_used_is_named(session: Path, options: list[str], words: str) -> None:
-    assert words in refused("register", session, *options)
+def test_what_cannot_be_used_is_named(
+    session: SessionStore, options: list[str], words: list[str]
+) -> None:
+    said = refused("register", session.folder, *options)
+    assert all(w in said for w in words)
+    assert not session.path("registration").exists()
 
 
-def test_a_flat_model_is_named_and_stays_out_of_the_session(session: Path, tmp_path: Path) -> None:
-    corners = np.array([[0.0, 0, 0], [0.09, 0, 0], [0.09, 0.06, 0], [0, 0.06, 0]])
-    sheet = Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
-    save_models(tmp_path / "lib", {50: ObjectModel(obj_id=50, name="sheet", mesh=sheet)})
-    said = refused("register", session, "--library", tmp_path / "lib", "--object", 50)
+def test_a_flat_model_is_named_and_stays_out_of_the_session(
+    session: SessionStore, tmp_path: Path
+) -> None:
+    sheet = ObjectModel(obj_id=50, name="sheet", mesh=square(0.05))
+    save_models(tmp_path / "lib", {50: sheet})
+    said = refused("register", session.folder, "--library", tmp_path / "lib", "--object", 50)
     assert "object 50" in said and "flat" in said
-    assert not list(session.glob("models/*000050*"))
+    assert not list(session.folder.glob("models/*000050*"))
 
 
-def test_a_wrong_number_of_views_is_refused(session: Path) -> None:
+def test_a_wrong_number_of_views_is_refused(session: SessionStore) -> None:
     for views in ("0", "-3", "some", "1.5"):
-        result = invoked("register", session, "--object", "mug", "--views", views)
+        result = invoked("register", session.folder, "--object", "mug", "--views", views)
         assert result.exit_code == 2 and views in result.output
 
 
-def test_views_and_models_that_take_part_are_chosen(session: Path) -> None:
-    store = SessionStore.open(session)
-    inputs = read_inputs(store, RegisterRequest(objects=("mug",), views=3))
+def test_views_and_models_that_take_part_are_chosen(session: SessionStore) -> None:
+    inputs = read_inputs(session, replace(MUG, views=3))
     assert inputs.views == (0, 4, 7) and list(inputs.models) == [part("mug").obj_id]
-    for frame in inputs.frames(store):
-        assert np.array_equal(frame.depth_m, store.depth_m(frame.index))
-    both = read_inputs(store, RegisterRequest(find_all=True))
+    for frame in inputs.frames(session):
+        assert np.array_equal(frame.depth_m, session.depth_m(frame.index))
+    both = read_inputs(session, RegisterRequest(find_all=True))
     assert both.wanted is None and len(both.models) == 2 and len(both.views) == 8
 
 
-def test_models_that_are_not_sought_are_named(session: Path, tmp_path: Path) -> None:
+def test_models_that_are_not_sought_are_named(session: SessionStore, tmp_path: Path) -> None:
     mug, wedge = (part(n).obj_id for n in ("mug", "wedge"))
     others = {mug: replace(models_of()[mug], name="jug"), 77: replace(models_of()[mug], obj_id=77)}
     save_models(tmp_path / "lib", others)
-    next(session.glob(f"models/obj_{wedge:06d}.ply")).unlink()
+    session.path(f"models/obj_{wedge:06d}.ply").unlink()
     request = RegisterRequest(find_all=True, library=tmp_path / "lib")
-    inputs = read_inputs(SessionStore.open(session), request)
+    inputs = read_inputs(session, request)
     assert sorted(inputs.models) == sorted([mug, 77]) and inputs.models[mug].name == "mug"
     clash, lost = inputs.models_out
     assert f"model {mug} of the library, 'jug', is not used" in clash
     assert lost.endswith(f"without a mesh, which are not sought: {wedge}.")
     save_models(tmp_path / "own", {mug: models_of()[mug]})
-    again = read_inputs(SessionStore.open(session), replace(request, library=tmp_path / "own"))
+    again = read_inputs(session, replace(request, library=tmp_path / "own"))
     assert len(again.models_out) == 1 and again.key != inputs.key
     (tmp_path / f"lib/obj_{77:06d}.ply").unlink()
-    last = read_inputs(SessionStore.open(session), request).models_out[-1]
+    last = read_inputs(session, request).models_out[-1]
     assert last.startswith("lib/models_info.json") and last.endswith(": 77.")
 
 
@@ -169,46 +165,38 @@ def test_a_scene_that_no_registration_made_is_kept(
     assert len(list((folder / "registration/earlier").iterdir())) == 1
 
 
-def test_the_key_changes_with_everything_that_matters(session: Path) -> None:
-    store = SessionStore.open(session)
-    base = RegisterRequest(objects=("mug",))
-    key = read_inputs(store, base).key
-    assert read_inputs(SessionStore.open(session), base).key == key
-    others = [
-        RegisterRequest(objects=("mug", "wedge")), RegisterRequest(find_all=True),
-        RegisterRequest(objects=("mug",), views=4),
-        RegisterRequest(objects=("mug",), method="top-down"),
-        RegisterRequest(objects=("mug",), refine_cameras=False),
-        RegisterRequest(objects=("mug",), depth_bias="off"),
-        RegisterRequest(objects=("mug",), odometry=True),
+def test_the_key_changes_with_everything_that_matters(session: SessionStore) -> None:
+    key = read_inputs(session, MUG).key
+    assert read_inputs(SessionStore.open(session.folder), MUG).key == key
+    others: list[dict[str, Any]] = [
+        {"objects": ("mug", "wedge")}, {"objects": (), "find_all": True}, {"views": 4},
+        {"method": "top-down"}, {"refine_cameras": False}, {"depth_bias": "off"},
+        {"odometry": True},
     ]  # fmt: skip
-    keys = {read_inputs(store, other).key for other in others}
+    keys = {read_inputs(session, replace(MUG, **other)).key for other in others}
     assert len(keys) == len(others) and key not in keys
     models = models_of()
     mug = models[part("mug").obj_id]
     larger = replace(mug, mesh=replace(mug.mesh, vertices=1.0001 * mug.mesh.vertices))
-    for file in store.path("models").iterdir():
+    for file in session.path("models").iterdir():
         file.unlink()  # linked to those of the other tests
-    save_models(store.path("models"), models | {larger.obj_id: larger})
-    keys.add(read_inputs(store, base).key)
-    store.set_cameras(
-        store.session.intrinsics,
-        {0: store.session.Ts_world_cam[0] @ se3.from_translation([1e-4, 0, 0])},
-    )
-    keys.add(read_inputs(store, base).key)
+    save_models(session.path("models"), models | {larger.obj_id: larger})
+    keys.add(read_inputs(session, MUG).key)
+    moved = session.session.Ts_world_cam[0] @ se3.from_translation([1e-4, 0, 0])
+    session.set_cameras(session.session.intrinsics, {0: moved})
+    keys.add(read_inputs(session, MUG).key)
     assert len(keys) == len(others) + 2 and key not in keys
 
 
-def test_a_start_brings_how_far_off_it_may_be(session: Path) -> None:
-    store = SessionStore.open(session)
+def test_a_start_brings_how_far_off_it_may_be(session: SessionStore) -> None:
     near, far = true_poses()
     rows = [
         {"obj_id": o.obj_id, "instance": o.instance, "T_world_obj": o.T_world_obj.tolist()}
         for o in (near, far)
     ]
     rows[1] |= {"radius_mm": 80.0, "turn_deg": 120.0}
-    store.write_json("registration/starts.json", {"source": "test", "starts": rows})
-    wanted = read_inputs(store, RegisterRequest()).wanted
+    session.write_json("registration/starts.json", {"source": "test", "starts": rows})
+    wanted = read_inputs(session, RegisterRequest()).wanted
     assert wanted is not None
     usual, told = (w.region for w in wanted)
     assert usual is not None and told is not None
@@ -219,24 +207,23 @@ def test_a_start_brings_how_far_off_it_may_be(session: Path) -> None:
         np.testing.assert_allclose(w.T_start, o.T_world_obj, atol=1e-15)
 
 
-def test_the_depth_bias_is_that_of_the_calibration_unless_it_is_off(session: Path) -> None:
-    store = SessionStore.open(session)
+def test_the_depth_bias_is_that_of_the_calibration_unless_it_is_off(session: SessionStore) -> None:
     C = [[1e-6, -2e-7], [-2e-7, 3e-6]]
     known = {
         "known": True, "scale": 1.002, "offset_per_m": -0.004, "covariance": C,
         "noise_per_m": None, "range_m": [0.2, "inf"], "separable": True,
     }  # fmt: skip
-    store.write_json("calibration/depth_bias.json", known)
-    config = config_of(store, RegisterRequest())
+    session.write_json("calibration/depth_bias.json", known)
+    config = config_of(session, RegisterRequest())
     assert (config.bias.scale, config.bias.offset_per_m) == (1.002, -0.004)
     assert np.array_equal(config.bias.covariance, C) and config.bias.range_m[1] == float("inf")
-    off = config_of(store, RegisterRequest(depth_bias="off"))
+    off = config_of(session, RegisterRequest(depth_bias="off"))
     assert off.bias.is_none and not off.refine.fit_bias and config.refine.fit_bias
-    store.write_json("calibration/depth_bias.json", {"known": False, "why": "one distance"})
-    assert config_of(store, RegisterRequest()).bias.is_none
-    other = session / "other.json"
+    session.write_json("calibration/depth_bias.json", {"known": False, "why": "one distance"})
+    assert config_of(session, RegisterRequest()).bias.is_none
+    other = session.folder / "other.json"
     other.write_text(json.dumps(known | {"scale": 0.999}))
-    assert config_of(store, RegisterRequest(depth_bias=str(other))).bias.scale == 0.999
+    assert config_of(session, RegisterRequest(depth_bias=str(other))).bias.scale == 0.999
     assert isinstance(load_depth_bias(other), DepthBias)
     other.write_text('{"scale": 1.0}')
     with pytest.raises(InputError, match="no depth bias: its entries are others"):
@@ -246,7 +233,7 @@ def test_the_depth_bias_is_that_of_the_calibration_unless_it_is_off(session: Pat
 def test_a_session_without_cameras_names_both_remedies(tmp_path: Path) -> None:
     store = table_session(tmp_path / "s", views=2, posed=False)
     with pytest.raises(InputError, match="calibrate") as error:
-        read_inputs(store, RegisterRequest(objects=("mug",)))
+        read_inputs(store, MUG)
     assert "--hand-held" in str(error.value)
 
 
