@@ -3,20 +3,21 @@
 import json
 import re
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import Result
 
+from begun_sessions import begun
 from photographed_boards import photograph
 from realsim.app.calibrate.folder import MADE_OF, made_of
 from realsim.app.register.config import load_depth_bias
 from realsim.arrays import Array
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
-from realsim.records import CameraIntrinsics, CaptureSession, TagBoard, View
+from realsim.records import CameraIntrinsics, TagBoard, View
 from realsim.records.depth_bias import DepthBias
 from realsim.store import SessionStore
 from realsim.store.atomic import write_json
@@ -58,44 +59,54 @@ def hands(rng: np.random.Generator) -> Array:
     return np.array(found)
 
 
+def write_poses(path: Path, columns: str, *values: Array) -> None:
+    """Write a table of the pictures' poses."""
+    rows = [",".join(f"{v:.9f}" for v in row) for row in np.hstack(values)]
+    lines = [f"name,{columns}", *(f"{k:03d}.png,{row}" for k, row in enumerate(rows))]
+    path.write_text("\n".join(lines) + "\n")
+
+
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder of every camera, a file of poses, and both targets."""
     folder = tmp_path_factory.mktemp("lab")
     rng = np.random.default_rng(3)
-    rows = ["name,x,y,z,qx,qy,qz,qw"]
     import cv2
 
     for name in ("wrist", *FIXED):
         (folder / name).mkdir()
-    for k, hand in enumerate(hands(rng)):
-        q = se3.quaternion_wxyz(hand[:3, :3])
-        numbers = [*hand[:3, 3], q[1], q[2], q[3], q[0]]
-        rows.append(f"{k:03d}.png," + ",".join(f"{v:.9f}" for v in numbers))
+    Ts = hands(rng)
+    q = np.array([se3.quaternion_wxyz(T[:3, :3]) for T in Ts])
+    write_poses(folder / "arm.csv", "x,y,z,qx,qy,qz,qw", Ts[:, :3, 3], q[:, [1, 2, 3, 0]])
+    for k, hand in enumerate(Ts):
         for name, eye in {"wrist": hand @ X_WRIST, **FIXED}.items():
             to_cam = se3.invert(eye)
             seen = [(TABLE, to_cam @ Z_TABLE)]
             if name != "wrist":
                 seen.append((HELD, to_cam @ hand @ Z_HELD))
             cv2.imwrite(str(folder / name / f"{k:03d}.png"), photograph(CAMERA, seen, rng))
-    (folder / "arm.csv").write_text("\n".join(rows) + "\n")
     for name, board in (("table", TABLE), ("held", HELD)):
         write_json(folder.parent / f"{name}.json", target_to_json(board))
     return folder
 
 
-def run(source: Path, out: Path, *more: str, cameras: str = "wrist=hand,left=fixed,right=fixed"
-        ) -> Result:  # fmt: skip
-    boards = ["--board", str(source.parent / "table.json")]
-    if not any(m.startswith("--held") for m in more):
-        boards += ["--held-board", str(source.parent / "held.json")]
-    return invoked("calibrate", source, "--cameras", cameras, *boards, "--out", out, *more)
+@pytest.fixture
+def lab(photos: Path, tmp_path: Path) -> Path:
+    """The same to be changed."""
+    return Path(shutil.copytree(photos.parent, tmp_path / "all")) / photos.name
 
 
-def refusal(result: Result) -> str:
-    """Return the words of a refusal."""
-    assert isinstance(result.exception, InputError), result.output
-    return str(result.exception)
+def words_for(lab: Path, cameras: str = "wrist=hand,left=fixed,right=fixed") -> list[object]:
+    """Return the command that calibrates cameras of a lab."""
+    boards = ("--board", lab.parent / "table.json", "--held-board", lab.parent / "held.json")
+    return ["calibrate", lab, "--cameras", cameras, *boards, "--out", lab.parent / "out"]
+
+
+def keep_first(lab: Path, names: Iterable[str], count: int) -> None:
+    """Take out all but the first pictures of cameras."""
+    for name in names:
+        for path in sorted((lab / name).glob("*.png"))[count:]:
+            path.unlink()
 
 
 def test_cameras_without_an_arm_get_all_their_files(photos: Path, tmp_path: Path) -> None:
@@ -120,7 +131,7 @@ def test_cameras_without_an_arm_get_all_their_files(photos: Path, tmp_path: Path
 @pytest.fixture(scope="module")
 def calibrated(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
     out = tmp_path_factory.mktemp("out") / "calibration"
-    return run(photos, out, "--json"), out
+    return invoked(*words_for(photos)[:-1], out, "--json"), out
 
 
 def test_pictures_give_every_camera(calibrated: tuple[Result, Path]) -> None:
@@ -170,40 +181,28 @@ def test_json_says_what_the_file_says(calibrated: tuple[Result, Path]) -> None:
     ],
 )
 def test_what_is_missing_is_named(
-    photos: Path, tmp_path: Path, gone: str, copied: str, cameras: str, words: str
+    lab: Path, gone: str, copied: str, cameras: str, words: str
 ) -> None:
-    folder = shutil.copytree(photos, tmp_path / "lab")
-    for name in ("table", "held"):
-        shutil.copy(photos.parent / f"{name}.json", tmp_path)
-    for name in ("wrist", *FIXED):
-        for path in sorted((folder / name).glob("*.png"))[3:]:
-            path.unlink()
+    keep_first(lab, ("wrist", *FIXED), 3)
     if copied:
-        shutil.copy(folder / "arm.csv", folder / copied)
+        shutil.copy(lab / "arm.csv", lab / copied)
     if gone:
-        (folder / gone).unlink()
-    result = run(folder, tmp_path / "out", cameras=cameras)
-    assert words in refusal(result)
+        (lab / gone).unlink()
+    assert words in refused(*words_for(lab, cameras))
 
 
 @pytest.mark.parametrize(
     ("gray", "words"), [(90, "shows nothing that looks like a target"), (12, "is too dark")]
 )
 def test_a_camera_that_sees_no_board_is_named_with_what_it_shows(
-    photos: Path, tmp_path: Path, gray: int, words: str
+    lab: Path, gray: int, words: str
 ) -> None:
     import cv2
 
-    folder = shutil.copytree(photos, tmp_path / "lab")
-    for name in ("table", "held"):
-        shutil.copy(photos.parent / f"{name}.json", tmp_path)
-    for path in (folder / "right").glob("*.png"):
+    for path in (lab / "right").glob("*.png"):
         cv2.imwrite(str(path), np.full((480, 640, 3), gray, np.uint8))
-    for name in ("wrist", "left"):
-        for path in sorted((folder / name).glob("*.png"))[2:]:
-            path.unlink()
-    result = run(folder, tmp_path / "out")
-    said = refusal(result)
+    keep_first(lab, ("wrist", "left"), 2)
+    said = refused(*words_for(lab))
     assert "camera 'right' never sees a board" in said and words in said
     assert "leave the camera out" in said
 
@@ -222,12 +221,8 @@ def test_a_board_that_is_said_to_be_elsewhere_is_named(
     """Whether the poses' reading is stated or must be proven, and whatever lens cannot be told."""
     poses = photos / "arm.csv"
     if not stated:
-        poses = tmp_path / "arm.csv"
-        rows = ["name,x,y,z,rx,ry,rz"]
-        for k, T in enumerate(hands(np.random.default_rng(3))):
-            numbers = [*T[:3, 3], *se3.log_so3(T[:3, :3])]
-            rows.append(f"{k:03d}.png," + ",".join(f"{v:.9f}" for v in numbers))
-        poses.write_text("\n".join(rows) + "\n")
+        poses, Ts = tmp_path / "arm.csv", hands(np.random.default_rng(3))
+        write_poses(poses, "x,y,z,rx,ry,rz", Ts[:, :3, 3], se3.log_so3(Ts[:, :3, :3]))
     board = (option, photos.parent / f"{file}.json")
     out = photos.parent / "refused"  # the points found are noted there
     given = ("--cameras", cameras, *board, "--out", out, "--poses", poses)
@@ -235,16 +230,15 @@ def test_a_board_that_is_said_to_be_elsewhere_is_named(
     assert "contradict the robot" in said and words in said
 
 
-def test_images_without_partners_are_left_out(photos: Path, tmp_path: Path) -> None:
+def test_images_without_partners_are_left_out(lab: Path) -> None:
     from realsim.app.calibrate.camera_frames import cameras_of, frames_of
     from realsim_calibration.inputs.pose_file import read_pose_file
 
-    folder = shutil.copytree(photos, tmp_path / "lab")
-    (folder / "left/004.png").unlink()
-    shutil.copy(folder / "right/000.png", folder / "right/099.png")
-    arm = folder / "arm.csv"
+    (lab / "left/004.png").unlink()
+    shutil.copy(lab / "right/000.png", lab / "right/099.png")
+    arm = lab / "arm.csv"
     cameras = cameras_of("wrist=hand,left=fixed,right=fixed")
-    frames = frames_of(folder, cameras, read_pose_file(arm))
+    frames = frames_of(lab, cameras, read_pose_file(arm))
     stranger = f"camera 'right': images without a pose are left out: 1 of {VIEWS + 1} (099.png)."
     assert frames.left_out == (stranger,)
     assert [len(frames.images[c.name]) for c in cameras] == [VIEWS, VIEWS - 1, VIEWS]
@@ -254,22 +248,17 @@ def test_images_without_partners_are_left_out(photos: Path, tmp_path: Path) -> N
     rows = arm.read_text().splitlines()
     rows[3] = rows[3].replace("002.png,", "002.png,nan,").rsplit(",", 1)[0]
     arm.write_text("\n".join(rows[:-1]) + "\n")
-    said = frames_of(folder, cameras, read_pose_file(arm)).left_out
+    said = frames_of(lab, cameras, read_pose_file(arm)).left_out
     assert f"left out: 1 of {VIEWS} ({VIEWS - 1:03d}.png)." in said[0]
-    assert said[1].endswith(f"with a NaN or infinite pose are left out: 1 of {VIEWS} "
-                            "(002.png (line 4)).")  # fmt: skip
+    of = f"1 of {VIEWS} (002.png (line 4))."
+    assert said[1].endswith(f"with a NaN or infinite pose are left out: {of}")
 
 
-def test_an_image_of_another_size_is_named_though_it_shows_no_board(
-    photos: Path, tmp_path: Path
-) -> None:
+def test_an_image_of_another_size_is_named_though_it_shows_no_board(lab: Path) -> None:
     import cv2
 
-    folder = shutil.copytree(photos, tmp_path / "lab")
-    for board in ("table", "held"):
-        shutil.copy(photos.parent / f"{board}.json", tmp_path)
-    cv2.imwrite(str(folder / "left/004.png"), np.full((240, 320, 3), 90, np.uint8))
-    said = refusal(run(folder, tmp_path / "out"))
+    cv2.imwrite(str(lab / "left/004.png"), np.full((240, 320, 3), 90, np.uint8))
+    said = refused(*words_for(lab))
     assert "camera 'left' has images of several sizes" in said and "004.png (320x240)" in said
 
 
@@ -286,15 +275,13 @@ def test_board_views_of_a_session(photos: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     views = tuple(View(index=k, T_base_ee=T) for k, T in enumerate(hands(rng)))
     capture = tmp_path / "session/calibration/capture"
-    session = CaptureSession(name="board", intrinsics=CAMERA, depth_unit_m=0.001)
-    store = SessionStore.create(capture, session)
+    store = begun(capture, CAMERA, unit_m=0.001)
     depth = np.zeros((CAMERA.height, CAMERA.width), np.uint16)
     for view in views:
-        rgb = load_image(photos / f"wrist/{view.index:03d}.png")
-        store.add_view(view, rgb, depth)
+        store.add_view(view, load_image(photos / f"wrist/{view.index:03d}.png"), depth)
     store.close()
     (capture / "rgb_right").mkdir()
-    left = SessionStore.create(camera_folder(capture, "left"), session)
+    left = begun(camera_folder(capture, "left"), CAMERA, unit_m=0.001)
     for k in range(VIEWS):
         hand = views[k].T_base_ee
         assert hand is not None
@@ -303,7 +290,7 @@ def test_board_views_of_a_session(photos: Path, tmp_path: Path) -> None:
         left.add_view(View(index=k), load_image(photos / f"left/{k:03d}.png"), seen)
         shutil.copy(photos / f"right/{k:03d}.png", capture / f"rgb_right/{k:06d}.png")
     # The session's own camera, which looks at the objects: not yet placed.
-    own = SessionStore.create(camera_folder(tmp_path / "session", "left"), session)
+    own = begun(camera_folder(tmp_path / "session", "left"), CAMERA, unit_m=0.001)
     for k in range(2):
         own.add_view(View(index=k), load_image(photos / "left/000.png"), depth)
     write_json(tmp_path / "session/calibration/board.json", target_to_json(TABLE))
