@@ -1,7 +1,9 @@
 """Pose logs and recordings by two clocks through `realsim calibrate`."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -59,21 +61,31 @@ def calibrate(folder: Path, out: Path, *more: str) -> Result:
     return invoked("calibrate", folder, *given, "--out", out, *more)
 
 
+def joined(folder: Path, offset: str, console: Console) -> tuple[Any, ...]:
+    """Return the pairs of both logs, and the clock."""
+    robot = read_pose_file(folder / "robot.csv")
+    board = read_pose_file(folder / "board.csv", board=True)
+    assert robot.stated is not None and board.stated is not None
+    stated = robot.stated, board.stated
+    found = pair_pose_logs(robot, board, stated, "eye_in_hand", offset, console)
+    assert found is not None and found[4] is not None
+    return found
+
+
+def refuses(folder: Path, out: Path, offset: str, words: str) -> None:
+    """Hold that logs cannot be paired by an offset, and with which words."""
+    done = calibrate(folder, out, "--clock-offset", offset)
+    with pytest.raises(InputError, match=words):
+        raise done.exception or AssertionError(done.output)
+
+
 def test_two_logs_are_joined_by_their_offset(logs: Path) -> None:
     """400 robot poses and 70 board poses give 70 pairs that fit one place of the camera."""
-    robot, board = (
-        read_pose_file(logs / "robot.csv"),
-        read_pose_file(logs / "board.csv", board=True),
-    )
-    assert robot.stated is not None and board.stated is not None
-    readings = robot.stated, board.stated
-    quiet = Console(quiet=True)
-    pairs = pair_pose_logs(robot, board, readings, "eye_in_hand", "auto", quiet)
-    assert pairs is not None and len(pairs[0]) == len(pairs[1]) == len(pairs[3]) == 70
+    pairs, told = (joined(logs, offset, Console(quiet=True)) for offset in ("auto", "0.08"))
+    assert len(pairs[0]) == len(pairs[1]) == len(pairs[3]) == 70
     found = solve_pose_pairs(pairs[0], pairs[1])
     assert np.linalg.norm(found.X[:3, 3] - X_TRUE[:3, 3]) < 1e-3
-    told = pair_pose_logs(robot, board, readings, "eye_in_hand", "0.08", quiet)
-    assert told is not None and told[4] is not None and told[4].offset_s == 0.08
+    assert told[4].offset_s == 0.08
     np.testing.assert_allclose(told[0], pairs[0], atol=5e-4)
 
 
@@ -93,10 +105,8 @@ def test_files_hold_the_offset(logs: Path, tmp_path: Path) -> None:
 
 def test_a_given_offset_is_taken_and_off_pairs_rows(logs: Path, tmp_path: Path) -> None:
     """A wrong given offset is taken at its word; without one 400 and 70 rows do not pair."""
-    far = calibrate(logs, tmp_path / "c", "--clock-offset", "100")
-    assert isinstance(far.exception, InputError) and "no time in common" in str(far.exception)
-    off = calibrate(logs, tmp_path / "c", "--clock-offset", "off")
-    assert isinstance(off.exception, InputError) and "belong together" in str(off.exception)
+    for offset, words in (("100", "no time in common"), ("off", "belong together")):
+        refuses(logs, tmp_path / "c", offset, words)
 
 
 def recorded(d: float) -> tuple[list[BoardView], Array]:
@@ -165,12 +175,20 @@ def changed(logs: Path, folder: Path, robot: Change, board: Change = same) -> Pa
     return folder
 
 
-def ms(a: Array) -> Array:
-    return a * [1e3, 1, 1, 1, 1, 1, 1, 1]
+def times(factor: float, a: Array) -> Array:
+    """Return a log whose stamps are multiplied."""
+    return a * [factor, 1, 1, 1, 1, 1, 1, 1]
 
 
-def still(a: Array) -> Array:
-    return a * [0, 1, 1, 1, 1, 1, 1, 1]
+def unknown(column: int, a: Array) -> Array:
+    """Return a log of which one number is NaN."""
+    b = a.copy()
+    b[100, column] = np.nan
+    return b
+
+
+ms: Change = partial(times, 1e3)
+no_pose: Change = partial(unknown, 1)
 
 
 def reset(a: Array) -> Array:
@@ -185,20 +203,8 @@ def stuck(a: Array) -> Array:
     return b
 
 
-def no_pose(a: Array) -> Array:
-    b = a.copy()
-    b[100, 1] = np.nan
-    return b
-
-
 def few(a: Array) -> Array:
     return a[:10]
-
-
-def no_stamp(a: Array) -> Array:
-    b = a.copy()
-    b[100, 0] = np.nan
-    return b
 
 
 @pytest.mark.parametrize(
@@ -208,7 +214,7 @@ def no_stamp(a: Array) -> Array:
         (same, ms, "auto", "board.csv: the time stamps are 100 apart .*milliseconds"),
         (ms, ms, "0.08", "robot.csv: the time stamps are 20 apart .*milliseconds"),
         (same, ms, "0.08", "no time in common. Are both in seconds"),
-        (still, same, "auto", "robot.csv: all time stamps are equal"),
+        (partial(times, 0.0), same, "auto", "robot.csv: all time stamps are equal"),
         (same, few, "auto", "board.csv: 10 poses .* 30 are needed"),
         (same, same, "off", "400 robot poses and 70 board poses.*--clock-offset off"),
         (no_pose, same, "auto", r"line 102 \(1 of 400\): NaN .* images if there are any"),
@@ -219,10 +225,7 @@ def no_stamp(a: Array) -> Array:
 def test_stamps_that_cannot_pair_are_named(
     logs: Path, tmp_path: Path, robot: Change, board: Change, option: str, words: str
 ) -> None:
-    folder = changed(logs, tmp_path / "s", robot, board)
-    with pytest.raises(InputError, match=words):
-        calibrated = calibrate(folder, tmp_path / "c", "--clock-offset", option)
-        raise calibrated.exception or AssertionError(calibrated.output)
+    refuses(changed(logs, tmp_path / "s", robot, board), tmp_path / "c", option, words)
 
 
 def test_what_a_log_does_not_know_is_left_out_and_named(
@@ -234,20 +237,14 @@ def test_what_a_log_does_not_know_is_left_out_and_named(
     """
 
     def pairs(name: str, how: Change) -> tuple[int, str]:
-        folder = changed(logs, tmp_path / name, how)
-        robot = read_pose_file(folder / "robot.csv")
-        board = read_pose_file(folder / "board.csv", board=True)
-        assert robot.stated is not None and board.stated is not None
-        readings = robot.stated, board.stated
-        found = pair_pose_logs(robot, board, readings, "eye_in_hand", "auto", Console())
-        assert found is not None and found[4] is not None
+        found = joined(changed(logs, tmp_path / name, how), "auto", Console())
         assert found[4].offset_s == pytest.approx(0.08, abs=3e-3)
         said = capsys.readouterr()
         return len(found[0]), " ".join((said.out + said.err).split())
 
-    nan = pairs("nan", no_stamp)
-    assert nan[0] == 70 and "1 of 400 poses are left out: without a time stamp" in nan[1]
-    assert "line 102" in nan[1]
+    n, said = pairs("nan", partial(unknown, 0))
+    assert n == 70 and "1 of 400 poses are left out: without a time stamp" in said
+    assert "line 102" in said
     n, said = pairs("stuck", stuck)
     assert 48 <= n <= 52 and "98 of 400 poses are left out: with the time stamp of" in said
     assert "line 154" in said and f"{70 - n} poses of" in said and "lie in gaps of" in said

@@ -7,21 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
+import typed_commands
 from begun_sessions import begun
 from realsim.app.console import Console
-from realsim.app.scan.scale.cli import RESULT, scale
+from realsim.app.scan.scale import inputs
+from realsim.app.scan.scale.cli import RESULT
 from realsim.app.scan.scale.files import Place, write_result
-from realsim.app.scan.scale.inputs import (
-    NamedMesh,
-    ScaleRequest,
-    fit_config,
-    inputs_of,
-    mesh_hash,
-    read_mesh,
-    usable_views,
-)
+from realsim.app.scan.scale.inputs import NamedMesh, ScaleRequest, read_mesh, usable_views
 from realsim.app.scan.scale.run import run_scale, view_poses
 from realsim.app.scan.scale.show import model_lines
 from realsim.errors import InputError, UnitError
@@ -36,6 +29,7 @@ from realsim.scanning.scale.measured import length_of, parse_measurement
 from realsim.store import SessionStore
 from refusals import refused
 from scale_fits import UNIT_M, fit_of, known_scan
+from typed_commands import invoked
 
 CONSOLE = Console(quiet=True)
 
@@ -70,11 +64,19 @@ def session(known, tmp_path):
 
 def named_of(known) -> NamedMesh:
     mesh = known.scan
-    return NamedMesh(mesh=mesh, name="mug", origin="file", where="mug.ply", sha256=mesh_hash(mesh))
+    sha256 = inputs.mesh_hash(mesh)
+    return NamedMesh(mesh=mesh, name="mug", origin="file", where="mug.ply", sha256=sha256)
 
 
-def record_of(known, fit, inputs) -> ScaleRecord:
-    return ScaleRecord(fit=fit, inputs=inputs, versions=installed_versions())
+def inputs_of(request, named, session):
+    views = usable_views(session, request.views)
+    return inputs.inputs_of(request, named, session, views, inputs.fit_config(session))
+
+
+def record_of(request, named, session, fit) -> ScaleRecord:
+    """What a run keeps of its fit."""
+    given = inputs_of(request, named, session)
+    return ScaleRecord(fit=fit, inputs=given, versions=installed_versions())
 
 
 # --- what is refused --------------------------------------------------------------------------
@@ -110,18 +112,18 @@ def test_a_mesh_without_anything_that_knows_metres_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("options", "error", "said"),
+    ("option", "value", "error", "said"),
     [
-        (("--rough-size", "90"), UnitError, "no unit"),
-        (("--between", "0,0,0=95mm"), InputError, "two different"),
-        (("--at", "0.4"), InputError, "x,y in metres"),
-        (("--at", "400,-50"), InputError, "millimetres"),
-        (("--start-file", "none.json"), InputError, "does not exist"),
+        ("--rough-size", "90", UnitError, "no unit"),
+        ("--between", "0,0,0=95mm", InputError, "two different"),
+        ("--at", "0.4", InputError, "x,y in metres"),
+        ("--at", "400,-50", InputError, "millimetres"),
+        ("--start-file", "none.json", InputError, "does not exist"),
     ],
 )
-def test_what_cannot_be_read_is_named(options, error, said):
-    with pytest.raises(error, match=said):
-        CliRunner().invoke(scale, ["mug.ply", *options], catch_exceptions=False)
+def test_what_cannot_be_read_is_named(option, value, error, said):
+    why = invoked("scan", "scale", "mug.ply", option, value).exception
+    assert isinstance(why, error) and said in str(why)
 
 
 # --- a mesh of the library --------------------------------------------------------------------
@@ -153,19 +155,11 @@ def test_a_name_in_both_is_the_mesh_without_scale_and_the_id_is_the_model(librar
     np.testing.assert_allclose(model.mesh.extent, UNIT_M * named.mesh.extent, rtol=1e-5)
 
 
-# --- the smallest box -------------------------------------------------------------------------
-
-
-# --- what is asked for ------------------------------------------------------------------------
-
-
 # --- the hash of the inputs -------------------------------------------------------------------
 
 
 def key_of(known, session, **changes):
-    request = ScaleRequest(mesh="mug.ply", **changes)
-    views = usable_views(session, request.views)
-    return inputs_of(request, named_of(known), session, views, fit_config(session))["key"]
+    return inputs_of(ScaleRequest(mesh="mug.ply", **changes), named_of(known), session)["key"]
 
 
 def test_the_key_changes_with_every_input_and_with_nothing_else(known, session):
@@ -191,11 +185,9 @@ def test_the_key_changes_with_every_input_and_with_nothing_else(known, session):
 def written(known, fit, tmp_path_factory):
     """A result in its session, as a fit leaves it; nobody changes it."""
     session = session_of(known, tmp_path_factory.mktemp("written") / "session")
-    request = ScaleRequest(mesh="mug.ply")
-    views = usable_views(session, ())
-    inputs = inputs_of(request, named_of(known), session, views, fit_config(session))
     place = Place(session, session.folder / "scans/mug")
-    record = replace(record_of(known, fit, inputs), poses=view_poses(fit, views))
+    record = record_of(ScaleRequest(mesh="mug.ply"), named_of(known), session, fit)
+    record = replace(record, poses=view_poses(fit, usable_views(session, ())))
     write_result(place, record, named_of(known), session)
     return place, record, session
 
@@ -250,9 +242,6 @@ def test_the_page_begins_with_the_verdict_and_needs_nothing_else(written):
         assert limit.text in text
 
 
-# --- what is said -----------------------------------------------------------------------------
-
-
 # --- whole runs -------------------------------------------------------------------------------
 
 
@@ -263,18 +252,15 @@ def mesh_file(known, tmp_path):
     return path
 
 
-def test_the_scale_by_a_caliper_alone_is_unchecked(known, mesh_file, tmp_path, capsys):
+def test_the_scale_by_a_caliper_alone_is_unchecked(known, mesh_file, tmp_path):
     longest = UNIT_M * length_of(known.scan, parse_measurement("longest=1m"))
-    words = [str(mesh_file), "--measured", f"longest={1e3 * longest}mm", "--out",
-             str(tmp_path / "out"), "--json-file", str(tmp_path / "s.json"), "--quiet"]  # fmt: skip
-    with pytest.raises(SystemExit) as stop:
-        scale.main(words, standalone_mode=False)
-    assert stop.value.code == 1
+    measured = ("scan", "scale", mesh_file, "--measured", f"longest={1e3 * longest}mm")
+    words = (*measured, "--out", tmp_path / "out", "--json-file", tmp_path / "s.json", "--quiet")
+    first = invoked(*words)
     (tmp_path / "out/model.ply").unlink()  # as if it had been ended before
-    with pytest.raises(SystemExit):
-        scale.main(words, standalone_mode=False)
-    refused("--overwrite", scale.main, words, standalone_mode=False)
-    said = capsys.readouterr().out
+    assert first.exit_code == invoked(*words).exit_code == 1
+    assert "--overwrite" in typed_commands.refused(*words)
+    said = first.stdout
     assert said.startswith("UNCHECKED: mug") and "model.ply in mm" in said
     assert "--library models --accept-doubtful" in said
     data = json.loads((tmp_path / "s.json").read_text())
@@ -288,10 +274,9 @@ def test_the_scale_by_a_caliper_alone_is_unchecked(known, mesh_file, tmp_path, c
 def test_a_second_run_finds_the_first(known, fit, session, mesh_file, capsys):
     request = ScaleRequest(mesh=str(mesh_file), session=session.folder)
     named = read_mesh(request)
-    views = usable_views(session, ())
-    inputs = inputs_of(request, named, session, views, fit_config(session))
     # As stored by PLY, in float32: the residuals are of these vertices.
-    record = record_of(known, replace(fit, verdict="accepted", reasons=()), inputs)
+    accepted = replace(fit, verdict="accepted", reasons=())
+    record = record_of(request, named, session, accepted)
     write_result(Place(session, session.folder / "scans/mug"), record, named, session)
     before = (session.folder / "scans/mug/scale.json").stat().st_mtime_ns
     assert run_scale(request, CONSOLE)
@@ -312,10 +297,9 @@ def test_an_accepted_scale_goes_into_the_library(tmp_path):
         mesh=str(tmp_path / "box.ply"), session=session.folder, library=tmp_path / "models"
     )
     named = read_mesh(request)
-    inputs = inputs_of(request, named, session, usable_views(session, ()), fit_config(session))
     place = Place(session, session.folder / "scans/box")
     doubtful = replace(fit, verdict="doubtful", reasons=("two scales.",))
-    write_result(place, record_of(known, doubtful, inputs), named, session)
+    write_result(place, record_of(request, named, session, doubtful), named, session)
     assert not run_scale(request, CONSOLE)
     assert not (tmp_path / "models").exists()
     assert not run_scale(replace(request, accept_doubtful=True), CONSOLE)

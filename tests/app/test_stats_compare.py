@@ -30,6 +30,13 @@ class WithGrasps(SceneInMemory):
         return self.tried
 
 
+def with_grasps(plain, tried):
+    """Return a scene of whose grasps one set is known."""
+    of = WithGrasps(folder=plain.folder, frames=plain.frames, masks=plain.masks)
+    of.tried = SceneGrasps(sets=(tried,))
+    return of
+
+
 def moved(frame):
     first, *others = frame.objects
     return (replace(first, T_cam_obj=first.T_cam_obj @ MOVE), *others)
@@ -42,9 +49,14 @@ def releases(tmp_path_factory):
     new = labelled_scene(home / "b", [0, 1, 2])
     new.change_frames(objects=lambda f: moved(f) if f.index == 1 else f.objects)
     del new.frames[2]
-    more = labelled_scene(home / "c", [0])
-    more.number, more.name = 9, "train-000009"
-    return written_bop(home / "old", old), written_bop(home / "new", new, more)
+    return written_bop(home / "old", old), written_bop(home / "new", new, ninth(home / "c"))
+
+
+def ninth(folder):
+    """Return a scene with another number."""
+    scene = labelled_scene(folder, [0])
+    scene.number, scene.name = 9, "train-000009"
+    return scene
 
 
 def compared(new, old, *options):
@@ -81,16 +93,10 @@ def test_grasps_are_added_lost_and_changed(tmp_path):
     scores[3] = 0.8
 
     def scene(rows, values):
-        of = WithGrasps(folder=plain.folder, frames=plain.frames, masks=plain.masks)
         s = replace(whole, scores=values)
-        picked = {
-            name: getattr(s, name)[rows]
-            for name in ("Ts_obj_grasp", "widths_m", "scores", "base_scores", "slip_m", "slip_rad",
-                         "reachable")
-        }  # fmt: skip
-        s = replace(s, **picked, failures=tuple(s.failures[k] for k in rows))
-        of.tried = SceneGrasps(sets=(s,))
-        return of
+        arrays = "Ts_obj_grasp widths_m scores base_scores slip_m slip_rad reachable"
+        picked = {name: getattr(s, name)[rows] for name in arrays.split()}
+        return with_grasps(plain, replace(s, **picked, failures=tuple(s.failures[k] for k in rows)))
 
     found = diff_scenes("s", scene(np.arange(10), whole.scores), scene(np.arange(2, 12), scores))
     assert (found.grasps_lost, found.grasps_added) == (2, 2)
@@ -103,8 +109,7 @@ def test_grasps_are_added_lost_and_changed(tmp_path):
 
 def changed_copy(releases, tmp_path, change):
     """Return what --compare says of a copy of a release in which one thing was changed."""
-    copy = tmp_path / "copy"
-    shutil.copytree(releases[0], copy)
+    copy = shutil.copytree(releases[0], tmp_path / "copy")
     change(copy / "train/000003")
     (row,) = compared(copy, releases[0])
     return row
@@ -150,15 +155,12 @@ def test_a_label_that_is_gone_from_one_frame_is_told(releases, tmp_path):
 
     row = changed_copy(releases, tmp_path, drop)
     assert (row["labels_lost"], row["labels_added"]) == (1, 0)
-    assert not row["objects_lost"] and row["files_changed"] == [
-        "scene_gt.json",
-        "scene_gt_info.json",
-    ]
+    assert not row["objects_lost"]
+    assert row["files_changed"] == ["scene_gt.json", "scene_gt_info.json"]
 
 
 def test_other_models_and_tables_are_told(releases, tmp_path):
-    copy = tmp_path / "copy"
-    shutil.copytree(releases[0], copy)
+    copy = shutil.copytree(releases[0], tmp_path / "copy")
     mesh = copy / "models/obj_000007.ply"
     mesh.write_bytes(mesh.read_bytes()[:-1] + b"\1")
     (copy / "camera.json").write_text("{}")
@@ -193,17 +195,16 @@ def test_another_instance_of_the_same_model_is_the_same_object(tmp_path):
     plain = labelled_scene(tmp_path / "s", [0, 1])
 
     def with_instances(*numbers):
+        def renamed(frame):
+            pairs = zip(frame.objects, numbers, strict=True)
+            return tuple(replace(o, instance=n) for o, n in pairs)
+
         scene = SceneInMemory(folder=plain.folder, frames=dict(plain.frames), masks=plain.masks)
-        return scene.change_frames(
-            objects=lambda f: tuple(
-                replace(o, instance=n) for o, n in zip(f.objects, numbers, strict=True)
-            )
-        )
+        return scene.change_frames(objects=renamed)
 
     found = diff_scenes("s", with_instances(0, 1, 2), with_instances(5, 1, 9))
     assert found.is_same
-    fewer = with_instances(5, 1, 9)
-    fewer.change_frames(objects=lambda f: f.objects[:2])
+    fewer = with_instances(5, 1, 9).change_frames(objects=lambda f: f.objects[:2])
     found = diff_scenes("s", with_instances(0, 1, 2), fewer)
     assert found.objects_lost == [("30", 2)] and not found.objects_added and not found.moved
 
@@ -217,12 +218,8 @@ def test_a_width_or_a_score_alone_is_a_change(tmp_path, name, by):
     before = replace(before, **{name: np.full(6, 0.02 if name == "widths_m" else 0.5)})
     values = getattr(before, name).copy()
     values[2] += by
-    scenes = []
-    for s in (before, replace(before, **{name: values})):
-        of = WithGrasps(folder=plain.folder, frames=plain.frames, masks=plain.masks)
-        of.tried = SceneGrasps(sets=(s,))
-        scenes.append(of)
-    found = diff_scenes("s", *scenes)
+    after = replace(before, **{name: values})
+    found = diff_scenes("s", *(with_grasps(plain, s) for s in (before, after)))
     assert (found.grasps_changed, found.grasps_kept) == (1, 5)
 
 
@@ -230,9 +227,9 @@ def test_labels_of_graspnets_format_are_compared(tmp_path):
     scene = labelled_scene(tmp_path / "s", [0])
     for name in ("old", "new"):
         written_graspnet(tmp_path / name, scene)
-    index = [[0, 3, 1, 2], [0, 5, 0, 0], [1, 3, 1, 2]]
     labels = GraspLabels(
-        points=np.array([[0.01, 0.0, 0.02], [0.0, 0.01, 0.02]]), index=np.array(index, np.int32),
+        points=np.array([[0.01, 0.0, 0.02], [0.0, 0.01, 0.02]]),
+        index=np.array([[0, 3, 1, 2], [0, 5, 0, 0], [1, 3, 1, 2]], np.int32),
         angles_rad=np.zeros(3, np.float32), depths_m=np.full(3, 0.02, np.float32),
         openings_m=np.full(3, 0.05, np.float32), friction=np.full(3, 0.4, np.float32),
         collision=np.zeros(3, np.bool_),
@@ -243,17 +240,13 @@ def test_labels_of_graspnets_format_are_compared(tmp_path):
     (row,) = compared(tmp_path / "new", tmp_path / "old")
     assert (row["grasps_lost"], row["grasps_added"]) == (1, 0)
     assert (row["grasps_changed"], row["grasps_kept"]) == (1, 1)
-    write_collision_labels(
-        tmp_path / "new/collision_label/scene_0003/collision_labels.npz",
-        [(labels, np.zeros(3, np.bool_))],
-    )
+    collisions = "collision_label/scene_0003/collision_labels.npz"
+    write_collision_labels(tmp_path / "new" / collisions, [(labels, np.zeros(3, np.bool_))])
     (row,) = compared(tmp_path / "new", tmp_path / "old")
-    assert row["files_changed"] == ["collision_label/scene_0003/collision_labels.npz"]
+    assert row["files_changed"] == [collisions]
 
 
 def test_two_data_sets_without_a_scene_in_common_are_told_so(releases, tmp_path):
-    other = labelled_scene(tmp_path / "c", [0])
-    other.number, other.name = 9, "train-000009"
-    written_bop(tmp_path / "other", other)
+    written_bop(tmp_path / "other", ninth(tmp_path / "c"))
     result = finished("stats", tmp_path / "other", "--compare", releases[0])
     assert "no scene is in both: 000009 beside 000003" in result.output
