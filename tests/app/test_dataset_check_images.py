@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
+from bop_scenes import edit, write_boxes
 from realsim.app.check.agreement import ObjectAgreement, SceneAgreement
 from realsim.app.check.checksums import check_checksums, checksum_list
 from realsim.app.check.dataset import checked_scenes
 from realsim.app.check.tally import MaskOverlap, Tally, agreement_of
 from realsim.errors import InputError
-from tests.support.bop_scenes import edit, write_boxes
 from typed_commands import finished, invoked
 
 IMAGES = (1, 5, 9, 13, 17, 21)
@@ -47,17 +47,13 @@ def test_sound_images_give_no_finding(scene: Path) -> None:
 
 def test_an_object_that_one_image_sees_elsewhere_is_found(scene: Path) -> None:
     def shift(rows: dict) -> None:
-        t = np.array(rows["9"][1]["cam_t_m2c"])
-        rows["9"][1]["cam_t_m2c"] = np.add(
-            t, [0, 0, 12.0]
-        ).tolist()  # along the view: no mask tells
+        rows["9"][1]["cam_t_m2c"][2] += 12.0  # along the view: no mask tells
 
     edit(scene / "scene_gt.json", shift)
     found = faulty(checked(scene))
     assert set(found) == {7}
-    assert "image 9: object 7 stands 12.0 mm from where the other 5 images see it" in " ".join(
-        found[7].faults
-    )
+    told = "image 9: object 7 stands 12.0 mm from where the other 5 images see it"
+    assert told in " ".join(found[7].faults)
 
 
 def test_one_shifted_mask_is_found(scene: Path) -> None:
@@ -69,13 +65,11 @@ def test_one_shifted_mask_is_found(scene: Path) -> None:
 
 
 def test_one_scaled_depth_image_is_found(scene: Path) -> None:
-    factor, way = 0.97, "nearer"
     path = scene / "depth/000005.png"
-    cv2.imwrite(str(path), np.round(cv2.imread(str(path), -1) * factor).astype(np.uint16))
-    found = checked(scene)
-    (told,) = found.findings
-    assert told.startswith("depth of image 5 is ") and f"mm {way} than that of the others" in told
-    assert told.endswith(f"scale {factor:.3f}")
+    cv2.imwrite(str(path), np.round(cv2.imread(str(path), -1) * 0.97).astype(np.uint16))
+    (told,) = checked(scene).findings
+    assert told.startswith("depth of image 5 is ") and "mm nearer than that of the others" in told
+    assert told.endswith("scale 0.970")
 
 
 def test_a_hand_in_front_is_no_damage(scene: Path) -> None:
@@ -103,11 +97,8 @@ def test_table_json_and_exit_code_say_the_same(scene: Path) -> None:
     # Also what the format's own check finds of an object stands with the object.
     assert any(f.startswith("scene_gt.json, image 9, object 1 (id 7)") for f in by_id[7])
     assert any("stands" in f for f in by_id[7])
-    table = [
-        line
-        for line in invoked("check", scene).output.splitlines()
-        if "│" in line and " 7 " in line
-    ]
+    lines = invoked("check", scene).output.splitlines()
+    table = [line for line in lines if "│" in line and " 7 " in line]
     assert table and table[0].rstrip(" │").endswith("no")
 
 

@@ -11,6 +11,7 @@ import pytest
 from click.testing import Result
 
 import upgradable_datasets as datasets
+from bop_scenes import edit
 from plain_meshes import square
 from realsim.app.console import Console
 from realsim.app.upgrade.analytic import FOLDER, agreement_of
@@ -20,7 +21,7 @@ from realsim.app.upgrade.outcome import Outcome, decide
 from realsim.app.upgrade.run import UpgradeConfig, run_upgrade
 from realsim.app.upgrade.source import prepare, told_apart, world_starts
 from realsim.app.upgrade.tables import notes_of
-from realsim.errors import InputError, RealsimError
+from realsim.errors import RealsimError
 from realsim.formats.graspnet.grasp_labels import read_grasp_labels
 from realsim.formats.grasps.hdf5 import read_grasps_hdf5
 from realsim.formats.grasps.scene_grasps import untried_set
@@ -34,6 +35,7 @@ from realsim.registration.photo import Picture, shifted
 from realsim.rendering.casting.pixel_caster import PixelCaster
 from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore, load_grasps
+from refusals import refused
 from typed_commands import invoked
 
 OFF_M = 0.003
@@ -65,6 +67,14 @@ def upgraded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Resu
     done = upgrade(dataset, root / "out", "--workers", "1")
     assert datasets.content_and_times(dataset) == before, "the data set is only read"
     return dataset, root / "out", done
+
+
+@pytest.fixture
+def copies(upgraded, tmp_path: Path) -> tuple[Path, Path]:
+    """The data set and the upgrade of it, to be changed; their times are kept."""
+    dataset, out, _ = upgraded
+    shutil.copytree(out, tmp_path / "out")
+    return Path(shutil.copytree(dataset, tmp_path / "dataset")), tmp_path / "out"
 
 
 # --- laws -------------------------------------------------------------------------------------
@@ -111,13 +121,10 @@ def test_tables_say_how_far_each_object_moved(upgraded) -> None:
 
 
 @pytest.mark.slow
-def test_a_second_run_does_nothing_again_and_takes_in_what_was_mended(upgraded, tmp_path) -> None:
-    dataset, out, _ = upgraded
-    copy, again = tmp_path / "dataset", tmp_path / "out"
-    shutil.copytree(dataset, copy)  # keeps the times
-    shutil.copytree(out, again)
+def test_a_second_run_does_nothing_again_and_takes_in_what_was_mended(copies) -> None:
+    copy, again = copies
     before = datasets.content_and_times(again / "test")
-    mended = dataset / "test/000001/depth/000003.png"
+    mended = copy / "test/000001/depth/000003.png"
     (copy / "test/000002/depth/000003.png").write_bytes(mended.read_bytes())
     # Of another scene: the objects lie elsewhere, so the pose is judged, the scene is not refused.
     done = upgrade(copy, again, "--workers", "1")
@@ -131,32 +138,28 @@ def test_a_second_run_does_nothing_again_and_takes_in_what_was_mended(upgraded, 
 
 
 @pytest.mark.slow
-def test_other_images_are_not_mixed_into_an_upgrade(upgraded, tmp_path) -> None:
-    dataset, out, _ = upgraded
-    copy, again = tmp_path / "dataset", tmp_path / "out"
-    shutil.copytree(dataset, copy)
-    shutil.copytree(out, again)
-    other = dataset / "test/000002/rgb/000003.png"
-    (copy / "test/000001/rgb/000003.png").write_bytes(other.read_bytes())
-    assert "upgrade of other images" in failed_with(copy, again, "--only-scenes", "1")
+def test_other_images_are_not_mixed_into_an_upgrade(copies) -> None:
+    dataset, out = copies
+    shutil.copy(dataset / "test/000002/rgb/000003.png", dataset / "test/000001/rgb/000003.png")
+    assert "upgrade of other images" in failed_with(dataset, out, "--only-scenes", "1")
 
 
 @pytest.mark.slow
-def test_another_data_set_is_not_mixed_into_an_upgrade(upgraded, tmp_path) -> None:
+def test_another_data_set_is_not_mixed_into_an_upgrade(upgraded, copies, tmp_path) -> None:
     dataset, out, _ = upgraded
     before = datasets.content_and_times(out)
-    shutil.copytree(dataset, moved := tmp_path / "moved")
-    gt = moved / "test/000001/scene_gt.json"
-    told = json.loads(gt.read_text())
-    told["3"][0]["cam_t_m2c"][0] += 15.0
-    gt.write_text(json.dumps(told))
+    moved, unknown = copies
+
+    def shift(rows: dict) -> None:
+        rows["3"][0]["cam_t_m2c"][0] += 15.0
+
+    edit(moved / "test/000001/scene_gt.json", shift)
     assert "upgrade of another data set: test/000001" in failed_with(moved, out)
     shutil.move(moved / "test/000001", moved / "test/000077")
     shutil.rmtree(moved / "test/000002")
     assert "upgrade of another data set" in failed_with(moved, out)
     assert datasets.content_and_times(out) == before
     # Where it is not known whose scene it is, its annotations tell.
-    shutil.copytree(out, unknown := tmp_path / "unknown")
     (unknown / "test/000001/imported/source.json").write_text("{}")
     assert upgrade(dataset, unknown, "--only-scenes", "1").exit_code == 0
     assert "of another folder" in failed_with(moved, unknown)
@@ -164,19 +167,16 @@ def test_another_data_set_is_not_mixed_into_an_upgrade(upgraded, tmp_path) -> No
 
 @pytest.mark.slow
 def test_what_is_done_anew_is_told_where_it_was_reviewed_and_where_its_models_changed(
-    upgraded, tmp_path
+    copies,
 ) -> None:
-    dataset, out, _ = upgraded
-    shutil.copytree(out, again := tmp_path / "out")
+    dataset, again = copies
     (again / "test/000001/review").mkdir()
     (again / "test/000001/review/journal.jsonl").write_text("")
     shutil.copytree(again / "test/000001", again / "test/000003")
     note = again / "test/000003" / NOTE
     note.write_text(note.read_text().replace("test/000001", "test/000003"))
     info = again / "test/000003/models/models_info.json"
-    models = json.loads(info.read_text())
-    models["1"]["diameter"] += 1.0
-    info.write_text(json.dumps(models))
+    edit(info, lambda models: models["1"].update(diameter=1.0 + models["1"]["diameter"]))
     told = upgrade(dataset, again, "--only-scenes", "1", "--views", "1").output
     assert "test/000001 was reviewed" in told
     assert "object 1 of test/000003: another model" in told
@@ -184,10 +184,8 @@ def test_what_is_done_anew_is_told_where_it_was_reviewed_and_where_its_models_ch
 
 @pytest.mark.slow
 def test_a_camera_that_no_scene_of_a_bop_data_set_names_is_refused(upgraded) -> None:
-    with pytest.raises(
-        InputError, match=r"no BOP scene of the camera 'kinect'.*Leave --camera-name out"
-    ):
-        scenes_of(upgraded[0], UpgradeConfig(camera="kinect"))
+    said = refused("no BOP scene", scenes_of, upgraded[0], UpgradeConfig(camera="kinect"))
+    assert "of the camera 'kinect'" in said and "Leave --camera-name out" in said
 
 
 # --- GraspNet ---------------------------------------------------------------------------------
@@ -197,10 +195,9 @@ def test_a_camera_and_a_number_of_images_can_be_asked_for(tmp_path) -> None:
     dataset = datasets.graspnet_dataset(tmp_path / "dataset")
     for place in (dataset, dataset / "scenes", dataset / "scenes/scene_0100/kinect"):
         assert [r.place for r in scenes_of(place, UpgradeConfig())] == ["test_kinect/000100"]
-    with pytest.raises(InputError, match="realsense"):
-        scenes_of(dataset, UpgradeConfig(kind="graspnet", camera="realsense"))
-    with pytest.raises(InputError, match="keyframe_poses"):
-        UpgradeConfig(kind="graspnet", start="cosypose")
+    other = UpgradeConfig(kind="graspnet", camera="realsense")
+    refused("realsense", scenes_of, dataset, other)
+    refused("keyframe_poses", UpgradeConfig, kind="graspnet", start="cosypose")
 
 
 # --- which annotations are one thing ----------------------------------------------------------
@@ -251,27 +248,26 @@ def judged(
     All of the depth is too far by `far_m`, and the new poses with it.
     """
     placed, (T,) = datasets.standing(0.5), datasets.cameras(1)
-    things = [*placed]
-    if hidden:  # a board between the camera and the parts
-        board = se3.from_translation([0.0, -0.2, 0.2]) @ se3.exp([0.8, 0, 0, 0, 0, 0])
-        things.append(PlacedMesh(-1, square(0.5), board))
-    (labels,) = datasets.looks(things, 1)
+    # A board between the camera and the parts.
+    board = se3.from_translation([0.0, -0.2, 0.2]) @ se3.exp([0.8, 0, 0, 0, 0, 0])
+    (labels,) = datasets.looks([*placed, *[PlacedMesh(-1, square(0.5), board)] * hidden], 1)
     depth_m = np.where(labels.depth_m > 0, labels.depth_m + far_m, 0).astype(np.float32)
     picture = Picture(
         intrinsics=datasets.CAMERA, depth_m=depth_m, T_world_cam=T, rgb=datasets.grey_of(labels)
     )
 
+    models = {part(n).obj_id: part(n) for n in datasets.NAMES}
+
     def at(off: float, far: float = 0.0) -> list[ObjectPose]:
         step = T @ se3.from_translation([off, 0, far]) @ se3.invert(T)
         return [
-            ObjectPose(obj_id=part(n).obj_id, instance=p.instance, verdict="accepted",
+            ObjectPose(obj_id=obj_id, instance=p.instance, verdict="accepted",
                        T_world_obj=step @ p.T_world_obj, covariance=SURE)
-            for n, p in zip(datasets.NAMES, placed, strict=True)
+            for obj_id, p in zip(models, placed, strict=True)
         ]  # fmt: skip
 
     table = SupportPlane(T_world_table=np.eye(4))
-    return decide([picture], {part(n).obj_id: part(n) for n in datasets.NAMES}, at(off_m),
-                  at(found_off_m, far_m), table)  # fmt: skip
+    return decide([picture], models, at(off_m), at(found_off_m, far_m), table)
 
 
 @pytest.mark.parametrize("off_m", [-0.02, -0.004, 0.002, 0.008])
@@ -423,9 +419,7 @@ def test_analytic_grasps_are_tried_and_kept_beside_the_schools_own(tmp_path: Pat
 
 def _a_graspnet_roots_own_labels_are_taken(tmp_path: Path, labels: Path) -> None:
     dataset = datasets.graspnet_dataset(tmp_path / "graspnet")
-    (dataset / "grasp_label").mkdir()
-    for file in labels.glob("*.npz"):
-        shutil.copy(file, dataset / "grasp_label" / file.name)
+    shutil.copytree(labels, dataset / "grasp_label")
     before, out = datasets.content_and_times(dataset), tmp_path / "from_graspnet"
     run_upgrade(UpgradeConfig(grasps_per_object=2, analytic=4, where=1), dataset, out, QUIET)
     assert datasets.content_and_times(dataset) == before
@@ -439,7 +433,7 @@ def _a_graspnet_roots_own_labels_are_taken(tmp_path: Path, labels: Path) -> None
         T = np.array(o["T_world_obj"])
         np.testing.assert_allclose(T[:3, 3], p.T_world_obj[:3, 3], atol=1.5e-3)
     assert not (out / "grasp_label").exists()
-    sets = load_grasps(out / "test_kinect/000100" / FOLDER)
+    sets = load_grasps(scene / FOLDER)
     assert {s.parameters["analytic"]["from"] for s in sets} <= {p.name for p in labels.glob("*")}
-    source = json.loads((out / "test_kinect/000100/imported/source.json").read_text())
+    source = json.loads((scene / "imported/source.json").read_text())
     assert source["grasp_labels"] == sorted(f"grasp_label/{p.name}" for p in labels.glob("*.npz"))
