@@ -23,23 +23,17 @@ SHIFT_M = 0.004
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Sessions: a; b with one object moved and one view less; bare without registration."""
+    """Sessions: a; b with one object moved and one view less."""
     root = tmp_path_factory.mktemp("compare")
-    for name, left_out in (("a", None), ("b", 1), ("bare", None)):
+    for name, left_out, shift_m in (("a", None, 0.0), ("b", 1, SHIFT_M)):
         store = table_session(root / name, views=3)
-        if name == "bare":
-            continue
         result = registered_by_hand(store, left_out=left_out)
-        if name == "b":
-            first = result.scene.objects[0]
-            moved = first.T_world_obj.copy()
-            moved[0, 3] += SHIFT_M
-            scene = replace(
-                result.scene, objects=(replace(first, T_world_obj=moved), *result.scene.objects[1:])
-            )
-            result = replace(result, scene=scene)
+        first, *others = result.scene.objects
+        moved = se3.from_translation([shift_m, 0, 0]) @ first.T_world_obj
+        objects = (replace(first, T_world_obj=moved), *others)
+        result = replace(result, scene=replace(result.scene, objects=objects))
         write_result(store, result, models_of(), {})
-    return {name: root / name for name in ("a", "b", "bare")}
+    return {name: root / name for name in ("a", "b")}
 
 
 @pytest.fixture(scope="module")
@@ -64,10 +58,11 @@ def test_a_against_b_is_the_opposite_of_b_against_a(both: list[Source]) -> None:
         assert d.value is None or e.value is None or d.value == -e.value
         assert d.sigma == e.sigma
         assert d.outcome is None or mirrored.get(d.outcome, d.outcome) == e.outcome
-    there, here = compare.object_differences(a, b), compare.object_differences(b, a)
-    assert [(o.name, o.mssd_mm, o.shift_mm, o.turn_deg, o.sigma_mm) for o in there] == [
-        (o.name, o.mssd_mm, o.shift_mm, o.turn_deg, o.sigma_mm) for o in here
-    ]
+    there, here = (
+        [(o.name, o.mssd_mm, o.shift_mm, o.turn_deg, o.sigma_mm) for o in found]
+        for found in (compare.object_differences(a, b), compare.object_differences(b, a))
+    )
+    assert there == here
 
 
 def test_what_moved_is_told_in_millimetres_and_against_its_noise(both: list[Source]) -> None:
@@ -160,20 +155,17 @@ def test_exit_codes_and_json_of_a_comparison(folders: dict[str, Path], tmp_path:
 
 
 def test_a_difference_within_two_sigmas_is_noise() -> None:
-    name = "school.mean_score"
+    def outcome(first: Figure, second: Figure) -> str | None:
+        return compare.Difference(name=first.name, first=first, second=second).outcome
 
-    def outcome(value: float, sigma: float | None) -> str | None:
-        first = Figure(name=name, value=0.5, sigma=0.03)
-        second = Figure(name=name, value=value, sigma=sigma)
-        return compare.Difference(name=name, first=first, second=second).outcome
+    def score(value: float, sigma: float | None) -> Figure:
+        return Figure(name="school.mean_score", value=value, sigma=sigma)
 
-    assert outcome(0.59, 0.04) == "same" and outcome(0.61, 0.04) == "better"
-    assert outcome(0.39, 0.04) == "worse" and outcome(0.39, None) == "unknown"
+    for value, told in ((0.59, "same"), (0.61, "better"), (0.39, "worse")):
+        assert outcome(score(0.5, 0.03), score(value, 0.04)) == told
+    assert outcome(score(0.5, 0.03), score(0.39, None)) == "unknown"
     lower = "registration.doubtful"
-    assert (
-        compare.Difference(name=lower, first=count(lower, 1), second=count(lower, 2)).outcome
-        == "worse"
-    )
+    assert outcome(count(lower, 1), count(lower, 2)) == "worse"
 
 
 def test_the_page_of_three_holds_its_document_and_escapes_names(

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from begun_sessions import add_drawn, begun
-from realsim import CameraIntrinsics, Mesh, ObjectModel, ObjectPose, Scene
+from plain_meshes import box
+from realsim import CameraIntrinsics, ObjectModel, ObjectPose, Scene
 from realsim.app.report.sliders import registration_pairs
 from realsim.app.stages import save_starts
 from realsim.formats.bop.models import save_models
@@ -18,11 +19,7 @@ INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5
 SHIFT_M = 0.02
 
 
-def block() -> Mesh:
-    import trimesh
-
-    solid = trimesh.creation.box((0.06, 0.05, 0.04))
-    return Mesh(vertices=solid.vertices, faces=solid.faces)
+BLOCK = box((0.06, 0.05, 0.04))
 
 
 def pose(x: float) -> ObjectPose:
@@ -32,15 +29,16 @@ def pose(x: float) -> ObjectPose:
 @pytest.fixture
 def store(tmp_path: Path) -> SessionStore:
     store = begun(tmp_path / "one", INTRINSICS)
-    renderer = LabelRenderer([PlacedMesh(2, block(), pose(0.0).T_world_obj)])
+    renderer = LabelRenderer([PlacedMesh(2, BLOCK, pose(0.0).T_world_obj)])
     eyes = [[0.3 * np.cos(a), 0.3 * np.sin(a), 0.25] for a in (0.0, 1.5, 3.0, 4.5)]
     add_drawn(store, renderer, [se3.look_at(eye, [0.0, 0.0, 0.02]) for eye in eyes])
     save_scene(store, Scene(name="one", objects=(pose(0.0),), plane=None))
-    save_models(store.folder / "models", {1: ObjectModel(obj_id=1, name="b", mesh=block())})
+    save_models(store.folder / "models", {1: ObjectModel(obj_id=1, name="b", mesh=BLOCK)})
     return store
 
 
-def coloured(picture: np.ndarray) -> np.ndarray:
+def coloured(picture: object) -> np.ndarray:
+    assert isinstance(picture, np.ndarray)
     return np.ptp(picture.astype(int), axis=-1) > 40
 
 
@@ -50,11 +48,7 @@ def test_the_outline_moves_from_the_start_onto_the_object(store: SessionStore) -
     assert "1 of 1 objects at the rough pose" in before and "cameras" not in before
     assert [p.caption for p in pairs] == ["view 0", "view 2", "view 3"]
     for p in pairs:
-        assert isinstance(p.pictures["before"], np.ndarray) and isinstance(
-            p.pictures["registered"], np.ndarray
-        )
-        photo = store.rgb(int(p.caption.split()[1]))
-        on_object = photo[..., 0] == 200
+        on_object = store.rgb(int(p.caption.split()[1]))[..., 0] == 200
         # After, the outline lies within the object; before, it does not.
         assert np.mean(on_object[coloured(p.pictures["registered"])]) > 0.99
         assert np.mean(on_object[coloured(p.pictures["before"])]) < 0.9
@@ -62,7 +56,6 @@ def test_the_outline_moves_from_the_start_onto_the_object(store: SessionStore) -
 
 def test_without_a_before_there_are_no_sliders(store: SessionStore) -> None:
     assert registration_pairs(store) == ([], "")
-    store.write_json(
-        "registration/starts.json", {"starts": [{"instance": 2, "click": [3, 80, 60]}]}
-    )
+    clicked = {"starts": [{"instance": 2, "click": [3, 80, 60]}]}
+    store.write_json("registration/starts.json", clicked)
     assert registration_pairs(store) == ([], "")

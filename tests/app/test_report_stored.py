@@ -8,38 +8,36 @@ from typing import Any
 
 import pytest
 
+from realsim.app.register.files import write_result
 from realsim.app.report.session import report_of, write_report
 from realsim.app.report.sources import read_stored
 from registered_sessions import models_of, registered_by_hand, table_session
 from typed_commands import refused
 
+Document = dict[str, Any]
+
 
 @pytest.fixture(scope="module")
-def document(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    from realsim.app.register.files import write_result
-
+def document(tmp_path_factory: pytest.TempPathFactory) -> Document:
     store = table_session(tmp_path_factory.mktemp("stored") / "s", views=2)
     write_result(store, registered_by_hand(store), models_of(), {})
     page = write_report(store, report_of(store, pictures="kept"))
     return json.loads((page.parent / "report.json").read_text("utf-8"))
 
 
-def test_what_a_report_says_is_read_as_it_was_written(
-    document: dict[str, Any], tmp_path: Path
-) -> None:
+def test_what_a_report_says_is_read_as_it_was_written(document: Document, tmp_path: Path) -> None:
     path = tmp_path / "r.json"
     path.write_text(json.dumps(document))
     read = read_stored(path, "A r")
     assert read.verdict == document["verdict"] and set(read.figures) == set(document["figures"])
-    assert [o["T_world_obj"] for o in read.objects] == [
-        o["T_world_obj"] for o in document["objects"]
-    ]
+    for a, b in zip(read.objects, document["objects"], strict=True):
+        assert a["T_world_obj"] == b["T_world_obj"]
     assert set(read.series) == set(document["series"])
 
 
 FIGURE = "registration.accepted"
-Change = Callable[[dict[str, Any]], Any]
-DAMAGES: list[tuple[Change, str]] = [
+SERIES = {"calibration.view_rms_px": {"view": [0], "value": []}}
+DAMAGES: list[tuple[Callable[[Document], Any], str]] = [
     (lambda d: d.update(session=[]), "session"),
     (lambda d: d.update(missing={"school": 3}), "missing.school"),
     (lambda d: d.update(stages={"plan": "perhaps"}), "stages.plan"),
@@ -47,10 +45,7 @@ DAMAGES: list[tuple[Change, str]] = [
     (lambda d: d.update(figures={}), "report.bad"),
     (lambda d: d["figures"][FIGURE].update(value="7"), FIGURE),
     (lambda d: d.update(verdict=["sound"]), "verdict"),
-    (
-        lambda d: d["series"].update({"calibration.view_rms_px": {"view": [0], "value": []}}),
-        "view_rms_px",
-    ),
+    (lambda d: d["series"].update(SERIES), "view_rms_px"),
     (lambda d: d["objects"][0].update(verdict="good"), "objects[0]"),
     (lambda d: d["objects"][0].update(T_world_obj=[[1, 0], [0, 1]]), "T_world_obj"),
     (lambda d: d["objects"].append(d["objects"][0]), "2 times"),
@@ -58,9 +53,7 @@ DAMAGES: list[tuple[Change, str]] = [
 
 
 @pytest.mark.parametrize("k", range(len(DAMAGES)))
-def test_a_damaged_field_is_named_with_its_file(
-    document: dict[str, Any], tmp_path: Path, k: int
-) -> None:
+def test_a_damaged_field_is_named_with_its_file(document: Document, tmp_path: Path, k: int) -> None:
     change, named = DAMAGES[k]
     damaged = copy.deepcopy(document)
     change(damaged)
