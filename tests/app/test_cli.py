@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from stored_sessions import flip, make_whole
-from typed_commands import complained, realsim
+from typed_commands import complained, realsim, started
 
 HEAVY = "numpy open3d pybullet gtsam cv2 viser trimesh scipy numba matplotlib".split()
 
@@ -75,9 +75,8 @@ def test_2_is_bad_input(
 
 
 def test_130_is_interrupted(tmp_path: Path) -> None:
-    code = "from realsim.app.cli import main; main()"
-    command = [sys.executable, "-c", code, "demo", "--out", str(tmp_path / "d"), "--workers", "1"]
-    with subprocess.Popen(command, text=True, stderr=subprocess.PIPE) as process:
+    words = ("demo", "--out", tmp_path / "d", "--workers", "1")
+    with started(*words, stderr=subprocess.PIPE) as process:
         until = time.monotonic() + 100
         while not (tmp_path / "d/demo.json").is_file() and time.monotonic() < until:
             time.sleep(0.1)

@@ -1,40 +1,32 @@
 """The whole loop in the simulated lab: a kill costs nothing."""
 
-import hashlib
 import json
 import re
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from file_trees import bytes_of
 from realsim.app.console import Console, StageTime
 from realsim.app.demo.run import DemoResult, show_demo
 from realsim.app.demo.site import PAGES, write_site
 from realsim.app.truth import LoopErrors, loop_errors
 from realsim.store import SessionStore
-from typed_commands import realsim
+from typed_commands import realsim, started
 
 SMALL = ["--quick", "--views", "6", "--objects", "2", "--grasps", "8", "--workers", "1",
          "--quiet"]  # fmt: skip
 """The demo of `demo_session`; `--quick` makes its pictures small."""
 
 
-def start_demo(out: Path) -> subprocess.Popen[str]:
-    code = "from realsim.app.cli import main; main()"
-    return subprocess.Popen(
-        [sys.executable, "-c", code, "demo", "--out", str(out), *SMALL],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-
-
 def kill_when(out: Path, reached: Callable[[Path], bool]) -> bool:
     """Start a demo and SIGKILL it as soon as `reached`; return whether it was caught alive."""
-    process = start_demo(out)
+    pipe = subprocess.PIPE
+    process = started("demo", "--out", out, *SMALL, stdout=pipe, stderr=pipe)
     deadline = time.monotonic() + 900
     while process.poll() is None and time.monotonic() < deadline:
         if reached(out / "session"):
@@ -45,10 +37,6 @@ def kill_when(out: Path, reached: Callable[[Path], bool]) -> bool:
     process.kill()
     process.communicate()
     return False
-
-
-def digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @pytest.mark.slow
@@ -68,9 +56,7 @@ def test_a_demo_killed_in_two_stages_ends_like_one_left_alone(
     finished = realsim("demo", "--out", killed, *SMALL)
     assert finished.returncode == 0, finished.stderr
     for pattern in ("rgb/*.png", "depth/*.png", "mask_visib/*.png"):
-        a = {p.name: digest(p) for p in (killed / "session").glob(pattern)}
-        b = {p.name: digest(p) for p in demo_session.glob(pattern)}
-        assert a == b and a, pattern
+        assert bytes_of(killed / "session", pattern) == bytes_of(demo_session, pattern) != {}
     for name in ("scene_gt.json", "registration/scene.json"):
         left = json.loads((killed / "session" / name).read_text())
         assert left == json.loads((demo_session / name).read_text()), name
@@ -104,9 +90,8 @@ def test_a_site_needs_nothing_but_its_folder(tmp_path: Path, demo_session: Path)
     assert index.name == "index.html" and names <= {p.name for p in site.iterdir()}
     for page in site.glob("*.html"):
         text = page.read_text()
-        named = re.findall(
-            r'<(?:a|link|img|script|iframe|video)\b[^>]*?(?:href|src)="([^"#]*)', text
-        )
+        links = r'<(?:a|link|img|script|iframe|video)\b[^>]*?(?:href|src)="([^"#]*)'
+        named = re.findall(links, text)
         kept = {name for name in named if name and not name.startswith("data:")}
         assert all((site / name).is_file() for name in kept), (page.name, kept)
         assert str(demo_session) not in text and str(tmp_path) not in text

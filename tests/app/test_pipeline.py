@@ -7,13 +7,12 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from unittest import mock
 
 import pytest
-from click.testing import CliRunner
 
+from file_trees import bytes_of
 from realsim.app.cli import commands
 from realsim.app.pipeline import chain
 from realsim.app.pipeline import run as pipeline_run
@@ -22,7 +21,7 @@ from realsim.app.pipeline.chain import SCENE, Ended
 from realsim.app.pipeline.page import page_of, verdicts_of
 from realsim.errors import InputError
 from realsim.pages import Page
-from typed_commands import realsim
+from typed_commands import invoked, realsim, started
 
 HEAD = '[campaign]\nout = "out"\nstages = ["annotate", "export", "stats"]\n'
 SCENES = '[generate]\nscenes = 2\nviews = 2\nobjects = "2"\nsize = "160x120"\nrange = "d405"\n'
@@ -30,10 +29,13 @@ EXPORT = '[export]\nto = "bop"\n'
 
 
 def run(path, *more):
-    return CliRunner().invoke(commands, ["pipeline", str(path), "--quiet", "--workers", "1", *more])
+    return invoked("pipeline", path, "--quiet", "--workers", "1", *more)
 
 
-def written(folder, text):
+WHOLE = HEAD + SCENES + EXPORT
+
+
+def written(folder, text=WHOLE):
     path = folder / "campaign.toml"
     path.write_text(text)
     return path
@@ -65,25 +67,25 @@ def test_a_file_that_cannot_be_used_names_line_and_key_and_runs_nothing(tmp_path
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_of_something_else_is_not_filled(tmp_path):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out/mine.txt").write_text("mine")
-    result = run(written(tmp_path, HEAD + SCENES + EXPORT))
-    assert "holds something else" in str(result.exception)
-    assert [p.name for p in (tmp_path / "out").iterdir()] == ["mine.txt"]
+OTHERS = '{"campaign": "../other.toml", "scenes": 2}'
 
 
-def test_the_folder_of_another_campaign_is_not_filled(tmp_path):
-    path = written(tmp_path, HEAD + SCENES + EXPORT)
+@pytest.mark.parametrize(
+    ("name", "text", "told"),
+    [
+        ("mine.txt", "mine", "holds something else"),
+        ("campaign.json", OTHERS, "is of another campaign, ../other.toml"),
+    ],
+)
+def test_a_folder_of_something_else_is_not_filled(tmp_path, name, text, told):
     (tmp_path / "out").mkdir()
-    (tmp_path / "out/campaign.json").write_text('{"campaign": "../other.toml", "scenes": 2}')
-    before = (tmp_path / "out/campaign.json").read_bytes()
-    assert "is of another campaign, ../other.toml" in str(run(path).exception)
-    assert (tmp_path / "out/campaign.json").read_bytes() == before
+    (tmp_path / "out" / name).write_text(text)
+    assert told in str(run(written(tmp_path)).exception)
+    assert bytes_of(tmp_path / "out") == {name: text.encode()}
 
 
 def test_what_a_person_has_to_look_at_is_on_the_page(tmp_path):
-    campaign = read_campaign(written(tmp_path, HEAD + SCENES + EXPORT), commands)
+    campaign = read_campaign(written(tmp_path), commands)
     scene = tmp_path / "out/scenes/scene_000000"
     (scene / "registration").mkdir(parents=True)
     objects = [{"verdict": "accepted"}, {"verdict": "accepted"}]
@@ -104,7 +106,7 @@ def test_what_a_person_has_to_look_at_is_on_the_page(tmp_path):
 
 
 def test_a_page_is_given_back_when_it_is_written(tmp_path):
-    campaign = read_campaign(written(tmp_path, HEAD + SCENES + EXPORT), commands)
+    campaign = read_campaign(written(tmp_path), commands)
     campaign.out.mkdir()
     gc.collect()
     before = {id(o) for o in gc.get_objects() if isinstance(o, Page)}
@@ -143,7 +145,7 @@ def exported(out):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A campaign's file and folder, and what it exported when it was done."""
-    path = written(tmp_path_factory.mktemp("whole"), HEAD + SCENES + EXPORT)
+    path = written(tmp_path_factory.mktemp("whole"))
     with no_interpreters():
         assert run(path).exit_code == 0
     out = path.parent / "out"
@@ -155,29 +157,27 @@ def whole(tmp_path_factory):
 
 @pytest.mark.slow
 def test_results_that_are_gone_or_of_others_are_seen_and_nobodys_files_are_removed(whole, tmp_path):
-    path, out = tmp_path / whole[0].name, tmp_path / "out"
+    path, out = written(tmp_path), tmp_path / "out"
     shutil.copytree(whole[1], out)
-    written(tmp_path, HEAD + SCENES + EXPORT)
     # Of one scene the labels' record is lost, the other was labelled again with other maps.
     (out / "scenes/scene_000000/stages/annotate.json").unlink()
     assert realsim("annotate", out / "scenes/scene_000001", "--maps", "none").returncode == 0
     (out / "export/NOTES.md").write_text("mine")
     card = out / "export/README.md"
     card.write_text(card.read_text() + "and mine")
-    with no_interpreters():
-        result = run(path)
-    assert result.exit_code == 0, result.output
-    told = " ".join(result.output.split())
-    assert "scene_000000: files that annotate left are gone or others" in told
-    assert "scene_000001: annotate was run outside this campaign" in told
-    # A view's mask is lost, another one's labels lost something.
-    scene = out / "scenes/scene_000000"
-    (scene / "mask_visib/000000_000000.png").unlink()
-    with no_interpreters():
-        result = run(path)
-    told = " ".join(result.output.split())
-    assert "scene_000000: files that annotate left are gone or others" in told
-    assert result.exit_code == 0 and (scene / "mask_visib/000000_000000.png").is_file()
+    lost = "scene_000000: files that annotate left are gone or others"
+    mask = out / "scenes/scene_000000/mask_visib/000000_000000.png"
+
+    def gone_on_with() -> str:
+        with no_interpreters():
+            result = run(path)
+        assert result.exit_code == 0, result.output
+        return " ".join(result.output.split())
+
+    told = gone_on_with()
+    assert lost in told and "scene_000001: annotate was run outside this campaign" in told
+    mask.unlink()
+    assert lost in gone_on_with() and mask.is_file()
     assert (out / "scenes/scene_000000/stages/annotate.json").is_file()
     assert sorted(p.name for p in (out / "export.kept").iterdir()) == ["NOTES.md", "README.md"]
     assert (out / "export.kept/README.md").read_text().endswith("and mine")
@@ -188,8 +188,7 @@ def test_results_that_are_gone_or_of_others_are_seen_and_nobodys_files_are_remov
 def test_a_scene_that_fails_is_listed_the_others_go_on_and_only_it_is_done_again(whole):
     path, out, _ = whole
     # One scene's poses are damaged, and it has to be done again.
-    record = out / "records/scene_000001.json"
-    record.unlink()
+    (out / "records/scene_000001.json").unlink()
     views = out / "scenes/scene_000001/registration/scene.json"
     kept = views.read_bytes()
     views.write_bytes(b"{")
@@ -208,7 +207,7 @@ def test_a_scene_that_fails_is_listed_the_others_go_on_and_only_it_is_done_again
         assert run(path).exit_code == 0
         assert document(out)["done"] == 2
         # Other options of an export: it is made anew. A photograph is damaged: the others are kept.
-        written(path.parent, HEAD + SCENES + EXPORT + 'licence = "CC0-1.0"\n')
+        written(path.parent, WHOLE + 'licence = "CC0-1.0"\n')
         assert run(path).exit_code == 0
         assert "CC0-1.0" in (out / "export/README.md").read_text()
         assert not (out / "export.before").exists()
@@ -222,11 +221,9 @@ def test_a_scene_that_fails_is_listed_the_others_go_on_and_only_it_is_done_again
 
 @pytest.mark.slow
 def test_a_campaign_that_was_interrupted_goes_on_and_comes_to_the_same(whole, tmp_path):
-    path, out = written(tmp_path, HEAD + SCENES + EXPORT), tmp_path / "out"
-    line = [sys.executable, "-c", "from realsim.app.cli import main; main()", "pipeline", str(path)]
-    process = subprocess.Popen(
-        [*line, "--workers", "1"], start_new_session=True, stderr=subprocess.PIPE, text=True
-    )
+    path, out = written(tmp_path), tmp_path / "out"
+    words = ("pipeline", path, "--workers", "1")
+    process = started(*words, start_new_session=True, stderr=subprocess.PIPE)
     while not (out / "scenes/scene_000000/session.json").is_file():
         assert process.poll() is None
         time.sleep(0.05)

@@ -14,9 +14,8 @@ from realsim.app.cli import commands
 from realsim.app.command import walk
 from realsim.app.verbs import run
 from shared_sessions import copy_of
-from typed_commands import realsim
+from typed_commands import realsim, started
 
-RUN = "from realsim.app.cli import main; main()"
 IMPORT = """
 import sys, time
 before = time.process_time()
@@ -25,12 +24,6 @@ print(time.process_time() - before, "numpy" in sys.modules, "click" in sys.modul
 """
 VERBS = ("annotate", "calibrate", "export", "open", "plan", "register", "render", "review", "scan",
          "school")  # fmt: skip
-
-
-def typed(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", RUN, *words], cwd=folder, capture_output=True, text=True
-    )
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -65,9 +58,9 @@ def test_named_arguments_are_options_of_the_commands() -> None:
     found = walk(commands)
     several = {"open": ("import",), "scan": ("scan", "import"), "school": ("school", "run")}
     for verb in VERBS:
-        known = {p.name for p in found[several.get(verb, (verb,))].params}
-        known |= {o.lstrip("-").replace("-", "_") for p in found[several.get(verb, (verb,))].params
-                  if isinstance(p, click.Option) for o in p.opts}  # fmt: skip
+        params = found[several.get(verb, (verb,))].params
+        options = [o for p in params if isinstance(p, click.Option) for o in p.opts]
+        known = {p.name for p in params} | {o.lstrip("-").replace("-", "_") for o in options}
         given = inspect.signature(getattr(rs, verb)).parameters.values()
         named = {p.name for p in given if p.kind is p.KEYWORD_ONLY} - {"progress"}
         assert named - known <= ({"session"} if verb == "scan" else set()), verb
@@ -115,15 +108,15 @@ def test_errors_say_what_the_command_prints(tmp_path: Path) -> None:
         return str(refused.value)
 
     nowhere = str(tmp_path / "nowhere")
-    printed = typed("register", nowhere, folder=tmp_path).stderr
+    process = started("register", nowhere, cwd=tmp_path, stderr=subprocess.PIPE)
+    printed = process.communicate()[1]
     assert printed == f"error: {told('register', nowhere)}\n"
     with pytest.raises(click.ClickException) as refused:
         commands.main(["plan", "--views", "0"], standalone_mode=False)
     assert refused.value.format_message() == told("plan", views=0)
-    (tmp_path / "mine.html").write_text("mine")
-    assert "is no page that this command wrote" in told(
-        "review", nowhere, static=tmp_path / "mine.html"
-    )
+    mine = tmp_path / "mine.html"
+    mine.write_text("mine")
+    assert "is no page that this command wrote" in told("review", nowhere, static=mine)
     assert "register has no option 'object_'; it has " in told("register", nowhere, object_="mug")
     assert "kind are for an import" in told("open", nowhere, kind="bop")
 

@@ -2,6 +2,7 @@
 
 - `realsim`: the whole of `realsim.app.cli.main`, so that exit codes and messages are those of the
   program. Laws about the process itself (kills, terminals, what is imported) start one.
+- `started`: the program as a process of its own.
 - `complained`: what the program said of bad input, which has to be in words.
 - `invoked`, `finished`, `refused`: the command alone, which says what it raised.
 """
@@ -11,6 +12,7 @@ import io
 import subprocess
 import sys
 import traceback
+from typing import Any
 
 from click.testing import CliRunner, Result
 
@@ -36,6 +38,13 @@ def realsim(*words: object) -> "subprocess.CompletedProcess[str]":
         finally:
             sys.argv = argv
     return subprocess.CompletedProcess(typed, code, said.getvalue(), complained.getvalue())
+
+
+def started(*words: object, **options: Any) -> "subprocess.Popen[str]":
+    """Start `realsim WORDS...` in an interpreter of its own; `options` are those of `Popen`."""
+    code = "from realsim.app.cli import main; main()"
+    line = [sys.executable, "-c", code, *map(str, words)]
+    return subprocess.Popen(line, text=True, **options)
 
 
 def complained(*words: object) -> str:
