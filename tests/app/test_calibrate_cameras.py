@@ -69,12 +69,12 @@ def write_poses(path: Path, columns: str, *values: Array) -> None:
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder of every camera, a file of poses, and both targets."""
-    folder = tmp_path_factory.mktemp("lab")
+    folder = tmp_path_factory.mktemp("lab") / "pictures"
     rng = np.random.default_rng(3)
     import cv2
 
     for name in ("wrist", *FIXED):
-        (folder / name).mkdir()
+        (folder / name).mkdir(parents=True)
     Ts = hands(rng)
     q = np.array([se3.quaternion_wxyz(T[:3, :3]) for T in Ts])
     write_poses(folder / "arm.csv", "x,y,z,qx,qy,qz,qw", Ts[:, :3, 3], q[:, [1, 2, 3, 0]])
