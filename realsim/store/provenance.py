@@ -23,7 +23,7 @@ from realsim.store import atomic
 from realsim.store.header import versions_of
 from realsim.store.manifest import Manifest
 from realsim.store.session_store import SessionStore
-from realsim.untrusted.own_json import read_own, to_json
+from realsim.untrusted.own_json import noted, read_own, to_json
 
 LIBRARIES = (
     "realsim", "numpy", "scipy", "numba", "opencv-python-headless", "open3d-cpu", "trimesh",
@@ -216,11 +216,7 @@ def read(folder: Path, stage: str = "") -> tuple[Provenance, Run]:
 
 def is_current(store: SessionStore, stage: str, key: str) -> bool:
     """Return whether this stage has already been done with these inputs."""
-    path = store.folder / file_of(stage)
-    try:
-        return path.is_file() and json.loads(path.read_text())["key"] == key
-    except (ValueError, KeyError, TypeError):
-        return False  # a damaged record is none: the stage is done again
+    return noted(store.folder / file_of(stage)).get("key") == key
 
 
 # --- what differs -----------------------------------------------------------------------------

@@ -132,6 +132,14 @@ def read_object(path: Path | str) -> dict[str, Any]:
     return {str(key): item for key, item in value.items()}  # pyright: ignore[reportUnknownVariableType]
 
 
+def noted(path: Path | str) -> dict[str, Any]:
+    """Return what a note of ours says; nothing where it is not there, and a damaged one is none."""
+    try:
+        return read_object(path)
+    except (InputError, OSError):
+        return {}
+
+
 def _words(kind: Any, field: str, names: bool, inside: bool = False) -> list[Any]:
     """Return the words, or the names of fields, that a field of this name may hold anywhere."""
     fields = getattr(kind, "fields", ())

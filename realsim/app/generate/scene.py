@@ -7,9 +7,8 @@ from typing import Any
 
 from realsim.app.console import cpu_seconds
 from realsim.app.generate.request import LAYOUTS, GenerateRequest
-from realsim.errors import InputError
 from realsim.store import SessionStore, atomic
-from realsim.untrusted.own_json import read_object
+from realsim.untrusted.own_json import noted, read_object
 from realsim_sim_bridge.synthetic.write import write_session
 from realsim_sim_bridge.table_scenes import sample
 from realsim_sim_bridge.table_scenes.cameras import intrinsics_of, views
@@ -59,13 +58,7 @@ def load_layout(out: Path, number: int) -> sample.Layout:
 def is_finished(out: Path, number: int, request: GenerateRequest) -> bool:
     """Return whether a scene of this request is complete: its note and all of its files."""
     path, folder = finished_path(out, number), out / scene_name(number)
-    if not path.is_file() or not (folder / "session.json").is_file():
-        return False
-    try:
-        note = read_object(path)
-    except InputError:
-        return False  # a damaged note is no note: the scene is looked at again
-    if note.get("key") != request.key:
+    if noted(path).get("key") != request.key or not (folder / "session.json").is_file():
         return False
     views = range(request.views.count)
     labelled = all((folder / f"annotations/{k:06d}.json").is_file() for k in views)

@@ -15,10 +15,9 @@ from realsim import __version__
 from realsim.app.console import Console
 from realsim.app.stages import content_key, judged_scene, session_models
 from realsim.app.upgrade.dataset import SceneJob
-from realsim.errors import InputError
 from realsim.records import GraspSet, ObjectModel
 from realsim.store import SessionStore, atomic
-from realsim.untrusted.own_json import read_object
+from realsim.untrusted.own_json import noted
 
 FOLDER = "grasps_analytic"
 LABELS = "grasp_label/{:03d}_labels.npz"
@@ -59,7 +58,7 @@ def try_analytic(store: SessionStore, job: SceneJob, console: Console) -> list[G
     files = {i: labels_file(model, job) for i, model in used.items()}
     tasks = object_tasks(scene, models, school, None, dict(solids), files)
     key = content_key(__version__, config.analytic, [t.inputs() for t in tasks])
-    if _is_finished(folder, key):
+    if noted(folder / NOTE).get("key") == key:
         return load_grasps(folder)
     with console.stage("analytic", f"up to {config.analytic} grasps an object") as tick:
         results = run_school_results(
@@ -69,13 +68,6 @@ def try_analytic(store: SessionStore, job: SceneJob, console: Console) -> list[G
     sets = [r.grasp_set for r in results]
     _write(folder, sets, {i: m.name for i, m in models.items()}, key)
     return sets
-
-
-def _is_finished(folder: Path, key: str) -> bool:
-    try:
-        return read_object(folder / NOTE).get("key") == key
-    except (InputError, OSError):
-        return False
 
 
 def labels_file(model: ObjectModel, job: SceneJob) -> Path:
@@ -89,7 +81,7 @@ def labels_file(model: ObjectModel, job: SceneJob) -> Path:
     path, note = job.out / name, job.out / f"{name}.json"
     mesh = model.mesh
     key = content_key(__version__, mesh.vertices.tolist(), mesh.faces.tolist())
-    if not (path.is_file() and note.is_file() and read_object(note).get("key") == key):
+    if not (path.is_file() and noted(note).get("key") == key):
         path.parent.mkdir(parents=True, exist_ok=True)
         labels = analytic_labels(mesh, np.random.default_rng(LABEL_SEED))
         write_grasp_labels(path, labels)

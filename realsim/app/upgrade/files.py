@@ -19,7 +19,7 @@ from realsim.app.register.from_review import UPGRADE_FILE
 from realsim.app.upgrade.dataset import SceneRef, UpgradeConfig
 from realsim.errors import InputError
 from realsim.store import SessionStore, atomic
-from realsim.untrusted.own_json import read_object
+from realsim.untrusted.own_json import noted, read_object
 
 RECORD = 2
 """Number of the records' layout: those of another are made again."""
@@ -53,13 +53,9 @@ def key_of(ref: SceneRef, config: UpgradeConfig) -> str:
 
 def finished_record(folder: Path, key: str) -> dict[str, Any] | None:
     """Return what came of a scene, where it has been upgraded with these inputs."""
-    path = folder / NOTE
-    try:
-        note: Any = json.loads(path.read_text(encoding="utf-8"))
-        is_current = note["key"] == key and (folder / "session.json").is_file()
-        return dict(note["record"]) if is_current else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None  # a damaged note is no note: the stages are gone through again
+    note = noted(folder / NOTE)
+    is_current = note.get("key") == key and (folder / "session.json").is_file()
+    return note.get("record") if is_current else None
 
 
 def all_records(out: Path) -> Iterator[dict[str, Any]]:
