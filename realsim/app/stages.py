@@ -235,18 +235,16 @@ def judged_scene(store: SessionStore) -> Scene:
     return reviewed_scene(load_scene(store), review_of(store))
 
 
-def registered_views(store: SessionStore) -> list[int] | None:
-    """Return the views in which the objects are known; None = all.
+def registered_views(store: SessionStore) -> list[int]:
+    """Return the views in which the objects are known.
 
-    Those that took part in the registration, but for what a reviewer excluded since.
+    Those that took part in the registration and are still there, but for what a reviewer excluded
+    since; all of them where no registration says which took part.
     """
     from realsim.app.register.results import load_cameras
     from realsim.app.reviewed import review_of
 
     record = load_cameras(store)
     excluded = review_of(store).excluded_views()
-    if record is not None and record.refined:
-        return sorted(set(record.refined) - set(excluded))
-    if not excluded:
-        return None
-    return [v.index for v in store.session.views if v.index not in excluded]
+    views = [v.index for v in store.session.views if v.index not in excluded]
+    return [k for k in views if record is None or not record.refined or k in record.refined]

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from begun_sessions import add_drawn, begun, light_things
-from realsim.app.annotate.current import annotate_session
+from realsim.app.annotate.current import annotate_session, what_is_stale
 from realsim.app.console import Console
 from realsim.app.register import results
 from realsim.app.register.files import documents, finish_interrupted, write_result
@@ -19,6 +19,7 @@ from realsim.app.stages import judged_scene, registered_views
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectPose, bop_units
 from realsim.store import SessionStore, atomic
+from realsim.store.session_repair import repair_session
 from registered_sessions import CAMERA, models_of, registered_by_hand, table_renderer, true_cameras
 from shared_sessions import copy_of
 
@@ -226,6 +227,16 @@ def test_views_that_were_left_out_get_no_labels_and_are_named(store: SessionStor
     page = write_report(store, report_of(store, pictures="kept"))
     shown = {p.name for p in page.parent.glob("overlay_*.png")}
     assert shown == {f"overlay_{k:06d}.png" for k in (0, 1, 3)}
+
+
+def test_labels_do_not_wait_for_a_view_that_was_taken_out_since(store: SessionStore) -> None:
+    write_result(store, registered_by_hand(store), MODELS, {})
+    store.path("rgb/000003.png").write_bytes(b"damaged")
+    repair_session(store.folder)
+    left = SessionStore.open(store.folder)
+    assert registered_views(left) == [0, 1, 2]
+    annotate_session(left, QUIET)
+    assert what_is_stale(left) == ""
 
 
 def test_an_interrupted_registration_is_finished_by_whoever_comes_next(store: SessionStore) -> None:

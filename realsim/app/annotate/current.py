@@ -79,8 +79,7 @@ def annotate_session(
 
     def write(words: str, of: SessionStore, broken: list[str]) -> "AnnotationSummary":
         only = registered_views(of)
-        n = len(of.session.views) if only is None else len(only)
-        with console.stage("annotate", f"{n} frames{words}") as tick:
+        with console.stage("annotate", f"{len(only)} frames{words}") as tick:
             return annotate(
                 of, scene, models, grasps, config,
                 only=only, progress=tick, workers=workers, surroundings=surroundings,
@@ -120,8 +119,7 @@ def what_is_stale(store: SessionStore) -> str:
             return f"instance {placed.instance} {why}"
     if labelled:
         return f"instance {min(labelled)} is in the labels and no more in the scene"
-    known = registered_views(store)
-    views = {v.index for v in store.session.views} if known is None else set(known)
+    views = set(registered_views(store))
     there = {int(p.stem) for p in store.path("annotations").glob("[0-9]*.json")}
     if there != views:
         return f"view {min(there ^ views)} is labelled and left out, or the other way round"

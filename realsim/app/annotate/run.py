@@ -77,8 +77,7 @@ def draw(store: SessionStore, summary: "AnnotationSummary", console: Console) ->
     from realsim.store import load_grasps
     from realsim_sim_bridge.annotation.pictures import overlay_pictures
 
-    known, scene = registered_views(store), judged_scene(store)
-    views = [v.index for v in store.session.views if known is None or v.index in known]
+    views, scene = registered_views(store), judged_scene(store)
     there = {(o.instance, o.obj_id) for o in scene.objects}
     sets = load_grasps(store.folder / "grasps")
     chosen = sheet_views(views, summary.flagged_views, PAGE_PICTURES)

@@ -162,9 +162,7 @@ def _photographs(section: Section, store: SessionStore) -> None:
         return
     scene, models = load_scene(store), session_models(store)
     grasps = load_grasps(store.folder / "grasps")
-    known = registered_views(store)
-    told = [k for k in indices if known is None or k in known] or indices
-    shown = evenly(told, OVERLAY_VIEWS)
+    shown = evenly(registered_views(store) or indices, OVERLAY_VIEWS)
     folder = store.folder / "reports"
     is_kept = section.pictures == "kept"
     for path in folder.glob("overlay_*.png") if is_kept else ():

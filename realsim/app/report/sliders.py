@@ -38,7 +38,7 @@ def registration_pairs(store: SessionStore) -> tuple[list[View], str]:
     claimed = claimed_cameras(store)
     told = registered_views(store)
     cameras = store.session.Ts_world_cam
-    seen = [k for k in cameras if k in claimed and (told is None or k in told)]
+    seen = [k for k in cameras if k in claimed and k in told]
     moved = [o for o in after if o.instance in started]
     refined = [k for k in seen if not is_same_pose(claimed[k], cameras[k])]
     if not seen or not after or not (moved or refined):
