@@ -174,8 +174,8 @@ def test_what_reviewers_decided_is_told(store: SessionStore) -> None:
 
 def test_a_hostile_name_is_only_text(tmp_path: Path) -> None:
     store = begun(tmp_path / "s", CAMERA, {"camera": HOSTILE, "x": "</script><b>"}, name=HOSTILE)
-    page = write_report(store, report_of(store, pictures="kept"), notes=[HOSTILE])
-    text = page.read_text("utf-8")
+    report = report_of(store, pictures="kept", notes=[HOSTILE])
+    text = write_report(store, report).read_text("utf-8")
     Tags(text)
     assert "<script>alert" not in text and "<b>" not in text.partition("</div>")[2]
     assert embedded(text)["session"] == HOSTILE

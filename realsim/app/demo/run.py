@@ -90,7 +90,7 @@ def run_demo(config: DemoConfig, out: Path, console: Console) -> DemoResult:
         annotate_session(store, console)
         with console.stage("report"):
             errors = loop_errors(store, out / "truth")
-            report = write_report(store, report_of(store, errors, "kept"), times=console.times)
+            report = write_report(store, report_of(store, errors, "kept", times=console.times))
     return DemoResult(store=store, grasps=grasps, errors=errors, report=report, times=console.times)
 
 

@@ -25,25 +25,14 @@ PAGE, DOCUMENT = "reports/report.html", "reports/report.json"
 Build = Callable[[Section], None]
 
 
-def write_report(
-    store: SessionStore,
-    report: Report,
-    *,
-    notes: Sequence[str] = (),
-    times: Sequence[StageTime] = (),
-) -> Path:
-    """Write SESSION/reports/report.html and report.json.
+def write_report(store: SessionStore, report: Report) -> Path:
+    """Write SESSION/reports/report.html and report.json; return the path of the page.
 
     Args:
         store: the session.
         report: what `report_of` made of it.
-        notes: what the reader must know first.
-        times: cost of the stages of the run that made it.
-
-    Returns:
-        The path of the page.
     """
-    page = page_of(store, report, notes=notes, times=times)
+    page = page_of(store, report)
     data = page.encode(math.inf)
     store.write_json(DOCUMENT, page.document)
     store.write_bytes(PAGE, data)
@@ -57,14 +46,17 @@ def hidden_of(store: SessionStore) -> dict[str, str]:
 
 
 def report_of(
-    store: SessionStore, errors: LoopErrors | None = None, pictures: Pictures = "none"
-) -> Report:
+    store: SessionStore, errors: LoopErrors | None = None, pictures: Pictures = "none",
+    notes: Sequence[str] = (), times: Sequence[StageTime] = (),
+) -> Report:  # fmt: skip
     """Return the report of a session, its sections written.
 
     Args:
         store: the session.
         errors: the errors against the simulated lab's truth; None on real data.
         pictures: whether they are drawn, and kept as files in reports/, too.
+        notes: what the reader must know first.
+        times: cost of the stages of the run that made it.
     """
     if pictures == "kept":
         (store.folder / "reports").mkdir(exist_ok=True)
@@ -97,25 +89,22 @@ def report_of(
     add("labels", "Labels", "annotate", lambda s: labels_section(s, store))
     add("files", "Files and checksums", "", lambda s: files_section(s, store))
     add("settings", "Versions and settings", "", lambda s: settings_section(s, store))
-    return Report(name=store.session.name, about=_about(store), sections=tuple(sections))
+    return Report(
+        name=store.session.name, about=_about(store), sections=tuple(sections), notes=notes,
+        times=times,
+    )  # fmt: skip
 
 
-def page_of(
-    store: SessionStore,
-    report: Report,
-    *,
-    notes: Sequence[str] = (),
-    times: Sequence[StageTime] = (),
-) -> Page:
+def page_of(store: SessionStore, report: Report) -> Page:
     """Return the page of a report; see `write_report`."""
     page = Page(title=report.name, about=report.about, hidden=hidden_of(store))
     page.document = report.document(page)
-    write_summary(page, report, notes, _first_picture(store))
+    write_summary(page, report, _first_picture(store))
     for section in report.sections:
         page.parts += section.page.parts
-    if times:
-        page.section("Cost of the run", folded=f"{sum(t.wall_s for t in times):.0f} s")
-        rows = [[t.name, f"{t.cpu_s:.1f}", f"{t.wall_s:.1f}"] for t in times]
+    if report.times:
+        page.section("Cost of the run", folded=f"{sum(t.wall_s for t in report.times):.0f} s")
+        rows = [[t.name, f"{t.cpu_s:.1f}", f"{t.wall_s:.1f}"] for t in report.times]
         page.table(["stage", "CPU [s]", "clock [s]"], rows)
     return page
 

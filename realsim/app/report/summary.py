@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from realsim.app.console import StageTime
 from realsim.app.report.figures import Figure, count, figures_to_json
 from realsim.app.report.section import SEVERITIES, ReportFinding, Section
 from realsim.pages import Cell, Page, Picture
@@ -39,6 +40,10 @@ class Report:
     name: str
     about: str
     sections: tuple[Section, ...]
+    notes: Sequence[str] = ()
+    """What the run that made it has to say, and the reader must know first."""
+    times: Sequence[StageTime] = ()
+    """Cost of the stages of that run."""
 
     @property
     def findings(self) -> list[ReportFinding]:
@@ -103,17 +108,13 @@ class Report:
 
 
 def write_summary(
-    page: Page,
-    report: Report,
-    notes: Sequence[str] = (),
-    picture: tuple[Picture | None, str] = (None, ""),
+    page: Page, report: Report, picture: tuple[Picture | None, str] = (None, "")
 ) -> None:
     """Write the first screen: verdict, one picture, the figures that matter, what to do next.
 
     Args:
         page: to write on.
         report: what was found.
-        notes: what the reader must know first.
         picture: that picture, and its caption.
     """
     found = [f for f in report.findings if f.severity != "note"]
@@ -138,7 +139,7 @@ def write_summary(
         state = _state(s)
         rows.append([Cell(text=s.title, href=s.key), state, s.headline, run])
     page.table(["stage", "state", "in short", "next"], rows)
-    _notes(page, notes)
+    _notes(page, report.notes)
 
 
 def _leading(report: Report) -> list[tuple[str, str]]:

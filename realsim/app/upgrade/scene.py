@@ -119,7 +119,7 @@ def upgrade_scene(job: SceneJob, source: SceneSource, shown: Console | None) -> 
         annotate_session(store, console)
         notes = [*source.notes, *registration_notes(store), *console.told]
         with console.stage("report"):
-            write_report(store, report_of(store, pictures="kept"), notes=notes)
+            write_report(store, report_of(store, pictures="kept", notes=notes))
         record = _record(job, source, store, scene, starts, grasps, notes)
         record["analytic"] = agreement_of(analytic)
         note(
