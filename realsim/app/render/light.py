@@ -6,21 +6,22 @@ the mean of the table's pixels is, and so is the paint of each object whose mode
 is no inverse rendering: where lamps hang is not asked.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from realsim.app.render.compare import label_ids
+from realsim.app.stages import evenly
 from realsim.arrays import Array, Int32, Mask, Rgb
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.geometry.colors import light_of_bytes
-from realsim.records import CameraIntrinsics, View
+from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.labels import LabelRenderer, Labels
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
-from realsim.review.content.views import spread, strided
+from realsim.review.content.views import strided
 from realsim.store import SessionStore
 from realsim_sim_bridge.synthetic.scene import SyntheticScene
 
@@ -132,20 +133,19 @@ def matched_look(
     Returns:
         None where no photograph shows enough of the objects.
     """
-    known = [v for v in store.session.views if v.T_world_cam is not None]
+    known = list(store.session.Ts_world_cam.items())
     if not known:
         return None
     # The objects are seen best where the camera is near them; any spread will do for a mean.
-    views = spread(known, VIEWS)
+    views = dict(evenly(known, VIEWS))
     stride = max(1, round(store.session.intrinsics.width / SMALL_PX))
     camera = strided(store.session.intrinsics, stride)
     renderer = LabelRenderer(synthetic.placed())
     regions = [
-        _regions(synthetic, renderer.render(camera, _pose(v)), camera, v,
-                 _annotated(store, v, stride))
-        for v in views
-    ]  # fmt: skip
-    photographs = [store.rgb(v.index)[::stride, ::stride] for v in views]
+        _regions(synthetic, renderer.render(camera, T), camera, T, _annotated(store, k, stride))
+        for k, T in views.items()
+    ]
+    photographs = [store.rgb(k)[::stride, ::stride] for k in views]
     paints = {i: Material(base_color=PAINT, name="as photographed") for i in _colorless(synthetic)}
     colored = {o.instance for o in synthetic.shown} - set(paints)
     telling = [_seen(r, colored) for r in regions]
@@ -156,7 +156,7 @@ def matched_look(
     error = table_error = float("nan")
     for round_ in range(ROUNDS + 1):
         look = replace(synthetic, environment=environment, materials=paints)
-        pictures = _rendered(look, table, camera, views)
+        pictures = _rendered(look, table, camera, views.values())
         means = _means(photographs, pictures, telling)
         if means is None:
             return None
@@ -212,11 +212,6 @@ def _repainted(
     return replace(material, base_color=(r, g, b))
 
 
-def _pose(view: View) -> Array:
-    """Return the camera pose (4, 4) of a view that has one."""
-    return np.asarray(view.T_world_cam)
-
-
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class _Regions:
     """What a small view shows."""
@@ -232,21 +227,21 @@ def _seen(regions: _Regions, instances: set[int]) -> Mask:
     return np.isin(regions.ids, sorted(instances))
 
 
-def _annotated(store: SessionStore, view: View, stride: int) -> Int32 | None:
+def _annotated(store: SessionStore, view: int, stride: int) -> Int32 | None:
     """Return the instances (H, W) of a real view's visible masks; None = it is not annotated.
 
     They leave out what something unknown, such as a hand, hides.
     """
-    if not store.has(f"annotations/{view.index:06d}.json"):
+    if not store.has(f"annotations/{view:06d}.json"):
         return None
-    return label_ids(store, view.index)[::stride, ::stride]
+    return label_ids(store, view)[::stride, ::stride]
 
 
 def _regions(
     synthetic: SyntheticScene,
     labels: Labels,
     camera: CameraIntrinsics,
-    view: View,
+    T_world_cam: Array,
     annotated: Int32 | None,
 ) -> _Regions:
     """Return where the objects are seen, without their rims, and the table near them."""
@@ -264,7 +259,7 @@ def _regions(
         return _Regions(ids=ids, table=np.zeros_like(table))
     points = ray_table(camera) * labels.depth_m[..., None]
     T_table_world = se3.invert(plane.T_world_table)
-    T_table_cam = T_table_world @ _pose(view)
+    T_table_cam = T_table_world @ T_world_cam
     on_table = points @ T_table_cam[:2, :3].T + T_table_cam[:2, 3]
     corners = np.concatenate([
         se3.transform(T_table_world @ o.T_world_obj, synthetic.models[o.obj_id].mesh.vertices)
@@ -277,9 +272,9 @@ def _regions(
 
 
 def _rendered(
-    look: SyntheticScene, table: Material | None, camera: CameraIntrinsics, views: list[View]
+    look: SyntheticScene, table: Material | None, camera: CameraIntrinsics, Ts: Iterable[Array]
 ) -> list[Rgb]:
-    """Return small noiseless pictures of the views."""
+    """Return small noiseless pictures from these places (4, 4)."""
     from realsim.rendering.photo import PhotoRenderer
 
     placed = [
@@ -287,7 +282,7 @@ def _rendered(
         for p in look.placed()
     ]
     renderer = PhotoRenderer(placed, environment=look.environment)
-    return [renderer.render(camera, _pose(v)).rgb for v in views]
+    return [renderer.render(camera, T).rgb for T in Ts]
 
 
 def _means(

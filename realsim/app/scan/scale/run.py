@@ -34,7 +34,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.json_values import json_value
 from realsim.models.library_records import ScaleNote
-from realsim.records import Mesh, Verdict, View
+from realsim.records import Mesh, View
 from realsim.scanning.scale.files import ScaleRecord, installed_versions, json_lines
 from realsim.scanning.scale.measured import smallest_box
 from realsim.scanning.scale.result import ScaleFit
@@ -80,15 +80,12 @@ def run_scale(request: ScaleRequest, console: Console) -> bool:
         console.say(f"nothing has changed since {place.folder / FILE} was written; --overwrite "
                     "does it again.")  # fmt: skip
     console.say(f"result    {place.folder}")
-    if request.json is not None:
-        write_file(request.json, result_bytes(record, box_mm))
-    console.result(json.loads(result_bytes(record, box_mm)))
-    _say_where(request, named, place.folder / MODEL_FILE, fit.verdict, console)
     found = ScaleNote(
         scale=fit.scale, sigma_percent=fit.sigma_percent, verdict=fit.verdict, reasons=fit.reasons,
         session=store.session.name, how="fit and measured" if record.measured else "fit",
     )  # fmt: skip
-    promote(request, named, found, console)
+    result = result_bytes(record, box_mm)
+    _finish(request, named, result, place.folder / MODEL_FILE, found, console)
     is_accepted = fit.verdict == "accepted"
     if is_accepted and not record.measured:
         console.say(CALIPER)
@@ -174,12 +171,17 @@ def _say_of_model(named: NamedMesh, fit: ScaleFit, console: Console) -> None:
     )
 
 
-def _say_where(
-    request: ScaleRequest, named: NamedMesh, model: Path | None, verdict: Verdict, console: Console
-) -> None:
-    """Say where the scaled model lies, and how it gets into a library if it does not."""
+def _finish(
+    request: ScaleRequest, named: NamedMesh, result: bytes, model: Path | None, note: ScaleNote,
+    console: Console,
+) -> None:  # fmt: skip
+    """Hand the result on, say where the scaled model lies, and put it into the library."""
+    if request.json is not None:
+        write_file(request.json, result)
+    console.result(json.loads(result))
     stored = request.library is not None or named.origin == "model"
-    console.say(*model_lines(named, model, verdict, is_stored=stored))
+    console.say(*model_lines(named, model, note.verdict, is_stored=stored))
+    promote(request, named, note, console)
 
 
 # --- without a session ------------------------------------------------------------------------
@@ -224,16 +226,12 @@ def _by_measurement(request: ScaleRequest, console: Console) -> bool:
         for name, data in files.items():
             write_file(request.out / name, data)
         console.say(f"result    {request.out}")
-    if request.json is not None:
-        write_file(request.json, text)
-    console.result(json.loads(text))
     model = None if request.out is None else request.out / MODEL_FILE
-    _say_where(request, named, model, "unchecked", console)
     found = ScaleNote(
         scale=scale, sigma_percent=100 * sigma / scale, verdict="unchecked", reasons=(reason,),
         session="", how="measured",
     )  # fmt: skip
-    promote(request, named, found, console)
+    _finish(request, named, text, model, found, console)
     return False
 
 
