@@ -1,6 +1,5 @@
 """Files against the list of checksums that an export wrote beside them (SHA256SUMS)."""
 
-import hashlib
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -9,6 +8,7 @@ from typing import Any
 
 from realsim.errors import InputError
 from realsim.formats.export_folder import SUMS_FILE
+from realsim.store.provenance import sha256_of
 
 ABOVE = 2
 """Folders above the given one that may hold the list: a scene of BOP stands in a split of a root,
@@ -17,8 +17,6 @@ LINE = re.compile(r"([0-9a-f]{64}) [ *](.+)")
 """As sha256sum writes it: 64 digits, a space, a mode and the path."""
 LONGEST_LINE = 5000
 """Characters; a path has 4096 at most."""
-CHUNK = 1 << 20
-"""[bytes] read at a time."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -113,11 +111,7 @@ def listed_sums(path: Path, folder: Path) -> Iterator[tuple[str, str]]:
 
 def _digest(file: Path) -> str:
     """Return a file's SHA-256; '' where it cannot be read."""
-    digest = hashlib.sha256()
     try:
-        with file.open("rb") as stream:
-            while chunk := stream.read(CHUNK):
-                digest.update(chunk)
+        return sha256_of(file)
     except OSError:
         return ""
-    return digest.hexdigest()

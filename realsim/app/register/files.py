@@ -15,6 +15,7 @@ in place.
 """
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -38,11 +39,8 @@ def documents(
 ) -> dict[str, Any]:
     """Return the values of every file of a registration, by its path in the session."""
     report = result.report | {
-        "not_placed": [
-            {"obj_id": n.obj_id, "instance": n.instance, "reason": n.reason}
-            for n in result.not_placed
-        ],
-        "findings": [{"view": r.view, "kind": r.kind, "words": r.words} for r in result.remarks],
+        "not_placed": [asdict(n) for n in result.not_placed],
+        "findings": [asdict(r) for r in result.remarks],
     }
     return {
         results.CAMERAS_FILE: _cameras_to_json(result.cameras),

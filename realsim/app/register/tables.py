@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -266,7 +267,7 @@ def as_json(result: Registered, models: Mapping[int, ObjectModel]) -> dict[str, 
             {"instance": n.instance, "obj_id": n.obj_id, "reason": n.reason}
             for n in result.not_placed
         ],
-        "findings": [{"view": r.view, "kind": r.kind, "words": r.words} for r in result.remarks],
+        "findings": [asdict(r) for r in result.remarks],
         "cameras": camera_line(result),
         "common_sigma_mm": result.report.get("refinement", {}).get("common_sigma_mm"),
         "own_sigma_mm": result.report.get("refinement", {}).get("own_sigma_mm"),

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from realsim.app.report.plots import labels
 from realsim.app.stats.statistics import VERDICTS, Statistics
 from realsim.formats.grasps.scene_grasps import labelled
 from realsim.pages import plots
@@ -33,7 +34,7 @@ def figures(stats: Statistics) -> Iterator[tuple[str, int, list[Drawn]]]:
     Pictures stand side by side where the page is wide enough, and one below the other on a phone.
     """
     if stats.school.judged:
-        both = [_outcomes(stats), _labels(stats)]
+        both = [_outcomes(stats), (labels(_sets(stats)), "Red: below 0.5.")]
         yield ("What became of the candidates, beside the paper's", plots.WIDTH_PX, both)
         yield ("Force closure against p_hold or score", plots.WIDTH_PX, [_closure(stats)])
     if len(stats.visibility) or stats.objects:
@@ -61,13 +62,6 @@ def _outcomes(stats: Statistics) -> Drawn:
     ax.invert_yaxis()
     ax.margins(x=0.12)
     return plots.png(figure), "Coloured: here. Grey: in the paper."
-
-
-def _labels(stats: Statistics) -> Drawn:
-    figure, ax = plots.axes()
-    counts, title, name = label_chart(_sets(stats))
-    plots.share_bars(ax, counts, title, name, "grasps")
-    return plots.png(figure), "Red: below 0.5."
 
 
 def _sets(stats: Statistics) -> list[GraspSet]:

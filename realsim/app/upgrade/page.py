@@ -1,6 +1,6 @@
 """The page of an upgrade: where every object was said to be, where it is, worst first."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -127,8 +127,7 @@ def _frame(folder: Path, image: int, objects: Sequence[Mapping[str, Any]], poses
     picture: Image = store.rgb(image)
     for key, thickness in zip(POSES[:poses], THICKNESS_PX, strict=False):
         for o in objects:
-            placed = PlacedMesh(0, models[int(o["obj_id"])].mesh, np.array(o["shown"][key]))
-            ids = FirstSurfaces([placed]).look(store.session.intrinsics, np.eye(4))[0]
+            ids = _surface(store, models, o, o["shown"][key])
             refined = VERDICT_RGB.get(o["verdict"], (255, 255, 255))
             color = BEFORE_RGB if key == POSES[0] else refined
             picture = draw_outlines(picture, ids, colors={0: color}, thickness=thickness)
@@ -137,7 +136,7 @@ def _frame(folder: Path, image: int, objects: Sequence[Mapping[str, Any]], poses
 
 def _pair(out: Path, record: Record, o: Mapping[str, Any]) -> View:
     """Return the two pictures of an object, drawn when the page asks for them."""
-    before, after = _pictures(out, str(record["place"]), o)
+    before, after = (partial(_drawn, out / record["place"], o, k) for k in (False, True))
     moved = f"moved by {o['moved_mm']:.1f} mm and {o['moved_deg']:.1f} deg"
     right, became = {  # what stands right of the handle, and what is said of the annotation
         "improved": ("improved", f"improved, {moved}"), "kept": ("kept", "kept"),
@@ -151,25 +150,22 @@ def _pair(out: Path, record: Record, o: Mapping[str, Any]) -> View:
     return View(label + more, {"as given": before, right: after})
 
 
-def _pictures(
-    out: Path, place: str, o: Mapping[str, Any]
-) -> tuple[Callable[[], Image], Callable[[], Image]]:
-    """Return what draws the pose as given and the refined one, in the same window."""
-    shown = o["shown"]
-    Ts = [np.array(shown[key]) for key in POSES if shown.get(key) is not None]
+def _drawn(folder: Path, o: Mapping[str, Any], changed: bool) -> Image:
+    """Return an object's pose as given, or the refined one too, in the same window."""
+    store, models = _scene(folder)
+    poses = [o["shown"][key] for key in POSES if o["shown"].get(key) is not None]
+    masks = [_surface(store, models, o, pose) for pose in poses]
+    written = VERDICT_RGB.get(o["verdict"], (255, 255, 255))
+    colors = [BEFORE_RGB, written, PROPOSED_RGB] if changed else [BEFORE_RGB]
+    return _cropped(store.rgb(int(o["shown"]["image"])), masks, colors)
 
-    def drawn(k: int) -> Image:
-        store, models = _scene(out / place)
-        mesh = models[int(o["obj_id"])].mesh
-        masks = [
-            FirstSurfaces([PlacedMesh(0, mesh, T)]).look(store.session.intrinsics, np.eye(4))[0]
-            for T in Ts
-        ]
-        written = VERDICT_RGB.get(o["verdict"], (255, 255, 255))
-        colors = [BEFORE_RGB, written, PROPOSED_RGB] if k else [BEFORE_RGB]
-        return _cropped(store.rgb(int(shown["image"])), masks, colors)
 
-    return (lambda: drawn(0)), (lambda: drawn(1))
+def _surface(
+    store: SessionStore, models: Mapping[int, ObjectModel], o: Mapping[str, Any], pose: Any
+) -> Int32:
+    """Return where an object alone is seen (0, elsewhere -1) as it is said to stand."""
+    placed = PlacedMesh(0, models[int(o["obj_id"])].mesh, np.array(pose))
+    return FirstSurfaces([placed]).look(store.session.intrinsics, np.eye(4))[0]
 
 
 @lru_cache(maxsize=1)
