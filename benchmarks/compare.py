@@ -137,6 +137,8 @@ def main() -> None:
     if given.page:
         PAGE.write_text(page_of(load(MEASURED)))
     elif given.keep:
+        if not given.results:
+            parser.error("--keep takes the runs to merge, behind the file that is written")
         merged = merge([d for path in given.results for d in load(path).values()])
         given.keep.write_text(json.dumps(merged, indent=1) + "\n")
     elif len(given.results) == 2:
