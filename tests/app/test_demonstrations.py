@@ -2,6 +2,8 @@
 
 import hashlib
 import re
+from concurrent.futures import Future
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -93,21 +95,44 @@ def test_page_checksums_and_card_are_there(written):
     assert not (written / ".export").exists()
 
 
+class FirstNeverEnds:
+    """A pool of two whose first attempt takes longer than all others."""
+
+    def __init__(self, source):
+        self.source, self.first = source, Future()
+
+    def capacity(self):
+        return 2
+
+    def submit(self, fn, sent, *args):
+        if args[-1] == 0:
+            return self.first
+        ended = Future()
+        ended.set_result(fn(self.source, *args))
+        return ended
+
+
 @pytest.mark.slow
+@pytest.mark.parametrize(("workers", "dies_at", "each"), [("1", 1, [0, 1, 2]), ("2", 2, [1, 0, 2])])
 def test_an_interrupted_export_goes_on_and_gives_the_same_bytes(
-    weak_school, written, tmp_path, monkeypatch
+    weak_school, written, tmp_path, monkeypatch, workers, dies_at, each
 ):
     asked, real = [], LeRobotDemonstrations.episode
 
     def dying(self, k):
-        if k == 1:
+        if k == dies_at:
             raise KeyboardInterrupt
         asked.append(k)
         return real(self, k)
 
     with monkeypatch.context() as patch:
         patch.setattr(LeRobotDemonstrations, "episode", dying)
-        assert invoked("demonstrations", weak_school, "--out", tmp_path / "demos", *SMALL).exit_code
+        pool = nullcontext(FirstNeverEnds(weak_school))
+        patch.setattr(demonstrations, "open_pool", lambda where: pool)
+        options = (*SMALL[:-1], workers)
+        assert invoked(
+            "demonstrations", weak_school, "--out", tmp_path / "demos", *options
+        ).exit_code
     other = (*SMALL[:1], "6", *SMALL[2:])
     assert "another request" in refused(weak_school, "--out", tmp_path / "demos", *other)
 
@@ -118,7 +143,7 @@ def test_an_interrupted_export_goes_on_and_gives_the_same_bytes(
     monkeypatch.setattr(LeRobotDemonstrations, "episode", counting)
     finished("demonstrations", weak_school, "--out", tmp_path / "demos", *SMALL)
     finished("demonstrations", weak_school, "--out", tmp_path / "demos", *SMALL)  # is all there
-    assert asked == [0, 1, 2]
+    assert asked == each
     assert files_of(tmp_path / "demos") == files_of(written)
     assert "finished export" in refused(weak_school, "--out", written)
 

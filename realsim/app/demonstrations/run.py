@@ -344,7 +344,7 @@ def _encode(
     source: Path, request: DemonstrationRequest, episodes: "LeRobotDemonstrations",
     where: PoolConfig, console: Console, numbers: "Sequence[int]", take: "Take",
 ) -> None:  # fmt: skip
-    """Hand the episodes of these numbers on, in order; say after the first what all cost.
+    """Hand each episode of these numbers on as it ends; say after the first what all cost.
 
     They are rendered and encoded by this process, or by others that open the source again.
     """
@@ -376,7 +376,7 @@ def _encode(
     sent = Sent(source)
     tasks = (Task(name=f"attempt {k}", fn=_encoded, args=(sent, request, k)) for k in numbers)
     with open_pool(where) as pool:
-        run_many(tasks, pool, done, in_order=True)
+        run_many(tasks, pool, done)
 
 
 def _encoded(

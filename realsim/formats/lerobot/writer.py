@@ -63,7 +63,7 @@ def write_lerobot(
             20 MB, far below the sizes up to which LeRobot itself fills a file.
         progress: called once an episode.
         encode: given the numbers of the episodes that are missing, hands each on, encoded
-            (`spool.encoded`), in their order: the place for other processes. None = one by one.
+            (`spool.encoded`), in any order: the place for other processes. None = one by one.
 
     Raises:
         InputError: PyAV is not installed, a file cannot have so many episodes, or the source
