@@ -119,10 +119,14 @@ def rows_of(data):
     return [row for rows in data.values() for row in rows]
 
 
-def inverted(data):
-    for row in data.values():
-        T = se3.invert(se3.from_rt(np.reshape(row["cam_R_w2c"], (3, 3)), row["cam_t_w2c"]))
-        row.update(cam_R_w2c=T[:3, :3].ravel().tolist(), cam_t_w2c=T[:3, 3].tolist())
+def inverted(of=dict.values, to="w2c"):
+    def change(data):
+        for row in of(data):
+            T = se3.from_rt(np.reshape(row[f"cam_R_{to}"], (3, 3)), row[f"cam_t_{to}"])
+            R, t = np.split(se3.invert(T)[:3], [3], axis=1)
+            row.update({f"cam_R_{to}": R.ravel().tolist(), f"cam_t_{to}": t.ravel().tolist()})
+
+    return change
 
 
 def opengl(data):
@@ -150,7 +154,7 @@ def scaled(key, factor, of=dict.values):
 
 
 TRAPS = {
-    "camera to world": ("camera", inverted, InputError, r"camera to world is taken for world to"),
+    "camera to world": ("camera", inverted(), InputError, r"camera to world is taken for world to"),
     "OpenGL's axes": ("camera", opengl, InputError, "OpenGL's camera axes"),
     "columns of w2c": ("camera", columns("cam_R_w2c"), InputError, "cam_R_w2c is written column"),
     "columns of m2c": ("gt", columns("cam_R_m2c", rows_of), InputError, "cam_R_m2c is written col"),
@@ -172,6 +176,28 @@ def test_traps_are_found(tmp_path, name, change, error, says):
     open_labelled_bop(tmp_path)
     edit(folder / f"scene_{name}.json", change)
     assert str(folder) in refused(says, open_labelled_bop, tmp_path, error=error)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "says"),
+    [
+        ("gt", inverted(rows_of, "m2c"), "are read inverted"),
+        ("gt", columns("cam_R_m2c", rows_of), "are read transposed"),
+        (
+            "camera",
+            each("cam_K", lambda K: K * [1.5, 1, 1, 1, 1.5, 1, 1, 1, 1]),
+            "focal lengths of cam_K times about 0.6",
+        ),
+    ],
+)
+def test_depth_finds_traps_where_there_are_no_masks(tmp_path, name, change, says):
+    folder = write_boxes(tmp_path, with_poses=False)
+    for left_out in ("mask", "mask_visib"):
+        shutil.rmtree(folder / left_out)
+    (folder / "scene_gt_info.json").unlink()
+    assert any("checked: measured depth" in note for note in open_labelled_bop(tmp_path).notes)
+    edit(folder / f"scene_{name}.json", change)
+    refused(says, open_labelled_bop, tmp_path)
 
 
 def test_moving_objects_are_told_not_refused(tmp_path):
@@ -222,10 +248,16 @@ def test_models_that_are_missing_are_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("scale", "said"), [(0.5, "not seen where cam_K"), (1 / 640, "of another image size")]
+    ("scale", "left_out", "said"),
+    [
+        (0.5, "depth", "not seen where cam_K"),
+        (0.5, "mask", "all of cam_K times about 2.0"),
+        (1 / 640, "mask", "of another image size"),
+    ],
 )
-def test_a_camera_of_another_image_size_is_named(tmp_path, scale, said):
+def test_a_camera_of_another_image_size_is_named(tmp_path, scale, left_out, said):
     folder = write_boxes(tmp_path)
+    shutil.rmtree(folder / left_out)
     shrunk = each("cam_K", lambda K: np.where(np.arange(9) < 6, scale * K, K))
     edit(folder / "scene_camera.json", shrunk)
     refused(said, open_labelled_bop, tmp_path)

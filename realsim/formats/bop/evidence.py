@@ -107,7 +107,7 @@ def _require_rows_first(
     Ts_world_cam: Array, things: Sequence[Thing], compared: str, where: str
 ) -> None:
     """Raise if orientations agree between views only with cam_R_m2c transposed."""
-    swapped = [[(view, _transposed(T)) for view, T in thing] for thing in things]
+    swapped = [[(view, transposed(T)) for view, T in thing] for thing in things]
     stated = objects_evidence(Ts_world_cam, things).spreads[STATED].deg
     other = objects_evidence(Ts_world_cam, swapped).spreads[STATED].deg
     if stated is None or other is None or not stated > TURNED_DEG:
@@ -120,7 +120,8 @@ def _require_rows_first(
         )
 
 
-def _transposed(T: Array) -> Array:
+def transposed(T: Array) -> Array:
+    """Return a pose (4, 4) whose rotation is read column by column."""
     return se3.from_rt(T[:3, :3].T, T[:3, 3])
 
 
@@ -180,7 +181,7 @@ def require_boxes(
     known = known[:: max(1, -(-len(known) // MOST_BOXES))]
     overlaps: list[tuple[float, float]] = []
     for box, obj_id, T, intrinsics in known:
-        pair = [_overlap(box, _box(intrinsics, U, corners[obj_id])) for U in (T, _transposed(T))]
+        pair = [_overlap(box, _box(intrinsics, U, corners[obj_id])) for U in (T, transposed(T))]
         if abs(pair[0] - pair[1]) > FIT_MARGIN:
             overlaps.append((pair[0], pair[1]))
     if len(overlaps) < LEAST_BOXES:

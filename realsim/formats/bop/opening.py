@@ -16,6 +16,7 @@ from realsim.formats.bop.rows import GroundTruth, Json, read_ground_truth, read_
 from realsim.formats.bop.run_lengths import read_coco_masks
 from realsim.formats.bop.scene import GT_FILE, BopSceneRef, cameras_with_images, ground_truth_file
 from realsim.formats.bop.source import choose_scene
+from realsim.formats.bop.surfaces import LabelledDepth, require_surfaces
 from realsim.formats.evidence import depth_ratio
 from realsim.formats.folders.listing import image_header, shown
 from realsim.records import ObjectModel
@@ -233,8 +234,8 @@ def _check(scene: BopLabelledScene, infos: Mapping[int, Sequence[Json]]) -> None
         said = evidence.check_camera_poses(Ts, _things(truth, posed), where)
         scene.notes_found.append(said.removeprefix(f"{where}: "))
     _check_boxes(scene, truth, infos, where)
-    _check_masks(scene, where)
     _check_depth(scene, where)
+    _check_masks(scene, where)
     _tell_apart(scene, truth, poses)
     _name_missing_models(scene, truth)
 
@@ -299,19 +300,27 @@ def _check_depth(scene: BopLabelledScene, where: str) -> None:
         scene.notes_found.append("the images have no depth.")
         return
     ratios: list[float] = []
-    unit_m = 0.0
+    measured: list[LabelledDepth] = []
+    models, unit_m = scene.models(), 0.0
     for i in evidence.sampled(deep, DEPTH_SAMPLES):
         file, unit = scene.depth_file(i), scene.depth_unit_m(i)
         if file is None or unit is None:
             continue
         unit_m = unit
         depth_m = images.read_depth(file, unit)
-        for k, o in enumerate(scene.frame(i).objects):
+        frame = scene.frame(i)
+        known = [(o.obj_id, o.T_cam_obj) for o in frame.objects if o.obj_id in models]
+        measured.append(LabelledDepth(depth_m=depth_m, intrinsics=frame.intrinsics, objects=known))
+        for k, o in enumerate(frame.objects):
             mask = scene.mask(i, k, visible=True)
-            ratio = depth_ratio(depth_m, mask, scene.intrinsics(i), o.T_cam_obj)
+            ratio = depth_ratio(depth_m, mask, frame.intrinsics, o.T_cam_obj)
             ratios += [] if ratio is None else [ratio]
-    said = evidence.require_depth_unit(ratios, unit_m, where)
-    scene.notes_found.append(said.removeprefix(f"{where}: "))
+    # Poses first: inverted ones look like another unit of the depth.
+    notes = [
+        require_surfaces(measured, models, where),
+        evidence.require_depth_unit(ratios, unit_m, where).removeprefix(f"{where}: "),
+    ]
+    scene.notes_found += [note for note in notes if note]
 
 
 def _tell_apart(
