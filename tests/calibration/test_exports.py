@@ -230,7 +230,7 @@ def test_the_shell_scripts_run_one_command_with_the_words(
 
 def test_write_exports_writes_readable_files(full_record: Maker, tmp_path: Path) -> None:
     report = full_record(se3.exp([0.1, 0.2, 0.3, 0.04, 0.05, 0.06]))
-    paths = write_exports(report, tmp_path / "out", frames=FRAMES)
+    paths = [*write_exports(report, tmp_path / "out", frames=FRAMES), tmp_path / "out/SHA256SUMS"]
     assert all(p.is_file() and p.stat().st_size > 0 for p in paths)
     on_disk = {p for p in (tmp_path / "out").rglob("*") if p.is_file()}
     assert set(paths) == on_disk  # nothing half-written is left beside them
@@ -241,6 +241,21 @@ def test_write_exports_writes_readable_files(full_record: Maker, tmp_path: Path)
         assert any("do not mix" in note for note in arrays["notes"])
         assert str(arrays["parent"]) == "tool0" and str(arrays["cam"]) == "cam_optical"
     assert np.abs(read_calibration(paths[0]).X - report.X).max() < 1e-12
+
+
+def test_edited_files_are_kept_beside_those_of_the_next_run(
+    full_record: Maker, tmp_path: Path
+) -> None:
+    told: list[str] = []
+    for k, edit in enumerate(("", "by hand", "anew", "")):
+        report = full_record(se3.exp([0.1, 0.2, 0.3, 0.04, 0.05, 0.06 + 0.01 * k]))
+        write_exports(report, tmp_path, frames=FRAMES, tell=told.append)
+        if edit:
+            (tmp_path / "camera.urdf").write_text(edit)
+    kept = {p.name: p.read_text() for p in tmp_path.rglob("*.kept*")}
+    assert kept == {"camera.urdf.kept": "by hand", "camera.urdf.kept2": "anew"}
+    assert len(told) == 2 and "camera.urdf.kept'" in told[0]
+    assert "by hand" not in (tmp_path / "camera.urdf").read_text()
 
 
 # --- what is refused ----------------------------------------------------------------------------

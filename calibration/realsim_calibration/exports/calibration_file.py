@@ -12,7 +12,6 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check, RobotErrorMap, Target
 from realsim.records.checked_arrays import rigid
-from realsim.store import atomic
 from realsim.untrusted.own_json import OwnFile, Real, from_json, read_object, to_json
 from realsim_calibration.exports.frames import FrameNames, parent_frame, quaternion_xyzw
 from realsim_calibration.results import BoardShape, Clock, HandEyeReport, Mode, Stretch, ViewReport
@@ -64,13 +63,6 @@ FITTED = (
     "map_name", "map_scores", "joint_offsets", "starts", "plain_scores", "stretch", "views",
     "information",
 )  # fmt: skip
-
-
-def write_calibration(report: HandEyeReport, path: Path | str, *, frames: FrameNames) -> Path:
-    """Write a calibration as `calibration.json`, whole or not at all."""
-    path = Path(path)
-    atomic.write_text(path, calibration_text(report, frames))
-    return path
 
 
 def calibration_text(report: HandEyeReport, frames: FrameNames) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from realsim.arrays import Array
 from realsim.store import atomic
 from realsim_calibration.exports import ros
-from realsim_calibration.exports.calibration_file import write_calibration
+from realsim_calibration.exports.calibration_file import calibration_text
 from realsim_calibration.exports.frames import (
     FrameNames,
     comments,
@@ -21,6 +21,7 @@ from realsim_calibration.exports.frames import (
     note_lines,
     parent_frame,
 )
+from realsim_calibration.exports.replaced import replace_files
 from realsim_calibration.lens.camera_files import yaml_matrix
 from realsim_calibration.results import HandEyeReport
 
@@ -84,18 +85,24 @@ def npz_arrays(report: HandEyeReport, frames: FrameNames) -> dict[str, Array | N
     }
 
 
-def write_exports(report: HandEyeReport, folder: Path | str, *, frames: FrameNames) -> list[Path]:
+def write_exports(
+    report: HandEyeReport, folder: Path | str, *, frames: FrameNames,
+    tell: Callable[[str], None] | None = None,
+) -> list[Path]:  # fmt: skip
     """Write the calibration in every format and return the files; each is whole or not there.
 
     Where the lens is not known (`nominal_lens`) no file that states one is written.
 
     Args:
         report: the calibration.
-        folder: where to write; made where needed, files of the same names are replaced.
+        folder: where to write; made where needed. Files of the same names are replaced; edited
+            ones are kept beside the new ones.
         frames: how the frames are called in the programs that will read it.
+        tell: told of files that were kept.
     """
     folder = Path(folder)
     texts: dict[str, Callable[[HandEyeReport, FrameNames], str]] = {
+        "calibration.json": calibration_text,
         f"easy_handeye2/{frames.name}.calib": ros.easy_handeye2_text,
         f"easy_handeye/{frames.name}.yaml": ros.easy_handeye_text,
         "ros2_static_transform.sh": ros.ros2_script,
@@ -108,11 +115,10 @@ def write_exports(report: HandEyeReport, folder: Path | str, *, frames: FrameNam
     if report.nominal_lens:
         for name in ("camera_info.yaml", "opencv.yml"):
             del texts[name]
-    written = [write_calibration(report, folder / "calibration.json", frames=frames)]
-    for name, text in texts.items():
-        atomic.write_text(folder / name, text(report, frames))
-        written.append(folder / name)
-    if report.nominal_lens:
-        return written
-    atomic.write_npz(folder / "calibration.npz", **npz_arrays(report, frames))
-    return [*written, folder / "calibration.npz"]
+    contents = {name: text(report, frames).encode() for name, text in texts.items()}
+    if not report.nominal_lens:
+        contents["calibration.npz"] = atomic.npz_bytes(**npz_arrays(report, frames))
+    for kept in replace_files(folder, contents):
+        if tell is not None:
+            tell(f"'{kept}' is a file of an earlier run that was edited; the new one is beside it.")
+    return [folder / name for name in contents]

@@ -148,8 +148,9 @@ def arm_of_poses(Ts_base_ee: Array, joints: Array, name: str = "") -> DhArm | No
 
 
 def write_results(
-    report: HandEyeReport, seen: Sequence[BoardView], store: SessionFiles, views_store: SessionStore
-) -> None:
+    report: HandEyeReport, seen: Sequence[BoardView], store: SessionFiles,
+    views_store: SessionStore, console: Console,
+) -> None:  # fmt: skip
     """Write report, pictures, depth bias and the files for other tools into the session."""
     from realsim_calibration.exports.frames import FrameNames
     from realsim_calibration.exports.write import write_exports
@@ -166,7 +167,7 @@ def write_results(
         if v.index in used
     ]
     depth = note_depth_bias(store, views, report)
-    write_exports(report, folder / "exports", frames=FrameNames())
+    write_exports(report, folder / "exports", frames=FrameNames(), tell=console.warn)
     write_calibration_report(report, folder / "report", images=views_store.rgb, depth_report=depth)
 
 

@@ -83,7 +83,7 @@ def run_cameras(source: Path, console: Console, options: dict[str, Any]) -> bool
     _require_seen(rig, frames)
     rig = _with_poses(rig, frames, raw, options["reading"], console)
     report = _calibrated(rig, options["arm"], console)
-    return _told(report, write_files(report, out), console)
+    return _told(report, write_files(report, out, console), console)
 
 
 def _run_session(
@@ -130,7 +130,7 @@ def _run_session(
     )  # fmt: skip
     _require_seen(rig, frames)
     report = _calibrated(rig, options["arm"], console)
-    files = write_files(report, folder / "cameras")
+    files = write_files(report, folder / "cameras", console)
     place_fixed(source, store, report, console)
     return _told(report, files, console)
 
@@ -288,7 +288,7 @@ def _calibrated(rig: Rig, arm: str, console: Console) -> CamerasReport:
         return calibrate_cameras(rig, arm=known)
 
 
-def write_files(report: CamerasReport, out: Path) -> list[Path]:
+def write_files(report: CamerasReport, out: Path, console: Console) -> list[Path]:
     """Write all files, and last the page, which tells that all are there; return it first."""
     from realsim_calibration.exports.frames import FrameNames
     from realsim_calibration.exports.write import write_exports
@@ -304,7 +304,8 @@ def write_files(report: CamerasReport, out: Path) -> list[Path]:
         if camera.mount == "fixed" and not moved:
             # The board does not hang on the hand: what the files call the hand is the base.
             names = replace(names, hand=names.robot_base)
-        files += write_exports(own, out / camera.name / "exports", frames=names)
+        home = out / camera.name / "exports"
+        files += write_exports(own, home, frames=names, tell=console.warn)
     write_bytes(out / page.PAGE, page.cameras_page(report).encode())
     return files
 

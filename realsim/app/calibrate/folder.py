@@ -396,7 +396,9 @@ def write_calibration(
     with console.stage("report", str(out)):
         write_text(out / MADE_OF, made_of(request.images))
         (out / PAGE_NAME).unlink(missing_ok=True)
-        exports = write_exports(result.hand_eye, out / "exports", frames=FrameNames())
+        exports = write_exports(
+            result.hand_eye, out / "exports", frames=FrameNames(), tell=console.warn
+        )
         pages = write_calibration_report(
             result.hand_eye, out,
             images=(lambda k: load_image(images[k])) if images else None,

@@ -123,5 +123,5 @@ def _fitted(
     times = np.array([v.time_s for v in views_store.session.views])
     seen, at = mend_views(seen, times, target, camera, clock, console)
     report = replace(calibrate_hand_eye_report(seen, target, camera, arm=known), clock=at)
-    board_views.write_results(report, seen, files, views_store)
+    board_views.write_results(report, seen, files, views_store, console)
     return report.hand_eye
