@@ -1,8 +1,6 @@
 """Arrays and their JSON notes in one npz file, written whole or not at all."""
 
 import json
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
+from realsim.store import atomic
 from realsim.untrusted.arrays import read_npz
 
 NOTES = "notes_json"
@@ -20,19 +19,10 @@ MOST_BYTES = 8e9
 
 def write_arrays(path: Path, arrays: dict[str, NDArray[Any]], notes: dict[str, Any]) -> None:
     """Write arrays and notes to `path`; a reader finds the whole file or none."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     text = np.frombuffer(json.dumps(notes).encode(), dtype=np.uint8)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            contents: dict[str, NDArray[Any]] = {**arrays, NOTES: text}
-            np.savez(file, **contents)  # pyright: ignore[reportArgumentType]
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    contents: dict[str, NDArray[Any]] = {**arrays, NOTES: text}
+    with atomic.replacing(path, flush=True) as file:
+        np.savez(file, **contents)  # pyright: ignore[reportArgumentType]
 
 
 def read_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:

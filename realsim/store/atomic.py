@@ -15,6 +15,7 @@ import io
 import json
 import os
 import shutil
+import threading
 from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import IO, Any
@@ -55,9 +56,10 @@ def storing(folder: Path, what: str) -> Generator[None]:
 
 
 def temporary(path: Path) -> Path:
-    """Return the name under which this process writes a file before it is whole."""
+    """Return the name under which this thread writes a file before it is whole."""
     # The process number tells a leftover from a file that another process is writing right now.
-    return path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
+    writer = f"{os.getpid()}-{threading.get_ident()}"
+    return path.with_name(f".{path.name}.{writer}{TEMPORARY_SUFFIX}")
 
 
 def sync_folder(folder: Path) -> None:
@@ -233,7 +235,8 @@ def leftovers(folder: Path | str) -> list[tuple[Path, Path]]:
     """Return (temporary file, its final path) of processes that are no longer running."""
     found: list[tuple[Path, Path]] = []
     for path in Path(folder).rglob(f".*{TEMPORARY_SUFFIX}"):
-        name, _, pid = path.name[1 : -len(TEMPORARY_SUFFIX)].rpartition(".")
+        name, _, writer = path.name[1 : -len(TEMPORARY_SUFFIX)].rpartition(".")
+        pid = writer.partition("-")[0]
         if name and pid.isdecimal() and not _is_running(int(pid)):
             found.append((path, path.with_name(name)))
     return found
