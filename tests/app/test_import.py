@@ -148,6 +148,9 @@ def test_a_folder_with_camera_and_poses(tmp_path):
     view = SessionStore.open(tmp_path / "c").session.views[2]
     assert view.T_base_ee is None
     np.testing.assert_allclose(view.T_world_cam, frame_of(2).T_base_ee, atol=1e-9)
+    os.truncate(folder / "rgb_004.png", 900)
+    refused(r"rgb_004\.png is truncated", run_import, request, tmp_path / "t", QUIET)
+    assert not (tmp_path / "t").exists()
 
 
 def test_seven_joints_come_too_and_are_the_named_arms(tmp_path):

@@ -74,8 +74,9 @@ class ImportSummary:
 
 
 def import_session(
-    source: FrameSource, folder: Path, console: Console, *, overwrite: bool = False
-) -> ImportSummary:
+    source: FrameSource, folder: Path, console: Console, *, overwrite: bool = False,
+    whole: bool = False,
+) -> ImportSummary:  # fmt: skip
     """Write a frame source into a session and say what it holds.
 
     Args:
@@ -83,10 +84,12 @@ def import_session(
         folder: the session; made if needed. An import of the same source goes on.
         console: where progress, notes and the table go.
         overwrite: replace a session that an earlier import made.
+        whole: whether a session that this call began is taken away where a frame is refused: a
+            source that is mended is another one, and would not go on with it.
 
     Raises:
         InputError: the folder holds something else, a frame cannot be read or has another size, or
-            time stamps do not increase. What was imported until then stays.
+            time stamps do not increase. What was imported until then stays, but for `whole`.
         UnitError: poses are not in metres.
     """
     started = time.perf_counter()
@@ -98,6 +101,7 @@ def import_session(
     folder.mkdir(parents=True, exist_ok=True)
     console.warn(*source.notes)
     with only_run_in(folder):
+        is_new = not (folder / SESSION_FILE).is_file()
         store = _opened(folder, source, key)
         done = len(store.completed)
         if done:
@@ -109,6 +113,10 @@ def import_session(
                 empty = _write_frames(source, store, done, tick, taken)
             _warn_of_unit(store, console)
             sheet = folder / write_contact_sheet(store, len(source), source.name, taken)
+        except InputError:
+            if whole and is_new:
+                shutil.rmtree(folder, ignore_errors=True)
+            raise
         finally:
             store.close()
     summary = _summary(source, store, done, time.perf_counter() - started, sheet)

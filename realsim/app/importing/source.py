@@ -76,6 +76,7 @@ def run_import(
     """
     from realsim.app.importing.archive import unpacked
     from realsim.app.importing.labels import import_labels, labels_of, require_models
+    from realsim.formats.bags.source import BagSource
 
     if out.resolve() == request.source.resolve():
         raise InputError(f"{out} is the source itself: give another folder for the session.")
@@ -85,7 +86,9 @@ def run_import(
         labels = None if request.no_labels else labels_of(given, source)
         if labels is not None and request.models is not None:
             require_models(*labels, request.models)
-        summary = import_session(source, out, console, overwrite=overwrite)
+        # A recording that is cut off keeps what could be read; files are mended one by one.
+        whole = not isinstance(source, BagSource)
+        summary = import_session(source, out, console, overwrite=overwrite, whole=whole)
         if labels is not None:
             import_labels(*labels, out, console, can_register=summary.with_depth > 0)
     return summary
