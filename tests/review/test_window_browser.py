@@ -66,6 +66,17 @@ def share_of(image: Any, rgb: tuple[int, int, int]) -> float:
     return float(np.mean(np.abs(image.astype(int) - np.array(rgb)).max(-1) < 30))
 
 
+def test_the_list_is_as_high_as_its_rows_and_at_most_half_of_the_window(
+    browser: ReviewBrowser, tmp_path: Path
+) -> None:
+    stores = [boxes_session(tmp_path / f"boxes{k}") for k in range(3)]
+    with serving(stores) as many, browser.page(many.url, width=1500, height=950) as page:
+        loaded(page)
+        row = "[...document.querySelectorAll('button')].find(b => b.innerText.includes('flat'))"
+        height = f"{row}.closest('.mantine-Paper-root').offsetHeight"
+        page.wait_until(lambda: page.page.evaluate(height) == 475, "half of the window")
+
+
 def test_a_scene_of_any_up_is_framed_at_once_and_a_link_shows_the_same(
     browser: ReviewBrowser, server: ReviewServer, tmp_path: Path
 ) -> None:

@@ -23,6 +23,14 @@ ROW_STYLE = """
   overflow-wrap: anywhere; height: auto; }}
 """
 """Two lines that begin at one place and are never cut off."""
+HEAD_PX, CHOICE_PX, ROW_PX = 187, 54, 66
+"""What stands above the rows, the choice of a scene, and a row of two lines, in the panel [px]."""
+PANEL_STYLE = """
+@media (min-width: 901px) {{
+  .mantine-Paper-root:has(:is({ids})) {{ min-height: min(50vh, {px}px); }}
+}}
+"""
+"""As high as its rows, and at most half of the window; on a phone the page decides."""
 ALL_SCENES = "all scenes"
 SHOWN: dict[str, scene_list.Which] = {
     "all objects": "all",
@@ -83,7 +91,10 @@ class ListPanel:
         self._page = min(self._page, pages - 1)
         self._pages.visible = pages > 1
         styles = [self._show(b, self._page * ROWS + k) for k, b in enumerate(self._buttons)]
-        style = f"<style>{ROW_STYLE.format(ids=self._ids)}{''.join(styles)}</style>"
+        shown = sum(button.visible for button in self._buttons)
+        height = HEAD_PX + CHOICE_PX * self._scene.visible + ROW_PX * shown
+        panel = PANEL_STYLE.format(ids=self._ids, px=height)
+        style = f"<style>{ROW_STYLE.format(ids=self._ids)}{panel}{''.join(styles)}</style>"
         if style != self._style.content:
             self._style.content = style
         told = [*window.server.remarks, *filter(None, [window.trouble])]
