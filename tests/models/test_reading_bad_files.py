@@ -4,10 +4,12 @@ import json
 import sys
 
 import pytest
+from PIL import Image
 
 from bop_scenes import edit
 from realsim.errors import MissingLibraryError
 from realsim.geometry.mesh import ply_bytes
+from realsim.models.mesh_loading import load_pieces
 from realsim.models.reading import read_scan
 from refusals import refused
 from written_meshes import as_trimesh, textured_box, write_gltf, write_textured_obj, write_usd
@@ -75,6 +77,19 @@ def test_without_the_extra_usd_says_what_to_install(tmp_path, monkeypatch):
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pxr", None)  # Python's own way to forbid an import
     refused(r"realsim\[usd\]", read_scan, tmp_path / "a.usda", None, error=MissingLibraryError)
+
+
+def test_a_texture_without_coordinates_is_named(tmp_path):
+    Image.new("RGB", (4, 4), (200, 10, 10)).save(tmp_path / "t.png")
+    (tmp_path / "box.mtl").write_text("newmtl m\nKd 0.2 0.4 0.6\nmap_Kd t.png\n")
+    mesh = textured_box()
+    rows = [f"v {x} {y} {z}" for x, y, z in mesh.vertices]
+    rows += [f"f {a} {b} {c}" for a, b, c in mesh.faces + 1]
+    (tmp_path / "box.obj").write_text("\n".join(["mtllib box.mtl", "usemtl m", *rows]))
+    content = load_pieces(tmp_path / "box.obj")
+    assert all(p.image is None for p in content.pieces)
+    told = [n for n in content.notes if "no texture coordinates" in n]
+    assert len(told) == 1 and "Unwrap" in told[0]
 
 
 def test_a_missing_texture_is_a_note(tmp_path):
