@@ -19,7 +19,7 @@ from formats_frames import Picture, real, simulated
 from numpy.typing import NDArray
 
 from realsim import images
-from realsim.formats.bop.image_copies import colour_content, depth_content
+from realsim.formats.bop.writing import colour_content, depth_content
 from realsim.formats.export_folder import Content, ExportFolder
 
 Files = Mapping[str, Content]
@@ -83,7 +83,7 @@ def _ways() -> dict[str, Way]:
 
 
 def _jpeg(rgb: Image) -> bytes:
-    """Return a JPEG as `realsim.formats.bop.image_copies` makes it."""
+    """Return a JPEG as `realsim.formats.bop.writing` makes it."""
     import cv2
 
     done, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])

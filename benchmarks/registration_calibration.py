@@ -47,7 +47,7 @@ from realsim.registration.judging.surface_residuals import (
     residual_checks,
     surface_residuals,
 )
-from realsim.registration.search.sameness import make_sameness
+from realsim.registration.search.candidates import make_sameness
 from realsim.registration.simulated import TableLabConfig, TableScene, scatter_objects, table_scene
 from realsim.registration.solver import COARSE, FINE, Stage, solve_pose
 from realsim.registration.table_planes import support_checks

@@ -17,7 +17,7 @@ from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 from realsim.models.convex import convex_parts
-from realsim.models.convex_config import ConvexConfig
+from realsim.models.convex_worker import ConvexConfig
 from realsim.records import ObjectModel, ObjectPose
 
 SCALE = 10.0

@@ -24,8 +24,8 @@ from registration_figures import Done
 
 from realsim.arrays import Array
 from realsim.formats.bop import scene as bop
-from realsim.formats.bop.keyframes import read_keyframe_poses
 from realsim.formats.bop.models import load_models
+from realsim.formats.bop.scene import read_keyframe_poses
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose
 from realsim.registration.body import footprint, make_body

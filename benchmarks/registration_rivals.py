@@ -22,7 +22,7 @@ from realsim.geometry.depth import points_from_depth
 from realsim.geometry.mesh import sample_surface
 from realsim.interop import import_open3d
 from realsim.records import ObjectPose
-from realsim.registration import single_view as ours
+from realsim.registration import top_down as ours
 from realsim.registration.body import Body, make_body
 from realsim.registration.evidence import DepthFrame
 

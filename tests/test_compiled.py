@@ -8,7 +8,7 @@ from types import ModuleType
 
 import pytest
 
-from realsim.app.config.files import find_config
+from realsim.app.config.settings import find_config
 from realsim.user_cache import user_cache
 
 CALLED = """

@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 from realsim.arrays import Array, Int32
 from realsim.errors import InputError
 from realsim.geometry.mesh import decimated, hull_vertices, mass_properties, welded_mesh
-from realsim.models.convex_config import ConvexConfig
 from realsim.models.convex_hulls import collision_obj, hull_volume, parts_from_collision_obj
-from realsim.models.convex_worker import decompose, light, passes, step_path
+from realsim.models.convex_worker import ConvexConfig, decompose, light, passes, step_path
 from realsim.models.model_records import ConvexParts
 from realsim.records import Mesh
 from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays

@@ -32,7 +32,6 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import diameter
 from realsim.models.model_records import Symmetries
-from realsim.models.symmetry_config import SymmetryConfig
 from realsim.models.symmetry_search import (
     COARSE_SCALES,
     FINE_SCALES,
@@ -48,7 +47,13 @@ from realsim.models.symmetry_search import (
     moved_about,
     turn,
 )
-from realsim.models.symmetry_surface import Surface, refinement, surface_of, texture_breaks
+from realsim.models.symmetry_surface import (
+    Surface,
+    SymmetryConfig,
+    refinement,
+    surface_of,
+    texture_breaks,
+)
 from realsim.records import Mesh, ObjectModel
 from realsim.store.arrays_on_disk import read_arrays, write_arrays
 

@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
-from realsim.models.symmetry_config import SymmetryConfig
-from realsim.models.symmetry_surface import Surface, refinement
+from realsim.models.symmetry_surface import Surface, SymmetryConfig, refinement
 
 GOLDEN = (1 + math.sqrt(5)) / 2
 SAME_ROTATION = 1e-6

@@ -19,8 +19,16 @@ from realsim.store.manifest import NAME as MANIFEST_FILE
 from realsim.store.manifest import Manifest, entry_from, entry_of
 from realsim.store.opening import BEGUN_FILE, CAMERA_FILE, RECOVERED, ROBOT_FILE, read_begun
 from realsim.store.robot_lines import CHECK, record_of
-from realsim.store.session_check import DAMAGED, CheckReport, check_session, read_lists
-from realsim.store.session_notes import PLAN_FILE, is_image, is_own, log_entries
+from realsim.store.session_check import (
+    DAMAGED,
+    PLAN_FILE,
+    CheckReport,
+    check_session,
+    is_image,
+    is_own,
+    log_entries,
+    read_lists,
+)
 from realsim.store.session_store import SessionStore
 from realsim.store.view_images import depth_path, rgb_path
 from realsim.untrusted.own_json import read_object

@@ -18,8 +18,8 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
+from realsim.untrusted.archives import opened_zip
 from realsim.untrusted.files import file_bytes
-from realsim.untrusted.zip_members import opened_zip
 
 MOST_BYTES = 1e9
 """Largest array, and the sum of the arrays of one archive [bytes, unpacked]."""

@@ -11,7 +11,7 @@ import pytest
 from begun_sessions import begun
 from franka_server import FrankaServer
 from given_plans import plan_through
-from realsim.app.doctor.devices import robot_findings
+from realsim.app.doctor.run import robot_findings
 from realsim.arrays import Array
 from realsim.geometry import se3
 from realsim.interop import import_pyrealsense2

@@ -10,8 +10,7 @@ import pytest
 
 from realsim.app.cli import commands
 from realsim.app.command import default_of, settable, spelling, walk
-from realsim.app.config.files import find_config, read_config
-from realsim.app.config.settings import settings_of
+from realsim.app.config.settings import find_config, read_config, settings_of
 from realsim.app.config.template import template, toml_value
 from realsim.app.option_values import Numbers
 from realsim.app.outputs import OutputFile

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from realsim.app.report.limits import read_limits
+from realsim.app.report.run import read_limits
 from realsim.errors import InputError
 from realsim.untrusted.toml_text import MOST_BYTES, parsed_toml, read_toml
 from typed_commands import refused

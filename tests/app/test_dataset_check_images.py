@@ -11,8 +11,7 @@ import pytest
 from bop_scenes import edit, write_boxes
 from realsim.app.check.agreement import ObjectAgreement, SceneAgreement
 from realsim.app.check.checksums import check_checksums, checksum_list
-from realsim.app.check.dataset import checked_scenes
-from realsim.app.check.tally import MaskOverlap, Tally, agreement_of
+from realsim.app.check.dataset import MaskOverlap, Tally, agreement_of, checked_scenes
 from realsim.errors import InputError
 from typed_commands import finished, invoked
 

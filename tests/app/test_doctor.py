@@ -11,11 +11,9 @@ import pytest
 from packaging.requirements import Requirement
 
 from realsim.app.console import Console
-from realsim.app.doctor import devices, isolation, machine, software
-from realsim.app.doctor.finding import Finding
-from realsim.app.doctor.isolation import Outcome, isolated
-from realsim.app.doctor.packages import EXTRAS, REQUIRED
-from realsim.app.doctor.run import show
+from realsim.app.doctor import machine, run
+from realsim.app.doctor.machine import Finding, Outcome, isolated
+from realsim.app.doctor.run import EXTRAS, REQUIRED, show
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
 from typed_commands import realsim
 
@@ -28,7 +26,7 @@ def no_tick(done: int, total: int) -> None:
 
 
 def outcomes(**changed: Outcome) -> Mapping[str, Outcome]:
-    found = dict.fromkeys([*software.software_probes(), "import:pyrealsense2"], OK)
+    found = dict.fromkeys([*run.software_probes(), "import:pyrealsense2"], OK)
     return found | {name.replace("__", ":").replace("_so", ".so"): o for name, o in changed.items()}
 
 
@@ -54,8 +52,8 @@ def test_a_missing_extra_is_a_note_with_the_command_that_gets_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     extra = EXTRAS[0].extra
-    monkeypatch.setattr(software, "_version", lambda p: None if p.extra == extra else "1.0")
-    found = software.software_findings(outcomes())
+    monkeypatch.setattr(run, "_version", lambda p: None if p.extra == extra else "1.0")
+    found = run.software_findings(outcomes())
     missing = [f for f in found if f.kind != "ok" and f.group.startswith("Extras")]
     assert {f.name for f in missing} == {p.name for p in EXTRAS if p.extra == extra}
     assert all(f.kind == "note" and f"realsim[{extra}]" in f.todo for f in missing)
@@ -63,14 +61,14 @@ def test_a_missing_extra_is_a_note_with_the_command_that_gets_it(
 
 def test_a_package_that_cannot_be_loaded_says_why() -> None:
     bad = Outcome(ok=False, told="crashed (SIGSEGV)")
-    found = named(software.software_findings(outcomes(import__open3d=bad)), "open3d-cpu")
+    found = named(run.software_findings(outcomes(import__open3d=bad)), "open3d-cpu")
     assert found.kind == "problem" and "SIGSEGV" in found.found
 
 
 def test_a_missing_library_is_a_problem_with_its_debian_package() -> None:
     missing = Outcome(ok=False, told="no such file")
     told = {**outcomes(), "library:libusb-1.0.so.0": missing, "import:pyrealsense2": missing}
-    found = named(software.software_findings(told), "libusb-1.0.so.0")
+    found = named(run.software_findings(told), "libusb-1.0.so.0")
     assert (
         found.kind == "problem" and "apt-get install" in found.todo and "libusb-1.0-0" in found.todo
     )
@@ -100,7 +98,7 @@ def crashing(monkeypatch: pytest.MonkeyPatch) -> None:
         assert command[1:3] == ["-m", "realsim.app.doctor.probe"]
         return real([sys.executable, "-c", CRASHING, *command[3:]], **options)  # type: ignore[call-overload]
 
-    monkeypatch.setattr(isolation.subprocess, "Popen", popen)
+    monkeypatch.setattr(machine.subprocess, "Popen", popen)
 
 
 @pytest.mark.usefixtures("crashing")
@@ -145,16 +143,16 @@ def test_a_folder_that_cannot_be_written_is_a_problem() -> None:
 
 def test_a_robot_that_answers_is_found_and_a_silent_one_within_the_time() -> None:
     with LoopbackController.start(robot="UR5", speedup=10) as controller:
-        found = devices.robot_findings(controller.host)
+        found = run.robot_findings(controller.host)
         assert [f.kind for f in found] == ["ok", "ok"], found
-    found = devices.robot_findings("192.0.2.1", timeout_s=0.3)  # TEST-NET: nobody answers there
+    found = run.robot_findings("192.0.2.1", timeout_s=0.3)  # TEST-NET: nobody answers there
     assert [f.kind for f in found] == ["problem", "problem"]
     assert all("network" in f.todo for f in found)
 
 
 @pytest.mark.parametrize("host", ["a" * 70, "\udcff"])
 def test_a_text_that_can_be_no_name_is_one_problem_that_can_be_printed(host: str) -> None:
-    (found,) = devices.robot_findings(host)
+    (found,) = run.robot_findings(host)
     assert found.kind == "problem" and "no host name" in found.found
     found.found.encode("utf-8")
 

@@ -12,8 +12,7 @@ from realsim.app.console import Console
 from realsim.app.render.compare import label_ids, rim_distances_px
 from realsim.app.render.light import neutral_environment, upright
 from realsim.app.render.request import RenderRequest, resized
-from realsim.app.render.run import notes_of, run_render
-from realsim.app.render.scene import twin_scene
+from realsim.app.render.run import notes_of, run_render, twin_scene
 from realsim.geometry import camera
 from realsim.geometry.colors import light_of_bytes
 from realsim.rendering.depth_sensors.model import DepthSensorModel

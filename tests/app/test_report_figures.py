@@ -15,7 +15,7 @@ from realsim.app.report.figures import (
     share,
     shown,
 )
-from realsim.app.report.limits import broken, limit_of, read_limits
+from realsim.app.report.run import broken, limit_of, read_limits
 from realsim.errors import InputError
 from realsim.geometry.parts import part
 from refusals import refused

@@ -12,7 +12,7 @@ import pytest
 from realsim.formats.bop.models import load_models, save_models
 from realsim.geometry.mesh import save_ply
 from realsim.geometry.parts import part
-from realsim.models.convex_config import ConvexConfig
+from realsim.models.convex_worker import ConvexConfig
 from realsim.models.library import ModelLibrary
 from realsim.models.library_prepare import PrepareConfig
 from realsim.models.library_records import ScaleNote

@@ -13,9 +13,8 @@ from begun_sessions import begun
 from realsim.app.console import Console
 from realsim.app.scan.scale import inputs
 from realsim.app.scan.scale.cli import RESULT
-from realsim.app.scan.scale.files import Place, write_result
 from realsim.app.scan.scale.inputs import NamedMesh, ScaleRequest, read_mesh, usable_views
-from realsim.app.scan.scale.run import run_scale, view_poses
+from realsim.app.scan.scale.run import Place, run_scale, view_poses, write_result
 from realsim.app.scan.scale.show import model_lines
 from realsim.errors import InputError, UnitError
 from realsim.geometry.mesh import load_mesh, save_ply

@@ -10,8 +10,7 @@ from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim_calibration import ClockOffset, estimate_clock_offset, solve_pose_pairs
-from realsim_calibration.clock.offset import autocorrelation_factor
-from realsim_calibration.clock.streams import interpolated
+from realsim_calibration.clock.offset import autocorrelation_factor, interpolated
 from realsim_calibration.pairs.drift import Drift, estimate_drift
 from realsim_calibration.results import Mode
 from refusals import refused

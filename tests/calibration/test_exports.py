@@ -24,7 +24,7 @@ from realsim.arrays import Array
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
-from realsim_calibration.exports import ros
+from realsim_calibration.exports import write
 from realsim_calibration.exports.calibration_file import calibration_text, read_calibration
 from realsim_calibration.exports.frames import FrameNames, note_lines, published_transform
 from realsim_calibration.exports.write import opencv_text, write_exports
@@ -94,11 +94,11 @@ LINK = FrameNames(
 @settings(max_examples=15, deadline=None)
 def test_easy_handeye_reads_the_same_transform(full_record: Maker, X: Array, mode: Mode) -> None:
     report = full_record(X, mode)
-    two = yaml11(ros.easy_handeye2_text(report, FRAMES))
+    two = yaml11(write.easy_handeye2_text(report, FRAMES))
     t, q = two["transform"]["translation"], two["transform"]["rotation"]
     assert all(type(v) is float for v in (*t.values(), *q.values()))
     assert same(rigid_of([t[k] for k in "xyz"], [q[k] for k in "xyzw"]), X)
-    T = yaml11(ros.easy_handeye_text(report, FRAMES))["transformation"]
+    T = yaml11(write.easy_handeye_text(report, FRAMES))["transformation"]
     assert all(type(v) is float for v in T.values())
     assert same(rigid_of([T[k] for k in "xyz"], [T[k] for k in ("qx", "qy", "qz", "qw")]), X)
 
@@ -110,18 +110,18 @@ def test_ros_commands_and_launch_carry_the_same_transform(
 ) -> None:
     report = full_record(X)
     expected, parent, child = published_transform(report, frames)
-    words = shlex.split(ros.ros2_command(report, frames))
+    words = shlex.split(write.ros2_command(report, frames))
     assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
     named = dict(zip(words[4::2], words[5::2], strict=True))
     assert (named["--frame-id"], named["--child-frame-id"]) == (parent, child)
     xyz = [named[f"--{k}"] for k in "xyz"]
     assert same(rigid_of(xyz, [named[f"--q{k}"] for k in "xyzw"]), expected)
 
-    old = shlex.split(ros.ros1_command(report, frames))
+    old = shlex.split(write.ros1_command(report, frames))
     assert len(old) == 12 and old[-2:] == [parent, child]
     assert same(rigid_of(old[3:6], old[6:10]), expected)
 
-    tree = ast.parse(ros.ros2_launch_text(report, frames))
+    tree = ast.parse(write.ros2_launch_text(report, frames))
     lists = [n for n in ast.walk(tree) if isinstance(n, ast.keyword) and n.arg == "arguments"]
     assert ast.literal_eval(lists[0].value) == words[4:]
 
@@ -130,7 +130,7 @@ def test_ros_commands_and_launch_carry_the_same_transform(
 @settings(max_examples=15, deadline=None)
 def test_urdf_reads_the_same_transform(full_record: Maker, X: Array, frames: FrameNames) -> None:
     """rpy about fixed axes: R = Rz Ry Rx, read with this formula and compared."""
-    root = ET.fromstring(ros.urdf_text(full_record(X), frames))
+    root = ET.fromstring(write.urdf_text(full_record(X), frames))
     T = np.eye(4)
     links = [link.attrib["name"] for link in root.findall("link")]
     for joint in root.findall("joint"):
@@ -177,7 +177,7 @@ def test_camera_link_of_a_camera_that_looks_along_the_tool(full_record: Maker) -
 
 def test_easy_handeye2_has_the_keys_of_its_message_and_no_others(full_record: Maker) -> None:
     """set_message_fields refuses unknown keys, so the layout must be the message's own."""
-    read = yaml11(ros.easy_handeye2_text(full_record(np.eye(4), "eye_to_hand"), FRAMES))
+    read = yaml11(write.easy_handeye2_text(full_record(np.eye(4), "eye_to_hand"), FRAMES))
     assert list(read) == ["parameters", "transform"]
     assert read["parameters"] == {
         "name": "ur5",
@@ -190,7 +190,7 @@ def test_easy_handeye2_has_the_keys_of_its_message_and_no_others(full_record: Ma
         "move_group_namespace": "/",
         "move_group": "manipulator",
     }
-    old = yaml11(ros.easy_handeye_text(full_record(np.eye(4)), FRAMES))
+    old = yaml11(write.easy_handeye_text(full_record(np.eye(4)), FRAMES))
     assert old["parameters"]["eye_on_hand"] is True and old["parameters"]["namespace"] == "/ur5/"
 
 
@@ -198,12 +198,12 @@ def test_every_text_says_frames_units_accuracy_and_warnings(full_record: Maker) 
     report = full_record(se3.from_translation([0.0, 0.0, 0.1]))
     notes = "\n".join(note_lines(report, FRAMES))
     for text in (
-        ros.easy_handeye2_text(report, FRAMES),
-        ros.easy_handeye_text(report, FRAMES),
-        ros.ros1_script(report, FRAMES),
-        ros.ros2_script(report, FRAMES),
-        ros.ros2_launch_text(report, FRAMES),
-        ros.urdf_text(report, FRAMES),
+        write.easy_handeye2_text(report, FRAMES),
+        write.easy_handeye_text(report, FRAMES),
+        write.ros1_script(report, FRAMES),
+        write.ros2_script(report, FRAMES),
+        write.ros2_launch_text(report, FRAMES),
+        write.urdf_text(report, FRAMES),
         opencv_text(report, FRAMES),
     ):
         assert "OPTICAL" in text and "Metres" in text and "1 sigma" in text
@@ -220,12 +220,12 @@ def test_the_shell_scripts_run_one_command_with_the_words(
     fake.chmod(0o755)
     report = full_record(se3.from_translation([0.1, -0.2, 1e-17]))
     script = tmp_path / "publish.sh"
-    script.write_text(ros.ros2_script(report, FRAMES))
+    script.write_text(write.ros2_script(report, FRAMES))
     ran = subprocess.run(
         ["/bin/sh", str(script)], env={"PATH": f"{tmp_path}:/bin:/usr/bin"}, capture_output=True,
         text=True, check=True,
     )  # fmt: skip
-    assert ran.stdout.split() == shlex.split(ros.ros2_command(report, FRAMES))[1:]
+    assert ran.stdout.split() == shlex.split(write.ros2_command(report, FRAMES))[1:]
 
 
 def test_write_exports_writes_readable_files(full_record: Maker, tmp_path: Path) -> None:

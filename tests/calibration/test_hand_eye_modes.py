@@ -31,8 +31,7 @@ from realsim_calibration.fit.effective import places_of
 from realsim_calibration.fit.linear_model import LinearModel
 from realsim_calibration.fit.robot_error import matching_arm, pose_features
 from realsim_calibration.fit.robust_fit import Solution, at_least, solve
-from realsim_calibration.hand_eye import setup_of
-from realsim_calibration.plain import choose_plain
+from realsim_calibration.hand_eye import choose_plain, setup_of
 from realsim_calibration.report.summary import places_rows, viewpoint
 from realsim_calibration.results import Clock
 from realsim_calibration.screening import Screened, screen, stacks

@@ -14,9 +14,9 @@ from realsim_calibration.lens.bundle import (
     _normal,  # pyright: ignore[reportPrivateUsage]
     shaped_points,
 )
-from realsim_calibration.lens.coverage import measure_coverage
 from realsim_calibration.lens.fit import IntrinsicsConfig
 from realsim_calibration.lens.intrinsics import calibrate_intrinsics
+from realsim_calibration.lens.report import measure_coverage
 from realsim_calibration.views import TargetDetection
 from refusals import refused
 

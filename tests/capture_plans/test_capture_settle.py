@@ -9,7 +9,7 @@ from realsim.robots.arm import UR5
 from realsim_capture_plans.capturing.checks import SHARPNESS_OF_MEDIAN, sharpness
 from realsim_capture_plans.capturing.look import SettleConfig, until_still
 from realsim_capture_plans.devices.interfaces import ArmState
-from realsim_capture_plans.lab.devices import SimulatedArm
+from realsim_capture_plans.lab.lab import SimulatedArm
 
 
 class RingingArm(SimulatedArm):

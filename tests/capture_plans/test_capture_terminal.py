@@ -27,7 +27,7 @@ from realsim_capture_plans.capturing.capture import CaptureJob, capture
 from realsim_capture_plans.capturing.log import LOG_FILE, CaptureLog
 from realsim_capture_plans.capturing.operator import TerminalOperator
 from realsim_capture_plans.devices.interfaces import Frame
-from realsim_capture_plans.lab.devices import SimulatedArm
+from realsim_capture_plans.lab.lab import SimulatedArm
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 VIEWS = 40

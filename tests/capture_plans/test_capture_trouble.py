@@ -28,7 +28,7 @@ from realsim_capture_plans.capturing.log import CaptureLog
 from realsim_capture_plans.capturing.operator import CaptureStatus, Command, NoOperator
 from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError, Frame, Stop
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
-from realsim_capture_plans.lab.devices import SimulatedArm, SimulatedDepthCamera
+from realsim_capture_plans.lab.lab import SimulatedArm, SimulatedDepthCamera
 from realsim_capture_plans.planning.record import CapturePlan
 
 VIEWS = 9

@@ -23,9 +23,8 @@ from realsim.robots.shapes import Box, WorkCell
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.pictures.drawing import PlanCurves
 from realsim_capture_plans.pictures.motion_charts import clearance_chart
-from realsim_capture_plans.pictures.plan_pictures import plan_pictures
+from realsim_capture_plans.pictures.plan_pictures import board_chart, coverage_chart, plan_pictures
 from realsim_capture_plans.pictures.replay import NEAR_RGB, PlanReplay, near_parts, write_replay
-from realsim_capture_plans.pictures.view_charts import board_chart, coverage_chart
 from realsim_capture_plans.planning import view_quality
 from realsim_capture_plans.planning.metrics import METRIC_MEANINGS, plan_metrics
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig

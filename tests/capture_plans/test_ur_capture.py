@@ -14,8 +14,7 @@ from realsim_capture_plans.capturing.operator import Command, NoOperator
 from realsim_capture_plans.devices.interfaces import ArmStoppedError
 from realsim_capture_plans.devices.ur import UrArm
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
-from realsim_capture_plans.lab.devices import SimulatedDepthCamera
-from realsim_capture_plans.lab.lab import LabConfig, SimulatedLab
+from realsim_capture_plans.lab.lab import LabConfig, SimulatedDepthCamera, SimulatedLab
 from realsim_capture_plans.planning.record import CapturePlan
 
 VIEWS = 4

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from realsim.formats.bags import camera_info, pixels, wire
+from realsim.formats.bags import pixels, topics, wire
 from realsim.geometry.camera import project
 from refusals import refused
 
@@ -170,31 +170,31 @@ def info(**changes: Any) -> Any:
 
 def test_distortion_models() -> None:
     d = np.array([0.1, -0.2, 1e-3, 2e-3, 0.05])
-    assert camera_info.camera_of(info(d=d), "t", 64, 48, False).distortion[:5].tolist() == list(d)
+    assert topics.camera_of(info(d=d), "t", 64, 48, False).distortion[:5].tolist() == list(d)
     d8 = np.arange(8) * 0.01
     rational = info(d=d8, distortion_model="rational_polynomial")
-    assert camera_info.camera_of(rational, "t", 64, 48, False).distortion.tolist() == list(d8)
+    assert topics.camera_of(rational, "t", 64, 48, False).distortion.tolist() == list(d8)
     for model in ("equidistant", "Inverse Brown Conrady", ""):
         other = info(d=d, distortion_model=model)
-        refused("plumb_bob", camera_info.camera_of, other, "t", 64, 48, False)
-        camera_info.camera_of(info(distortion_model=model), "t", 64, 48, False)  # all zero
+        refused("plumb_bob", topics.camera_of, other, "t", 64, 48, False)
+        topics.camera_of(info(distortion_model=model), "t", 64, 48, False)  # all zero
 
 
 def test_rectified_images_have_p_and_no_distortion() -> None:
     p = np.array([40.0, 0, 30, 0, 0, 41, 22, 0, 0, 0, 1, 0])
     message = info(d=np.full(5, 0.1), p=p)
-    rectified = camera_info.camera_of(message, "t", 64, 48, True)
+    rectified = topics.camera_of(message, "t", 64, 48, True)
     assert (rectified.fx, rectified.fy, rectified.cx, rectified.cy) == (40, 41, 30, 22)
     assert not rectified.is_distorted
-    assert camera_info.camera_of(message, "t", 64, 48, False).fx == 50
-    assert camera_info.is_rectified("/cam/image_rect_color/compressed")
-    assert not camera_info.is_rectified("/rectified_cam/image_raw")
+    assert topics.camera_of(message, "t", 64, 48, False).fx == 50
+    assert topics.is_rectified("/cam/image_rect_color/compressed")
+    assert not topics.is_rectified("/rectified_cam/image_raw")
 
 
 def test_a_binned_region_sees_the_same_directions() -> None:
     roi = SimpleNamespace(x_offset=8, y_offset=4, width=32, height=24)
-    part = camera_info.camera_of(info(roi=roi, binning_x=2, binning_y=2), "t", 16, 12, False)
-    whole = camera_info.camera_of(info(), "t", 64, 48, False)
+    part = topics.camera_of(info(roi=roi, binning_x=2, binning_y=2), "t", 16, 12, False)
+    whole = topics.camera_of(info(), "t", 64, 48, False)
     point = np.array([0.1, -0.05, 1.0])
     full, binned = project(whole, point), project(part, point)
     # The binned pixel (0, 0) covers full pixels 8..9 and 4..5, so its centre is (8.5, 4.5).
@@ -202,8 +202,8 @@ def test_a_binned_region_sees_the_same_directions() -> None:
 
 
 def test_uncalibrated_and_wrong_size_are_refused() -> None:
-    refused("no calibration", camera_info.camera_of, info(k=np.zeros(9)), "t", 64, 48, False)
-    refused("64x48, but they are 32x24", camera_info.camera_of, info(), "t", 32, 24, False)
+    refused("no calibration", topics.camera_of, info(k=np.zeros(9)), "t", 64, 48, False)
+    refused("64x48, but they are 32x24", topics.camera_of, info(), "t", 32, 24, False)
 
 
 @pytest.mark.parametrize(
@@ -217,4 +217,4 @@ def test_uncalibrated_and_wrong_size_are_refused() -> None:
 )
 def test_camera_info_is_found_by_name(image: str, expected: str | None) -> None:
     there = ["/cam/color/camera_info", "/device_0/sensor_1/Color_0/info/camera_info"]
-    assert camera_info.info_topic(image, there) == expected
+    assert topics.info_topic(image, there) == expected

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from plain_meshes import box
-from realsim.formats.bop.check import Sheet, check_bop_scene, check_info
-from realsim.formats.bop.check_poses import pose_findings, silhouette
+from realsim.formats.bop.check import Sheet, check_bop_scene, check_info, pose_findings, silhouette
 from realsim.formats.bop.layout import SceneLayout
 from realsim.formats.bop.opening import open_labelled_bop
 from realsim.geometry import se3

@@ -20,7 +20,7 @@ from realsim.formats.graspnet.grasp_labels import (
     write_collision_labels,
     write_grasp_labels,
 )
-from realsim.formats.graspnet.rect import rect_rows
+from realsim.formats.graspnet.writing import rect_rows
 from realsim.formats.grasps.scene_grasps import untried_set
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics

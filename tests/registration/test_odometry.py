@@ -11,7 +11,7 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.registration.odometry.cross_check import KinematicsCheck, check_kinematics
 from realsim.registration.odometry.hand_held import hand_held_poses
-from realsim.registration.odometry.kiss import FitConfig, LocalMap, thin_points
+from realsim.registration.odometry.pairs import FitConfig, LocalMap, thin_points
 from realsim.registration.simulated import DEPTH_UNIT_M, render_depth
 from realsim.registration.views import SampleConfig, ViewPoints
 from refusals import refused

@@ -14,12 +14,11 @@ from realsim.geometry.parts import part
 from realsim.records import Mesh, ObjectModel, ObjectPose
 from realsim.registration.evidence import Cloud, join_clouds
 from realsim.registration.find_table import find_table
-from realsim.registration.search.candidates import Candidate, Sought, fuse
+from realsim.registration.search.candidates import Candidate, Sought, fuse, make_sameness
 from realsim.registration.search.find import FindConfig, find_objects
 from realsim.registration.search.peel import clusters, explained_points, suspects
 from realsim.registration.search.polish import SAME_SHARE, Decision, decide_rivals
 from realsim.registration.search.records import SearchResult, Wanted
-from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import Render, Score, ScoreConfig, make_canvas
 from realsim.registration.search.templates import TemplateConfig
 from realsim.registration.simulated import TableScene, table_scene

@@ -10,8 +10,13 @@ from realsim.geometry.mesh import symmetry_transforms
 from realsim.geometry.metrics import mssd
 from realsim.geometry.parts import part
 from realsim.registration.body import Body, footprint
-from realsim.registration.search.candidates import Candidate, Sought, candidate
-from realsim.registration.search.sameness import distinct, make_sameness
+from realsim.registration.search.candidates import (
+    Candidate,
+    Sought,
+    candidate,
+    distinct,
+    make_sameness,
+)
 from realsim.registration.search.scoring import (
     Canvas,
     ScoreConfig,

@@ -11,8 +11,7 @@ from realsim.geometry import camera, se3
 from realsim.geometry.colors import srgb_encoded
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Environment, Material
-from realsim.rendering.developing import developed
-from realsim.rendering.photo import Lighting, LightSampling, PhotoRenderer, PlacedMesh
+from realsim.rendering.photo import Lighting, LightSampling, PhotoRenderer, PlacedMesh, developed
 from refusals import refused
 from trimesh_solids import solid
 

@@ -11,7 +11,7 @@ import pytest
 
 from realsim import InputError, images
 from realsim.review.content import quick_png
-from realsim.review.content.thumbnails import FOLDER, Thumbnails, thumbnail
+from realsim.review.content.content import FOLDER, Thumbnails, thumbnail
 from realsim.store import SessionStore
 from reviewed_boxes import boxes_session
 

@@ -8,9 +8,13 @@ import pytest
 from realsim.formats.graspnet import gripper_frame as frame
 from realsim.geometry import se3
 from realsim.robots.hand import find_hand
-from realsim_sim_bridge.grasping.analytic import AnalyticConfig, analytic_labels, gripper_boxes
+from realsim_sim_bridge.grasping.analytic import (
+    AnalyticConfig,
+    analytic_labels,
+    gripper_boxes,
+    select_rows,
+)
 from realsim_sim_bridge.grasping.analytic_given import given_candidates, standing_labels
-from realsim_sim_bridge.grasping.analytic_select import select_rows
 from realsim_sim_bridge.grasping.candidates import CandidateConfig, Surroundings
 from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
 from tried_grasps import assert_same

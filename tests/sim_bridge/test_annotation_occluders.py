@@ -11,8 +11,8 @@ from realsim.geometry import se3
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.labels import LabelRenderer, Labels, PlacedMesh
 from realsim.rendering.rays import BACKGROUND
+from realsim_sim_bridge.annotation.annotate import frame_files
 from realsim_sim_bridge.annotation.config import AnnotationConfig
-from realsim_sim_bridge.annotation.frame import frame_files
 from realsim_sim_bridge.annotation.inputs import FrameInputs, FrameView, table_slab
 from tried_grasps import plain_grasps
 

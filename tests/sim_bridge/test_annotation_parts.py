@@ -15,7 +15,7 @@ from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.rendering.rays import BACKGROUND
 from realsim_sim_bridge.annotation import frame_maps
 from realsim_sim_bridge.annotation.config import OccluderConfig, SightConfig
-from realsim_sim_bridge.annotation.frame_grasps import (
+from realsim_sim_bridge.annotation.files import (
     GraspsInView,
     GraspVisibility,
     grasps_in_view,

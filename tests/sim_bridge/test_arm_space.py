@@ -23,7 +23,7 @@ from realsim_sim_bridge.arm.obstacles import least_distance, obstacles_of
 from realsim_sim_bridge.arm.timing import TimingConfig, straight_times, timed_path
 from realsim_sim_bridge.slip.bullet_shapes import hand_urdf
 from realsim_sim_bridge.slip.world import PadModel
-from realsim_sim_bridge.validation.arm_urdf import PANDA_LINKS, arm_urdf
+from realsim_sim_bridge.validation.full_arm import PANDA_LINKS, arm_urdf
 from refusals import refused
 
 HAND = find_hand()

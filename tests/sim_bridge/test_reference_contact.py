@@ -14,7 +14,6 @@ from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import Closing, Grips, PadModel, SlipPhysics
 from realsim_sim_bridge.validation.config import LabelConfig, ValidationConfig
 from realsim_sim_bridge.validation.full_arm import carry_cube, stage_joints
-from realsim_sim_bridge.validation.known_outcomes import peak_load
 from realsim_sim_bridge.validation.loads import hand_patch, hold, with_hand
 from realsim_sim_bridge.validation.reference_contact import ReferenceEngine, ReferenceSettings
 from realsim_sim_bridge.validation.reference_loops import closest
@@ -28,7 +27,7 @@ from realsim_sim_bridge.validation.specimens import (
     panda,
     specimen,
 )
-from realsim_sim_bridge.validation.suite import validate
+from realsim_sim_bridge.validation.suite import peak_load, validate
 from refusals import refused
 
 HAND = find_hand()

@@ -21,7 +21,6 @@ from realsim_calibration.lens.bundle import CAMERA_TERMS, LensFit, Observations,
 from realsim_calibration.lens.checks import intrinsics_checks
 from realsim_calibration.lens.choice import ModelScore, fold_of_views, halves, score_models
 from realsim_calibration.lens.covariance import global_covariance
-from realsim_calibration.lens.coverage import GOOD_TILT_DEG, measure_coverage
 from realsim_calibration.lens.fit import (
     SIGMA_FLOOR_PX,
     Candidate,
@@ -33,7 +32,12 @@ from realsim_calibration.lens.fit import (
 )
 from realsim_calibration.lens.models import MODELS, lens_prior
 from realsim_calibration.lens.observations import ROUNDS, Corners, find_outliers, gather
-from realsim_calibration.lens.report import IntrinsicsReport, LensView
+from realsim_calibration.lens.report import (
+    GOOD_TILT_DEG,
+    IntrinsicsReport,
+    LensView,
+    measure_coverage,
+)
 from realsim_calibration.lens.start import choose_twins, start_state, view_errors
 from realsim_calibration.results import BoardShape
 from realsim_calibration.views import TargetDetection

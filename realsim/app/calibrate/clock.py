@@ -14,7 +14,7 @@ from realsim.arrays import Array, Mask
 from realsim.errors import DegenerateError, InputError
 from realsim.records import CameraIntrinsics, Target
 from realsim_calibration import BoardView, ClockOffset, estimate_board_pose, estimate_clock_offset
-from realsim_calibration.clock.streams import checked_stream, in_gap, interpolated
+from realsim_calibration.clock.offset import checked_stream, in_gap, interpolated
 from realsim_calibration.inputs.raw_poses import RawPoses
 from realsim_calibration.inputs.readings import PoseReading
 from realsim_calibration.results import Clock, Mode

@@ -75,8 +75,8 @@ def warn_of_pictures(
     folder: "FolderInput", detections: Sequence[TargetDetection], target: Target, console: Console
 ) -> None:
     """Say which images have drawings on the target, and which show another target."""
-    from realsim_calibration.detect.blur import BLURRED
     from realsim_calibration.detect.drawings import COVERED, DRAWN
+    from realsim_calibration.detect.find import BLURRED
     from realsim_calibration.detect.visible import what_is_visible
     from realsim_calibration.inputs.image_files import load_image
 
@@ -172,8 +172,8 @@ def why_not_found(path: Path, name: str) -> str:
 
     It is too dark, drawn over or blurred, or it shows something else.
     """
-    from realsim_calibration.detect.blur import blur_reason
     from realsim_calibration.detect.drawings import drawing_reason
+    from realsim_calibration.detect.find import blur_reason
     from realsim_calibration.detect.images import gray_image
     from realsim_calibration.detect.visible import dark_reason, what_is_visible
     from realsim_calibration.inputs.image_files import load_image

@@ -5,8 +5,7 @@ from pathlib import Path
 import click
 
 from realsim.app.command import Group
-from realsim.app.config.files import HERE, ConfigFile, find_config
-from realsim.app.config.settings import settings_of
+from realsim.app.config.settings import HERE, ConfigFile, find_config, settings_of
 from realsim.errors import InputError
 
 FILE = "realsim.config_file"

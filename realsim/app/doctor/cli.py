@@ -10,7 +10,7 @@ from realsim.app.option_values import FOLDER
 from realsim.app.options import command, options
 
 if TYPE_CHECKING:
-    from realsim.app.doctor.finding import Finding
+    from realsim.app.doctor.machine import Finding
 
 
 @command(
@@ -40,7 +40,7 @@ def doctor_command(
 def _settings(ctx: click.Context) -> "list[Finding]":
     """Return what is to be said of the file of settings."""
     from realsim.app.config.applied import config_file
-    from realsim.app.doctor.finding import Finding
+    from realsim.app.doctor.machine import Finding
     from realsim.errors import InputError
 
     group, name = "Settings", "file of settings"

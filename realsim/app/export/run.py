@@ -15,9 +15,8 @@ from realsim.app.export import sources
 from realsim.app.export.card import CARD_FILE, DatasetCard, SceneFacts, card_bytes
 from realsim.app.export.croissant import CROISSANT_FILE, croissant_bytes
 from realsim.app.export.data_set_targets import DATA_SETS
-from realsim.app.export.grasp_targets import GRASPS
 from realsim.app.export.request import ExportRequest
-from realsim.app.export.scene_targets import SCENES
+from realsim.app.export.scene_targets import GRASPS, SCENES
 from realsim.app.export.target import TABLE, TRIED, RootJob, SceneJob, ScenePlace, Target
 from realsim.app.outputs import require_outside
 from realsim.app.stages import made_of, open_session

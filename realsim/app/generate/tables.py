@@ -9,8 +9,7 @@ import numpy as np
 
 from realsim.app.console import Console
 from realsim.app.generate.request import GenerateRequest
-from realsim.app.generate.run import GenerateOutcome
-from realsim.app.generate.scene import is_finished, load_layout, stored_costs
+from realsim.app.generate.run import GenerateOutcome, is_finished, load_layout, stored_costs
 from realsim.errors import InputError
 from realsim.store import provenance
 from realsim.untrusted.own_json import read_object

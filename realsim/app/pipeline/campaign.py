@@ -25,8 +25,7 @@ from typing import Any, cast
 import click
 
 from realsim.app.command import Group, settable, spelling, typed, walk
-from realsim.app.config.files import ConfigFile, read_config
-from realsim.app.config.settings import settings_of
+from realsim.app.config.settings import ConfigFile, read_config, settings_of
 from realsim.errors import InputError
 
 OF_A_SCENE = {

@@ -7,8 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from realsim.app.report.catalogue import CATALOGUE
-from realsim.app.report.figures import Figure, shown
+from realsim.app.report.figures import CATALOGUE, Figure, shown
 from realsim.app.report.sources import Source
 from realsim.arrays import Array
 from realsim.geometry import se3

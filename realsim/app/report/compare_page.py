@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from realsim.app.report import compare
-from realsim.app.report.catalogue import CATALOGUE
-from realsim.app.report.figures import figures_to_json
+from realsim.app.report.figures import CATALOGUE, figures_to_json
 from realsim.app.report.sources import Source
 from realsim.app.report.summary import SCHEMA_VERSION, VERDICTS
 from realsim.pages import Cell, Page, plots

@@ -144,7 +144,7 @@ def _start_poses(
         return {
             k: [(o.obj_id, o.instance, o.T_cam_obj) for o in f.objects] for k, f in frames.items()
         }
-    from realsim.formats.bop.keyframes import read_keyframe_poses
+    from realsim.formats.bop.scene import read_keyframe_poses
 
     rows: dict[int, list[tuple[int, int | None, Array]]] = {}
     for index in frames:

@@ -6,8 +6,8 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.formats.bags import camera_info as ci
 from realsim.formats.bags import realsense as rs
+from realsim.formats.bags import topics as ci
 from realsim.formats.bags.recording import Recording
 from realsim.formats.bags.tf_tree import TfTree
 from realsim.formats.bags.topics import CAMERA_INFO, BagChoice, ImageTopic, Topics

@@ -15,9 +15,9 @@ import numpy as np
 
 from realsim.arrays import Array
 from realsim.errors import InputError
-from realsim.formats.bags.camera_info import without_transport
 from realsim.formats.bags.recording import Recording
 from realsim.formats.bags.tf_tree import T_of_numbers
+from realsim.formats.bags.topics import without_transport
 from realsim.formats.bags.wire import Cursor
 from realsim.geometry import se3
 

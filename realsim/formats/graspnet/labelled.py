@@ -6,6 +6,8 @@
 
 Metres, OpenCV cameras. Object ids are GraspNet's numbers + 1, as in cls_indexes and in the label
 images, which show the visible pixels only.
+
+The images of a GraspNet camera folder: sizes read from headers, labels and depth checked.
 """
 
 from collections.abc import Mapping
@@ -14,10 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from realsim import images
 from realsim.arrays import Array, Mask, UInt16
 from realsim.errors import InputError
-from realsim.formats.graspnet import image_files
 from realsim.formats.graspnet.cameras import CameraFiles
 from realsim.formats.graspnet.image_objects import ImageObject, ImageObjects, read_image_objects
 from realsim.formats.graspnet.instances import Instances
@@ -25,7 +28,79 @@ from realsim.formats.graspnet.models import load_models
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.geometry import se3
-from realsim.records import ObjectModel
+from realsim.records import CameraIntrinsics, ObjectModel
+
+RGB, DEPTH, LABEL = "rgb", "depth", "label"
+MOST_PX = 50e6
+"""An image with more is not decoded."""
+
+
+def image_file(folder: Path, kind: str, index: int) -> Path:
+    """Return the file of an image: kind is rgb, depth or label."""
+    return folder / kind / f"{index:04d}.png"
+
+
+def numbers_in(folder: Path, suffix: str) -> set[int]:
+    """Return the numbers of the files of a folder that are named as the format names them."""
+    stems = [p.stem for p in folder.glob(f"*{suffix}")]
+    numbers = {s: int(s) for s in stems if s.isascii() and s.isdigit() and len(s) <= 9}
+    return {n for s, n in numbers.items() if s == f"{n:04d}"}
+
+
+def same_size(files: list[Path]) -> tuple[int, int]:
+    """Return (width, height) of images that belong together.
+
+    Raises:
+        InputError: one is damaged, enormous, or of another size.
+    """
+    sizes = [images.image_size(file) for file in files]
+    width, height = sizes[0]
+    if width * height > MOST_PX:
+        raise InputError(
+            f"{files[0]} claims {width}x{height} pixels; at most {MOST_PX / 1e6:g} million are."
+        )
+    for file, size in zip(files, sizes, strict=True):
+        if size != sizes[0]:
+            raise InputError(
+                f"{file} has {size[0]}x{size[1]} pixels and {files[0]} {width}x{height}; the "
+                "images of one view have one size. Restore the one that was resized."
+            )
+    return width, height
+
+
+def intrinsics_of(K: Array, size: tuple[int, int], where: str) -> CameraIntrinsics:
+    """Return the camera of an image.
+
+    Raises:
+        InputError: no camera matrix, or its principal point is not in the image.
+    """
+    try:
+        camera = CameraIntrinsics.from_K(K, *size)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+    if not (0 <= camera.cx < size[0] and 0 <= camera.cy < size[1]):
+        raise InputError(
+            f"{where} puts the principal point at ({camera.cx:.1f}, {camera.cy:.1f}), outside the "
+            f"image of {size[0]}x{size[1]} pixels. It belongs to images of another size."
+        )
+    return camera
+
+
+def read_label(path: Path) -> UInt16:
+    """Return a label image (H, W): object numbers + 1, 0 = none.
+
+    Raises:
+        InputError: damaged, or not one channel.
+    """
+    same_size([path])
+    label: NDArray[Any] = images.read_image(path)
+    if label.ndim != 2 or label.dtype.kind != "u":
+        raise InputError(
+            f"{path} has the shape {label.shape} and the type {label.dtype}; a label image is one "
+            "channel of object numbers + 1. Is it a coloured picture of the labels?"
+        )
+    return label.astype(np.uint16)
+
 
 FACTOR_DEPTH = 1000.0
 """Counts per metre where no meta file says it; graspnetAPI takes nothing else."""
@@ -108,16 +183,16 @@ class GraspnetLabelledScene:
         T_0_cam = None if self._Ts_0_cam is None else self._Ts_0_cam[index]
         T_world_cam = None if T_0_cam is None else self._T_world_0 @ T_0_cam
         K = self._matrix(found, index)
-        kinds = (image_files.RGB, image_files.DEPTH, image_files.LABEL)
+        kinds = (RGB, DEPTH, LABEL)
         files = [self._image(kind, index) for kind in kinds]
-        size = image_files.same_size([file for file in files if file is not None])
+        size = same_size([file for file in files if file is not None])
         instances = self._instances.of(
             [o.number for o in found.objects], stands_at(found.objects, T_0_cam)
         )
         factor = FACTOR_DEPTH if found.meta is None else found.meta.factor_depth
         return LabelledFrame(
             index=index,
-            intrinsics=image_files.intrinsics_of(K, size, f"the camera of image {index} of {self}"),
+            intrinsics=intrinsics_of(K, size, f"the camera of image {index} of {self}"),
             depth_unit_m=None if self.depth_file(index) is None else 1.0 / factor,
             objects=tuple(_labelled(o, i) for o, i in zip(found.objects, instances, strict=True)),
             T_world_cam=T_world_cam,
@@ -127,15 +202,15 @@ class GraspnetLabelledScene:
     def colour_file(self, index: int) -> Path:
         """Return the file of the colour image."""
         self._require(index)
-        return image_files.image_file(self.ref.folder, image_files.RGB, index)
+        return image_file(self.ref.folder, RGB, index)
 
     def depth_file(self, index: int) -> Path | None:
         """Return the file of the 16-bit depth image; None = there is none."""
-        return self._image(image_files.DEPTH, index)
+        return self._image(DEPTH, index)
 
     def label_file(self, index: int) -> Path | None:
         """Return the file of the label image; None = there is none."""
-        return self._image(image_files.LABEL, index)
+        return self._image(LABEL, index)
 
     def label(self, index: int) -> UInt16 | None:
         """Return the label image (H, W) of object ids, 0 = none; None = there is none.
@@ -147,7 +222,7 @@ class GraspnetLabelledScene:
         if path is None:
             return None
         if self._label is None or self._label[0] != index:
-            self._label = (index, image_files.read_label(path))
+            self._label = (index, read_label(path))
         return self._label[1]
 
     def mask(self, index: int, k: int, *, visible: bool) -> Mask | None:
@@ -211,7 +286,7 @@ class GraspnetLabelledScene:
 
     def _image(self, kind: str, index: int) -> Path | None:
         self._require(index)
-        path = image_files.image_file(self.ref.folder, kind, index)
+        path = image_file(self.ref.folder, kind, index)
         return path if path.is_file() else None
 
     def _matrix(self, found: ImageObjects, index: int) -> Array:

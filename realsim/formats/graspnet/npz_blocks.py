@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.store import atomic
+from realsim.untrusted.archives import opened_zip
 from realsim.untrusted.arrays import read_header
-from realsim.untrusted.zip_members import opened_zip
 
 _DAMAGE = (
     OSError, EOFError, ValueError, RuntimeError, KeyError, TypeError, IndexError, OverflowError,

@@ -7,7 +7,7 @@ import numpy as np
 from realsim import images
 from realsim.errors import InputError
 from realsim.formats.bop.evidence import sampled
-from realsim.formats.graspnet import evidence, image_files
+from realsim.formats.graspnet import evidence, labelled
 from realsim.formats.graspnet.annotations import ANNOTATIONS
 from realsim.formats.graspnet.cameras import FIRST, MATRIX, POSES, CameraFiles, read_camera_files
 from realsim.formats.graspnet.image_objects import ImageObjects, read_image_objects
@@ -71,9 +71,9 @@ def _indices(folder: Path, cameras: CameraFiles, notes: list[str]) -> tuple[int,
     Raises:
         InputError: none, or images without a camera pose.
     """
-    seen = image_files.numbers_in(folder / image_files.RGB, ".png")
-    annotated = image_files.numbers_in(folder / ANNOTATIONS, ".xml")
-    annotated |= image_files.numbers_in(folder / META, ".mat")
+    seen = labelled.numbers_in(folder / labelled.RGB, ".png")
+    annotated = labelled.numbers_in(folder / ANNOTATIONS, ".xml")
+    annotated |= labelled.numbers_in(folder / META, ".mat")
     indices = tuple(sorted(seen & annotated))
     if not indices:
         raise InputError(

@@ -11,7 +11,7 @@ from pathlib import Path
 from realsim import images
 from realsim.arrays import Array, Mask
 from realsim.errors import InputError
-from realsim.formats.graspnet import evidence, image_files
+from realsim.formats.graspnet import evidence, labelled
 from realsim.formats.graspnet.image_objects import joined_objects
 from realsim.formats.graspnet.instances import number_instances
 from realsim.formats.graspnet.labelled import ENTRY
@@ -115,8 +115,8 @@ def open_graspnet_frame(folder: Path | str, *, models: Path | str | None = None)
             f"{folder} has no {', '.join(missing)}; one image of GraspNet has {', '.join(needed)}."
         )
     meta = read_meta(folder / META_FILE)
-    size = image_files.same_size([folder / COLOUR_FILE, folder / DEPTH_FILE])
-    intrinsics = image_files.intrinsics_of(meta.K, size, str(folder / META_FILE))
+    size = labelled.same_size([folder / COLOUR_FILE, folder / DEPTH_FILE])
+    intrinsics = labelled.intrinsics_of(meta.K, size, str(folder / META_FILE))
     objects = joined_objects(None, meta, str(folder / META_FILE))
     unit_m = 1.0 / meta.factor_depth
     seen = evidence.SeenImage(

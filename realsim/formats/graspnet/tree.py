@@ -7,8 +7,7 @@ from pathlib import Path
 
 from realsim.errors import InputError
 from realsim.formats.graspnet.annotations import ANNOTATIONS
-from realsim.formats.graspnet.image_files import RGB
-from realsim.formats.graspnet.labelled import GraspnetSceneRef
+from realsim.formats.graspnet.labelled import RGB, GraspnetSceneRef
 from realsim.formats.graspnet.meta import META
 
 CAMERAS = ("realsense", "kinect")

@@ -19,11 +19,11 @@ from realsim.geometry.clouds import plane_frame
 from realsim.interop import T_from_pose3, pose3_from_T
 from realsim.records import CameraIntrinsics
 from realsim.registration.evidence import DepthFrame, EvidenceConfig, check_frames, measure_noise
-from realsim.registration.odometry.kiss import FitConfig
 from realsim.registration.odometry.pairs import (
     LEAST_POINTS,
     LEAST_SHARE,
     Edge,
+    FitConfig,
     PairConfig,
     PairMeter,
     ViewCloud,

@@ -16,13 +16,19 @@ from realsim.registration.compare import spread
 from realsim.registration.evidence import DepthFrame, DepthNoise
 from realsim.registration.find_table import region_of_interest
 from realsim.registration.near_start import perturbed_starts
-from realsim.registration.search.candidates import Candidate, Fused, Sought, candidates, fuse
+from realsim.registration.search.candidates import (
+    Candidate,
+    Fused,
+    Sought,
+    candidates,
+    fuse,
+    make_sameness,
+)
 from realsim.registration.search.height_grid import HeightGrid, height_grid
 from realsim.registration.search.matching import match_templates
 from realsim.registration.search.near_symmetry import NearSymmetryConfig, near_symmetries
 from realsim.registration.search.polish import LATTICE
 from realsim.registration.search.records import Region, Wanted
-from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import Canvas, ScoreConfig, make_canvas, without_far
 from realsim.registration.search.templates import ModelTemplates, TemplateConfig, model_templates
 from realsim.registration.views import ViewPoints, world_cloud

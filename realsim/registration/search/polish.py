@@ -22,10 +22,10 @@ from realsim.registration.search.candidates import (
     Candidate,
     Sought,
     candidate,
+    distinct,
     nearby,
     quick_fit,
 )
-from realsim.registration.search.sameness import distinct
 from realsim.registration.search.scoring import (
     Canvas,
     Render,

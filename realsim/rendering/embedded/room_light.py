@@ -14,8 +14,8 @@ from realsim.arrays import Array, Array32, Int32, Int64, Mask, UInt8, UInt16
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.records import Mesh
-from realsim.rendering.embedded.face_geometry import Edges, edges_of, plane_met
 from realsim.rendering.embedded.materials import Surface
+from realsim.rendering.embedded.surface_table import Edges, edges_of, plane_met
 from realsim.rendering.rays import PlacedMesh
 
 MOST_HALVINGS = 16

@@ -1,23 +1,181 @@
-"""Anything at random: a material of one kind or for one purpose, a sky outside, a room inside."""
+"""Anything at random: a material of one kind or for one purpose, a sky outside, a room inside.
+
+Wood cut from trunks: growth rings, pores and boards; and what imitates it or hides it.
+
+A board is a flat cut near the axis of a trunk, so its growth rings are hyperbola-like arches
+("cathedrals") in the middle and straight lines at the sides. The grain runs along u.
+"""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from realsim.arrays import Array32, Int64
 from realsim.errors import InputError
 from realsim.rendering.appearance import Environment, Material
-from realsim.rendering.procedural import fabrics, minerals, woods
+from realsim.rendering.procedural import fabrics, minerals
+from realsim.rendering.procedural.noise import (
+    Tint,
+    blurred,
+    fine,
+    finished,
+    fractal,
+    grid,
+    mixed,
+    random_tint,
+    shaded,
+    smooth,
+    step,
+)
 from realsim.rendering.procedural.rooms import room
 from realsim.rendering.procedural.skies import balanced, exposed, overcast_sky, sunny_sky
 
+WOOD_PX = 1024
+"""Side of wooden tiles [px]: 0.6 mm a texel, about a pixel of a view from a metre."""
+LAMINATE_PX = 512
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Timber:
+    """What tells one kind of wood from another."""
+
+    name: str
+    early: Tint
+    """sRGB of the light wood of spring."""
+    late: Tint
+    """sRGB of the dark line that ends the year."""
+    rings_per_m: float
+    """Growth rings across a board."""
+    contrast: float
+    """How much darker the late wood is [0, 1]."""
+    pores: float
+    """Share of the early wood that is open pores [0, 1]."""
+    pore_m: float
+    """Length of a pore along the grain [m]."""
+
+
+TIMBERS = {t.name: t for t in (
+    Timber(name="oak", early=(205, 167, 118), late=(148, 106, 64), rings_per_m=210,
+           contrast=0.62, pores=0.30, pore_m=0.016),
+    Timber(name="walnut", early=(126, 90, 62), late=(66, 43, 29), rings_per_m=150,
+           contrast=0.75, pores=0.18, pore_m=0.012),
+    Timber(name="birch", early=(231, 205, 165), late=(204, 168, 120), rings_per_m=130,
+           contrast=0.55, pores=0.05, pore_m=0.006),
+    Timber(name="pine", early=(232, 197, 138), late=(188, 124, 62), rings_per_m=170,
+           contrast=0.8, pores=0.0, pore_m=0.006),
+)}  # fmt: skip
+
+
+def boards(name: str) -> Callable[[np.random.Generator], Material]:
+    """Return the maker of boards of a timber, each from its own trunk, glued side by side."""
+    return lambda rng: _boards(rng, TIMBERS[name])
+
+
+def _boards(rng: np.random.Generator, timber: Timber) -> Material:
+    n = WOOD_PX
+    period_m = float(rng.uniform(0.45, 0.75))
+    count = int(rng.integers(3, 7))
+    u, v = grid(n)
+    board, across = _board_of(rng, v, count)
+    rings = _rings(rng, u, across, board, count, timber.rings_per_m * period_m)
+    year = rings - np.floor(rings)
+    # Spring wood darkens slowly; the year ends at once.
+    line = (year**2.2 * step(1.0 - year, 0.0, 0.12)).astype(np.float32)
+    fibre = smooth(rng, n, 7.0, 260.0)
+    tone = timber.contrast * line + 0.07 * fibre + 0.09 * smooth(rng, n, 2.0, 30.0)
+    color = mixed(timber.early, timber.late, (0.08 + tone).astype(np.float32))
+
+    pore = np.zeros((n, n), np.float32)
+    if timber.pores > 0:
+        streak = smooth(rng, n, 0.5 * period_m / timber.pore_m, 340.0)
+        # Ring-porous wood has its pores where the year begins.
+        needed = np.float32(2.6 - 2.2 * timber.pores) + 0.9 * np.minimum(year / 0.45, 1.0)
+        pore = step(streak - needed.astype(np.float32), 0.0, 0.8)
+        color = mixed(color, 0.62 * np.asarray(timber.late), 0.8 * pore)
+    tint = 1.0 + 0.075 * rng.standard_normal((count, 1)) + 0.02 * rng.standard_normal((count, 3))
+    color *= tint[board[:, 0]][:, None, :].astype(np.float32)
+    line_between = (board != np.roll(board, 1, 0)).astype(np.float32)
+    joint = np.maximum(line_between, 0.5 * np.roll(line_between, -1, 0))
+    color *= (1.0 - 0.55 * joint)[..., None]
+
+    roughness = float(rng.uniform(0.28, 0.6)) / 0.8
+    height = -6e-5 * pore - 1.2e-4 * joint - 1.5e-5 * line + 4e-6 * fibre
+    return finished(
+        timber.name, period_m, color, roughness,
+        gloss=0.80 + 0.05 * fibre + 0.2 * pore + 0.2 * joint,
+        height_m=blurred(height.astype(np.float32), 0.8),
+    )  # fmt: skip
+
+
+def _board_of(rng: np.random.Generator, v: Array32, count: int) -> tuple[Int64, Array32]:
+    """Return the board (n, 1) of every row and the place (n, 1) across it, -0.5 to 0.5."""
+    width = rng.uniform(0.8, 1.2, count)
+    edges = np.concatenate([[0.0], np.cumsum(width / width.sum())])
+    board = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, count - 1)
+    across = (v - edges[board]) / (edges[board + 1] - edges[board]) - 0.5
+    return board, across.astype(np.float32)
+
+
+def _rings(
+    rng: np.random.Generator, u: Array32, across: Array32, board: Int64, count: int, per_tile: float
+) -> Array32:
+    """Return the age (n, n) in years at every texel, by the distance to the trunk's axis."""
+    n = u.shape[1]
+    axis = rng.uniform(-0.9, 0.9, (count, 1))[board[:, 0]]
+    depth = np.zeros((n, n), np.float32)
+    for waves in (1, 2, 3):
+        # The trunk bends, so that the cut leaves and enters rings: closed under the tile's edge.
+        size = rng.normal(0.0, 0.30 / waves**1.4, (count, 1))[board[:, 0]]
+        phase = rng.uniform(0, 2 * np.pi, (count, 1))[board[:, 0]]
+        depth += (size * np.sin(2 * np.pi * waves * u + phase)).astype(np.float32)
+    wobble = 0.035 * smooth(rng, n, 3.0, 8.0) + 0.006 * smooth(rng, n, 14.0, 30.0)
+    lift = rng.uniform(0.25, 0.8, (count, 1))[board[:, 0]]
+    sideways = (across - axis).astype(np.float32) + wobble
+    radius = np.sqrt(sideways**2 + (depth + lift).astype(np.float32) ** 2)
+    start = rng.uniform(0, 50, (count, 1))[board[:, 0]]
+    return (radius * (per_tile / count) + start).astype(np.float32)
+
+
+LAMINATES: tuple[tuple[str, Tint], ...] = (
+    ("white", (236, 236, 232)), ("light grey", (200, 203, 205)), ("grey", (146, 150, 153)),
+    ("anthracite", (62, 65, 69)), ("black", (34, 34, 36)), ("beige", (216, 203, 180)),
+    ("blue grey", (126, 146, 164)), ("sage", (150, 166, 146)),
+)  # fmt: skip
+
+
+def laminate(rng: np.random.Generator) -> Material:
+    """Return a laminated board: one colour, hardly any pattern, the fine grain of the press."""
+    n = LAMINATE_PX
+    name, tint = LAMINATES[int(rng.integers(len(LAMINATES)))]
+    speckle = fine(rng, n, 60.0)
+    cloud = fractal(rng, n, 1.6)
+    color = shaded(rng, tint, 4.0) + (1.4 * speckle + 1.8 * cloud)[..., None]
+    height = 6e-6 * fine(rng, n, 130.0) + 6e-6 * smooth(rng, n, 40.0)
+    return finished(f"{name} laminate", 0.25, color, rng.uniform(0.22, 0.55), height_m=height)
+
+
+def painted_wood(rng: np.random.Generator) -> Material:
+    """Return wood under paint: the colour of the paint, the relief of the grain."""
+    n, period_m = LAMINATE_PX, float(rng.uniform(0.3, 0.5))
+    grain = smooth(rng, n, 4.0, 110.0)
+    stroke = smooth(rng, n, 3.0, 60.0)
+    tint = np.asarray(random_tint(rng, (0.1, 0.55), (0.45, 0.95)), np.float32)
+    color = tint + (1.2 * stroke - 3.5 * np.maximum(grain - 0.8, 0))[..., None]
+    height = -3.0e-5 * np.maximum(grain - 0.3, 0) + 1.0e-5 * stroke
+    return finished(
+        "painted wood", period_m, color, rng.uniform(0.3, 0.6),
+        gloss=0.9 + 0.05 * grain, height_m=height,
+    )  # fmt: skip
+
+
 MAKERS: dict[str, Callable[[np.random.Generator], Material]] = {
-    "oak": woods.boards("oak"),
-    "walnut": woods.boards("walnut"),
-    "birch": woods.boards("birch"),
-    "pine": woods.boards("pine"),
-    "laminate": woods.laminate,
-    "painted wood": woods.painted_wood,
+    "oak": boards("oak"),
+    "walnut": boards("walnut"),
+    "birch": boards("birch"),
+    "pine": boards("pine"),
+    "laminate": laminate,
+    "painted wood": painted_wood,
     "marble": minerals.marble,
     "granite": minerals.granite,
     "concrete": minerals.concrete,

@@ -11,7 +11,7 @@ from realsim.arrays import Array
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
-from realsim.scanning.sfm.alignment import align_to_robot
+from realsim.scanning.sfm.alignment import align_to_robot, tested_freely, tested_refined
 from realsim.scanning.sfm.bundle import Bundle, adjust, halves, prior_sigmas, reliability
 from realsim.scanning.sfm.config import SfmConfig
 from realsim.scanning.sfm.database import MatchDatabase
@@ -25,7 +25,6 @@ from realsim.scanning.sfm.mapping import (
 )
 from realsim.scanning.sfm.photographs import Photographs
 from realsim.scanning.sfm.result import Alignment, Poses, Progress
-from realsim.scanning.sfm.uncertainty import tested_freely, tested_refined
 
 MODEL = "model"
 """Folder of the COLMAP model, in metres where the scale is known."""

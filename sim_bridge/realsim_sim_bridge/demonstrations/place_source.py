@@ -20,8 +20,7 @@ from realsim.records.checked_arrays import rows_of
 from realsim.records.trajectories import PHASES
 from realsim.robots.compiled_chain import follow_lines
 from realsim_sim_bridge.arm.timing import trapezoid, trapezoid_share
-from realsim_sim_bridge.demonstrations.attempt_motion import AttemptMotion
-from realsim_sim_bridge.demonstrations.falling import fall
+from realsim_sim_bridge.demonstrations.attempt_motion import AttemptMotion, fall
 from realsim_sim_bridge.demonstrations.placing import PlaceGoal, Standing, goals_of, middle, unmet
 from realsim_sim_bridge.demonstrations.records import ALL_PHASES, GraspGoal
 from realsim_sim_bridge.demonstrations.source import (

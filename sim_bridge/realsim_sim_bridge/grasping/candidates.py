@@ -14,7 +14,7 @@ from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim.records.checked_arrays import rows_of
 from realsim.robots.hand import Hand, along_approach
-from realsim_sim_bridge.grasping.analytic_select import farthest_rows, grasp_features
+from realsim_sim_bridge.grasping.analytic import farthest_rows, grasp_features
 from realsim_sim_bridge.grasping.antipodal import (
     AntipodalPairs,
     CandidateConfig,

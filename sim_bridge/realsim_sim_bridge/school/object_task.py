@@ -19,9 +19,8 @@ from realsim.records import Mesh
 from realsim.records.trajectories import GraspTrajectories
 from realsim_sim_bridge.arm.reach import Reach, ReachTask, check_reach
 from realsim_sim_bridge.arm.reach_config import grasping_arm
-from realsim_sim_bridge.grasping.analytic import AnalyticConfig, analytic_labels
+from realsim_sim_bridge.grasping.analytic import AnalyticConfig, analytic_labels, select_rows
 from realsim_sim_bridge.grasping.analytic_given import given_candidates, standing_labels
-from realsim_sim_bridge.grasping.analytic_select import select_rows
 from realsim_sim_bridge.grasping.candidates import Candidates, sample_candidates
 from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
 from realsim_sim_bridge.grasping.surroundings import Surroundings, standing_object

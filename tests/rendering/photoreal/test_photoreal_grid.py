@@ -8,8 +8,8 @@ from plain_meshes import ball, box, square
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Environment, Material
-from realsim.rendering.developing import developed
 from realsim.rendering.labels import LabelRenderer
+from realsim.rendering.photo import developed
 from realsim.rendering.photoreal import PhotorealConfig, PhotorealRenderer
 from realsim.rendering.rays import PlacedMesh
 

@@ -17,7 +17,7 @@ from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.embedded.materials import PLAIN_COLORS
 from realsim.rendering.photoreal import PhotorealConfig, PhotorealRenderer, find_llvm, llvm_probe
-from realsim.rendering.photoreal.tracing import denoised
+from realsim.rendering.photoreal.renderer import denoised
 from realsim.rendering.rays import PlacedMesh
 
 CAMERA = CameraIntrinsics(width=32, height=32, fx=32.0, fy=32.0, cx=15.5, cy=15.5)

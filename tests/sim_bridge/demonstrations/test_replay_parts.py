@@ -9,7 +9,7 @@ import pytest
 from held_boxes import held_box
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
-from realsim_sim_bridge.demonstrations.falling import fall
+from realsim_sim_bridge.demonstrations.attempt_motion import fall
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of, tried_body
 from realsim_sim_bridge.demonstrations.slip_replay import RecordedEngine, replay_grasp
 from realsim_sim_bridge.school import run_school_results
