@@ -21,10 +21,6 @@ PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text
 OK = Outcome(ok=True, told="")
 
 
-def no_tick(done: int, total: int) -> None:
-    """Nothing is shown."""
-
-
 def outcomes(**changed: Outcome) -> Mapping[str, Outcome]:
     found = dict.fromkeys([*run.software_probes(), "import:pyrealsense2"], OK)
     return found | {name.replace("__", ":").replace("_so", ".so"): o for name, o in changed.items()}
@@ -40,11 +36,8 @@ def named(findings: list[Finding], name: str) -> Finding:
 def test_every_package_of_the_project_is_looked_at_and_no_other() -> None:
     wanted = {Requirement(line).name for line in PROJECT["dependencies"]}
     assert {p.name for p in REQUIRED} == wanted
-    extras = {
-        (extra, Requirement(line).name)
-        for extra, lines in PROJECT["optional-dependencies"].items()
-        for line in lines
-    }
+    optional = PROJECT["optional-dependencies"].items()
+    extras = {(extra, Requirement(line).name) for extra, lines in optional for line in lines}
     assert {(p.extra, p.name) for p in EXTRAS} == extras
 
 
@@ -69,9 +62,8 @@ def test_a_missing_library_is_a_problem_with_its_debian_package() -> None:
     missing = Outcome(ok=False, told="no such file")
     told = {**outcomes(), "library:libusb-1.0.so.0": missing, "import:pyrealsense2": missing}
     found = named(run.software_findings(told), "libusb-1.0.so.0")
-    assert (
-        found.kind == "problem" and "apt-get install" in found.todo and "libusb-1.0-0" in found.todo
-    )
+    assert found.kind == "problem"
+    assert "apt-get install" in found.todo and "libusb-1.0-0" in found.todo
 
 
 # --- isolation ----------------------------------------------------------------------------------
@@ -118,7 +110,7 @@ def test_a_crash_takes_only_its_own_probe_along() -> None:
 
 @pytest.mark.usefixtures("crashing")
 def test_what_hangs_is_ended() -> None:
-    found = isolated(["crash:slow", "import:json"], no_tick, timeout_s=3.0)
+    found = isolated(["crash:slow", "import:json"], lambda done, total: None, timeout_s=3.0)
     assert not found["crash:slow"].ok and "3 s" in found["crash:slow"].told
     assert found["import:json"].ok
 
@@ -127,14 +119,11 @@ def test_what_hangs_is_ended() -> None:
 
 
 def test_what_the_store_needs_works_here_and_nothing_is_left(tmp_path: Path) -> None:
-    found = machine.machine_findings(tmp_path, OK)
-    assert named(found, "locks and atomic writing").kind == "ok"
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_cannot_be_written_is_a_problem() -> None:
-    found = machine.machine_findings(Path("/proc"), OK)
-    bad = named(found, "locks and atomic writing")
+    good, bad = (
+        named(machine.machine_findings(folder, OK), "locks and atomic writing")
+        for folder in (tmp_path, Path("/proc"))
+    )
+    assert good.kind == "ok" and list(tmp_path.iterdir()) == []
     assert bad.kind == "problem" and "/proc" in bad.found and "local disk" in bad.todo
 
 

@@ -1,19 +1,16 @@
 """`realsim generate`: data sets that go on after an interruption and repeat to the byte."""
 
-import hashlib
 import json
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
-from click.testing import Result
 
 from bop_scenes import edit
-from typed_commands import finished, invoked, refused
+from file_trees import bytes_of
+from typed_commands import finished, invoked, refused, started
 
 SMALL = ("--views", "2", "--size", "160x90", "--objects", "2-3", "--seed", "5", "--workers", "1",
          "--depth", "disparity", "--quiet")  # fmt: skip
@@ -24,21 +21,15 @@ UNREPEATED = (
 """Files that name the time at which they were begun or how long it took, lists of checksums."""
 
 
-def _run(out: Path, *arguments: str) -> Result:
-    return invoked("generate", out, *arguments)
-
-
-def _refusal(out: Path, *arguments: str) -> str:
+def _refusal(out: Path, *arguments: object) -> str:
     return refused("generate", out, *SMALL, *arguments)
 
 
-def _content(folder: Path) -> dict[str, str]:
+def _content(folder: Path) -> dict[str, bytes]:
     return {
-        str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest()
-        for p in sorted(folder.rglob("*"))
-        if p.is_file()
-        and p.name not in UNREPEATED
-        and not p.name.endswith((".finished.json", ".run.json"))
+        name: data
+        for name, data in bytes_of(folder).items()
+        if Path(name).name not in UNREPEATED and not name.endswith((".finished.json", ".run.json"))
     }
 
 
@@ -74,36 +65,33 @@ def test_the_data_set_says_what_was_used(dataset: Path) -> None:
 def test_a_finished_scene_is_kept_and_a_view_that_is_missing_is_made_again(
     dataset: Path, tmp_path: Path
 ) -> None:
-    out = tmp_path / "copy"
-    shutil.copytree(dataset, out)
+    out = Path(shutil.copytree(dataset, tmp_path / "copy"))
+    words = ("generate", out, *SMALL, "--scenes", "1")
     before = _content(out)
-    assert "kept" in _run(out, *SMALL, "--scenes", "1").output
+    assert "kept" in finished(*words).output
     assert _content(out) == before
     # What a registration made of the labels is not told as what was generated.
     labels = out / "scene_000000/scene_gt_info.json"
     edit(labels, lambda rows: rows["0"][0].update(visib_fract=0.123))
     written = {n: (out / n).read_bytes() for n in ("dataset.json", "index.html")}
-    finished("generate", out, *SMALL, "--scenes", "1")
+    finished(*words)
     assert {n: (out / n).read_bytes() for n in written} == written
     shutil.copyfile(dataset / "scene_000000/scene_gt_info.json", labels)
     for name in ("rgb/000001.png", "annotations/000001.json"):
         (out / "scene_000000" / name).unlink()
-    assert "made" in finished("generate", out, *SMALL, "--scenes", "1").output
+    assert "made" in finished(*words).output
     # The list of views is only ever added to: the view that was taken again is there twice.
-    lines = "scene_000000/robot.jsonl"
-    assert {k: v for k, v in _content(out).items() if k != lines} == {
-        k: v for k, v in before.items() if k != lines
-    }
+    after, lines = _content(out), "scene_000000/robot.jsonl"
+    assert after | {lines: before[lines]} == before
 
 
 @pytest.mark.slow
 def test_a_run_that_is_killed_goes_on_to_the_bytes_that_seed_and_number_make(
     dataset: Path, tmp_path: Path
 ) -> None:
-    script = "from realsim.app.generate.cli import generate_command as g; g()"
     out = tmp_path / "killed"
     arguments = [*SMALL, "--scenes", "2"]
-    with subprocess.Popen([sys.executable, "-c", script, str(out), *arguments]) as process:
+    with started("generate", out, *arguments) as process:
         while not (out / "scene_000000/rgb/000000.png").is_file() and process.poll() is None:
             time.sleep(0.02)
         process.kill()
@@ -145,18 +133,19 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_folder_in_which_nothing_was_made_is_free_for_another_request(tmp_path: Path) -> None:
-    (tmp_path / "pool").mkdir()
-    (tmp_path / "pool/torn.obj").write_text("v 0 0\nf 1 2 3\n")
-    arguments = (*SMALL, "--scenes", "1", "--pool", str(tmp_path / "pool"))
-    result = _run(tmp_path / "out", *arguments)
+    pool, out = tmp_path / "pool", tmp_path / "out"
+    pool.mkdir()
+    (pool / "torn.obj").write_text("v 0 0\nf 1 2 3\n")
+    arguments = ("--scenes", "1", "--pool", pool)
+    result = invoked("generate", out, *SMALL, *arguments)
     assert result.exit_code == 1 and "no scene was made" in result.output
     assert "scene_000000 could not be made" in result.output and "torn.obj" in result.output
-    (tmp_path / "pool/torn.obj").write_text("v 0 0\nf 1 2 3\nf 1 2 4\n")  # mended, as they think
-    result = _run(tmp_path / "out", *arguments)
+    (pool / "torn.obj").write_text("v 0 0\nf 1 2 3\nf 1 2 4\n")  # mended, as they think
+    result = invoked("generate", out, *SMALL, *arguments)
     assert result.exit_code == 1, repr(result.exception)
-    (tmp_path / "out/layouts").mkdir()
-    (tmp_path / "out/layouts/scene_000000.json").write_text("{}")
-    assert "seed (5 there, 6 wanted)" in _refusal(tmp_path / "out", *arguments, "--seed", "6")
+    (out / "layouts").mkdir()
+    (out / "layouts/scene_000000.json").write_text("{}")
+    assert "seed (5 there, 6 wanted)" in _refusal(out, *arguments, "--seed", "6")
 
 
 @pytest.mark.parametrize(
@@ -171,7 +160,6 @@ def test_a_picture_that_is_no_panorama_is_named_before_anything_falls(
 ) -> None:
     (tmp_path / "skies").mkdir()
     (tmp_path / "skies" / name).write_bytes(content)
-    said = _refusal(tmp_path / "out", "--hdris", str(tmp_path / "skies"))
-    assert name in said
-    assert words in said
+    said = _refusal(tmp_path / "out", "--hdris", tmp_path / "skies")
+    assert name in said and words in said
     assert not (tmp_path / "out").exists()

@@ -24,17 +24,7 @@ from realsim.geometry.parts import part
 from realsim.records import Mesh, ObjectModel
 from realsim.robots.hand import find_hand
 from realsim.store import SessionStore, load_grasps, save_scene
-from school_sessions import (
-    GRASPS,
-    NAMES,
-    QUICK,
-    T_WORLD_TABLE,
-    finished,
-    refused,
-    registered,
-    run,
-    scene,
-)
+from school_sessions import GRASPS, NAMES, QUICK, T_WORLD_TABLE, finished, refused, run, scene
 
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[3] / "shared/data"))
 GRASPIT = DATA / "school/graspit_assets/scene.yaml"
@@ -95,12 +85,11 @@ def test_a_second_run_computes_nothing_and_other_parameters_are_refused(schooled
 
 
 @pytest.mark.slow
-def test_a_hand_on_an_arc_goes_from_the_scene_to_the_exports(tmp_path: Path) -> None:
+def test_a_hand_on_an_arc_goes_from_the_scene_to_the_exports(session: Path, tmp_path: Path) -> None:
     """The pads meet where the contacts are, the set keeps the hand, the exports speak of it."""
-    folder = registered(tmp_path / "s")
-    finished(folder, *QUICK, "--hand", "robotiq_2f85")
+    finished(session, *QUICK, "--hand", "robotiq_2f85")
     hand = find_hand("robotiq_2f85")
-    sets = stored_grasps(folder)[0].sets
+    sets = stored_grasps(session)[0].sets
     assert any(s.good.any() for s in sets)
     for s in sets:
         assert s.hand == (hand.name, hand.digest)
@@ -108,9 +97,9 @@ def test_a_hand_on_an_arc_goes_from_the_scene_to_the_exports(tmp_path: Path) -> 
         back = np.sum((s.Ts_obj_grasp - s.Ts_obj_pads)[:, :3, 3] * s.Ts_obj_grasp[:, :3, 2], axis=1)
         assert back == pytest.approx(-hand.z_pad(s.widths_m), abs=1e-12)
     for target in ("isaac", "graspgen", "hdf5", "parquet"):
-        finished("export", folder, "--to", target, "--out", tmp_path / target)
+        finished("export", session, "--to", target, "--out", tmp_path / target)
     acronym = ("--to", "acronym", "--out", tmp_path / "acronym")
-    assert "Panda's hand alone" in refused("export", folder, *acronym)
+    assert "Panda's hand alone" in refused("export", session, *acronym)
 
 
 @pytest.mark.slow
