@@ -11,6 +11,7 @@ from click.testing import Result
 from realsim import images
 from realsim.app.annotate.page import PAGE_FILE
 from realsim.app.annotate.run import SHEET_FILE
+from realsim.geometry import se3
 from realsim.store import SessionStore, load_scene, save_scene
 from realsim.store.lock import only_run_in
 from registered_sessions import models_of
@@ -30,10 +31,9 @@ def run(store: SessionStore, *options: str) -> Result:
 
 
 def test_it_tells_of_every_object_and_draws_the_frames(store: SessionStore) -> None:
-    result = run(store, "--maps", "all")
-    assert "4 views annotated (0 still held)" in result.output
-    for model in MODELS.values():
-        assert model.name in result.output
+    said = run(store, "--maps", "all").output
+    for words in ("4 views annotated (0 still held)", *(m.name for m in MODELS.values())):
+        assert words in said
     assert images.read_rgb(store.path(SHEET_FILE)).shape[0] > 100
     for name in ("instance", "depth", "coordinates", "normals"):
         assert len(list(store.path(f"labels/{name}").iterdir())) == 4
@@ -72,10 +72,8 @@ def page_of(store: SessionStore) -> str:
 
 def the_page_shows_photographs_maps_objects_and_the_registration(store: SessionStore) -> None:
     page = page_of(store)
-    titles = re.findall(r"<h2>(.*?)</h2>", page)
-    assert titles == [
-        "Photographs and labels", "Objects", "Maps", "Before and after registration"
-    ]  # fmt: skip
+    titles = ["Photographs and labels", "Objects", "Maps", "Before and after registration"]
+    assert re.findall(r"<h2>(.*?)</h2>", page) == titles
     layers = re.findall(r'data-layer="(.*?)"', page)
     assert set(layers) == {"photo", "instances", "exact depth", "object coordinates", "normals"}
     assert all(m.name in page for m in MODELS.values())
@@ -88,10 +86,9 @@ def captions_of(store: SessionStore) -> list[str]:
 
 def test_an_object_out_of_sight_is_named_under_the_picture(store: SessionStore) -> None:
     scene = load_scene(store)
-    away = scene.objects[0].T_world_obj.copy()
-    away[2, 3] += 5.0
-    gone = replace(scene.objects[0], T_world_obj=away)
-    save_scene(store, replace(scene, objects=(gone, scene.objects[1])))
+    first, second = scene.objects
+    gone = replace(first, T_world_obj=se3.from_translation([0, 0, 5.0]) @ first.T_world_obj)
+    save_scene(store, replace(scene, objects=(gone, second)))
     assert "nan" not in run(store).output  # agreement of what nobody saw
     name = MODELS[gone.obj_id].name
     assert all(f"(not visible: {name})" in c for c in captions_of(store)[:4])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from typed_commands import realsim
+from typed_commands import realsim, started
 
 MAIN = "from realsim.app.cli import main; main()"
 CLOSED = "<&- >&- 2>&-"
@@ -54,17 +54,12 @@ def test_a_reader_that_has_gone_is_no_failed_check(
     reading, writing = os.pipe()
     os.close(reading)
     errors = writing if also_errors else subprocess.PIPE
-    done = subprocess.run(
-        [sys.executable, "-c", MAIN, *typed],
-        stdout=writing,
-        stderr=errors,
-        timeout=120,
-        check=False,
-    )
+    process = started(*typed, stdout=writing, stderr=errors)
+    said = process.communicate(timeout=120)[1]
     os.close(writing)
     writes = also_errors or words != ["no"]
-    assert done.returncode == (128 + signal.SIGPIPE if writes else 2)
-    assert not done.stderr or b"Traceback" not in done.stderr
+    assert process.returncode == (128 + signal.SIGPIPE if writes else 2)
+    assert not said or "Traceback" not in said
 
 
 def test_pycolmap_leaves_the_answer_to_sigterm_alone() -> None:

@@ -5,12 +5,14 @@ import os
 import shutil
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from begun_sessions import add_drawn, begun
+from plain_meshes import square
 from realsim.app import stages
 from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
@@ -19,7 +21,7 @@ from realsim.errors import InputError, UnitError
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.parts import part
-from realsim.records import CameraIntrinsics, Mesh, ObjectPose
+from realsim.records import CameraIntrinsics, ObjectPose
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore, load_scene
 from realsim.store.arrays_on_disk import is_whole, write_arrays
@@ -35,9 +37,8 @@ def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session of four views of a box on a table, with its start."""
     model = part("box")
     T = se3.from_translation([0.0, 0.0, -model.mesh.bounds[0, 2]])
-    corners = np.array([[-0.4, -0.4, 0], [0.4, -0.4, 0], [0.4, 0.4, 0], [-0.4, 0.4, 0]])
-    table = Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]]))
-    renderer = LabelRenderer([PlacedMesh(0, model.mesh, T), PlacedMesh(-1, table, np.eye(4))])
+    table = PlacedMesh(-1, square(0.4), np.eye(4))
+    renderer = LabelRenderer([PlacedMesh(0, model.mesh, T), table])
     folder = tmp_path_factory.mktemp("damaged") / "s"
     store = begun(folder, CAMERA, {"gravity_up_world": [0, 0, 1]})
     eyes = [[0.35 * np.cos(1.5 * k), 0.35 * np.sin(1.5 * k), 0.35] for k in range(4)]
@@ -59,9 +60,9 @@ def registered(pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return folder
 
 
-def starts_of(store: SessionStore) -> list[ObjectPose]:
-    rows = store.read_json("registration/starts.json")["starts"]
-    return [ObjectPose(**row) for row in rows]
+def start_of(store: SessionStore) -> ObjectPose:
+    (row,) = store.read_json("registration/starts.json")["starts"]
+    return ObjectPose(**row)
 
 
 @pytest.mark.parametrize("spoil", ["zero depth", "cut list", "lost photograph"])
@@ -92,11 +93,10 @@ def test_a_damaged_note_is_no_note(registered: Path, tmp_path: Path) -> None:
 def test_an_object_out_of_every_view_is_not_placed_and_all_files_are_written(
     store: SessionStore,
 ) -> None:
-    (start,) = starts_of(store)
+    start = start_of(store)
     away = se3.from_translation([2.0, 0.0, 0.0]) @ start.T_world_obj
-    far = ObjectPose(obj_id=start.obj_id, instance=1, T_world_obj=away)
-    double = ObjectPose(obj_id=start.obj_id, instance=9, T_world_obj=start.T_world_obj)
-    stages.save_starts(store, [start, far, double], "test")
+    others = replace(start, instance=1, T_world_obj=away), replace(start, instance=9)
+    stages.save_starts(store, [start, *others], "test")
     scene = register_session(store, QUIET)
     assert [o.verdict for o in scene.objects] == ["accepted"]
     report = store.read_json("registration/report.json")
@@ -108,11 +108,10 @@ def test_an_object_out_of_every_view_is_not_placed_and_all_files_are_written(
 
 
 def test_starts_in_millimetres_are_found_out(store: SessionStore) -> None:
-    (start,) = starts_of(store)
+    start = start_of(store)
     T = start.T_world_obj.copy()
     T[:3, 3] = [300.0, 20.0, 52.0]
-    wrong = ObjectPose(obj_id=start.obj_id, instance=0, T_world_obj=T)
-    stages.save_starts(store, [wrong], "test")
+    stages.save_starts(store, [replace(start, T_world_obj=T)], "test")
     refused("millimetres", register_session, store, QUIET, error=UnitError)
 
 

@@ -26,10 +26,8 @@ QUIET = Console(quiet=True)
 @pytest.fixture(scope="module")
 def labelled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     store = table_session(tmp_path_factory.mktemp("labelled") / "s", views=3)
-    save_scene(
-        store,
-        Scene(name="s", objects=tuple(true_poses()), plane=SupportPlane(T_world_table=np.eye(4))),
-    )
+    plane = SupportPlane(T_world_table=np.eye(4))
+    save_scene(store, Scene(name="s", objects=tuple(true_poses()), plane=plane))
     annotate_session(store, QUIET, maps="instance")
     return store.folder
 
