@@ -231,6 +231,7 @@ def test_views_that_were_left_out_get_no_labels_and_are_named(store: SessionStor
 
 def test_labels_do_not_wait_for_a_view_that_was_taken_out_since(store: SessionStore) -> None:
     write_result(store, registered_by_hand(store), MODELS, {})
+    store.path("rgb/000003.png").unlink()  # it is linked: what is written to it is written to all
     store.path("rgb/000003.png").write_bytes(b"damaged")
     repair_session(store.folder)
     left = SessionStore.open(store.folder)
