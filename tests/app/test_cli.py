@@ -1,16 +1,26 @@
-"""The command line: quick to answer, and clear about what it cannot use."""
+"""The command line: quick to answer, and clear about what it cannot use.
+
+The laws of the command line: every option is explained, and the same thing is spelled alike.
+"""
 
 import contextlib
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import click
 import pytest
 
+from realsim.app.cli import commands
+from realsim.app.command import context_of, settable, spelling, variable, walk
+from realsim.app.front import COMMANDS, GROUPS, help_text
+from realsim.app.meanings import MEANINGS, OLD_NAMES
+from realsim.app.options import two_meanings
 from stored_sessions import flip, make_whole
 from typed_commands import complained, realsim, started
 
@@ -120,3 +130,134 @@ def test_unwritable_output_is_one_paragraph() -> None:
 def test_upgrade_names_a_folder_without_scenes(tmp_path: Path) -> None:
     assert "scene" in complained("upgrade", tmp_path, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+EVERY = walk(commands)
+OPTIONS = [(path, option) for path, command in EVERY.items() for option in settable(command)]
+WITHOUT_RESULT = {("completion",), ("config", "template")}
+"""These print a text that is their result; JSON of it would help nobody."""
+SHARED = {
+    "json": (click.types.BoolParamType, True), "quiet": (click.types.BoolParamType, True),
+    "overwrite": (click.types.BoolParamType, True), "restart": (click.types.BoolParamType, True),
+    "no-pictures": (click.types.BoolParamType, True), "workers": (click.IntRange, False),
+    "seed": (click.IntRange, False), "out": (click.Path, False), "json-file": (click.Path, False),
+    "port": (click.IntRange, False),
+}  # fmt: skip
+"""Option -> its type, and whether it is a flag, wherever it is."""
+OTHER_SPELLINGS = {
+    "output": "out", "out-dir": "out", "output-dir": "out", "outdir": "out", "jobs": "workers",
+    "processes": "workers", "n-workers": "workers", "random-seed": "seed", "force-overwrite":
+    "overwrite", "replace": "overwrite", "silent": "quiet", "color": "no-color", "verbose": "quiet",
+    "json-out": "json-file", "as-json": "json",
+}  # fmt: skip
+
+
+def named(path: tuple[str, ...], option: click.Option) -> str:
+    return f"{' '.join(path)} --{spelling(option)}"
+
+
+def test_every_option_is_explained_and_spelled_in_one_way() -> None:
+    for path, option in OPTIONS:
+        name, said = spelling(option), named(path, option)
+        assert option.help and len(option.help) <= 160, said
+        assert re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name), said
+        assert name not in OTHER_SPELLINGS, f"{said}: say --{OTHER_SPELLINGS.get(name)}"
+        if name in SHARED:
+            kind, is_flag = SHARED[name]
+            assert isinstance(option.type, kind), said
+            assert option.is_flag == is_flag, said
+
+
+def test_what_a_command_needs_is_asked_for(tmp_path: Path) -> None:
+    needy = [(path, c) for path, c in EVERY.items() if any(o.required for o in settable(c))]
+    assert {path[0] for path, _ in needy} >= {"upgrade", "export", "demonstrations", "capture"}
+    for path, c in needy:
+        given = [str(tmp_path) for p in c.params if isinstance(p, click.Argument) and p.required]
+        context = click.Context(c, info_name=" ".join(path))
+        with pytest.raises(click.MissingParameter):
+            c.parse_args(context, given)
+
+
+def test_every_command_that_works_has_json_and_quiet() -> None:
+    for path in EVERY.keys() - WITHOUT_RESULT:
+        assert {"json", "quiet"} <= {spelling(option) for option in settable(EVERY[path])}, path
+
+
+def test_the_shared_options_say_the_same_everywhere() -> None:
+    for name in ("json", "quiet"):
+        helps = {o.help for path, o in OPTIONS if spelling(o) == name}
+        assert len(helps) == 1, helps
+
+
+def test_each_variable_is_of_one_option() -> None:
+    names = [variable(path, option) for path, option in OPTIONS]
+    assert len(set(names)) == len(names)
+    assert "REALSIM_REGISTER_VIEWS" in names and "REALSIM_SCHOOL_RUN_FORCE" in names
+    for path, option in OPTIONS:
+        assert option.envvar == variable(path, option)
+
+
+def test_every_command_is_listed_with_a_whole_sentence() -> None:
+    ctx = click.Context(commands, info_name="realsim")
+    lines = commands.get_help(ctx).splitlines()
+    for title, group in GROUPS.items():
+        at = lines.index(f"{title}:")
+        assert [f"  {name:15} {does}." for name, does in group.items()] == lines[
+            at + 1 : at + 1 + len(group)
+        ]
+    for name in COMMANDS:
+        command = commands.get_command(ctx, name)
+        assert command is not None and command.name == name
+        assert not command.get_short_help_str(200).endswith("..."), name
+    assert help_text() == commands.get_help(ctx) + "\n"
+
+
+def test_no_option_has_two_meanings() -> None:
+    assert two_meanings(EVERY) == {}
+    other = click.Command("other", params=[click.Option(["--views"], help="Other views.")])
+    assert set(two_meanings({**EVERY, ("other",): other})) == {"views"}
+    taken = {spelling(o) for _, o in OPTIONS}
+    assert MEANINGS.keys() - taken == set(), "no command takes these"
+
+
+def test_rare_options_are_shown_by_help_all_alone() -> None:
+    short = realsim("import", "--help").stdout
+    every = realsim("import", "--help-all").stdout
+    shown = [o for path, o in OPTIONS if path == ("import",) and o.opts[0] in short]
+    assert len(shown) <= 12 and "--help-all" in short and "--ee-frame" not in short
+    assert all(o.opts[0] in every for path, o in OPTIONS if path == ("import",))
+    assert realsim("demo", "--help-all").stdout == realsim("demo", "--help").stdout
+
+
+def test_old_names_work_with_a_note(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path, names in OLD_NAMES.items():
+        command = EVERY[tuple(path.split())]
+        known = {spelling(o) for o in settable(command)}
+        assert set(names.values()) <= known and not known & names.keys(), path
+    command = EVERY["capture",]
+    ctx = command.make_context(
+        "capture", [str(tmp_path / "out"), "--plan=p", "--views=1-3", "--camera", "7"],
+        parent=context_of(commands, ()),
+    )  # fmt: skip
+    assert ctx.params["views"] == (1, 2, 3) and ctx.params["camera"] == "7"
+    said = capsys.readouterr().err
+    assert "--views is now called --only-views" in said and "--camera-serial" in said
+    monkeypatch.setenv("REALSIM_CAPTURE_CAMERA", "8")
+    monkeypatch.setenv("REALSIM_CAPTURE_CAMERA_SERIAL", "")
+    monkeypatch.delenv("REALSIM_CAPTURE_CAMERA_SERIAL")  # unset again at the end
+    ctx = command.make_context(
+        "capture", [str(tmp_path / "out"), "--plan=p"], parent=context_of(commands, ())
+    )
+    assert ctx.params["camera"] == "8"
+    (tmp_path / "s.toml").write_text('[render]\ncamera = "d435"\n')
+    done = realsim("--config", tmp_path / "s.toml", "config", "show", "render")
+    assert "camera is now called sensor" in done.stderr and "d435" in done.stdout
+
+
+def test_the_help_fits_a_terminal_of_80_columns() -> None:
+    for path, command in EVERY.items():
+        ctx = click.Context(command, info_name="realsim", terminal_width=80)
+        text = command.get_help(ctx).partition("Examples:")[0]
+        assert max(len(line) for line in text.splitlines()) <= 80, path

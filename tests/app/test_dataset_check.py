@@ -1,5 +1,9 @@
-"""`realsim check` of a data set: what agrees ends with 0, what was spoiled is named, with 1."""
+"""`realsim check` of a data set: what agrees ends with 0, what was spoiled is named, with 1.
 
+One damaged image among sound ones is found and named, whatever the median of all says.
+"""
+
+import hashlib
 import json
 import shutil
 from collections.abc import Callable
@@ -9,8 +13,11 @@ import cv2
 import numpy as np
 import pytest
 
-from bop_scenes import edit
-from realsim.app.check.dataset import checked_scenes
+from bop_scenes import edit, write_boxes
+from realsim.app.check.agreement import ObjectAgreement, SceneAgreement
+from realsim.app.check.checksums import check_checksums, checksum_list
+from realsim.app.check.dataset import MaskOverlap, Tally, agreement_of, checked_scenes
+from realsim.errors import InputError
 from typed_commands import complained, finished, invoked
 from upgradable_datasets import bop_dataset, graspnet_dataset
 
@@ -94,3 +101,160 @@ def test_a_graspnet_tree_agrees_up_to_its_four_decimals(tmp_path: Path) -> None:
 
 def test_a_data_set_is_not_repaired(pristine: Path) -> None:
     assert "only sessions are repaired" in complained("check", pristine, "--repair")
+
+
+IMAGES = (1, 5, 9, 13, 17, 21)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """A scene with visible masks only and no scene_gt_info.json."""
+    folder = write_boxes(tmp_path / "dataset", count=len(IMAGES))
+    for file in folder.glob("mask/*"):
+        file.unlink()
+    (folder / "mask").rmdir()
+    (folder / "scene_gt_info.json").unlink()
+    return folder
+
+
+def checked(scene: Path) -> SceneAgreement:
+    (found,) = checked_scenes(scene)
+    return found
+
+
+def faulty(found: SceneAgreement) -> dict[int, ObjectAgreement]:
+    return {o.obj_id: o for o in found.objects if o.faults}
+
+
+def test_sound_images_give_no_finding(scene: Path) -> None:
+    found = checked(scene)
+    assert found.agrees, (found.findings, faulty(found))
+    assert found.frames == len(IMAGES) and all(o.visible_iou is not None for o in found.objects)
+
+
+def test_an_object_that_one_image_sees_elsewhere_is_found(scene: Path) -> None:
+    def shift(rows: dict) -> None:
+        rows["9"][1]["cam_t_m2c"][2] += 12.0  # along the view: no mask tells
+
+    edit(scene / "scene_gt.json", shift)
+    found = faulty(checked(scene))
+    assert set(found) == {7}
+    told = "image 9: object 7 stands 12.0 mm from where the other 5 images see it"
+    assert told in " ".join(found[7].faults)
+
+
+def test_one_shifted_mask_is_found(scene: Path) -> None:
+    path = scene / "mask_visib/000013_000001.png"
+    cv2.imwrite(str(path), np.roll(cv2.imread(str(path), 0), 6, axis=1))
+    found = faulty(checked(scene))
+    assert set(found) == {7} and len(found[7].faults) >= 1
+    assert "mask_visib of image 13 has the IoU 0." in found[7].faults[0]
+
+
+def test_one_scaled_depth_image_is_found(scene: Path) -> None:
+    path = scene / "depth/000005.png"
+    cv2.imwrite(str(path), np.round(cv2.imread(str(path), -1) * 0.97).astype(np.uint16))
+    (told,) = checked(scene).findings
+    assert told.startswith("depth of image 5 is ") and "mm nearer than that of the others" in told
+    assert told.endswith("scale 0.970")
+
+
+def test_a_hand_in_front_is_no_damage(scene: Path) -> None:
+    """What has no model but is measured in front hides an object, as BOP's masks say."""
+    visible = scene / "mask_visib/000009_000001.png"
+    mask = cv2.imread(str(visible), 0)
+    columns = np.flatnonzero(mask.any(0))
+    hand = np.zeros(mask.shape, bool)
+    hand[:, columns[: len(columns) // 2]] = True
+    for file in scene.glob("mask_visib/000009_*.png"):
+        cv2.imwrite(str(file), np.where(hand, 0, cv2.imread(str(file), 0)))
+    depth = cv2.imread(str(scene / "depth/000009.png"), -1)
+    cv2.imwrite(str(scene / "depth/000009.png"), np.where(hand, depth // 2, depth))
+    assert faulty(checked(scene)) == {}
+    cv2.imwrite(str(scene / "depth/000009.png"), depth)
+    assert 7 in faulty(checked(scene)), "half a mask that nothing hides is damage"
+
+
+def test_table_json_and_exit_code_say_the_same(scene: Path) -> None:
+    edit(scene / "scene_gt.json", lambda rows: rows["9"][1]["cam_t_m2c"].__setitem__(0, 400.0))
+    result = invoked("check", scene, "--json")
+    told = json.loads(result.output)
+    assert result.exit_code == 1 and told["agrees"] is False and told["checksums"] is None
+    by_id = {o["obj_id"]: o["faults"] for o in told["scenes"][0]["objects"]}
+    # Also what the format's own check finds of an object stands with the object.
+    assert any(f.startswith("scene_gt.json, image 9, object 1 (id 7)") for f in by_id[7])
+    assert any("stands" in f for f in by_id[7])
+    lines = invoked("check", scene).output.splitlines()
+    table = [line for line in lines if "│" in line and " 7 " in line]
+    assert table and table[0].rstrip(" │").endswith("no")
+
+
+# --- laws of the comparison of images -------------------------------------------------------------
+
+
+def seen_at(points_mm: np.ndarray) -> Tally:
+    tally = Tally()
+    for k, p in enumerate(points_mm):
+        tally.note_places(k, [0], [1e-3 * np.asarray(p, float)])
+    return tally
+
+
+def strays(tally: Tally) -> tuple[str, ...]:
+    return agreement_of(8, "", tally).faults
+
+
+def test_images_that_all_differ_have_no_stray_among_them() -> None:
+    rng = np.random.default_rng(0)
+    spread = rng.normal(0, 8.0, (40, 3))
+    assert strays(seen_at(spread)) == ()
+    spread[7] += [150.0, 0, 0]
+    (told,) = strays(seen_at(spread))
+    assert told.startswith("image 7:")
+
+
+@pytest.mark.parametrize(("outline_px", "strays_told"), [(0.6, 0), (2.4, 1)])
+def test_a_half_hidden_thing_is_all_outline(outline_px: float, strays_told: int) -> None:
+    """The same IoU is a rounded pose of a sliver, or a wrong mask of something large."""
+    sound = [MaskOverlap(image=k, iou=0.98, outline_px=0.2) for k in range(6)]
+    tally = Tally(visible=[*sound, MaskOverlap(image=6, iou=0.8, outline_px=outline_px)])
+    assert len(strays(tally)) == strays_told
+
+
+# --- checksums ------------------------------------------------------------------------------------
+
+
+def summed(root: Path) -> Path:
+    """Write SHA256SUMS of a folder, as `realsim export` does."""
+    files = sorted(p for p in root.rglob("*") if p.is_file())
+    lines = [f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.relative_to(root)}" for p in files]
+    (root / "SHA256SUMS").write_text("\n".join(lines) + "\n")
+    return root
+
+
+def test_files_are_held_against_their_checksums(scene: Path) -> None:
+    root = summed(scene.parents[1])
+    for folder in (root, scene.parent, scene):
+        told = json.loads(invoked("check", folder, "--json").output)
+        assert told["agrees"] and told["checksums"]["listed"] > 0
+    colour = scene / "rgb/000009.png"
+    colour.write_bytes(colour.read_bytes() + b"\0")
+    (scene / "rgb/000013.png").unlink()
+    result = invoked("check", scene, "--json")
+    report = json.loads(result.output)["checksums"]
+    assert result.exit_code == 1
+    assert report["changed"] == ["test/000003/rgb/000009.png"]
+    assert report["missing"] == ["test/000003/rgb/000013.png"]
+    shown = " ".join(invoked("check", root).output.split())
+    assert "rgb/000009.png: other bytes" in shown and "rgb/000013.png: the file is" in shown
+    # What lies beside the given folder is not its matter.
+    finished("check", root / "models")
+
+
+@pytest.mark.parametrize("line", ["a" * 64 + "  ../secret", "no sum"])
+def test_a_list_that_is_none_or_leads_out_is_refused(tmp_path: Path, line: str) -> None:
+    (tmp_path / "file").write_text("x")
+    (summed(tmp_path) / "SHA256SUMS").open("a").write(line + "\n")
+    path = checksum_list(tmp_path)
+    assert path is not None
+    with pytest.raises(InputError, match="line 2 of"):
+        check_checksums(path, tmp_path)

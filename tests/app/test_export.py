@@ -1,4 +1,7 @@
-"""Laws of `realsim export` and of importing labels: what goes in comes out, nothing is mixed."""
+"""Laws of `realsim export` and of importing labels: what goes in comes out, nothing is mixed.
+
+A registered session as a scene for simulators: what their own programs read back.
+"""
 
 import hashlib
 import json
@@ -15,9 +18,11 @@ from realsim import images
 from realsim.formats.bop.labels import mask_of
 from realsim.formats.bop.models import load_models
 from realsim.formats.bop.opening import open_labelled_bop
+from realsim.formats.graspit.scene import read_graspit_scene
 from realsim.formats.graspnet.annotations import read_objects
 from realsim.geometry.metrics import mask_iou
 from realsim.store import SessionStore
+from school_sessions import registered, scene
 from typed_commands import finished, refused
 
 
@@ -340,3 +345,40 @@ def test_the_description_names_files_with_their_checksums_and_sets_that_find_the
     assert sums - found <= {"README.md", "croissant.json", "provenance.json"}
     (records,) = document["recordSet"]
     assert [f["name"] for f in records["field"]] == ["path", "image"]
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    return registered(tmp_path_factory.mktemp("scenes") / "scene_000007")
+
+
+def exported(session, target, out):
+    finished("export", session, "--to", target, "--out", out, "--quiet")
+    return out / "scene_000007"
+
+
+def test_mujoco_reads_the_poses(session, tmp_path):
+    import mujoco
+
+    folder = exported(session, "mjcf", tmp_path / "out")
+    model = mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    free = [b for b in range(model.nbody) if model.body_dofnum[b] == 6]
+    assert len(free) == len(scene().objects)
+    for body, o in zip(free, scene().objects, strict=True):
+        np.testing.assert_allclose(data.xpos[body], o.T_world_obj[:3, 3], atol=1e-9)
+        np.testing.assert_allclose(data.xmat[body].reshape(3, 3), o.T_world_obj[:3, :3], atol=1e-9)
+
+
+def test_the_authors_scene_is_read_back(session, tmp_path):
+    folder = exported(session, "graspit", tmp_path / "out")
+    back = read_graspit_scene(folder / "scene.yaml", order="wxyz")
+    assert len(back.scene.objects) == len(scene().objects)
+    for a, b in zip(back.scene.objects, scene().objects, strict=True):
+        np.testing.assert_allclose(a.T_world_obj, b.T_world_obj, atol=1e-9)
+
+
+def test_a_scene_without_views_is_no_data_set(session, tmp_path):
+    assert "no views" in refused("export", session, "--to", "bop", "--out", tmp_path / "o")
+    assert not (tmp_path / "o").exists()

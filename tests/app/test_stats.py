@@ -1,4 +1,7 @@
-"""Laws of the statistics: parts add up, order does not matter, figures are counted by hand."""
+"""Laws of the statistics: parts add up, order does not matter, figures are counted by hand.
+
+Two releases of a data set: what differs is told, and what is the same is not.
+"""
 
 import csv
 import json
@@ -6,16 +9,28 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from bop_scenes import edit
+from labelled_scenes import SceneInMemory, labelled_scene, written_bop, written_graspnet
+from realsim import images
 from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
 from realsim.app.stats.collect import session_facts
+from realsim.app.stats.compare import diff_scenes
 from realsim.app.stats.statistics import all_rows, same_content, statistics_of
+from realsim.formats.graspnet.grasp_labels import (
+    GraspLabels,
+    write_collision_labels,
+    write_grasp_labels,
+)
+from realsim.formats.grasps.scene_grasps import SceneGrasps
+from realsim.geometry import se3
 from realsim.store import load_scene, save_grasps, save_scene
 from synthetic_scenes import captured_session
-from tried_grasps import plain_grasps
+from tried_grasps import plain_grasps, tried_set
 from typed_commands import finished, refused
 
 QUIET = Console(quiet=True)
@@ -132,3 +147,233 @@ def test_what_is_no_session_is_refused(session, tmp_path):
     assert "given twice" in refused("stats", session, session)
     (tmp_path / "file").write_text("")
     assert "is a file" in refused("stats", session, "--out", tmp_path / "file")
+
+
+MOVE = se3.from_rt(se3.exp_so3([0.0, 0.0, np.radians(0.5)]), [0.002, 0.0, 0.0])
+
+
+class WithGrasps(SceneInMemory):
+    def grasps(self):
+        return self.tried
+
+
+def with_grasps(plain, tried):
+    """Return a scene of whose grasps one set is known."""
+    of = WithGrasps(folder=plain.folder, frames=plain.frames, masks=plain.masks)
+    of.tried = SceneGrasps(sets=(tried,))
+    return of
+
+
+def moved(frame):
+    first, *others = frame.objects
+    return (replace(first, T_cam_obj=first.T_cam_obj @ MOVE), *others)
+
+
+@pytest.fixture(scope="module")
+def releases(tmp_path_factory):
+    home = tmp_path_factory.mktemp("releases")
+    old = labelled_scene(home / "a", [0, 1, 2])
+    new = labelled_scene(home / "b", [0, 1, 2])
+    new.change_frames(objects=lambda f: moved(f) if f.index == 1 else f.objects)
+    del new.frames[2]
+    return written_bop(home / "old", old), written_bop(home / "new", new, ninth(home / "c"))
+
+
+def ninth(folder):
+    """Return a scene with another number."""
+    scene = labelled_scene(folder, [0])
+    scene.number, scene.name = 9, "train-000009"
+    return scene
+
+
+def compared(new, old, *options):
+    result = finished("stats", new, "--compare", old, "--json", *options)
+    return json.loads(result.stdout)["comparison"]
+
+
+def test_scenes_frames_objects_and_motions_are_told(releases):
+    old, new = releases
+    kept, added = compared(new, old)
+    assert (kept["scene"], kept["state"]) == ("000003", "kept")
+    assert (added["scene"], added["state"]) == ("000009", "added")
+    assert (kept["frames"], kept["frames_added"], kept["frames_lost"]) == (2, 0, 1)
+    (motion,) = kept["moved"]
+    assert motion["object"] == "tall"
+    assert motion["mm"] == pytest.approx(2.0, abs=1e-6)
+    assert motion["deg"] == pytest.approx(0.5, abs=1e-6)
+    assert [row["state"] for row in compared(old, new)] == ["kept", "lost"]
+
+
+def test_a_release_is_the_same_as_itself(releases):
+    for row in compared(releases[0], releases[0]):
+        assert row["frames"] == 3 and row["state"] == "kept"
+        assert not (row["moved"] or row["objects_added"] or row["objects_lost"])
+        assert not (row["frames_added"] or row["frames_lost"])
+        assert not (row["cameras_changed"] or row["images_changed"] or row["masks_changed"])
+
+
+def test_grasps_are_added_lost_and_changed(tmp_path):
+    plain = labelled_scene(tmp_path / "s", [0])
+    whole = tried_set(np.random.default_rng(3), 12, obj_id=7, instance=1, measures=())
+    whole = replace(whole, scores=np.full(12, 0.5))
+    scores = np.full(12, 0.5)
+    scores[3] = 0.8
+
+    def scene(rows, values):
+        s = replace(whole, scores=values)
+        arrays = "Ts_obj_grasp widths_m scores base_scores slip_m slip_rad reachable"
+        picked = {name: getattr(s, name)[rows] for name in arrays.split()}
+        return with_grasps(plain, replace(s, **picked, failures=tuple(s.failures[k] for k in rows)))
+
+    found = diff_scenes("s", scene(np.arange(10), whole.scores), scene(np.arange(2, 12), scores))
+    assert (found.grasps_lost, found.grasps_added) == (2, 2)
+    assert (found.grasps_changed, found.grasps_kept) == (1, 7)
+    assert not found.is_same
+
+
+# --- what is easily overlooked -----------------------------------------------------------------
+
+
+def changed_copy(releases, tmp_path, change):
+    """Return what --compare says of a copy of a release in which one thing was changed."""
+    copy = shutil.copytree(releases[0], tmp_path / "copy")
+    change(copy / "train/000003")
+    (row,) = compared(copy, releases[0])
+    return row
+
+
+def repaint(file):
+    image = images.read_image(file).copy()
+    image[7, 9] = 255 - image[7, 9]
+    file.write_bytes(images.png_bytes(image))
+
+
+def test_a_moved_camera_and_another_focal_length_are_told(releases, tmp_path):
+    def shift(rows):
+        rows["1"]["cam_t_w2c"][0] += 5.0
+        rows["2"]["cam_K"][0] += 1.0
+
+    row = changed_copy(releases, tmp_path, lambda f: edit(f / "scene_camera.json", shift))
+    assert row["cameras_changed"] == 2
+    assert row["images_changed"] == row["masks_changed"] == 0 and not row["moved"]
+
+
+def test_other_pixels_are_told_and_another_packing_is_not(releases, tmp_path):
+    def repaint_all(folder):
+        repaint(folder / "rgb/000000.png")
+        repaint(folder / "depth/000001.png")
+        repaint(folder / "mask_visib/000002_000001.png")
+        file = folder / "rgb/000002.png"
+        bgr = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        before = file.read_bytes()
+        cv2.imwrite(str(file), bgr, [cv2.IMWRITE_PNG_COMPRESSION, 0])
+        assert file.read_bytes() != before
+
+    row = changed_copy(releases, tmp_path, repaint_all)
+    assert (row["images_changed"], row["masks_changed"]) == (2, 1)
+
+
+def test_a_label_that_is_gone_from_one_frame_is_told(releases, tmp_path):
+    def drop(folder):
+        for name in ("scene_gt", "scene_gt_info"):
+            edit(folder / f"{name}.json", lambda rows: rows["1"].pop())
+        for kind in ("mask", "mask_visib"):
+            (folder / kind / "000001_000002.png").unlink()
+
+    row = changed_copy(releases, tmp_path, drop)
+    assert (row["labels_lost"], row["labels_added"]) == (1, 0)
+    assert not row["objects_lost"]
+    assert row["files_changed"] == ["scene_gt.json", "scene_gt_info.json"]
+
+
+def test_other_models_and_tables_are_told(releases, tmp_path):
+    copy = shutil.copytree(releases[0], tmp_path / "copy")
+    mesh = copy / "models/obj_000007.ply"
+    mesh.write_bytes(mesh.read_bytes()[:-1] + b"\1")
+    (copy / "camera.json").write_text("{}")
+    edit(copy / "models/models_info.json", lambda rows: rows["30"].update(diameter=1.0))
+    files = json.loads(finished("stats", copy, "--compare", releases[0], "--json").stdout)["files"]
+    assert files == ["camera.json", "models/flat.ply", "models/models_info.json"]
+
+
+def test_renumbered_models_are_the_same_objects(releases, tmp_path):
+    def renumber(folder):
+        new = {1: 4, 7: 2, 30: 9}
+
+        def ids(rows):
+            for row in (o for many in rows.values() for o in many):
+                row["obj_id"] = new[row["obj_id"]]
+
+        edit(folder / "scene_gt.json", ids)
+        models = folder.parents[1] / "models"
+        info = json.loads((models / "models_info.json").read_text())
+        info = {str(new[int(k)]): row for k, row in info.items()}
+        (models / "models_info.json").write_text(json.dumps(info))
+        for file in [models / f"obj_{k:06d}.ply" for k in new]:
+            file.rename(file.with_suffix(".was"))
+        for k, n in new.items():
+            (models / f"obj_{k:06d}.was").rename(models / f"obj_{n:06d}.ply")
+
+    row = changed_copy(releases, tmp_path, renumber)
+    assert not (row["objects_added"] or row["objects_lost"] or row["moved"])
+
+
+def test_another_instance_of_the_same_model_is_the_same_object(tmp_path):
+    plain = labelled_scene(tmp_path / "s", [0, 1])
+
+    def with_instances(*numbers):
+        def renamed(frame):
+            pairs = zip(frame.objects, numbers, strict=True)
+            return tuple(replace(o, instance=n) for o, n in pairs)
+
+        scene = SceneInMemory(folder=plain.folder, frames=dict(plain.frames), masks=plain.masks)
+        return scene.change_frames(objects=renamed)
+
+    found = diff_scenes("s", with_instances(0, 1, 2), with_instances(5, 1, 9))
+    assert found.is_same
+    fewer = with_instances(5, 1, 9).change_frames(objects=lambda f: f.objects[:2])
+    found = diff_scenes("s", with_instances(0, 1, 2), fewer)
+    assert found.objects_lost == [("30", 2)] and not found.objects_added and not found.moved
+
+
+@pytest.mark.parametrize(
+    ("name", "by"), [("widths_m", 0.01), ("scores", 0.3), ("base_scores", 0.25)]
+)
+def test_a_width_or_a_score_alone_is_a_change(tmp_path, name, by):
+    plain = labelled_scene(tmp_path / "s", [0])
+    before = tried_set(np.random.default_rng(3), 6, obj_id=7, instance=1, measures=("p_hold",))
+    before = replace(before, **{name: np.full(6, 0.02 if name == "widths_m" else 0.5)})
+    values = getattr(before, name).copy()
+    values[2] += by
+    after = replace(before, **{name: values})
+    found = diff_scenes("s", *(with_grasps(plain, s) for s in (before, after)))
+    assert (found.grasps_changed, found.grasps_kept) == (1, 5)
+
+
+def test_labels_of_graspnets_format_are_compared(tmp_path):
+    scene = labelled_scene(tmp_path / "s", [0])
+    for name in ("old", "new"):
+        written_graspnet(tmp_path / name, scene)
+    labels = GraspLabels(
+        points=np.array([[0.01, 0.0, 0.02], [0.0, 0.01, 0.02]]),
+        index=np.array([[0, 3, 1, 2], [0, 5, 0, 0], [1, 3, 1, 2]], np.int32),
+        angles_rad=np.zeros(3, np.float32), depths_m=np.full(3, 0.02, np.float32),
+        openings_m=np.full(3, 0.05, np.float32), friction=np.full(3, 0.4, np.float32),
+        collision=np.zeros(3, np.bool_),
+    )  # fmt: skip
+    write_grasp_labels(tmp_path / "old/grasp_label/006_labels.npz", labels)
+    other = replace(labels, depths_m=np.array([0.02, 0.03, 0.02], np.float32))
+    write_grasp_labels(tmp_path / "new/grasp_label/006_labels.npz", other.rows(np.arange(2)))
+    (row,) = compared(tmp_path / "new", tmp_path / "old")
+    assert (row["grasps_lost"], row["grasps_added"]) == (1, 0)
+    assert (row["grasps_changed"], row["grasps_kept"]) == (1, 1)
+    collisions = "collision_label/scene_0003/collision_labels.npz"
+    write_collision_labels(tmp_path / "new" / collisions, [(labels, np.zeros(3, np.bool_))])
+    (row,) = compared(tmp_path / "new", tmp_path / "old")
+    assert row["files_changed"] == [collisions]
+
+
+def test_two_data_sets_without_a_scene_in_common_are_told_so(releases, tmp_path):
+    written_bop(tmp_path / "other", ninth(tmp_path / "c"))
+    result = finished("stats", tmp_path / "other", "--compare", releases[0])
+    assert "no scene is in both: 000009 beside 000003" in result.output

@@ -1,8 +1,18 @@
-"""Laws of a folder that an export fills: whole or not at all, gone on with to the same bytes."""
+"""Laws of a folder that an export fills: whole or not at all, gone on with to the same bytes.
+
+Law of exports: the memory of a writer does not grow with what it has written.
+
+An export in a process of its own is looked at when few frames are written and when all are, and
+closed: what it needs more, a frame, is far less than what a frame is. So 100,000 frames fit in the
+memory that a few hundred need, and a frame that is kept, or its rows, or its masks, shows.
+"""
 
 import hashlib
 import json
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -96,3 +106,101 @@ def test_a_refusal_leaves_nothing_of_a_new_export_and_all_of_an_old_one(tmp_path
     ExportFolder.begin(tmp_path / "export", ASKED).write_piece("one", {"1": b"x"})
     ExportFolder.begin(tmp_path / "export", ASKED).abandon()
     assert ExportFolder.begin(tmp_path / "export", ASKED).has("one")
+
+
+FEW = 300
+MOST_KB = 4.0
+"""[kB] a frame: 100,000 frames grow by less than half of a gigabyte. Names of pieces, poses of
+cameras and what closing needs are 0.9 to 2.4; the rows of a frame as Python has them are 7, its two
+masks 20."""
+
+WORKER = """
+import json, sys
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from realsim import CameraIntrinsics
+from realsim import images
+from realsim.formats.bop.root_files import write_bop_root
+from realsim.formats.bop.writing import write_bop_scene
+from realsim.formats.export_folder import ExportFolder
+from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
+from realsim.geometry import se3
+
+CAMERA = CameraIntrinsics(width=128, height=80, fx=90.0, fy=90.0, cx=64.0, cy=40.0)
+
+
+class Long:
+    name, split, camera, number, notes = "train-000000", "train", "", 0, ()
+    T_world_table = np.eye(4)
+
+    def __init__(self, home, frames):
+        self.home, self.indices = home, tuple(range(frames))
+        (home / "colour.png").write_bytes(images.png_bytes(np.full((80, 128, 3), 90, np.uint8)))
+        (home / "depth.png").write_bytes(images.png_bytes(np.full((80, 128), 700, np.uint16)))
+
+    @lru_cache(maxsize=1)
+    def frame(self, index):
+        T_world_cam = se3.from_rt(se3.exp_so3([np.pi, 0, 1e-3 * np.sin(index)]), [0, 0, 0.7])
+        thing = LabelledObject(obj_id=1, instance=0, T_cam_obj=se3.invert(T_world_cam))
+        return LabelledFrame(index=index, intrinsics=CAMERA, depth_unit_m=1e-3,
+                             objects=(thing,), T_world_cam=T_world_cam)
+
+    def colour_file(self, index):
+        return self.home / "colour.png"
+
+    def depth_file(self, index):
+        return self.home / "depth.png"
+
+    def mask(self, index, k, *, visible):
+        mask = np.zeros((80, 128), bool)
+        mask[30:50, 50:78] = True
+        return mask
+
+    def models(self):
+        return {}
+
+    def grasps(self):
+        return None
+
+
+def memory_kb(key):
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(key + ":"))
+
+
+def write(home, name, frames, few=0):
+    peaks = []
+
+    def one_more():
+        peaks.append(memory_kb("VmHWM") if len(peaks) < few else 0)
+
+    export = ExportFolder.begin(home / name, {})
+    scene = Long(home, frames)
+    write_bop_scene(scene, export, progress=one_more)
+    write_bop_root(export, name="long")
+    export.finish({})
+    return max(peaks)
+
+
+frames, few, home = int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3])
+write(home, "first", 20)  # what is imported on the way, and buffers that stay
+Path("/proc/self/clear_refs").write_text("5")
+level = memory_kb("VmRSS")
+with_few = write(home, "long", frames, few)
+print(json.dumps([level, with_few, memory_kb("VmHWM")]))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peaks are read from /proc")
+@pytest.mark.slow
+def test_a_frame_more_needs_no_more_memory(tmp_path):
+    frames = 1000
+    command = [sys.executable, "-c", WORKER, str(frames), str(FEW), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    level, with_few, peak = json.loads(done.stdout.splitlines()[-1])
+    assert (peak - with_few) / (frames - FEW) < MOST_KB
+    assert peak - level < 60_000
