@@ -136,9 +136,7 @@ def main() -> None:
     given = parser.parse_args()
     if given.page:
         PAGE.write_text(page_of(load(MEASURED)))
-    elif given.keep:
-        if not given.results:
-            parser.error("--keep takes the runs to merge, behind the file that is written")
+    elif given.keep and given.results:
         merged = merge([d for path in given.results for d in load(path).values()])
         given.keep.write_text(json.dumps(merged, indent=1) + "\n")
     elif len(given.results) == 2:
@@ -148,7 +146,7 @@ def main() -> None:
         print(f"{len(rows)} moved by more than their noise, {worse} are worse or missing")
         sys.exit(1 if worse else 0)
     else:
-        parser.error("give BEFORE and AFTER, or --keep, or --page")
+        parser.error("give BEFORE and AFTER, or --keep FILE and the runs to merge, or --page")
 
 
 if __name__ == "__main__":

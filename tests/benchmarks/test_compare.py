@@ -58,7 +58,7 @@ def test_runs_kept_together_know_their_noise(tmp_path: Path) -> None:
     assert kept["figures"] == {"error_mm": 0.2} and kept["seeds"] == [0, 1, 2]
     assert kept["noise"]["error_mm"] == pytest.approx(0.3)
     none = [sys.executable, COMPARE, "--keep", tmp_path / "none"]
-    assert "takes the runs" in subprocess.run(none, capture_output=True, text=True).stderr
+    assert "the runs to merge" in subprocess.run(none, capture_output=True, text=True).stderr
 
 
 def test_the_page_of_what_was_measured_is_made_of_the_kept_runs(
