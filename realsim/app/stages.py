@@ -8,7 +8,7 @@ imports none of them.
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -98,6 +98,12 @@ def require_sound(store: SessionStore) -> list[str]:
             f"`realsim check {store.folder} --repair` takes damaged views out and keeps the rest."
         )
     return [f.path for f in found]
+
+
+def changed_fields(request: Any, plain: Any) -> dict[str, Any]:
+    """Return what a request says otherwise than one in which nothing is said, by its fields."""
+    said = {f.name: getattr(request, f.name) for f in fields(request)}
+    return {name: value for name, value in said.items() if value != getattr(plain, name)}
 
 
 def content_key(*parts: Any) -> str:

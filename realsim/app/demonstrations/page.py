@@ -2,18 +2,19 @@
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from realsim.app.export.card import DatasetCard, SceneFacts, card_bytes
+from realsim.app.export.card import DatasetCard, SceneFacts, card_bytes, options_told
 from realsim.arrays import Rgb
 from realsim.formats.export_folder import Content
 from realsim.formats.labelled_scene import WrittenScene
 from realsim.formats.lerobot import episodes as layout
 from realsim.formats.lerobot.spool import read_video
+from realsim.images import resized
 from realsim.pages import Page
 from realsim.pages.pictures import Picture
 
@@ -95,8 +96,8 @@ def _add_attempt(
         begin, end = (row[f"videos/{camera}/{at}_timestamp"] for at in ("from", "to"))
         middle = int(row["length"]) // 2
         seen = _pictures(folder / path, round(begin * fps), {*times, middle})
-        strips.append(np.concatenate([_scaled(seen[k], PICTURE_PX) for k in times], axis=1))
-        videos.append((f"{path}#t={begin:g},{end:g}", _scaled(seen[middle], POSTER_PX)))
+        strips.append(np.concatenate([resized(seen[k], PICTURE_PX) for k in times], axis=1))
+        videos.append((f"{path}#t={begin:g},{end:g}", resized(seen[middle], POSTER_PX)))
     if strips:
         page.picture(np.concatenate(strips), "steps")
     page.videos(videos)
@@ -114,14 +115,6 @@ def _pictures(path: Path, first: int, steps: Collection[int]) -> dict[int, Rgb]:
     return {k: np.asarray(rgb, np.uint8) for k, (_, rgb) in zip(sorted(steps), found, strict=False)}
 
 
-def _scaled(rgb: Rgb, width_px: int) -> Rgb:
-    """Return a picture of another width."""
-    import cv2
-
-    size = width_px, round(width_px * rgb.shape[0] / rgb.shape[1])
-    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
 # --- The card of a data set of demonstrations ----------------------------------------------------
 
 
@@ -134,8 +127,6 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 dataset = LeRobotDataset("local/demonstrations", root="FOLDER")
 step = dataset[0]  # observation.state, observation.images.front, action, task, ...
 """
-STATED = ("name", "licence", "models_licence", "attribution")
-"""Options that the card tells elsewhere."""
 
 
 def demonstrations_card(
@@ -165,12 +156,7 @@ def demonstrations_card(
         grasps_tried=written.counts["episodes"],
         grasps_good=successes,
     )
-    plain = type(request)()
-    options = [
-        (name.replace("_", "-"), str(value))
-        for name, value in asdict(request).items()
-        if value != getattr(plain, name) and name not in STATED
-    ]
+    options = options_told(request, type(request)())
     return card_bytes(
         DatasetCard(
             name=request.name or out.resolve().name,

@@ -7,13 +7,17 @@ it is. What nobody stated is written as "not stated", never left out.
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from realsim import __version__
 from realsim.app.console import shortened
+from realsim.app.stages import changed_fields
 from realsim.formats.labelled_scene import WrittenScene
 
 CARD_FILE = "README.md"
 NOT_STATED = "not stated: ask the source before publishing"
+STATED = ("name", "licence", "models_licence", "attribution")
+"""Options that the card tells elsewhere."""
 CHECKED = "checked:"
 """How notes begin that say what was held against what, and agreed."""
 LICENCE_IDS = (
@@ -79,6 +83,12 @@ class DatasetCard:
     attribution: str
     licence_files: Sequence[str] = ()
     """Licences that lay beside the sources and were copied along."""
+
+
+def options_told(request: Any, plain: Any) -> list[tuple[str, str]]:
+    """Return the options of a request that a card tells under 'Made with', with their values."""
+    said = changed_fields(request, plain).items()
+    return [(name.replace("_", "-"), str(value)) for name, value in said if name not in STATED]
 
 
 def card_bytes(card: DatasetCard) -> bytes:

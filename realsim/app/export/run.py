@@ -4,7 +4,7 @@ import itertools
 import re
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,14 @@ from typing import Any
 from realsim.app.annotate.current import refresh_labels
 from realsim.app.console import Console
 from realsim.app.export import sources
-from realsim.app.export.card import CARD_FILE, DatasetCard, SceneFacts, card_bytes
+from realsim.app.export.card import CARD_FILE, DatasetCard, SceneFacts, card_bytes, options_told
 from realsim.app.export.croissant import CROISSANT_FILE, croissant_bytes
 from realsim.app.export.data_set_targets import DATA_SETS
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.scene_targets import GRASPS, SCENES
 from realsim.app.export.target import TABLE, TRIED, RootJob, SceneJob, ScenePlace, Target
 from realsim.app.outputs import require_outside
-from realsim.app.stages import made_of, open_session
+from realsim.app.stages import changed_fields, made_of, open_session
 from realsim.errors import InputError
 from realsim.formats.bop.labelled import BopLabelledScene
 from realsim.formats.export_folder import CONTENT, STATE, ExportFolder
@@ -34,8 +34,6 @@ from realsim.store.lock import only_run_in
 
 ALWAYS = ("sources", "target", "scenes", "name", "licence", "models_licence", "attribution")
 """Options of every format."""
-STATED = ("name", "licence", "models_licence", "attribution")
-"""Options that the card tells elsewhere."""
 OPTION_NAMES = {"masks": "no-masks", "camera": "camera-name", "scenes": "only-scenes",
                 "points": "colmap-points", "name": "title"}  # fmt: skip
 TARGETS: dict[str, Target] = {**DATA_SETS, **SCENES, **GRASPS}
@@ -173,7 +171,7 @@ def target_of(request: ExportRequest) -> Target:
         raise InputError(f"there is no format '{request.target}'; there are {', '.join(TARGETS)}.")
     target = TARGETS[request.target]
     plain = ExportRequest(sources=request.sources, target=request.target)
-    given = [f.name for f in fields(request) if getattr(request, f.name) != getattr(plain, f.name)]
+    given = changed_fields(request, plain)
     wrong = [name for name in given if name not in (*ALWAYS, *target.options)]
     if wrong:
         options = ", ".join(map(option_name, wrong))
@@ -304,11 +302,6 @@ def _card(
     licences: dict[str, Path],
 ) -> DatasetCard:
     plain = ExportRequest(sources=request.sources, target="")
-    command = [
-        (f.name.replace("_", "-"), str(getattr(request, f.name)))
-        for f in fields(request)
-        if getattr(request, f.name) != getattr(plain, f.name) and f.name not in STATED
-    ]
     inside = facts[0].written.folder.relative_to(out)
     return DatasetCard(
         name=request.name or out.resolve().name,
@@ -317,7 +310,7 @@ def _card(
         scenes=[replace(f, written=_inside(f.written, out)) for f in facts],
         objects={i: m.name for i, m in models.items()} if target.kind in HOLD_OBJECTS else {},
         loading=_loading(target, out, inside),
-        command=command,
+        command=options_told(request, plain),
         sources=[s.resolve().name for s in request.sources],
         licence=request.licence,
         models_licence=request.models_licence,

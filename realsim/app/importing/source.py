@@ -2,13 +2,14 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from realsim.app.console import Console
 from realsim.app.importing.folder import ImportRequest, camera_of_file, open_image_folder
 from realsim.app.importing.session import ImportSummary, import_session
+from realsim.app.stages import changed_fields
 from realsim.errors import InputError
 from realsim.formats.folders.listing import ENDINGS, shown
 from realsim.formats.frame_source import FrameSource
@@ -218,13 +219,8 @@ def kind_of(request: ImportRequest, console: Console) -> str:
 
 def require_fitting(request: ImportRequest, kind: str) -> None:
     """Raise if an option was given that says nothing of this kind."""
-    defaults = ImportRequest(source=request.source)
-    given = [
-        f.name
-        for f in fields(request)
-        if f.name in ONLY_FOR and getattr(request, f.name) != getattr(defaults, f.name)
-    ]
-    wrong = [name for name in given if kind not in ONLY_FOR[name]]
+    given = changed_fields(request, ImportRequest(source=request.source))
+    wrong = [name for name in given if kind not in ONLY_FOR.get(name, (kind,))]
     if wrong:
         options = ", ".join(
             f"--{name.replace('_', '-')} (for {' and '.join(ONLY_FOR[name])})" for name in wrong
