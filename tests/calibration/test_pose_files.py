@@ -324,7 +324,7 @@ ROW = "0.5 -0.1 0.4 1.1 2.8 -0.1\n"
         ("a.xml", "<a/>", "not .xml"),
     ],
 )
-def test_malformed_files_are_refused_by_tmp_path(tmp_path, name, content, says):
+def test_malformed_files_are_refused_by_place(tmp_path, name, content, says):
     (tmp_path / name).write_text(content)
     refused(says, read_pose_file, tmp_path / name)
 
