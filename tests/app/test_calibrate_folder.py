@@ -153,6 +153,15 @@ def test_fewer_poses_than_images_are_named_with_what_to_do(lab):
     refused(r"10 images and 7 poses.*image's name beside each", read, lab)
 
 
+def test_degrees_under_names_of_radians_are_asked_for_by_their_unit(lab):
+    hands = pictures()[1]
+    twists = [[*T[:3, 3], *np.degrees(se3.log_so3(T[:3, :3]))] for T in hands]
+    rows = ["x_m,y_m,z_m,rx_rad,ry_rad,rz_rad", *(",".join(map(str, row)) for row in twists)]
+    (lab / "poses.json").unlink()
+    (lab / "poses.csv").write_text("\n".join(rows) + "\n")
+    refused("in the units that their names state.*--reading rotvec,deg,mm", read, lab)
+
+
 @pytest.mark.parametrize("what", ["corners", "axes"])
 def test_drawings_on_the_target_are_named(lab, what, capsys):
     import cv2

@@ -140,7 +140,7 @@ def test_the_worst_object_stands_first_and_is_judged(
         page.wait_for("2 of 2 objects judged")
         # Judged bad, it is the worst now.
         page.wait_until(
-            lambda: rows(page)[0].startswith("\u25b6 0 tall\n\u2713 rejected"), "another order"
+            lambda: rows(page)[0].startswith("\u25b6 0 tall\n\u2717 rejected"), "another order"
         )
         page.reload()
         page.wait_for("2 of 2 objects judged")

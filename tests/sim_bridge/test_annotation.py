@@ -157,6 +157,7 @@ def test_a_rejected_object_leaves_and_takes_its_masks_along(tmp_path: Path) -> N
     only = rejected(SCENE, 3)
     summary = annotate(store, only, MODELS, GRASPS)
     assert summary.left_out == (3,) and summary.grasps == 6
+    assert "instance 3 is rejected, so nothing hides behind it" in summary.notes[0]
     names = sorted(p.name for p in (store.folder / "mask").iterdir())
     assert names == [f"{i:06d}_000000.png" for i in CAMERAS]
     assert all(len(rows) == 1 for rows in store.read_json("scene_gt.json").values())

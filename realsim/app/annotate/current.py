@@ -163,7 +163,9 @@ def refresh_labels(store: SessionStore, console: Console) -> bool:
     console.say(f"the labels of {store.folder} are older than its scene ({why}): computed anew.")
     parts = sorted(store.path("annotations").glob("[0-9]*.json"))
     maps = json.loads(parts[0].read_text())["maps"] if parts else []
-    annotate_session(store, console, maps=",".join(maps) or "none")
+    summary = annotate_session(store, console, maps=",".join(maps) or "none")
+    if summary.left_out:
+        console.say(f"note: {summary.notes[0]}")
     return True
 
 

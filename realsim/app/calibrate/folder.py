@@ -264,9 +264,10 @@ def _proven(
             )
             return usual
         raise InputError(
-            f"how the poses are to be read is not clear from the file, and the images do not "
+            "how the poses are to be read is not clear from the file, and the images do not "
             f"decide: {proof.sentence} Do images and poses belong together, and are all images "
-            f"the right way up? If so, say how the poses are written: --reading {proof.best}."
+            "the right way up, and are angles and lengths in the units that their names state? If "
+            "so, say how the poses are written, such as --reading rotvec,deg,mm."
         )
     best = reading_from_text(proof.best)
     if proof.best_mode != request.mode:

@@ -209,7 +209,8 @@ def list_label(row: ObjectRow, scene: str, *, with_scene: bool) -> str:
         what.append(scene)
     moved = ["moved"] if row.is_changed else []
     if row.is_decided:
-        said = [f"\u2713 {row.verdict} by a person", *moved]
+        mark = "\u2717" if row.verdict == "rejected" else "\u2713"
+        said = [f"{mark} {row.verdict} by a person", *moved]
     else:
         said = [f"computed: {row.verdict}", *moved]
         if np.isfinite(row.agree):

@@ -107,11 +107,16 @@ def summary_of(
     """
     by_object = tuple(_object_summary(inputs, o, parts) for o in inputs.objects)
     empty = tuple(v for v, part in parts.items() if part["is_empty"])
+    left_out = tuple(o.instance for o in scene.objects if o.verdict == "rejected")
+    hides_nothing = (
+        f"instance {numbers(left_out)} is rejected, so nothing hides behind it: masks of what "
+        "stands there may be too large, unless the measured depth shows it.",
+    )
     return AnnotationSummary(
         views=len(parts),
         skipped=skipped,
         objects=tuple(o.instance for o in inputs.objects),
-        left_out=tuple(o.instance for o in scene.objects if o.verdict == "rejected"),
+        left_out=left_out,
         doubtful=tuple(o.instance for o in inputs.objects if o.verdict != "accepted"),
         views_left_out=tuple(v for v in all_views if v not in parts),
         agreement={o.instance: o.agreement for o in by_object},
@@ -119,7 +124,7 @@ def summary_of(
         by_object=by_object,
         empty_views=empty,
         flagged_views=tuple(v for v, part in parts.items() if _is_flagged(part)),
-        notes=_notes(inputs, parts, empty),
+        notes=(*(hides_nothing if left_out else ()), *_notes(inputs, parts, empty)),
     )
 
 
