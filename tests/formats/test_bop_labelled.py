@@ -191,9 +191,10 @@ def test_traps_are_found(tmp_path, name, change, error, says):
         ("camera", of_K([0.5] * 8 + [1]), "all of cam_K times about 2"),
     ],
 )
-def test_depth_finds_traps_where_there_are_no_masks(tmp_path, name, change, says):
+@pytest.mark.parametrize("with_masks", [True, False])
+def test_depth_finds_traps_with_and_without_masks(tmp_path, name, change, says, with_masks):
     folder = write_boxes(tmp_path, with_poses=False)
-    for left_out in ("mask", "mask_visib"):
+    for left_out in () if with_masks else ("mask", "mask_visib"):
         shutil.rmtree(folder / left_out)
     (folder / "scene_gt_info.json").unlink()
     assert any("checked: measured depth" in note for note in open_labelled_bop(tmp_path).notes)
@@ -249,10 +250,12 @@ def test_models_that_are_missing_are_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("scale", "said"), [(0.5, "not seen where cam_K"), (1 / 640, "of another image size")]
+    ("scale", "left_out", "said"),
+    [(0.5, "depth", "not seen where cam_K"), (1 / 640, "mask", "of another image size")],
 )
-def test_a_camera_of_another_image_size_is_named(tmp_path, scale, said):
+def test_a_camera_of_another_image_size_is_named(tmp_path, scale, left_out, said):
     folder = write_boxes(tmp_path)
+    shutil.rmtree(folder / left_out)
     shrunk = each("cam_K", lambda K: np.where(np.arange(9) < 6, scale * K, K))
     edit(folder / "scene_camera.json", shrunk)
     refused(said, open_labelled_bop, tmp_path)

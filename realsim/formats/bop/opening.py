@@ -8,7 +8,7 @@ import numpy as np
 
 from realsim import images
 from realsim.arrays import Array
-from realsim.errors import InputError, UnitError
+from realsim.errors import InputError
 from realsim.formats.bop import evidence
 from realsim.formats.bop.instances import stated_instances, tell_apart
 from realsim.formats.bop.labelled import BopLabelledScene, SceneContent, model_ids
@@ -300,46 +300,31 @@ def _check_depth(scene: BopLabelledScene, where: str) -> None:
         scene.notes_found.append("the images have no depth.")
         return
     ratios: list[float] = []
-    unit_m, has_masks = 0.0, False
-    sampled = evidence.sampled(deep, DEPTH_SAMPLES)
-    for i in sampled:
+    measured: list[LabelledDepth] = []
+    unit_m = 0.0
+    try:
+        models = scene.models()
+    except InputError:
+        models = {}  # a broken mesh is told where it is needed
+    for i in evidence.sampled(deep, DEPTH_SAMPLES):
         file, unit = scene.depth_file(i), scene.depth_unit_m(i)
         if file is None or unit is None:
             continue
         unit_m = unit
         depth_m = images.read_depth(file, unit)
-        for k, o in enumerate(scene.frame(i).objects):
-            mask = scene.mask(i, k, visible=True)
-            has_masks = has_masks or mask is not None
-            ratio = depth_ratio(depth_m, mask, scene.intrinsics(i), o.T_cam_obj)
-            ratios += [] if ratio is None else [ratio]
-    if not has_masks:
-        scene.notes_found += _surfaces(scene, sampled, where)
-    try:
-        said = evidence.require_depth_unit(ratios, unit_m, where)
-    except UnitError:
-        _surfaces(scene, sampled, where)  # inverted poses look like another unit of the depth
-        raise
-    scene.notes_found.append(said.removeprefix(f"{where}: "))
-
-
-def _surfaces(scene: BopLabelledScene, indices: Sequence[int], where: str) -> list[str]:
-    """Return notes on how depth fits the models' surfaces; a mesh that is broken is no reason."""
-    try:
-        models = scene.models()
-    except InputError:
-        return []
-    measured: list[LabelledDepth] = []
-    for i in indices:
-        file, unit = scene.depth_file(i), scene.depth_unit_m(i)
-        if file is None or unit is None:
-            continue
         frame = scene.frame(i)
         known = [(o.obj_id, o.T_cam_obj) for o in frame.objects if o.obj_id in models]
-        depth_m = images.read_depth(file, unit)
         measured.append(LabelledDepth(depth_m=depth_m, intrinsics=frame.intrinsics, objects=known))
-    said = require_surfaces(measured, models, where)
-    return [said] if said else []
+        for k, o in enumerate(frame.objects):
+            mask = scene.mask(i, k, visible=True)
+            ratio = depth_ratio(depth_m, mask, frame.intrinsics, o.T_cam_obj)
+            ratios += [] if ratio is None else [ratio]
+    # Poses first: inverted ones look like another unit of the depth.
+    notes = [
+        require_surfaces(measured, models, where),
+        evidence.require_depth_unit(ratios, unit_m, where).removeprefix(f"{where}: "),
+    ]
+    scene.notes_found += [note for note in notes if note]
 
 
 def _tell_apart(
