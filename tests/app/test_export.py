@@ -126,6 +126,13 @@ def test_labels_that_came_along_become_starts_and_are_never_overwritten(bop, tmp
     assert (tmp_path / "session/imported/scene_gt.json").read_bytes() == before
     bare = finished("import", bop, tmp_path / "bare", "--no-depth", "--quiet").output
     assert "refines" in first and "refines" not in bare and "register` needs" in bare
+    broken = shutil.copytree(bop, tmp_path / "broken")
+    next(broken.glob("*/*/mask/000014_000001.png")).write_bytes(b"")
+    said = refused("import", broken, tmp_path / "new", "--quiet")
+    assert "truncated" in said and "Nothing was kept" in said and not (tmp_path / "new").exists()
+    said = refused("import", broken, tmp_path / "session", "--overwrite", "--quiet")
+    assert "stays as it was" in said
+    assert (tmp_path / "session/imported/scene_gt.json").read_bytes() == before
 
 
 def test_the_sums_and_counts_on_the_card_are_those_of_the_folder(bop, tmp_path):

@@ -61,6 +61,10 @@ def test_another_source_is_refused_until_it_is_said(tmp_path):
     for other in others:
         refused(r"another source.*--overwrite", import_session, other, folder, QUIET)
         check_equal(folder, ten())
+    broken = Recording(ten(), content="b", stop=5)
+    kept = "cannot.*earlier import in .* stays as it was"
+    refused(kept, import_session, broken, folder, QUIET, overwrite=True)
+    check_equal(folder, ten())
     import_session(Recording(ten()[:4], content="b"), folder, QUIET, overwrite=True)
     check_equal(folder, ten()[:4])
     assert [p.name for p in tmp_path.iterdir()] == ["s"]

@@ -20,7 +20,6 @@ from realsim.formats.labelled_frames import LabelledFrames
 from realsim.formats.labelled_scene import LabelledScene
 from realsim.records import ObjectPose
 from realsim.store import SessionStore
-from realsim.store.lock import only_run_in
 
 if TYPE_CHECKING:
     from realsim.app.importing.source import ImportRequest
@@ -51,10 +50,9 @@ def labels_of(
     return (scene, source.indices) if has_any else None
 
 
-def import_labels(
-    scene: LabelledScene, indices: tuple[int, ...], folder: Path, console: Console, *,
-    can_register: bool,
-) -> None:  # fmt: skip
+def save_labels(
+    scene: LabelledScene, indices: tuple[int, ...], store: SessionStore, console: Console
+) -> bool:
     """Keep the labels and models of a data set in the session that its images were imported into.
 
     The labels lie in SESSION/imported, untouched by what realsim computes. Where the cameras'
@@ -63,30 +61,48 @@ def import_labels(
     Args:
         scene: the data set's scene.
         indices: numbers of its images, in the order of the session's views.
-        folder: the session.
+        store: the session.
         console: where progress goes.
-        can_register: whether there is depth to register by.
+
+    Returns:
+        False where the labels were there.
 
     Raises:
         InputError: a pose, a mask or a model cannot be used.
     """
+    models = scene.models()
+    if models and not (store.folder / "models" / INFO_FILE).is_file():
+        save_models(store.folder / "models", models)
+    if load_imported(store) is not None:
+        return False
+    _place_cameras(store, scene, indices, console)
+    starts = starts_of(scene, indices, {v.index: v.T_world_cam for v in store.session.views})
+    if starts:
+        save_starts(store, starts, f"labels of {scene.name}")
+    with console.stage("labels", scene.name) as tick:
+        save_imported(store, scene, dict(enumerate(indices)), tick)
+    return True
+
+
+def show_labels(
+    scene: LabelledScene, indices: tuple[int, ...], folder: Path, console: Console, *,
+    can_register: bool,
+) -> None:  # fmt: skip
+    """Say which labels a session has now, what they are worth, and what to do with them.
+
+    Args:
+        scene: the data set's scene.
+        indices: numbers of its images.
+        folder: the session.
+        console: where it is said.
+        can_register: whether there is depth to register by.
+    """
     ids = {o.obj_id for i in indices for o in scene.frame(i).objects}
-    with only_run_in(folder), SessionStore.open(folder) as store:
-        models = scene.models()
-        if models and not (folder / "models" / INFO_FILE).is_file():
-            save_models(folder / "models", models)
-        if load_imported(store) is not None:
-            return
-        _place_cameras(store, scene, indices, console)
-        starts = starts_of(scene, indices, {v.index: v.T_world_cam for v in store.session.views})
-        if starts:
-            save_starts(store, starts, f"labels of {scene.name}")
-        with console.stage("labels", scene.name) as tick:
-            save_imported(store, scene, dict(enumerate(indices)), tick)
     for note in scene.notes:
         if note.startswith("the labels"):  # what they are worth must not be missed
             console.warn(f"{scene.name}: {note}")
     poses = sum(len(scene.frame(i).objects) for i in indices)
+    models = scene.models()
     missing = sorted(ids - set(models))
     then = f" `realsim register {folder}` refines and judges them." if can_register else ""
     console.say(

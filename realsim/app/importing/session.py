@@ -8,6 +8,7 @@ import hashlib
 import json
 import shutil
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,7 +27,9 @@ from realsim.untrusted.own_json import to_json
 from realsim_capture_plans.capturing.contact_sheet import Thumbnails, cell_size, write_contact_sheet
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Generator, Iterator, Sequence
+
+    from realsim.formats.labelled_scene import LabelledScene
 
 KEY = "import"
 """Entry of the session's extra under which the source is described."""
@@ -75,7 +78,7 @@ class ImportSummary:
 
 def import_session(
     source: FrameSource, folder: Path, console: Console, *, overwrite: bool = False,
-    whole: bool = False,
+    whole: bool = False, labels: "tuple[LabelledScene, tuple[int, ...]] | None" = None,
 ) -> ImportSummary:  # fmt: skip
     """Write a frame source into a session and say what it holds.
 
@@ -83,46 +86,47 @@ def import_session(
         source: the recording or folder.
         folder: the session; made if needed. An import of the same source goes on.
         console: where progress, notes and the table go.
-        overwrite: replace a session that an earlier import made.
-        whole: whether a session that this call began is taken away where a frame is refused: a
-            source that is mended is another one, and would not go on with it.
+        overwrite: replace a session that an earlier import made, once the new one is whole.
+        whole: whether a session that this call began is taken away where a frame or a label is
+            refused: a source that is mended is another one, and would not go on with it.
+        labels: the data set's scene and the numbers of its images, in the order of the views.
 
     Raises:
         InputError: the folder holds something else, a frame cannot be read or has another size, or
-            time stamps do not increase. What was imported until then stays, but for `whole`.
+            time stamps do not increase. What was imported until then stays, but for `whole` and
+            `overwrite`.
         UnitError: poses are not in metres.
     """
+    from realsim.app.importing.labels import save_labels, show_labels
+
     started = time.perf_counter()
     if not len(source):
         raise InputError(f"{source.name} has no frames. {' '.join(source.notes)}")
     key = content_key(source)
     folder = Path(folder)
-    _make_room(folder, source, key, overwrite=overwrite)
-    folder.mkdir(parents=True, exist_ok=True)
-    console.warn(*source.notes)
-    with only_run_in(folder):
-        is_new = not (folder / SESSION_FILE).is_file()
-        store = _opened(folder, source, key)
-        done = len(store.completed)
-        if done:
-            console.say(f"{done} of {len(source)} frames are in {folder} already: going on.")
-        size = (source.intrinsics.width, source.intrinsics.height)
-        taken = Thumbnails(cell_size(len(source), size)[1:])
+    with _place_for(folder, source, key, overwrite=overwrite, whole=whole) as place:
+        console.warn(*source.notes)
+        store = _opened(place, source, key)
         try:
+            done = len(store.completed)
+            if done:
+                console.say(f"{done} of {len(source)} frames are in {folder} already: going on.")
+            size = (source.intrinsics.width, source.intrinsics.height)
+            taken = Thumbnails(cell_size(len(source), size)[1:])
             with console.stage("import", source.name) as tick:
                 empty = _write_frames(source, store, done, tick, taken)
             _warn_of_unit(store, console)
             sheet = folder / write_contact_sheet(store, len(source), source.name, taken)
-        except InputError:
-            if whole and is_new:
-                shutil.rmtree(folder, ignore_errors=True)
-            raise
+            are_new = labels is not None and save_labels(*labels, store, console)
+            summary = _summary(source, store, done, folder, sheet)
         finally:
             store.close()
-    summary = _summary(source, store, done, time.perf_counter() - started, sheet)
-    summary = replace(summary, with_depth=summary.with_depth - len(empty))
+    seconds = time.perf_counter() - started
+    summary = replace(summary, with_depth=summary.with_depth - len(empty), seconds=seconds)
     show_import(summary, console)
     _warn_of_depth(summary, empty, console)
+    if labels is not None and are_new:
+        show_labels(*labels, folder, console, can_register=summary.with_depth > 0)
     return summary
 
 
@@ -145,8 +149,48 @@ def content_key(source: FrameSource) -> str:
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
-def _make_room(folder: Path, source: FrameSource, key: str, *, overwrite: bool) -> None:
-    """Check that the folder may hold this import; take an earlier one away where that was said.
+@contextmanager
+def _place_for(
+    folder: Path, source: FrameSource, key: str, *, overwrite: bool, whole: bool
+) -> "Generator[Path]":
+    """Yield where to write: the session's folder, or one beside it that then takes its place.
+
+    Raises:
+        InputError: the folder may not hold this import, or the import was refused; says what stays.
+    """
+    aside = folder.with_name(f".{folder.name}.replaced")
+    if aside.is_dir() and not folder.exists():  # a kill came between the two renames
+        aside.rename(folder)
+    is_replaced = _is_replaced(folder, source, key, overwrite=overwrite)
+    folder.mkdir(parents=True, exist_ok=True)
+    place = folder.with_name(f".{folder.name}.new") if is_replaced else folder
+    is_new = not (place / SESSION_FILE).is_file()
+    with only_run_in(folder):
+        try:
+            if is_replaced:
+                shutil.rmtree(place, ignore_errors=True)
+                place.mkdir()
+            yield place
+            if is_replaced:
+                shutil.rmtree(aside, ignore_errors=True)
+                folder.rename(aside)
+                place.rename(folder)
+                shutil.rmtree(aside)
+        except InputError as error:
+            stays = f"The frames that are there stay in {folder}."
+            if is_replaced:
+                stays = f"The earlier import in {folder} stays as it was."
+            elif whole and is_new:
+                shutil.rmtree(folder, ignore_errors=True)
+                stays = f"Nothing was kept in {folder}."
+            raise type(error)(f"{error} {stays}") from error
+        finally:
+            if is_replaced:
+                shutil.rmtree(place, ignore_errors=True)
+
+
+def _is_replaced(folder: Path, source: FrameSource, key: str, *, overwrite: bool) -> bool:
+    """Check that the folder may hold this import; return whether an earlier one has to go.
 
     Raises:
         InputError: it is a file, holds other things, or another session.
@@ -155,7 +199,7 @@ def _make_room(folder: Path, source: FrameSource, key: str, *, overwrite: bool) 
         raise InputError(f"{folder} is a file; the folder of a session is expected.")
     finish_beginning(folder)
     if not folder.is_dir() or not any(p for p in folder.iterdir()):
-        return
+        return False
     if not (folder / SESSION_FILE).is_file():
         found = ", ".join(sorted(p.name for p in folder.iterdir())[:6])
         raise InputError(
@@ -173,7 +217,7 @@ def _make_room(folder: Path, source: FrameSource, key: str, *, overwrite: bool) 
     is_same = imported.get("key") == key
     is_whole = len(store.completed) == len(source)
     if is_same and not (overwrite and is_whole):
-        return
+        return False
     if not overwrite:
         raise InputError(
             f"{folder} holds the import of another source: '{store.session.name}' from "
@@ -181,12 +225,7 @@ def _make_room(folder: Path, source: FrameSource, key: str, *, overwrite: bool) 
             f"'{source.name}' has {len(source)} frames, or its files, camera or options have "
             "changed. Choose another folder, or replace that import with --overwrite."
         )
-    with only_run_in(folder):
-        # Renamed first: what a kill leaves is not half a session under the session's name.
-        aside = folder.with_name(f".{folder.name}.replaced")
-        shutil.rmtree(aside, ignore_errors=True)
-        folder.rename(aside)
-        shutil.rmtree(aside)
+    return True
 
 
 def _opened(folder: Path, source: FrameSource, key: str) -> SessionStore:
@@ -244,7 +283,7 @@ def _write_frames(
     if index != len(source):
         raise InputError(
             f"'{source.name}' announced {len(source)} frames and gave {index}: it is cut off or "
-            f"still being written. The {index} frames stay in {store.folder}."
+            "still being written."
         )
     return empty
 
@@ -324,17 +363,17 @@ def _warn_of_depth(summary: ImportSummary, empty: "Sequence[str]", console: Cons
 
 
 def _summary(
-    source: FrameSource, store: SessionStore, done: int, seconds: float, sheet: Path
+    source: FrameSource, store: SessionStore, done: int, folder: Path, sheet: Path
 ) -> ImportSummary:
     views = store.session.views
     times = [v.time_s for v in views]
     return ImportSummary(
-        folder=store.folder, frames=len(views), imported=len(views) - done,
+        folder=folder, frames=len(views), imported=len(views) - done,
         with_depth=sum(store.has_depth(v.index) for v in views),
         with_joints=sum(v.joints is not None for v in views),
         with_tool_pose=sum(v.T_base_ee is not None for v in views),
         with_camera_pose=len(store.session.Ts_world_cam),
-        time_span_s=max(times) - min(times), seconds=seconds, notes=tuple(source.notes),
+        time_span_s=max(times) - min(times), seconds=0.0, notes=tuple(source.notes),
         contact_sheet=sheet,
     )  # fmt: skip
 

@@ -76,7 +76,7 @@ def run_import(
         InputError: it is not known what it is, or it cannot be read or joined.
     """
     from realsim.app.importing.archive import unpacked
-    from realsim.app.importing.labels import import_labels, labels_of, require_models
+    from realsim.app.importing.labels import labels_of, require_models
     from realsim.formats.bags.source import BagSource
 
     if out.resolve() == request.source.resolve():
@@ -89,10 +89,7 @@ def run_import(
             require_models(*labels, request.models)
         # A recording that is cut off keeps what could be read; files are mended one by one.
         whole = not isinstance(source, BagSource)
-        summary = import_session(source, out, console, overwrite=overwrite, whole=whole)
-        if labels is not None:
-            import_labels(*labels, out, console, can_register=summary.with_depth > 0)
-    return summary
+        return import_session(source, out, console, overwrite=overwrite, whole=whole, labels=labels)
 
 
 def kinds_of(path: Path) -> dict[str, str]:
