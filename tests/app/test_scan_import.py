@@ -160,6 +160,11 @@ def test_nothing_is_replaced_unasked(imported, meshes: Path, tmp_path: Path):
     assert scan_import(meshes, library, *words)[0] == 0
     assert load_entries(library) == ["wedge"]
     assert (library / "obj_000001.ply").read_bytes() != before
+    for name, other in (("wedge", "a b"), ("box", "a_b")):
+        shutil.copy(meshes / f"{name}.ply", tmp_path / f"{other}.ply")
+    words = ("a b.ply", "a_b.ply", "--unit", "mm", "--overwrite")
+    code, _, err = scan_import(tmp_path, tmp_path / "m", *words)
+    assert code == 2 and "a_b.ply: not imported" in err and "a b.ply is. Import it by" in err
 
 
 def test_a_bop_folder_is_completed(tmp_path: Path):

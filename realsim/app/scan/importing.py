@@ -46,8 +46,14 @@ def run_scan_import(request: ImportRequest, console: Console) -> int:
     verdicts: list[str] = []
     rows: list[tuple[str, ...]] = []
     told: list[dict[str, object]] = []
+    named: dict[str, Path] = {}
     for path in request.meshes:
         try:
+            name = _name(path, request)
+            if (first := named.setdefault(name, path)) != path:
+                raise InputError(
+                    f"it would be called '{name}', as {first} is. Import it by itself, with --name."
+                )
             verdict, row, document = _import_one(path, request, console)
         except RealsimError as error:
             if len(request.meshes) == 1:

@@ -6,8 +6,9 @@ skipped and named, so that one broken file of ten thousand does not end a run.
 
 import hashlib
 import math
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, cast
 
@@ -41,6 +42,8 @@ class PoolSource:
     """Files below the folder, or object ids of a library, in a fixed order."""
     weight: float = 1.0
     """How often objects are drawn from here, against the other sources' weights."""
+    shared: frozenset[str] = frozenset()
+    """Names that several objects of the pool would have: each gets one of its own."""
 
     @property
     def digest(self) -> str:
@@ -88,7 +91,10 @@ def open_pool(texts: Sequence[str]) -> ObjectPool:
     """
     if not texts:
         raise InputError("no pool of objects is named; 'pybullet' or a folder of meshes is needed.")
-    return ObjectPool(sources=tuple(_source(text) for text in texts))
+    sources = [_source(text) for text in texts]
+    times = Counter(name for source in sources for name in _names(source))
+    shared = frozenset(name for name, n in times.items() if n > 1)
+    return ObjectPool(sources=tuple(replace(source, shared=shared) for source in sources))
 
 
 def _source(text: str) -> PoolSource:
@@ -229,7 +235,7 @@ def read_object(
     if parts is None:
         parts = _parts(mesh, config, cache)
     return PoolObject(
-        name=_name_of(source, key),
+        name=_told_apart(_name_of(source, key), source, key),
         mesh=mesh,
         parts=parts,
         symmetries=np.eye(4)[None],
@@ -283,7 +289,7 @@ def _from_library(source: PoolSource, obj_id: int, config: PoolConfig) -> PoolOb
     _check(mesh, f"object {obj_id} of {source.folder}", config)
     parts = found.parts if found.parts is not None else _parts(mesh, config, None)
     return PoolObject(
-        name=found.model.name,
+        name=_told_apart(found.model.name, source, str(obj_id)),
         mesh=mesh,
         parts=parts,
         symmetries=found.model.symmetries,
@@ -329,6 +335,24 @@ def _parts(mesh: Mesh, config: PoolConfig, cache: Path | None) -> ConvexParts:
         seconds=parts.seconds,
         notes=parts.notes,
     )
+
+
+def _names(source: PoolSource) -> list[str]:
+    """Return the names of a source's objects, by themselves."""
+    from realsim.models.library_files import model_file, read_info
+
+    if source.kind != "library":
+        return [_name_of(source, key) for key in source.keys]
+    infos = read_info(source.folder).items()
+    return [str(info.get("name", Path(model_file(i)).stem)) for i, info in infos]
+
+
+def _told_apart(name: str, source: PoolSource, key: str) -> str:
+    """Return the name, with a mark of the file where others of the pool would have it, too."""
+    if name not in source.shared:
+        return name
+    mark = hashlib.sha256(f"{source.label}/{key}".encode()).hexdigest()[:6]
+    return f"{name[-57:].lstrip('-.+')}-{mark}"
 
 
 def _name_of(source: PoolSource, key: str) -> str:

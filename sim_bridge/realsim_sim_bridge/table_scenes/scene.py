@@ -1,5 +1,6 @@
 """A laid-out scene with its looks, as the renderer takes it; and its models as a library."""
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -246,11 +247,13 @@ def build_scene(
 
 
 def _unique(names: list[str]) -> Iterator[str]:
-    """Yield the names with a number after those that come again."""
-    seen: dict[str, int] = {}
+    """Yield the names with a number after those that come again; no file's own name is taken."""
+    seen: set[str] = set()
     for name in names:
-        seen[name] = seen.get(name, 0) + 1
-        yield name if seen[name] == 1 else f"{name}-no{seen[name]}"
+        numbered = (f"{name}-no{k}" for k in itertools.count(2))
+        free = name if name not in seen else next(n for n in numbered if n not in {*seen, *names})
+        seen.add(free)
+        yield free
 
 
 def _provenance(layout: Layout, pool: ObjectPool) -> dict[str, Any]:

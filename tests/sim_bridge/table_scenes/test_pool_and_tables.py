@@ -1,5 +1,6 @@
 """Pools of objects: a fixed order, weights, what is broken is named."""
 
+import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -52,6 +53,18 @@ def test_meshes_are_found_in_folders_of_folders_and_drawn_by_weight(tmp_path: Pa
     rng = np.random.default_rng(0)
     drawn = Counter(pool.draw(rng)[0] for _ in range(4000))
     assert drawn[0] / 4000 == pytest.approx(0.75, abs=0.03)
+
+
+def test_files_whose_names_read_alike_have_names_of_their_own(tmp_path: Path) -> None:
+    cube = _folder(tmp_path, ("cube",)) / "cube.ply"
+    for name in ("a/büchse", "a/bächse", "a/a b", "a/a-b", "a/cube", "b/cube"):
+        copied = tmp_path / "pools" / f"{name}.ply"
+        copied.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(cube, copied)
+    first, second = (str(tmp_path / "pools" / name) for name in "ab")
+    pool = open_pool([first, second])
+    assert len({read_object(s, k, HULLS).name for s in pool.sources for k in s.keys}) == 6
+    assert read_object(open_pool([second]).sources[0], "cube.ply", HULLS).name == "cube"
 
 
 def test_convex_parts_are_kept_by_content_whatever_the_size(tmp_path: Path) -> None:

@@ -226,6 +226,14 @@ def test_the_same_seed_gives_the_same_looks_to_the_byte() -> None:
     assert set(a.materials) == {0, 1}
 
 
+def test_no_object_gets_the_name_of_another_file() -> None:
+    layout = _small_layout()
+    names = ("mug", "mug", "mug-no2")
+    called = tuple(replace(layout.objects[0], name=name) for name in names)
+    scene = build_scene(replace(layout, objects=called), open_pool(["pybullet"]), SCENE).synthetic
+    assert [m.name for m in scene.models.values()] == ["mug", "mug-no3", "mug-no2"]
+
+
 def test_the_users_own_pictures_cover_table_floor_and_objects(tmp_path: Path) -> None:
     for k, color in enumerate(((0, 0, 255), (0, 255, 0))):
         cv2.imwrite(str(tmp_path / f"paint{k}.png"), np.full((16, 16, 3), color, np.uint8))
