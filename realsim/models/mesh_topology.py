@@ -135,6 +135,11 @@ def topology(mesh: Mesh) -> Topology:
     return Topology(positions=positions, index=index, faces=faces, size=size, **edges)
 
 
+def open_edges(mesh: Mesh) -> int:
+    """Return how many edges have one face only; 0 = the surface is closed."""
+    return int(np.count_nonzero(topology(mesh).edge_uses == 1))
+
+
 def _edges(positions: Array, faces: Int32) -> dict[str, Any]:
     """Return proper faces, half edges and edges of faces (F, 3) over positions (P, 3)."""
     n = len(positions)

@@ -11,6 +11,7 @@ from realsim.app.console import Console
 from realsim.app.generate.request import GenerateRequest
 from realsim.app.generate.run import GenerateOutcome, is_finished, load_layout, stored_costs
 from realsim.errors import InputError
+from realsim.formats.folders.listing import shown
 from realsim.store import provenance
 from realsim.untrusted.own_json import read_object
 from realsim_sim_bridge.table_scenes.sample import Layout
@@ -53,7 +54,8 @@ def dataset_of(out: Path, request: GenerateRequest, layouts: list[Layout]) -> di
                 "side_m": layout.side_m,
                 "objects": [
                     {"instance": k, "obj_id": k + 1, "name": o.name, "pool": o.source,
-                     "key": o.key, "scale": o.scale, "size_m": o.size_m}
+                     "key": o.key, "scale": o.scale, "size_m": o.size_m,
+                     "open_edges": o.open_edges}
                     for k, o in enumerate(layout.objects)
                 ],
                 "drawn": layout.drawn,
@@ -213,9 +215,17 @@ def summary_of(dataset: dict[str, Any]) -> str:
 
 
 def notes_of(dataset: dict[str, Any], outcome: GenerateOutcome) -> list[str]:
-    """Return meshes that were skipped, what the renderer says, scenes that could not be made."""
+    """Return meshes that were skipped or are open, what the renderer says, scenes not made."""
     reasons = sorted({r for scene in dataset["scenes"] for r in scene["skipped"]})[:5]
     notes = [f"skipped: {reason}" for reason in reasons]
+    laid: list[dict[str, Any]] = [o for scene in dataset["scenes"] for o in scene["objects"]]
+    edges = {(o["pool"], o["key"]): n for o in laid if (n := o.get("open_edges"))}
+    if edges:
+        found = shown([f"{key} ({n} boundary edges)" for (_, key), n in sorted(edges.items())])
+        notes.append(
+            f"open meshes: {found}. Volume and mass of an open mesh are not known, physics closes "
+            "it. Is the file whole? `realsim scan import` says where it is open."
+        )
     notes += sorted({note for costs in outcome.made for note in costs.notes})
     return notes + [
         f"{scene_name(number)} could not be made: {why}" for number, why in outcome.failed.items()

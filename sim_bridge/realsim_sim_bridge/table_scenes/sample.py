@@ -14,6 +14,7 @@ from realsim.arrays import Array
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.models.library_records import KnownSolid
+from realsim.models.mesh_topology import open_edges
 from realsim.models.properties import physical_properties
 from realsim.records import ObjectModel
 from realsim_sim_bridge.slip.world import SlipBody
@@ -44,6 +45,8 @@ class LaidObject:
     """Its largest extent [m]."""
     T_table_obj: Array
     """(4, 4) [m]."""
+    open_edges: int = 0
+    """Edges with one face only: its surface is not closed, so that its volume is not known."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -310,6 +313,7 @@ def _layout(
             scale=objects.drawn[k].scale,
             size_m=float(np.max(objects.drawn[k].model.mesh.extent)),
             T_table_obj=se3.check_rigid(T, "a pose of PyBullet"),
+            open_edges=open_edges(objects.drawn[k].model.mesh),
         )
         for k, T in sorted(rest.Ts_table_obj.items())
     )  # fmt: skip

@@ -276,9 +276,11 @@ def write_models(folder: Path, built: BuiltScene) -> None:
     for obj_id, model in built.synthetic.models.items():
         solid = built.solids[obj_id]
         new = {files.collision_file(obj_id): collision_obj(solid.parts), **model_files(model)}
+        open_edges = int(laid[obj_id - 1]["open_edges"])
         properties = ModelProperties(
             name=model.name,
-            verdict="accepted",
+            verdict="doubtful" if open_edges else "accepted",
+            reasons=(f"open: {open_edges} boundary edges",) if open_edges else (),
             obj_id=obj_id,
             matter=solid.matter,
             convex=convex_note(solid.parts),

@@ -8,8 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from realsim.app.generate.run import GenerateOutcome
+from realsim.app.generate.tables import notes_of
 from realsim.geometry.mesh import mass_properties, save_ply
 from realsim.geometry.parts import part
+from realsim.models.library_files import properties_file, read_properties
 from realsim.models.library_session import known_solids
 from realsim.rendering.appearance import Material
 from realsim_sim_bridge.slip.world import SlipBody
@@ -124,6 +127,22 @@ def test_a_pool_of_one_object_gives_scenes_of_that_object(tmp_path: Path) -> Non
     assert [o.name for o in layout.objects] == ["box"] * 2
     assert len({o.scale for o in layout.objects}) == 2
     assert len({m.name for m in built.synthetic.models.values()}) == 2
+    assert {o.open_edges for o in layout.objects} == {0}
+
+
+def test_a_mesh_that_lacks_faces_is_told_as_open(tmp_path: Path) -> None:
+    box = part("box").mesh
+    save_ply(tmp_path / "cut.ply", replace(box, faces=box.faces[:-40]), "mm")
+    pool = open_pool([str(tmp_path)])
+    layout = sample_layout(0, 0, pool, HULLS)
+    edges = layout.objects[0].open_edges
+    write_models(tmp_path, build_scene(layout, pool, HULLS))
+    said = read_properties(tmp_path / properties_file(1))
+    assert edges > 0
+    assert said.verdict == "doubtful" and said.reasons == (f"open: {edges} boundary edges",)
+    laid = {"pool": 0, "key": "cut.ply", "open_edges": edges}
+    (note,) = notes_of({"scenes": [{"skipped": [], "objects": [laid]}]}, GenerateOutcome())
+    assert f"open meshes: cut.ply ({edges} boundary edges)" in note
 
 
 def test_broken_meshes_are_skipped_and_named_and_the_scene_is_made(tmp_path: Path) -> None:
