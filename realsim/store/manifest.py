@@ -203,6 +203,14 @@ class Manifest:
             else:
                 temporary.unlink(missing_ok=True)
 
+    def is_as_written(self, path: str) -> bool:
+        """Return whether a file that is there has the bytes that were listed, if any were."""
+        entry = self._entries.get(path)
+        if entry is None or fault_of(self._folder, entry) is None:
+            return True
+        now = Manifest(self._folder)._entries.get(path)  # another process may have written it since
+        return now is None or (now != entry and fault_of(self._folder, now) is None)
+
     def verify(self) -> list[Fault]:
         """Return every listed file that is missing or has other bytes than were written."""
         faults = (fault_of(self._folder, entry) for entry in self._entries.values())

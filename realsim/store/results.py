@@ -79,8 +79,20 @@ def save_scene(store: SessionStore, scene: Scene, name: str = SCENE_FILE) -> Non
 
 
 def load_scene(store: SessionStore, name: str = SCENE_FILE) -> Scene:
-    """Return the registered scene of the session."""
-    return read_own(store.path(name), Scene)
+    """Return the registered scene of the session.
+
+    Raises:
+        InputError: the file is damaged, or is not the one that was written.
+    """
+    scene = read_own(store.path(name), Scene)
+    if not store.is_as_written(name):
+        raise InputError(
+            f"{store.path(name)} was changed after it was written: its verdicts and sigmas may be "
+            f"those of other poses. Restore it, or `realsim check {store.folder} --repair` moves "
+            "it to damaged/ and the step that wrote it (`realsim register`) writes it again. "
+            "Objects are moved by hand in `realsim review`."
+        )
+    return scene
 
 
 # --- grasps -----------------------------------------------------------------------------------

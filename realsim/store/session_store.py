@@ -51,7 +51,6 @@ if TYPE_CHECKING:
 
 __all__ = ["ROBOT_FILE", "SESSION_FILE", "SessionStore", "depth_path", "rgb_path"]
 
-
 EAGER_VIEWS = 256
 """Up to so many views scene_camera.json is written anew with each."""
 LAZY_GROWTH = 1.1
@@ -427,6 +426,10 @@ class SessionStore:
     def read_image(self, relative: str) -> NDArray[Any]:
         """Return an image of the session as it was written: RGB, grey or 16 bit; masks as 0/255."""
         return images.read_image(self.path(relative))
+
+    def is_as_written(self, relative: str) -> bool:
+        """Return whether a file that is there has the bytes that were listed, if any were."""
+        return self._manifest.is_as_written(PurePosixPath(relative).as_posix())
 
     def verify(self) -> list[Fault]:
         """Return every listed file that is missing or does not have the bytes that were written."""

@@ -55,6 +55,7 @@ SCENES = {
     "a negative id": (first_object(obj_id=-1), "obj_id is -1"),
     "a negative instance": (first_object(instance=-2), "the instance of object .* is -2"),
     "an object far away": (moved(1e9), r"1e\+09 m from the origin"),
+    "a pose by hand": (moved(0.3), "changed after it was written.*`realsim review`"),
 }
 FAR = [[1, 0, 0, 1e9], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 HEADERS = {
