@@ -87,6 +87,17 @@ def test_every_decision_that_changes_labels_is_noticed(
         assert not refresh_labels(again, QUIET)
 
 
+def test_cameras_that_changed_a_little_at_a_time_make_labels_stale(session: SessionStore) -> None:
+    lens, cameras = session.session.intrinsics, session.session.Ts_world_cam
+    for _ in range(2):
+        cameras[1] = cameras[1] @ se3.from_translation([2e-4, 0, 0])
+        session.set_cameras(lens, cameras)
+        assert what_is_stale(session) == "view 1 was labelled with its camera elsewhere"
+    assert refresh_labels(session, QUIET) and not refresh_labels(session, QUIET)
+    session.set_cameras(replace(lens, fx=1.001 * lens.fx), cameras)
+    assert what_is_stale(session) == "view 0 was labelled with another lens"
+
+
 def test_an_export_carries_the_reviewed_poses_and_leaves_out_what_was_rejected(
     session: SessionStore, tmp_path: Path
 ) -> None:

@@ -12,6 +12,7 @@ from realsim.many import Workers
 from realsim.records import GraspSet, ObjectPose, Scene
 from realsim.store import SessionStore, provenance
 from realsim.store.cameras import open_cameras
+from realsim.untrusted.own_json import to_json
 
 if TYPE_CHECKING:
     from realsim_sim_bridge.annotation.annotate import AnnotationSummary
@@ -123,6 +124,22 @@ def what_is_stale(store: SessionStore) -> str:
     there = {int(p.stem) for p in store.path("annotations").glob("[0-9]*.json")}
     if there != views:
         return f"view {min(there ^ views)} is labelled and left out, or the other way round"
+    of_view = (_other_camera(s) for s in (store, *filter(_is_placed, open_cameras(store).values())))
+    return next(filter(None, of_view), "")
+
+
+def _other_camera(store: SessionStore) -> str:
+    """Return which view's labels were made with another camera than the session has; '' = none."""
+    lens = to_json(store.session.intrinsics)
+    for view in store.session.views:
+        path = f"annotations/{view.index:06d}.json"
+        if not store.has(path) or view.T_world_cam is None:
+            continue
+        label = store.read_json(path)
+        if label["camera"] != lens:
+            return f"view {view.index} was labelled with another lens"
+        if np.abs(np.array(label["T_world_cam"]) - view.T_world_cam).max() > SAME:
+            return f"view {view.index} was labelled with its camera elsewhere"
     return ""
 
 
