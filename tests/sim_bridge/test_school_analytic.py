@@ -104,6 +104,12 @@ def test_the_same_sets_give_the_same_bytes_and_an_object_stands_as_it_is_told_to
     assert png != school_sheet(s, {1: model()}, title="Tisch 1", Ts_up_obj={0: turned})
 
 
+def test_the_bars_of_the_label_hold_as_many_grasps_as_their_title_says():
+    figure = sheet_figure(some_sets(), {1: model()}, "t", {})
+    ax = next(ax for ax in figure.axes if "tried grasps" in ax.get_title("left"))
+    assert f"of {sum(bar.get_height() for bar in ax.patches):.0f} tried" in ax.get_title("left")
+
+
 @pytest.mark.parametrize("measures", [("margin",), tuple(MEASURES)])
 def test_no_two_words_overlap_and_all_are_on_the_sheet(measures):
     name = "a name that is far too long for any panel of a sheet, with a number 000123"

@@ -12,7 +12,6 @@ import numpy as np
 
 from realsim.arrays import Array, Int64
 from realsim.errors import InputError
-from realsim.formats.grasps.scene_grasps import labelled
 from realsim.models.model_picture_views import INK, MUTED, PAPER
 from realsim.pages.plots import png
 from realsim.records import GraspSet, ObjectModel
@@ -197,15 +196,10 @@ def _attrition(ax: Any, sets: Sequence[GraspSet]) -> None:
 
 
 def _label_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
-    """Draw how many grasps have which p_hold or score in ten bins, those of no trajectory in grey.
-
-    Those have a score, which is 0, but no label of their own.
-    """
+    """Draw how many of the tried grasps have which p_hold or score in ten bins."""
     counts, title, name = label_chart(sets)
-    nowhere = sum(int(np.sum(~labelled(s) & (s.scores == 0))) for s in sets)
-    ax.bar(0, nowhere, BAR, align="edge", bottom=counts[0], color=STOPS[1][1])
     colors = [score_hex(x) for x in np.linspace(0, 1, LABEL_BINS)]
-    _ten_bars(ax, counts, colors, title, name, int(counts[0] + nowhere))
+    _ten_bars(ax, counts, colors, title, name)
 
 
 def _margin_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
@@ -215,14 +209,12 @@ def _margin_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
     _ten_bars(ax, counts, BAR_COLOR, "Margins over friction and force", "margin")
 
 
-def _ten_bars(
-    ax: Any, counts: Int64, colors: str | list[str], title: str, name: str, top: int = 1
-) -> None:
-    """Draw counts of ten equal bins from 0 to 1; `top` is what is drawn there already."""
+def _ten_bars(ax: Any, counts: Int64, colors: str | list[str], title: str, name: str) -> None:
+    """Draw counts of ten equal bins from 0 to 1."""
     ax.bar(np.arange(LABEL_BINS) / LABEL_BINS, counts, BAR, align="edge", color=colors)
     ax.set_xlim(-0.02, 1.02)
     ax.set_xticks([0, 0.25, 0.5, 0.75, 1])
-    ax.set_ylim(0, 1.18 * max(1, top, int(counts.max())))
+    ax.set_ylim(0, 1.18 * max(1, int(counts.max())))
     ax.yaxis.get_major_locator().set_params(integer=True)
     _named(ax, title, name, "grasps")
 
