@@ -96,6 +96,11 @@ def folder(tmp_path_factory):
     return path
 
 
+def test_a_note_says_of_which_episodes_it_is(tmp_path):
+    source = Source(change={"notes": {"number": 0, "notes": ["it slips"]}})
+    assert write(tmp_path / "set", source).notes == ("episode 0, 1, 2, 3, 4: it slips",)
+
+
 def rows_of(folder, pattern):
     files = sorted(folder.glob(pattern))
     return [row for f in files for row in pq.read_table(f).to_pylist()]

@@ -41,7 +41,8 @@ from realsim.store import atomic
 
 GROUPS = "meta/groups"
 """Rows of the export's own: what is known of each group of episodes."""
-
+MOST_LISTED = 6
+"""Episodes that a note names; of more it says how many."""
 
 Take = Callable[[int, EncodedEpisode], None]
 
@@ -145,20 +146,29 @@ class _Writer:
         """Write what is said of all episodes."""
         _write_meta(self._folder, self._source, self._frames)
         rows = self._known.values()
-        notes = [note for row in rows for e in row["episodes"] for note in e.get("notes", ())]
+        told: dict[str, list[str]] = {}
+        for episode in (e for row in rows for e in row["episodes"]):
+            for note in episode.get("notes", ()):
+                told.setdefault(note, []).append(str(episode["episode_index"]))
         return WrittenScene(
             name=self._source.name,
             folder=self._folder.folder,
             frames=self._frames,
             frames_written=self._written,
             objects=self._frames,
-            notes=tuple(dict.fromkeys(notes)),
+            notes=tuple(f"episode {_listed(of)}: {note}" for note, of in told.items()),
             counts={
                 "episodes": len(self._source),
                 "tasks": len(self._source.tasks),
                 "videos": len(self._source.cameras) * len(self._known),
             },
         )
+
+
+def _listed(episodes: Sequence[str]) -> str:
+    """Return the first numbers of episodes, and how many more there are."""
+    rest = len(episodes) - MOST_LISTED
+    return ", ".join(episodes[:MOST_LISTED]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def _write_group(
