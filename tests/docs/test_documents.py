@@ -140,6 +140,11 @@ def test_every_guide_is_on_the_entry_page() -> None:
     assert guides and not [g.name for g in guides if f"how-to/{g.name}" not in entry]
 
 
+def test_every_guide_says_how_its_commands_are_typed() -> None:
+    guides = {g.name: read(g) for g in sorted((ROOT / "docs/how-to").glob("*.md"))}
+    assert not [n for n, text in guides.items() if typed_commands(text) and "`uv run`" not in text]
+
+
 def test_every_command_is_in_a_document() -> None:
     from realsim.app.cli import commands
 
