@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +12,11 @@ import click
 from realsim.app.cli import commands
 
 ROOT = Path(__file__).parents[2]
-DOCUMENTS = (
-    ROOT / "README.md",
-    *sorted(ROOT.glob("*/README.md")),
-    *sorted((ROOT / "docs").rglob("*.md")),
-)
+TRACKED = subprocess.run(
+    ["git", "ls-files", "README.md", "*/README.md", "docs/*.md"],
+    cwd=ROOT, check=True, capture_output=True, text=True,
+).stdout.splitlines()  # fmt: skip
+DOCUMENTS = tuple(ROOT / name for name in TRACKED)
 FENCE = re.compile(r"^(?P<mark>```+)(?P<info>[^\n`]*)\n(?P<text>.*?)^(?P=mark)\s*$", re.M | re.S)
 INDENTED = re.compile(r"(?:^(?: {4}|\t)\S[^\n]*\n(?:^(?: {4}|\t)[^\n]*\n|^\s*\n(?=^ {4}))*)", re.M)
 INLINE = re.compile(r"`([^`\n]+)`")
