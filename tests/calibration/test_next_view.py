@@ -68,7 +68,6 @@ def test_a_view_never_increases_the_covariance(report: HandEyeReport) -> None:
     assert all(v.rms_mm <= now * (1 + 1e-9) and v.gain >= -1e-9 for v in rows)
     assert all(v.sigma_mm <= report.sigma_mm * (1 + 1e-9) for v in rows)
     assert all(v.sigma_deg <= report.sigma_deg * (1 + 1e-9) for v in rows)
-    assert all(v.gain_nats >= -1e-9 for v in rows)
     steps = choose_next_views(report, plan_of(report, rng, 20), 8)
     assert len(steps) == 8 and np.all(np.diff([v.rms_mm for v in steps]) < 0)
     assert np.all(np.diff([v.sigma_mm for v in steps]) <= 1e-12)

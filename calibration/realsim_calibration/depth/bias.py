@@ -96,8 +96,6 @@ class DepthBiasReport:
     """1-sigma of that, board and lens included [m]."""
     scatter_per_m: float
     """tau: 1-sigma between views that poses and noise do not explain [1/m]."""
-    shift_px: Array
-    """(2,) depth pixel u shows what colour pixel u + shift shows [px]."""
     noise_exponent: float
     """p of sigma_z ~ z^p over the views; 2 for a stereo camera, NaN = one distance."""
     held_out_m: float
@@ -224,15 +222,13 @@ def _report(
     focal = config.focal_px or setup.depth.fx
     rows = tuple(_view_report(d, fit, list(used)) for d in measured)
     there = [r for r in rows if r.used]
-    shift = np.array([setup.depth.fx, setup.depth.fy])
     return DepthBiasReport(
         bias=bias, view_covariance=seen, board_covariance=board,
         disparity_px=bias.disparity_px(focal, config.baseline_m),
         disparity_sd_px=float(np.sqrt(bias.covariance[1, 1])) * focal * config.baseline_m,
         focal_px=focal, baseline_m=config.baseline_m, middle_m=middle,
         middle_bias_m=float(bias.bias_m(middle)), middle_sd_m=float(bias.sigma_m(middle)),
-        scatter_per_m=fit.scatter, shift_px=fit.theta[2:] * shift,
-        noise_exponent=_noise_exponent(there),
+        scatter_per_m=fit.scatter, noise_exponent=_noise_exponent(there),
         held_out_m=float(np.sqrt(np.mean([r.unseen_m**2 for r in there]))),
         uncorrected_m=float(np.sqrt(np.mean([r.bias_m**2 for r in there]))),
         views=rows, checks=(),

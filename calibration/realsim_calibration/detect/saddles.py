@@ -70,8 +70,6 @@ class Saddles:
     """(n, 2) [px]."""
     sd_px: Array
     """(n,) predicted 1-sigma of a coordinate [px]."""
-    blur_px: Array
-    """(n,) sigma of the blurred edges [px]."""
     faults: tuple[str, ...]
     """(n,) why a corner cannot be used, '' where it can."""
 
@@ -117,7 +115,7 @@ def refine_saddles(
     """
     start = np.asarray(start, dtype=np.float64).reshape(-1, 2)
     if not len(start):
-        return Saddles(uv=start, sd_px=np.zeros(0), blur_px=np.zeros(0), faults=())
+        return Saddles(uv=start, sd_px=np.zeros(0), faults=())
     image = gray.astype(np.float64)
     arms = np.asarray(arms, dtype=np.float64)
     length = np.linalg.norm(arms, axis=-1)
@@ -135,7 +133,7 @@ def refine_saddles(
     assert measured is not None
     square = np.linalg.norm(arms, axis=-1).min(-1)
     faults = tuple(_faults(measured, start, square, gray.shape))
-    return Saddles(uv=measured.uv, sd_px=measured.sd, blur_px=measured.blur, faults=faults)
+    return Saddles(uv=measured.uv, sd_px=measured.sd, faults=faults)
 
 
 def _measure(

@@ -84,8 +84,6 @@ class NextView:
     """Expected RMS displacement of a point at the working distance after this view [mm]."""
     gain: float
     """Share by which this view lowers `rms_mm`; 0 where it is not visible."""
-    gain_nats: float
-    """Information gained about X, half the logarithm of the ratio of determinants."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -361,8 +359,7 @@ class _Planned:
         none = np.zeros((1, SHARED, SHARED))
         covariances = state.covariances(np.concatenate([none, self.informations[where]]))
         rms = state.rms(covariances)
-        _, logdet = np.linalg.slogdet(covariances)
-        for k, C, after, volume in zip(where, covariances[1:], rms[1:], logdet[1:], strict=True):
+        for k, C, after in zip(where, covariances[1:], rms[1:], strict=True):
             g, reason, (mm, deg) = self.geometry[k], self.reasons[k], worst_sigmas(C)
             yield NextView(
                 plan_index=int(k), T_base_ee=self.Ts[k], visible=not reason, reason=reason,
@@ -370,5 +367,4 @@ class _Planned:
                 tilt_deg=g.tilt_deg, roll_deg=g.roll_deg,
                 sigma_mm=mm, sigma_deg=deg,
                 rms_mm=float(1e3 * after), gain=float(1 - after / rms[0]),
-                gain_nats=float(logdet[0] - volume) / 2,
             )  # fmt: skip

@@ -123,7 +123,6 @@ class SlipReplay:
     opening_m: float
     """Distance of the finger faces from which the test let them close [m]."""
     score: float
-    base_score: float
     failure: str
     """Where and why it stopped; '' = it passed all."""
     agrees: bool
@@ -183,7 +182,6 @@ def replay_grasp(
         stages=tuple(stages),
         opening_m=float(trial.grips(config.slip.headroom_m).openings_m[0]),
         score=float(score[0]),
-        base_score=float(base[0]),
         failure=slips.failures[0],
         agrees=bool(
             base[0] == grasps.base_scores[row]
