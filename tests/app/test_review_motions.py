@@ -19,19 +19,41 @@ from realsim_sim_bridge.demonstrations.school_settings import school_config_of
 from realsim_sim_bridge.demonstrations.source import DemonstrationSource
 from school_sessions import WEAK, refused, registered, run
 
+Stored = tuple[SceneGrasps, dict[int, ObjectModel]]
 CLOSE = PHASES.index("close")
 SAME = 1e-5
 """The school follows poses to 1e-6 m; files round."""
 
 
 @pytest.fixture(scope="module")
-def stored(weak_school: Path) -> tuple[SceneGrasps, dict[int, ObjectModel]]:
+def stored(weak_school: Path) -> Stored:
     return stored_grasps(weak_school)
 
 
+@pytest.fixture(scope="module", params=["tried again", "as stored"])
+def kind(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def motions(weak_school: Path) -> SessionMotions:
-    return SessionMotions.of_session(weak_school, with_arm=False)
+def school(kind: str, stored: Stored) -> Stored:
+    """A school, or one whose attempts cannot be tried again: its matter is another."""
+    grasps, models = stored
+    if kind == "tried again":
+        return stored
+    sets = tuple(
+        replace(s, parameters={k: v for k, v in s.parameters.items() if k != "density"})
+        for s in grasps.sets
+    )
+    heavier = {i: replace(m, density=2.0 * m.density) for i, m in models.items()}
+    return replace(grasps, sets=sets), heavier
+
+
+@pytest.fixture(scope="module")
+def motions(kind: str, school: Stored, weak_school: Path) -> SessionMotions:
+    if kind == "tried again":
+        return SessionMotions.of_session(weak_school, with_arm=False)
+    return SessionMotions(*school, with_arm=False)
 
 
 def attempts(grasps: SceneGrasps) -> list[tuple[int, int]]:
@@ -41,35 +63,24 @@ def attempts(grasps: SceneGrasps) -> list[tuple[int, int]]:
     return pairs[:3]
 
 
-def as_stored(
-    stored: tuple[SceneGrasps, dict[int, ObjectModel]], grasps: SceneGrasps | None = None
-) -> SessionMotions:
-    """Return motions of a school whose attempts cannot be tried again: its matter is another."""
-    models = {i: replace(m, density=2.0 * m.density) for i, m in stored[1].items()}
-    sets = tuple(
-        replace(s, parameters={k: v for k, v in s.parameters.items() if k != "density"})
-        for s in stored[0].sets
-    )
-    return SessionMotions(replace(grasps or stored[0], sets=sets), models, with_arm=False)
-
-
-@pytest.mark.parametrize("kind", ["tried again", "as stored"])
-def test_the_hand_closes_in_the_grasp_and_comes_from_home(
-    kind: str, motions: SessionMotions, stored: tuple[SceneGrasps, dict[int, ObjectModel]]
+def test_the_hand_comes_from_home_and_closes_in_the_grasp_and_the_object_goes_along_from_then(
+    kind: str, motions: SessionMotions, school: Stored
 ) -> None:
-    grasps, _ = stored
-    source = motions if kind == "tried again" else as_stored(stored)
+    grasps, _ = school
     sets = {s.instance: s for s in grasps.sets}
+    carried = 0
     for instance, row in attempts(grasps):
-        motion, s = source.motion(instance, row), sets[instance]
+        motion, s = motions.motion(instance, row), sets[instance]
         assert motion is not None
         assert any(FIXED_IN_HAND in n for n in motion.notes) is (kind == "as stored")
         assert np.all(np.diff(motion.time_s) > 0)
-        closing = motion.phase == CLOSE
-        T_world_grasp = grasps.Ts_world_obj[instance] @ s.Ts_obj_grasp[row]
-        np.testing.assert_allclose(
-            motion.Ts_world_hand[closing], np.tile(T_world_grasp, (closing.sum(), 1, 1)), atol=SAME
-        )
+        before, closing, lifted = (f(motion.phase, CLOSE) for f in (np.less, np.equal, np.greater))
+        T_world_obj = grasps.Ts_world_obj[instance]
+        for Ts, T, atol in (
+            (motion.Ts_world_hand[closing], T_world_obj @ s.Ts_obj_grasp[row], SAME),
+            (motion.Ts_world_obj[before], T_world_obj, 1e-9),
+        ):
+            np.testing.assert_allclose(Ts, np.broadcast_to(T, Ts.shape), atol=atol)
         x, y = s.parameters["middle_xy_m"]
         reach = school_config_of(s).reach
         arm = grasping_arm(reach, find_hand())
@@ -77,36 +88,15 @@ def test_the_hand_closes_in_the_grasp_and_comes_from_home(
         home = T_world_base @ arm.forward(home_joints(reach, arm, (x, y)))
         np.testing.assert_allclose(motion.Ts_world_hand[0], home, atol=SAME)
         assert motion.phase_name(0) == "reach"
-
-
-@pytest.mark.parametrize("kind", ["tried again", "as stored"])
-def test_the_object_stands_still_until_the_fingers_close_and_goes_along_after(
-    kind: str, motions: SessionMotions, stored: tuple[SceneGrasps, dict[int, ObjectModel]]
-) -> None:
-    grasps, _ = stored
-    source = motions if kind == "tried again" else as_stored(stored)
-    carried = 0
-    for instance, row in attempts(grasps):
-        motion = source.motion(instance, row)
-        assert motion is not None
-        before = motion.phase < CLOSE
-        T = grasps.Ts_world_obj[instance]
-        np.testing.assert_allclose(
-            motion.Ts_world_obj[before], np.tile(T, (before.sum(), 1, 1)), atol=1e-9
-        )
         carried += float(np.ptp(motion.Ts_world_obj[:, 2, 3])) > 0.05
-        if kind == "as stored":
-            lifted = motion.phase > CLOSE
+        if kind == "as stored" and lifted.any():
             Ts_hand_obj = se3.invert(motion.Ts_world_hand[lifted]) @ motion.Ts_world_obj[lifted]
-            assert np.ptp(Ts_hand_obj, axis=0).max() < 1e-9 if lifted.any() else True
+            assert np.ptp(Ts_hand_obj, axis=0).max() < 1e-9
     assert carried, "no attempt lifts its object: the law was not tried"
 
 
-@pytest.mark.parametrize("kind", ["tried again", "as stored"])
-def test_the_replay_moves_with_the_world(
-    kind: str, motions: SessionMotions, stored: tuple[SceneGrasps, dict[int, ObjectModel]]
-) -> None:
-    grasps, models = stored
+def test_the_replay_moves_with_the_world(motions: SessionMotions, school: Stored) -> None:
+    grasps, models = school
     T = se3.random_transform(np.random.default_rng(8))
     assert grasps.T_world_table is not None
     moved = replace(
@@ -114,12 +104,8 @@ def test_the_replay_moves_with_the_world(
         Ts_world_obj={i: T @ P for i, P in grasps.Ts_world_obj.items()},
         T_world_table=T @ grasps.T_world_table,
     )
-    if kind == "tried again":
-        here, there = motions, SessionMotions(moved, models, with_arm=False)
-    else:
-        here, there = as_stored(stored), as_stored(stored, moved)
-    instance, row = attempts(grasps)[0]
-    a, b = here.motion(instance, row), there.motion(instance, row)
+    attempt = attempts(grasps)[0]
+    a, b = (m.motion(*attempt) for m in (motions, SessionMotions(moved, models, with_arm=False)))
     assert a is not None and b is not None
     np.testing.assert_array_equal(a.time_s, b.time_s)
     np.testing.assert_array_equal(a.phase, b.phase)
@@ -128,9 +114,7 @@ def test_the_replay_moves_with_the_world(
     np.testing.assert_allclose(b.Ts_world_obj, T @ a.Ts_world_obj, atol=1e-3)
 
 
-def test_a_grasp_without_a_trajectory_shows_the_approach_and_says_so(
-    stored: tuple[SceneGrasps, dict[int, ObjectModel]],
-) -> None:
+def test_a_grasp_without_a_trajectory_shows_the_approach_and_says_so(stored: Stored) -> None:
     grasps, models = stored
     bare = SessionMotions(replace(grasps, trajectories={}), models, with_arm=False)
     s = grasps.sets[0]
@@ -143,7 +127,7 @@ def test_a_grasp_without_a_trajectory_shows_the_approach_and_says_so(
 
 @pytest.mark.slow
 def test_arm_and_hand_are_drawn_where_the_kinematics_have_them(
-    weak_school: Path, stored: tuple[SceneGrasps, dict[int, ObjectModel]]
+    weak_school: Path, stored: Stored
 ) -> None:
     instance, row = attempts(stored[0])[0]
     motion = SessionMotions.of_session(weak_school).motion(instance, row)
