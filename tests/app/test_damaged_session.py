@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 import time
 from dataclasses import replace
@@ -11,51 +10,39 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from begun_sessions import add_drawn, begun
-from plain_meshes import square
 from realsim.app import stages
 from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
 from realsim.app.register.run import register_session
 from realsim.errors import InputError, UnitError
-from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
-from realsim.geometry.parts import part
-from realsim.records import CameraIntrinsics, ObjectPose
-from realsim.rendering.labels import LabelRenderer, PlacedMesh
+from realsim.records import ObjectPose
 from realsim.store import SessionStore, load_scene
 from realsim.store.arrays_on_disk import is_whole, write_arrays
 from realsim.store.lock import only_run_in
 from refusals import refused
+from registered_sessions import true_poses
+from shared_sessions import copy_of
 
-CAMERA = CameraIntrinsics(width=240, height=180, fx=220.0, fy=220.0, cx=120.0, cy=90.0)
 QUIET = Console(quiet=True)
 
 
 @pytest.fixture(scope="module")
-def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A session of four views of a box on a table, with its start."""
-    model = part("box")
-    T = se3.from_translation([0.0, 0.0, -model.mesh.bounds[0, 2]])
-    table = PlacedMesh(-1, square(0.4), np.eye(4))
-    renderer = LabelRenderer([PlacedMesh(0, model.mesh, T), table])
-    folder = tmp_path_factory.mktemp("damaged") / "s"
-    store = begun(folder, CAMERA, {"gravity_up_world": [0, 0, 1]})
-    eyes = [[0.35 * np.cos(1.5 * k), 0.35 * np.sin(1.5 * k), 0.35] for k in range(4)]
-    add_drawn(store, renderer, [se3.look_at(eye, [0, 0, 0.04]) for eye in eyes])
-    save_models(store.folder / "models", {model.obj_id: model})
-    stages.save_starts(store, [ObjectPose(obj_id=model.obj_id, instance=0, T_world_obj=T)], "test")
+def pristine(few_views: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session of four views of which one object is sought, from its start."""
+    folder = copy_of(few_views, tmp_path_factory.mktemp("damaged") / "s")
+    stages.save_starts(SessionStore.open(folder), true_poses()[:1], "test")
     return folder
 
 
 @pytest.fixture
 def store(pristine: Path, tmp_path: Path) -> SessionStore:
-    return SessionStore.open(Path(shutil.copytree(pristine, tmp_path / "s")))
+    return SessionStore.open(copy_of(pristine, tmp_path / "s"))
 
 
 @pytest.fixture(scope="module")
 def registered(pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = Path(shutil.copytree(pristine, tmp_path_factory.mktemp("registered") / "s"))
+    folder = copy_of(pristine, tmp_path_factory.mktemp("registered") / "s")
     register_session(SessionStore.open(folder), QUIET)
     return folder
 
@@ -69,8 +56,9 @@ def start_of(store: SessionStore) -> ObjectPose:
 def test_a_changed_capture_is_refused_even_after_it_was_registered(
     registered: Path, tmp_path: Path, spoil: str
 ) -> None:
-    store = SessionStore.open(Path(shutil.copytree(registered, tmp_path / "s")))
+    store = SessionStore.open(copy_of(registered, tmp_path / "s"))
     if spoil == "zero depth":
+        store.path("depth/000002.png").unlink()  # it is linked to that of the other tests
         store.path("depth/000002.png").write_bytes(store.path("depth/000001.png").read_bytes())
     elif spoil == "cut list":
         path = store.path("robot.jsonl")
@@ -83,7 +71,7 @@ def test_a_changed_capture_is_refused_even_after_it_was_registered(
 
 
 def test_a_damaged_note_is_no_note(registered: Path, tmp_path: Path) -> None:
-    store = SessionStore.open(Path(shutil.copytree(registered, tmp_path / "s")))
+    store = SessionStore.open(copy_of(registered, tmp_path / "s"))
     store.path("stages/register.json").write_text('{"key": "abc')
     scene = register_session(store, QUIET)
     assert scene.objects[0].verdict == "accepted"

@@ -6,46 +6,29 @@ Stored reports are files of others: what is not as `realsim report` writes it is
 import copy
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from begun_sessions import add_drawn, begun
-from plain_meshes import box
-from realsim import CameraIntrinsics, ObjectModel, ObjectPose, Scene
+from realsim import Scene
 from realsim.app.register.files import write_result
 from realsim.app.report.session import report_of, write_report
 from realsim.app.report.sliders import registration_pairs
 from realsim.app.report.sources import read_stored
 from realsim.app.stages import save_starts
-from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
-from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore, save_scene
-from registered_sessions import models_of, registered_by_hand, table_session
+from registered_sessions import models_of, registered_by_hand, table_session, true_poses
 from typed_commands import refused
-
-INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
-SHIFT_M = 0.02
-
-
-BLOCK = box((0.06, 0.05, 0.04))
-
-
-def pose(x: float) -> ObjectPose:
-    return ObjectPose(obj_id=1, instance=2, T_world_obj=se3.from_translation([x, 0.0, 0.02]))
 
 
 @pytest.fixture
 def store(tmp_path: Path) -> SessionStore:
-    store = begun(tmp_path / "one", INTRINSICS)
-    renderer = LabelRenderer([PlacedMesh(2, BLOCK, pose(0.0).T_world_obj)])
-    eyes = [[0.3 * np.cos(a), 0.3 * np.sin(a), 0.25] for a in (0.0, 1.5, 3.0, 4.5)]
-    add_drawn(store, renderer, [se3.look_at(eye, [0.0, 0.0, 0.02]) for eye in eyes])
-    save_scene(store, Scene(name="one", objects=(pose(0.0),), plane=None))
-    save_models(store.folder / "models", {1: ObjectModel(obj_id=1, name="b", mesh=BLOCK)})
+    store = table_session(tmp_path / "s", views=4, sigma=(0.0, 0.0))
+    save_scene(store, Scene(name="two", objects=tuple(true_poses()), plane=None))
     return store
 
 
@@ -55,9 +38,11 @@ def coloured(picture: object) -> np.ndarray:
 
 
 def test_the_outline_moves_from_the_start_onto_the_object(store: SessionStore) -> None:
-    save_starts(store, [pose(SHIFT_M)], "a rough guess")
+    aside = se3.from_translation([0.02, 0.0, 0.0])
+    starts = [replace(o, T_world_obj=aside @ o.T_world_obj) for o in true_poses()]
+    save_starts(store, starts, "a rough guess")
     pairs, before = registration_pairs(store)
-    assert "1 of 1 objects at the rough pose" in before and "cameras" not in before
+    assert "2 of 2 objects at the rough pose" in before and "cameras" not in before
     assert [p.caption for p in pairs] == ["view 0", "view 2", "view 3"]
     for p in pairs:
         on_object = store.rgb(int(p.caption.split()[1]))[..., 0] == 200
@@ -68,7 +53,7 @@ def test_the_outline_moves_from_the_start_onto_the_object(store: SessionStore) -
 
 def test_without_a_before_there_are_no_sliders(store: SessionStore) -> None:
     assert registration_pairs(store) == ([], "")
-    clicked = {"starts": [{"instance": 2, "click": [3, 80, 60]}]}
+    clicked = {"starts": [{"instance": 0, "click": [3, 80, 60]}]}
     store.write_json("registration/starts.json", clicked)
     assert registration_pairs(store) == ([], "")
 
