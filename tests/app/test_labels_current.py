@@ -11,21 +11,21 @@ from realsim.app.annotate.current import annotate_session, refresh_labels, what_
 from realsim.app.console import Console
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.run import run_export
-from realsim.errors import InputError
 from realsim.formats.bop.scene import find_scenes, read_scene
 from realsim.geometry import se3
 from realsim.records import ObjectPose, Scene, SupportPlane
 from realsim.review import journal
 from realsim.store import SessionStore, load_scene, provenance, save_scene
-from registered_sessions import table_session, true_poses
+from refusals import refused
+from registered_sessions import true_poses
 from shared_sessions import copy_of
 
 QUIET = Console(quiet=True)
 
 
 @pytest.fixture(scope="module")
-def labelled(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    store = table_session(tmp_path_factory.mktemp("labelled") / "s", views=3)
+def labelled(few_views: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    store = SessionStore.open(copy_of(few_views, tmp_path_factory.mktemp("labelled") / "s"))
     plane = SupportPlane(T_world_table=np.eye(4))
     save_scene(store, Scene(name="s", objects=tuple(true_poses()), plane=plane))
     annotate_session(store, QUIET, maps="instance")
@@ -59,32 +59,24 @@ def test_frames_are_said_to_show_other_grasps_where_they_do(session: SessionStor
     assert current.other_grasps_shown(session) == "still show the grasps of before"
 
 
-@pytest.mark.parametrize(
-    ("action", "words"),
-    [
-        ("move", "was moved"),
-        ("reject", "is rejected"),
-        ("swap", "is object"),
-        ("exclude", "view 2"),
-    ],
-)
-def test_every_decision_that_changes_labels_is_noticed(
-    session: SessionStore, action: journal.Action, words: str
-) -> None:
+def test_every_decision_that_changes_labels_is_noticed(session: SessionStore) -> None:
     first, second = load_scene(session).objects[:2]
     T = first.T_world_obj @ se3.from_translation([0.004, 0, 0])
-    said = {
-        "move": {"pose": T}, "reject": {}, "exclude": {"view": 2},
-        "swap": {"pose": first.T_world_obj, "obj_id": second.obj_id},
-    }[action]  # fmt: skip
-    say(session, action, None if action == "exclude" else first, **said)
-    assert words in what_is_stale(session)
-    if action == "move":
-        say(session, "comment", second, comment="nothing changes by this")
-        assert refresh_labels(session, QUIET)
-        again = SessionStore.open(session.folder)
-        assert what_is_stale(again) == ""
-        assert not refresh_labels(again, QUIET)
+    decisions: list[tuple[journal.Action, ObjectPose | None, dict[str, object], str]] = [
+        ("reject", first, {}, "is rejected"),
+        ("swap", first, {"pose": first.T_world_obj, "obj_id": second.obj_id}, "is object"),
+        ("exclude", None, {"view": 2}, "view 2"),
+        ("move", first, {"pose": T}, "was moved"),
+    ]
+    for action, placed, said, words in decisions:
+        session.path(journal.JOURNAL_FILE).unlink(missing_ok=True)
+        say(session, action, placed, **said)
+        assert words in what_is_stale(session)
+    say(session, "comment", second, comment="nothing changes by this")
+    assert refresh_labels(session, QUIET)
+    again = SessionStore.open(session.folder)
+    assert what_is_stale(again) == ""
+    assert not refresh_labels(again, QUIET)
 
 
 def test_cameras_that_changed_a_little_at_a_time_make_labels_stale(session: SessionStore) -> None:
@@ -128,5 +120,4 @@ def test_only_what_a_review_changes_makes_it_another_export(
         path.write_bytes(b"x")
     assert run_export(request, tmp_path / "out", QUIET).was_finished
     say(session, "reject", load_scene(session).objects[0])
-    with pytest.raises(InputError, match=r"finished export.*delete that one first"):
-        run_export(request, tmp_path / "out", QUIET)
+    refused("finished export.*delete that one first", run_export, request, tmp_path / "out", QUIET)

@@ -1,45 +1,37 @@
-"""A missing library of the system is named with its Debian package, not with a traceback."""
+"""What is missing is named with what installs it, not with a traceback."""
 
 import sys
 
 import pytest
 
 from realsim import app
-from realsim.app.cli import main
 from realsim.app.config import applied
 
+SHARED = "libstdc++.so.6: cannot open shared object file: No such file or directory"
 
-def test_a_missing_shared_library_ends_with_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def missing(*_: object, **__: object) -> None:
-        raise ImportError(
-            "libstdc++.so.6: cannot open shared object file: No such file or directory",
-            name="pinocchio",
-        )
 
-    monkeypatch.setattr(applied, "apply_config", missing)
+@pytest.mark.parametrize(
+    ("missing", "words"),
+    [
+        (ImportError(SHARED, name="pinocchio"), ("pinocchio", "libstdc++6", "apt-get install")),
+        (ModuleNotFoundError("No module named 'numba'", name="numba"),
+         ("numba is not installed", "uv sync")),
+        (ModuleNotFoundError("No module named 'realsim.nowhere'", name="realsim.nowhere"), ()),
+    ],
+    ids=lambda of: getattr(of, "name", ""),
+)  # fmt: skip
+def test_what_is_missing_ends_with_what_to_install_and_a_bug_with_its_place(
+    missing: ImportError, words: tuple[str, ...],
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    def load(*_: object, **__: object) -> None:
+        raise missing
+
+    monkeypatch.setattr(applied, "apply_config", load)
     monkeypatch.setattr(sys, "argv", ["realsim", "config", "show"])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert stop.value.code == 2
-    said = capsys.readouterr().err
-    assert "pinocchio" in said and "libstdc++6" in said and "apt-get install" in said
-    assert "realsim doctor" in said
-
-
-@pytest.mark.parametrize(("module", "mended"), [("numba", True), ("realsim.nowhere", False)])
-def test_a_missing_package_ends_with_what_to_install_and_a_bug_with_its_place(
-    module: str, mended: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def missing(*_: object, **__: object) -> None:
-        raise ModuleNotFoundError(f"No module named '{module}'", name=module)
-
-    monkeypatch.setattr(applied, "apply_config", missing)
-    monkeypatch.setattr(sys, "argv", ["realsim", "config", "show"])
-    with pytest.raises(SystemExit if mended else ModuleNotFoundError) as stop:
+    with pytest.raises(SystemExit if words else ModuleNotFoundError) as stop:
         app.main()
-    if mended:
+    if words:
         assert getattr(stop.value, "code", None) == 2
         said = capsys.readouterr().err
-        assert "numba is not installed" in said and "uv sync" in said and "realsim doctor" in said
+        assert all(w in said for w in (*words, "realsim doctor"))
