@@ -14,6 +14,8 @@ from realsim.app.config.settings import find_config, read_config, settings_of
 from realsim.app.config.template import template, toml_value
 from realsim.app.option_values import Numbers
 from realsim.app.outputs import OutputFile
+from realsim.app.report.run import read_limits
+from realsim.untrusted.toml_text import MOST_BYTES, parsed_toml, read_toml
 from refusals import refused
 from typed_commands import complained, finished, realsim
 
@@ -247,3 +249,40 @@ def test_bytes_that_are_no_text_are_named() -> None:
 def test_a_variable_that_cannot_be_used_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("REALSIM_DEMO_VIEWS", "many")
     assert "REALSIM_DEMO_VIEWS" in complained("demo")
+
+
+# --- files that no editor writes: each is refused in one sentence --------------------------------
+
+HOSTILE = {
+    "deep": ("a = " + "[" * 5000, "nested deeper"),
+    "tables": ("a = {" + "b = {" * 3000, "nested deeper"),
+    "digits": ("a = " + "9" * 6000, "thousands of digits"),
+    "hexadecimal": ("[register]\nviews = 0x" + "f" * 6000, "64 bits"),
+    "zero": ('[review]\nstatic = "\\u0000"', "static has a text with the character zero"),
+    "zero in a name": ('"a\\u0000b" = 1', "character zero"),
+    "parts": ("a" + ".a" * 100_000 + " = 1", "more than 20 parts"),
+    "parts inside": ("x = {a" + ".a" * 100_000 + " = 1}", "more than 20 parts"),
+    "large": ("#" * int(MOST_BYTES + 1), "at most 1 MB"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_it_is_refused_with_the_name_of_the_file_as_settings_and_as_limits(name: str) -> None:
+    text, named = HOSTILE[name]
+    path = written(text, "strange.toml")
+    for said in (complained("--config", path, "config", "show"), refused(".", read_limits, path)):
+        assert named in said and "strange.toml" in said and len(said) < 600
+
+
+def test_plain_files_are_read_as_they_stand() -> None:
+    text = '# 1.2.3. and so on ......................... \n[a.b]\nc = "x.y.z.' + "a." * 3 + '"\n'
+    path = Path("plain.toml")
+    path.write_text(text, encoding="utf-8-sig")
+    read, values = read_toml(path)
+    assert (read, values) == (text, {"a": {"b": {"c": "x.y.z.a.a.a."}}})
+    assert parsed_toml("a = 9223372036854775807", "f")["a"] == 2**63 - 1
+
+
+def test_a_home_that_nobody_has_is_no_path() -> None:
+    path = written('[review]\nstatic = "~nobody-of-this-name/page.html"', "home.toml")
+    assert "home" in complained("--config", path, "config", "show")

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+import refusals
 from begun_sessions import begun
 from realsim.app.console import Console
 from realsim.app.scan.sfm.run import SfmRequest, run_scan_sfm
-from realsim.errors import DegenerateError, InputError
+from realsim.errors import RealsimError
 from realsim.formats.bop.models import load_models, save_models
 from realsim.geometry import se3
 from realsim.geometry.mesh import save_ply
@@ -204,9 +205,8 @@ def put(folder: Path, sizes: list[tuple[int, int]]) -> Path:
 
 
 def refused(folder: Path, **options: object) -> str:
-    with pytest.raises((InputError, DegenerateError)) as caught:
-        run_scan_sfm(SfmRequest(images=folder, **options), Console(quiet=True))  # pyright: ignore[reportArgumentType]
-    return str(caught.value)
+    request = SfmRequest(images=folder, **options)  # pyright: ignore[reportArgumentType]
+    return refusals.refused(".", run_scan_sfm, request, Console(quiet=True), error=RealsimError)
 
 
 def test_bad_photographs_are_named(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from realsim.app.register.files import write_result
 from realsim.app.school.inputs import SchoolRequest
 from realsim.app.school.run import run_in_session
 from realsim.app.stages import save_starts
+from realsim.arrays import Array32
 from realsim.geometry.parts import part
 from realsim.images import depth_counts, png_bytes
 from realsim.records import CameraIntrinsics, Mesh
@@ -27,6 +28,7 @@ from upgradable_datasets import bop_dataset
 
 GRASPS = 4
 """Tried on each object."""
+D405 = DepthSensorModel.from_profile("d405", disparity_noise_px=0.06)
 
 
 def make_inputs(root: Path, *, grasps: bool) -> None:
@@ -46,7 +48,7 @@ def make_inputs(root: Path, *, grasps: bool) -> None:
     shutil.copytree(session / "depth", root / "frames/depth")
     camera_file(root / "camera.json", CAMERA)
     plan_file(root / "plan.json")
-    walls(root / "wall")
+    walls(root / "wall", CAMERA)
     mesh_files(root)
 
 
@@ -69,15 +71,18 @@ def camera_file(path: Path, camera: CameraIntrinsics) -> None:
     path.write_text(json.dumps({n: getattr(camera, n) for n in names} | {"depth_scale": 0.1}))
 
 
-def walls(folder: Path) -> None:
+def wall(camera: CameraIntrinsics, z: float, tilt: float) -> Array32:
+    """Return the depth of a slanted plane that is z away in the middle [m]."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    return (z / (1 + tilt * x + 0.2 * y)).astype(np.float32)
+
+
+def walls(folder: Path, camera: CameraIntrinsics) -> None:
     """Write three depth images of a plane by a known D405."""
     folder.mkdir()
-    model = DepthSensorModel.from_profile("d405", disparity_noise_px=0.06)
-    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
-    x, y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
     for k, (z, tilt) in enumerate(((0.26, 0.2), (0.33, -0.2), (0.42, 0.1))):
-        plane = (z / (1 + tilt * x + 0.2 * y)).astype(np.float32)
-        seen = model.measure(plane, CAMERA, np.random.default_rng(k))
+        seen = D405.measure(wall(camera, z, tilt), camera, np.random.default_rng(k))
         (folder / f"{k:06d}.png").write_bytes(png_bytes(depth_counts(seen, 1e-4)))
 
 
