@@ -146,6 +146,10 @@ def test_an_interrupted_export_goes_on_and_gives_the_same_bytes(
     assert asked == each
     assert files_of(tmp_path / "demos") == files_of(written)
     assert "finished export" in refused(weak_school, "--out", written)
+    video = next((tmp_path / "demos").rglob("*.mp4"))
+    video.write_bytes(video.read_bytes()[:-1])
+    damaged = refused(weak_school, "--out", tmp_path / "demos", *SMALL)
+    assert f"{video.name}: other bytes than were written" in damaged
 
 
 @pytest.mark.slow

@@ -280,6 +280,13 @@ def test_sources_that_were_only_touched_are_the_same(bop, tmp_path):
     for _ in range(2):
         finished(*words)
         assert {p: p.read_bytes() for p in before} == before
+    (out / "README.md").write_text("a card of my own")
+    finished(*words)
+    written = next(out.glob("*/*/rgb/*.png"))
+    whole = written.read_bytes()
+    written.write_bytes(whole[:-1])
+    assert f"{written.name}: other bytes than were written" in refused(*words)
+    written.write_bytes(whole)
     file = next(source.glob("*/*/rgb/*.png"))
     file.write_bytes(file.read_bytes() + b"\0")
     assert "holds a finished export" in refused(*words)

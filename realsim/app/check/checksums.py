@@ -6,6 +6,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from realsim.app.console import Console, shortened
+from realsim.app.export.card import CARD_FILE
 from realsim.errors import InputError
 from realsim.formats.export_folder import SUMS_FILE
 from realsim.store.provenance import sha256_of
@@ -85,6 +87,27 @@ def check_checksums(
     return ChecksumReport(
         file=str(path), listed=len(listed), changed=tuple(changed), missing=tuple(missing)
     )
+
+
+def require_as_written(folder: Path, console: Console) -> None:
+    """Refuse to call an output finished of which a file is not as it was written.
+
+    Its card may be edited: nothing is read from it.
+
+    Raises:
+        InputError: names the files and says what to do.
+    """
+    faults = [f"{SUMS_FILE}: the file is missing"]
+    if (folder / SUMS_FILE).is_file():
+        with console.stage("checksums", folder.name) as tick:
+            report = check_checksums(folder / SUMS_FILE, folder, progress=tick)
+        faults = [fault for fault in report.faults() if not fault.startswith(f"{CARD_FILE}:")]
+    if faults:
+        raise InputError(
+            f"'{folder}' holds the finished export of this very request, but files are not as they "
+            f"were written: {'; '.join(shortened(faults, 5, 'and {} more'))}. Restore them, or "
+            "delete that folder and run the same command again."
+        )
 
 
 def listed_sums(path: Path, folder: Path) -> Iterator[tuple[str, str]]:

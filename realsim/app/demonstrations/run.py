@@ -269,6 +269,7 @@ def export_demonstrations(
     Raises:
         InputError: something given cannot be used, PyAV is missing, or `out` holds something else.
     """
+    from realsim.app.check.checksums import require_as_written
     from realsim.app.demonstrations.page import demonstrations_card, page_file
     from realsim.app.export.card import CARD_FILE
     from realsim.formats.lerobot.writer import write_lerobot
@@ -279,6 +280,7 @@ def export_demonstrations(
     attempts, episodes = _episodes(source, request, console)
     asked = _asked(source, attempts, request)
     if ExportFolder.is_finished(out, asked):
+        require_as_written(out, console)
         shutil.rmtree(out / STATE, ignore_errors=True)  # left by a run that ended just there
         frames = int(read_object(out / INFO)["total_frames"])
         written = WrittenScene(

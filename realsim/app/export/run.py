@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from realsim.app.annotate.current import refresh_labels
+from realsim.app.check.checksums import require_as_written
 from realsim.app.console import Console
 from realsim.app.export import sources
 from realsim.app.export.card import CARD_FILE, DatasetCard, SceneFacts, card_bytes, options_told
@@ -72,6 +73,7 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
             refresh_labels(open_session(folder), console)
     asked = request.asked() | {CONTENT: sources.content_of(scenes)}
     if ExportFolder.is_finished(out, asked) or _is_of(out, request):
+        require_as_written(out, console)
         shutil.rmtree(out / STATE, ignore_errors=True)  # left by a run that ended just there
         return ExportResult(folder=out, card=out / CARD_FILE, scenes=(), was_finished=True)
     folder = ExportFolder.begin(out, asked)
