@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 import numpy as np
@@ -24,15 +24,8 @@ from realsim.store.cameras import session_of_camera
 from realsim.store.opening import require_header
 from realsim.untrusted.own_json import to_json
 
-T = TypeVar("T")
 BOARD_VIEWS = "calibration/capture"
 """Where in a session the views of the tag board lie: a session of their own."""
-
-
-def evenly(items: Sequence[T], most: int) -> list[T]:
-    """Return at most `most` of the items, evenly spread over their order."""
-    places = np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)
-    return [items[k] for k in places]
 
 
 def arm_sigma_mm(hand_eye: HandEye) -> float | None:

@@ -126,7 +126,8 @@ def loop_errors(store: SessionStore, truth_folder: Path) -> LoopErrors:
 
 def _mask_ious(store: SessionStore, truth: LabTruth) -> tuple[dict[int, float], int]:
     """Return the mean IoU of every instance's written visible masks with the true ones."""
-    from realsim.app.stages import evenly, session_models
+    from realsim.app.stages import session_models
+    from realsim.arrays import evenly
     from realsim.rendering.labels import LabelRenderer, PlacedMesh
 
     models = session_models(store)

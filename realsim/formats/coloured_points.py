@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from realsim import images
-from realsim.arrays import Array, UInt8
+from realsim.arrays import Array, UInt8, evenly
 from realsim.errors import InputError
 from realsim.formats.export_folder import Content, ExportFolder
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
@@ -108,9 +108,7 @@ def _taken(scene: LabelledScene) -> list[int]:
     """Return the numbers of images with depth and pose, spread evenly over the scene."""
     deep = [i for i in scene.indices if scene.depth_file(i) is not None]
     posed = [i for i in deep if scene.frame(i).T_world_cam is not None]
-    if len(posed) <= FRAMES:
-        return posed
-    return [posed[int(k)] for k in np.linspace(0, len(posed) - 1, FRAMES).round()]
+    return evenly(posed, FRAMES)
 
 
 def _of_frame(scene: LabelledScene, frame: LabelledFrame) -> tuple[Array, Array]:

@@ -4,13 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from realsim.app.annotate.current import annotate_session
 from realsim.app.annotate.page import HEADER, object_row, write_page
 from realsim.app.console import Console, shortened
 from realsim.app.stages import judged_scene, open_session, registered_views, session_models
-from realsim.arrays import Image
+from realsim.arrays import Image, evenly
 from realsim.many import Workers
 from realsim.store import SessionStore
 from realsim.store.lock import only_run_in
@@ -115,6 +113,4 @@ def sheet_views(views: Sequence[int], flagged: Sequence[int], most: int = PICTUR
     first = [v for v in views if v in set(flagged)]
     others = [v for v in views if v not in set(flagged)]
     shown = first[: most if not others else max(most // 2, most - len(others))]
-    free = min(most - len(shown), len(others))
-    pick = np.linspace(0, len(others) - 1, free).round().astype(int) if free else []
-    return shown + [others[k] for k in sorted(set(pick))]
+    return shown + evenly(others, most - len(shown))

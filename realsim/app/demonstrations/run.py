@@ -17,7 +17,7 @@ from realsim.app.console import Console, shortened
 from realsim.app.outputs import require_outside
 from realsim.app.school.files import stored_grasps
 from realsim.app.school.inputs import CACHE, SchoolInputs, SchoolRequest, is_session, weighed
-from realsim.app.stages import evenly
+from realsim.arrays import evenly
 from realsim.errors import InputError
 from realsim.formats.export_folder import STATE, ExportFolder
 from realsim.formats.grasps.scene_grasps import SceneGrasps

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from realsim.app.outputs import require_free_file
-from realsim.app.stages import evenly
-from realsim.arrays import Array32
+from realsim.arrays import Array32, evenly
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.profiles import NOMINAL_FOCAL_PX, DepthProfile, profile

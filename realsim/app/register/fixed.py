@@ -9,8 +9,8 @@ import numpy as np
 
 from realsim.app.register.config import BIAS_FILE, OFF, RegisterRequest, load_depth_bias
 from realsim.app.register.results import CameraChange, claimed_cameras
-from realsim.app.stages import evenly, require_sound
-from realsim.arrays import Array
+from realsim.app.stages import require_sound
+from realsim.arrays import Array, evenly
 from realsim.errors import InputError
 from realsim.records.depth_bias import DepthBias
 from realsim.store import SessionStore

@@ -14,8 +14,8 @@ from realsim.app.register.fixed import FixedInput, read_fixed
 from realsim.app.register.from_review import accepted_in, review_starts
 from realsim.app.register.results import claimed_cameras, load_cameras
 from realsim.app.reviewed import exclusion_words, review_of
-from realsim.app.stages import content_key, evenly, session_models, take_models
-from realsim.arrays import Array, Array32
+from realsim.app.stages import content_key, session_models, take_models
+from realsim.arrays import Array, Array32, evenly
 from realsim.errors import InputError, UnitError
 from realsim.records import ObjectModel, View
 from realsim.records.depth_bias import DepthBias

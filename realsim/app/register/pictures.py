@@ -9,8 +9,7 @@ import numpy as np
 
 from realsim.app.first_surfaces import FirstSurfaces
 from realsim.app.register.results import Registered
-from realsim.app.stages import evenly
-from realsim.arrays import Array, Image, Int32
+from realsim.arrays import Array, Image, Int32, evenly
 from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel, ObjectPose
 from realsim.records.depth_bias import DepthBias

@@ -12,8 +12,8 @@ from realsim.app.register.files import costs_of, finish_interrupted, write_resul
 from realsim.app.register.inputs import RegisterInputs, read_inputs
 from realsim.app.register.results import CameraChange, Registered, Remark
 from realsim.app.reviewed import damage_words, review_of, stray_words
-from realsim.app.stages import content_key, evenly, note, require_sound, take_models
-from realsim.arrays import Array
+from realsim.app.stages import content_key, note, require_sound, take_models
+from realsim.arrays import Array, evenly
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, ObjectModel, Scene
 from realsim.registration.refinement.uncertainty import SeenPose, without_turns

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from realsim.app.stages import evenly
-from realsim.arrays import Array32, Int32, Mask, Rgb, UInt8
+from realsim.arrays import Array32, Int32, Mask, Rgb, UInt8, evenly
 from realsim.formats.bop.labels import mask_path
 from realsim.geometry.metrics import mask_iou
 from realsim.pages import View

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from realsim.app.render.compare import label_ids
-from realsim.app.stages import evenly
-from realsim.arrays import Array, Int32, Mask, Rgb
+from realsim.arrays import Array, Int32, Mask, Rgb, evenly
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.geometry.colors import light_of_bytes

@@ -152,7 +152,8 @@ def _named_row(view: int, o: Any) -> list[object]:
 
 def _photographs(section: Section, store: SessionStore) -> None:
     """Add annotated photographs spread over the session."""
-    from realsim.app.stages import evenly, registered_views, session_models
+    from realsim.app.stages import registered_views, session_models
+    from realsim.arrays import evenly
     from realsim.rendering.overlay import save_png
     from realsim.store import load_grasps, load_scene
     from realsim_sim_bridge.annotation.pictures import overlay_pictures

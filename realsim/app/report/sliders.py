@@ -11,8 +11,8 @@ from typing import Any
 
 from realsim.app.register.inputs import STARTS_FILE
 from realsim.app.register.results import claimed_cameras, is_same_pose
-from realsim.app.stages import evenly, registered_views, session_models
-from realsim.arrays import Array, UInt8
+from realsim.app.stages import registered_views, session_models
+from realsim.arrays import Array, UInt8, evenly
 from realsim.geometry import se3
 from realsim.pages import View
 from realsim.rendering.rays import PlacedMesh

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from realsim import images
-from realsim.app.stages import evenly
 from realsim.app.upgrade.dataset import GT, SceneRef, UpgradeConfig
-from realsim.arrays import Array
+from realsim.arrays import Array, evenly
 from realsim.errors import InputError, UnitError
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
 from realsim.geometry import se3

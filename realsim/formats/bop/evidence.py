@@ -249,9 +249,3 @@ def _overlap(box: Sequence[float], projected: Array) -> float:
     inside = float(np.prod(np.maximum(size, 0)))
     both = float(np.prod(a[2:] - a[:2]) + np.prod(projected[2:] - projected[:2]))
     return inside / (both - inside) if both > inside else 0.0
-
-
-def sampled(items: Sequence[int], count: int) -> list[int]:
-    """Return about `count` of the items, evenly."""
-    places = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
-    return [items[int(k)] for k in places]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from realsim import images
-from realsim.arrays import Array
+from realsim.arrays import Array, evenly
 from realsim.errors import InputError
 from realsim.formats.bop import evidence
 from realsim.formats.bop.instances import stated_instances, tell_apart
@@ -257,7 +257,7 @@ def _check_boxes(
 ) -> None:
     corners = _corners(scene)
     boxes: list[Any] = []
-    for i in evidence.sampled(scene.indices, evidence.MOST_BOXES):
+    for i in evenly(scene.indices, evidence.MOST_BOXES):
         Ts = truth.Ts_cam_obj[truth.places(i)]
         for k, info in enumerate(infos.get(i, ())):
             box = info.get("bbox_obj")
@@ -285,7 +285,7 @@ def _check_masks(scene: BopLabelledScene, where: str) -> None:
     """Check that the objects are seen where camera and poses project them to."""
     corners = _corners(scene)
     found: list[bool] = []
-    for i in evidence.sampled(scene.indices, DEPTH_SAMPLES):
+    for i in evenly(scene.indices, DEPTH_SAMPLES):
         for k, o in enumerate(scene.frame(i).objects):
             mask = scene.mask(i, k, visible=True) if o.obj_id in corners else None
             if mask is not None and np.any(mask):
@@ -306,7 +306,7 @@ def _check_depth(scene: BopLabelledScene, where: str) -> None:
         models = scene.models()
     except InputError:
         models = {}  # a broken mesh is told where it is needed
-    for i in evidence.sampled(deep, DEPTH_SAMPLES):
+    for i in evenly(deep, DEPTH_SAMPLES):
         file, unit = scene.depth_file(i), scene.depth_unit_m(i)
         if file is None or unit is None:
             continue

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from realsim import images
-from realsim.arrays import Counts
+from realsim.arrays import Counts, evenly
 from realsim.errors import InputError, UnitError
 
 DepthCoding = Literal["plain", "apc"]
@@ -90,8 +90,7 @@ def decoded(counts: Counts, coding: DepthCoding) -> Counts:
 
 def depth_evidence(paths: Sequence[Path]) -> DepthEvidence:
     """Return what some of these depth images, spread over all, show."""
-    picks = np.unique(np.linspace(0, len(paths) - 1, SAMPLES).round().astype(int))
-    sampled = [images.read_counts(paths[int(k)]) for k in picks]
+    sampled = [images.read_counts(p) for p in evenly(paths, SAMPLES)]
     values = np.concatenate([c[c > 0] for c in sampled])
     total = sum(c.size for c in sampled)
     if not len(values):

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from realsim import images
+from realsim.arrays import evenly
 from realsim.errors import InputError
-from realsim.formats.bop.evidence import sampled
 from realsim.formats.graspnet import evidence, labelled
 from realsim.formats.graspnet.annotations import ANNOTATIONS
 from realsim.formats.graspnet.cameras import FIRST, MATRIX, POSES, CameraFiles, read_camera_files
@@ -42,7 +42,7 @@ def open_scene(ref: GraspnetSceneRef) -> GraspnetLabelledScene:
     notes: list[str] = []
     cameras = read_camera_files(ref.folder)
     indices = _indices(ref.folder, cameras, notes)
-    chosen = sampled(indices, COMPARED)
+    chosen = evenly(indices, COMPARED)
     found = {i: read_image_objects(ref.folder, i) for i in chosen}
     _compare_matrices(found, cameras, ref.folder)
     poses = cameras.poses
@@ -61,7 +61,7 @@ def open_scene(ref: GraspnetSceneRef) -> GraspnetLabelledScene:
     notes += said + _missing_models(ref, set(instances.places))
     _count_meta(found, notes)
     scene = GraspnetLabelledScene(ref, indices, cameras, instances, notes)
-    notes += _check_pixels(scene, {i: found[i] for i in sampled(chosen, LOOKED_AT)})
+    notes += _check_pixels(scene, {i: found[i] for i in evenly(chosen, LOOKED_AT)})
     return scene
 
 

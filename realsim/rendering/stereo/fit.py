@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from realsim.arrays import Array, Array32, Mask
+from realsim.arrays import Array, Array32, Mask, evenly
 from realsim.errors import InputError
 from realsim.json_values import json_value
 from realsim.records import CameraIntrinsics, Mesh
@@ -378,9 +378,7 @@ def _growth_and_floor(own: Array, real: Array) -> tuple[float, float]:
 
 def _over_distances(twins: Sequence[PlaneTwin]) -> list[PlaneTwin]:
     """Return at most MOST_TWINS of the twins, from the nearest to the farthest."""
-    ordered = sorted(twins, key=lambda t: t.distance_m)
-    places = np.unique(np.linspace(0, len(ordered) - 1, MOST_TWINS).round().astype(int))
-    return [ordered[k] for k in places]
+    return evenly(sorted(twins, key=lambda t: t.distance_m), MOST_TWINS)
 
 
 def _notes(frames: Sequence[TwinFigures], config: StereoConfig, kind: DepthProfile) -> list[str]:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from realsim.arrays import Array, UInt8
+from realsim.arrays import Array, UInt8, evenly
 from realsim.errors import InputError
 from realsim.formats.bop.models import load_models, model_file, require_meshes
 from realsim.images import resized
@@ -29,7 +29,7 @@ from realsim.review.content import clouds, quick_png
 from realsim.review.content.clouds import LeveledCloud
 from realsim.review.content.config import SceneConfig
 from realsim.review.content.meshes import DisplayMesh, display_mesh
-from realsim.review.content.views import FirstLook, Region, first_look, region_of, spread
+from realsim.review.content.views import FirstLook, Region, first_look, region_of
 from realsim.store import SessionStore, atomic, load_grasps, load_scene
 from realsim.store.manifest import Manifest
 from realsim.store.session_store import rgb_path
@@ -222,7 +222,7 @@ class SceneContent:
         up = np.array([0.0, 0.0, 1.0])
         if scene.plane is not None:
             up = scene.plane.T_world_table[:3, 2].copy()
-        shown = tuple(spread(views, config.most_cameras))
+        shown = tuple(evenly(views, config.most_cameras))
         thumbnails = Thumbnails(store, config.thumbnail_px, config.thumbnail_quality)
         with_depth = [v for v in views if store.has_depth(v.index)]
         numbers = {v.index for v in shown}
@@ -233,7 +233,7 @@ class SceneContent:
                 thumbnails.take(index, rgb)
 
         cloud = clouds.fused_cloud(
-            store, spread(with_depth, config.most_fused_views), region,
+            store, evenly(with_depth, config.most_fused_views), region,
             voxel_m=config.voxel_m, most=config.most_points, coarse=config.coarse_points,
             damaged=damaged, on_photograph=take,
         )  # fmt: skip

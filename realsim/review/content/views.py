@@ -24,13 +24,6 @@ def worst_first(objects: Sequence[ObjectPose]) -> list[ObjectPose]:
     return sorted(objects, key=lambda o: (rank(o.verdict), o.checks.get("agree", 0.0), o.instance))
 
 
-def spread(views: Sequence[View], most: int) -> list[View]:
-    """Return at most `most` of the views, evenly spread over their order."""
-    if len(views) <= most:
-        return list(views)
-    return [views[k] for k in np.linspace(0, len(views) - 1, most).round().astype(int)]
-
-
 def strided(intrinsics: CameraIntrinsics, stride: int) -> CameraIntrinsics:
     """Return the camera of an image's every `stride`-th row and column; exact, lens included."""
     i = intrinsics

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from realsim.arrays import Array, Array32, Int32, Mask, Rgb
+from realsim.arrays import Array, Array32, Int32, Mask, Rgb, evenly
 from realsim.errors import InputError
 from realsim.geometry import camera, mesh_shape, se3
 from realsim.pages.pictures import jpeg_bytes
@@ -21,7 +21,7 @@ from realsim.rendering.casting.pixel_caster import PixelCaster, empty_buffers, e
 from realsim.rendering.overlay import VERDICT_RGB
 from realsim.rendering.rays import PlacedMesh
 from realsim.review.content.content import SceneContent
-from realsim.review.content.views import spread, strided
+from realsim.review.content.views import strided
 from realsim.review.placing.depth_residuals import SIGMAS, legend, noise_of, residual_rgb
 from realsim.review.placing.measured_views import depth_bias_of
 
@@ -137,7 +137,7 @@ class Photographs:
         """
         content = self._content
         number = next((k for k, o in enumerate(objects) if o.instance == instance), None)
-        chosen = spread([v for v in content.views if v.index not in content.damaged], MOST_VIEWS)
+        chosen = evenly([v for v in content.views if v.index not in content.damaged], MOST_VIEWS)
         found: dict[int, dict[str, Any]] = {}
         end, kept = time.monotonic() + soon_s, len(self._scores)
         for v in chosen:

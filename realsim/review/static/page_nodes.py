@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 
 from realsim import local_pages
-from realsim.arrays import Array, Int64
+from realsim.arrays import Array, Int64, evenly
 from realsim.interop import viser_wxyz_position
 from realsim.records import GraspSet, Scene
 from realsim.rendering.overlay import VERDICT_RGB, evenly_ranked, grasp_rgb
 from realsim.review.content.config import SceneConfig
 from realsim.review.content.content import SceneContent
 from realsim.review.content.meshes import glb_of, within_budget
-from realsim.review.content.views import spread
 from realsim.review.drawing.grasp_drawing import gripper_mesh, gripper_scales, linear_rgb
 from realsim.review.drawing.scene_nodes import add_frustum, add_table, box_edges, light
 
@@ -96,7 +95,7 @@ def _build(api: Any, content: SceneContent, scene: Scene, size: StaticSize) -> N
         )  # fmt: skip
     if scene.plane is not None:
         add_table(api, scene.plane.T_world_table, config)
-    for view in spread(content.shown_views, size.cameras):
+    for view in evenly(content.shown_views, size.cameras):
         add_frustum(api, f"/cameras/{view.index}", view, content, config)
     _add_objects(api, content, scene, size)
     _add_grasps(api, content, scene, size)

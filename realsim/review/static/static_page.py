@@ -23,7 +23,7 @@ import numpy as np
 from markupsafe import Markup
 
 from realsim import __version__
-from realsim.arrays import Array
+from realsim.arrays import Array, evenly
 from realsim.errors import InputError
 from realsim.formats.bop.models import model_file
 from realsim.geometry import se3
@@ -32,7 +32,7 @@ from realsim.records import GraspSet, ObjectModel, ObjectPose, Scene
 from realsim.records.grasps import label_words
 from realsim.rendering.overlay import VERDICT_RGB
 from realsim.review.content.content import SceneContent
-from realsim.review.content.views import spread, worst_first
+from realsim.review.content.views import worst_first
 from realsim.review.corrections import DECIDED, corrected_scene, decision_on, reviewed_scene
 from realsim.review.journal import Entry, ReviewState
 from realsim.review.placing.ellipsoid import pose_sigmas
@@ -299,7 +299,7 @@ def _page(
 
 def _cameras(content: SceneContent, size: StaticSize) -> list[Any]:
     """Return the views that are drawn."""
-    return spread(content.shown_views, size.cameras)
+    return evenly(content.shown_views, size.cameras)
 
 
 def _data(content: SceneContent, scene: Scene, size: StaticSize) -> dict[str, Any]:

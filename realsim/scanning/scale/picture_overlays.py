@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from realsim.arrays import Array, Array32, Image
+from realsim.arrays import Array, Array32, Image, evenly
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.pages.plots import png
@@ -54,8 +54,7 @@ def chosen_views(fit: ScaleFit) -> tuple[int, ...]:
         return tuple(v.index for v in fit.views)
     worst = [v.index for v in worst_views(fit)[:2]]
     rest = [v.index for v in fit.views if v.index not in worst]
-    spread = np.unique(np.linspace(0, len(rest) - 1, n - len(worst)).round().astype(int))
-    return tuple(sorted([*worst, *(rest[k] for k in spread)]))
+    return tuple(sorted([*worst, *evenly(rest, n - len(worst))]))
 
 
 def worst_views(fit: ScaleFit) -> list[ViewAgreement]:

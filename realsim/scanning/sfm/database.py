@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from realsim.arrays import Array, Mask
+from realsim.arrays import Array, Mask, evenly
 from realsim.errors import DegenerateError
 from realsim.interop import colmap_from_opencv_px, quiet_output
 from realsim.records import CameraIntrinsics
@@ -226,8 +226,7 @@ def _chosen_threshold(photographs: Photographs, config: SfmConfig) -> float:
     from realsim.images import read_grey
 
     f, paths = config.features, photographs.paths
-    picks = np.unique(np.linspace(0, len(paths) - 1, f.probe_images).round().astype(int))
-    images = [np.ascontiguousarray(read_grey(paths[k])) for k in picks]
+    images = [np.ascontiguousarray(read_grey(p)) for p in evenly(paths, f.probe_images)]
     for threshold in f.peak_thresholds[:-1]:
         with quiet_output():
             extractor: Any = pycolmap.FeatureExtractor.create(_sift(config, threshold))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from realsim import images
-from realsim.arrays import Array, Array32, Mask, UInt16
+from realsim.arrays import Array, Array32, Mask, UInt16, evenly
 from realsim.formats.graspnet.write_plan import greatest_displacement_px
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
@@ -218,8 +218,7 @@ def cost_of_the_lens(scene: LabelledScene) -> str:
     The masks of some frames, cast through the lens, are compared with those that such a reader
     renders from the same poses.
     """
-    places = np.unique(np.linspace(0, len(scene.indices) - 1, COMPARED_FRAMES).round().astype(int))
-    chosen = [scene.frame(scene.indices[k]) for k in places]
+    chosen = [scene.frame(k) for k in evenly(scene.indices, COMPARED_FRAMES)]
     bent = [f for f in chosen if f.intrinsics.is_distorted]
     if not bent:
         return ""

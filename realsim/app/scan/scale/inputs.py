@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from realsim import __version__
 from realsim.app.option_values import ranges_of
-from realsim.app.stages import arm_sigma_mm, content_key, evenly
+from realsim.app.stages import arm_sigma_mm, content_key
+from realsim.arrays import evenly
 from realsim.errors import InputError
 from realsim.formats.bop.models import INFO_FILE
 from realsim.records import Mesh, View
