@@ -1,4 +1,4 @@
-"""BOP scenes: what is written is read again, broken data is named."""
+"""BOP scenes: what is written is read again, also as frames and maps; broken data is named."""
 
 import json
 import shutil
@@ -8,10 +8,13 @@ import pytest
 
 from begun_sessions import begun, random_views
 from bop_scenes import edit
+from map_formulas import normal_counts
 from realsim.errors import InputError, NotRigidError, UnitError
+from realsim.formats import label_maps
 from realsim.formats.bop import labels as bop_labels
 from realsim.formats.bop import models as bop_models
 from realsim.formats.bop import scene as bop
+from realsim.formats.bop.source import open_bop
 from realsim.geometry import se3
 from realsim.geometry.mesh import symmetry_transforms
 from realsim.records import CameraIntrinsics, Mesh, ObjectModel
@@ -227,3 +230,96 @@ def test_models_in_the_wrong_unit_are_found_out(tmp_path):
     save_ply(tmp_path / "obj_000001.ply", box((0.06, 0.06, 0.06)), "m")
     refused("scan import FILE --unit m` makes", bop_models.load_models, tmp_path, error=UnitError)
     refused("nowhere does not exist; files obj", bop_models.load_models, tmp_path / "nowhere")
+
+
+# --- BOP scenes as frame sources: cameras, counts and poses exactly as the scene has them.
+
+
+LENS = CameraIntrinsics(
+    width=64, height=48, fx=60.1, fy=60.2, cx=31.3, cy=24.7, distortion=np.array([0.1, -0.01])
+)
+
+
+def with_gaps(folder, n=4):
+    """Return a session of n images whose numbers have gaps."""
+    store = begun(folder, LENS)
+    random_views(store, range(0, 3 * n, 3))
+    return store
+
+
+def test_a_scene_comes_back_as_frames(tmp_path):
+    """Law: cameras to 1e-9, pixels and counts exactly, in the order of the images' numbers."""
+    store = with_gaps(tmp_path / "000007")
+    source = open_bop(tmp_path / "000007")
+    frames = list(source.frames())
+    assert [f.time_s for f in frames] == [0, 3, 6, 9] and source.depth_unit_m == 1e-4
+    np.testing.assert_allclose(source.intrinsics.K, LENS.K, atol=1e-9)
+    np.testing.assert_allclose(source.intrinsics.distortion, LENS.distortion, atol=1e-9)
+    for frame, view in zip(frames, store.session.views, strict=True):
+        np.testing.assert_allclose(frame.T_world_cam, view.T_world_cam, atol=1e-9)
+        assert np.array_equal(frame.rgb, store.rgb(view.index))
+        assert frame.depth_counts is not None
+        metres = (frame.depth_counts * np.float64(1e-4)).astype(np.float32)
+        assert np.array_equal(metres, store.depth_m(view.index))
+
+
+def test_images_without_depth_are_named_and_left_out(tmp_path):
+    with_gaps(tmp_path / "1")
+    (tmp_path / "1/depth/000003.png").unlink()
+    source = open_bop(tmp_path / "1")
+    assert len(source) == 3 and any("no depth" in n and " 3." in n for n in source.notes)
+    colour = open_bop(tmp_path / "1", use_depth=False)
+    assert len(colour) == 4 and colour.depth_unit_m is None
+
+
+def test_several_scenes_are_listed(tmp_path):
+    for k in (4, 9):
+        with_gaps(tmp_path / f"test/{k:06d}", 1)
+    refused(r"2 scenes: 4 \(test/000004\), 9.*--scene", open_bop, tmp_path)
+    assert open_bop(tmp_path, scene=9).extra["scene"] == 9
+    refused("no scene 5", open_bop, tmp_path, scene=5)
+
+
+def test_missing_poses_are_said(tmp_path):
+    with_gaps(tmp_path / "1")
+    for key in ("cam_R_w2c", "cam_t_w2c"):
+        edit(tmp_path / "1/scene_camera.json", lambda entries, k=key: entries["3"].pop(k))
+    source = open_bop(tmp_path / "1")
+    assert any("1 of 4 images have no camera pose" in n for n in source.notes)
+    assert [f.T_world_cam is None for f in source.frames()] == [False, True, False, False]
+
+
+# --- Label maps: round trips within a count, and zeros that mean 'nothing' alone.
+
+
+def test_instances_come_back():
+    ids = np.random.default_rng(0).integers(-1, 300, (20, 30)).astype(np.int32)
+    np.testing.assert_array_equal(label_maps.instances_of(label_maps.instance_counts(ids)), ids)
+    refused("65535 are in this view", label_maps.instance_counts, np.full((2, 2), 65535, np.int32))
+
+
+def test_normals_come_back_and_nothing_stays_nothing():
+    rng = np.random.default_rng(2)
+    n = rng.normal(size=(40, 50, 3)).astype(np.float32)
+    n /= np.linalg.norm(n, axis=-1, keepdims=True)
+    n[0, :3] = [[0, 0, -1], [-1, 0, 0], [1, 0, 0]]
+    n[5:9] = 0
+    counts = normal_counts(n)
+    assert not counts[5:9].any() and counts[:5].any(axis=-1).all()
+    np.testing.assert_array_equal(counts[0, 0], [32768, 32768, 0])
+    np.testing.assert_allclose(label_maps.normals_of(counts), n, atol=2e-5)
+
+
+def test_run_lengths_of_a_window_are_those_of_the_image():
+    rng = np.random.default_rng(3)
+    for x, y, w, h in [(0, 0, 7, 5), (2, 0, 3, 5), (2, 1, 4, 3), (6, 4, 1, 1), (1, 1, 0, 0)]:
+        for density in (0.0, 0.5, 1.0):
+            window = rng.random((h, w)) < density
+            image = np.zeros((5, 7), bool)
+            image[y : y + h, x : x + w] = window
+            rle = bop_labels.rle_of(window, origin=(x, y), shape=(5, 7))
+            assert rle == bop_labels.rle_of(image)
+            np.testing.assert_array_equal(bop_labels.mask_of(rle), image)
+            area, box = bop_labels.rle_area_and_bbox(rle)
+            assert area == image.sum() and box == bop_labels.bbox_of(image, inclusive=True)
+    refused("reaches out", bop_labels.rle_of, np.ones((3, 3), bool), origin=(5, 0), shape=(5, 7))

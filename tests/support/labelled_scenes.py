@@ -13,6 +13,7 @@ from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspnet.opening import open_scene
 from realsim.formats.graspnet.tree import open_graspnet
 from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
+from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer
@@ -57,6 +58,7 @@ class SceneInMemory:
     split: str = "train"
     camera: str = ""
     notes: tuple = ()
+    tried: SceneGrasps | None = None
 
     @property
     def indices(self):
@@ -79,7 +81,7 @@ class SceneInMemory:
         return self.models_by_id
 
     def grasps(self):
-        return None
+        return self.tried
 
     def change_frames(self, **changes):
         """Replace fields of all frames; a function gets the frame."""
