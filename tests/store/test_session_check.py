@@ -25,6 +25,12 @@ DEAD = 2**22 + 1
 """A process number that no process has."""
 
 
+@pytest.fixture
+def session(small_session: Path, tmp_path: Path) -> Path:
+    # Nothing is linked: these tests damage images where they stand.
+    return Path(shutil.copytree(small_session, tmp_path / "s"))
+
+
 def test_a_sound_session_is_sound_and_looking_changes_nothing(session: Path) -> None:
     before = bytes_of(session)
     report = SessionStore.open(session).check()

@@ -1,4 +1,4 @@
-"""A session comes back bit for bit, and no kill leaves half a view."""
+"""A session, its grasps and their trajectories come back as they were; a kill leaves no half view."""
 
 import json
 import shutil
@@ -8,14 +8,19 @@ from functools import partial
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from bop_scenes import edit
 from killed_children import killed_growing
+from realsim import store as stores
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.store import SessionStore, atomic
 from realsim.store.manifest import Manifest, entry_of
+from realsim.store.trajectories import load_trajectories, save_trajectories
 from refusals import refused
-from tried_grasps import assert_same
+from tried_grasps import assert_same, attempts_of, tried_set
 
 CAMERA = CameraIntrinsics(
     width=64, height=48, fx=60.1, fy=60.2, cx=31.7, cy=23.9,
@@ -281,3 +286,82 @@ def test_a_file_killed_between_its_line_and_its_name_gets_its_name(tmp_path):
         store = SessionStore.open(tmp_path)
         assert store.read_json("reports/a.json") == [1 + is_listed] and store.verify() == []
     assert not list(tmp_path.rglob("*.part"))
+
+
+# --- grasps and their trajectories ---------------------------------------------------------------
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=15, deadline=None)
+def test_sets_with_measures_come_back_bit_for_bit(tmp_path_factory, seed):
+    folder = tmp_path_factory.mktemp("g")
+    s = tried_set(np.random.default_rng(seed), 12)
+    stores.save_grasps(folder, s)
+    assert_same(s, stores.load_grasps(folder)[0])
+
+
+def test_files_of_the_first_format_are_still_read(tmp_path):
+    s = tried_set(np.random.default_rng(1), 12, measures=())
+    note = stores.save_grasps(tmp_path, s).with_suffix(".json")
+    edit(note, lambda head: head.update(format_version=1))
+    edit(note, lambda head: head.pop("measures"))
+    assert_same(s, stores.load_grasps(tmp_path)[0])
+
+
+def test_a_newer_format_is_refused_by_its_number(tmp_path):
+    path = stores.save_grasps(tmp_path, tried_set(np.random.default_rng(1), 3))
+    for found in (3, 0, "2", None):
+        edit(path.with_suffix(".json"), lambda head, v=found: head.update(format_version=v))
+        refused(r"format.version", stores.load_grasps, tmp_path)
+
+
+def tried(seed):
+    """Return grasps, and attempts at them."""
+    rng = np.random.default_rng(seed)
+    s = tried_set(rng, 20)
+    return s, attempts_of(rng, s)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=15, deadline=None)
+def test_attempts_come_back_bit_for_bit(tmp_path_factory, seed):
+    folder, (s, t) = tmp_path_factory.mktemp("t"), tried(seed)
+    path = save_trajectories(folder, s, t)
+    data = path.read_bytes()
+    assert_same(t, load_trajectories(folder, s))
+    assert save_trajectories(folder, s, t).read_bytes() == data
+
+
+def test_in_a_session_they_are_listed_with_their_checksum(tmp_path):
+    store, (s, t) = SessionStore.create(tmp_path, empty_session()), tried(2)
+    stores.save_grasps(store, s)
+    path = save_trajectories(store, s, t)
+    store = SessionStore.open(tmp_path)
+    assert store.verify() == []
+    for where in (store, tmp_path, tmp_path / "grasps"):
+        assert_same(t, load_trajectories(where, stores.load_grasps(store)[0]))
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    assert [f.path for f in store.verify()] == [path.relative_to(tmp_path).as_posix()]
+
+
+def test_where_none_were_kept_there_are_none(tmp_path):
+    assert load_trajectories(tmp_path, tried_set(np.random.default_rng(0), 3)) is None
+
+
+def test_attempts_of_other_grasps_are_refused(tmp_path):
+    s, t = tried(3)
+    save_trajectories(tmp_path, s, t)
+    moved = s.Ts_obj_grasp @ se3.from_translation([0.0, 0.0, 1e-6])
+    refused("other grasps", load_trajectories, tmp_path, replace(s, Ts_obj_grasp=moved))
+    refused("rows", save_trajectories, tmp_path, s, replace(t, rows=t.rows + 100))
+    # What the scores became later does not make them other grasps.
+    assert load_trajectories(tmp_path, replace(s, measures={})) is not None
+
+
+def test_a_torn_file_is_named(tmp_path):
+    s, t = tried(4)
+    path = save_trajectories(tmp_path, s, t)
+    data = path.read_bytes()
+    for share in (0.0, 0.3, 0.7, 0.99):
+        path.write_bytes(data[: int(share * len(data))])
+        refused("not a complete file of trajectories", load_trajectories, tmp_path, s)

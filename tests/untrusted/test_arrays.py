@@ -1,18 +1,22 @@
-"""Arrays of others: what numpy wrote is read back, what a header only claims is refused."""
+"""Arrays of others: what numpy or scipy wrote is read back, what a header claims is refused."""
 
 import io
-import tracemalloc
+import struct
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+import traced_memory
 from realsim.untrusted.arrays import read_npy, read_npz
+from realsim.untrusted.mat_files import read_mat
 from refusals import refused
 
 NUMBERS = st.sampled_from(
@@ -70,12 +74,8 @@ def test_claims_of_a_header_are_refused_before_anything_is_allocated(
 ) -> None:
     path = tmp_path / "a.npy"
     path.write_bytes(claim)
-    tracemalloc.start()
-    try:
+    with traced_memory.below(20e6):
         refused(r"a\.npy", read_npy, path)
-        assert tracemalloc.get_traced_memory()[1] < 20e6
-    finally:
-        tracemalloc.stop()
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("x.npy", claim)
     refused(r"a\.npz", read_npz, tmp_path / "a.npz")
@@ -112,3 +112,80 @@ def test_a_member_there_twice_or_of_a_size_that_lies_is_refused(tmp_path: Path) 
     for claim in (size - 8, size + 8, 2**31):
         lies.write_bytes(raw.replace(size.to_bytes(4, "little"), claim.to_bytes(4, "little")))
         refused(r"lies\.npz", read_npz, lies)
+
+
+# --- .mat files: what scipy wrote is read as it reads it ------------------------------------------
+
+
+VARIABLES: dict[str, Any] = {
+    "intrinsic_matrix": np.array([[900.0, 0, 640], [0, 901, 360], [0, 0, 1]]),
+    "factor_depth": np.array([[1000.0]]),
+    "cls_indexes": np.arange(1, 6, dtype=np.int32),
+    "poses": np.random.default_rng(0).normal(size=(3, 4, 5)),
+    "single": np.float32([[1.5, 2.5]]),
+    "yes": np.array([True, False]),
+    "name": "text",
+    "record": {"a": 1},
+    "cells": np.array([1, "a"], dtype=object),
+    "waves": np.array([1 + 2j]),
+    "empty": np.zeros((0, 3)),
+}
+PLAIN = ["intrinsic_matrix", "factor_depth", "cls_indexes", "poses", "single", "yes", "empty"]
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_mat_files_are_read_as_scipy_reads_them(tmp_path: Path, packed: bool) -> None:
+    path = tmp_path / "a.mat"
+    scipy.io.savemat(path, VARIABLES, do_compression=packed)
+    theirs = scipy.io.loadmat(path)
+    ours = read_mat(path, PLAIN)
+    assert sorted(ours) == sorted(PLAIN)
+    for name, array in ours.items():
+        np.testing.assert_array_equal(array, theirs[name])
+        assert array.dtype.isnative
+        assert array.shape == theirs[name].shape
+    for other in ("name", "record", "cells", "waves"):
+        refused(f"'{other}' is", read_mat, path, [other])
+    refused(r"no variable 'x'.*'poses'", read_mat, path, ["x"])
+
+
+def test_numbers_that_matlab_stored_in_a_smaller_type_have_their_own_again(tmp_path: Path) -> None:
+    path = tmp_path / "a.mat"
+    scipy.io.savemat(path, {"K": np.array([[1.0, 2.0]])})
+    raw = path.read_bytes()
+    body = struct.pack("<II", 9, 16) + np.array([1.0, 2.0]).tobytes()
+    small = struct.pack("<HHBBxx", 2, 2, 1, 2)
+    assert body in raw
+    length = struct.unpack_from("<I", raw, 132)[0]
+    heads = (struct.pack("<II", 14, n) for n in (length, length - len(body) + len(small)))
+    path.write_bytes(raw.replace(body, small).replace(*heads))
+    found = read_mat(path, ["K"])["K"]
+    assert found.dtype == np.float64
+    np.testing.assert_array_equal(found, [[1.0, 2.0]])
+
+
+def test_every_cut_of_a_mat_file_is_refused_or_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.mat"
+    scipy.io.savemat(path, {"a": np.arange(12.0), "b": np.arange(3)}, do_compression=True)
+    raw = path.read_bytes()
+    for end in range(len(raw)):
+        path.write_bytes(raw[:end])
+        refused(r"a\.mat", read_mat, path, ["a", "b"])
+
+
+def test_mat_files_that_unfold_or_lie_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.mat"
+    scipy.io.savemat(path, {"a": np.zeros(1_000_000)}, do_compression=True)
+    refused("unpacks to more", read_mat, path, ["a"], most_bytes=1e6)
+    head = path.read_bytes()[:128]
+    flags = struct.pack("<IIII", 6, 8, 6, 0)
+    shape = struct.pack("<IIii", 5, 8, 2**31 - 1, 2**31 - 1)
+    name = struct.pack("<HHI", 1, 1, ord("a"))
+    body = flags + shape + name + struct.pack("<II", 9, 2**32 - 8)
+    packed = zlib.compress(struct.pack("<II", 14, len(body)) + body)
+    path.write_bytes(head + struct.pack("<II", 15, len(packed)) + packed)
+    refused("could not read bytes", read_mat, path, ["a"])
+    path.write_bytes(b"\x89HDF" + bytes(200))
+    refused(r"7\.3", read_mat, path, ["a"])
+    scipy.io.savemat(path, {"a": np.arange(3)}, format="4")
+    refused("version 5", read_mat, path, ["a"])
