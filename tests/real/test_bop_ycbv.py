@@ -1,13 +1,14 @@
 """Real BOP data: genuine YCB-Video frames are read right, and come through a round trip."""
 
 import json
-import os
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from real_data import DATA, needs
 from realsim.errors import UnitError
 from realsim.formats.bop import labels as bop_labels
 from realsim.formats.bop import models as bop_models
@@ -21,9 +22,12 @@ from realsim.geometry.metrics import mssd
 from realsim.records import CaptureSession, View
 from realsim.store import SessionStore
 
-DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+
+import registration_real as real
+
 YCBV = DATA / "scenes/ycbv_mini"
-needs_ycbv = pytest.mark.skipif(not YCBV.is_dir(), reason=f"no YCB-V data at {YCBV}")
+needs_ycbv = needs(YCBV)
 
 
 @needs_ycbv
@@ -152,3 +156,42 @@ def test_a_wrong_depth_scale_of_a_real_scene_is_found(tmp_path):
     path.write_text(json.dumps(rows))
     with pytest.raises(UnitError, match=r"with depth_scale 0\.1 depth would be 0\.9"):
         open_labelled_bop(tmp_path)
+
+
+# --- registered poses agree with the depth better than the published ones ------------------------
+
+
+@needs_ycbv
+@pytest.mark.real
+@pytest.mark.slow
+@pytest.mark.parametrize("scene_id", real.MATCHING[:1])
+def test_two_starts_end_alike_and_nearer_to_the_depth_than_the_published_pose(scene_id):
+    intrinsics, frame, models, truth, network = real.ycbv_frame(scene_id)
+    first, second = real.registered(scene_id, "truth"), real.registered(scene_id, "network")
+    by = {p.instance: p for p in second.scene.objects}
+    said = {p.instance: p for p in network}
+    ours, published, compared = [], [], 0
+    for p, t in zip(first.scene.objects, truth, strict=True):
+        model = models[p.obj_id]
+        ours.append(real.median_dz_mm(intrinsics, frame, model, p.T_world_obj))
+        published.append(real.median_dz_mm(intrinsics, frame, model, t.T_world_obj))
+        start = said.get(p.instance)
+        if p.obj_id in real.SYMMETRIC or start is None:
+            continue
+        if real.apart_by(model, t.T_world_obj, start.T_world_obj)[1] > real.TURNED_DEG:
+            continue
+        mm, deg = real.apart_by(model, p.T_world_obj, by[p.instance].T_world_obj)
+        assert mm < 1.0, model.name
+        assert deg < 0.5, model.name
+        compared += 1
+    assert compared >= 2
+    assert np.median(ours) < np.median(published)
+
+
+@needs_ycbv
+@pytest.mark.real
+@pytest.mark.slow
+@pytest.mark.parametrize("scene_id", real.SHIFTED[:1])
+def test_poses_of_a_neighbouring_image_are_named(scene_id):
+    found = real.registered(scene_id, "truth")
+    assert any(f.kind == "common shift" for f in found.findings)

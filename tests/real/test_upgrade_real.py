@@ -17,17 +17,13 @@ import cv2
 import numpy as np
 import pytest
 
+from real_data import DATA, needs
 from realsim.app.check.dataset import checked_scenes
 from realsim.app.console import Console
 from realsim.app.upgrade.run import UpgradeConfig, run_upgrade
 
-DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
 YCBV = DATA / "scenes/ycbv_mini"
-pytestmark = [
-    pytest.mark.real,
-    pytest.mark.slow,
-    pytest.mark.skipif(not YCBV.is_dir(), reason=f"no YCB-V data at {YCBV} (set REALSIM_DATA)"),
-]
+pytestmark = [pytest.mark.real, pytest.mark.slow, needs(YCBV)]
 SCENES = (50, 52)
 APPROXIMATE = (52,)
 DELTA_MM = 15.0
