@@ -10,15 +10,22 @@ memory that a few hundred need, and a frame that is kept, or its rows, or its ma
 import hashlib
 import json
 import shutil
-import subprocess
-import sys
+from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from bounded_memory import alone, own_kb
 from file_trees import bytes_of
+from labelled_scenes import SceneInMemory
+from realsim import CameraIntrinsics, images
 from realsim.errors import InputError
+from realsim.formats.bop.root_files import write_bop_root
+from realsim.formats.bop.writing import write_bop_scene
 from realsim.formats.export_folder import FINISHED, STATE, SUMS_FILE, ExportFolder
+from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
+from realsim.geometry import se3
 from refusals import refused
 
 ASKED = {"target": "bop", "scenes": [1, 2]}
@@ -114,93 +121,63 @@ MOST_KB = 4.0
 cameras and what closing needs are 0.9 to 2.4; the rows of a frame as Python has them are 7, its two
 masks 20."""
 
-WORKER = """
-import json, sys
-from functools import lru_cache
-from pathlib import Path
-
-import numpy as np
-
-from realsim import CameraIntrinsics
-from realsim import images
-from realsim.formats.bop.root_files import write_bop_root
-from realsim.formats.bop.writing import write_bop_scene
-from realsim.formats.export_folder import ExportFolder
-from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
-from realsim.geometry import se3
-
 CAMERA = CameraIntrinsics(width=128, height=80, fx=90.0, fy=90.0, cx=64.0, cy=40.0)
 
 
-class Long:
-    name, split, camera, number, notes = "train-000000", "train", "", 0, ()
-    T_world_table = np.eye(4)
+class Long(SceneInMemory):
+    """A scene of many frames, none of which is kept."""
 
-    def __init__(self, home, frames):
-        self.home, self.indices = home, tuple(range(frames))
-        (home / "colour.png").write_bytes(images.png_bytes(np.full((80, 128, 3), 90, np.uint8)))
-        (home / "depth.png").write_bytes(images.png_bytes(np.full((80, 128), 700, np.uint16)))
+    @property
+    def indices(self):
+        return range(self.count)
 
-    @lru_cache(maxsize=1)
+    @lru_cache(maxsize=1)  # noqa: B019 - there is one scene in the process
     def frame(self, index):
         T_world_cam = se3.from_rt(se3.exp_so3([np.pi, 0, 1e-3 * np.sin(index)]), [0, 0, 0.7])
         thing = LabelledObject(obj_id=1, instance=0, T_cam_obj=se3.invert(T_world_cam))
-        return LabelledFrame(index=index, intrinsics=CAMERA, depth_unit_m=1e-3,
-                             objects=(thing,), T_world_cam=T_world_cam)
+        return LabelledFrame(
+            index=index, intrinsics=CAMERA, depth_unit_m=1e-3, objects=(thing,),
+            T_world_cam=T_world_cam,
+        )  # fmt: skip
 
     def colour_file(self, index):
-        return self.home / "colour.png"
+        return self.folder / "colour.png"
 
     def depth_file(self, index):
-        return self.home / "depth.png"
+        return self.folder / "depth.png"
 
     def mask(self, index, k, *, visible):
         mask = np.zeros((80, 128), bool)
         mask[30:50, 50:78] = True
         return mask
 
-    def models(self):
-        return {}
 
-    def grasps(self):
-        return None
-
-
-def memory_kb(key):
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(key + ":"))
-
-
-def write(home, name, frames, few=0):
+def written(home, name, frames, few=0):
+    """Write a scene of so many frames; return the peak of memory after few of them [kB]."""
     peaks = []
-
-    def one_more():
-        peaks.append(memory_kb("VmHWM") if len(peaks) < few else 0)
-
     export = ExportFolder.begin(home / name, {})
-    scene = Long(home, frames)
-    write_bop_scene(scene, export, progress=one_more)
+    scene = Long(folder=home, frames={}, masks={}, models_by_id={}, T_world_table=np.eye(4))
+    scene.count = frames
+    write_bop_scene(
+        scene, export, progress=lambda: peaks.append(own_kb("VmHWM") if len(peaks) < few else 0)
+    )
     write_bop_root(export, name="long")
     export.finish({})
     return max(peaks)
 
 
-frames, few, home = int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3])
-write(home, "first", 20)  # what is imported on the way, and buffers that stay
-Path("/proc/self/clear_refs").write_text("5")
-level = memory_kb("VmRSS")
-with_few = write(home, "long", frames, few)
-print(json.dumps([level, with_few, memory_kb("VmHWM")]))
-"""
+def measured(home, frames=1000):
+    (home / "colour.png").write_bytes(images.png_bytes(np.full((80, 128, 3), 90, np.uint8)))
+    (home / "depth.png").write_bytes(images.png_bytes(np.full((80, 128), 700, np.uint16)))
+    written(home, "first", 20)  # what is imported on the way, and buffers that stay
+    Path("/proc/self/clear_refs").write_text("5")
+    level = own_kb("VmRSS")
+    with_few, peak = written(home, "long", frames, FEW), own_kb("VmHWM")
+    assert (peak - with_few) / (frames - FEW) < MOST_KB
+    assert peak - level < 60_000
 
 
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peaks are read from /proc")
 @pytest.mark.slow
 def test_a_frame_more_needs_no_more_memory(tmp_path):
-    frames = 1000
-    command = [sys.executable, "-c", WORKER, str(frames), str(FEW), str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    level, with_few, peak = json.loads(done.stdout.splitlines()[-1])
-    assert (peak - with_few) / (frames - FEW) < MOST_KB
-    assert peak - level < 60_000
+    alone(measured, tmp_path)

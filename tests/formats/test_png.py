@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-import traced_memory
+import bounded_memory
 from realsim import images
 from realsim.formats.bags.pixels import kind_of, rgb_of
 from realsim.formats.bags.wire import ImageMessage
@@ -229,7 +229,7 @@ def test_sixty_thousand_by_sixty_thousand_pixels_are_refused_at_once(
 ) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(data)
-    with traced_memory.below(20e6):
+    with bounded_memory.below(20e6):
         for read in (images.read_rgb, images.read_grey, images.read_image, images.image_size):
             refused(r"a\.png", read, path)
         refused(r"a\.png", images.read_depth, path, 1e-3)
@@ -273,6 +273,6 @@ def test_a_compressed_message_that_claims_gigapixels_is_no_picture() -> None:
 
 def test_a_row_that_claims_gigabytes_of_padding_costs_none() -> None:
     row = RGB[:1].tobytes()
-    with traced_memory.below(1e6):
+    with bounded_memory.below(1e6):
         found = rgb_of(message(row, "rgb8", 40, 1, 2**31), compressed=False, name="topic")
     assert np.array_equal(found, RGB[:1])

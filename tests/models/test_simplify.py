@@ -1,13 +1,12 @@
 """Simplified meshes stay closed, keep their colours, and how far they are off is measured."""
 
-import multiprocessing
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bounded_memory import alone, own_kb
 from realsim.errors import UnitError
 from realsim.geometry import se3
 from realsim.geometry.mesh import ply_bytes, transformed
@@ -108,20 +107,13 @@ def test_two_million_faces_are_read_and_repaired_within_the_memory(tmp_path):
     mesh = bent_torus(2_000_000)
     rgb = np.clip(255 * (mesh.vertices / 0.3 + 0.5), 0, 255).astype(np.uint8)
     (tmp_path / "a.ply").write_bytes(ply_bytes(replace(mesh, colors=rgb), "m"))
-    # In a process of its own: its peak of memory is then not that of other tests.
-    spawned = multiprocessing.get_context("spawn")
-    alone = spawned.Process(target=measured, args=(tmp_path / "a.ply",))
-    alone.start()
-    alone.join()
-    assert alone.exitcode == 0, "the job failed; its traceback is in the captured stderr"
+    alone(measured, tmp_path / "a.ply")
 
 
 def measured(path):
     repair = repaired(read_scan(path, "m").mesh)
     assert [p.kind for p in repair.before.problems] == ["gigantic"]
-    # Not ru_maxrss: that one survives exec, so it would hold what the test's own process had.
-    peak_kb = int(re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())[1])
-    assert peak_kb < 2.0e6
+    assert own_kb("VmHWM") < 2.0e6
     assert 900_000 < len(repair.mesh.faces) <= 1_000_000
     assert repair.after.is_watertight and repair.after.is_outward
     off = float(re.search(r"by at most ([\d.e-]+) % of the extent", repair.actions[-1])[1])

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-import traced_memory
+import bounded_memory
 from realsim.untrusted.arrays import read_npy, read_npz
 from realsim.untrusted.mat_files import read_mat
 from refusals import refused
@@ -74,7 +74,7 @@ def test_claims_of_a_header_are_refused_before_anything_is_allocated(
 ) -> None:
     path = tmp_path / "a.npy"
     path.write_bytes(claim)
-    with traced_memory.below(20e6):
+    with bounded_memory.below(20e6):
         refused(r"a\.npy", read_npy, path)
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("x.npy", claim)
