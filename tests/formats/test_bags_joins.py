@@ -3,7 +3,6 @@
 librealsense's own recordings: a real .bag of a D435, and a .db3 by the SDK's software device.
 """
 
-import os
 import sqlite3
 import time
 from dataclasses import replace
@@ -16,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from real_data import DATA, needs
 from realsim.errors import UnitError
 from realsim.formats.bags import BagChoice, clocks, open_bag, pixels, wire
 from realsim.formats.bags.joints import UR_JOINTS, JointTrack, prefixes
@@ -180,8 +180,6 @@ def test_a_plane_stays_a_plane_without_holes(zoom: float, roll: float) -> None:
         distortion=np.array([0.05, -0.02, 1e-3, -1e-3, 0.0]),
     )  # fmt: skip
     found = depth_in_colour(counts, CAMERA, colour, T, 1e-4)
-    from realsim.geometry.camera import ray_table
-
     n2 = R @ normal
     d2 = distance + n2 @ T[:3, 3]
     rays2 = ray_table(colour).astype(np.float64)
@@ -210,26 +208,19 @@ def test_the_nearer_surface_hides_the_farther() -> None:
     assert np.all(found[22:38, 5:30] == 10000)
 
 
-BAGS = Path(os.environ.get("REALSIM_DATA", "../shared/data")) / "bags"
+RECORDING = DATA / "bags/single_depth_color_640x480.bag"
 WIDTH, HEIGHT = 320, 240
 T_COLOUR_DEPTH = se3.from_rt(se3.exp_so3(np.array([0.01, -0.02, 0.03])), [0.015, 0.001, 0.002])
 FRAMES = 5
-
-
-def real(name: str) -> Path:
-    path = BAGS / name
-    if not path.exists():
-        pytest.skip(f"{path} is not here: set REALSIM_DATA")
-    return path
 
 
 # --- a real recording -----------------------------------------------------------------------------
 
 
 @pytest.mark.real
+@needs(RECORDING)
 def test_a_real_d435s_depth_lies_on_its_colour_image() -> None:
-    path = real("single_depth_color_640x480.bag")
-    source = open_bag(path, BagChoice(max_pair_gap_s=0.11))
+    source = open_bag(RECORDING, BagChoice(max_pair_gap_s=0.11))
     assert len(source) == 1
     assert source.depth_unit_m == 0.001
     assert source.intrinsics.fx == pytest.approx(613.20367)

@@ -1,5 +1,6 @@
 """Messages of recordings: their bytes, pixels and cameras."""
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,31 +9,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from realsim.formats.bags import pixels, topics, wire
 from realsim.geometry.camera import project
 from refusals import refused
+from written_bags import Bag
 
-ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
-TF = "tf2_msgs/msg/TFMessage"
-ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
 FORMS = ("ros1", "cdr", "cdr big endian")
+BAGS = {form: Bag(Path(), "ros1" if form == "ros1" else "mcap") for form in FORMS}
 S = wire.NS_PER_S
-
-
-def serialised(message: Any, form: str) -> tuple[bytes, bool]:
-    kind = message.__msgtype__
-    if form == "ros1":
-        return bytes(ROS1.serialize_ros1(message, kind)), False
-    little = form == "cdr"
-    return bytes(ROS2.serialize_cdr(message, kind, little_endian=little)), True
-
-
-def header(form: str, stamp_ns: int, frame_id: str) -> Any:
-    t = (ROS1 if form == "ros1" else ROS2).types
-    stamp = t["builtin_interfaces/msg/Time"](stamp_ns // S, stamp_ns % S)
-    return t["std_msgs/msg/Header"](*((7,) if form == "ros1" else ()), stamp, frame_id)
 
 
 # --- bytes ----------------------------------------------------------------------------------------
@@ -48,11 +33,15 @@ def header(form: str, stamp_ns: int, frame_id: str) -> Any:
 def test_joint_states_are_read_as_the_full_deserialiser_reads_them(
     form: str, frame: str, names: list[str], stamp: int
 ) -> None:
-    t = (ROS1 if form == "ros1" else ROS2).types
-    q = np.linspace(-3, 3, len(names))
-    head = header(form, stamp, frame)
-    message = t["sensor_msgs/msg/JointState"](head, names, q, 2 * q, np.zeros(0))
-    found = wire.joints_of(*serialised(message, form))
+    bag, q = BAGS[form], np.linspace(-3, 3, len(names))
+    values = (bag.header(stamp, frame), names, q, 2 * q, np.zeros(0))
+    message = bag.t["sensor_msgs/msg/JointState"](*values)
+    kind = message.__msgtype__
+    if bag.is_ros1:
+        data = bag.store.serialize_ros1(message, kind)
+    else:
+        data = bag.store.serialize_cdr(message, kind, little_endian=form == "cdr")
+    found = wire.joints_of(bytes(data), not bag.is_ros1)
     assert (found.stamp_ns, found.names) == (stamp, tuple(names))
     assert np.array_equal(found.position, q)
     assert np.array_equal(found.velocity, 2 * q)

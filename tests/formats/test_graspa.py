@@ -1,19 +1,17 @@
 """GRASPA's trials of a real robot: its frame, its layout, and what is wrong with a folder."""
 
-import os
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from graspa_folders import T_BOARD_BOX, box_grasps, trials_xml, write_graspa
+from real_data import DATA, needs
 from realsim.formats.grasps.graspa import read_graspa
 from realsim.geometry import se3
 from realsim.robots.hand import find_hand
 from refusals import refused
 
-DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
 OPEN = DATA / "school/graspa_open"
 
 
@@ -135,12 +133,11 @@ def test_a_bad_board_or_mesh_is_named(folder):
 
 @pytest.fixture(scope="module")
 def real():
-    if not OPEN.is_dir():
-        pytest.skip(f"no real trials at {OPEN} (set REALSIM_DATA)")
     return read_graspa(OPEN)
 
 
 @pytest.mark.real
+@needs(OPEN)
 def test_the_open_trials_are_330_of_eight_objects_and_64_percent_held(real):
     held = np.concatenate([obj.held for obj in real])
     assert len(held) == 330 and held.mean() == pytest.approx(0.642, abs=5e-4)
@@ -148,6 +145,7 @@ def test_the_open_trials_are_330_of_eight_objects_and_64_percent_held(real):
 
 
 @pytest.mark.real
+@needs(OPEN)
 @pytest.mark.slow
 def test_the_fingers_close_along_y(real):
     """Between pads that close along y lies the object; along x it lies in fewer hands."""

@@ -1,7 +1,6 @@
 """Convex parts: they fill the mesh and not its hollows, in bounded time; and their file."""
 
 import subprocess
-import sys
 import time
 from dataclasses import replace
 
@@ -18,6 +17,7 @@ from realsim.models.convex import ConvexConfig, collision_obj, convex_parts
 from realsim.models.convex_hulls import fewest, hull_volume, outermost
 from realsim.records import Mesh
 from refusals import refused
+from started_scripts import started
 from trimesh_solids import box, solid
 
 QUICK = ConvexConfig(thresholds=(0.1, 0.05), mcts_iterations=10, mcts_depth=1)
@@ -130,11 +130,7 @@ def waited_for(found, seconds):
 @pytest.mark.slow
 def test_no_process_is_left_behind_by_a_kill(tmp_path):
     # A script without `if __name__ == "__main__"`, as a user writes it.
-    script = tmp_path / "cut.py"
-    script.write_text(SCRIPT)
-    process = subprocess.Popen(
-        [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-    )  # fmt: skip
+    process = started(tmp_path, SCRIPT)
     try:
         workers = waited_for(lambda: {p for p, of in running().items() if of == process.pid}, 120)
         assert workers

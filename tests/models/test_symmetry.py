@@ -1,13 +1,12 @@
 """Symmetries: laws of the group, exact shapes, scans with shape error, and what breaks them."""
 
 import math
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from real_data import DATA, needs
 from realsim.geometry import se3
 from realsim.geometry.mesh import diameter, symmetry_transforms, transformed
 from realsim.geometry.parts import object_model, part
@@ -21,7 +20,7 @@ from refusals import refused
 from trimesh_solids import ball, solid
 
 PHI = (1 + math.sqrt(5)) / 2
-DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
+YCBV_MODELS = DATA / "scenes/ycbv_mini/models"
 
 
 def hull(points, size_m=0.05):
@@ -211,12 +210,10 @@ YCBV = {
 
 @pytest.mark.slow
 @pytest.mark.real
+@needs(YCBV_MODELS)
 @pytest.mark.parametrize("obj_id", YCBV)
 def test_scanned_objects_have_the_symmetries_that_bop_lists(obj_id):
-    folder = DATA / "scenes/ycbv_mini/models"
-    if not folder.is_dir():
-        pytest.skip(f"no data at {folder}")
-    found = find_symmetries(read_scan(folder / f"obj_{obj_id:06d}.ply", "mm").mesh)
+    found = find_symmetries(read_scan(YCBV_MODELS / f"obj_{obj_id:06d}.ply", "mm").mesh)
     assert (len(found.discrete), len(found.axes)) == YCBV[obj_id]
 
 
