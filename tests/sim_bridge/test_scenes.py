@@ -1,5 +1,6 @@
 """A scene under physics: what rests must rest, and what cannot stand must be named."""
 
+import shutil
 from dataclasses import replace
 from functools import partial
 from unittest.mock import patch
@@ -9,14 +10,11 @@ import numpy as np
 import pytest
 from pybullet_utils.bullet_client import BulletClient
 
-from bop_scenes import mm, png
+import bop_scenes
 from realsim.errors import RealsimError
-from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
-from realsim.geometry.camera import ray_table
 from realsim.models.properties import physical_properties
-from realsim.records import CameraIntrinsics, Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
-from realsim.store.atomic import write_json
+from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim_sim_bridge.scenes import stable_state, table_world
 from realsim_sim_bridge.scenes.importers import from_bop, load_scene_source
 from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, Support, known_solids
@@ -221,41 +219,25 @@ def test_rows_and_picture_say_what_happened():
 
 # --- Scenes of other programs: recognised by content, with everything physics needs.
 
-SIZE = (0.06, 0.08, 0.1)
+BLOCKS = ((7, -0.1, 0.0, 0.0), (7, 0.12, 0.0, 0.0))
+SIZE = bop_scenes.SIZES_M[7]
 
 
-def write_bop(root, cameras=1, with_poses=False, depth=True):
-    """Write a dataset of one scene: two blocks on a table, seen by cameras that look down at it."""
-    folder = root / "test" / "000003"
-    K = CameraIntrinsics(fx=200.0, fy=200.0, cx=159.5, cy=119.5, width=320, height=240)
-    camera, truth = {}, {}
-    placed = [se3.from_translation([x, 0.0, SIZE[2] / 2]) for x in (-0.1, 0.12)]
-    for k in range(cameras):
-        T_world_cam = se3.look_at([0.15 * k, -0.5, 0.5], [0.0, 0.0, 0.0])
-        T_cam_world = se3.invert(T_world_cam)
-        camera[str(k)] = {"cam_K": K.K.ravel().tolist(), "depth_scale": 0.1}
-        if with_poses:
-            R, t = mm(T_cam_world)
-            camera[str(k)] |= {"cam_R_w2c": R, "cam_t_w2c": t}
-        seen = [mm(T_cam_world @ T) for T in placed]
-        truth[str(k)] = [{"obj_id": 4, "cam_R_m2c": R, "cam_t_m2c": t} for R, t in seen]
-        rays = ray_table(K) @ T_world_cam[:3, :3].T
-        z = -T_world_cam[2, 3] / rays[..., 2]  # rays have z = 1 in the camera: depth of the table
-        png(folder / f"rgb/{k:06d}.png", np.full((240, 320, 3), 90, np.uint8))
-        if depth:
-            counts = np.where((z > 0) & (z < 3), z * 1e4, 0).astype(np.uint16)
-            png(folder / f"depth/{k:06d}.png", counts)
-    write_json(folder / "scene_camera.json", camera)
-    write_json(folder / "scene_gt.json", truth)
-    save_models(root / "models", {4: ObjectModel(obj_id=4, name="block", mesh=box(SIZE))})
-    return root
+def write_bop(root, count=1, with_poses=False):
+    """Write a dataset of one scene: two alike blocks on a table; return its scene's folder."""
+    K = np.array([[200.0, 0, 159.5], [0, 200.0, 119.5], [0, 0, 1]])
+    with patch.multiple(bop_scenes, WIDTH=320, HEIGHT=240, K=K):
+        return bop_scenes.write_boxes(
+            root, count=count, with_poses=with_poses, things=BLOCKS, drift=0.0
+        )
 
 
 @pytest.mark.parametrize(("cameras", "with_poses"), [(3, True), (1, False)])
 def test_a_bop_scene_stands_on_the_table_that_its_depth_shows(tmp_path, cameras, with_poses):
-    scene = load_scene_source(write_bop(tmp_path, cameras, with_poses))
-    assert [o.obj_id for o in scene.scene.objects] == [4, 4]
-    assert list(scene.names().values()) == ["block #0", "block #1"]
+    write_bop(tmp_path, cameras, with_poses)
+    scene = load_scene_source(tmp_path)
+    assert [o.obj_id for o in scene.scene.objects] == [7, 7]
+    assert list(scene.names().values()) == ["box7 #0", "box7 #1"]
     for o, x in zip(scene.scene.objects, (-0.1, 0.12), strict=True):
         T = scene.T_table_world @ o.T_world_obj
         assert T[2, 3] == pytest.approx(SIZE[2] / 2, abs=5e-4)
@@ -266,15 +248,17 @@ def test_a_bop_scene_stands_on_the_table_that_its_depth_shows(tmp_path, cameras,
 
 
 def test_bop_scenes_that_lack_something_are_refused(tmp_path):
-    dark = write_bop(tmp_path / "a", depth=False)
-    refused("no image with annotated objects and depth", from_bop, dark)
-    refused("image 7", from_bop, write_bop(tmp_path / "b"), image=7)
-    refused("no scene 9", load_scene_source, tmp_path / "b", scene_id=9)
+    folder = write_bop(tmp_path)
+    refused("image 7", from_bop, tmp_path, image=7)
+    refused("no scene 9", load_scene_source, tmp_path, scene_id=9)
+    shutil.rmtree(folder / "depth")
+    refused("no image with annotated objects and depth", from_bop, tmp_path)
 
 
 def test_a_weighed_mass_reaches_the_engine(tmp_path):
-    scene = load_scene_source(write_bop(tmp_path), Matter(masses_kg={4: 0.321}))
-    assert scene.solids[4].matter.mass_kg == pytest.approx(0.321)
+    write_bop(tmp_path)
+    scene = load_scene_source(tmp_path, Matter(masses_kg={7: 0.321}))
+    assert scene.solids[7].matter.mass_kg == pytest.approx(0.321)
     with TableWorld(scene) as world:
         info = world._engine.getDynamicsInfo(world.bodies[0], -1)
     sides = np.array(SIZE) ** 2

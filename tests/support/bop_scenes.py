@@ -67,16 +67,19 @@ def mm(T):
 
 def write_boxes(
     root, *, split="test", scene="000003", camera="", count=5, depth_scale=0.1, colour="rgb",
-    things=THINGS, with_poses=True, models=True, seed=3,
+    things=THINGS, with_poses=True, models=True, seed=3, drift=1.0,
 ):  # fmt: skip
-    """Write a scene as BOP's own programs would; return its folder."""
+    """Write a scene as BOP's own programs would; return its folder.
+
+    The principal point moves by `drift` times (0.5, -0.25) px from image to image.
+    """
     folder = Path(root) / split / scene
     s = f"_{camera}" if camera else ""
     rng = np.random.default_rng(seed)
     cameras, truth, infos = {}, {}, {}
     for k, T_world_cam in enumerate(camera_poses(count, seed)):
         i = 4 * k + 1
-        Kk = K + np.array([[0, 0, 0.5 * k], [0, 0, -0.25 * k], [0, 0, 0]])
+        Kk = K + drift * k * np.array([[0, 0, 0.5], [0, 0, -0.25], [0, 0, 0]])
         T_cw = se3.invert(T_world_cam)
         R, t = mm(T_cw)
         cameras[i] = {"cam_K": Kk.ravel().tolist(), "depth_scale": depth_scale}
