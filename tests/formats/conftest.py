@@ -1,4 +1,4 @@
-"""A placed scene, and the folder that a module's `write(scene, folder)` makes of it."""
+"""A placed scene, and the folder that a module's writer `WRITE` makes of it."""
 
 from pathlib import Path
 
@@ -15,5 +15,5 @@ def scene():
 @pytest.fixture(scope="module")
 def folder(request: pytest.FixtureRequest, scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("written") / "scene"
-    request.module.write(scene, path)
+    placed_scenes.written(request.module.WRITE, scene, path)
     return path

@@ -186,8 +186,7 @@ def held_grasps(found, sets):
         assert np.allclose(Ts, T_world_obj @ s.Ts_obj_grasp, rtol=0, atol=1e-12)
 
 
-def test_what_is_written_is_read_again_with_the_grasps_of_each_instance(tmp_path):
-    scene = placed_scenes.placed_scene()
+def test_what_is_written_is_read_again_with_the_grasps_of_each_instance(scene, tmp_path):
     told = write(scene, grasps(), tmp_path / "s")
     found = read_graspit_scene(tmp_path / "s")
     same(found, scene, grasps())
@@ -199,8 +198,7 @@ def test_what_is_written_is_read_again_with_the_grasps_of_each_instance(tmp_path
     assert height == pytest.approx(scene.table.T_world_table[2, 3], abs=1e-6)
 
 
-def test_the_pairs_are_a_grasp_and_its_half_turn_in_world(tmp_path):
-    scene = placed_scenes.placed_scene()
+def test_the_pairs_are_a_grasp_and_its_half_turn_in_world(scene, tmp_path):
     write(scene, grasps(), tmp_path / "s")
     with h5py.File(tmp_path / "s/grasps.hdf5") as file:
         assert sorted(file) == ["_2_box", "bracket_0", "bracket_2"]
@@ -212,8 +210,8 @@ def test_the_pairs_are_a_grasp_and_its_half_turn_in_world(tmp_path):
     assert np.allclose(Ts[:, 0], wanted, atol=1e-12)
 
 
-def test_a_table_that_leans_in_world_becomes_level(tmp_path):
-    scene = placed_scenes.turned_to(placed_scenes.placed_scene())
+def test_a_table_that_leans_in_world_becomes_level(scene, tmp_path):
+    scene = placed_scenes.turned_to(scene)
     told = write(scene, grasps(), tmp_path / "s")
     found = read_graspit_scene(tmp_path / "s")
     assert any("table's frame" in n for n in told.notes)
@@ -223,8 +221,7 @@ def test_a_table_that_leans_in_world_becomes_level(tmp_path):
     held_grasps(found, grasps())
 
 
-def test_the_same_scene_gives_the_same_bytes_and_several_go_into_one_export(tmp_path):
-    scene = placed_scenes.placed_scene()
+def test_the_same_scene_gives_the_same_bytes_and_several_go_into_one_export(scene, tmp_path):
     for name in "ab":
         write(scene, grasps(), tmp_path / name)
     assert bytes_of(tmp_path / "a") == bytes_of(tmp_path / "b")
@@ -237,7 +234,7 @@ def test_the_same_scene_gives_the_same_bytes_and_several_go_into_one_export(tmp_
     assert text.startswith("grasp_path: scenes/scene_1/grasps.hdf5\n")
 
 
-def test_grasps_of_nothing_are_refused(tmp_path):
+def test_grasps_of_nothing_are_refused(scene, tmp_path):
     stranger = dataclasses.replace(grasps()[0], instance=9)
     assert isinstance(stranger, WorldGrasps)
-    refused("instance 9", write, placed_scenes.placed_scene(), [stranger], tmp_path / "s")
+    refused("instance 9", write, scene, [stranger], tmp_path / "s")

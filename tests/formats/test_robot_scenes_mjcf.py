@@ -3,7 +3,6 @@
 Registered scenes as engines take them: bodies, names, table; what cannot be is refused.
 """
 
-import dataclasses
 from dataclasses import replace
 
 import mujoco
@@ -19,9 +18,7 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 from refusals import refused
 
-
-def write(scene, folder):
-    return placed_scenes.written(write_mjcf_scene, scene, folder)
+WRITE = write_mjcf_scene
 
 
 @pytest.fixture(scope="module")
@@ -104,14 +101,13 @@ def test_the_cameras_frustum_is_that_of_its_intrinsics(scene, model, data):
 
 
 def test_distortion_that_has_no_place_is_told(scene, tmp_path):
-    lens = dataclasses.replace(placed_scenes.CAMERA, distortion=np.array([0.1, 0, 0, 0, 0]))
-    views = (dataclasses.replace(scene.cameras[0], intrinsics=lens),)
-    told = write(dataclasses.replace(scene, cameras=views), tmp_path / "s")
+    lens = replace(placed_scenes.CAMERA, distortion=np.array([0.1, 0, 0, 0, 0]))
+    views = (replace(scene.cameras[0], intrinsics=lens),)
+    told = placed_scenes.written(WRITE, replace(scene, cameras=views), tmp_path / "s")
     assert any("distortion of view_0" in n for n in told.notes)
 
 
-def test_another_world_frame_moves_everything_alike_and_back():
-    scene = placed_scenes.placed_scene()
+def test_another_world_frame_moves_everything_alike_and_back(scene):
     T = se3.random_transform(np.random.default_rng(0))
     moved = seen_from(scene, T)
     a, b = scene.objects[0], moved.objects[0]
@@ -133,8 +129,7 @@ def test_gravity_and_table_follow_the_plane_wherever_the_world_is():
     assert np.allclose(turned.table.size_m, straight.table.size_m)
 
 
-def test_the_table_carries_all_objects_with_its_margin():
-    scene = placed_scenes.placed_scene()
+def test_the_table_carries_all_objects_with_its_margin(scene):
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for o in scene.objects:
         at = se3.invert(scene.table.T_world_table) @ o.T_world_obj
@@ -145,17 +140,16 @@ def test_the_table_carries_all_objects_with_its_margin():
     assert np.allclose(low, -half + TABLE_MARGIN_M) and np.allclose(high, half - TABLE_MARGIN_M)
 
 
-def test_an_object_without_known_matter_has_its_hull_and_its_density_and_a_note_says_so():
-    scene = placed_scenes.placed_scene()
+def test_an_object_without_known_matter_has_its_hull_and_its_density_and_a_note_says_so(scene):
     box = scene.bodies[2]
     assert box.parts is None and np.isclose(box.mass_kg, 1000 * 0.05 * 0.06 * 0.1)
     assert any("2 box" in n and "hull" in n and "0.3 kg" in n for n in scene.notes)
     assert not any("bracket" in n for n in scene.notes)
 
 
-def test_convex_parts_are_closed_and_keep_their_volume():
+def test_convex_parts_are_closed_and_keep_their_volume(scene):
     foot, back = placed_scenes.bracket_bars()
-    parts = placed_scenes.placed_scene().bodies[1].parts
+    parts = scene.bodies[1].parts
     solids = [mass_properties(p, 1.0) for p in parts]
     assert all(s.is_watertight for s in solids)
     assert np.allclose([s.volume_m3 for s in solids], [foot.volume, back.volume])
@@ -184,18 +178,17 @@ def test_scenes_that_cannot_be_simulated_are_refused():
         ({"parts": ()}, "convex parts"),
     ],
 )
-def test_bodies_that_cannot_be_are_refused(change, what):
-    body = placed_scenes.placed_scene().bodies[1]
+def test_bodies_that_cannot_be_are_refused(scene, change, what):
+    body = scene.bodies[1]
     refused(what, replace, body, **change)
     assert isinstance(body, RigidBody)
 
 
-def test_names_are_files_and_prims_and_differ():
+def test_names_are_files_and_prims_and_differ(scene):
     assert file_name("2 box/é") == "_2_box" and file_name("") == "object"
     names = unique_names({0: "mug", 1: "Mug", 2: "table", 3: "can", 4: "mug_0"})
     assert len({n.lower() for n in names.values()}) == 5 and names[3] == "can"
     assert all(n == file_name(n) and n != "table" for n in names.values())
-    scene = placed_scenes.placed_scene()
     refused("letters, digits", replace, scene.objects[0], name="a b")
     twice = tuple(replace(o, name="one") for o in scene.objects)
     refused("used twice", replace, scene, objects=twice)

@@ -10,14 +10,11 @@ import trimesh
 from PIL import Image
 from pybullet_utils.bullet_client import BulletClient
 
-import placed_scenes
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.robot_scenes.urdf import write_urdf_scene
 from realsim.interop import T_from_pybullet, import_pinocchio, quiet_output
 
-
-def write(scene, folder):
-    return placed_scenes.written(write_urdf_scene, scene, folder)
+WRITE = write_urdf_scene
 
 
 @pytest.fixture

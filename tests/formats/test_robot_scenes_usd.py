@@ -13,9 +13,7 @@ from realsim.formats.robot_scenes.mesh_obj import collision_parts
 from realsim.formats.robot_scenes.usd_scene import write_usd_scene
 from refusals import refused
 
-
-def write(scene, folder):
-    return placed_scenes.written(write_usd_scene, scene, folder)
+WRITE = write_usd_scene
 
 
 @pytest.fixture(scope="module")

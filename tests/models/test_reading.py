@@ -162,7 +162,6 @@ def test_nodes_are_placed_and_mirrored_ones_stay_outward(tmp_path):
 
 
 def test_usd_transforms_instances_and_mirrors(tmp_path):
-    pytest.importorskip("pxr", reason="the extra realsim[usd] is not installed")
     from pxr import Gf, Usd, UsdGeom
 
     write_usd(tmp_path / "part.usda", BRACKET)
@@ -349,7 +348,6 @@ def test_bad_files_are_named(tmp_path):
 
 
 def test_bad_usd_files_are_named(tmp_path):
-    pytest.importorskip("pxr", reason="the extra realsim[usd] is not installed")
     (tmp_path / "noise.usda").write_text("#usda 1.0\n(nonsense")
     (tmp_path / "noise.usdz").write_bytes(bytes(range(256)))
     (tmp_path / "nothing.usda").write_text("#usda 1.0\n(metersPerUnit = 1)\n")

@@ -116,8 +116,6 @@ def test_contact_sheet_holds_every_picture() -> None:
 
 
 def test_legend_and_png(tmp_path: Path) -> None:
-    import cv2
-
     out = overlay.draw_legend(black(), [("mug", (255, 0, 0))])
     overlay.save_png(tmp_path / "a.png", out)
     assert np.array_equal(cv2.imread(str(tmp_path / "a.png"))[..., ::-1], out)

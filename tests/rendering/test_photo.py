@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -45,8 +46,6 @@ def photo_of_board(
 
 def edge_offsets(rgb: np.ndarray, T_cam_board: np.ndarray) -> np.ndarray:
     """Return (edges, 3): how far outward each tag edge is seen [px], and its outward normal."""
-    import cv2
-
     grey = rgb.mean(-1).astype(np.float32)
     s = np.linspace(-2.8, 2.8, 57)
     found: list[list[float]] = []
@@ -91,8 +90,6 @@ def test_the_measurement_would_see_half_a_pixel() -> None:
 
 
 def test_a_detector_reads_the_tags_upright() -> None:
-    import cv2
-
     rgb, corners, _ = photo_of_board([0.37, -0.1, 0.26])
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX

@@ -39,9 +39,7 @@ from trimesh_solids import box
 
 @pytest.fixture(params=ENGINES)
 def engine(request):
-    """The name of each engine that is there."""
-    if request.param == "mujoco":
-        pytest.importorskip("mujoco")
+    """The name of each engine."""
     return request.param
 
 
@@ -122,15 +120,13 @@ def test_a_stiffness_that_cannot_be_is_refused_with_what_can():
         refused("1000 to 500000 N/m is accepted", PadModel, pad_stiffness_n_per_m=value)
     soft = PadModel(pad_stiffness_n_per_m=2e4)
     refused(r"4\.667e\+04 N/m or more .* 30 N or less", SlipPhysics, force_n=70.0, pads=soft)
-    if pytest.importorskip("mujoco"):
-        trial, long = cube_trial(20.0, DOWN[None], find_hand()), MujocoSettings(step_s=0.1)
-        physics = SlipPhysics(pads=PadModel(pad_stiffness_n_per_m=5e5))
-        world = make_engine(long).world
-        refused("shorter step_s", world, trial.body, trial.grips(0.004), physics, find_hand())
+    trial, long = cube_trial(20.0, DOWN[None], find_hand()), MujocoSettings(step_s=0.1)
+    physics = SlipPhysics(pads=PadModel(pad_stiffness_n_per_m=5e5))
+    world = make_engine(long).world
+    refused("shorter step_s", world, trial.body, trial.grips(0.004), physics, find_hand())
 
 
 def test_pads_of_an_arc_are_where_it_has_them_while_they_close():
-    pytest.importorskip("mujoco")
     hand = find_hand("robotiq_2f140")
     trial = cube_trial(0.125, DOWN[None], hand)
     y = np.linspace(0.0, hand.max_opening_m / 2, 50)
@@ -359,7 +355,6 @@ def test_labels_are_counted_and_what_one_did_not_judge_is_left_out():
 
 
 def test_two_engines_agree_on_a_box_that_coulomb_s_law_decides():
-    pytest.importorskip("mujoco")
     # 2 mu F against 2.9 N of weight: 28 N hold; with 0.4 N, and with all weight 6 cm beside the
     # pads, the box falls or turns.
     strong = checked([0.0, 0.02], force_n=70.0, friction=0.2)

@@ -14,8 +14,6 @@ from realsim_sim_bridge.slip.mujoco_world import MujocoEngine
 from realsim_sim_bridge.slip.world import Closing, Grips, SlipPhysics
 from refusals import refused
 
-pytest.importorskip("mujoco")
-
 CENTRED = np.eye(4)[None]
 CUBE = held_box(0.125)
 GRAVITY = np.array([0.0, 0.0, -9.81])

@@ -272,7 +272,6 @@ def ray_workers_below(pid):
 
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_finds_what_one_process_finds():
-    pytest.importorskip("ray")
     killed = []
 
     def kill_one(done, of):

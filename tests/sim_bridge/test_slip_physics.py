@@ -323,8 +323,6 @@ def test_levels_that_do_not_descend_are_refused():
 
 @pytest.mark.parametrize(("engine", "mass"), [("pybullet", 0.125), ("mujoco", 0.5)])
 def test_the_least_friction_and_force_are_coulomb_s(engine, mass):
-    if engine == "mujoco":
-        pytest.importorskip("mujoco")
     # Two pads carry 2 mu F. Below the weight the box falls, above the peak load it stays; between
     # it slides for a moment, which may stay below 2 cm.
     force_n, friction = 20.0, 0.25
@@ -347,7 +345,6 @@ def test_the_least_friction_and_force_are_coulomb_s(engine, mass):
 
 
 def test_pads_that_cannot_be_and_forces_that_press_them_through_are_left_out():
-    pytest.importorskip("mujoco")
     own = SlipPhysics(force_n=20.0).with_pads(3e4)
     sweep = SweepConfig(frictions=(1.0,), forces_n=(70.0, 20.0), stiffness_factors=(50.0, 1.0, 0.3))
     found = measured(trial(mass=0.2), sweep, own, "mujoco")

@@ -85,7 +85,6 @@ def test_the_shipped_settings_pass_a_small_suite():
 
 @pytest.mark.slow
 def test_the_quick_suite_passes():
-    pytest.importorskip("mujoco")
     told = Mock()
     report = validate(settings_of("mujoco"), ValidationConfig().quick(), told)
     assert failed(report) == set(), report.to_rows()
@@ -137,7 +136,6 @@ def test_a_light_object_without_a_mass_floor_fails():
 
 
 def test_soft_friction_in_mujoco_creeps():
-    pytest.importorskip("mujoco")
     assert failed(run("creep", settings=MujocoSettings())) == set()
     report = run("creep", settings=MujocoSettings(creep_n_s_per_m=400.0))
     assert {"no creep", "no creeping turn", "no creep on a cylinder"} <= failed(report)

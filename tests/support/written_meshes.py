@@ -1,7 +1,6 @@
 """Meshes with textures, and files of them as other programs write them."""
 
 import numpy as np
-import pytest
 
 from realsim.records import Mesh
 
@@ -74,7 +73,6 @@ def write_textured_obj(path, mesh, texture_name="skin.png"):
 
 def write_usd(path, mesh, *, metres=1.0, up="Z", texture="skin.png", uv_scale=None):
     """Write a mesh with a UsdPreviewSurface; faceVarying coordinates, as exporters do."""
-    pytest.importorskip("pxr", reason="the extra realsim[usd] is not installed")
     from PIL import Image
     from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
