@@ -65,6 +65,9 @@ def test_another_source_is_refused_until_it_is_said(tmp_path):
     kept = "cannot.*earlier import in .* stays as it was"
     refused(kept, import_session, broken, folder, QUIET, overwrite=True)
     check_equal(folder, ten())
+    folder.rename(tmp_path / ".s.replaced")  # as of a kill just before the new one has its name
+    refused("another source", import_session, others[0], folder, QUIET)
+    check_equal(folder, ten())
     import_session(Recording(ten()[:4], content="b"), folder, QUIET, overwrite=True)
     check_equal(folder, ten()[:4])
     assert [p.name for p in tmp_path.iterdir()] == ["s"]
