@@ -54,6 +54,19 @@ def test_real_scenes_are_read(tmp_path):
 
 
 @needs_ycbv
+def test_ids_of_two_objects_that_are_swapped_are_named(tmp_path):
+    shutil.copytree(YCBV / "test/000050", tmp_path / "test/000050", copy_function=shutil.copyfile)
+    (tmp_path / "models").symlink_to(YCBV / "models")
+    assert "swapped" not in " ".join(open_labelled_bop(tmp_path).notes)
+    path = tmp_path / "test/000050/scene_gt.json"
+    rows = json.loads(path.read_text())
+    for row in rows["1"]:
+        row["obj_id"] = {2: 4, 4: 2}.get(row["obj_id"], row["obj_id"])
+    path.write_text(json.dumps(rows))
+    assert "object 2 and object 4 seem to be swapped" in " ".join(open_labelled_bop(tmp_path).notes)
+
+
+@needs_ycbv
 def test_a_real_scene_makes_the_round_trip(tmp_path):
     scene = bop.read_scene(bop.find_scenes(YCBV)[0])
     session = CaptureSession(
