@@ -1,15 +1,43 @@
-"""What a replay is made of: the configuration read back, the watched engine, the fall."""
+"""What a replay is made of: the configuration read back, the watched engine, the fall.
+
+Where it is seen from, and goals in words: met where the words say so, and nowhere else.
+"""
 
 import json
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import trimesh_solids
 from held_boxes import held_box
+from realsim.app.school.files import stored_grasps
 from realsim.geometry import se3
+from realsim.geometry.camera import project
 from realsim.geometry.mesh import mass_properties
 from realsim_sim_bridge.demonstrations.attempt_motion import fall
+from realsim_sim_bridge.demonstrations.front_view import (
+    BORDER,
+    FrontView,
+    Happening,
+    hidden,
+    nearest_camera,
+    placed_front,
+    view_intrinsics,
+    wrist_camera,
+)
+from realsim_sim_bridge.demonstrations.place_source import PlacingSource
+from realsim_sim_bridge.demonstrations.placing import (
+    FREE,
+    PHRASES,
+    PlaceGoal,
+    Standing,
+    distance,
+    goals_of,
+    unmet,
+)
+from realsim_sim_bridge.demonstrations.records import ALL_PHASES
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of, tried_body
 from realsim_sim_bridge.demonstrations.slip_replay import RecordedEngine, replay_grasp
 from realsim_sim_bridge.school import run_school_results
@@ -19,7 +47,6 @@ from realsim_sim_bridge.slip.engines import make_engine, settings_of
 from refusals import refused
 from school_scenes import CONFIG, at, model, scene, small_worlds
 from tried_grasps import plain_grasps
-from trimesh_solids import box
 
 
 def test_a_configuration_comes_back_from_the_parameters():
@@ -70,7 +97,7 @@ def test_a_box_that_is_dropped_lands_on_its_face():
 
 def test_a_thrown_box_flies_on_and_lands_on_what_stands_there():
     twist = np.array([0, 0, 0, 0.5, 0, 0.0])
-    block = box((0.2, 0.2, 0.05), (0.07, 0, 0.025)).vertices
+    block = trimesh_solids.box((0.2, 0.2, 0.05), (0.07, 0, 0.025)).vertices
     T = se3.from_translation([0.0, 0, 0.2])
     Ts = fall(held_box(0.1), T, twist, [block], np.array([0.1, 1.0]))
     assert Ts[0, 0, 3] == pytest.approx(0.05, abs=2e-3)
@@ -101,3 +128,174 @@ def test_a_replay_in_bullet_ends_as_the_school_did():
         ends = [st.Ts_grasp_obj[-1] for st in replay.stages[:-1]]
         for end, stage in zip(ends, replay.stages[1:], strict=True):
             np.testing.assert_array_equal(end, stage.Ts_grasp_obj[0])
+
+
+# --- The camera beside the table: it sees all that happens, as near and as little hidden as can be.
+
+
+CAMERA = view_intrinsics(40.0)
+TOWARDS = np.array([1.0, 0.4, 0.6])
+
+
+def some(seed, n=40):
+    return np.random.default_rng(seed).uniform([-0.2, -0.1, 0], [0.2, 0.3, 0.4], (n, 3))
+
+
+def a_grasp(arms, away=(1.0, 0.0)):
+    grasp = np.array([[0.0, 0.0, 0.05]])
+    return Happening(
+        standing=some(1) * [1, 1, 0.2], moving=some(2), grasps=grasp,
+        hands=grasp[:, None] + [0.0, 0.0, 0.1], arms=np.array(arms, float).reshape(1, -1, 3),
+        away_from_base=np.array(away),
+    )  # fmt: skip
+
+
+def test_the_nearest_camera_sees_all_and_no_nearer_one_does():
+    points = some(0)
+    T = nearest_camera(points, TOWARDS, CAMERA)
+    p = se3.transform(se3.invert(T), points)
+    uv = project(CAMERA, p)
+    edge = BORDER * np.array([CAMERA.width, CAMERA.height])
+    low, high = edge - 0.5, np.array([CAMERA.width, CAMERA.height]) - edge - 0.5
+    assert p[:, 2].min() > 0 and (uv > low - 1e-6).all() and (uv < high + 1e-6).all()
+    # It touches two opposite borders, so that no camera nearer along its axis has room for all.
+    assert np.any(np.isclose(uv.min(axis=0), low) & np.isclose(uv.max(axis=0), high))
+
+
+def test_a_scene_that_is_elsewhere_is_seen_alike():
+    moved = se3.exp([0.0, 0.0, 0.7, 0.3, -0.2, 0.0])
+    T = nearest_camera(some(0), TOWARDS, CAMERA)
+    again = nearest_camera(se3.transform(moved, some(0)), moved[:3, :3] @ TOWARDS, CAMERA)
+    np.testing.assert_allclose(again, moved @ T, atol=1e-9)
+
+
+def test_an_arm_between_camera_and_grasp_hides_it_and_one_behind_does_not():
+    eye = np.array([1.0, 0.0, 0.5])
+    between, behind = a_grasp([[0.5, 0.02, 0.275]]), a_grasp([[-0.5, 0.0, -0.2]])
+    assert hidden(between, eye).tolist() == [True]
+    assert hidden(behind, eye).tolist() == [False]
+    assert hidden(between, np.array([0.0, 1.0, 0.5])).tolist() == [False]
+
+
+def test_the_camera_goes_to_the_side_that_the_arm_leaves_free():
+    # An arm that reaches around: it comes from the side opposite its base, and from one more.
+    line = np.linspace(0.1, 0.6, 12)[:, None]
+    wall = [line * [np.cos(a), np.sin(a), 0.6] + [0, 0, 0.05] for a in np.radians([0, -30, -60])]
+    seen = a_grasp(np.concatenate([np.add(w, [0, 0, up]) for w in wall for up in (0.0, 0.1)]))
+    camera = placed_front(FrontView(), seen)
+    assert camera.T_frame_cam[1, 3] > 0.2
+    assert not hidden(seen, camera.T_frame_cam[:3, 3]).any()
+    turned = placed_front(FrontView(), replace(seen, away_from_base=np.array([-1.0, 0.0])))
+    assert turned.T_frame_cam[0, 3] < 0
+
+
+# --- Goals in words: met where the words say so, and nowhere else.
+
+
+MUG, BOWL = 3, 7
+NAMES = {MUG: "mug", BOWL: "bowl"}
+OPPOSITE = {"left": "right", "right": "left", "front": "behind", "behind": "front"}
+MIRRORED = {"left": [0, 1], "right": [0, -1], "front": [-1, 0], "behind": [1, 0]}
+"""Directions of the relations for a robot that looks along x."""
+
+
+def box(x: float, y: float, half: float, height: float = 0.1) -> np.ndarray:
+    corners = [[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (0, 1)]
+    return np.array(corners) * [half, half, height] + [x, y, 0.0]
+
+
+def standing(turn: float = 0.0, gap: float = 0.02) -> Standing:
+    """A mug before the robot and a bowl left of it, the whole scene turned."""
+    R = se3.exp_so3([0.0, 0.0, turn])
+    return Standing(
+        corners={MUG: box(0.0, 0.0, 0.03) @ R.T, BOWL: box(0.02, 0.08 + gap, 0.05) @ R.T},
+        names=NAMES,
+        ahead=(R @ [1.0, 0.0, 0.0])[:2],
+    )
+
+
+def put(goal: PlaceGoal) -> np.ndarray:
+    return se3.from_translation([*goal.shift_m, 0.0])
+
+
+@pytest.mark.parametrize("turn", (0.0, 0.9, 2.8))
+def test_goals_are_met_where_they_lead_and_not_where_they_do_not(turn: float) -> None:
+    there = standing(turn)
+    goals = list(goals_of(there, MUG, 0))
+    assert {g.relation for g in goals} == set(PHRASES) - {"right"}  # it is there already
+    for goal in goals:
+        assert unmet(goal, there, MUG, np.eye(4), put(goal)) == ""
+        moved = se3.transform(put(goal), there.corners[MUG])
+        assert distance(moved, [there.corners[BOWL]]) >= 0.02
+        if goal.relation == FREE:
+            continue
+        for other in goals:
+            if other.relation == OPPOSITE[goal.relation]:
+                assert "is not" in unmet(goal, there, MUG, np.eye(4), put(other))
+        assert "is not" in unmet(goal, there, MUG, np.eye(4), np.eye(4))
+        # Where the words lead, by hand.
+        R = se3.exp_so3([0.0, 0.0, turn])
+        apart = moved.mean(axis=0) - there.corners[BOWL].mean(axis=0)
+        x, y, _ = R.T @ apart
+        assert np.dot(MIRRORED[goal.relation], [x, y]) > 0.05
+
+
+def test_what_leans_hangs_or_is_too_near_does_not_meet_its_goal() -> None:
+    there = standing()
+    goal = next(g for g in goals_of(there, MUG, 0) if g.relation == "left")
+    tipped = se3.from_rt(se3.exp_so3([np.pi / 2, 0.0, 0.0]), [0.0, 0.03, 0.03])
+    assert "leans 90 deg" in unmet(goal, there, MUG, np.eye(4), put(goal) @ tipped)
+    hanging = se3.from_translation([0.0, 0.0, 0.02]) @ put(goal)
+    assert "on the table" in unmet(goal, there, MUG, np.eye(4), hanging)
+    free = next(g for g in goals_of(there, MUG, 0) if g.relation == FREE)
+    near = se3.from_translation([0.02, 0.01, 0.0])
+    assert "10 mm from another" in unmet(free, there, MUG, np.eye(4), near)
+
+
+def test_phrasings_are_taken_in_turn_and_name_both_things() -> None:
+    said = [next(goals_of(standing(), MUG, k)).language for k in range(4)]
+    assert len(set(said[:3])) == 3
+    assert said[3] == said[0]
+    assert all("mug" in words and "bowl" in words for words in said)
+
+
+def test_things_of_one_name_are_no_reference_to_each_other() -> None:
+    there = standing()
+    same = replace(there, names={MUG: "mug", BOWL: "mug"})
+    assert [g.relation for g in goals_of(same, MUG, 0)] == [FREE]
+    apart = standing(gap=0.1)
+    assert FREE not in [g.relation for g in goals_of(apart, MUG, 0)]  # nothing is near it
+
+
+def test_overlap_is_no_distance() -> None:
+    assert distance(box(0, 0, 0.05), [box(0.02, 0, 0.01)]) == 0.0
+    assert distance(box(0, 0, 0.05), [box(0.2, 0, 0.05)]) == pytest.approx(0.1, abs=1e-9)
+    assert distance(box(0, 0, 0.05), []) == np.inf
+
+
+@pytest.mark.slow
+def test_an_object_is_carried_let_go_and_where_its_task_says(weak_school: Path) -> None:
+    grasps, models = stored_grasps(weak_school)
+    cameras = (FrontView(size_px=(64, 48)), wrist_camera(None, (64, 48)))
+    source = PlacingSource(grasps, models, cameras=cameras, cache=weak_school / "grasps/cache")
+    done = [source[k] for k in range(len(source))]
+    good = [d for d in done if d.outcome.success]
+    assert good
+    assert len(good) < len(done)  # the weak hand loses some
+    for d in done:
+        place = d.goal.place
+        assert place is not None
+        assert d.outcome.success == (d.outcome.failure == "")
+        instance = d.name.instance
+        T0, T = source.scenery.Ts_table_obj[instance], d.motion.Ts_table_obj[-1]
+        if d.outcome.success:
+            assert unmet(place, source.standing, instance, T0, T) == ""
+            phases = [ALL_PHASES[p] for p in np.unique(d.motion.phase)]
+            assert phases[-4:] == ["carry", "lower", "release", "withdraw"]
+            # What hangs askew in the weak hand comes down askew, and turns as it lands.
+            np.testing.assert_allclose(T[:2, 3] - T0[:2, 3], place.shift_m, atol=0.05)
+            # It rests, and the hand has gone.
+            np.testing.assert_allclose(d.motion.Ts_table_obj[-3], T, atol=1e-3)
+            assert not d.motion.held[-1]
+            steps = np.abs(np.diff(d.motion.joints_rad, axis=0)).max()
+            assert steps < 0.25  # nothing jumps [rad in 50 ms]

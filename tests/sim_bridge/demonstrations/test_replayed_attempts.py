@@ -8,7 +8,9 @@ import pytest
 
 from realsim.app.school.files import stored_grasps
 from realsim.geometry import se3
+from realsim.geometry.camera import project
 from realsim.records.trajectories import PHASES
+from realsim_sim_bridge.demonstrations.front_view import FINGERS_M, FrontView, wrist_camera
 from realsim_sim_bridge.demonstrations.records import DemonstrationConfig
 from realsim_sim_bridge.demonstrations.source import DemonstrationSource
 from refusals import refused
@@ -17,6 +19,14 @@ from scanned_objects import scaled
 pytestmark = pytest.mark.slow  # the school of all of them takes long
 
 LIFT = PHASES.index("lift")
+SMALL = (64, 48)
+
+
+@pytest.fixture(scope="module")
+def source(weak_school):
+    """The attempts of one school that succeed, slip and are lost, with small pictures."""
+    cameras = (FrontView(size_px=SMALL), wrist_camera(None, SMALL))
+    return sourced(weak_school, cameras=cameras)
 
 
 def sourced(school, grasps=None, **options):
@@ -149,3 +159,22 @@ def test_grasps_that_do_not_say_how_they_were_tried_are_refused(weak_school):
     untold = replace(grasps, sets=bare)
     refused("do not say what they were tried with", DemonstrationSource, untold, models)
     refused("without trajectories", DemonstrationSource, replace(grasps, trajectories={}), models)
+
+
+def test_fingers_and_objects_are_in_the_picture_from_pre_grasp_to_lift(source):
+    camera = source.scenery.cameras["front"]
+    i, T_cam_table = camera.intrinsics, se3.invert(camera.T_frame_cam)
+    shown = [PHASES.index(p) for p in ("approach", "close", "lift")]
+    for d in source[: len(source)]:
+        m = d.motion
+        for k in np.nonzero(np.isin(m.phase, shown) & ((m.phase < shown[-1]) | m.held))[0]:
+            points = [se3.transform(d.scenery.T_table_base @ m.Ts_base_ee[k], FINGERS_M)]
+            points += [
+                se3.transform(m.Ts_table_obj[k] if n == d.name.instance else T, o.mesh.vertices)
+                for (n, o), T in zip(
+                    d.scenery.models.items(), d.scenery.Ts_table_obj.values(), strict=True
+                )
+            ]
+            u, v = project(i, se3.transform(T_cam_table, np.concatenate(points))).T
+            assert u.min() >= -0.5 and u.max() <= i.width - 0.5, (d.name, k)
+            assert v.min() >= -0.5 and v.max() <= i.height - 0.5, (d.name, k)
