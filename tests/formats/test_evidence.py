@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.formats.evidence import (
     depth_evidence,
     objects_evidence,
@@ -63,8 +62,8 @@ def test_objects_agree_only_under_the_right_reading():
     for name in WRONG:
         wrong = objects_evidence(readings(Ts)[name], things)
         assert wrong.contradicts and wrong.decisive
-        with pytest.raises(InputError, match=r"not what they are said to be.*as stated: \d+"):
-            require_direction(wrong, "scene 3")
+        said = r"not what they are said to be.*as stated: \d+"
+        refused(said, require_direction, wrong, "scene 3")
 
 
 def test_the_verdict_does_not_depend_on_the_world():

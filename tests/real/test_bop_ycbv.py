@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bop_scenes import edit
 from real_data import DATA, needs
 from realsim.errors import UnitError
 from realsim.formats.bop import labels as bop_labels
@@ -21,6 +22,7 @@ from realsim.geometry.mesh import diameter, mass_properties
 from realsim.geometry.metrics import mssd
 from realsim.records import CaptureSession, View
 from realsim.store import SessionStore
+from refusals import refused
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 
@@ -164,11 +166,9 @@ def test_depth_of_real_scenes_lies_just_before_the_labelled_origins():
 def test_a_wrong_depth_scale_of_a_real_scene_is_found(tmp_path):
     shutil.copytree(YCBV / "test/000050", tmp_path / "test/000050")
     path = tmp_path / "test/000050/scene_camera.json"
-    rows = json.loads(path.read_text())
-    rows["1"]["depth_scale"] *= 10.0
-    path.write_text(json.dumps(rows))
-    with pytest.raises(UnitError, match=r"with depth_scale 0\.1 depth would be 0\.9"):
-        open_labelled_bop(tmp_path)
+    edit(path, lambda rows: rows["1"].update(depth_scale=10.0 * rows["1"]["depth_scale"]))
+    told = r"with depth_scale 0\.1 depth would be 0\.9"
+    refused(told, open_labelled_bop, tmp_path, error=UnitError)
 
 
 # --- registered poses agree with the depth better than the published ones ------------------------

@@ -1,6 +1,7 @@
 """Shadows of a second eye: by rays, by brute force, and by the scan of a depth image."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,6 @@ import pytest
 
 from fault_sessions import losses
 from plain_meshes import square
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, Mesh
@@ -113,12 +113,10 @@ def test_a_given_shadow_is_lost_and_mistakes_are_named() -> None:
     shadow = np.zeros((72, 96), bool)
     shadow[10:20, 30:40] = True
     model = replace(DepthSensorModel.noiseless(), occlusion=True)
-    out = model.measure(depth, CAMERA, np.random.default_rng(0), shadow=shadow)
-    assert np.array_equal(out == 0, shadow)
-    with pytest.raises(InputError, match="give T_world_cam"):
-        model.measure(depth, CAMERA, np.random.default_rng(0), scene=RayScene(placed()))
-    with pytest.raises(InputError, match="the camera 96x72"):
-        model.measure(depth, CAMERA, np.random.default_rng(0), shadow=shadow[:10])
+    measured = partial(model.measure, depth, CAMERA, np.random.default_rng(0))
+    assert np.array_equal(measured(shadow=shadow) == 0, shadow)
+    refused("give T_world_cam", measured, scene=RayScene(placed()))
+    refused("the camera 96x72", measured, shadow=shadow[:10])
 
 
 # --- The one depth camera: every source sees the same scene, and each fault comes from where it is.

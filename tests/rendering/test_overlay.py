@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, GraspSet
 from realsim.rendering import overlay
@@ -217,8 +216,8 @@ def test_a_photograph_stays_where_no_instance_is() -> None:
     picture = instance_picture(IDS, np.full((2, 3, 3), 200, np.uint8), strength=1.0)
     assert tuple(picture[0, 0]) == (200, 200, 200)
     assert tuple(picture[0, 2]) == instance_color(3)
-    with pytest.raises(InputError, match=r"photograph is 3x4 and the instances are 3x2"):
-        instance_picture(IDS, np.zeros((4, 3, 3), np.uint8))
+    other = np.zeros((4, 3, 3), np.uint8)
+    refused("photograph is 3x4 and the instances are 3x2", instance_picture, IDS, other)
 
 
 def test_normals_towards_the_viewer_are_blue_upwards_green_rightwards_red() -> None:

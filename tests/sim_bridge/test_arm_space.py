@@ -8,7 +8,6 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull, KDTree
 
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.interop import pybullet_client
 from realsim.robots.arm import find_arm
@@ -390,5 +389,4 @@ def test_a_rounded_path_is_used_only_where_it_is_free_and_is_quicker():
 
 def test_timings_that_make_no_sense_are_refused():
     for wrong in ({"velocity_share": 0.0}, {"acceleration_share": 1.5}, {"sample_hz": 0.0}):
-        with pytest.raises(InputError):
-            TimingConfig(**wrong)
+        refused(".", TimingConfig, **wrong)

@@ -10,7 +10,7 @@ import pytest
 
 from llvm_library import NEEDS_LLVM
 from plain_meshes import box, square
-from realsim.errors import InputError, MissingLibraryError
+from realsim.errors import MissingLibraryError
 from realsim.geometry import se3
 from realsim.geometry.colors import srgb_decoded
 from realsim.records import CameraIntrinsics
@@ -19,6 +19,7 @@ from realsim.rendering.embedded.materials import PLAIN_COLORS
 from realsim.rendering.photoreal import PhotorealConfig, PhotorealRenderer, find_llvm, llvm_probe
 from realsim.rendering.photoreal.renderer import denoised
 from realsim.rendering.rays import PlacedMesh
+from refusals import refused
 
 CAMERA = CameraIntrinsics(width=32, height=32, fx=32.0, fy=32.0, cx=15.5, cy=15.5)
 FROM_ABOVE = se3.look_at([0.0, 0.0, 1.0], [0.0, 0.0, 0.0])
@@ -108,9 +109,8 @@ def test_metal_mirrors_the_room_in_its_own_colour() -> None:
 def test_a_material_that_needs_coordinates_on_a_mesh_without_is_named() -> None:
     mesh = replace(square(), uv=None)
     material = Material(base_color_image=COLORS, projection="uv", name="label")
-    with pytest.raises(InputError, match=r"label.*box"):
-        PhotorealRenderer([PlacedMesh(4, mesh, np.eye(4), material)], WHITE_ROOM,
-                          PhotorealConfig(variant="scalar"))  # fmt: skip
+    placed, config = [PlacedMesh(4, mesh, np.eye(4), material)], PhotorealConfig(variant="scalar")
+    refused("label.*box", PhotorealRenderer, placed, WHITE_ROOM, config)
 
 
 # --- Which variant renders, what is said when it is not the fast one, and that seeds reproduce.
@@ -234,8 +234,8 @@ def test_llvm_asked_for_and_not_there_is_an_error_that_offers_the_other(
 ) -> None:
     monkeypatch.delitem(sys.modules, "drjit", raising=False)
     monkeypatch.setattr(llvm_probe, "library_patterns", lambda: (f"{tmp_path}/libLLVM*.so*",))
-    with pytest.raises(InputError, match=r"'llvm' was asked for.*libllvm19.*'scalar'"):
-        PhotorealRenderer([], SKY, PhotorealConfig(variant="llvm", samples=1))
+    told, config = "'llvm' was asked for.*libllvm19.*'scalar'", PhotorealConfig(variant="llvm")
+    refused(told, PhotorealRenderer, [], SKY, config)
     assert not verdicts.exists()
 
 
@@ -252,13 +252,12 @@ def test_without_llvm_the_scalar_variant_renders_and_says_so(
 
 def test_without_mitsuba_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    with pytest.raises(MissingLibraryError, match=r"realsim\[photo\]"):
-        PhotorealRenderer([], SKY, PhotorealConfig(variant="scalar", samples=1))
+    config = PhotorealConfig(variant="scalar", samples=1)
+    refused(r"realsim\[photo\]", PhotorealRenderer, [], SKY, config, error=MissingLibraryError)
 
 
 @pytest.mark.parametrize(
     "bad", [{"samples": 0}, {"max_depth": 0}, {"psf_px": -1.0}, {"variant": "cuda"}]
 )
 def test_a_config_out_of_range_is_named(bad: dict[str, object]) -> None:
-    with pytest.raises(InputError, match=str(next(iter(bad.values())))):
-        PhotorealConfig(**bad)  # pyright: ignore[reportArgumentType]
+    refused(str(next(iter(bad.values()))), PhotorealConfig, **bad)  # pyright: ignore[reportArgumentType]

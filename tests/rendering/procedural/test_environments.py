@@ -1,5 +1,6 @@
 """Skies and rooms: formulas that are kept, light that adds up, a grey card that is mid-grey."""
 
+import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -7,12 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry.colors import luminance
 from realsim.rendering.appearance import Environment
 from realsim.rendering.procedural import rooms, skies
 from realsim.rendering.procedural.choose import random_environment
-from realsim.rendering.procedural.hdri import read_environment, split_sun
+from realsim.rendering.procedural.hdri import _mended, read_environment, split_sun
 from realsim.rendering.procedural.skies import card_light, directions, solid_angles, sunny_sky
 from refusals import refused
 
@@ -200,8 +200,6 @@ def test_large_panoramas_are_reduced_with_their_light(tmp_path: Path) -> None:
 
 
 def test_values_that_are_no_light_are_named_and_mended() -> None:
-    from realsim.rendering.procedural.hdri import _mended
-
     bad = np.ones((4, 8, 3), np.float32)
     bad[0, 0], bad[1, 1, 0], bad[2, 2] = np.nan, np.inf, -3.0
     notes: list[str] = []
@@ -218,8 +216,8 @@ def test_values_that_are_no_light_are_named_and_mended() -> None:
 def test_bad_files_are_named(tmp_path: Path) -> None:
     square = write_hdr(tmp_path / "square.hdr", np.ones((64, 64, 3)))
     refused(r"64x64.*twice as wide", read_environment, square)
-    with pytest.raises(InputError, match="black all over"):
-        read_environment(write_hdr(tmp_path / "black.hdr", np.zeros((64, 128, 3))))
+    black = write_hdr(tmp_path / "black.hdr", np.zeros((64, 128, 3)))
+    refused("black all over", read_environment, black)
     refused("does not exist", read_environment, tmp_path / "gone.hdr")
     refused(r"'\.pdf' is no picture", read_environment, tmp_path / "x.pdf")
     for name in ("cut.hdr", "cut.png", "empty.hdr"):
@@ -232,7 +230,8 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
 
 
 def test_openexr_is_read_where_mitsuba_is_installed(tmp_path: Path) -> None:
-    mitsuba = pytest.importorskip("mitsuba")
+    import mitsuba
+
     if mitsuba.variant() is None:
         mitsuba.set_variant("scalar_rgb")
     panorama = sky_with_sun(64, 3.0)
@@ -246,8 +245,6 @@ def test_openexr_is_read_where_mitsuba_is_installed(tmp_path: Path) -> None:
 def test_openexr_without_a_reader_says_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import sys
-
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     (tmp_path / "sky.exr").write_bytes(b"\x76\x2f\x31\x01" + bytes(100))
     refused(r"realsim\[photo\].*convert.*\.hdr", read_environment, tmp_path / "sky.exr")
