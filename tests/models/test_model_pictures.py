@@ -8,15 +8,9 @@ import pytest
 from realsim.geometry import se3
 from realsim.geometry.mesh import merged
 from realsim.geometry.parts import part
+from realsim.models import model_picture_views as views
 from realsim.models.library_prepare import PrepareConfig, prepare_unscaled
 from realsim.models.library_records import ModelProperties
-from realsim.models.model_picture_views import (
-    drawn_size,
-    rendered,
-    rim_layer,
-    rotation_axes,
-    view_of,
-)
 from realsim.models.model_records import ConvexParts
 from realsim.models.pictures import PANEL, figure_lines, model_sheet
 
@@ -31,9 +25,9 @@ def near(image: np.ndarray, color: np.ndarray) -> int:
 
 def test_open_rims_are_red_and_closed_meshes_have_none():
     mesh = part("tube").mesh
-    assert rim_layer(mesh, 1.0).lines == ()
+    assert views.rim_layer(mesh, 1.0).lines == ()
     cut = replace(mesh, faces=mesh.faces[np.arange(len(mesh.faces)) % 40 != 0])
-    assert len(rim_layer(cut, 1.0).lines) > 30
+    assert len(views.rim_layer(cut, 1.0).lines) > 30
     assert near(model_sheet(cut, UNKNOWN), RIM) > 200
 
 
@@ -51,9 +45,9 @@ def test_every_part_has_its_colour():
 
 
 def test_a_pixel_is_as_wide_as_the_scale_bar_says():
-    drawn, factor = drawn_size(part("cube").mesh)
-    view = view_of(drawn.vertices, (0.0, -1.0, 0.0), SIZE)
-    _, depth = rendered([drawn], view)
+    drawn, factor = views.drawn_size(part("cube").mesh)
+    view = views.view_of(drawn.vertices, (0.0, -1.0, 0.0), SIZE)
+    _, depth = views.rendered([drawn], view)
     wide_px = np.ptp(np.nonzero(depth > 0)[1]) + 1
     # Perspective: the front face is nearer than the middle, for which the bar holds.
     nearer = view.T_obj_cam[1, 3] / (view.T_obj_cam[1, 3] + 0.025 * factor)
@@ -65,11 +59,11 @@ def test_a_pixel_is_as_wide_as_the_scale_bar_says():
 )
 def test_the_axes_of_known_shapes(name: str, orders: dict[int, int]):
     symmetries = part(name).symmetries
-    found = [order for order, _, _ in rotation_axes(symmetries)]
+    found = [order for order, _, _ in views.rotation_axes(symmetries)]
     assert {n: found.count(n) for n in set(found)} == orders
     # Equivariance: where the object is put, its axes go along.
     T = se3.from_rt(se3.exp_so3([0.4, -0.9, 0.3]), [0.2, -0.1, 0.5])
-    moved = rotation_axes(T @ symmetries @ se3.invert(T))
+    moved = views.rotation_axes(T @ symmetries @ se3.invert(T))
     for order, direction, point in moved:
         S = se3.from_rt(R := se3.exp_so3(2 * np.pi / order * direction), point - R @ point)
         assert min(np.abs(T @ A @ se3.invert(T) - S).max() for A in symmetries) < 1e-6

@@ -13,20 +13,10 @@ from hypothesis import strategies as st
 from msgspec import Meta
 
 from begun_sessions import begun
+from realsim import records
 from realsim import store as stores
 from realsim.arrays import Array
 from realsim.geometry import se3
-from realsim.records import (
-    ArmErrorMap,
-    CameraIntrinsics,
-    HandEye,
-    ObjectPose,
-    RobotErrorMap,
-    Scene,
-    SupportPlane,
-    TagBoard,
-    View,
-)
 from realsim.records.calibration import RobotMap
 from realsim.records.depth_bias import DepthBias
 from realsim.robots.arm import UR5
@@ -45,14 +35,14 @@ def through_text(value):
 
 def camera(rng):
     fx, fy, cx, cy = rng.uniform(100, 1000, 4).tolist()
-    return CameraIntrinsics(
+    return records.CameraIntrinsics(
         width=640, height=480, fx=fx, fy=fy, cx=cx, cy=cy, distortion=rng.normal(size=8)
     )
 
 
 def hand_eye(rng):
     A = rng.normal(size=(6, 6))
-    return HandEye(
+    return records.HandEye(
         T_ee_cam=se3.random_transform(rng), covariance=A @ A.T,
         T_base_board=se3.random_transform(rng), intrinsics=camera(rng),
         intrinsics_sd=rng.random(12), view_indices=(0, 2, 5),
@@ -64,21 +54,21 @@ def hand_eye(rng):
 def scene(rng):
     A = rng.normal(size=(6, 6))
     objects = tuple(
-        ObjectPose(
+        records.ObjectPose(
             obj_id=3, instance=k, T_world_obj=se3.random_transform(rng),
             covariance=A @ A.T if k else None, verdict="doubtful", reasons=("hidden",),
             checks={"agree": float(rng.random()), "free": float("nan"), "gap": float("-inf")},
         )
         for k in range(3)
     )  # fmt: skip
-    plane = SupportPlane(
+    plane = records.SupportPlane(
         T_world_table=se3.random_transform(rng), rms_m=float(rng.random()), inliers=77
     )
-    return Scene(name="table 1", objects=objects, plane=plane)
+    return records.Scene(name="table 1", objects=objects, plane=plane)
 
 
 def views(rng):
-    return View(
+    return records.View(
         index=4, T_base_ee=se3.random_transform(rng), joints=rng.normal(size=6),
         T_world_cam=se3.random_transform(rng), time_s=float(rng.random()),
     )  # fmt: skip
@@ -95,8 +85,8 @@ def test_reading_undoes_writing_bit_for_bit(make, seed):
     assert through_text(to_json(back)) == text
 
 
-ARM = ArmErrorMap(arm=UR5.bare(), errors=np.arange(24.0), T_flange_tool=np.eye(4))
-POSES = RobotErrorMap(
+ARM = records.ArmErrorMap(arm=UR5.bare(), errors=np.arange(24.0), T_flange_tool=np.eye(4))
+POSES = records.RobotErrorMap(
     frame="base", mean=np.zeros(12), sd_m=np.nan, weights=np.ones((6, 12)), reach=np.ones((3, 12))
 )
 
@@ -104,8 +94,8 @@ POSES = RobotErrorMap(
 @pytest.mark.parametrize(
     "record",
     [
-        TagBoard(rows=5, columns=7, tag_size_m=0.03, gap_m=0.009, first_id=3), View(index=1),
-        Scene(name="empty", objects=()), DepthBias(),
+        records.TagBoard(rows=5, columns=7, tag_size_m=0.03, gap_m=0.009, first_id=3),
+        records.View(index=1), records.Scene(name="empty", objects=()), DepthBias(),
         replace(hand_eye(np.random.default_rng(1)), robot_map=ARM),
         replace(hand_eye(np.random.default_rng(1)), robot_map=POSES),
     ],
@@ -124,7 +114,7 @@ def test_numbers_that_json_lacks():
 def test_a_rotation_edited_by_hand_is_made_rigid_again():
     data = to_json(views(np.random.default_rng(0)))
     data["T_base_ee"] = np.round(data["T_base_ee"], 6).tolist()
-    R = from_json(data, View, "the view").T_base_ee[:3, :3]
+    R = from_json(data, records.View, "the view").T_base_ee[:3, :3]
     assert np.abs(R.T @ R - np.eye(3)).max() < 1e-14
 
 
@@ -132,7 +122,7 @@ class Note(OwnFile, kw_only=True):
     format: Literal["note 1"] = "note 1"
     unit_m: Annotated[float, Meta(gt=0, le=0.02)]
     sigma: Real = math.nan
-    scene: Scene | None = None
+    scene: records.Scene | None = None
     map: RobotMap | None = None
     pad: PadFile | None = None
 
@@ -172,7 +162,7 @@ def test_what_is_no_sound_json_is_refused_as_that_of_others(tmp_path, text):
 def test_results_live_in_the_session(tmp_path):
     rng = np.random.default_rng(5)
     store, h, s = begun(tmp_path, camera(rng), unit_m=1e-3), hand_eye(rng), scene(rng)
-    board = TagBoard(rows=5, columns=7, tag_size_m=0.03, gap_m=0.009)
+    board = records.TagBoard(rows=5, columns=7, tag_size_m=0.03, gap_m=0.009)
     sets = [tried_set(rng, instance=2), tried_set(rng, n=0, instance=0)]
     stores.save_hand_eye(store, h)
     stores.save_scene(store, s)

@@ -16,27 +16,9 @@ from realsim.app.school.files import stored_grasps
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.mesh import mass_properties
+from realsim_sim_bridge.demonstrations import front_view, placing
 from realsim_sim_bridge.demonstrations.attempt_motion import fall
-from realsim_sim_bridge.demonstrations.front_view import (
-    BORDER,
-    FrontView,
-    Happening,
-    hidden,
-    nearest_camera,
-    placed_front,
-    view_intrinsics,
-    wrist_camera,
-)
 from realsim_sim_bridge.demonstrations.place_source import PlacingSource
-from realsim_sim_bridge.demonstrations.placing import (
-    FREE,
-    PHRASES,
-    PlaceGoal,
-    Standing,
-    distance,
-    goals_of,
-    unmet,
-)
 from realsim_sim_bridge.demonstrations.records import ALL_PHASES
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of, tried_body
 from realsim_sim_bridge.demonstrations.slip_replay import RecordedEngine, replay_grasp
@@ -133,7 +115,7 @@ def test_a_replay_in_bullet_ends_as_the_school_did():
 # --- The camera beside the table: it sees all that happens, as near and as little hidden as can be.
 
 
-CAMERA = view_intrinsics(40.0)
+CAMERA = front_view.view_intrinsics(40.0)
 TOWARDS = np.array([1.0, 0.4, 0.6])
 
 
@@ -143,7 +125,7 @@ def some(seed, n=40):
 
 def a_grasp(arms, away=(1.0, 0.0)):
     grasp = np.array([[0.0, 0.0, 0.05]])
-    return Happening(
+    return front_view.Happening(
         standing=some(1) * [1, 1, 0.2], moving=some(2), grasps=grasp,
         hands=grasp[:, None] + [0.0, 0.0, 0.1], arms=np.array(arms, float).reshape(1, -1, 3),
         away_from_base=np.array(away),
@@ -152,10 +134,10 @@ def a_grasp(arms, away=(1.0, 0.0)):
 
 def test_the_nearest_camera_sees_all_and_no_nearer_one_does():
     points = some(0)
-    T = nearest_camera(points, TOWARDS, CAMERA)
+    T = front_view.nearest_camera(points, TOWARDS, CAMERA)
     p = se3.transform(se3.invert(T), points)
     uv = project(CAMERA, p)
-    edge = BORDER * np.array([CAMERA.width, CAMERA.height])
+    edge = front_view.BORDER * np.array([CAMERA.width, CAMERA.height])
     low, high = edge - 0.5, np.array([CAMERA.width, CAMERA.height]) - edge - 0.5
     assert p[:, 2].min() > 0 and (uv > low - 1e-6).all() and (uv < high + 1e-6).all()
     # It touches two opposite borders, so that no camera nearer along its axis has room for all.
@@ -164,17 +146,19 @@ def test_the_nearest_camera_sees_all_and_no_nearer_one_does():
 
 def test_a_scene_that_is_elsewhere_is_seen_alike():
     moved = se3.exp([0.0, 0.0, 0.7, 0.3, -0.2, 0.0])
-    T = nearest_camera(some(0), TOWARDS, CAMERA)
-    again = nearest_camera(se3.transform(moved, some(0)), moved[:3, :3] @ TOWARDS, CAMERA)
+    T = front_view.nearest_camera(some(0), TOWARDS, CAMERA)
+    again = front_view.nearest_camera(
+        se3.transform(moved, some(0)), moved[:3, :3] @ TOWARDS, CAMERA
+    )
     np.testing.assert_allclose(again, moved @ T, atol=1e-9)
 
 
 def test_an_arm_between_camera_and_grasp_hides_it_and_one_behind_does_not():
     eye = np.array([1.0, 0.0, 0.5])
     between, behind = a_grasp([[0.5, 0.02, 0.275]]), a_grasp([[-0.5, 0.0, -0.2]])
-    assert hidden(between, eye).tolist() == [True]
-    assert hidden(behind, eye).tolist() == [False]
-    assert hidden(between, np.array([0.0, 1.0, 0.5])).tolist() == [False]
+    assert front_view.hidden(between, eye).tolist() == [True]
+    assert front_view.hidden(behind, eye).tolist() == [False]
+    assert front_view.hidden(between, np.array([0.0, 1.0, 0.5])).tolist() == [False]
 
 
 def test_the_camera_goes_to_the_side_that_the_arm_leaves_free():
@@ -182,10 +166,11 @@ def test_the_camera_goes_to_the_side_that_the_arm_leaves_free():
     line = np.linspace(0.1, 0.6, 12)[:, None]
     wall = [line * [np.cos(a), np.sin(a), 0.6] + [0, 0, 0.05] for a in np.radians([0, -30, -60])]
     seen = a_grasp(np.concatenate([np.add(w, [0, 0, up]) for w in wall for up in (0.0, 0.1)]))
-    camera = placed_front(FrontView(), seen)
+    camera = front_view.placed_front(front_view.FrontView(), seen)
     assert camera.T_frame_cam[1, 3] > 0.2
-    assert not hidden(seen, camera.T_frame_cam[:3, 3]).any()
-    turned = placed_front(FrontView(), replace(seen, away_from_base=np.array([-1.0, 0.0])))
+    assert not front_view.hidden(seen, camera.T_frame_cam[:3, 3]).any()
+    back = replace(seen, away_from_base=np.array([-1.0, 0.0]))
+    turned = front_view.placed_front(front_view.FrontView(), back)
     assert turned.T_frame_cam[0, 3] < 0
 
 
@@ -204,35 +189,35 @@ def box(x: float, y: float, half: float, height: float = 0.1) -> np.ndarray:
     return np.array(corners) * [half, half, height] + [x, y, 0.0]
 
 
-def standing(turn: float = 0.0, gap: float = 0.02) -> Standing:
+def standing(turn: float = 0.0, gap: float = 0.02) -> placing.Standing:
     """A mug before the robot and a bowl left of it, the whole scene turned."""
     R = se3.exp_so3([0.0, 0.0, turn])
-    return Standing(
+    return placing.Standing(
         corners={MUG: box(0.0, 0.0, 0.03) @ R.T, BOWL: box(0.02, 0.08 + gap, 0.05) @ R.T},
         names=NAMES,
         ahead=(R @ [1.0, 0.0, 0.0])[:2],
     )
 
 
-def put(goal: PlaceGoal) -> np.ndarray:
+def put(goal: placing.PlaceGoal) -> np.ndarray:
     return se3.from_translation([*goal.shift_m, 0.0])
 
 
 @pytest.mark.parametrize("turn", (0.0, 0.9, 2.8))
 def test_goals_are_met_where_they_lead_and_not_where_they_do_not(turn: float) -> None:
     there = standing(turn)
-    goals = list(goals_of(there, MUG, 0))
-    assert {g.relation for g in goals} == set(PHRASES) - {"right"}  # it is there already
+    goals = list(placing.goals_of(there, MUG, 0))
+    assert {g.relation for g in goals} == set(placing.PHRASES) - {"right"}  # it is there already
     for goal in goals:
-        assert unmet(goal, there, MUG, np.eye(4), put(goal)) == ""
+        assert placing.unmet(goal, there, MUG, np.eye(4), put(goal)) == ""
         moved = se3.transform(put(goal), there.corners[MUG])
-        assert distance(moved, [there.corners[BOWL]]) >= 0.02
-        if goal.relation == FREE:
+        assert placing.distance(moved, [there.corners[BOWL]]) >= 0.02
+        if goal.relation == placing.FREE:
             continue
         for other in goals:
             if other.relation == OPPOSITE[goal.relation]:
-                assert "is not" in unmet(goal, there, MUG, np.eye(4), put(other))
-        assert "is not" in unmet(goal, there, MUG, np.eye(4), np.eye(4))
+                assert "is not" in placing.unmet(goal, there, MUG, np.eye(4), put(other))
+        assert "is not" in placing.unmet(goal, there, MUG, np.eye(4), np.eye(4))
         # Where the words lead, by hand.
         R = se3.exp_so3([0.0, 0.0, turn])
         apart = moved.mean(axis=0) - there.corners[BOWL].mean(axis=0)
@@ -242,18 +227,18 @@ def test_goals_are_met_where_they_lead_and_not_where_they_do_not(turn: float) ->
 
 def test_what_leans_hangs_or_is_too_near_does_not_meet_its_goal() -> None:
     there = standing()
-    goal = next(g for g in goals_of(there, MUG, 0) if g.relation == "left")
+    goal = next(g for g in placing.goals_of(there, MUG, 0) if g.relation == "left")
     tipped = se3.from_rt(se3.exp_so3([np.pi / 2, 0.0, 0.0]), [0.0, 0.03, 0.03])
-    assert "leans 90 deg" in unmet(goal, there, MUG, np.eye(4), put(goal) @ tipped)
+    assert "leans 90 deg" in placing.unmet(goal, there, MUG, np.eye(4), put(goal) @ tipped)
     hanging = se3.from_translation([0.0, 0.0, 0.02]) @ put(goal)
-    assert "on the table" in unmet(goal, there, MUG, np.eye(4), hanging)
-    free = next(g for g in goals_of(there, MUG, 0) if g.relation == FREE)
+    assert "on the table" in placing.unmet(goal, there, MUG, np.eye(4), hanging)
+    free = next(g for g in placing.goals_of(there, MUG, 0) if g.relation == placing.FREE)
     near = se3.from_translation([0.02, 0.01, 0.0])
-    assert "10 mm from another" in unmet(free, there, MUG, np.eye(4), near)
+    assert "10 mm from another" in placing.unmet(free, there, MUG, np.eye(4), near)
 
 
 def test_phrasings_are_taken_in_turn_and_name_both_things() -> None:
-    said = [next(goals_of(standing(), MUG, k)).language for k in range(4)]
+    said = [next(placing.goals_of(standing(), MUG, k)).language for k in range(4)]
     assert len(set(said[:3])) == 3
     assert said[3] == said[0]
     assert all("mug" in words and "bowl" in words for words in said)
@@ -262,21 +247,22 @@ def test_phrasings_are_taken_in_turn_and_name_both_things() -> None:
 def test_things_of_one_name_are_no_reference_to_each_other() -> None:
     there = standing()
     same = replace(there, names={MUG: "mug", BOWL: "mug"})
-    assert [g.relation for g in goals_of(same, MUG, 0)] == [FREE]
+    assert [g.relation for g in placing.goals_of(same, MUG, 0)] == [placing.FREE]
     apart = standing(gap=0.1)
-    assert FREE not in [g.relation for g in goals_of(apart, MUG, 0)]  # nothing is near it
+    # Nothing is near it.
+    assert placing.FREE not in [g.relation for g in placing.goals_of(apart, MUG, 0)]
 
 
 def test_overlap_is_no_distance() -> None:
-    assert distance(box(0, 0, 0.05), [box(0.02, 0, 0.01)]) == 0.0
-    assert distance(box(0, 0, 0.05), [box(0.2, 0, 0.05)]) == pytest.approx(0.1, abs=1e-9)
-    assert distance(box(0, 0, 0.05), []) == np.inf
+    assert placing.distance(box(0, 0, 0.05), [box(0.02, 0, 0.01)]) == 0.0
+    assert placing.distance(box(0, 0, 0.05), [box(0.2, 0, 0.05)]) == pytest.approx(0.1, abs=1e-9)
+    assert placing.distance(box(0, 0, 0.05), []) == np.inf
 
 
 @pytest.mark.slow
 def test_an_object_is_carried_let_go_and_where_its_task_says(weak_school: Path) -> None:
     grasps, models = stored_grasps(weak_school)
-    cameras = (FrontView(size_px=(64, 48)), wrist_camera(None, (64, 48)))
+    cameras = (front_view.FrontView(size_px=(64, 48)), front_view.wrist_camera(None, (64, 48)))
     source = PlacingSource(grasps, models, cameras=cameras, cache=weak_school / "grasps/cache")
     done = [source[k] for k in range(len(source))]
     good = [d for d in done if d.outcome.success]
@@ -289,7 +275,7 @@ def test_an_object_is_carried_let_go_and_where_its_task_says(weak_school: Path) 
         instance = d.name.instance
         T0, T = source.scenery.Ts_table_obj[instance], d.motion.Ts_table_obj[-1]
         if d.outcome.success:
-            assert unmet(place, source.standing, instance, T0, T) == ""
+            assert placing.unmet(place, source.standing, instance, T0, T) == ""
             phases = [ALL_PHASES[p] for p in np.unique(d.motion.phase)]
             assert phases[-4:] == ["carry", "lower", "release", "withdraw"]
             # What hangs askew in the weak hand comes down askew, and turns as it lands.
