@@ -86,14 +86,6 @@ def poses_on_table():
     return dict(zip(NUMBERS, Ts, strict=True))
 
 
-def cameras():
-    rng = np.random.default_rng(8)
-    first = se3.random_transform(rng)
-    relative = se3.random_transform(rng, 3, spread=0.3)
-    relative[0] = np.eye(4)
-    return first, relative
-
-
 def annotation(Ts_cam_obj):
     rows = []
     for number, T in Ts_cam_obj.items():
@@ -109,10 +101,12 @@ def annotation(Ts_cam_obj):
 
 @pytest.fixture
 def dataset(tmp_path):
+    """Return the folder of a scene of a data set."""
     import trimesh
 
-    first, relative = cameras()
-    root = tmp_path / "scenes" / "scene_0007" / "kinect"
+    rng, root = np.random.default_rng(8), tmp_path / "scenes/scene_0007/kinect"
+    first, relative = se3.random_transform(rng), se3.random_transform(rng, 3, spread=0.3)
+    relative[0] = np.eye(4)
     (root / "annotations").mkdir(parents=True)
     np.save(root / "camera_poses.npy", relative)
     np.save(root / "cam0_wrt_table.npy", first)
@@ -125,15 +119,11 @@ def dataset(tmp_path):
         folder.mkdir(parents=True)
         mesh = trimesh.creation.box((0.05, 0.06, 0.1))
         (folder / "nontextured.ply").write_bytes(mesh.export(file_type="ply"))
-    return tmp_path
-
-
-def scene_of(dataset):
-    return dataset / "scenes" / "scene_0007"
+    return root.parent
 
 
 def test_the_poses_on_the_table_are_the_same_from_every_image(dataset):
-    found = read_graspnet_scene(scene_of(dataset))
+    found = read_graspnet_scene(dataset)
     for o, (number, T) in zip(found.scene.objects, poses_on_table().items(), strict=True):
         assert o.obj_id == number + 1
         off = se3.invert(T) @ o.T_world_obj
@@ -144,34 +134,34 @@ def test_the_poses_on_the_table_are_the_same_from_every_image(dataset):
 
 
 def test_an_image_that_disagrees_is_named(dataset):
-    path = scene_of(dataset) / "kinect/annotations/0002.xml"
+    path = dataset / "kinect/annotations/0002.xml"
     seen = read_annotation(path)
     seen[27] = se3.from_translation([0.02, 0, 0]) @ seen[27]
     path.write_text(annotation(seen))
-    (note,) = [n for n in read_graspnet_scene(scene_of(dataset)).notes if "elsewhere" in n]
+    (note,) = [n for n in read_graspnet_scene(dataset).notes if "elsewhere" in n]
     assert "object 027" in note and "image 2" in note and "20." in note
 
 
 def test_a_scene_without_objects_and_an_object_twice_are_named(dataset):
-    path = scene_of(dataset) / "kinect/annotations/0000.xml"
+    path = dataset / "kinect/annotations/0000.xml"
     text = path.read_text()
     path.write_text(text.replace("<obj_id>27<", "<obj_id>0<"))
-    refused("each once", read_graspnet_scene, scene_of(dataset))
+    refused("each once", read_graspnet_scene, dataset)
     path.write_text("<scene></scene>")
-    refused("holds no <obj>", read_graspnet_scene, scene_of(dataset))
+    refused("holds no <obj>", read_graspnet_scene, dataset)
 
 
 def test_missing_and_broken_files_are_named(dataset, tmp_path):
     refused("no realsense or kinect/camera_poses", read_graspnet_scene, tmp_path)
-    refused("no mesh", read_graspnet_scene, scene_of(dataset), tmp_path)
-    root = scene_of(dataset) / "kinect"
+    refused("no mesh", read_graspnet_scene, dataset, tmp_path)
+    root = dataset / "kinect"
     (root / "annotations/0000.xml").rename(root / "annotations/0009.xml")
     refused("annotation of image 0", read_graspnet_scene, root)
     (root / "annotations/0009.xml").rename(root / "annotations/0000.xml")
     np.save(root / "cam0_wrt_table.npy", np.diag([1.0, 1.0, -1.0, 1.0]))
-    refused("mirrored", read_graspnet_scene, scene_of(dataset), error=NotRigidError)
+    refused("mirrored", read_graspnet_scene, dataset, error=NotRigidError)
     np.save(root / "cam0_wrt_table.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    refused("only numbers", read_graspnet_scene, scene_of(dataset))
+    refused("only numbers", read_graspnet_scene, dataset)
 
 
 HOME = "scenes/scene_0003/realsense"

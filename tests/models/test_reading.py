@@ -302,48 +302,40 @@ def test_texture_transforms_of_gltf_and_usd():
     np.testing.assert_allclose(up, np.stack([0.1 - uv[:, 1], 2 * uv[:, 0]], -1), atol=1e-12)
 
 
-def broken_files(folder):
-    box = as_trimesh(textured_box())
-    glb = box.export(file_type="glb")
-    (folder / "cut.glb").write_bytes(glb[: len(glb) // 2])
-    (folder / "noise.glb").write_bytes(bytes(range(256)) * 9)
-    stl = box.export(file_type="stl")
-    (folder / "cut.stl").write_bytes(stl[: len(stl) - 100])
-    (folder / "noise.ply").write_bytes(b"ply\nformat nonsense\n" + bytes(range(256)))
-    ply = ply_bytes(textured_box(), "m")
-    (folder / "cut.ply").write_bytes(ply[: len(ply) - 60])
-    (folder / "noise.obj").write_bytes(b"v a b c\nf x y z\n")
-    (folder / "noise.off").write_bytes(b"OFF\n3 1\n0 0 0\n")
-    (folder / "far.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
-    (folder / "empty.stl").write_bytes(b"")
-    (folder / "points.ply").write_bytes(
-        b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n"
-        b"property float z\nend_header\n0 0 0\n1 1 1\n"
-    )
-    (folder / "points.obj").write_text("v 0 0 0\nv 1 0 0\n")
-    (folder / "nan.ply").write_bytes(
-        b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
-        b"property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
-        b"0 0 0\n1 nan 1\n0 1 0\n3 0 1 2\n"
-    )
-    (folder / "point.off").write_text("OFF\n3 1 0\n1 1 1\n1 1 1\n1 1 1\n3 0 1 2\n")
-    (folder / "shape.step").write_text("ISO-10303-21;")
-    return sorted(p.name for p in folder.iterdir())
+def broken_files():
+    """Return bytes by name, with what is said of them beside the name."""
+    box, ply = as_trimesh(textured_box()), ply_bytes(textured_box(), "m")
+    glb, stl = (box.export(file_type=kind) for kind in ("glb", "stl"))
+    noise, xyz = bytes(range(256)), b"property float x\nproperty float y\nproperty float z\n"
+    return {
+        "cut.glb": (glb[: len(glb) // 2], ""),
+        "noise.glb": (noise * 9, ""),
+        "cut.stl": (stl[: len(stl) - 100], ""),
+        "noise.ply": (b"ply\nformat nonsense\n" + noise, ""),
+        "cut.ply": (ply[: len(ply) - 60], ""),
+        "noise.obj": (b"v a b c\nf x y z\n", ""),
+        "noise.off": (b"OFF\n3 1\n0 0 0\n", ""),
+        "far.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", ""),
+        "empty.stl": (b"", "0 bytes"),
+        "points.ply": (
+            b"ply\nformat ascii 1.0\nelement vertex 2\n" + xyz + b"end_header\n0 0 0\n1 1 1\n",
+            "cloud of points",
+        ),
+        "points.obj": (b"v 0 0 0\nv 1 0 0\n", "cloud of points"),
+        "nan.ply": (
+            b"ply\nformat ascii 1.0\nelement vertex 3\n" + xyz + b"element face 1\nproperty list "
+            b"uchar int vertex_indices\nend_header\n0 0 0\n1 nan 1\n0 1 0\n3 0 1 2\n",
+            "1 of 3 vertices",
+        ),
+        "point.off": (b"OFF\n3 1 0\n1 1 1\n1 1 1\n1 1 1\n3 0 1 2\n", "no extent"),
+        "shape.step": (b"ISO-10303-21;", "not a mesh format"),
+    }
 
 
 def test_bad_files_are_named(tmp_path):
-    for name in broken_files(tmp_path):
-        refused(name, read_scan, tmp_path / name, "m")
-    said = {
-        "empty.stl": "0 bytes",
-        "points.ply": "cloud of points",
-        "points.obj": "cloud of points",
-        "nan.ply": "1 of 3 vertices",
-        "point.off": "no extent",
-        "shape.step": "not a mesh format",
-    }
-    for name, words in said.items():
-        refused(words, read_scan, tmp_path / name, "m")
+    for name, (data, says) in broken_files().items():
+        (tmp_path / name).write_bytes(data)
+        assert says in refused(name, read_scan, tmp_path / name, "m")
     refused("does not exist", read_scan, tmp_path / "nothing.glb", "m")
 
 
