@@ -165,6 +165,13 @@ def test_what_fails_counts_as_done_so_that_the_page_goes_on(
     page.wait(lambda: 'data-at-work="0"' in hands._html.content)
 
 
+@pytest.mark.filterwarnings("ignore:Queued a GuiUpdateMessage")
+def test_work_that_outlives_the_server_sets_controls_that_call_nothing(page: Page) -> None:
+    show: Any = page.window.grasps._show  # pyright: ignore[reportPrivateUsage]
+    page.server.stop()
+    show.value = not show.value  # no "Event loop is closed", no callback that is never awaited
+
+
 def test_a_failure_whose_refresh_fails_too_does_not_raise(
     page: Page, monkeypatch: pytest.MonkeyPatch
 ) -> None:

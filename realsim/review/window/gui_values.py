@@ -62,6 +62,17 @@ def refuse_foreign_values(gui: viser.GuiApi, refuse: Callable[[str], None]) -> N
     wire.register_handler(viser_messages.ViewerCameraMessage, seen)
 
 
+def forget_callbacks(gui: viser.GuiApi) -> None:
+    """Let no control call anything when it is set: its browser is gone.
+
+    Work that is still under way sets controls. Viser would begin a callback for each, on a loop
+    that may be closed by then.
+    """
+    api: Any = gui
+    for handle in tuple(api._gui_input_handle_from_uuid.values()):
+        handle._impl.update_cb.clear()
+
+
 def is_camera(camera: Any) -> bool:
     """Return whether what a browser gives as its camera has a place, a direction and what is up."""
     parts = ((camera.wxyz, 4), (camera.position, 3), (camera.look_at, 3), (camera.up_direction, 3))

@@ -28,7 +28,7 @@ from realsim.review.reviewed_session import ReviewedSession, Standing
 from realsim.review.window import window_text
 from realsim.review.window.browser import Browser
 from realsim.review.window.camera_stand import Standpoint
-from realsim.review.window.gui_values import refuse_foreign_values
+from realsim.review.window.gui_values import forget_callbacks, refuse_foreign_values
 from realsim.review.window.hands import Hands
 from realsim.review.window.keys import bind_keys
 from realsim.review.window.panel_correct import CorrectPanel
@@ -132,6 +132,7 @@ class Window:
     def close(self) -> None:
         """Forget the browser: it is gone."""
         self._is_closed = True
+        forget_callbacks(self.client.gui)
         self.grasps.close()
         self.hands.close()
 
