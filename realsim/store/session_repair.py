@@ -13,22 +13,12 @@ from typing import Any
 from realsim import images
 from realsim.errors import InputError, RealsimError
 from realsim.records import CaptureSession, bop_units
-from realsim.store import atomic
+from realsim.store import atomic, session_check
 from realsim.store.header import SESSION_FILE, checked_header, new_header
 from realsim.store.manifest import NAME as MANIFEST_FILE
 from realsim.store.manifest import Manifest, entry_from, entry_of
 from realsim.store.opening import BEGUN_FILE, CAMERA_FILE, RECOVERED, ROBOT_FILE, read_begun
 from realsim.store.robot_lines import CHECK, record_of
-from realsim.store.session_check import (
-    DAMAGED,
-    PLAN_FILE,
-    CheckReport,
-    check_session,
-    is_image,
-    is_own,
-    log_entries,
-    read_lists,
-)
 from realsim.store.session_store import SessionStore
 from realsim.store.view_images import depth_path, rgb_path
 from realsim.untrusted.own_json import read_object
@@ -45,8 +35,8 @@ SHOWN = 8
 class RepairReport:
     """What a repair did to one session, and to the sessions inside it."""
 
-    before: CheckReport
-    after: CheckReport
+    before: session_check.CheckReport
+    after: session_check.CheckReport
     dropped_views: tuple[int, ...]
     """Views that count as not captured from now on."""
     moved: tuple[tuple[str, str], ...]
@@ -77,10 +67,10 @@ class _Repair:
 
     def _place(self, path: str) -> Path:
         """Return a free name for a file in the folder of damaged files."""
-        target, count = self.folder / DAMAGED / path, 0
+        target, count = self.folder / session_check.DAMAGED / path, 0
         while target.exists():
             count += 1
-            target = self.folder / DAMAGED / f"{path}.{count}"
+            target = self.folder / session_check.DAMAGED / f"{path}.{count}"
         target.parent.mkdir(parents=True, exist_ok=True)
         return target
 
@@ -162,19 +152,19 @@ class _Repair:
         elif listed is not None:
             manifest.forget(ROBOT_FILE)
 
-    def list_anew(self, before: CheckReport) -> None:
+    def list_anew(self, before: session_check.CheckReport) -> None:
         """List the session's own files that no checksum covers, and say which they are."""
         lost = any(f.path == MANIFEST_FILE and f.kind == "missing" for f in before.findings)
         orphans = set(before.paths("unlisted"))
         there = [
             p for p in before.unproven
-            if is_own(p) and p not in orphans and (self.folder / p).is_file()
+            if session_check.is_own(p) and p not in orphans and (self.folder / p).is_file()
         ]  # fmt: skip
         manifest = Manifest(self.folder)
         manifest.add(
             entry_of(p, (self.folder / p).read_bytes())
             for p in there
-            if p not in manifest.entries and not is_image(p)
+            if p not in manifest.entries and not session_check.is_image(p)
         )
         if there and not lost:
             named = ", ".join(there[:SHOWN]) + (", ..." if len(there) > SHOWN else "")
@@ -202,7 +192,7 @@ def repair_session(folder: Path | str) -> RepairReport:
     """
     folder = Path(folder)
     with atomic.storing(folder, "the repaired lists"):
-        before = check_session(folder)
+        before = session_check.check_session(folder)
         repair = _Repair(folder)
         dropped = set(before.damaged_views)
         damaged = {f.path for f in before.findings if f.is_damage}
@@ -225,7 +215,7 @@ def repair_session(folder: Path | str) -> RepairReport:
         _advise(repair, before, dropped, damaged)
         return RepairReport(
             before=before,
-            after=check_session(folder),
+            after=session_check.check_session(folder),
             dropped_views=tuple(sorted(dropped)),
             moved=tuple(repair.moved),
             notes=tuple(repair.notes),
@@ -233,7 +223,9 @@ def repair_session(folder: Path | str) -> RepairReport:
         )
 
 
-def _advise(repair: _Repair, before: CheckReport, dropped: set[int], damaged: set[str]) -> None:
+def _advise(
+    repair: _Repair, before: session_check.CheckReport, dropped: set[int], damaged: set[str]
+) -> None:
     """Say what is to be done about what was taken out."""
     if dropped:
         named = ", ".join(map(str, sorted(dropped)[:12])) + ("..." if len(dropped) > 12 else "")
@@ -247,8 +239,10 @@ def _advise(repair: _Repair, before: CheckReport, dropped: set[int], damaged: se
             f"results were taken out ({', '.join(results[:4])}{'...' if len(results) > 4 else ''})"
             ": run the steps that write them again."
         )
-    if PLAN_FILE in damaged:
-        repair.notes.append(f"{PLAN_FILE} was taken out: capturing with the same plan writes it.")
+    if session_check.PLAN_FILE in damaged:
+        repair.notes.append(
+            f"{session_check.PLAN_FILE} was taken out: capturing with the same plan writes it."
+        )
 
 
 def _is_entry(line: str) -> bool:
@@ -276,7 +270,7 @@ def _recovered_header(folder: Path, begun: dict[str, Any] | None) -> dict[str, A
     Raises:
         InputError: nothing is left to make it from.
     """
-    if begun is not None and not read_lists(folder).records:
+    if begun is not None and not session_check.read_lists(folder).records:
         return begun | {"T_world_cam": {}}  # without views, nothing has changed since
     rgb = next(iter(sorted((folder / "rgb").glob("*.png"))), None)
     try:
@@ -306,7 +300,7 @@ def _recovered_header(folder: Path, begun: dict[str, Any] | None) -> dict[str, A
 
 def _devices(folder: Path) -> dict[str, Any]:
     """Return what the capture log's first run says of arm and camera."""
-    begun = next((e for e in log_entries(folder) if e.get("event") == "begun"), {})
+    begun = next((e for e in session_check.log_entries(folder) if e.get("event") == "begun"), {})
     return {f"{key}_description": begun[key] for key in ("arm", "camera") if key in begun}
 
 
@@ -322,6 +316,6 @@ def _still_told(folder: Path) -> dict[str, Any]:
 def _plan_hash(folder: Path) -> dict[str, str]:
     """Return the hash of the session's plan as captures note it, if there is a plan."""
     try:
-        return {"plan_hash": str(read_object(folder / PLAN_FILE)["sha256"])}
+        return {"plan_hash": str(read_object(folder / session_check.PLAN_FILE)["sha256"])}
     except (RealsimError, KeyError):
         return {}

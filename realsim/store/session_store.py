@@ -28,20 +28,10 @@ from realsim import images
 from realsim.arrays import Array32, UInt8, UInt16
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, CaptureSession, View, bop_units
-from realsim.store import atomic
+from realsim.store import atomic, opening
 from realsim.store.atomic import storing
 from realsim.store.header import SESSION_FILE, header_to_open, new_header
 from realsim.store.manifest import Fault, Manifest, entry_of
-from realsim.store.opening import (
-    BEGUN_FILE,
-    CAMERA_FILE,
-    ROBOT_FILE,
-    begun_bytes,
-    keep_beginning,
-    require_free,
-    require_session,
-    stored_faults,
-)
 from realsim.store.robot_lines import RobotLines, record_of
 from realsim.store.view_images import check_sizes, depth_path, is_whole, rgb_path
 from realsim.untrusted.own_json import from_json, read_values, to_json
@@ -49,7 +39,7 @@ from realsim.untrusted.own_json import from_json, read_values, to_json
 if TYPE_CHECKING:
     from realsim.store.session_check import CheckReport
 
-__all__ = ["ROBOT_FILE", "SESSION_FILE", "SessionStore", "depth_path", "rgb_path"]
+__all__ = ["SESSION_FILE", "SessionStore", "depth_path", "rgb_path"]
 
 EAGER_VIEWS = 256
 """Up to so many views scene_camera.json is written anew with each."""
@@ -66,7 +56,7 @@ class SessionStore:
         self.folder = folder
         self._header: dict[str, Any] = header
         self._manifest = Manifest(folder)
-        self._lines = RobotLines(folder / ROBOT_FILE)
+        self._lines = RobotLines(folder / opening.ROBOT_FILE)
         self._robot = self._lines.records
         self._session: CaptureSession | None = None
         self._views: dict[int, View] = {}
@@ -91,7 +81,7 @@ class SessionStore:
             InputError: there is a session already, or the record brings views without images.
         """
         folder = Path(folder)
-        require_free(folder)
+        opening.require_free(folder)
         if session.views:
             raise InputError(
                 f"session '{session.name}' brings {len(session.views)} views without images; "
@@ -102,7 +92,7 @@ class SessionStore:
         store = cls(folder, header)
         with storing(folder, SESSION_FILE):
             store._write_header()
-            store._manifest.write(BEGUN_FILE, begun_bytes(header))
+            store._manifest.write(opening.BEGUN_FILE, opening.begun_bytes(header))
             store._write_cameras()
         return store
 
@@ -116,11 +106,11 @@ class SessionStore:
         """
         folder = Path(folder)
         path = folder / SESSION_FILE
-        require_session(folder)
+        opening.require_session(folder)
         header = header_to_open(path)
         with storing(folder, "what an interrupted run left undone"):
             Manifest(folder).finish_interrupted()
-            atomic.repair_lines(folder / ROBOT_FILE)
+            atomic.repair_lines(folder / opening.ROBOT_FILE)
             if path.is_file():  # an interrupted write of the header has been finished by now
                 header = header_to_open(path)
             store = cls(folder, header)
@@ -129,26 +119,28 @@ class SessionStore:
 
     def _finish_interrupted(self) -> None:
         """Do what a kill between a view's robot line and its manifest lines left undone."""
-        listed, path = self._manifest.entries, self.folder / ROBOT_FILE
+        listed, path = self._manifest.entries, self.folder / opening.ROBOT_FILE
         data = path.read_bytes() if path.is_file() else b""
-        known = listed.get(ROBOT_FILE)
+        known = listed.get(opening.ROBOT_FILE)
         start = 0 if known is None else known.bytes
         # Only what was appended is listed: a file that was changed stays a fault of `verify`.
-        sound = known is None or entry_of(ROBOT_FILE, data[:start]) == known
+        sound = known is None or entry_of(opening.ROBOT_FILE, data[:start]) == known
         if sound:
             new = {int(record_of(line)["index"]) for line in data[start:].decode().splitlines()}
             names = [
                 p for i in self._robot for p in self._files_of(i) if i in new or p not in listed
             ]
-            names += [ROBOT_FILE] if new else []
+            names += [opening.ROBOT_FILE] if new else []
             # An image without a checksum is only listed if it is whole: `check` names the others.
-            whole = [p for p in names if p == ROBOT_FILE or is_whole(self.folder / p)]
+            whole = [p for p in names if p == opening.ROBOT_FILE or is_whole(self.folder / p)]
             self._manifest.add(entry_of(p, (self.folder / p).read_bytes()) for p in whole)
-        keep_beginning(self.folder, self._header, self._manifest)
+        opening.keep_beginning(self.folder, self._header, self._manifest)
         self._camera_lines = {v.index: self._camera_line(v) for v in self.session.views}
-        cameras, data = self.folder / CAMERA_FILE, self._camera_bytes()
+        cameras, data = self.folder / opening.CAMERA_FILE, self._camera_bytes()
         is_same = cameras.is_file() and cameras.read_bytes() == data
-        is_listed = self._manifest.entries.get(CAMERA_FILE) == entry_of(CAMERA_FILE, data)
+        is_listed = self._manifest.entries.get(opening.CAMERA_FILE) == entry_of(
+            opening.CAMERA_FILE, data
+        )
         # A view whose image was deleted keeps its line: no kill does that, and it may come back.
         kept = (p for i in self._robot for p in self._files_of(i) if p in listed)
         sound = sound and all((self.folder / p).is_file() for p in kept)
@@ -215,7 +207,7 @@ class SessionStore:
             record, T = dict(self._robot[index]), self._header["T_world_cam"].get(str(index))
             if T is not None:
                 record["T_world_cam"] = T
-            where = f"view {index} in {SESSION_FILE} or {ROBOT_FILE} of {self.folder}"
+            where = f"view {index} in {SESSION_FILE} or {opening.ROBOT_FILE} of {self.folder}"
             self._views[index] = from_json(record, View, where)
         return self._views[index]
 
@@ -269,11 +261,11 @@ class SessionStore:
             if len(self._camera_lines) <= max(EAGER_VIEWS, LAZY_GROWTH * self._cameras_written):
                 # Not flushed: `open` writes it again if a power cut loses it.
                 data = self._camera_bytes()
-                atomic.write_bytes(self.folder / CAMERA_FILE, data, flush=False)
-                entries.append(entry_of(CAMERA_FILE, data))
+                atomic.write_bytes(self.folder / opening.CAMERA_FILE, data, flush=False)
+                entries.append(entry_of(opening.CAMERA_FILE, data))
                 self._cameras_written, self._cameras_due = len(self._camera_lines), 0
             # The list of views comes last: where its line is missing, a run was interrupted.
-            self._manifest.add_sealed([*entries, self._lines.entry(ROBOT_FILE)])
+            self._manifest.add_sealed([*entries, self._lines.entry(opening.ROBOT_FILE)])
 
     def rgb(self, index: int) -> UInt8:
         """Return the colour image (H, W, 3) uint8 of a view."""
@@ -343,12 +335,12 @@ class SessionStore:
 
     def _write_cameras(self) -> None:
         self._camera_lines = {v.index: self._camera_line(v) for v in self.session.views}
-        self._manifest.write(CAMERA_FILE, self._camera_bytes())
+        self._manifest.write(opening.CAMERA_FILE, self._camera_bytes())
         self._cameras_written, self._cameras_due = len(self._camera_lines), 0
 
     def _write_due_cameras(self) -> None:
         if self._cameras_due:
-            with storing(self.folder, CAMERA_FILE):
+            with storing(self.folder, opening.CAMERA_FILE):
                 self._write_cameras()
 
     # --- other files --------------------------------------------------------------------------
@@ -441,7 +433,7 @@ class SessionStore:
         Only names and sizes are compared, which costs nothing; `verify` reads every byte.
         """
         paths = [p for i in sorted(self._robot) for p in self._files_of(i)]
-        return stored_faults(self.folder, paths, self._manifest.entries)
+        return opening.stored_faults(self.folder, paths, self._manifest.entries)
 
     def check(self) -> "CheckReport":
         """Return what is sound, missing or damaged in the session's folder; nothing is changed."""

@@ -29,7 +29,7 @@ from realsim.formats.bop.layout import SceneLayout, cameras_of, scene_number
 from realsim.formats.bop.rows import read_cameras, read_ground_truth
 from realsim.geometry import se3
 from realsim.records import CaptureSession, View, bop_units
-from realsim.store.session_store import CAMERA_FILE
+from realsim.store.opening import CAMERA_FILE
 from realsim.untrusted.files import checked_text
 
 YCB_OBJECTS = (

@@ -14,7 +14,7 @@ from realsim.formats.bop.scene import BopScene, BopSceneRef, find_scenes, read_s
 from realsim.formats.folders.listing import image_header, shown
 from realsim.formats.folders.source import file_digest, require_one_size
 from realsim.formats.frame_source import SourceFrame
-from realsim.store.session_store import CAMERA_FILE
+from realsim.store.opening import CAMERA_FILE
 
 TYPICAL_DEPTHS = 3
 """Depth images whose median distance is shown: enough to notice a wrong depth_scale."""

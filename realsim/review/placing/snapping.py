@@ -18,20 +18,12 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.records.depth_bias import DepthBias
-from realsim.registration import verify
+from realsim.registration import near_start, verify
 from realsim.registration.blind import keep_start, nearest_to_start, uncertainty
 from realsim.registration.body import Body, make_body
 from realsim.registration.compare import FRAMES, Comparer, spread_frames
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import Cloud, average_cloud, without_table
-from realsim.registration.near_start import (
-    assign_points,
-    coarse_voxel,
-    drop_height,
-    fine_voxel,
-    free_space_of,
-    search,
-)
 from realsim.registration.refinement.config import CameraPrior, RefineConfig
 from realsim.registration.refinement.refine import refine
 from realsim.registration.solver import FINE, solve_pose
@@ -198,11 +190,11 @@ class _Task:
         bodies = [self.body, *self.close]
         poses = [T_world_obj, *(o.T_start for o in self.close)]
         clouds = [cloud, *(_no_points(cloud) for _ in self.close)]
-        return assign_points(bodies, poses, clouds)[0]
+        return near_start.assign_points(bodies, poses, clouds)[0]
 
     def checks(self, T_world_obj: Array) -> dict[str, float]:
         """Return the registration's checks of the object at a pose, neighbours in place."""
-        cloud = average_cloud(self.near, self.body.T_start, fine_voxel(self.body))
+        cloud = average_cloud(self.near, self.body.T_start, near_start.fine_voxel(self.body))
         own = self.own(cloud, T_world_obj)
         comparer = self.spread(verify.FRAMES)
         bodies = [self.body, *self.hiding]
@@ -243,7 +235,7 @@ def _task(
     table_m = config.refine.points.table_margin_m
     index = np.flatnonzero(away2 < (body.radius_m + max(REACH_M, table_m)) ** 2)
     within = index[away2[index] < (body.radius_m + REACH_M) ** 2]
-    near = without_table(views.cloud(within), plane, drop_height(body, plane))
+    near = without_table(views.cloud(within), plane, near_start.drop_height(body, plane))
     comparer = replace(views.comparer, plane=plane)
     balls = [(o.center(o.T_start), o.radius_m) for o in neighbours]
     ball = (center, body.radius_m)
@@ -276,14 +268,14 @@ def _snapped(task: _Task, tick: Callable[[], None]) -> Snapped:
     """Return the result of all stages."""
     body, config, T_start = task.body, task.config, task.body.T_start
     free = _without_neighbours(task.near, task.close)
-    coarse = average_cloud(free, T_start, coarse_voxel(body))
+    coarse = average_cloud(free, T_start, near_start.coarse_voxel(body))
     if len(coarse.points) < LEAST_POINTS:
         taken = len(task.near.points) - len(free.points)
         return _nothing(body, task.checks(T_start), len(coarse.points), taken)
-    fine = average_cloud(free, T_start, fine_voxel(body))
+    fine = average_cloud(free, T_start, near_start.fine_voxel(body))
     few = task.spread(FRAMES)
-    space = free_space_of(few) if len(task.views.views) < config.refine_from else None
-    found = search(body, coarse, fine, few, space)
+    space = near_start.free_space_of(few) if len(task.views.views) < config.refine_from else None
+    found = near_start.search(body, coarse, fine, few, space)
     tick()
     T = _refined(task, found.fit.T_world_obj)
     tick()

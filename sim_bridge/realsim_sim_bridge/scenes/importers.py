@@ -22,7 +22,7 @@ from realsim.formats.graspnet.single_frame import is_graspnet_frame, open_graspn
 from realsim.geometry import se3
 from realsim.models.library_records import KnownSolid
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene, SupportPlane
-from realsim.store.session_store import CAMERA_FILE
+from realsim.store.opening import CAMERA_FILE
 from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, known_solids
 
 TABLE_STRIDE = 6
