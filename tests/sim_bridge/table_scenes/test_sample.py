@@ -340,8 +340,8 @@ def test_files_whose_names_read_alike_have_names_of_their_own(tmp_path: Path) ->
         shutil.copy(cube, copied)
     first, second = (str(tmp_path / "pools" / name) for name in "ab")
     pool = open_pool([first, second])
-    assert len({read_object(s, k, HULLS).name for s in pool.sources for k in s.keys}) == 6
-    assert read_object(open_pool([second]).sources[0], "cube.ply", HULLS).name == "cube"
+    assert len({read_object(s, k, HULLS.pool).name for s in pool.sources for k in s.keys}) == 6
+    assert read_object(open_pool([second]).sources[0], "cube.ply", HULLS.pool).name == "cube"
 
 
 def test_convex_parts_are_kept_by_content_whatever_the_size(tmp_path: Path) -> None:
