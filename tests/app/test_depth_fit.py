@@ -57,17 +57,15 @@ def test_the_stereo_camera_is_fitted_to_the_same_folder(frames: Path, tmp_path: 
 
 def test_the_wrong_unit_is_named(frames: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.json"
-    for unit in ("1", "nan"):
-        said = complained("depth-fit", frames, "--depth-unit", unit, "--out", out)
-        assert "0.001 where the counts are millimetres" in said
-    # Tenths of a millimetre taken for centimetres: a wall 26 m away.
-    assert "millimetres" in complained(
-        "depth-fit", frames, "--depth-unit", "0.01", "--out", out, "--quiet"
-    )
-    # Tenths taken for millimetres: a wall at 2.6 m, where a D405 measures nothing.
-    said = complained("depth-fit", frames, "--depth-unit", "0.001", "--out", out, "--quiet")
-    assert "measures from 0.1 to 1.5 m" in said and "--depth-unit" in said
-    assert not out.exists()
+    for unit, words in (
+        ("1", "0.001 where the counts are millimetres"),
+        ("nan", "0.001 where the counts are millimetres"),
+        ("0.01", "millimetres"),  # a wall 26 m away
+        ("0.001", "measures from 0.1 to 1.5 m"),  # a wall at 2.6 m, where a D405 measures nothing
+    ):
+        said = complained("depth-fit", frames, "--depth-unit", unit, "--out", out, "--quiet")
+        assert words in said, said
+    assert "--depth-unit" in said and not out.exists()
 
 
 def test_frames_without_a_plane_are_named(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import pytest
 from click.testing import Result
 from PIL import Image
 
+import refusals
 from plain_meshes import square
 from realsim.app import stages
 from realsim.app.console import Console
@@ -25,7 +26,6 @@ from realsim.app.register.page import page_bytes
 from realsim.app.register.pictures import draw_pictures
 from realsim.app.register.results import CameraChange, Registered, claimed_cameras, load_registered
 from realsim.app.register.run import pixel_sigma, register_session
-from realsim.errors import InputError
 from realsim.formats.bop.models import save_models
 from realsim.geometry import camera, se3
 from realsim.geometry.parts import part
@@ -235,15 +235,12 @@ def test_the_depth_bias_is_that_of_the_calibration_unless_it_is_off(session: Ses
     assert config_of(session, RegisterRequest(depth_bias=str(other))).bias.scale == 0.999
     assert isinstance(load_depth_bias(other), DepthBias)
     other.write_text('{"scale": 1.0}')
-    with pytest.raises(InputError, match="no depth bias: its entries are others"):
-        load_depth_bias(other)
+    refusals.refused("no depth bias: its entries are others", load_depth_bias, other)
 
 
 def test_a_session_without_cameras_names_both_remedies(tmp_path: Path) -> None:
     store = table_session(tmp_path / "s", views=2, posed=False)
-    with pytest.raises(InputError, match="calibrate") as error:
-        read_inputs(store, MUG)
-    assert "--hand-held" in str(error.value)
+    assert "--hand-held" in refusals.refused("calibrate", read_inputs, store, MUG)
 
 
 @pytest.mark.slow

@@ -101,13 +101,12 @@ def test_a_damaged_depth_image_is_named(known, session, tmp_path):
     save_ply(tmp_path / "mug.ply", known.scan, "m")
     path = session.path("depth/000002.png")
     path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(InputError, match="000002"):
-        run_scale(ScaleRequest(mesh=str(tmp_path / "mug.ply"), session=session.folder), CONSOLE)
+    request = ScaleRequest(mesh=str(tmp_path / "mug.ply"), session=session.folder)
+    refused("000002", run_scale, request, CONSOLE)
 
 
 def test_a_mesh_without_anything_that_knows_metres_is_refused():
-    with pytest.raises(InputError, match=r"SESSION.*--measured"):
-        run_scale(ScaleRequest(mesh="mug.ply"), CONSOLE)
+    refused("SESSION.*--measured", run_scale, ScaleRequest(mesh="mug.ply"), CONSOLE)
 
 
 @pytest.mark.parametrize(
@@ -306,5 +305,5 @@ def test_an_accepted_scale_goes_into_the_library(tmp_path):
     assert kept.scale is not None and kept.scale.verdict == "doubtful"
     assert kept.scale.scale == fit.scale and kept.scale.session == session.session.name
     np.testing.assert_allclose(kept.model.mesh.extent, UNIT_M * known.scan.extent, rtol=1e-3)
-    with pytest.raises(InputError, match=r"neither a file nor a model.*box"):
-        read_mesh(ScaleRequest(mesh="boxx", library=tmp_path / "models"))
+    request = ScaleRequest(mesh="boxx", library=tmp_path / "models")
+    refused("neither a file nor a model.*box", read_mesh, request)

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import refusals
 from graspa_folders import box_grasps, write_graspa
 from realsim.app.school import tables
 from realsim.app.school.inputs import SchoolRequest
 from realsim.app.school.run import config_of
-from realsim.errors import InputError
 from realsim.geometry.parts import part
 from realsim.untrusted.own_json import read_own
 from realsim_sim_bridge.hold.calibration import Calibration
@@ -53,8 +53,8 @@ def test_trials_are_judged_and_a_calibration_is_fitted_on_them(trials: Path) -> 
     assert again.exit_code == 0 and '"in_sample": true' in again.output
     config = config_of(SchoolRequest(calibration=fit), scene())
     assert config.calibration == told
-    with pytest.raises(InputError, match=r"reality\.json"):
-        config_of(SchoolRequest(calibration=out / "reality.json"), scene())
+    none = SchoolRequest(calibration=out / "reality.json")
+    refusals.refused(r"reality\.json", config_of, none, scene())
     assert "one of them" in refused("reality", trials, "--fit", fit, "--p-hold-calibration", fit)
 
 

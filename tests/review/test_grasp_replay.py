@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import viser
 
-from realsim import InputError, Mesh
+from realsim import Mesh
 from realsim.geometry import se3
 from realsim.records import STAGES
 from realsim.records.trajectories import PHASES
 from realsim.review.replaying import grasp_words as words
 from realsim.review.replaying.grasp_replay import GraspMotion, Motions, ReplayPlayer, hand_approach
 from realsim.robots.hand import find_hand
+from refusals import refused
 from reviewed_boxes import grasp_set
 from tried_grasps import tried_set
 
@@ -81,10 +82,8 @@ def test_motions_that_are_none_are_refused() -> None:
         {"phase": np.full(len(good), 17)}, {"Ts_world_obj": good.Ts_world_obj[:2]},
         {"link_meshes": (TRIANGLE,), "Ts_world_link": np.zeros((len(good), 2, 4, 4))},
     ):  # fmt: skip
-        with pytest.raises(InputError):
-            replace(good, **broken)
-    with pytest.raises(InputError, match="no sample"):
-        replace(good, time_s=np.zeros(0))
+        refused(".", replace, good, **broken)
+    refused("no sample", replace, good, time_s=np.zeros(0))
 
 
 # --- the player ---------------------------------------------------------------------------------
@@ -255,8 +254,7 @@ def test_one_sentence_says_why_a_grasp_failed() -> None:
     ]
     unknown = replace(grasps, failures=("",) * 7, base_scores=np.zeros(7))
     assert words.why_words(unknown, 4) == "It failed: no reason is stored."
-    with pytest.raises(IndexError):
-        words.grasp_words(grasps, 7)
+    refused(".", words.grasp_words, grasps, 7, error=IndexError)
 
 
 def test_names_of_people_are_neither_html_nor_markdown() -> None:

@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
-from realsim import InputError, local_pages
+from realsim import local_pages
 from realsim.local_pages import Door
 from realsim.review import ReviewServer
 from realsim.store import SessionStore
@@ -321,8 +321,8 @@ def test_a_token_file_that_never_ends_is_refused(tmp_path: Path) -> None:
 
 
 def test_an_unregistered_session_is_refused(store: SessionStore, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"scene\.json"):
-        ReviewServer(SessionStore.create(tmp_path / "s", replace(store.session, views=())))
+    bare = SessionStore.create(tmp_path / "s", replace(store.session, views=()))
+    refused(r"scene\.json", ReviewServer, bare)
 
 
 def test_the_first_scene_is_read_before_any_browser_comes(server: ReviewServer) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from realsim import InputError
+import refusals
 from realsim.app.review.run import ReviewRequest, open_all, write_page
 from realsim.review.reviewed_session import ReviewedSession
 from realsim.review.server import counted
@@ -29,8 +29,7 @@ def test_sessions_that_cannot_be_reviewed_are_told_and_the_others_opened(tmp_pat
     assert [s.folder.name for s in stores] == ["a"] and len(remarks) == 2
     assert "b is left out" in remarks[0] and "realsim register" in remarks[0]
     assert "c is left out" in remarks[1] and "not valid JSON" in remarks[1]
-    with pytest.raises(InputError, match="not registered yet"):
-        open_all((tmp_path / "root/b",))
+    refusals.refused("not registered yet", open_all, (tmp_path / "root/b",))
 
 
 def test_ctrl_c_ends_with_a_summary_and_exit_code_0(tmp_path: Path) -> None:
@@ -65,10 +64,10 @@ def test_a_static_page_is_of_one_scene(tmp_path: Path, capsys: pytest.CaptureFix
     torn.parent.mkdir()
     torn.write_text('{"format": 2, "id\n')
     boxes_session(tmp_path / "root/b").close()
-    console = Console(quiet=True, as_json=True)
-    with pytest.raises(InputError, match="writes one scene, and there are 2"):
-        write_page(ReviewRequest(folders=(tmp_path / "root",)), tmp_path / "page.html", console)
-    write_page(ReviewRequest(folders=(tmp_path / "root/a",)), tmp_path / "page.html", console)
+    both, one = (ReviewRequest(folders=(tmp_path / name,)) for name in ("root", "root/a"))
+    to = tmp_path / "page.html", Console(quiet=True, as_json=True)
+    refusals.refused("writes one scene, and there are 2", write_page, both, *to)
+    write_page(one, *to)
     assert (tmp_path / "page.html").read_bytes().lstrip()[:15].lower() == b"<!doctype html>"
     assert "line 1 of" in capsys.readouterr().err
 

@@ -199,8 +199,8 @@ def test_a_folder_that_is_gone_is_not_made_anew(session: ReviewedSession) -> Non
     looked_at = seen(session, 3)
     folder = session.store.folder
     folder.rename(folder.with_name("elsewhere"))
-    with pytest.raises(SessionGone, match="folder of the session is gone"):
-        session.decide("accept", looked_at, "ada")
+    why = "folder of the session is gone"
+    refused(why, session.decide, "accept", looked_at, "ada", error=SessionGone)
     assert not folder.exists()
     folder.with_name("elsewhere").rename(folder)
     session.decide("accept", looked_at, "ada")

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from realsim import InputError
 from realsim.review import journal
 from realsim.review.content.config import SceneConfig
 from realsim.review.content.content import SceneContent
 from realsim.review.static.page_nodes import LABEL_EDGES, drawn_grasps, label_class
 from realsim.review.static.static_page import PageWords, StaticSummary, write_static
 from realsim.store import save_grasps, save_scene
+from refusals import refused
 from registered_sessions import registered_by_hand, table_session, true_poses
 from review_browser import CHROMIUM, WAIT_S, review_browser
 from reviewed_boxes import grasp_set
@@ -95,8 +95,8 @@ def test_a_swap_to_a_missing_model_is_refused_with_the_file(
 ) -> None:
     first = content.scene.objects[0]
     line = journal.new_entry("swap", first, "ada", pose=first.T_world_obj, obj_id=99)
-    with pytest.raises(InputError, match=r"instance 0 .* object 99, .*obj_000099\.ply"):
-        write_static(content, journal.replay([line]), tmp_path / "scene.html", title="Scene")
+    why, state = r"instance 0 .* object 99, .*obj_000099\.ply", journal.replay([line])
+    refused(why, write_static, content, state, tmp_path / "scene.html", title="Scene")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -132,8 +132,7 @@ def test_what_cannot_be_written_is_refused_and_nothing_is_left(
         ("a", "smaller", {"title": "a", "most_bytes": 1e5}),
     ]  # fmt: skip
     for name, words, how in given:
-        with pytest.raises(InputError, match=words):
-            write_static(content, state, tmp_path / name, **how)
+        refused(words, write_static, content, state, tmp_path / name, **how)
     assert list(tmp_path.iterdir()) == []
 
 
