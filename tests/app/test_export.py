@@ -8,21 +8,26 @@ import json
 import shutil
 import tarfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from labelled_scenes import INTRINSICS, MODELS, labelled_scene, written_bop
 from realsim import images
+from realsim.app.annotate.current import annotate_session
+from realsim.app.console import Console
 from realsim.formats.bop.labels import mask_of
 from realsim.formats.bop.models import load_models
 from realsim.formats.bop.opening import open_labelled_bop
 from realsim.formats.graspit.scene import read_graspit_scene
 from realsim.formats.graspnet.annotations import read_objects
+from realsim.formats.graspnet.grasp_group import read_grasp_group
+from realsim.formats.session_scene import open_session_scene
 from realsim.geometry.metrics import mask_iou
-from realsim.store import SessionStore
+from realsim.store import SessionStore, load_grasps, load_scene, save_grasps
 from school_sessions import registered, scene
+from synthetic_scenes import captured_session
+from tried_grasps import tried_set
 from typed_commands import finished, refused
 
 
@@ -39,25 +44,19 @@ def scene_files(root):
     return folder, names
 
 
-def numbers_of(path):
-    return json.loads(path.read_text(), parse_float=str)
-
-
 def assert_same_scene(first, second):
     """Every number to the last digit, every pixel."""
     (a, names), (b, others) = scene_files(first), scene_files(second)
     assert names == others
     for name in names:
-        if name.endswith("coco.json"):
-            assert (
-                json.loads((a / name).read_text())["annotations"]
-                == (json.loads((b / name).read_text())["annotations"])
-            )
-        elif name.endswith(".json"):
-            assert numbers_of(a / name) == numbers_of(b / name), name
+        one, other = a / name, b / name
+        if name.endswith(".json"):
+            mine, theirs = (json.loads(p.read_text(), parse_float=str) for p in (one, other))
+            if name.endswith("coco.json"):  # it says when it was made
+                mine, theirs = mine["annotations"], theirs["annotations"]
+            assert mine == theirs, name
         else:
-            same = np.array_equal(images.read_image(a / name), images.read_image(b / name))
-            assert same, name
+            assert np.array_equal(images.read_image(one), images.read_image(other)), name
 
 
 def test_bop_to_the_store_and_back_is_the_same_to_the_last_digit(bop, tmp_path):
@@ -151,14 +150,15 @@ def test_the_sums_and_counts_on_the_card_are_those_of_the_folder(bop, tmp_path):
 
 def test_what_cannot_be_is_refused_and_leaves_nothing(bop, tmp_path):
     out = tmp_path / "out"
-    assert "says nothing of COLMAP" in refused(
-        "export", bop, "--to", "colmap", "--out", out, "--table-is-world"
-    )
-    assert "lies inside the source" in refused("export", bop, "--to", "bop", "--out", bop / "again")
-    assert "it has 3" in refused("export", bop, "--to", "bop", "--out", out, "--only-scenes", "4")
-    assert "not there" in refused("export", tmp_path / "no", "--to", "bop", "--out", out)
     (tmp_path / "empty").mkdir()
-    assert "accepted are" in refused("export", tmp_path / "empty", "--to", "bop", "--out", out)
+    for source, target, to, words, told in (
+        (bop, "colmap", out, ["--table-is-world"], "says nothing of COLMAP"),
+        (bop, "bop", bop / "again", [], "lies inside the source"),
+        (bop, "bop", out, ["--only-scenes", "4"], "it has 3"),
+        (tmp_path / "no", "bop", out, [], "not there"),
+        (tmp_path / "empty", "bop", out, [], "accepted are"),
+    ):
+        assert told in refused("export", source, "--to", target, "--out", to, *words)
     assert not out.exists()
 
 
@@ -207,19 +207,17 @@ def test_bop_is_what_a_pinhole_reader_renders_of_its_poses(bent, tmp_path):
 
 
 def test_a_lens_that_is_kept_says_what_it_costs(bent, tmp_path):
-    card = "README.md"
-    finished(
-        "export", bent, "--to", "bop", "--out", tmp_path / "raw", "--keep-distortion", "--quiet"
-    )
-    assert_same_scene(bent, tmp_path / "raw")
-    said = (tmp_path / "raw" / card).read_text()
+    raw = tmp_path / "raw"
+    finished("export", bent, "--to", "bop", "--out", raw, "--keep-distortion", "--quiet")
+    assert_same_scene(bent, raw)
+    said = (raw / "README.md").read_text()
     assert "the lens is kept" in said and "visible masks compared have an IoU below 0.99" in said
     args = ("export", bent, "--to", "graspnet", "--table-is-world", "--quiet", "--out")
     finished(*args, tmp_path / "g")
-    assert "the lens is kept" not in (tmp_path / "g" / card).read_text()
+    assert "the lens is kept" not in (tmp_path / "g/README.md").read_text()
     # The straight edge of a box is straight again: its mask is that of an ideal camera.
     ideal = labelled_scene(tmp_path / "ideal", [0, 1, 2])
-    label = images.read_image(next(Path(tmp_path / "g").glob("scenes/*/*/label/0000.png")))
+    label = images.read_image(next((tmp_path / "g").glob("scenes/*/*/label/0000.png")))
     for k, obj_id in enumerate(MODELS):
         assert mask_iou(label == obj_id, ideal.mask(0, k, visible=True)) >= 0.9999
     assert "contradict" in refused(*args, tmp_path / "x", "--undistort", "--keep-distortion")
@@ -396,3 +394,44 @@ def test_the_authors_scene_is_read_back(session, tmp_path):
 def test_a_scene_without_views_is_no_data_set(session, tmp_path):
     assert "no views" in refused("export", session, "--to", "bop", "--out", tmp_path / "o")
     assert not (tmp_path / "o").exists()
+
+
+# --- Grasps of a session in other programs' formats.
+
+
+@pytest.fixture(scope="module")
+def tried(tmp_path_factory):
+    store = captured_session(tmp_path_factory.mktemp("grasps") / "scene_000002", count=2)
+    rng = np.random.default_rng(4)
+    for o in load_scene(store).objects:
+        save_grasps(store, tried_set(rng, 30, obj_id=o.obj_id, instance=o.instance))
+    annotate_session(store, Console(quiet=True))
+    return store.folder
+
+
+def test_grasps_of_a_frame_are_in_its_camera(tried, tmp_path):
+    finished("export", tried, "--to", "grasp-group", "--out", tmp_path / "out", "--quiet")
+    store = SessionStore.open(tried)
+    sets = load_grasps(store)
+    scene = open_session_scene(store)
+    for index in scene.indices:
+        group = read_grasp_group(tmp_path / f"out/scene_000002/{index:06d}.npy")
+        poses = {o.instance: o.T_cam_obj for o in scene.frame(index).objects}
+        want = [
+            (poses[s.instance] @ T, label)
+            for s in sets
+            for T, label in zip(s.Ts_obj_grasp, s.labels, strict=True)
+            if np.isfinite(label)
+        ]
+        assert len(group) == len(want) > 10
+        np.testing.assert_allclose(group.Ts_a_grasp, [T for T, _ in want], atol=2e-6)
+        np.testing.assert_allclose(group.scores, [label for _, label in want], atol=1e-6)
+
+
+def test_grasps_are_of_sessions(tried, tmp_path):
+    finished("export", tried, "--to", "bop", "--out", tmp_path / "bop", "--quiet")
+    hdf5 = ("--to", "hdf5", "--out", tmp_path / "o")
+    assert "is no session" in refused("export", tmp_path / "bop", *hdf5)
+    assert not (tmp_path / "o").exists()
+    said = refused("export", tried, *hdf5, "--least-score", "0.5")
+    assert "says nothing of realsim HDF5" in said
