@@ -19,8 +19,9 @@ from realsim_sim_bridge.school import recompute_scores, run_school, run_school_r
 from realsim_sim_bridge.school.object_slips import in_words
 from realsim_sim_bridge.school.run_record import RUN_FILE, folder_of_run
 from refusals import refused
-from school_scenes import at, model, same_result, scene, small_worlds
+from school_scenes import at, model, scene, small_worlds
 from started_scripts import started
+from tried_grasps import assert_same
 
 CONFIG = small_worlds()
 SHARD = 2
@@ -66,7 +67,8 @@ def test_ctrl_c_says_how_to_go_on_and_the_next_run_does_no_shard_again(tmp_path,
             assert before.get(name, 0) in (0, (tmp_path / name).stat().st_mtime_ns)
 
     result = run(tmp_path, progress=look)[0]
-    assert seen[0] >= judged and same_result(result, whole)
+    assert seen[0] >= judged
+    assert_same(result, whole)
     assert names(tmp_path, "") == ["instance_000000.grasps.npz"]
 
 
@@ -79,7 +81,7 @@ def test_a_damaged_piece_is_made_again(tmp_path, whole):
         run(tmp_path, progress=stop)
     for path in tmp_path.glob("instance_*.npz"):
         path.write_bytes(path.read_bytes()[:100])
-    assert same_result(run(tmp_path)[0], whole)
+    assert_same(run(tmp_path)[0], whole)
 
 
 SCRIPT = """
@@ -117,7 +119,7 @@ def test_a_run_killed_at_random_moments_ends_as_if_it_had_not_been(tmp_path):
     assert int(lines[0].split()[0]) >= judged > 0
     kept = run(tmp_path / "cache", objects=TWO)
     for a, b in zip(kept, run(objects=TWO), strict=True):
-        assert same_result(a, b)
+        assert_same(a, b)
     assert not list((tmp_path / "cache").glob(".*"))
 
 
@@ -178,7 +180,7 @@ def test_a_shard_that_kills_its_workers_is_given_up_with_its_grasps_named(
     others = np.setdiff1d(np.arange(6), shard)
     assert np.array_equal(found.scores[others], whole.grasp_set.scores[others])
     monkeypatch.undo()
-    assert same_result(run(tmp_path)[0], whole)
+    assert_same(run(tmp_path)[0], whole)
 
 
 def test_an_error_in_a_shard_names_object_and_grasps(deadly):
@@ -248,7 +250,7 @@ def test_two_runs_at_once_in_one_folder_are_refused(tmp_path):
 def test_only_a_finished_run_gives_way_to_another(tmp_path, whole):
     other = replace(CONFIG, seed=7)
     run(tmp_path, other)
-    assert same_result(run(tmp_path, restart="finished")[0], whole)
+    assert_same(run(tmp_path, restart="finished")[0], whole)
     grasps = names(tmp_path, "grasps")
     written = [(tmp_path / name).stat().st_mtime_ns for name in grasps]
     run(tmp_path, restart="finished")
@@ -287,4 +289,5 @@ def test_a_cluster_that_loses_a_worker_finds_what_one_process_finds():
     found = run(objects=TWO, workers=where, progress=kill_one)
     assert killed, "a worker was killed in the middle"
     for a, b in zip(found, run(objects=TWO), strict=True):
-        assert not a.unfinished and same_result(a, b)
+        assert not a.unfinished
+        assert_same(a, b)

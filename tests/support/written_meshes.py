@@ -71,7 +71,7 @@ def write_textured_obj(path, mesh, texture_name="skin.png"):
     path.write_text("\n".join(lines) + "\n")
 
 
-def write_usd(path, mesh, *, metres=1.0, up="Z", texture="skin.png", uv_scale=None):
+def write_usd(path, mesh, *, metres=1.0, up="Z", texture="skin.png"):
     """Write a mesh with a UsdPreviewSurface; faceVarying coordinates, as exporters do."""
     from PIL import Image
     from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
