@@ -4,21 +4,22 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn, get_args
+from typing import Annotated, Any, Literal
 
-import numpy as np
+from msgspec import Meta
 
 from realsim.app.report.figures import Figure, figures_from_json
-from realsim.app.report.section import READING, SEVERITIES
+from realsim.app.report.section import READING, Severity, State
 from realsim.app.report.session import DOCUMENT, hidden_of, report_of
-from realsim.app.report.summary import SCHEMA, SCHEMA_VERSION, STATE_KIND, VERDICTS
+from realsim.app.report.summary import SCHEMA, SCHEMA_VERSION
 from realsim.app.stages import open_session, session_models
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.pages import Page
 from realsim.records import ObjectModel, Verdict
 from realsim.untrusted.json_text import read_json
-from realsim.untrusted.values import mapping, number, numbers, whole
+from realsim.untrusted.own_json import from_json, to_json
+from realsim.untrusted.values import mapping, numbers
 
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
@@ -102,6 +103,51 @@ SERIES_OF_SHARES = ("school.scores", "school.p_hold", "labels.visibility")
 """Series of values between 0 and 1."""
 
 
+Number = Annotated[int, Meta(ge=0, le=2**31)]
+Sigma = Annotated[float, Meta(ge=0)] | None
+"""None = not known."""
+Row = Annotated[list[float], Meta(min_length=4, max_length=4)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Finding:
+    severity: Severity
+    section: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Object:
+    instance: Number
+    obj_id: Number
+    name: str
+    verdict: Verdict
+    probability: Annotated[float, Meta(ge=0, le=1)] | None
+    sigma_mm: Sigma
+    sigma_deg: Sigma
+    T_world_obj: Annotated[list[Row], Meta(min_length=4, max_length=4)]
+
+
+@dataclass(frozen=True, slots=True)
+class _ByView:
+    view: list[Number]
+    value: list[float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Stored:
+    """What `realsim.app.report.summary.Report.document` writes."""
+
+    session: str
+    verdict: Literal["bad", "look", "unfinished", "sound"]
+    figures: dict[str, Any]
+    missing: dict[str, str]
+    stages: dict[str, State]
+    findings: list[_Finding]
+    objects: list[_Object]
+    series: dict[str, Any]
+
+
 def read_stored(path: Path, label: str) -> Source:
     """Return a stored report; figures and series that this version does not know are left out.
 
@@ -131,117 +177,39 @@ def read_stored(path: Path, label: str) -> Source:
 
 
 def _checked(told: Mapping[str, Any], label: str) -> Source:
-    _text(_of(told, "session", "the report"), "'session'")
-    for name, state in mapping(_of(told, "stages", "the report"), "'stages'").items():
-        _one_of(state, tuple(STATE_KIND), f"'stages.{name:.60}'")
-    for name, command in mapping(_of(told, "missing", "the report"), "'missing'").items():
-        _text(command, f"'missing.{name:.60}'")
-    for k, row in enumerate(_list(_of(told, "findings", "the report"), "'findings'")):
-        _require_finding(row, f"'findings[{k}]'")
-    figures = figures_from_json(_of(told, "figures", "the report"))
+    stored = from_json(told, _Stored, "the report")
+    figures = figures_from_json(stored.figures)
     for name in ALWAYS:
-        _of(figures, name, "'figures'")
+        if name not in figures:
+            raise InputError(f"'figures' has no '{name}'.")
+    times = Counter(o.instance for o in stored.objects)
+    for instance, n in times.items():
+        if n > 1:
+            raise InputError(f"'objects' has the instance {instance} {n} times.")
     return Source(
         label=label,
-        verdict=_one_of(_of(told, "verdict", "the report"), tuple(VERDICTS), "'verdict'"),
+        verdict=stored.verdict,
         figures=figures,
-        objects=_objects(_of(told, "objects", "the report")),
-        series=_series(_of(told, "series", "the report")),
+        objects=[_row(o, k) for k, o in enumerate(stored.objects)],
+        series=_series(stored.series),
         models={},
     )
 
 
-def _require_finding(row: Any, name: str) -> None:
-    finding = mapping(row, name)
-    _one_of(_of(finding, "severity", name), SEVERITIES, f"{name}.severity")
-    for key in ("section", "text"):
-        _text(_of(finding, key, name), f"{name}.{key}")
-
-
-def _objects(value: Any) -> list[dict[str, Any]]:
-    rows = [_object(row, f"'objects[{k}]'") for k, row in enumerate(_list(value, "'objects'"))]
-    times = Counter(row["instance"] for row in rows)
-    for instance, n in times.items():
-        if n > 1:
-            raise InputError(f"'objects' has the instance {instance} {n} times.")
-    return rows
-
-
-def _object(value: Any, where: str) -> dict[str, Any]:
+def _row(o: _Object, k: int) -> dict[str, Any]:
     """Return an object's row with a rigid pose."""
-    row = mapping(value, where)
-    told = {key: _of(row, key, where) for key in (
-        "instance", "obj_id", "name", "verdict", "probability", "sigma_mm", "sigma_deg",
-        "T_world_obj",
-    )}  # fmt: skip
-    name = f"{where}.T_world_obj"
-    rows = _list(told["T_world_obj"], name)
-    if len(rows) != 4:
-        raise InputError(f"{name} has {len(rows)} rows; 4 rows of 4 numbers are expected.")
-    T = se3.check_rigid(np.stack([numbers(r, 4, f"a row of {name}") for r in rows]), name)
-    return {
-        "instance": whole(told["instance"], f"{where}.instance", 0, 2**31),
-        "obj_id": whole(told["obj_id"], f"{where}.obj_id", 0, 2**31),
-        "name": _text(told["name"], f"{where}.name"),
-        "verdict": _one_of(told["verdict"], get_args(Verdict), f"{where}.verdict"),
-        "probability": _known(told["probability"], f"{where}.probability", 0.0, 1.0),
-        "sigma_mm": _known(told["sigma_mm"], f"{where}.sigma_mm", 0.0),
-        "sigma_deg": _known(told["sigma_deg"], f"{where}.sigma_deg", 0.0),
-        "T_world_obj": T.tolist(),
-    }
+    T = se3.check_rigid(o.T_world_obj, f"'objects[{k}].T_world_obj'")
+    return to_json(o) | {"T_world_obj": T.tolist()}
 
 
-def _series(value: Any) -> dict[str, Any]:
-    series = mapping(value, "'series'")
+def _series(series: Mapping[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name in SERIES_BY_VIEW:
         if name in series:
-            where = f"'series.{name}'"
-            row = mapping(series[name], where)
-            listed = _list(_of(row, "view", where), f"{where}.view")
-            views = [whole(v, f"{where}.view", 0, 2**31) for v in listed]
-            values = numbers(_of(row, "value", where), len(views), f"{where}.value")
-            found[name] = {"view": views, "value": values.tolist()}
+            row = from_json(series[name], _ByView, f"'series.{name}'")
+            values = numbers(row.value, len(row.view), f"'series.{name}.value'")
+            found[name] = {"view": row.view, "value": values.tolist()}
     for name in SERIES_OF_SHARES:
         if name in series:
             found[name] = numbers(series[name], None, f"'series.{name}'").tolist()
     return found
-
-
-# --- single values ----------------------------------------------------------------------------
-
-
-def _of(row: Mapping[str, Any], key: str, where: str) -> Any:
-    if key not in row:
-        raise InputError(f"{where} has no '{key}'.")
-    return row[key]
-
-
-def _known(value: Any, name: str, low: float, high: float = float("inf")) -> float | None:
-    """Return a number, or None for null: not known."""
-    return None if value is None else number(value, name, low, high)
-
-
-def _list(value: Any, name: str) -> list[Any]:
-    if not isinstance(value, list):
-        _refuse(value, name, "a list")
-    return value  # pyright: ignore[reportUnknownVariableType]
-
-
-def _text(value: Any, name: str) -> str:
-    """Return a text; an empty one, and any character, may stand in a report."""
-    if not isinstance(value, str):
-        _refuse(value, name, "a text")
-    return value
-
-
-def _one_of(value: Any, known: tuple[str, ...], name: str) -> str:
-    if value not in known:
-        _refuse(value, name, " or ".join(known))
-    return value
-
-
-def _refuse(value: Any, name: str, expected: str) -> NoReturn:
-    is_single = value is None or isinstance(value, str | int | float)
-    shown = repr(value)[:60] if is_single else f"a {type(value).__name__}"
-    raise InputError(f"{name} is {shown}; {expected} is expected.")
